@@ -1,0 +1,1 @@
+"""Physics of the hybrid actuator, its process models, and the simulated rig."""

@@ -1,0 +1,53 @@
+"""Grey-box system identification: models as plain functions, populations at vector speed."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from sysid.data import Dataset, output_scale
+from sysid.metrics import Metrics, evaluate, fit_percent, msd, rmse
+from sysid.model import (
+    Constraint,
+    Input,
+    ModelError,
+    Output,
+    Parameter,
+    ProcessModel,
+    State,
+)
+from sysid.simulation import BatchResult, BatchSimulator, Status
+from sysid.space import SearchSpace
+
+if TYPE_CHECKING:
+    from sysid.gassi import GASSI
+
+__all__ = [
+    "GASSI",
+    "BatchResult",
+    "BatchSimulator",
+    "Constraint",
+    "Dataset",
+    "Input",
+    "Metrics",
+    "ModelError",
+    "Output",
+    "Parameter",
+    "ProcessModel",
+    "SearchSpace",
+    "State",
+    "Status",
+    "evaluate",
+    "fit_percent",
+    "msd",
+    "output_scale",
+    "rmse",
+]
+
+
+def __getattr__(name: str) -> Any:
+    # scikit-learn takes most of a second to import; only the estimator needs it.
+    if name == "GASSI":
+        from sysid.gassi import GASSI
+
+        return GASSI
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,0 +1,88 @@
+"""Uniformly sampled records that a process model is fitted to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sysid.model import FloatArray, ModelError, ProcessModel
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """One record: row k holds the outputs latched at time k*dt and the inputs from then on.
+
+    inputs: (n_samples, n_inputs); outputs: (n_samples, n_outputs), NaN where a sample was
+    lost, so that a gap keeps its length in time. SI units, columns in the model's order.
+
+    Raises ModelError for mismatched shapes, fewer than two rows, or inputs that are not finite.
+    """
+
+    inputs: FloatArray
+    outputs: FloatArray
+    dt: float
+    name: str = "data"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "inputs", _matrix(self.inputs))
+        object.__setattr__(self, "outputs", _matrix(self.outputs))
+        if len(self.inputs) != len(self.outputs):
+            raise ModelError(
+                f"{self.name}: {len(self.inputs)} rows of inputs, {len(self.outputs)} of outputs"
+            )
+        if len(self.outputs) < 2:
+            raise ModelError(f"{self.name}: it has {len(self.outputs)} row(s); at least 2 needed")
+        if not (np.isfinite(self.dt) and self.dt > 0):
+            raise ModelError(f"{self.name}: sample time {self.dt} s must be positive")
+        if not np.all(np.isfinite(self.inputs)):
+            row = int(np.argmax(~np.all(np.isfinite(self.inputs), axis=1)))
+            raise ModelError(f"{self.name}: an input is not finite in row {row}")
+
+    @property
+    def n_samples(self) -> int:
+        return len(self.outputs)
+
+    @property
+    def time(self) -> FloatArray:
+        """Sample instants [s], shape (n_samples,)."""
+        return np.arange(self.n_samples) * self.dt
+
+    def check(self, model: ProcessModel) -> None:
+        """Raise ModelError unless the columns match the model's inputs and outputs."""
+        expected = (len(model.inputs), len(model.outputs))
+        found = (self.inputs.shape[1], self.outputs.shape[1])
+        if found != expected:
+            raise ModelError(
+                f"{self.name}: {found[0]} inputs and {found[1]} outputs, but model "
+                f"{model.name} has {expected[0]} and {expected[1]}"
+            )
+
+    def initial_state(self, model: ProcessModel) -> FloatArray:
+        """Start of a free run: states that are outputs from the first row, others as declared.
+
+        Shape (n_states,).
+        """
+        x0 = model.initial_state
+        first = dict(zip(model.output_names, self.outputs[0], strict=True))
+        for i, name in enumerate(model.state_names):
+            if np.isfinite(first.get(name, np.nan)):
+                x0[i] = first[name]
+        return x0
+
+
+def _matrix(values: FloatArray) -> FloatArray:
+    array = np.ascontiguousarray(values, dtype=np.float64)
+    return array[:, None] if array.ndim == 1 else array
+
+
+def output_scale(datasets: list[Dataset], per_log: bool = False) -> list[FloatArray]:
+    """max|y| of each output, the unit of (4.22) and of tables 4.2 and 4.3.
+
+    One (n_outputs,) array per dataset: its own maximum with ``per_log``, else the maximum over
+    all of them. An output that never leaves zero gets 1.
+    """
+    peaks = np.array([np.nanmax(np.abs(data.outputs), axis=0) for data in datasets])
+    if not per_log:
+        peaks = np.broadcast_to(peaks.max(axis=0), peaks.shape)
+    return [np.where(peak > 0.0, peak, 1.0) for peak in peaks]

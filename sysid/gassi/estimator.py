@@ -1,0 +1,261 @@
+"""GASSI as a scikit-learn style estimator over any process model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from sklearn.base import BaseEstimator
+from sklearn.utils.validation import check_is_fitted
+
+from sysid.data import Dataset
+from sysid.gassi.search import PRESETS, GeneticSearch, PresetName
+from sysid.metrics import fit_percent
+from sysid.model import FloatArray, ModelError, ProcessModel
+from sysid.objective import Objective
+from sysid.refinement import refine
+from sysid.simulation import BatchSimulator, Status
+from sysid.space import SearchSpace
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a watcher of the search is told: step ``done`` of ``total`` and the best error."""
+
+    stage: str
+    done: int
+    total: int
+    error: float
+
+
+class GASSI(BaseEstimator):  # type: ignore[misc]
+    """Identify a process model's parameters with a genetic algorithm.
+
+    Parameters
+    ----------
+    model : ProcessModel
+    preset : ``default``, ``thesis`` (Algorithms 2 to 5 with the penalty (4.13)-(4.20), as
+        written), ``cega`` (the same without penalty) or ``classic`` (Algorithm 1).
+    population, generations : chromosomes per generation, generations evaluated.
+    ranges : {name: (lower, upper)}, search ranges in place of the model's.
+    fixed : {name: value}, parameters not searched.
+    elite_percent : share of the population replaced by the elite, r_elite.
+    minimum_generations, termination_ratio : i_min and r_termination of (4.11).
+    weights : {output: weight}, relative importance of the outputs.
+    per_log : normalise each record by its own max|y| instead of the maximum over all.
+    accuracy : normalised RMS error that a simulation aims at.
+    max_steps : integration steps a sample may take before a chromosome is flagged.
+    threads : default all cores; the result does not depend on it.
+    random_state : seed; one seed gives one result.
+
+    Attributes
+    ----------
+    parameters_ : dict of all the model's parameters after ``fit``.
+    vector_ : (n_parameters,), the same in the model's order.
+    chromosome_ : (n_free,), the free ones in ``space_.names`` order.
+    space_ : SearchSpace that was searched.
+    error_ : mean over outputs of the RMSE normalised by max|y| (see ``Objective``).
+    search_error_ : the error before local refinement.
+    feasible_ : whether all constraints hold.
+    history_ : (n_generations,), the best error after each generation.
+    stopped_ : ``generations``, ``converged`` or ``interrupted``.
+    flagged_ : {status name: count} of simulations that failed during the search.
+    n_simulations_ : simulations of one chromosome on all records.
+    """
+
+    def __init__(
+        self,
+        model: ProcessModel | None = None,
+        *,
+        preset: PresetName = "default",
+        population: int = 300,
+        generations: int = 40,
+        ranges: Mapping[str, tuple[float, float]] | None = None,
+        fixed: Mapping[str, float] | None = None,
+        elite_percent: float = 0.5,
+        minimum_generations: int = 0,
+        termination_ratio: float = 0.0,
+        weights: Mapping[str, float] | None = None,
+        per_log: bool = False,
+        accuracy: float = 1e-3,
+        max_steps: int = 512,
+        threads: int | None = None,
+        random_state: int = 0,
+    ) -> None:
+        self.model = model
+        self.preset = preset
+        self.population = population
+        self.generations = generations
+        self.ranges = ranges
+        self.fixed = fixed
+        self.elite_percent = elite_percent
+        self.minimum_generations = minimum_generations
+        self.termination_ratio = termination_ratio
+        self.weights = weights
+        self.per_log = per_log
+        self.accuracy = accuracy
+        self.max_steps = max_steps
+        self.threads = threads
+        self.random_state = random_state
+
+    def fit(
+        self,
+        X: Dataset | Sequence[Dataset] | FloatArray,
+        y: FloatArray | None = None,
+        *,
+        dt: float | None = None,
+        on_progress: Callable[[Progress], None] | None = None,
+    ) -> GASSI:
+        """Search the parameters that make the model follow the records.
+
+        X: one Dataset, several of any lengths and rates, or an (n_samples, n_inputs) array
+        with y (n_samples, n_outputs) and the sample time dt [s]. Ctrl-C stops the search and
+        keeps the best so far. Raises ModelError when every simulation of the first generation
+        fails, or for settings that make no sense.
+        """
+        model = self._model()
+        records = _records(X, y, dt)
+        preset = PRESETS.get(self.preset)
+        if preset is None:
+            raise ModelError(f"unknown preset {self.preset!r}; choose from {', '.join(PRESETS)}")
+        self.space_ = SearchSpace.of(model, self.ranges, self.fixed, preset.log_scale)
+        simulator = self._simulator()
+        objective = Objective(
+            simulator, self.space_, records, per_log=self.per_log, weights=self._weights(model)
+        )
+        search = GeneticSearch(
+            self.space_,
+            preset,
+            self.population,
+            self.generations,
+            np.random.default_rng(self.random_state),
+            self.elite_percent,
+            self.minimum_generations,
+            self.termination_ratio,
+        )
+        notify = on_progress or (lambda progress: None)
+        self.flagged_: dict[str, int] = {}
+        self.stopped_ = "generations"
+        try:
+            self._search(search, objective, notify)
+            self._take(search.elite, search.elite_error, search.elite_feasible)
+            self.search_error_ = self.error_
+            if preset.refine:
+                self._refine(objective, notify)
+        except KeyboardInterrupt:
+            if search.elite is None:
+                raise
+            self.stopped_ = "interrupted"
+            if not hasattr(self, "search_error_"):
+                self._take(search.elite, search.elite_error, search.elite_feasible)
+                self.search_error_ = self.error_
+        self.history_ = np.array(search.history)
+        self.n_simulations_ = objective.simulations
+        return self
+
+    def predict(self, X: Dataset | FloatArray, *, dt: float | None = None) -> FloatArray:
+        """Free-run outputs of the identified model, (n_samples, n_outputs).
+
+        An array X starts from the declared initial states; a Dataset from its first sample.
+        """
+        check_is_fitted(self, "vector_")
+        if not isinstance(X, Dataset):
+            outputs = np.full((len(X), len(self._model().outputs)), np.nan)
+            X = Dataset(X, outputs, _sample_time(dt))
+        return self._simulator().trajectories(self.vector_, X)[0]
+
+    def score(self, X: Dataset | FloatArray, y: FloatArray | None = None, *, dt: float | None = None) -> float:
+        """Mean fit % over the outputs, divided by 100: 1 is perfect."""
+        (record,) = _records(X, y, dt)
+        return float(np.nanmean(fit_percent(record.outputs, self.predict(record)))) / 100.0
+
+    def _model(self) -> ProcessModel:
+        if self.model is None:
+            raise ModelError("GASSI needs a process model: GASSI(model)")
+        return self.model
+
+    def _simulator(self) -> BatchSimulator:
+        return BatchSimulator(
+            self._model(), accuracy=self.accuracy, threads=self.threads, max_steps=self.max_steps
+        )
+
+    def _weights(self, model: ProcessModel) -> FloatArray | None:
+        if self.weights is None:
+            return None
+        for name, weight in self.weights.items():
+            if name not in model.output_names:
+                raise ModelError(
+                    f"weight for unknown output {name!r}; model {model.name} has "
+                    + ", ".join(model.output_names)
+                )
+            if not (np.isfinite(weight) and weight >= 0.0):
+                raise ModelError(f"weight of {name} is {weight}; it must be 0 or more")
+        weights = np.array([float(self.weights.get(name, 1.0)) for name in model.output_names])
+        if weights.sum() == 0.0:
+            raise ModelError("every output has weight 0; at least one must count")
+        return weights
+
+    def _search(
+        self, search: GeneticSearch, objective: Objective, notify: Callable[[Progress], None]
+    ) -> None:
+        while not search.done:
+            errors, result = objective.evaluate(search.ask())
+            for status in (Status.UNBOUNDED, Status.OVER_BUDGET):
+                count = int(np.sum(result.status == status))
+                if count:
+                    name = status.name.lower()
+                    self.flagged_[name] = self.flagged_.get(name, 0) + count
+            if not np.isfinite(errors).any() and search.elite is None:
+                raise ModelError(
+                    f"every simulation of the first generation failed ({self.flagged_}); "
+                    "narrow the ranges, or raise max_steps if the model is this stiff"
+                )
+            search.tell(errors)
+            notify(
+                Progress("search", len(search.history), self.generations, search.elite_error)
+            )
+        if search.converged:
+            self.stopped_ = "converged"
+
+    def _refine(self, objective: Objective, notify: Callable[[Progress], None]) -> None:
+        limit = 50
+
+        def watch(iteration: int, error: float) -> None:
+            notify(Progress("refine", iteration, limit, error))
+
+        result = refine(objective, self.chromosome_, max_iterations=limit, on_iteration=watch)
+        if result.error < self.error_:
+            self._take(result.chromosome, result.error, True)
+
+    def _take(self, chromosome: FloatArray | None, error: float, feasible: bool) -> None:
+        assert chromosome is not None
+        self.chromosome_ = chromosome
+        self.vector_ = self.space_.full(chromosome)
+        names = self._model().parameter_names
+        self.parameters_ = {n: float(v) for n, v in zip(names, self.vector_, strict=True)}
+        self.error_ = error
+        self.feasible_ = feasible
+
+    def __sklearn_is_fitted__(self) -> bool:
+        return hasattr(self, "vector_")
+
+
+def _records(
+    X: Dataset | Sequence[Dataset] | FloatArray, y: FloatArray | None, dt: float | None
+) -> list[Dataset]:
+    if isinstance(X, Dataset):
+        return [X]
+    items: list[Any] = list(X)
+    if items and all(isinstance(item, Dataset) for item in items):
+        return items
+    if y is None:
+        raise ModelError("fit needs Datasets, or arrays X and y with the sample time dt")
+    return [Dataset(np.asarray(X), np.asarray(y), _sample_time(dt))]
+
+
+def _sample_time(dt: float | None) -> float:
+    if dt is None:
+        raise ModelError("arrays carry no time: give the sample time as dt=... in seconds")
+    return dt

@@ -1,0 +1,110 @@
+"""Steps of the genetic algorithms: initialisation, fitness, crossover, mutation, elitism.
+
+Each takes the random generator it draws from; the adaptive ones change the population in
+place, chromosome after chromosome, as Algorithms 4 and 5 are written. (Their superscripts
+i and i+1 are the population before and after the step: taken literally, the mutation's
+right-hand side would undo the crossover.)
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sysid.model import BoolArray, FloatArray
+
+
+def uniform(n: int, lower: FloatArray, upper: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Initial population spread evenly at random over the ranges, (n, n_free)."""
+    return rng.uniform(lower, upper, size=(n, len(lower)))
+
+
+def stratified(
+    n: int, lower: FloatArray, upper: FloatArray, rng: np.random.Generator
+) -> FloatArray:
+    """Latin hypercube: every n-th part of every range holds exactly one chromosome."""
+    cells = np.stack([rng.permutation(n) for _ in lower], axis=1)
+    return lower + (cells + rng.random(cells.shape)) / n * (upper - lower)
+
+
+def normalised_fitness(errors: FloatArray, flagged: BoolArray) -> FloatArray:
+    """Algorithm 3: 1 for the lowest error, 0 for the highest; flagged chromosomes get 0."""
+    fitness = np.zeros(len(errors))
+    good = ~flagged
+    if not good.any():
+        return fitness
+    highest = errors[good].max()
+    if highest <= 0.0:
+        fitness[good] = 1.0
+        return fitness
+    fitness[good] = 1.0 - errors[good] / highest
+    fitness[good] -= fitness[good].min()
+    top = fitness[good].max()
+    if top > 0.0:
+        fitness[good] /= top
+    return fitness
+
+
+def adaptive_crossover(
+    population: FloatArray, fitness: FloatArray, rng: np.random.Generator
+) -> None:
+    """Algorithm 4: of n random pairs, the less fit moves towards the fitter by a common ratio."""
+    n = len(population)
+    ratio = rng.random()
+    for a, b in rng.integers(n, size=(n, 2)):
+        if fitness[a] > fitness[b]:
+            population[b] = ratio * population[a] + (1.0 - ratio) * population[b]
+        else:
+            population[a] = ratio * population[b] + (1.0 - ratio) * population[a]
+
+
+def adaptive_mutation(
+    population: FloatArray, fitness: FloatArray, sigma: FloatArray, rng: np.random.Generator
+) -> None:
+    """Algorithm 5: chromosomes less fit than a common threshold r get r times normal noise.
+
+    sigma: (n_free,), standard deviation of the noise of each parameter.
+    """
+    n = len(population)
+    threshold = rng.random()
+    for a in rng.integers(n, size=n):
+        if fitness[a] < threshold:
+            population[a] += threshold * rng.normal(0.0, sigma)
+
+
+def replace_by_elite(
+    population: FloatArray, elite: FloatArray, percent: float, rng: np.random.Generator
+) -> None:
+    """Put the elite in place of randomly chosen chromosomes, ``percent`` of them, at least one."""
+    count = max(1, round(len(population) * percent / 100.0))
+    population[rng.choice(len(population), size=count, replace=False)] = elite
+
+
+def roulette(population: FloatArray, fitness: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Proportional selection (4.2): a new population drawn in proportion to fitness."""
+    total = fitness.sum()
+    share = fitness / total if total > 0.0 else np.full(len(fitness), 1.0 / len(fitness))
+    return population[rng.choice(len(population), size=len(population), p=share)]
+
+
+def arithmetical_crossover(
+    population: FloatArray, ratio: float, probability: float, rng: np.random.Generator
+) -> None:
+    """(4.3), (4.4): random pairs are replaced by their two weighted means."""
+    order = rng.permutation(len(population))
+    for a, b in zip(order[0::2], order[1::2], strict=False):
+        if rng.random() < probability:
+            first, second = population[a].copy(), population[b].copy()
+            population[a] = ratio * first + (1.0 - ratio) * second
+            population[b] = ratio * second + (1.0 - ratio) * first
+
+
+def uniform_mutation(
+    population: FloatArray,
+    lower: FloatArray,
+    upper: FloatArray,
+    probability: float,
+    rng: np.random.Generator,
+) -> None:
+    """Each parameter is drawn anew from its range with the given probability."""
+    chosen = rng.random(population.shape) < probability
+    population[chosen] = rng.uniform(lower, upper, size=population.shape)[chosen]

@@ -1,0 +1,99 @@
+"""Self-adaptive penalty for infeasible chromosomes, (4.13)-(4.20).
+
+Source: Farmani & Wright, "Self-adaptive fitness formulation for constrained optimization",
+IEEE Trans. Evolutionary Computation 7(5), 2003. Where the thesis's print differs from that
+paper, the paper is followed: (4.15) uses max(0, |h| - delta), and the outer cases of (4.20)
+compare the worst infeasible error with the best and scale by the population's highest error.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sysid.model import BoolArray, FloatArray
+
+
+def infeasibility(violations: FloatArray) -> FloatArray:
+    """Infeasibility score (4.16) in [0, 1] of each chromosome, (n,).
+
+    violations: (n, n_constraints), c_k of (4.15). Each constraint counts relative to its
+    largest violation in the population.
+    """
+    if violations.shape[1] == 0:
+        return np.zeros(len(violations))
+    worst = violations.max(axis=0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        relative = np.where(violations > 0.0, violations / worst, 0.0)
+    # An infinite violation is as bad as can be, not an undefined fraction.
+    relative = np.where(np.isnan(relative), 1.0, relative)
+    return relative.mean(axis=1)
+
+
+@dataclass(frozen=True)
+class Indicators:
+    """Rows of the three chromosomes that set the penalty's scale."""
+
+    best: int
+    worst_infeasible: int
+    highest_error: int
+
+
+def find_indicators(errors: FloatArray, scores: FloatArray) -> Indicators:
+    """Best, worst infeasible and highest-error chromosome among those simulated, section 4.1.3.3.
+
+    errors: (n,), finite where simulated; scores: (n,), infeasibility. At least one error must
+    be finite and one score positive.
+    """
+    usable = np.isfinite(errors)
+    rows = np.flatnonzero(usable)
+    feasible = rows[scores[rows] == 0.0]
+    infeasible = rows[scores[rows] > 0.0]
+    if len(feasible):
+        best = int(feasible[np.argmin(errors[feasible])])
+    else:
+        best = int(min(rows, key=lambda j: (scores[j], errors[j])))
+    below = infeasible[errors[infeasible] < errors[best]]
+    if len(below):
+        # Among those that look better than the best, the most infeasible; ties: lowest error.
+        worst = min(below, key=lambda j: (-scores[j], errors[j]))
+    else:
+        worst = min(infeasible, key=lambda j: (-scores[j], -errors[j]))
+    return Indicators(best, int(worst), int(rows[np.argmax(errors[rows])]))
+
+
+def penalise(errors: FloatArray, violations: FloatArray) -> FloatArray:
+    """Errors with the two penalties (4.18) and (4.19) added to infeasible chromosomes, (n,).
+
+    Errors that are not finite (flagged simulations) pass through and take no part in the
+    scale, so that one NaN does not switch the penalty off.
+    """
+    scores = infeasibility(violations)
+    usable = np.isfinite(errors)
+    infeasible: BoolArray = usable & (scores > 0.0)
+    if not infeasible.any():
+        return errors.copy()
+    at = find_indicators(errors, scores)
+    best, worst, highest = errors[at.best], errors[at.worst_infeasible], errors[at.highest_error]
+    span = scores[at.worst_infeasible] - scores[at.best]
+    # (4.17); with every chromosome equally infeasible there is nothing to grade.
+    graded = (scores - scores[at.best]) / span if span > 0.0 else np.zeros_like(scores)
+
+    first = errors.copy()
+    if worst < best:
+        first[infeasible] += graded[infeasible] * (best - worst)  # (4.18)
+    second = first.copy()
+    growth = (np.exp(2.0 * graded) - 1.0) / (np.exp(2.0) - 1.0)
+    second[infeasible] += (
+        _severity(best, worst, highest) * np.abs(first[infeasible]) * growth[infeasible]
+    )  # (4.19)
+    return second
+
+
+def _severity(best: float, worst: float, highest: float) -> float:
+    """gamma_penal of (4.20): brings the worst infeasible up to the highest error."""
+    if worst == best:
+        return 0.0
+    reference = best if worst <= best else worst
+    return (highest - reference) / reference if reference > 0.0 else 0.0

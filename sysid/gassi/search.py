@@ -1,0 +1,183 @@
+"""The genetic search, asked for populations and told their errors.
+
+``GeneticSearch`` knows no simulation: it proposes chromosomes (``ask``), takes their errors
+(``tell``), and says when it is done. The presets are settings of this one loop.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from sysid.gassi import operators
+from sysid.gassi.penalty import infeasibility, penalise
+from sysid.model import FloatArray, ModelError
+from sysid.space import SearchSpace
+
+PresetName = Literal["default", "thesis", "cega", "classic"]
+
+
+@dataclass(frozen=True)
+class Preset:
+    """What distinguishes the algorithms that share the loop.
+
+    operators: ``adaptive`` (Algorithms 2 to 5) or ``classic`` (Algorithm 1). penalty: whether
+    infeasible chromosomes are penalised (4.13)-(4.20). log_scale: search parameters marked
+    ``log`` by their logarithm. keep_in_range: clip to the ranges; else a range is only where
+    the search starts. spread: mutation noise from the ``initial`` population, as written, or
+    from the ``current`` one. stratified: Latin-hypercube start. refine: finish with local
+    least squares.
+    """
+
+    operators: Literal["adaptive", "classic"]
+    penalty: bool
+    log_scale: bool = False
+    keep_in_range: bool = False
+    spread: Literal["initial", "current"] = "initial"
+    stratified: bool = False
+    refine: bool = False
+
+
+PRESETS: dict[PresetName, Preset] = {
+    "classic": Preset(operators="classic", penalty=False),
+    "cega": Preset(operators="adaptive", penalty=False),
+    "thesis": Preset(operators="adaptive", penalty=True),
+    "default": Preset(
+        operators="adaptive",
+        penalty=True,
+        log_scale=True,
+        keep_in_range=True,
+        spread="current",
+        stratified=True,
+        refine=True,
+    ),
+}
+
+# Hyperparameters that Algorithm 1 leaves open and the adaptive algorithms do without.
+_CLASSIC_RATIO, _CLASSIC_CROSSOVER, _CLASSIC_MUTATION = 0.3, 0.8, 0.05
+
+
+@dataclass
+class GeneticSearch:
+    """One run of a genetic algorithm over a search space.
+
+    population: chromosomes per generation. generations: how many are evaluated (i_max).
+    elite_percent: r_elite. minimum_generations, termination_ratio: i_min and r_termination of
+    (4.11); a ratio of 0 leaves only the count of generations.
+
+    After each ``tell``: ``elite`` (n_free,), ``elite_error``, ``elite_feasible``, and
+    ``history``, the elite's error per generation.
+    """
+
+    space: SearchSpace
+    preset: Preset
+    population: int
+    generations: int
+    rng: np.random.Generator
+    elite_percent: float = 0.5
+    minimum_generations: int = 0
+    termination_ratio: float = 0.0
+    elite: FloatArray | None = field(default=None, init=False)
+    elite_error: float = field(default=np.inf, init=False)
+    elite_feasible: bool = field(default=False, init=False)
+    history: list[float] = field(default_factory=list, init=False)
+    converged: bool = field(default=False, init=False)
+
+    def __post_init__(self) -> None:
+        if self.population < 2:
+            raise ModelError(f"population is {self.population}; it must be at least 2")
+        if self.generations < 1:
+            raise ModelError(f"generations is {self.generations}; it must be at least 1")
+        if not 0.0 <= self.elite_percent < 100.0:
+            raise ModelError(f"elite_percent is {self.elite_percent}; it must be in [0, 100)")
+        log = self.space.log
+        self._lower, self._upper = self.space.lower.copy(), self.space.upper.copy()
+        self._lower[log], self._upper[log] = np.log(self._lower[log]), np.log(self._upper[log])
+        draw = operators.stratified if self.preset.stratified else operators.uniform
+        self._coded = draw(self.population, self._lower, self._upper, self.rng)
+        self._initial_spread = self._coded.std(axis=0)
+        self._elite_score = np.inf
+        self._first_error = np.inf
+        self._first_change: int | None = None
+
+    @property
+    def done(self) -> bool:
+        """The termination rule (4.11)."""
+        return self.converged or len(self.history) >= self.generations
+
+    def ask(self) -> FloatArray:
+        """The population to evaluate, (population, n_free), in the parameters' own units."""
+        return self.space.decode(self._coded)
+
+    def tell(self, errors: FloatArray) -> None:
+        """Take the population's errors, not finite where a simulation failed; breed the next."""
+        chromosomes = self.space.decode(self._coded)
+        flagged = ~np.isfinite(errors)
+        violations = self.space.violations(chromosomes)
+        scores = infeasibility(violations)
+        self._save_elite(errors, scores, chromosomes)
+        self._check_termination()
+        if self.done:
+            return
+        ranked = penalise(errors, violations) if self.preset.penalty else errors
+        fitness = operators.normalised_fitness(ranked, flagged)
+        if self.preset.operators == "adaptive":
+            self._breed_adaptive(fitness)
+        else:
+            self._breed_classic(fitness)
+        if self.preset.keep_in_range:
+            np.clip(self._coded, self._lower, self._upper, out=self._coded)
+
+    def _save_elite(self, errors: FloatArray, scores: FloatArray, chromosomes: FloatArray) -> None:
+        """Keep the best yet: feasible before infeasible, then the lower error (4.9)."""
+        if not self.preset.penalty:
+            scores = np.zeros_like(scores)
+        # An infeasibility score is relative to its own generation; between generations only
+        # feasible or not, and the error, can be compared.
+        usable = np.flatnonzero(np.isfinite(errors))
+        if len(usable):
+            best = min(usable, key=lambda j: (scores[j] > 0.0, errors[j]))
+            rank = (scores[best] > 0.0, errors[best])
+            if self.elite is None or rank < (not self.elite_feasible, self.elite_error):
+                self.elite = chromosomes[best].copy()
+                self.elite_error = float(errors[best])
+                self.elite_feasible = bool(scores[best] == 0.0)
+        self.history.append(self.elite_error)
+
+    def _check_termination(self) -> None:
+        """Running mean of the elite's error since it first changed, (4.10) and (4.11).
+
+        The mean divides by the number of its terms; (4.10) prints one less, which would be
+        undefined in the first generation it applies to.
+        """
+        i = len(self.history) - 1
+        if i == 0:
+            self._first_error = self.history[0]
+            return
+        if self._first_change is None and self.history[i] != self.history[i - 1]:
+            self._first_change = i
+        if self._first_change is None or i <= self.minimum_generations:
+            return
+        mean = float(np.mean(self.history[self._first_change :]))
+        self.converged = mean <= self.termination_ratio * self._first_error
+
+    def _breed_adaptive(self, fitness: FloatArray) -> None:
+        sigma = self._initial_spread
+        if self.preset.spread == "current":
+            sigma = self._coded.std(axis=0)
+        operators.adaptive_crossover(self._coded, fitness, self.rng)
+        operators.adaptive_mutation(self._coded, fitness, sigma, self.rng)
+        if self.elite is not None:
+            elite = self.space.encode(self.elite)
+            operators.replace_by_elite(self._coded, elite, self.elite_percent, self.rng)
+
+    def _breed_classic(self, fitness: FloatArray) -> None:
+        self._coded = operators.roulette(self._coded, fitness, self.rng)
+        operators.arithmetical_crossover(
+            self._coded, _CLASSIC_RATIO, _CLASSIC_CROSSOVER, self.rng
+        )
+        operators.uniform_mutation(
+            self._coded, self._lower, self._upper, _CLASSIC_MUTATION, self.rng
+        )

@@ -1,0 +1,56 @@
+"""How close a simulated output is to a measured one.
+
+Inputs are (n_samples, n_outputs); lost samples (NaN in the measurement) do not count. Results
+are (n_outputs,).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sysid.model import FloatArray
+
+
+def rmse(measured: FloatArray, simulated: FloatArray, scale: FloatArray | float = 1.0) -> FloatArray:
+    """Root of the mean squared error, divided by ``scale`` (max|y| for tables 4.2 and 4.3)."""
+    return np.sqrt(np.nanmean((simulated - measured) ** 2, axis=0)) / scale
+
+
+def msd(measured: FloatArray, simulated: FloatArray, scale: FloatArray | float = 1.0) -> FloatArray:
+    """Mean signed deviation, simulated minus measured, divided by ``scale``."""
+    return np.nanmean(simulated - measured, axis=0) / scale
+
+
+def fit_percent(measured: FloatArray, simulated: FloatArray) -> FloatArray:
+    """100 (1 - ||y - y_sim|| / ||y - mean y||); 100 is perfect, 0 no better than the mean.
+
+    An output that never changes has no spread to explain: NaN.
+    """
+    residual = np.sqrt(np.nansum((simulated - measured) ** 2, axis=0))
+    spread = np.sqrt(np.nansum((measured - np.nanmean(measured, axis=0)) ** 2, axis=0))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(spread > 0.0, 100.0 * (1.0 - residual / spread), np.nan)
+
+
+@dataclass(frozen=True)
+class Metrics:
+    """RMSE and MSD on outputs normalised by max|y| of the record, fit %, each (n_outputs,)."""
+
+    rmse: FloatArray
+    msd: FloatArray
+    fit: FloatArray
+    scale: FloatArray
+
+
+def evaluate(measured: FloatArray, simulated: FloatArray) -> Metrics:
+    """All metrics of one record; ``scale`` of the result is max|y| of ``measured``."""
+    peak = np.nanmax(np.abs(measured), axis=0)
+    scale = np.where(peak > 0.0, peak, 1.0)
+    return Metrics(
+        rmse=rmse(measured, simulated, scale),
+        msd=msd(measured, simulated, scale),
+        fit=fit_percent(measured, simulated),
+        scale=scale,
+    )

@@ -1,0 +1,70 @@
+"""The figure that identification minimises, for whole populations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sysid.data import Dataset, output_scale
+from sysid.model import FloatArray
+from sysid.simulation import BatchResult, BatchSimulator
+from sysid.space import SearchSpace
+
+
+class Objective:
+    """Mean over outputs of the RMSE on outputs normalised by max|y|.
+
+    This is (4.22) with the sum inside each root divided by the number of samples, so that it
+    does not grow with the record's length; for one record the two rank chromosomes alike, (4.22)
+    being sqrt(n_samples) times this. Several records count as one long one. ``weights``:
+    (n_outputs,), relative importance of the outputs, default equal.
+    """
+
+    def __init__(
+        self,
+        simulator: BatchSimulator,
+        space: SearchSpace,
+        records: Sequence[Dataset],
+        *,
+        per_log: bool = False,
+        weights: FloatArray | None = None,
+    ) -> None:
+        self.simulator = simulator
+        self.space = space
+        self.records = list(records)
+        self.scales = output_scale(self.records, per_log)
+        q = len(simulator.model.outputs)
+        relative = np.ones(q) if weights is None else np.asarray(weights, dtype=np.float64)
+        self.weights = relative / relative.sum()
+        self._counts = np.sum([np.isfinite(r.outputs).sum(axis=0) for r in self.records], axis=0)
+        self.simulations = 0
+
+    def evaluate(self, chromosomes: FloatArray) -> tuple[FloatArray, BatchResult]:
+        """Error of each chromosome, (n,), infinite where its simulation failed; and the batch."""
+        result = self.simulator.errors(self.space.full(chromosomes), self.records, self.scales)
+        self.simulations += len(chromosomes)
+        return self._mean_rmse(result.sse.sum(axis=1)), result
+
+    def residuals(self, chromosomes: FloatArray, n_steps: Sequence[int]) -> FloatArray:
+        """Normalised residuals at common step counts, (n, n_residuals, n_outputs).
+
+        The records follow one another; lost samples leave 0.
+        """
+        vectors = self.space.full(chromosomes)
+        parts = []
+        for record, scale, steps in zip(self.records, self.scales, n_steps, strict=True):
+            simulated = self.simulator.trajectories(vectors, record, steps)
+            missing = ~np.isfinite(record.outputs)
+            parts.append(np.where(missing, 0.0, (simulated - record.outputs) / scale))
+        self.simulations += len(vectors)
+        return np.concatenate(parts, axis=1)
+
+    def error_of(self, residuals: FloatArray) -> FloatArray:
+        """The error of residuals as returned by ``residuals``, (n,)."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            return self._mean_rmse(np.sum(residuals**2, axis=1))
+
+    def _mean_rmse(self, sse: FloatArray) -> FloatArray:
+        errors = np.sqrt(sse / self._counts) @ self.weights
+        return np.where(np.isfinite(errors), errors, np.inf)

@@ -1,0 +1,136 @@
+"""Which parameters are searched, where, and on which scale."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from sysid.model import FloatArray, ModelError, Parameter, ProcessModel, check_range
+
+
+@dataclass(frozen=True)
+class SearchSpace:
+    """The free parameters of a model between their ranges; the rest stay fixed.
+
+    A chromosome is a row of free parameters in their own units, (n_free,). ``encode`` maps it
+    to search coordinates (logarithm where the scale is log), ``decode`` back.
+    """
+
+    model: ProcessModel
+    parameters: tuple[Parameter, ...]
+    base: FloatArray
+    index: tuple[int, ...]
+    use_log: bool = True
+
+    @classmethod
+    def of(
+        cls,
+        model: ProcessModel,
+        ranges: Mapping[str, tuple[float, float]] | None = None,
+        fixed: Mapping[str, float] | None = None,
+        use_log: bool = True,
+    ) -> SearchSpace:
+        """Space from the model's own ranges, overridden by ``ranges`` and ``fixed``.
+
+        A parameter given a range becomes free; one given a value becomes fixed. Raises
+        ModelError for an unknown name, a bad range, or when nothing is left to search.
+        """
+        ranges, fixed = dict(ranges or {}), dict(fixed or {})
+        for name in (*ranges, *fixed):
+            model.parameter(name)
+        both = sorted(set(ranges) & set(fixed))
+        if both:
+            raise ModelError(f"parameter {both[0]} has both a range and a fixed value; keep one")
+        base = model.vector(fixed)
+        free, index = [], []
+        for i, parameter in enumerate(model.parameters):
+            if parameter.name in fixed or (parameter.fixed and parameter.name not in ranges):
+                continue
+            lower, upper = ranges.get(parameter.name, (parameter.lower, parameter.upper))
+            # A range that touches zero cannot be searched by logarithm.
+            scale = parameter.scale if lower > 0.0 else "linear"
+            check_range(parameter.name, lower, upper, scale)
+            _check_limits(parameter, lower, upper)
+            nominal = min(max(parameter.nominal, parameter.minimum), parameter.maximum)
+            free.append(
+                Parameter(
+                    parameter.name, parameter.unit, nominal, lower, upper, scale, False,
+                    parameter.minimum, parameter.maximum, parameter.description,
+                )
+            )
+            index.append(i)
+        if not free:
+            raise ModelError(f"model {model.name}: every parameter is fixed; free at least one")
+        return cls(model, tuple(free), base, tuple(index), use_log)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(parameter.name for parameter in self.parameters)
+
+    @property
+    def lower(self) -> FloatArray:
+        return np.array([parameter.lower for parameter in self.parameters])
+
+    @property
+    def upper(self) -> FloatArray:
+        return np.array([parameter.upper for parameter in self.parameters])
+
+    @property
+    def minimum(self) -> FloatArray:
+        return np.array([parameter.minimum for parameter in self.parameters])
+
+    @property
+    def maximum(self) -> FloatArray:
+        return np.array([parameter.maximum for parameter in self.parameters])
+
+    @property
+    def log(self) -> np.ndarray:
+        """Mask of the parameters searched by logarithm, (n_free,)."""
+        flags = [self.use_log and parameter.scale == "log" for parameter in self.parameters]
+        return np.array(flags, dtype=bool)
+
+    def encode(self, chromosomes: FloatArray) -> FloatArray:
+        """Search coordinates of chromosomes, (..., n_free)."""
+        coded = np.array(chromosomes, dtype=np.float64)
+        coded[..., self.log] = np.log(coded[..., self.log])
+        return coded
+
+    def decode(self, coded: FloatArray) -> FloatArray:
+        """Chromosomes of search coordinates, (..., n_free)."""
+        chromosomes = np.array(coded, dtype=np.float64)
+        chromosomes[..., self.log] = np.exp(chromosomes[..., self.log])
+        return chromosomes
+
+    def full(self, chromosomes: FloatArray) -> FloatArray:
+        """Complete parameter vectors of chromosomes, (..., n_parameters)."""
+        chromosomes = np.asarray(chromosomes)
+        vectors = np.broadcast_to(self.base, (*chromosomes.shape[:-1], len(self.base))).copy()
+        vectors[..., list(self.index)] = chromosomes
+        return vectors
+
+    def violations(self, chromosomes: FloatArray) -> FloatArray:
+        """Inequality violations max(0, g) of (4.15), (n_chromosomes, n_constraints).
+
+        First the physical limits of each free parameter, then the model's constraints.
+        """
+        vectors = self.full(chromosomes)
+        columns = tuple(vectors[:, i] for i in range(vectors.shape[1]))
+        below = np.maximum(0.0, self.minimum - chromosomes)
+        above = np.maximum(0.0, chromosomes - self.maximum)
+        rows = [below, above]
+        for constraint in self.model.constraints:
+            values = np.broadcast_to(constraint.function(columns), (len(chromosomes),))
+            rows.append(np.maximum(0.0, values)[:, None])
+        violations = np.concatenate(rows, axis=1)
+        # Not-a-number is no proof of feasibility.
+        return np.where(np.isnan(violations), np.inf, violations)
+
+
+def _check_limits(parameter: Parameter, lower: float, upper: float) -> None:
+    if lower < parameter.minimum or upper > parameter.maximum:
+        raise ModelError(
+            f"parameter {parameter.name}: range [{lower:g}, {upper:g}] leaves what is physically "
+            f"possible, [{parameter.minimum:g}, {parameter.maximum:g}]"
+        )
