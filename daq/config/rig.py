@@ -1,0 +1,83 @@
+"""The rig's configuration: which backend, which calibration, which limits."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import Field, field_validator
+
+from daq.config.base import Section
+
+Sign = Literal[-1, 1]
+
+
+class AnalogInput(Section):
+    """Volts at an input to SI units: value = sign * scale * (volts - offset)."""
+
+    scale: float = Field(gt=0.0, description="SI units per volt")
+    sign: Sign = Field(1, description="-1 turns the direction round")
+
+
+class Encoder(Section):
+    """Quadrature encoder: four counts per cycle."""
+
+    cycles: int = Field(2048, ge=1, le=1_000_000, description="cycles per revolution")
+    sign: Sign = Field(1, description="-1 turns the direction round")
+
+
+class Sensors(Section):
+    """Calibration of every measured channel; the only place where volts become SI units."""
+
+    current_motor: AnalogInput = Field(
+        AnalogInput(scale=0.5), description="motor current sense, A per volt (0.5 is 2 V/A)"
+    )
+    current_brake: AnalogInput = Field(
+        AnalogInput(scale=0.5), description="brake current sense, A per volt (0.5 is 2 V/A)"
+    )
+    torque: AnalogInput = Field(
+        AnalogInput(scale=0.706), description="torque bridge, N*m per volt (3.53 N*m at 5 V)"
+    )
+    encoder: Encoder = Field(Encoder(), description="shaft encoder")
+
+
+class CommandLimits(Section):
+    """Range of each command [V at the amplifier input]; beyond it the range's end is applied."""
+
+    motor: tuple[float, float] = Field((-5.0, 5.0), description="motor command [V]")
+    brake: tuple[float, float] = Field(
+        (0.0, 0.38), description="brake command [V]; 0.38 V gives 0.19 A at 0.5 A/V"
+    )
+
+    @field_validator("motor", "brake")
+    @classmethod
+    def _ordered(cls, limits: tuple[float, float]) -> tuple[float, float]:
+        low, high = limits
+        if low >= high:
+            raise ValueError(f"low end {low:g} is not below high end {high:g}; write [low, high]")
+        if not low <= 0.0 <= high:
+            raise ValueError("the range must include 0 V, to which the outputs are made safe")
+        return limits
+
+
+class CurrentLimits(Section):
+    """Measured current at which the run is stopped and the outputs zeroed [A]."""
+
+    motor: float = Field(2.4, gt=0.0, le=10.0, description="motor current [A]")
+    brake: float = Field(0.19, gt=0.0, le=10.0, description="brake current [A]")
+
+
+class Limits(Section):
+    """What keeps the rig and the hand on it whole."""
+
+    command: CommandLimits = Field(CommandLimits(), description="clamps of the commands")
+    current: CurrentLimits = Field(CurrentLimits(), description="current interlocks")
+
+
+class RigConfig(Section):
+    """A rig: the backend that talks to it, its calibration and its limits."""
+
+    name: str = Field("rig", min_length=1, max_length=80, description="shown in captures")
+    backend: str = Field("simulated", min_length=1, description="name of an installed backend")
+    options: dict[str, Any] = Field(default_factory=dict, description="the backend's own settings")
+    sensors: Sensors = Field(Sensors(), description="calibration of the measured channels")
+    limits: Limits = Field(Limits(), description="clamps and interlocks")

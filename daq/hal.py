@@ -1,0 +1,172 @@
+"""The hardware abstraction layer: what a rig is to everything above it.
+
+One tick, on every backend: at device time t_k the device latches all sensors, *then* applies
+command u_k and holds it until t_k+1. Row k of a log is therefore (y_k, u_k) with y_k older
+than u_k, and a simulation of it is x_k+1 = Phi(x_k, u_k), y_k = h(x_k).
+
+A backend implements ``Device`` in raw volts and counts. ``daq.rig.Rig`` puts SI units, clamps
+and interlocks around any device, so that those exist once.
+"""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+CHANNELS = ("motor", "brake")
+ANALOG_INPUTS = ("current_motor", "current_brake", "torque")
+
+
+class Flag(enum.IntFlag):
+    """What else is to be known of a sample; bits of the log's ``flags`` column."""
+
+    CLAMPED = 1
+    """The command asked for was outside its range; the range's end was applied."""
+    HELD = 2
+    """No command had arrived for this tick; the device held the one before."""
+    LOST = 4
+    """Samples are missing between the row before and this one."""
+    INTERLOCK = 8
+    """A limit was passed in this sample; from it on the outputs are zero."""
+    UNDERFLOW = 16
+    """The preloaded waveform ran dry; the outputs are zero."""
+    SATURATED = 32
+    """An analog input stood at the end of its converter's range."""
+
+
+class Mode(enum.Enum):
+    """Who decides when a command is late."""
+
+    OPEN_LOOP = "open loop"
+    """The waveform is preloaded and played by the device's clock; running dry zeroes it."""
+    CLOSED_LOOP = "closed loop"
+    """One command per tick; a tick without one holds the command before and flags HELD."""
+
+
+class Phase(enum.Enum):
+    """Steps of a run, in order."""
+
+    OPEN = "open"
+    CALIBRATION = "calibration"
+    HOMING = "homing"
+    RUN = "run"
+    SAFE = "safe"
+    CLOSE = "close"
+
+
+@dataclass(frozen=True)
+class RawSamples:
+    """A block of consecutive device frames, n rows, in the device's own units.
+
+    tick: (n,), index of the sample since ``start``; a gap means lost samples.
+    analog: (n, 3), volts at the inputs in ``ANALOG_INPUTS`` order.
+    counts: (n,), quadrature counts. count_rate: (n,), the device's speed estimate [counts/s].
+    applied: (n, 2), volts applied from this tick on, in ``CHANNELS`` order. flags: (n,).
+    """
+
+    tick: IntArray
+    analog: FloatArray
+    counts: IntArray
+    count_rate: FloatArray
+    applied: FloatArray
+    flags: IntArray
+
+
+@dataclass(frozen=True)
+class Samples:
+    """A block of samples in SI units, each field (n,), as the log stores it.
+
+    cmd_* is what was asked, applied_* what the device did [V at the amplifier input].
+    """
+
+    tick: IntArray
+    time: FloatArray
+    cmd_voltage_motor: FloatArray
+    cmd_voltage_brake: FloatArray
+    applied_voltage_motor: FloatArray
+    applied_voltage_brake: FloatArray
+    current_motor: FloatArray
+    current_brake: FloatArray
+    torque: FloatArray
+    theta: FloatArray
+    omega: FloatArray
+    flags: IntArray
+
+    def __len__(self) -> int:
+        return len(self.tick)
+
+
+@dataclass(frozen=True)
+class Guard:
+    """Limits that the device itself enforces within one tick, in volts.
+
+    command_low/high: (2,), outputs are clamped to them. analog_low/high: (3,), a latched input
+    beyond them zeroes both outputs until the next ``start`` and flags INTERLOCK.
+    """
+
+    command_low: FloatArray
+    command_high: FloatArray
+    analog_low: FloatArray
+    analog_high: FloatArray
+
+
+@dataclass(frozen=True)
+class DeviceInfo:
+    """Who answers, and what it can do.
+
+    max_rate [Hz]; queue: commands it can hold ahead of time; volts_in: (low, high) of its
+    analog inputs; virtual_time: whether its clock waits for the host.
+    """
+
+    name: str
+    max_rate: float
+    queue: int
+    volts_in: tuple[float, float]
+    virtual_time: bool = False
+
+
+class Device(Protocol):
+    """What a backend implements.
+
+    Methods raise ``DeviceError`` with cause and cure; ``safe`` never raises.
+    """
+
+    def open(self) -> DeviceInfo:
+        """Connect; outputs are zero afterwards."""
+
+    def announce(self, phase: Phase, turns: float = 0.0) -> None:
+        """Tell whoever stands at the rig which phase begins; homing asks to wind ``turns``.
+
+        Hardware has nothing to do here; the simulated rig's user acts on it.
+        """
+
+    def start(self, sample_rate: float, mode: Mode, guard: Guard) -> None:
+        """Begin sampling with tick 0 and zero outputs at ``sample_rate`` [Hz].
+
+        In open loop the clock starts when the first commands have been sent.
+        """
+
+    def send(self, tick: int, commands: FloatArray) -> None:
+        """Queue commands (n, 2) [V] for ticks ``tick``, ``tick + 1``, ..."""
+
+    def room(self) -> int:
+        """How many more commands the queue can take now."""
+
+    def receive(self) -> RawSamples:
+        """Block until at least one sample is there; return all that are."""
+
+    def stop(self) -> None:
+        """End sampling; outputs are zero afterwards."""
+
+    def safe(self) -> None:
+        """Zero both outputs now, in any state, any number of times, without raising."""
+
+    def close(self) -> None:
+        """Disconnect; outputs are zero afterwards."""

@@ -1,0 +1,1 @@
+"""Experiments: each protocol is one file, with its shipped YAML beside it."""

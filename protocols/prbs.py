@@ -1,0 +1,76 @@
+"""Pseudo-random binary sequences on both channels."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from pydantic import Field
+
+from daq.config import Experiment
+from daq.config.base import Section
+from daq.hal import CHANNELS, FloatArray, IntArray
+
+REGISTER_BITS = 16
+SEQUENCE_LENGTH = 2**REGISTER_BITS - 1
+
+# Taps 16, 14, 13, 11 of a register whose bit 16 leaves first: as shifts of its value.
+_TAP_SHIFTS = (0, 2, 3, 5)
+
+
+class PrbsChannel(Section):
+    """One channel: offset plus or minus amplitude, switched by a shift register."""
+
+    amplitude: float = Field(ge=0.0, le=10.0, description="half the step between levels [V]")
+    offset: float = Field(0.0, ge=-10.0, le=10.0, description="mean of the two levels [V]")
+    minimum_period: float = Field(gt=0.0, le=3600.0, description="shortest time at a level [s]")
+    seed: int = Field(
+        ge=1, le=SEQUENCE_LENGTH, description="first content of the register, not zero"
+    )
+
+
+class Prbs(Experiment):
+    """PRBS from a 16-bit Fibonacci shift register, one for each channel."""
+
+    motor: PrbsChannel
+    brake: PrbsChannel
+
+    def waveform(self) -> FloatArray:
+        """Both channels' sequences, (n_samples, 2) [V]."""
+        self.check_length()
+        columns = []
+        for name in CHANNELS:
+            channel: PrbsChannel = getattr(self, name)
+            hold = self._samples_per_bit(name, channel.minimum_period)
+            bits = lfsr_bits(channel.seed, math.ceil(self.n_samples / hold))
+            levels = channel.offset + channel.amplitude * (2.0 * bits - 1.0)
+            columns.append(np.repeat(levels, hold)[: self.n_samples])
+        return np.stack(columns, axis=1)
+
+    def _samples_per_bit(self, name: str, period: float) -> int:
+        samples = period * self.sample_rate
+        nearest = max(1, round(samples))
+        if math.isclose(samples, nearest, rel_tol=1e-9):
+            return nearest
+        below, above = max(1, math.floor(samples)), max(1, math.ceil(samples))
+        near = " or ".join(f"{n / self.sample_rate:.10g}" for n in sorted({below, above}))
+        raise ValueError(
+            f"{name}.minimum_period: {period:g} s is {samples:.6g} samples at "
+            f"{self.sample_rate:g} Hz, not a whole number; the nearest that are: {near} s"
+        )
+
+
+def lfsr_bits(seed: int, n: int) -> IntArray:
+    """First n bits that leave a 16-bit Fibonacci shift register, taps 16, 14, 13, 11.
+
+    The polynomial is primitive: any seed but 0 gives all 65535 states before it repeats.
+    """
+    state = seed
+    bits = np.empty(n, dtype=np.int64)
+    for i in range(n):
+        bits[i] = state & 1
+        feedback = 0
+        for shift in _TAP_SHIFTS:
+            feedback ^= state >> shift
+        state = (state >> 1) | ((feedback & 1) << (REGISTER_BITS - 1))
+    return bits
