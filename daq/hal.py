@@ -67,13 +67,13 @@ class RawSamples:
 
     tick: (n,), index of the sample since ``start``; a gap means lost samples.
     analog: (n, 3), volts at the inputs in ``ANALOG_INPUTS`` order.
-    counts: (n,), quadrature counts. count_rate: (n,), the device's speed estimate [counts/s].
+    counts: (n,), quadrature counts (whole numbers on hardware). count_rate: (n,), the device's speed estimate [counts/s].
     applied: (n, 2), volts applied from this tick on, in ``CHANNELS`` order. flags: (n,).
     """
 
     tick: IntArray
     analog: FloatArray
-    counts: IntArray
+    counts: FloatArray
     count_rate: FloatArray
     applied: FloatArray
     flags: IntArray

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import TracebackType
 
@@ -110,6 +111,11 @@ class Rig:
         self._asked_until += len(commands)
         low, high = self._command_limits()
         self._device.send(tick, np.clip(commands, low, high))
+
+    def take_offsets(self, means: Mapping[str, float]) -> None:
+        """Make what the inputs read now, in SI units by name, their zero."""
+        read = np.array([means[name] for name in ANALOG_INPUTS])
+        self.offsets = Offsets(self.offsets.volts + read / self._scales())
 
     def room(self) -> int:
         """How many more commands the device can take now."""

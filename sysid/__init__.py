@@ -17,6 +17,7 @@ from sysid.model import (
 )
 from sysid.simulation import BatchResult, BatchSimulator, Status
 from sysid.space import SearchSpace
+from sysid.stepping import Stepper
 
 if TYPE_CHECKING:
     from sysid.gassi import GASSI
@@ -36,6 +37,7 @@ __all__ = [
     "SearchSpace",
     "State",
     "Status",
+    "Stepper",
     "evaluate",
     "fit_percent",
     "msd",

@@ -7,6 +7,7 @@ gets a new name, and an old kernel is never used for it.
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import math
 import os
@@ -34,9 +35,11 @@ class Kernels:
 
     simulate: Callable[..., None]
     spectrum: Callable[..., None]
+    advance: Callable[..., None]
     work_size: int
 
 
+@functools.lru_cache(maxsize=8)
 def kernels(model: ProcessModel) -> Kernels:
     """Compile a model's kernels, or load them from the cache folder.
 
@@ -67,6 +70,7 @@ def kernels(model: ProcessModel) -> Kernels:
     return Kernels(
         _guarded(model, decorate(scope["simulate"])),
         _guarded(model, decorate(scope["spectrum"])),
+        _guarded(model, decorate(scope["advance"])),
         _kernel.work_size(shape),
     )
 

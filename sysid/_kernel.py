@@ -48,11 +48,13 @@ def work_size(shape: Shape) -> int:
 
 
 def source(shape: Shape) -> str:
-    """Python text of ``simulate`` and ``spectrum``; needs np, math, derivative, output as globals.
+    """Python text of the kernels; needs np, math, derivative and output as globals.
 
+    ``simulate`` runs lanes of chromosomes over a record, ``spectrum`` bounds the fastest rate
+    of the model at given points, ``advance`` runs one trajectory and keeps every step of it.
     ``simulate`` works in X, (work_size,) floats that start on a cache line.
     """
-    return _simulate(shape) + "\n\n" + _spectrum(shape) + "\n"
+    return "\n\n".join((_simulate(shape), _spectrum(shape), _advance(shape), ""))
 
 
 def _simulate(s: Shape) -> str:
@@ -81,14 +83,16 @@ def _simulate(s: Shape) -> str:
     for j in range(q):
         add(f"        y{j} = y[k, {j}]")
         add(f"        w{j} = w[k, {j}]")
+    # Lane l of state i is X[i*L + l]; the parameters follow the states.
+    outputs = _outputs(s, f"X[{{}} * {lanes} + l]", f"X[({n} + {{}}) * {lanes} + l]")
     add(f"        for l in range({lanes}):")
-    lines += _outputs(s, lanes)
+    lines += [" " * 12 + line for line in outputs]
     for j in range(q):
         add(f"            e = (o{j} - y{j}) * w{j}")
         add(f"            X[{(n + r + j) * lanes} + l] += e * e")
     add("        if store:")
     add(f"            for l in range({lanes}):")
-    lines += [f"    {line}" for line in _outputs(s, lanes)]
+    lines += [" " * 16 + line for line in outputs]
     for j in range(q):
         add(f"                record[k, {j}, l] = o{j}")
     add("        if every > 0 and k % every == 0 and k // every < snapshots.shape[0]:")
@@ -105,48 +109,86 @@ def _simulate(s: Shape) -> str:
     add(f"                alive = alive or math.isfinite({total})")
     add("            if not alive:")
     add("                break")
-    for j, foh in enumerate(s.foh):
-        if foh:
-            add(f"        s{j} = (u[k + 1, {j}] - v{j}) / n_steps")
+    lines += [" " * 8 + line for line in _slopes(s)]
     add("        for step in range(n_steps):")
-    for j, foh in enumerate(s.foh):
-        if foh:
-            add(f"            a{j} = v{j} + s{j} * step")
-            add(f"            b{j} = a{j} + 0.5 * s{j}")
-            add(f"            c{j} = a{j} + s{j}")
-        else:
-            add(f"            a{j} = v{j}")
-            add(f"            b{j} = v{j}")
-            add(f"            c{j} = v{j}")
+    lines += [" " * 12 + line for line in _stage_inputs(s)]
     add(f"            for l in range({lanes}):")
     for i in range(n):
         add(f"                x{i} = X[{i * lanes} + l]")
     add(f"                pp = {_tuple(f'X[{(n + i) * lanes} + l]' for i in range(r))}")
-    stages = (
-        ("k", [f"x{i}" for i in range(n)], "a"),
-        ("f", [f"x{i} + h2 * k{i}" for i in range(n)], "b"),
-        ("g", [f"x{i} + h2 * f{i}" for i in range(n)], "b"),
-        ("d", [f"x{i} + h * g{i}" for i in range(n)], "c"),
-    )
-    for name, at, held in stages:
-        left = _targets(name, n)
-        args = f"{_tuple(at)}, {_tuple(f'{held}{j}' for j in range(m))}, pp"
-        add(f"                {left} = derivative({args})")
+    lines += [" " * 16 + line for line in _runge_kutta(s)]
     for i in range(n):
-        add(f"                X[{i * lanes} + l] = x{i} + h6 * (k{i} + 2.0 * (f{i} + g{i}) + d{i})")
+        add(f"                X[{i * lanes} + l] = n{i}")
     add(f"    for j in range({q}):")
     add(f"        for l in range({lanes}):")
     add(f"            sse[j, l] = X[({n + r} + j) * {lanes} + l]")
     return "\n".join(lines)
 
 
-def _outputs(s: Shape, lanes: int) -> list[str]:
+def _slopes(s: Shape) -> list[str]:
+    """Change per step of the interpolated inputs in the interval from sample k."""
+    return [f"s{j} = (u[k + 1, {j}] - v{j}) / n_steps" for j, foh in enumerate(s.foh) if foh]
+
+
+def _stage_inputs(s: Shape) -> list[str]:
+    """Inputs at the start (a), middle (b) and end (c) of a step."""
+    lines = []
+    for j, foh in enumerate(s.foh):
+        if foh:
+            lines += [f"a{j} = v{j} + s{j} * step", f"b{j} = a{j} + 0.5 * s{j}", f"c{j} = a{j} + s{j}"]
+        else:
+            lines += [f"a{j} = v{j}", f"b{j} = v{j}", f"c{j} = v{j}"]
+    return lines
+
+
+def _runge_kutta(s: Shape) -> list[str]:
+    """Classical RK4 from x to n with parameters pp: one step, all stages as scalars."""
+    n = s.n_states
+    stages = (
+        ("k", [f"x{i}" for i in range(n)], "a"),
+        ("f", [f"x{i} + h2 * k{i}" for i in range(n)], "b"),
+        ("g", [f"x{i} + h2 * f{i}" for i in range(n)], "b"),
+        ("d", [f"x{i} + h * g{i}" for i in range(n)], "c"),
+    )
+    lines = []
+    for name, at, held in stages:
+        args = f"{_tuple(at)}, {_tuple(f'{held}{j}' for j in range(s.n_inputs))}, pp"
+        lines.append(f"{_targets(name, n)} = derivative({args})")
+    lines += [f"n{i} = x{i} + h6 * (k{i} + 2.0 * (f{i} + g{i}) + d{i})" for i in range(n)]
+    return lines
+
+
+def _advance(s: Shape) -> str:
+    lines = [
+        "def advance(u, x, p, dt, n_steps, trace, outputs):",
+        f"    pp = {_tuple(f'p[{i}]' for i in range(s.n_parameters))}",
+        "    h = dt / n_steps",
+        "    h2 = 0.5 * h",
+        "    h6 = h / 6.0",
+        *[f"    x{i} = x[{i}]" for i in range(s.n_states)],
+        "    for k in range(u.shape[0] - 1):",
+        *[f"        v{j} = u[k, {j}]" for j in range(s.n_inputs)],
+        *[f"        {line}" for line in _outputs(s, "x{}", "p[{}]")],
+        *[f"        outputs[k, {j}] = o{j}" for j in range(s.n_outputs)],
+        *[f"        {line}" for line in _slopes(s)],
+        "        for step in range(n_steps):",
+        *[f"            {line}" for line in _stage_inputs(s)],
+        *[f"            trace[k * n_steps + step, {i}] = x{i}" for i in range(s.n_states)],
+        *[f"            {line}" for line in _runge_kutta(s)],
+        *[f"            x{i} = n{i}" for i in range(s.n_states)],
+        *[f"    x[{i}] = x{i}" for i in range(s.n_states)],
+    ]
+    return "\n".join(lines)
+
+
+def _outputs(s: Shape, state: str, parameter: str) -> list[str]:
+    """Lines that set the outputs o; the patterns name state and parameter number {}."""
     if s.output_states is not None:
-        return [f"            o{j} = X[{i * lanes} + l]" for j, i in enumerate(s.output_states)]
-    x = _tuple(f"X[{i * lanes} + l]" for i in range(s.n_states))
+        return [f"o{j} = {state.format(i)}" for j, i in enumerate(s.output_states)]
+    x = _tuple(state.format(i) for i in range(s.n_states))
     u = _tuple(f"v{j}" for j in range(s.n_inputs))
-    p = _tuple(f"X[{(s.n_states + i) * lanes} + l]" for i in range(s.n_parameters))
-    return [f"            {_targets('o', s.n_outputs)} = output({x}, {u}, {p})"]
+    p = _tuple(parameter.format(i) for i in range(s.n_parameters))
+    return [f"{_targets('o', s.n_outputs)} = output({x}, {u}, {p})"]
 
 
 def _spectrum(s: Shape) -> str:

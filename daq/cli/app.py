@@ -1,0 +1,164 @@
+"""Commands of ``rig``: arguments and help texts. The work is imported inside each command."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+app = typer.Typer(
+    name="rig",
+    help=(
+        "Excite a hybrid haptic actuator (DC motor and magnetorheological brake), log every "
+        "sample, and identify its parameters.\n\n"
+        "Start with:  rig run prbs.yaml --identify"
+    ),
+    no_args_is_help=True,
+    rich_markup_mode="rich",
+    pretty_exceptions_enable=False,
+    add_completion=True,
+)
+
+ExperimentName = Annotated[
+    str,
+    typer.Argument(
+        metavar="EXPERIMENT.yaml",
+        help="Experiment file; a bare name not in this folder means the shipped one.",
+    ),
+]
+RigName = Annotated[
+    str,
+    typer.Option("--rig", metavar="RIG.yaml", help="Rig file; default the simulated rig."),
+]
+Logs = Annotated[
+    list[Path],
+    typer.Argument(metavar="RUN_OR_CSV...", help="Capture folders, CSV logs, or folders of them."),
+]
+ModelName = Annotated[
+    str | None,
+    typer.Option("--model", metavar="NAME|FILE.py:OBJECT", help="Process model; see rig models."),
+]
+ConfigFile = Annotated[
+    Path | None,
+    typer.Option("--config", metavar="ID.yaml", help="Search settings and column names."),
+]
+AsJson = Annotated[bool, typer.Option("--json", help="One JSON document on standard output.")]
+
+
+@app.command(epilog="Example:  rig run prbs.yaml --identify")
+def run(
+    experiment: ExperimentName,
+    rig: RigName = "simulated.yaml",
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", help="Where capture folders go.")
+    ] = Path("runs"),
+    identify: Annotated[
+        bool,
+        typer.Option(
+            "--identify", help="Record a validation run as well, then identify the model."
+        ),
+    ] = False,
+    model: ModelName = None,
+    config: ConfigFile = None,
+    json: AsJson = False,
+) -> None:
+    """Run an experiment on a rig and log every sample."""
+    from daq.cli.running import run_command
+
+    run_command(experiment, rig, out, identify, model, config, json)
+
+
+@app.command(epilog="Example:  rig check prbs.yaml --rig my_rig.yaml")
+def check(
+    experiment: ExperimentName,
+    rig: RigName = "simulated.yaml",
+    json: AsJson = False,
+) -> None:
+    """Validate an experiment against a rig's limits, without energising anything."""
+    from daq.cli.running import check_command
+
+    check_command(experiment, rig, json)
+
+
+@app.command(
+    epilog="Example:  rig identify runs/20260101T120000Z-prbs --validate other_log.csv"
+)
+def identify(
+    logs: Logs,
+    model: ModelName = None,
+    config: ConfigFile = None,
+    validate: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--validate", metavar="RUN_OR_CSV", help="Log kept for validation; may be repeated."
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="DIR", help="Where results go; default beside the log."),
+    ] = None,
+    preset: Annotated[
+        str | None,
+        typer.Option("--preset", help="default, thesis, cega or classic."),
+    ] = None,
+    population: Annotated[
+        int | None, typer.Option("--population", help="Chromosomes per generation.")
+    ] = None,
+    generations: Annotated[
+        int | None, typer.Option("--generations", help="Generations evaluated.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option("--seed", help="One seed gives one result.")] = None,
+    json: AsJson = False,
+) -> None:
+    """Identify a model's parameters from logs: one parameter set for all of them."""
+    from daq.cli.identifying import identify_command
+
+    overrides = {
+        "model": model,
+        "preset": preset,
+        "population": population,
+        "generations": generations,
+        "seed": seed,
+    }
+    identify_command(logs, validate or [], config, out, overrides, json)
+
+
+@app.command(
+    epilog="Example:  rig replay runs/20260101T120000Z-prbs "
+    "--parameters runs/20260101T120000Z-prbs/identification/parameters.yaml"
+)
+def replay(
+    log: Annotated[
+        Path, typer.Argument(metavar="RUN_OR_CSV", help="Capture folder or CSV log.")
+    ],
+    rig: RigName = "simulated.yaml",
+    parameters: Annotated[
+        Path | None,
+        typer.Option(
+            "--parameters",
+            metavar="PARAMETERS.yaml",
+            help="Result of an identification; default the simulated rig's own values.",
+        ),
+    ] = None,
+    config: ConfigFile = None,
+    json: AsJson = False,
+) -> None:
+    """Simulate a log's applied commands and measured load, and say how close the outputs are."""
+    from daq.cli.replaying import replay_command
+
+    replay_command(log, rig, parameters, config, json)
+
+
+@app.command(epilog="Example:  rig models actuator --json")
+def models(
+    name: Annotated[
+        str | None,
+        typer.Argument(metavar="[NAME|FILE.py:OBJECT]", help="Show this model in full."),
+    ] = None,
+    json: AsJson = False,
+) -> None:
+    """List the installed process models, or one with its states, signals and parameters."""
+    from daq.cli.modelling import models_command
+
+    models_command(name, json)

@@ -1,0 +1,184 @@
+"""From log files to the records a process model is fitted to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from daq import capture
+from daq.config.identification import Column, Columns
+from daq.config.yaml_file import YamlFile, suggestion
+from daq.errors import ConfigError
+from daq.hal import FloatArray, IntArray
+from daq.log import Log, read_table, require_rows, sample_time, ticks_of
+from sysid.data import Dataset
+from sysid.model import Input, ModelError, Output, ProcessModel
+
+
+@dataclass(frozen=True)
+class Mapping:
+    """The 'columns' section of a configuration file, checked against a model."""
+
+    file: YamlFile
+    columns: Columns
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """One log as a record for the model; ``warning`` when its run did not complete."""
+
+    dataset: Dataset
+    path: Path
+    warning: str | None
+
+
+def expand(paths: list[Path]) -> list[Path]:
+    """Logs named on the command line: a folder without a log.csv stands for the CSVs in it."""
+    found: list[Path] = []
+    for path in paths:
+        if path.is_dir() and not (path / capture.LOG_NAME).exists():
+            inside = sorted(path.glob("*.csv"))
+            if not inside:
+                raise ConfigError(
+                    f"{path}: neither a capture folder (with log.csv) nor a folder of CSV files"
+                )
+            found += inside
+        else:
+            found.append(path)
+    return found
+
+
+def load(path: Path, model: ProcessModel, mapping: Mapping | None) -> Loaded:
+    """One log as a record; ConfigError names the file, line and column of what is wrong."""
+    try:
+        if mapping is not None:
+            return _load_foreign(capture.log_path(path), model, mapping)
+        recording = capture.load(path)
+        dataset = _from_log(recording.log, model, recording.name)
+        return Loaded(dataset, recording.log.path, recording.warning)
+    except ModelError as error:
+        raise ConfigError(f"{path}: {error}") from None
+
+
+def check_mapping(model: ProcessModel, mapping: Mapping) -> None:
+    """Raise ConfigError unless every signal of the model, and no other, has its column."""
+    groups = (
+        ("inputs", mapping.columns.inputs, model.input_names),
+        ("outputs", mapping.columns.outputs, model.output_names),
+    )
+    for group, given, needed in groups:
+        for name in given:
+            if name not in needed:
+                raise mapping.file.error(
+                    ("columns", group, name),
+                    f"model {model.name} has no such signal; {suggestion(name, needed)}",
+                )
+        for name in needed:
+            if name not in given:
+                raise mapping.file.error(
+                    ("columns", group), f"{name!r} of model {model.name} is missing"
+                )
+    for name, column in mapping.columns.outputs.items():
+        if column.constant is not None:
+            raise mapping.file.error(
+                ("columns", "outputs", name), "an output must be measured, not constant"
+            )
+    for signal in (*model.inputs, *model.outputs):
+        group = "inputs" if signal in model.inputs else "outputs"
+        column = getattr(mapping.columns, group)[signal.name]
+        _factor(mapping, ("columns", group, signal.name, "unit"), column.unit, signal.unit)
+
+
+def _from_log(log: Log, model: ProcessModel, name: str) -> Dataset:
+    columns = list(log.frame.columns)
+    for signal in (*model.inputs, *model.outputs):
+        if signal.name not in columns:
+            raise ConfigError(
+                f"{log.path}: model {model.name} needs {signal.name!r}, which is no column of "
+                f"this log; {suggestion(signal.name, columns)} Name the column in the 'columns' "
+                "section of a file given with --config"
+            )
+    inputs = log.frame[list(model.input_names)].to_numpy(dtype=np.float64)
+    outputs = log.frame[list(model.output_names)].to_numpy(dtype=np.float64)
+    tick = log.frame["tick"].to_numpy()
+    return _dataset(log.path, model, inputs, outputs, tick, log.dt, name)
+
+
+def _load_foreign(path: Path, model: ProcessModel, mapping: Mapping) -> Loaded:
+    columns = mapping.columns
+    sources = {**columns.inputs, **columns.outputs}
+    names = [columns.time.column, *(c.column for c in sources.values() if c.column is not None)]
+    table = read_table(path, list(dict.fromkeys(names)))
+    frame = table.frame
+    require_rows(path, len(frame))
+    seconds = _factor(mapping, ("columns", "time", "unit"), columns.time.unit, "s")
+    time = frame[columns.time.column].to_numpy() * seconds
+    dt = sample_time(path, time)
+
+    def values(signal: Input | Output, group: str, source: Column) -> FloatArray:
+        key = ("columns", group, signal.name, "unit")
+        factor = source.sign * _factor(mapping, key, source.unit, signal.unit)
+        if source.column is None:
+            assert source.constant is not None
+            return np.full(len(frame), source.constant * factor)
+        return np.asarray(frame[source.column].to_numpy() * factor)
+
+    inputs = [values(s, "inputs", columns.inputs[s.name]) for s in model.inputs]
+    outputs = [values(s, "outputs", columns.outputs[s.name]) for s in model.outputs]
+    dataset = _dataset(
+        path,
+        model,
+        np.stack(inputs, axis=1) if inputs else np.zeros((len(frame), 0)),
+        np.stack(outputs, axis=1),
+        ticks_of(path, time, dt),
+        dt,
+        path.stem,
+    )
+    return Loaded(dataset, path, capture.describe_end(path, table.torn))
+
+
+def _dataset(
+    path: Path,
+    model: ProcessModel,
+    inputs: FloatArray,
+    outputs: FloatArray,
+    tick: IntArray,
+    dt: float,
+    name: str,
+) -> Dataset:
+    """A record in which lost samples keep their place: inputs held, outputs missing."""
+    rows = tick - tick[0]
+    length = int(rows[-1]) + 1
+    if length > 50 * len(rows) + 1000:
+        raise ConfigError(
+            f"{path}: the log covers {length} sample times but holds {len(rows)} samples; "
+            "too much is missing to identify anything from it"
+        )
+    whole = np.full((length, len(model.outputs)), np.nan)
+    whole[rows] = outputs
+    latest = np.zeros(length, dtype=np.int64)
+    latest[rows] = np.arange(len(rows))
+    return Dataset(inputs[np.maximum.accumulate(latest)], whole, dt, name)
+
+
+def _factor(mapping: Mapping, key: tuple[str, ...], unit: str | None, wanted: str) -> float:
+    """Factor from a unit in the file to the model's unit."""
+    if unit is None or unit == wanted:
+        return 1.0
+    import pint
+
+    registry = pint.UnitRegistry()
+    try:
+        return float(registry.Quantity(1.0, _spelt(unit)).to(_spelt(wanted)).magnitude)
+    except pint.DimensionalityError:
+        raise mapping.file.error(key, f"{unit!r} does not convert to {wanted!r}") from None
+    except Exception:
+        raise mapping.file.error(
+            key, f"unit {unit!r} is not understood; write it as in 'mm/s' or 'N*m'"
+        ) from None
+
+
+def _spelt(unit: str) -> str:
+    return unit.replace("·", "*").replace("^", "**") if unit != "1" else "dimensionless"

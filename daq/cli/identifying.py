@@ -1,0 +1,367 @@
+"""``rig identify``: from logs to parameters, metrics and files."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Mapping as MappingType
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from daq import capture
+from daq.cli import console, datasets
+from daq.cli.datasets import Loaded, Mapping
+from daq.cli.modelling import DEFAULT_MODEL, find_model
+from daq.config import yaml_file
+from daq.config.identification import IdentificationConfig
+from daq.config.yaml_file import YamlFile, suggestion
+from daq.errors import ConfigError
+from sysid import ModelError, SearchSpace, evaluate
+from sysid.gassi import GASSI, PRESETS, Progress
+from sysid.metrics import Metrics
+from sysid.model import ProcessModel
+
+# A search value this close to an end of its range, in parts of the range, stands on it.
+_ON_BOUND = 1e-3
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """Settings of an identification, checked before any log is read or rig moved."""
+
+    model: ProcessModel
+    model_name: str
+    settings: IdentificationConfig
+    mapping: Mapping | None
+
+
+def identify_command(
+    logs: list[Path],
+    validate: list[Path],
+    config: Path | None,
+    out: Path | None,
+    overrides: MappingType[str, Any],
+    as_json: bool,
+) -> None:
+    """Identify one parameter set from logs and print it."""
+    prepared = prepare(config, overrides)
+    folder = out or _default_folder(logs, prepared.model.name)
+    report = identify_logs(prepared, logs, validate, folder, as_json)
+    if as_json:
+        console.print_json(report)
+
+
+def prepare(config: Path | None, overrides: MappingType[str, Any]) -> Prepared:
+    """Read and check settings and model; ConfigError names file, line, key and cure."""
+    given = {key: value for key, value in overrides.items() if value is not None}
+    if config is not None:
+        file = yaml_file.load(config)
+    else:
+        file = YamlFile(Path("(command line)"), {}, {})
+    settings = yaml_file.validate(file, IdentificationConfig, {**file.content, **given})
+    if settings.preset not in PRESETS:
+        raise file.error(
+            ("preset",), f"unknown preset {settings.preset!r}; "
+            f"{suggestion(settings.preset, list(PRESETS))}"
+        )  # fmt: skip
+    # A name on the command line is relative to where it is typed, one in a file to that file.
+    beside = config.parent if config is not None and "model" not in given else None
+    name = settings.model or DEFAULT_MODEL
+    try:
+        model = find_model(name, beside)
+    except ConfigError as error:
+        if config is None or "model" in given or settings.model is None:
+            raise
+        raise file.error(("model",), str(error)) from None
+    _check_names(file, settings, model)
+    mapping = Mapping(file, settings.columns) if settings.columns else None
+    if mapping is not None:
+        datasets.check_mapping(model, mapping)
+    return Prepared(model, name, settings, mapping)
+
+
+def identify_logs(
+    prepared: Prepared,
+    training: list[Path],
+    validation: list[Path],
+    folder: Path,
+    as_json: bool,
+) -> dict[str, Any]:
+    """Identify, print for people unless ``as_json``, write files; the report for machines."""
+    model = prepared.model
+    train = [datasets.load(p, model, prepared.mapping) for p in datasets.expand(training)]
+    check = [datasets.load(p, model, prepared.mapping) for p in datasets.expand(validation)]
+    _no_overlap(train, check)
+    for log in (*train, *check):
+        if log.warning is not None:
+            console.report_note(log.warning)
+    estimator = _fit(prepared, train, as_json)
+    scores = {
+        "training": [_score(estimator, log) for log in train],
+        "validation": [_score(estimator, log) for log in check],
+    }
+    report = _report(prepared, estimator, scores, train, check)
+    path = _write(folder, report)
+    report["files"] = {"parameters": str(path)}
+    if not as_json:
+        _print_report(estimator, model, scores, train, check, path)
+    return report
+
+
+def _check_names(file: YamlFile, settings: IdentificationConfig, model: ProcessModel) -> None:
+    groups: tuple[tuple[str, dict[str, Any], tuple[str, ...]], ...] = (
+        ("ranges", settings.ranges, model.parameter_names),
+        ("fixed", settings.fixed, model.parameter_names),
+        ("weights", settings.weights, model.output_names),
+    )
+    for group, given, known in groups:
+        for name in given:
+            if name not in known:
+                raise file.error(
+                    (group, name),
+                    f"model {model.name} has no such name; {suggestion(name, known)}",
+                )
+    for name in settings.ranges:
+        try:
+            SearchSpace.of(model, {name: settings.ranges[name]}, {})
+        except ModelError as error:
+            raise file.error(("ranges", name), str(error)) from None
+    try:
+        SearchSpace.of(model, settings.ranges, settings.fixed)
+    except ModelError as error:
+        raise file.error(("fixed",), str(error)) from None
+
+
+def _no_overlap(train: list[Loaded], check: list[Loaded]) -> None:
+    known = {log.path.resolve() for log in train}
+    for log in check:
+        if log.path.resolve() in known:
+            raise ConfigError(
+                f"{log.path}: the same log is given for training and for validation; "
+                "a model proves itself only on data it has not seen"
+            )
+
+
+def _default_folder(logs: list[Path], model: str) -> Path:
+    """Beside a single capture's log; otherwise a new folder under runs/."""
+    if len(logs) == 1 and capture.log_path(logs[0]).name == capture.LOG_NAME:
+        return capture.log_path(logs[0]).parent / "identification"
+    now = datetime.datetime.now(datetime.UTC)
+    return Path("runs") / f"{now:%Y%m%dT%H%M%SZ}-identify-{model}" / "identification"
+
+
+def _fit(prepared: Prepared, train: list[Loaded], quiet: bool) -> GASSI:
+    settings = prepared.settings
+    estimator = GASSI(
+        prepared.model,
+        preset=settings.preset,  # type: ignore[arg-type]
+        population=settings.population,
+        generations=settings.generations,
+        ranges=settings.ranges,
+        fixed=settings.fixed,
+        elite_percent=settings.elite_percent,
+        weights=settings.weights or None,
+        per_log=settings.per_log,
+        accuracy=settings.accuracy,
+        max_steps=settings.max_steps,
+        random_state=settings.seed,
+    )
+    with console.progress(quiet) as bar:
+
+        def watch(step: Progress) -> None:
+            title = "Genetic search" if step.stage == "search" else "Local refinement"
+            unit = "generation" if step.stage == "search" else "iteration"
+            note = f"{unit} {step.done}/{step.total}, best error {step.error:.3g}"
+            bar.update(title, step.done, step.total, note)
+
+        try:
+            return estimator.fit([log.dataset for log in train], on_progress=watch)
+        except ModelError as error:
+            raise ConfigError(str(error)) from None
+
+
+def _score(estimator: GASSI, log: Loaded) -> Metrics:
+    return evaluate(log.dataset.outputs, estimator.predict(log.dataset))
+
+
+def _report(
+    prepared: Prepared,
+    estimator: GASSI,
+    scores: dict[str, list[Metrics]],
+    train: list[Loaded],
+    check: list[Loaded],
+) -> dict[str, Any]:
+    model = prepared.model
+    free = dict(zip(estimator.space_.names, estimator.space_.parameters, strict=True))
+    parameters = {}
+    for parameter in model.parameters:
+        entry: dict[str, Any] = {
+            "value": estimator.parameters_[parameter.name],
+            "unit": parameter.unit,
+        }
+        if parameter.name in free:
+            searched = free[parameter.name]
+            entry["range"] = [searched.lower, searched.upper]
+            entry["on_bound"] = _on_bound(estimator, parameter.name)
+        else:
+            entry["fixed"] = True
+        parameters[parameter.name] = entry
+    logs = {
+        part: [
+            {"log": str(log.path), "name": log.dataset.name, **_metrics(model, metrics)}
+            for log, metrics in zip(group, scores[part], strict=True)
+        ]
+        for part, group in (("training", train), ("validation", check))
+    }
+    return {
+        "model": prepared.model_name,
+        "parameters": parameters,
+        "error": {
+            "value": estimator.error_,
+            "meaning": "mean over outputs of the RMSE on outputs normalised by max|y|",
+            "before_refinement": estimator.search_error_,
+        },
+        "metrics": logs,
+        "search": {
+            "preset": prepared.settings.preset,
+            "seed": prepared.settings.seed,
+            "population": prepared.settings.population,
+            "generations": len(estimator.history_),
+            "simulations": estimator.n_simulations_,
+            "stopped": estimator.stopped_,
+            "flagged": estimator.flagged_,
+            "feasible": estimator.feasible_,
+        },
+        "software": capture.software_versions(),
+    }
+
+
+def _metrics(model: ProcessModel, metrics: Metrics) -> dict[str, Any]:
+    return {
+        "outputs": {
+            name: {
+                "rmse": float(metrics.rmse[j]),
+                "msd": float(metrics.msd[j]),
+                "fit_percent": float(metrics.fit[j]),
+                "max_abs": float(metrics.scale[j]),
+            }
+            for j, name in enumerate(model.output_names)
+        }
+    }
+
+
+def _on_bound(estimator: GASSI, name: str) -> bool:
+    space = estimator.space_
+    at = space.names.index(name)
+    ends = space.encode(np.stack([space.lower, space.upper]))[:, at]
+    place = (space.encode(estimator.chromosome_)[at] - ends[0]) / (ends[1] - ends[0])
+    return bool(place < _ON_BOUND or place > 1.0 - _ON_BOUND)
+
+
+def _write(folder: Path, report: dict[str, Any]) -> Path:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(
+            f"{folder}: cannot be created: {error.strerror}; choose a folder with --out"
+        ) from None
+    path = folder / "parameters.yaml"
+    text = yaml.safe_dump(report, sort_keys=False, allow_unicode=True)
+    capture.write_whole(path, text)
+    return path
+
+
+def _print_report(
+    estimator: GASSI,
+    model: ProcessModel,
+    scores: dict[str, list[Metrics]],
+    train: list[Loaded],
+    check: list[Loaded],
+    path: Path,
+) -> None:
+    console.print_line()
+    console.print_table(
+        f"Parameters of {model.name}",
+        ["parameter", "value", "unit", "searched in", "what it is"],
+        [_parameter_row(estimator, model, p.name) for p in model.parameters],
+    )
+    single = len(train) == 1 and len(check) <= 1
+    if single:
+        print_metrics(model, scores["training"][0], scores["validation"])
+    else:
+        _print_logs("Training logs", model, train, scores["training"])
+        if check:
+            _print_logs("Validation logs", model, check, scores["validation"])
+    if estimator.stopped_ == "interrupted":
+        console.print_line(
+            f"Stopped by Ctrl-C after {len(estimator.history_)} generations: "
+            "these are the best parameters until then."
+        )
+    if not estimator.feasible_:
+        console.print_line(
+            "Warning: no parameters were found that satisfy all of the model's constraints."
+        )
+    bound = [name for name in estimator.space_.names if _on_bound(estimator, name)]
+    if bound:
+        console.print_line(
+            f"On the end of their range: {', '.join(bound)}. The data want more room, or cannot "
+            "tell; see ranges in --config."
+        )
+    console.print_line(f"Parameters: {path}")
+    console.print_line(f"Next: rig replay {check[-1].path if check else train[0].path} "
+                       f"--parameters {path}")  # fmt: skip
+
+
+def _parameter_row(estimator: GASSI, model: ProcessModel, name: str) -> list[str]:
+    parameter = model.parameter(name)
+    value = console.number(estimator.parameters_[name])
+    searched = dict(zip(estimator.space_.names, estimator.space_.parameters, strict=True))
+    if name not in searched:
+        return [name, value, parameter.unit, "fixed", parameter.description]
+    low, high = searched[name].lower, searched[name].upper
+    span = f"{console.number(low, 3)} .. {console.number(high, 3)}"
+    return [name, value, parameter.unit, span, parameter.description]
+
+
+def print_metrics(
+    model: ProcessModel, training: Metrics, validation: list[Metrics], label: str = "training"
+) -> None:
+    """Table of RMSE, MSD and fit of each output, on one log or on two."""
+    head = ["output", f"RMSE, {label}", "MSD", "fit [%]"]
+    if validation:
+        head += ["RMSE, validation", "MSD", "fit [%]"]
+    rows = []
+    for j, name in enumerate(model.output_names):
+        row = [name]
+        for metrics in (training, *validation):
+            row += [
+                console.number(float(metrics.rmse[j]), 3),
+                console.number(float(metrics.msd[j]), 2),
+                f"{metrics.fit[j]:.1f}",
+            ]
+        rows.append(row)
+    console.print_table("Free-run simulation, RMSE and MSD in parts of max|y|", head, rows)
+
+
+def _print_logs(
+    title: str, model: ProcessModel, logs: list[Loaded], metrics: list[Metrics]
+) -> None:
+    head = ["log", *(f"fit of {name} [%]" for name in model.output_names)]
+    head += [f"RMSE of {name}" for name in model.output_names]
+    rows = [
+        [
+            log.dataset.name,
+            *(f"{value:.1f}" for value in result.fit),
+            *(console.number(float(value), 3) for value in result.rmse),
+        ]
+        for log, result in zip(logs, metrics, strict=True)
+    ]
+    fits = np.nanmean([result.fit for result in metrics], axis=0)
+    errors = np.mean([result.rmse for result in metrics], axis=0)
+    rows.append(
+        ["mean", *(f"{v:.1f}" for v in fits), *(console.number(float(v), 3) for v in errors)]
+    )
+    console.print_table(title, head, rows)

@@ -1,0 +1,116 @@
+"""``rig replay``: a log's inputs through a model with given parameters."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from daq.cli import console, datasets
+from daq.cli.datasets import Mapping
+from daq.cli.files import load_rig
+from daq.cli.identifying import prepare, print_metrics
+from daq.cli.modelling import find_model
+from daq.config import yaml_file
+from daq.config.yaml_file import suggestion
+from daq.errors import ConfigError
+from sysid import BatchSimulator, ModelError, evaluate
+from sysid.model import ProcessModel
+
+
+def replay_command(
+    log: Path, rig: str, parameters: Path | None, config: Path | None, as_json: bool
+) -> None:
+    """Simulate what the log's inputs do to a model, and compare with what was measured."""
+    if parameters is not None:
+        model, values = read_parameters(parameters)
+        source = str(parameters)
+    else:
+        model, values = _rig_truth(rig)
+        source = rig
+    mapping = _mapping(config, model)
+    loaded = datasets.load(log, model, mapping)
+    if loaded.warning is not None:
+        console.report_note(loaded.warning)
+    try:
+        simulated = BatchSimulator(model).trajectories(model.vector(values), loaded.dataset)[0]
+    except ModelError as error:
+        raise ConfigError(str(error)) from None
+    metrics = evaluate(loaded.dataset.outputs, simulated)
+    if as_json:
+        console.print_json(
+            {
+                "log": str(loaded.path),
+                "model": model.name,
+                "parameters": source,
+                "outputs": {
+                    name: {
+                        "rmse": metrics.rmse[j],
+                        "msd": metrics.msd[j],
+                        "fit_percent": metrics.fit[j],
+                    }
+                    for j, name in enumerate(model.output_names)
+                },
+            }
+        )
+        return
+    console.print_line(f"{loaded.path} through {model.name} with the parameters of {source}")
+    print_metrics(model, metrics, [], "replay")
+
+
+def read_parameters(path: Path) -> tuple[ProcessModel, dict[str, float]]:
+    """Model and parameters from a parameters.yaml, as identification writes it.
+
+    Raises ConfigError naming line and key of what is missing or wrong.
+    """
+    file = yaml_file.load(path)
+    name = file.content.get("model")
+    if not isinstance(name, str):
+        raise file.error(("model",), "this key is missing; it names the process model")
+    try:
+        model = find_model(name, path.parent)
+    except ConfigError as error:
+        raise file.error(("model",), str(error)) from None
+    entries = file.content.get("parameters")
+    if not isinstance(entries, dict):
+        raise file.error(("parameters",), "this key is missing; it holds 'name: value' lines")
+    values = {}
+    for key, entry in entries.items():
+        if key not in model.parameter_names:
+            hint = suggestion(str(key), model.parameter_names)
+            raise file.error(
+                ("parameters", str(key)), f"model {model.name} has no such parameter; {hint}"
+            )
+        values[key] = _value(file, ("parameters", str(key)), entry)
+    return model, values
+
+
+def _value(file: yaml_file.YamlFile, key: tuple[str, ...], entry: Any) -> float:
+    value = entry.get("value") if isinstance(entry, dict) else entry
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise file.error(key, f"expected a number, found {value!r}")
+    return float(value)
+
+
+def _rig_truth(rig: str) -> tuple[ProcessModel, dict[str, float]]:
+    config, _device = load_rig(rig)
+    if config.backend != "simulated":
+        raise ConfigError(
+            f"{rig}: only a simulated rig knows its own parameters; "
+            "give those of an identification with --parameters"
+        )
+    from sim_rig.actuator import actuator
+    from sim_rig.plant import actuator_truth
+
+    return actuator(), actuator_truth()
+
+
+def _mapping(config: Path | None, model: ProcessModel) -> Mapping | None:
+    if config is None:
+        return None
+    prepared = prepare(config, {})
+    if prepared.mapping is not None and prepared.model.name != model.name:
+        raise ConfigError(
+            f"{config}: its columns are those of model {prepared.model.name}, "
+            f"but the parameters are of {model.name}"
+        )
+    return prepared.mapping

@@ -1,0 +1,163 @@
+"""``rig run`` and ``rig check``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from daq.cli import console
+from daq.cli.files import LoadedExperiment, load_experiment, load_rig
+from daq.config.rig import RigConfig
+from daq.hal import CHANNELS, Device, Phase
+from daq.run import PhaseProgress, RunResult, run_experiment
+
+_TITLES = {
+    Phase.CALIBRATION: "Offset calibration",
+    Phase.HOMING: "Winding the load",
+    Phase.RUN: "Exciting and logging",
+}
+
+
+def run_command(
+    experiment: str,
+    rig: str,
+    out: Path,
+    identify: bool,
+    model: str | None,
+    config: Path | None,
+    as_json: bool,
+) -> None:
+    """Run an experiment; with ``identify`` record a validation run and identify the model."""
+    loaded = load_experiment(experiment)
+    rig_config, device = load_rig(rig)
+    loaded.plan(rig_config)
+    validation = loaded.validation() if identify else None
+    if validation is not None:
+        validation.plan(rig_config)
+    overrides = {"model": model}
+    prepared = None
+    if identify:
+        from daq.cli.identifying import prepare
+
+        # A mistake in the model must show before the rig moves.
+        prepared = prepare(config, overrides)
+    result = _run(loaded, rig_config, device, out, as_json)
+    check = _run(validation, rig_config, device, out, as_json) if validation else None
+    report = {"run": _summary(result), "validation": _summary(check) if check else None}
+    if prepared is not None:
+        from daq.cli.identifying import identify_logs
+
+        if check is None and not as_json:
+            console.report_note(
+                f"{loaded.file.path} has no 'validation' section, so there is no validation run"
+            )
+        folders = [check.folder] if check else []
+        report["identification"] = identify_logs(
+            prepared, [result.folder], folders, result.folder / "identification", as_json
+        )
+    if as_json:
+        console.print_json(report)
+        return
+    _print_end(result, check, identify)
+
+
+def check_command(experiment: str, rig: str, as_json: bool) -> None:
+    """Validate an experiment and say what it would do."""
+    loaded = load_experiment(experiment)
+    rig_config, _device = load_rig(rig)
+    waveform = loaded.plan(rig_config)
+    validation = loaded.validation()
+    if validation is not None:
+        validation.plan(rig_config)
+    settings = loaded.experiment
+    channels = {}
+    for index, name in enumerate(CHANNELS):
+        column = waveform[:, index]
+        channels[name] = {
+            "lowest_volts": float(column.min()),
+            "highest_volts": float(column.max()),
+            "mean_volts": float(column.mean()),
+            "changes": int(np.count_nonzero(np.diff(column))),
+            "limits_volts": list(getattr(rig_config.limits.command, name)),
+        }
+    if as_json:
+        console.print_json(
+            {
+                "experiment": str(loaded.file.path),
+                "protocol": settings.protocol,
+                "sample_rate_hz": settings.sample_rate,
+                "samples": len(waveform),
+                "duration_seconds": len(waveform) / settings.sample_rate,
+                "channels": channels,
+                "validation_run": validation is not None,
+                "rig": rig_config.name,
+            }
+        )
+        return
+    console.print_table(
+        f"{loaded.file.path} on {rig_config.name}: "
+        f"{len(waveform)} samples at {settings.sample_rate:g} Hz, "
+        f"{len(waveform) / settings.sample_rate:g} s",
+        ["channel", "lowest [V]", "highest [V]", "mean [V]", "changes", "limits [V]"],
+        [
+            [
+                name,
+                console.number(facts["lowest_volts"], 3),
+                console.number(facts["highest_volts"], 3),
+                console.number(facts["mean_volts"], 3),
+                str(facts["changes"]),
+                "{:g} to {:g}".format(*facts["limits_volts"]),
+            ]
+            for name, facts in channels.items()
+        ],
+    )
+    turns = settings.homing.turns
+    before = [f"{settings.calibration.samples} samples of offset calibration"]
+    if turns > 0:
+        before.append(f"{turns:g} turns to wind within {settings.homing.timeout:g} s")
+    console.print_line(f"Before it: {', '.join(before)}.")
+    console.print_line(
+        "With --identify a validation run follows." if validation else
+        "It has no 'validation' section: rig run --identify will identify without validation."
+    )  # fmt: skip
+    console.print_line(f"Next: rig run {experiment} --identify")
+
+
+def _run(
+    loaded: LoadedExperiment, rig: RigConfig, device: Device, out: Path, as_json: bool
+) -> RunResult:
+    if not as_json:
+        console.report_note(f"{loaded.name} on {rig.name}")
+    with console.progress(quiet=as_json) as bar:
+
+        def watch(step: PhaseProgress) -> None:
+            done = f"{step.done:.0f}" if step.unit == "samples" else f"{step.done:.1f}"
+            bar.update(
+                _TITLES[step.phase], step.done, step.total, f"{done}/{step.total:g} {step.unit}"
+            )
+
+        return run_experiment(loaded.experiment, loaded.name, rig, device, out, watch)
+
+
+def _summary(result: RunResult) -> dict[str, Any]:
+    return {
+        "folder": str(result.folder),
+        "samples": result.n_samples,
+        "timing": result.timing,
+    }
+
+
+def _print_end(result: RunResult, check: RunResult | None, identified: bool) -> None:
+    for label, run in (("Log", result), ("Validation log", check)):
+        if run is None:
+            continue
+        flagged = run.timing["flagged_samples"]
+        notes = ", ".join(f"{count} {name}" for name, count in flagged.items())
+        console.print_line(
+            f"{label}: {run.folder / 'log.csv'} ({run.n_samples} samples"
+            + (f"; flagged: {notes})" if notes else ")")
+        )
+    if not identified:
+        console.print_line(f"Next: rig identify {result.folder}")

@@ -1,0 +1,79 @@
+"""How logs are turned into parameters: model, search settings, and foreign columns."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from daq.config.base import Section
+
+
+class TimeColumn(Section):
+    """The column that holds time."""
+
+    column: str = Field(min_length=1, description="name in the CSV's header")
+    unit: str = Field("s", min_length=1, description="unit of the numbers")
+
+
+class Column(Section):
+    """Where one signal of the model comes from: a column of the CSV, or a constant."""
+
+    column: str | None = Field(None, min_length=1, description="name in the CSV's header")
+    constant: float | None = Field(None, description="value in place of a column")
+    unit: str | None = Field(None, description="unit of the numbers; default the model's")
+    sign: Literal[-1, 1] = Field(1, description="-1 turns the direction round")
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Column:
+        if (self.column is None) == (self.constant is None):
+            raise ValueError("give either 'column' (a name in the CSV) or 'constant' (a value)")
+        return self
+
+
+class Columns(Section):
+    """Names, units and signs of a foreign CSV's columns, by the model's signal names."""
+
+    time: TimeColumn
+    inputs: dict[str, Column] = Field(description="for each input of the model")
+    outputs: dict[str, Column] = Field(description="for each output of the model")
+
+
+class IdentificationConfig(Section):
+    """Settings of ``rig identify``; each may be left out."""
+
+    model: str | None = Field(None, description="built-in model, or file.py:object")
+    preset: str = Field("default", description="default, thesis, cega or classic")
+    population: int = Field(300, ge=2, le=1_000_000, description="chromosomes per generation")
+    generations: int = Field(40, ge=1, le=1_000_000, description="generations evaluated")
+    seed: int = Field(0, ge=0, le=2**32 - 1, description="one seed, one result")
+    accuracy: float = Field(
+        1e-3, ge=1e-12, le=0.1, description="normalised RMS error of a simulation"
+    )
+    max_steps: int = Field(
+        512, ge=1, le=1_000_000, description="integration steps a sample may take"
+    )
+    elite_percent: float = Field(0.5, ge=0.0, lt=100.0, description="r_elite [%]")
+    ranges: dict[str, tuple[float, float]] = Field(
+        default_factory=dict, description="search ranges in place of the model's"
+    )
+    fixed: dict[str, float] = Field(default_factory=dict, description="parameters not searched")
+    weights: dict[str, float] = Field(
+        default_factory=dict, description="relative importance of the outputs"
+    )
+    per_log: bool = Field(
+        False, description="normalise each log by its own largest output, not by the overall one"
+    )
+    columns: Columns | None = Field(None, description="how a foreign CSV's columns are meant")
+
+    @field_validator("ranges")
+    @classmethod
+    def _ordered(
+        cls, ranges: dict[str, tuple[float, float]]
+    ) -> dict[str, tuple[float, float]]:
+        for name, (low, high) in ranges.items():
+            if low >= high:
+                raise ValueError(
+                    f"{name}: low end {low:g} is not below high end {high:g}; write [low, high]"
+                )
+        return ranges

@@ -1,0 +1,331 @@
+"""The run loop: open, calibrate, home, excite, make safe, close, logging every sample."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import numpy as np
+
+from daq.capture import COMPLETED, Capture
+from daq.config.experiment import Experiment, peaks
+from daq.config.rig import RigConfig
+from daq.errors import ConfigError, DeviceError, Interlock, RigError, RunError, Terminated
+from daq.hal import CHANNELS, Device, Flag, FloatArray, Mode, Phase, Samples
+from daq.log import LogWriter
+from daq.rig import Rig, interlock_reason, mark_interlock
+
+_REST_TIME = 1.0  # s that the shaft must stand still to end homing
+_REST_TURNS = 0.01  # turns it may creep meanwhile
+
+
+@dataclass(frozen=True)
+class PhaseProgress:
+    """What a watcher of a run is told: ``done`` of ``total`` in ``unit`` of a phase."""
+
+    phase: Phase
+    done: float
+    total: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """A completed run: its folder, what was logged, and what was noticed."""
+
+    folder: Path
+    n_samples: int
+    timing: dict[str, Any]
+
+
+Watcher = Callable[[PhaseProgress], None]
+
+
+@dataclass
+class _Timing:
+    """Statistics of the run phase, for run.json."""
+
+    started: float = field(default_factory=time.perf_counter)
+    blocks: int = 0
+    longest_gap: float = 0.0
+    flags: dict[str, int] = field(default_factory=dict)
+    _last: float = field(default_factory=time.perf_counter)
+
+    def block(self, samples: Samples) -> None:
+        now = time.perf_counter()
+        self.longest_gap = max(self.longest_gap, now - self._last)
+        self._last = now
+        self.blocks += 1
+        for flag in Flag:
+            count = int(np.count_nonzero(samples.flags & int(flag)))
+            if count:
+                name = str(flag.name).lower()
+                self.flags[name] = self.flags.get(name, 0) + count
+
+    def summary(self) -> dict[str, Any]:
+        return {
+            "wall_seconds": round(time.perf_counter() - self.started, 6),
+            "blocks": self.blocks,
+            "longest_wait_seconds": round(self.longest_gap, 6),
+            "flagged_samples": self.flags,
+        }
+
+
+def plan(experiment: Experiment, rig: RigConfig) -> FloatArray:
+    """The commands of a run, (n_samples, 2) [V], checked against the rig's limits.
+
+    Raises ConfigError, before anything is energised, for settings that make no waveform or
+    commands that the rig would clamp.
+    """
+    try:
+        waveform = experiment.waveform()
+    except ValueError as error:
+        raise ConfigError(str(error)) from None
+    for name, low, high in zip(CHANNELS, *peaks(waveform), strict=True):
+        least, most = getattr(rig.limits.command, name)
+        if low < least or high > most:
+            beyond, row = (low, int(np.argmin(waveform[:, CHANNELS.index(name)])))
+            if high > most:
+                beyond, row = high, int(np.argmax(waveform[:, CHANNELS.index(name)]))
+            raise ConfigError(
+                f"{name}: the plan asks for {beyond:.6g} V in sample {row}, outside the rig's "
+                f"limits [{least:g}, {most:g}] V; change amplitude or offset, or "
+                f"limits.command.{name} in the rig's file if the hardware allows it"
+            )
+    return waveform
+
+
+def run_experiment(
+    experiment: Experiment,
+    name: str,
+    rig_config: RigConfig,
+    device: Device,
+    root: Path,
+    watch: Watcher = lambda progress: None,
+) -> RunResult:
+    """Run an experiment on a device and log it under ``root``.
+
+    Whatever ends it, both outputs are zeroed first and the capture folder says why. Raises
+    ConfigError before energising; DeviceError, Interlock, RunError, KeyboardInterrupt or
+    Terminated afterwards.
+    """
+    waveform = plan(experiment, rig_config)
+    capture = Capture.create(
+        root,
+        name,
+        {"experiment": experiment.describe(), "rig": rig_config.model_dump(mode="json")},
+    )
+    run = _Run(experiment, waveform, Rig(device, rig_config), capture, watch)
+    with _sigterm_raises():
+        return run.execute()
+
+
+@contextlib.contextmanager
+def _sigterm_raises() -> Iterator[None]:
+    """SIGTERM ends the run as Ctrl-C does: by an exception, past every ``finally``."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def terminate(number: int, frame: FrameType | None) -> None:
+        raise Terminated
+
+    before = signal.signal(signal.SIGTERM, terminate)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+class _Run:
+    """One run through its phases."""
+
+    def __init__(
+        self,
+        experiment: Experiment,
+        waveform: FloatArray,
+        rig: Rig,
+        capture: Capture,
+        watch: Watcher,
+    ) -> None:
+        self.experiment = experiment
+        self.waveform = waveform
+        self.rig = rig
+        self.capture = capture
+        self.watch = watch
+        self.phase = Phase.OPEN
+        self.timing = _Timing()
+
+    def execute(self) -> RunResult:
+        """All phases; the record in the capture folder names how they ended."""
+        try:
+            with LogWriter(self.capture.log_path) as log:
+                self._phases(log)
+        except BaseException as error:
+            self._finish(*_outcome(error, self.phase))
+            raise
+        self._finish(COMPLETED, None)
+        return RunResult(self.capture.folder, log.n_samples, self.capture.record["timing"])
+
+    def _phases(self, log: LogWriter) -> None:
+        try:
+            self._enter(Phase.OPEN)
+            info = self.rig.open()
+            self.capture.record["device"] = info.name
+            self._enter(Phase.CALIBRATION)
+            self._calibrate()
+            if self.experiment.homing.turns > 0.0:
+                self._enter(Phase.HOMING, self.experiment.homing.turns)
+                self._home()
+            self._enter(Phase.RUN)
+            self._excite(log)
+            self._enter(Phase.SAFE)
+        finally:
+            self.rig.safe()
+            self.rig.close()
+        self.phase = Phase.CLOSE
+
+    def _enter(self, phase: Phase, turns: float = 0.0) -> None:
+        self.phase = phase
+        if phase is not Phase.OPEN:
+            self.rig.announce(phase, turns)
+
+    def _finish(self, status: str, reason: str | None) -> None:
+        # A record that cannot be written (the disk is full) must not hide why the run ended;
+        # the folder then still says "running", which a reader reports as interrupted.
+        with contextlib.suppress(RigError):
+            self.capture.finish(
+                status, reason, phase=self.phase.value, timing=self.timing.summary()
+            )
+
+    def _calibrate(self) -> None:
+        """Mean of the inputs at zero command becomes their offset."""
+        wanted = self.experiment.calibration.samples
+        blocks: list[Samples] = []
+
+        def enough(samples: Samples) -> bool:
+            blocks.append(samples)
+            done = sum(len(block) for block in blocks)
+            self.watch(PhaseProgress(Phase.CALIBRATION, min(done, wanted), wanted, "samples"))
+            return done >= wanted
+
+        self._stream_zeros(enough)
+        means = {
+            name: float(np.concatenate([getattr(block, name) for block in blocks]).mean())
+            for name in ("current_motor", "current_brake", "torque")
+        }
+        self.rig.take_offsets(means)
+        self.capture.record["offsets"] = {
+            **{name: value for name, value in means.items()},
+            "volts": self.rig.offsets.volts.tolist(),
+        }
+
+    def _home(self) -> None:
+        """Wait until the load is wound and the shaft has come to rest."""
+        homing = self.experiment.homing
+        rate = self.experiment.sample_rate
+        start: float | None = None
+        calm_from, calm_turns = 0.0, 0.0
+
+        def wound(samples: Samples) -> bool:
+            nonlocal start, calm_from, calm_turns
+            now = float(samples.time[-1])
+            turns = float(samples.theta[-1]) / (2.0 * np.pi)
+            start = turns if start is None else start
+            done = abs(turns - start)
+            self.watch(PhaseProgress(Phase.HOMING, min(done, homing.turns), homing.turns, "turns"))
+            if abs(turns - calm_turns) > _REST_TURNS:
+                calm_from, calm_turns = now, turns
+            if done >= homing.turns and now - calm_from >= _REST_TIME:
+                return True
+            if now > homing.timeout:
+                raise RunError(
+                    f"homing: {done:.2f} of {homing.turns:g} turns were wound in "
+                    f"{homing.timeout:g} s; wind the load and start again, or raise "
+                    "homing.timeout in the experiment"
+                )
+            return False
+
+        self._stream_zeros(wound)
+        self.capture.record["homing"] = {"turns": calm_turns - (start or 0.0), "rate": rate}
+
+    def _stream_zeros(self, enough: Callable[[Samples], bool]) -> None:
+        """Sample at zero command until ``enough`` says so."""
+        self.rig.start(self.experiment.sample_rate, Mode.CLOSED_LOOP)
+        asked = 1
+        self.rig.send(0, np.zeros((1, len(CHANNELS))))
+        while True:
+            samples = self.rig.receive()
+            self._check(samples)
+            if enough(samples):
+                break
+            missing = int(samples.tick[-1]) + 2 - asked
+            if missing > 0:
+                self.rig.send(asked, np.zeros((missing, len(CHANNELS))))
+                asked += missing
+        self.rig.stop()
+
+    def _excite(self, log: LogWriter) -> None:
+        """Preload and play the waveform; every sample is in the log before the next wait."""
+        total = len(self.waveform)
+        self.rig.start(self.experiment.sample_rate, Mode.OPEN_LOOP)
+        self.timing = _Timing()
+        sent = done = 0
+        while done < total:
+            room = self.rig.room()
+            if sent < total and room > 0:
+                chunk = self.waveform[sent : sent + room]
+                self.rig.send(sent, chunk)
+                sent += len(chunk)
+            samples = _first(self.rig.receive(), total)
+            trip = interlock_reason(samples, self.rig.config)
+            if trip is not None:
+                self.rig.safe()
+                samples = mark_interlock(_first(samples, int(samples.tick[trip[0]]) + 1), trip[0])
+            log.append(samples)
+            self.timing.block(samples)
+            done = int(samples.tick[-1]) + 1
+            self.watch(PhaseProgress(Phase.RUN, done, total, "samples"))
+            if trip is not None:
+                raise Interlock(f"interlock in sample {done - 1}: {trip[1]}; outputs are zero")
+            if np.any(samples.flags & int(Flag.UNDERFLOW)):
+                raise DeviceError(
+                    f"the device ran out of commands by sample {done - 1} and made itself safe; "
+                    "the host was too slow to refill it"
+                )
+        self.rig.stop()
+
+    def _check(self, samples: Samples) -> None:
+        trip = interlock_reason(samples, self.rig.config)
+        if trip is not None:
+            self.rig.safe()
+            raise Interlock(f"interlock during {self.phase.value}: {trip[1]}; outputs are zero")
+
+
+def _first(samples: Samples, end_tick: int) -> Samples:
+    """The samples with ticks before ``end_tick``."""
+    keep = samples.tick < end_tick
+    if keep.all():
+        return samples
+    return Samples(**{name: getattr(samples, name)[keep] for name in samples.__dataclass_fields__})
+
+
+def _outcome(error: BaseException, phase: Phase) -> tuple[str, str]:
+    """Status and reason that the capture folder keeps of an ended run."""
+    where = f"during {phase.value}"
+    if isinstance(error, KeyboardInterrupt):
+        return "stopped", f"stopped by Ctrl-C {where}"
+    if isinstance(error, Terminated):
+        return "stopped", f"stopped by SIGTERM {where}"
+    if isinstance(error, Interlock):
+        return "interlock", str(error)
+    if isinstance(error, RigError):
+        return "failed", str(error)
+    return "failed", f"{type(error).__name__} {where}: {error}"
