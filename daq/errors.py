@@ -23,7 +23,7 @@ class RunError(RigError):
     """A run ended before its time; the log holds what was measured until then."""
 
 
-class Interlock(RunError):
+class InterlockError(RunError):
     """A measured quantity passed its limit; the outputs were zeroed."""
 
 

@@ -67,7 +67,8 @@ class RawSamples:
 
     tick: (n,), index of the sample since ``start``; a gap means lost samples.
     analog: (n, 3), volts at the inputs in ``ANALOG_INPUTS`` order.
-    counts: (n,), quadrature counts (whole numbers on hardware). count_rate: (n,), the device's speed estimate [counts/s].
+    counts: (n,), quadrature counts, whole numbers on hardware. count_rate: (n,), the device's
+    estimate of their rate [1/s].
     applied: (n, 2), volts applied from this tick on, in ``CHANNELS`` order. flags: (n,).
     """
 

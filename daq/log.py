@@ -195,7 +195,6 @@ def ticks_of(path: Path, time: FloatArray, dt: float) -> IntArray:
     Raises ConfigError, naming the line, when the times fit no common rate.
     """
     exact = (time - time[0]) / dt
-    tick = np.round(exact).astype(np.int64)
     # A rate off by its printed digits drifts slowly; jumps between neighbours are what counts.
     wrong = np.flatnonzero(np.abs(np.diff(exact) - np.round(np.diff(exact))) > 0.3)
     if len(wrong):
@@ -205,7 +204,8 @@ def ticks_of(path: Path, time: FloatArray, dt: float) -> IntArray:
             f"{time[wrong[0] + 1] - time[wrong[0]]:g} s here; resample the log to a constant rate"
         )
     steps = np.round(np.diff(exact)).astype(np.int64)
-    tick[1:] = tick[0] + np.cumsum(np.maximum(steps, 1))
+    tick: IntArray = np.zeros(len(time), dtype=np.int64)
+    tick[1:] = np.cumsum(np.maximum(steps, 1))
     return tick
 
 
@@ -245,9 +245,7 @@ def _complete_lines(path: Path) -> tuple[str, bool]:
 
 def _check_header(path: Path, header: list[str], columns: Sequence[str]) -> None:
     if all(_is_number(name) for name in header):
-        raise ConfigError(
-            f"{path}:1: the first line holds numbers; it must hold the column names"
-        )
+        raise ConfigError(f"{path}:1: the first line holds numbers; it must hold the column names")
     twice = sorted({name for name in header if header.count(name) > 1})
     if twice:
         raise ConfigError(f"{path}:1: column {twice[0]!r} stands twice")

@@ -26,6 +26,5 @@ def load_plugin(group: Group, name: str) -> Any:
         return found[name].load()
     except Exception as error:
         raise ConfigError(
-            f"{kind} {name!r} ({found[name].value}) does not load: "
-            f"{type(error).__name__}: {error}"
+            f"{kind} {name!r} ({found[name].value}) does not load: {type(error).__name__}: {error}"
         ) from error

@@ -35,6 +35,7 @@ class Offsets:
 
     @classmethod
     def zero(cls) -> Offsets:
+        """No offsets."""
         return cls(np.zeros(len(ANALOG_INPUTS)))
 
 

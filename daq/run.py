@@ -17,7 +17,7 @@ import numpy as np
 from daq.capture import COMPLETED, Capture
 from daq.config.experiment import Experiment, peaks
 from daq.config.rig import RigConfig
-from daq.errors import ConfigError, DeviceError, Interlock, RigError, RunError, Terminated
+from daq.errors import ConfigError, DeviceError, InterlockError, RigError, RunError, Terminated
 from daq.hal import CHANNELS, Device, Flag, FloatArray, Mode, Phase, Samples
 from daq.log import LogWriter
 from daq.rig import Rig, interlock_reason, mark_interlock
@@ -113,7 +113,7 @@ def run_experiment(
     """Run an experiment on a device and log it under ``root``.
 
     Whatever ends it, both outputs are zeroed first and the capture folder says why. Raises
-    ConfigError before energising; DeviceError, Interlock, RunError, KeyboardInterrupt or
+    ConfigError before energising; DeviceError, InterlockError, RunError, KeyboardInterrupt or
     Terminated afterwards.
     """
     waveform = plan(experiment, rig_config)
@@ -223,7 +223,7 @@ class _Run:
         }
         self.rig.take_offsets(means)
         self.capture.record["offsets"] = {
-            **{name: value for name, value in means.items()},
+            **means,
             "volts": self.rig.offsets.volts.tolist(),
         }
 
@@ -294,7 +294,7 @@ class _Run:
             done = int(samples.tick[-1]) + 1
             self.watch(PhaseProgress(Phase.RUN, done, total, "samples"))
             if trip is not None:
-                raise Interlock(f"interlock in sample {done - 1}: {trip[1]}; outputs are zero")
+                raise InterlockError(f"interlock in sample {done - 1}: {trip[1]}; outputs are zero")
             if np.any(samples.flags & int(Flag.UNDERFLOW)):
                 raise DeviceError(
                     f"the device ran out of commands by sample {done - 1} and made itself safe; "
@@ -306,7 +306,9 @@ class _Run:
         trip = interlock_reason(samples, self.rig.config)
         if trip is not None:
             self.rig.safe()
-            raise Interlock(f"interlock during {self.phase.value}: {trip[1]}; outputs are zero")
+            raise InterlockError(
+                f"interlock during {self.phase.value}: {trip[1]}; outputs are zero"
+            )
 
 
 def _first(samples: Samples, end_tick: int) -> Samples:
@@ -324,7 +326,7 @@ def _outcome(error: BaseException, phase: Phase) -> tuple[str, str]:
         return "stopped", f"stopped by Ctrl-C {where}"
     if isinstance(error, Terminated):
         return "stopped", f"stopped by SIGTERM {where}"
-    if isinstance(error, Interlock):
+    if isinstance(error, InterlockError):
         return "interlock", str(error)
     if isinstance(error, RigError):
         return "failed", str(error)

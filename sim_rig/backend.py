@@ -80,9 +80,7 @@ class SimulatedDevice:
             [options.current_sense, options.current_sense, options.torque_sense]
         )
         self._steppers: dict[float, Stepper] = {}
-        self._x = self._plant.initial_state
         self._p = self._plant.nominal
-        self._encoder = EncoderCounter(4 * options.encoder_cycles)
         self._user_turns = 0.0
         self._user_start: float | None = None
         self._user_from = 0.0
@@ -92,8 +90,10 @@ class SimulatedDevice:
         self._reset_queue()
 
     def open(self) -> DeviceInfo:
-        """Switch on; sampling starts with ``start``."""
+        """Switch on, the load let down since the last time; sampling starts with ``start``."""
         self._open = True
+        self._x = self._plant.initial_state
+        self._encoder = EncoderCounter(4 * self.options.encoder_cycles)
         return DeviceInfo(
             name="simulated rig",
             max_rate=20_000.0,

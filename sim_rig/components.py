@@ -48,7 +48,7 @@ def bouc_wen_rate(exponent: float = 1.0) -> RateFunction:
     else:
 
         def rate(omega: float, z: float, gamma: float, beta: float, A: float) -> float:
-            size = abs(z) ** (exponent - 1.0)
+            size: float = abs(z) ** (exponent - 1.0)
             return A * omega - size * (gamma * abs(omega) * z + beta * omega * abs(z))
 
     return rate

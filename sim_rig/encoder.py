@@ -51,7 +51,7 @@ class EncoderCounter:
         return counts, rates
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _count(
     positions: FloatArray,
     start: float,

@@ -64,7 +64,7 @@ def _fixed(name: str, unit: str, value: float, why: str) -> Parameter:
 
 
 # Each value with the reason for it. "Assumed" ones stand in no data sheet of the rig.
-PARAMETERS = (
+PARAMETERS: tuple[Parameter, ...] = (
     _fixed("K_dm", "V/A", 120.0, "of the order of row C; leaves 0.99 of the 0.5 A/V at rest"),
     _fixed("omega_dm", "rad/s", 1828.0, "row C of table 4.1"),
     _fixed("K_db", "V/A", 13000.0, "assumed: leaves 0.99 of the 0.5 A/V into 126 ohm"),
@@ -81,9 +81,7 @@ PARAMETERS = (
     _fixed("beta", "1/rad", 20.0, "assumed: see gamma"),
     _fixed("A", "1/rad", 60.0, "assumed: yields after about 20 mrad"),
     _fixed("alpha0", "N*m", 0.0112, "assumed: residual torque 2 % of the rated one"),
-    _fixed(
-        "alpha1", "N*m/A", (0.6779 / 1.25 - 0.0112) / 0.19, "rating: 0.6779 N*m at 0.19 A"
-    ),
+    _fixed("alpha1", "N*m/A", (0.6779 / 1.25 - 0.0112) / 0.19, "rating: 0.6779 N*m at 0.19 A"),
     _fixed("c0", "N*m*s/rad", 1.2e-4, "assumed: viscous part small against the hysteretic"),
     _fixed("c1", "N*m*s/(rad*A)", 6e-4, "assumed: see c0"),
     _fixed("K_v2i", "A/V", 0.5, "amplifier data sheet"),
@@ -105,7 +103,7 @@ STATES = (
     State("omega", "rad/s"),
     State("z", "1"),
     State("theta", "rad"),
-    State("height", "m", -0.25 * GRAVITY / 5000.0, "of the hanging mass"),
+    State("height", "m", -0.25 * GRAVITY / 5000.0, "of the hanging mass, cable stretched"),
     State("speed", "m/s", 0.0, "of the hanging mass"),
 )
 

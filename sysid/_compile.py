@@ -176,7 +176,7 @@ def _source_file(name: str, text: str) -> Path | None:
         with os.fdopen(handle, "w", encoding="utf-8") as file:
             file.write(text)
         # Two processes may race to here; either's file is the right one.
-        os.replace(temporary, path)
+        Path(temporary).replace(path)
     except OSError:
         return None
     return path

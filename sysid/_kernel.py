@@ -135,7 +135,11 @@ def _stage_inputs(s: Shape) -> list[str]:
     lines = []
     for j, foh in enumerate(s.foh):
         if foh:
-            lines += [f"a{j} = v{j} + s{j} * step", f"b{j} = a{j} + 0.5 * s{j}", f"c{j} = a{j} + s{j}"]
+            lines += [
+                f"a{j} = v{j} + s{j} * step",
+                f"b{j} = a{j} + 0.5 * s{j}",
+                f"c{j} = a{j} + s{j}",
+            ]
         else:
             lines += [f"a{j} = v{j}", f"b{j} = v{j}", f"c{j} = v{j}"]
     return lines

@@ -41,6 +41,7 @@ class Dataset:
 
     @property
     def n_samples(self) -> int:
+        """Number of rows."""
         return len(self.outputs)
 
     @property
@@ -72,8 +73,8 @@ class Dataset:
 
 
 def _matrix(values: FloatArray) -> FloatArray:
-    array = np.ascontiguousarray(values, dtype=np.float64)
-    return array[:, None] if array.ndim == 1 else array
+    array: FloatArray = np.ascontiguousarray(values, dtype=np.float64)
+    return array.reshape(-1, 1) if array.ndim == 1 else array
 
 
 def output_scale(datasets: list[Dataset], per_log: bool = False) -> list[FloatArray]:

@@ -13,14 +13,18 @@ import numpy as np
 from sysid.model import FloatArray
 
 
-def rmse(measured: FloatArray, simulated: FloatArray, scale: FloatArray | float = 1.0) -> FloatArray:
+def rmse(
+    measured: FloatArray, simulated: FloatArray, scale: FloatArray | float = 1.0
+) -> FloatArray:
     """Root of the mean squared error, divided by ``scale`` (max|y| for tables 4.2 and 4.3)."""
-    return np.sqrt(np.nanmean((simulated - measured) ** 2, axis=0)) / scale
+    result: FloatArray = np.sqrt(np.nanmean((simulated - measured) ** 2, axis=0)) / scale
+    return result
 
 
 def msd(measured: FloatArray, simulated: FloatArray, scale: FloatArray | float = 1.0) -> FloatArray:
     """Mean signed deviation, simulated minus measured, divided by ``scale``."""
-    return np.nanmean(simulated - measured, axis=0) / scale
+    result: FloatArray = np.nanmean(simulated - measured, axis=0) / scale
+    return result
 
 
 def fit_percent(measured: FloatArray, simulated: FloatArray) -> FloatArray:

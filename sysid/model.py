@@ -146,18 +146,22 @@ class ProcessModel:
 
     @property
     def state_names(self) -> tuple[str, ...]:
+        """Names of the states, in order."""
         return tuple(state.name for state in self.states)
 
     @property
     def input_names(self) -> tuple[str, ...]:
+        """Names of the inputs, in order."""
         return tuple(signal.name for signal in self.inputs)
 
     @property
     def output_names(self) -> tuple[str, ...]:
+        """Names of the outputs, in order."""
         return tuple(signal.name for signal in self.outputs)
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
+        """Names of the parameters, in order."""
         return tuple(parameter.name for parameter in self.parameters)
 
     @property
@@ -198,7 +202,9 @@ class ProcessModel:
         parameters = tuple(replace(p, **changes.get(p.name, {})) for p in self.parameters)
         return replace(self, parameters=parameters)
 
-    def evaluate_output(self, x: Sequence[Any], u: Sequence[Any], p: Sequence[Any]) -> tuple[Any, ...]:
+    def evaluate_output(
+        self, x: Sequence[Any], u: Sequence[Any], p: Sequence[Any]
+    ) -> tuple[Any, ...]:
         """Outputs at one point; arrays of equal shape may stand in place of floats."""
         if self.output is not None:
             return self.output(tuple(x), tuple(u), tuple(p))

@@ -40,7 +40,9 @@ def simulate(
             break
         slope = np.where(foh, record.inputs[k + 1] - u0, 0.0) / record.dt
 
-        def rhs(t: float, state: FloatArray, u0: FloatArray = u0, slope: FloatArray = slope) -> FloatArray:
+        def rhs(
+            t: float, state: FloatArray, u0: FloatArray = u0, slope: FloatArray = slope
+        ) -> FloatArray:
             u = u0 + slope * t
             return np.array(model.derivative(tuple(state), tuple(u), p))
 

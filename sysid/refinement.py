@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sysid._kernel import LANES
-from sysid.model import FloatArray
+from sysid.model import BoolArray, FloatArray
 from sysid.objective import Objective
 
 _DAMPING = 10.0 ** np.linspace(2.0, -8.0, LANES)
@@ -121,9 +121,11 @@ def _candidates(
         projected = vectors.T @ gradient[free]
         damping = _DAMPING * max(values.max(), 1e-300)
         moves[:, free] = -(projected / (values + damping[:, None])) @ vectors.T
-    return np.clip(at + moves * width, lower, upper)
+    clipped: FloatArray = np.clip(at + moves * width, lower, upper)
+    return clipped
 
 
-def _feasible(objective: Objective, candidates: FloatArray) -> np.ndarray:
+def _feasible(objective: Objective, candidates: FloatArray) -> BoolArray:
     violations = objective.space.violations(objective.space.decode(candidates))
-    return np.all(violations <= 0.0, axis=1)
+    kept: BoolArray = np.all(violations <= 0.0, axis=1)
+    return kept

@@ -256,8 +256,18 @@ class _Runner:
         x0 = np.repeat(self.x0[:, None], LANES, axis=1)
         sse = np.empty((self.y.shape[1], LANES))
         self.kernels.simulate(
-            _aligned(self.kernels.work_size), self.record.inputs, self.y, self.w, x0, p, self.record.dt, n_steps, sse,
-            record, self.every if len(snapshots) else 0, snapshots,
+            _aligned(self.kernels.work_size),
+            self.record.inputs,
+            self.y,
+            self.w,
+            x0,
+            p,
+            self.record.dt,
+            n_steps,
+            sse,
+            record,
+            self.every if len(snapshots) else 0,
+            snapshots,
         )
         return sse.T[: len(lanes)]
 
@@ -280,9 +290,7 @@ class _Runner:
     def _rates(self, instants: IntArray, states: FloatArray, parameters: FloatArray) -> FloatArray:
         rates = np.zeros(len(parameters))
         p = np.ascontiguousarray(parameters.T)
-        self.kernels.spectrum(
-            self.record.inputs[instants], np.ascontiguousarray(states), p, rates
-        )
+        self.kernels.spectrum(self.record.inputs[instants], np.ascontiguousarray(states), p, rates)
         return rates
 
     def _rungs(self, rates: FloatArray) -> IntArray:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sysid.model import FloatArray, ModelError, Parameter, ProcessModel, check_range
+from sysid.model import BoolArray, FloatArray, ModelError, Parameter, ProcessModel, check_range
 
 
 @dataclass(frozen=True)
@@ -56,8 +56,16 @@ class SearchSpace:
             nominal = min(max(parameter.nominal, parameter.minimum), parameter.maximum)
             free.append(
                 Parameter(
-                    parameter.name, parameter.unit, nominal, lower, upper, scale, False,
-                    parameter.minimum, parameter.maximum, parameter.description,
+                    parameter.name,
+                    parameter.unit,
+                    nominal,
+                    lower,
+                    upper,
+                    scale,
+                    False,
+                    parameter.minimum,
+                    parameter.maximum,
+                    parameter.description,
                 )
             )
             index.append(i)
@@ -67,26 +75,31 @@ class SearchSpace:
 
     @property
     def names(self) -> tuple[str, ...]:
+        """Names of the free parameters, in order."""
         return tuple(parameter.name for parameter in self.parameters)
 
     @property
     def lower(self) -> FloatArray:
+        """Low ends of the ranges, (n_free,)."""
         return np.array([parameter.lower for parameter in self.parameters])
 
     @property
     def upper(self) -> FloatArray:
+        """High ends of the ranges, (n_free,)."""
         return np.array([parameter.upper for parameter in self.parameters])
 
     @property
     def minimum(self) -> FloatArray:
+        """Physical minima, (n_free,)."""
         return np.array([parameter.minimum for parameter in self.parameters])
 
     @property
     def maximum(self) -> FloatArray:
+        """Physical maxima, (n_free,)."""
         return np.array([parameter.maximum for parameter in self.parameters])
 
     @property
-    def log(self) -> np.ndarray:
+    def log(self) -> BoolArray:
         """Mask of the parameters searched by logarithm, (n_free,)."""
         flags = [self.use_log and parameter.scale == "log" for parameter in self.parameters]
         return np.array(flags, dtype=bool)

@@ -24,8 +24,7 @@ class Stepper:
     ) -> None:
         if len(parameters) != len(model.parameters):
             raise ModelError(
-                f"model {model.name} has {len(model.parameters)} parameters, "
-                f"not {len(parameters)}"
+                f"model {model.name} has {len(model.parameters)} parameters, not {len(parameters)}"
             )
         self.model = model
         self.parameters = np.ascontiguousarray(parameters, dtype=np.float64)
@@ -57,4 +56,4 @@ class Stepper:
             self.parameters[:, None],
             rate,
         )
-        return max(1, math.ceil(rate[0] * self.dt / _STEP_LIMIT))
+        return max(1, math.ceil(float(rate[0]) * self.dt / _STEP_LIMIT))

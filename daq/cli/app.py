@@ -81,9 +81,7 @@ def check(
     check_command(experiment, rig, json)
 
 
-@app.command(
-    epilog="Example:  rig identify runs/20260101T120000Z-prbs --validate other_log.csv"
-)
+@app.command(epilog="Example:  rig identify runs/20260101T120000Z-prbs --validate other_log.csv")
 def identify(
     logs: Logs,
     model: ModelName = None,
@@ -129,9 +127,7 @@ def identify(
     "--parameters runs/20260101T120000Z-prbs/identification/parameters.yaml"
 )
 def replay(
-    log: Annotated[
-        Path, typer.Argument(metavar="RUN_OR_CSV", help="Capture folder or CSV log.")
-    ],
+    log: Annotated[Path, typer.Argument(metavar="RUN_OR_CSV", help="Capture folder or CSV log.")],
     rig: RigName = "simulated.yaml",
     parameters: Annotated[
         Path | None,

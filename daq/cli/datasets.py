@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -85,25 +86,27 @@ def check_mapping(model: ProcessModel, mapping: Mapping) -> None:
             raise mapping.file.error(
                 ("columns", "outputs", name), "an output must be measured, not constant"
             )
-    for signal in (*model.inputs, *model.outputs):
-        group = "inputs" if signal in model.inputs else "outputs"
-        column = getattr(mapping.columns, group)[signal.name]
-        _factor(mapping, ("columns", group, signal.name, "unit"), column.unit, signal.unit)
+    for group, given, signals in (
+        ("inputs", mapping.columns.inputs, [(s.name, s.unit) for s in model.inputs]),
+        ("outputs", mapping.columns.outputs, [(s.name, s.unit) for s in model.outputs]),
+    ):
+        for name, unit in signals:
+            _factor(mapping, ("columns", group, name, "unit"), given[name].unit, unit)
 
 
-def _from_log(log: Log, model: ProcessModel, name: str) -> Dataset:
+def _from_log(log: Log, model: ProcessModel, title: str) -> Dataset:
     columns = list(log.frame.columns)
-    for signal in (*model.inputs, *model.outputs):
-        if signal.name not in columns:
+    for name in (*model.input_names, *model.output_names):
+        if name not in columns:
             raise ConfigError(
-                f"{log.path}: model {model.name} needs {signal.name!r}, which is no column of "
-                f"this log; {suggestion(signal.name, columns)} Name the column in the 'columns' "
+                f"{log.path}: model {model.name} needs {name!r}, which is no column of "
+                f"this log; {suggestion(name, columns)} Name the column in the 'columns' "
                 "section of a file given with --config"
             )
     inputs = log.frame[list(model.input_names)].to_numpy(dtype=np.float64)
     outputs = log.frame[list(model.output_names)].to_numpy(dtype=np.float64)
     tick = log.frame["tick"].to_numpy()
-    return _dataset(log.path, model, inputs, outputs, tick, log.dt, name)
+    return _dataset(log.path, model, inputs, outputs, tick, log.dt, title)
 
 
 def _load_foreign(path: Path, model: ProcessModel, mapping: Mapping) -> Loaded:
@@ -169,7 +172,7 @@ def _factor(mapping: Mapping, key: tuple[str, ...], unit: str | None, wanted: st
         return 1.0
     import pint
 
-    registry = pint.UnitRegistry()
+    registry: Any = pint.UnitRegistry()
     try:
         return float(registry.Quantity(1.0, _spelt(unit)).to(_spelt(wanted)).magnitude)
     except pint.DimensionalityError:

@@ -169,7 +169,9 @@ def _as_model(found: Any, where: str) -> ProcessModel:
         except ModelError as error:
             raise ConfigError(f"{where}: {error}") from None
         except Exception as error:
-            raise ConfigError(f"{where}: calling it fails: {type(error).__name__}: {error}") from None
+            raise ConfigError(
+                f"{where}: calling it fails: {type(error).__name__}: {error}"
+            ) from None
     if not isinstance(found, ProcessModel):
         raise ConfigError(
             f"{where} is a {type(found).__name__}, not a sysid.ProcessModel or a function "

@@ -72,7 +72,7 @@ def check_command(experiment: str, rig: str, as_json: bool) -> None:
     if validation is not None:
         validation.plan(rig_config)
     settings = loaded.experiment
-    channels = {}
+    channels: dict[str, dict[str, Any]] = {}
     for index, name in enumerate(CHANNELS):
         column = waveform[:, index]
         channels[name] = {

@@ -68,9 +68,7 @@ class IdentificationConfig(Section):
 
     @field_validator("ranges")
     @classmethod
-    def _ordered(
-        cls, ranges: dict[str, tuple[float, float]]
-    ) -> dict[str, tuple[float, float]]:
+    def _ordered(cls, ranges: dict[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
         for name, (low, high) in ranges.items():
             if low >= high:
                 raise ValueError(

@@ -117,9 +117,7 @@ def suggestion(name: str, known: Sequence[str]) -> str:
     return f"known are {', '.join(sorted(known))}" if known else "none are known"
 
 
-def _collect(
-    path: Path, node: yaml.Node, key: Key, places: dict[Key, tuple[int, int]]
-) -> None:
+def _collect(path: Path, node: yaml.Node, key: Key, places: dict[Key, tuple[int, int]]) -> None:
     places[key] = (node.start_mark.line + 1, node.start_mark.column + 1)
     if isinstance(node, yaml.MappingNode):
         for name, value in node.value:

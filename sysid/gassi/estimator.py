@@ -162,11 +162,14 @@ class GASSI(BaseEstimator):  # type: ignore[misc]
         """
         check_is_fitted(self, "vector_")
         if not isinstance(X, Dataset):
-            outputs = np.full((len(X), len(self._model().outputs)), np.nan)
-            X = Dataset(X, outputs, _sample_time(dt))
-        return self._simulator().trajectories(self.vector_, X)[0]
+            unknown = np.full((len(X), len(self._model().outputs)), np.nan)
+            X = Dataset(X, unknown, _sample_time(dt))
+        outputs: FloatArray = self._simulator().trajectories(self.vector_, X)[0]
+        return outputs
 
-    def score(self, X: Dataset | FloatArray, y: FloatArray | None = None, *, dt: float | None = None) -> float:
+    def score(
+        self, X: Dataset | FloatArray, y: FloatArray | None = None, *, dt: float | None = None
+    ) -> float:
         """Mean fit % over the outputs, divided by 100: 1 is perfect."""
         (record,) = _records(X, y, dt)
         return float(np.nanmean(fit_percent(record.outputs, self.predict(record)))) / 100.0
@@ -213,9 +216,7 @@ class GASSI(BaseEstimator):  # type: ignore[misc]
                     "narrow the ranges, or raise max_steps if the model is this stiff"
                 )
             search.tell(errors)
-            notify(
-                Progress("search", len(search.history), self.generations, search.elite_error)
-            )
+            notify(Progress("search", len(search.history), self.generations, search.elite_error))
         if search.converged:
             self.stopped_ = "converged"
 

@@ -28,7 +28,8 @@ def infeasibility(violations: FloatArray) -> FloatArray:
         relative = np.where(violations > 0.0, violations / worst, 0.0)
     # An infinite violation is as bad as can be, not an undefined fraction.
     relative = np.where(np.isnan(relative), 1.0, relative)
-    return relative.mean(axis=1)
+    score: FloatArray = relative.mean(axis=1)
+    return score
 
 
 @dataclass(frozen=True)

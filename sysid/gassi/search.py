@@ -175,9 +175,7 @@ class GeneticSearch:
 
     def _breed_classic(self, fitness: FloatArray) -> None:
         self._coded = operators.roulette(self._coded, fitness, self.rng)
-        operators.arithmetical_crossover(
-            self._coded, _CLASSIC_RATIO, _CLASSIC_CROSSOVER, self.rng
-        )
+        operators.arithmetical_crossover(self._coded, _CLASSIC_RATIO, _CLASSIC_CROSSOVER, self.rng)
         operators.uniform_mutation(
             self._coded, self._lower, self._upper, _CLASSIC_MUTATION, self.rng
         )
