@@ -1,7 +1,7 @@
 """The DC motor of the thesis's section 4.1.4, as a process model of one's own.
 
-States: armature current and speed. Inputs: terminal voltage and load torque, both interpolated
-between samples (they are smooth functions of time, not commands of a converter).
+States: armature current and speed. Inputs: terminal voltage, held between samples as a
+converter holds it, and load torque, interpolated because it changes smoothly.
 """
 
 from sysid import Input, Output, Parameter, ProcessModel, State
@@ -25,7 +25,7 @@ model = ProcessModel(
     name="dc_motor",
     description="brushed DC motor with viscous damping",
     states=(State("current", "A"), State("omega", "rad/s")),
-    inputs=(Input("voltage", "V", "foh"), Input("load", "N*m", "foh")),
+    inputs=(Input("voltage", "V", "zoh"), Input("load", "N*m", "foh")),
     outputs=(Output("current", "A"), Output("omega", "rad/s")),
     parameters=(
         Parameter("resistance", "ohm", **around(1.0, 10.0)),

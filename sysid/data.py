@@ -47,7 +47,8 @@ class Dataset:
     @property
     def time(self) -> FloatArray:
         """Sample instants [s], shape (n_samples,)."""
-        return np.arange(self.n_samples) * self.dt
+        instants: FloatArray = np.arange(self.n_samples) * self.dt
+        return instants
 
     def check(self, model: ProcessModel) -> None:
         """Raise ModelError unless the columns match the model's inputs and outputs."""
@@ -74,7 +75,9 @@ class Dataset:
 
 def _matrix(values: FloatArray) -> FloatArray:
     array: FloatArray = np.ascontiguousarray(values, dtype=np.float64)
-    return array.reshape(-1, 1) if array.ndim == 1 else array
+    if array.ndim == 1:
+        array = array.reshape(-1, 1)
+    return array
 
 
 def output_scale(datasets: list[Dataset], per_log: bool = False) -> list[FloatArray]:

@@ -38,10 +38,12 @@ def print_line(text: str = "") -> None:
     sys.stdout.write(text + "\n")
 
 
-def print_table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+def print_table(
+    title: str, head: Sequence[str], rows: Sequence[Sequence[str]], text: Sequence[str] = ()
+) -> None:
     """A table: with rules on a terminal, aligned plain text otherwise.
 
-    The first column is text, the others numbers.
+    The first column and those named in ``text`` are text, the others numbers.
     """
     from rich import box
     from rich.console import Console
@@ -56,7 +58,8 @@ def print_table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) 
         box=box.SIMPLE_HEAD if console.is_terminal else box.SIMPLE, pad_edge=False,
     )  # fmt: skip
     for index, name in enumerate(head):
-        table.add_column(name, justify="left" if index == 0 else "right", no_wrap=True)
+        words = index == 0 or name in text
+        table.add_column(name, justify="left" if words else "right", no_wrap=not words)
     for row in rows:
         table.add_row(*row)
     console.print(table)

@@ -285,8 +285,9 @@ def _print_report(
     console.print_line()
     console.print_table(
         f"Parameters of {model.name}",
-        ["parameter", "value", "unit", "searched in", "what it is"],
+        ["parameter", "value", "unit", "searched in", ""],
         [_parameter_row(estimator, model, p.name) for p in model.parameters],
+        text=["unit", ""],
     )
     single = len(train) == 1 and len(check) <= 1
     if single:
@@ -304,11 +305,10 @@ def _print_report(
         console.print_line(
             "Warning: no parameters were found that satisfy all of the model's constraints."
         )
-    bound = [name for name in estimator.space_.names if _on_bound(estimator, name)]
-    if bound:
+    if any(_on_bound(estimator, name) for name in estimator.space_.names):
         console.print_line(
-            f"On the end of their range: {', '.join(bound)}. The data want more room, or cannot "
-            "tell; see ranges in --config."
+            "At the end of its range: the data want more room there, or cannot tell.\n"
+            "Set 'ranges' in a file given with --config."
         )
     console.print_line(f"Parameters: {path}")
     console.print_line(f"Next: rig replay {check[-1].path if check else train[0].path} "
@@ -320,10 +320,10 @@ def _parameter_row(estimator: GASSI, model: ProcessModel, name: str) -> list[str
     value = console.number(estimator.parameters_[name])
     searched = dict(zip(estimator.space_.names, estimator.space_.parameters, strict=True))
     if name not in searched:
-        return [name, value, parameter.unit, "fixed", parameter.description]
+        return [name, value, parameter.unit, "fixed", ""]
     low, high = searched[name].lower, searched[name].upper
-    span = f"{console.number(low, 3)} .. {console.number(high, 3)}"
-    return [name, value, parameter.unit, span, parameter.description]
+    span = f"{low:g} .. {high:g}"
+    return [name, value, parameter.unit, span, "at its end" if _on_bound(estimator, name) else ""]
 
 
 def print_metrics(

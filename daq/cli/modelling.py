@@ -55,6 +55,7 @@ def models_command(name: str | None, as_json: bool) -> None:
             ]
             for key, model in found.items()
         ],
+        text=["what it is"],
     )
     console.print_line("Next: rig models NAME, or rig models my_model.py:model for one of your own")
 
@@ -95,7 +96,9 @@ def _describe(model: ProcessModel, as_json: bool) -> None:
     rows = [["state", s.name, s.unit, f"starts at {s.initial:g}"] for s in model.states]
     rows += [["input", s.name, s.unit, s.hold] for s in model.inputs]
     rows += [["output", s.name, s.unit, s.description] for s in model.outputs]
-    console.print_table("Signals", ["", "name", "unit", ""], rows)
+    console.print_table(
+        "Signals", ["kind", "name", "unit", "note"], rows, text=["name", "unit", "note"]
+    )
     console.print_table(
         "Parameters",
         ["name", "unit", "nominal", "range", "scale", "what it is"],
@@ -110,6 +113,7 @@ def _describe(model: ProcessModel, as_json: bool) -> None:
             ]
             for p in model.parameters
         ],
+        text=["unit", "scale", "what it is"],
     )
     for constraint in model.constraints:
         console.print_line(f"Constraint: {constraint.text}")

@@ -227,6 +227,8 @@ class GASSI(BaseEstimator):  # type: ignore[misc]
             notify(Progress("refine", iteration, limit, error))
 
         result = refine(objective, self.chromosome_, max_iterations=limit, on_iteration=watch)
+        # It rarely needs all the iterations it may take.
+        notify(Progress("refine", result.iterations, result.iterations, result.error))
         if result.error < self.error_:
             self._take(result.chromosome, result.error, True)
 

@@ -1,0 +1,70 @@
+"""What the benchmarks share: arguments, the machine's name, a log of the simulated rig."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from daq import capture
+from daq.cli import datasets
+from daq.cli.files import load_experiment, load_rig
+from daq.run import run_experiment
+from sysid import Dataset
+from sysid.model import ProcessModel
+from sysid.simulation import available_cores
+
+
+def arguments(description: str) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("--json", action="store_true", help="one JSON document")
+    return parser
+
+
+def machine() -> dict[str, Any]:
+    """Processor, cores and versions that the figures belong to."""
+    cpu = platform.processor() or platform.machine()
+    info = Path("/proc/cpuinfo")
+    if info.exists():
+        lines = info.read_text(encoding="utf-8").splitlines()
+        cpu = next((s.split(":", 1)[1].strip() for s in lines if s.startswith("model name")), cpu)
+    return {"cpu": cpu, "cores": available_cores(), **capture.software_versions()}
+
+
+def report(figures: dict[str, Any], as_json: bool, show: Callable[[dict[str, Any]], None]) -> None:
+    """Print the figures with the machine they were measured on."""
+    figures = {"machine": machine(), **figures}
+    if as_json:
+        json.dump(figures, sys.stdout, indent=2)
+        print()
+        return
+    about = figures["machine"]
+    print(f"{about['cpu']}, {about['cores']} cores, Python {about['python']}")
+    show(figures)
+
+
+def timed(function: Callable[[], Any]) -> tuple[float, Any]:
+    """Seconds a call takes, and what it returns."""
+    start = time.perf_counter()
+    result = function()
+    return time.perf_counter() - start, result
+
+
+def simulated_logs(model: ProcessModel) -> tuple[Dataset, Dataset]:
+    """Training and validation record of the shipped experiment on the simulated rig."""
+    loaded = load_experiment("prbs.yaml")
+    validation = loaded.validation()
+    assert validation is not None
+    rig, device = load_rig("simulated.yaml")
+    with tempfile.TemporaryDirectory() as folder:
+        records = []
+        for item in (loaded, validation):
+            run = run_experiment(item.experiment, item.name, rig, device, Path(folder))
+            records.append(datasets.load(run.folder, model, None).dataset)
+    return records[0], records[1]
