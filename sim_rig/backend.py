@@ -84,7 +84,8 @@ class SimulatedDevice:
         self._user_turns = 0.0
         self._user_start: float | None = None
         self._user_from = 0.0
-        self._clock = 0.0  # device time since it was switched on [s]
+        self._clock = 0.0  # device time since it was switched on [s], at the next tick
+        self._origin = 0.0  # and at tick 0
         self._open = False
         self._running = False
         self._reset_queue()
@@ -118,6 +119,7 @@ class SimulatedDevice:
             self._steppers[sample_rate] = Stepper(self._plant, self._p, 1.0 / sample_rate)
         self._stepper = self._steppers[sample_rate]
         self._rate, self._mode, self._guard = sample_rate, mode, guard
+        self._origin = self._clock
         self._reset_queue()
         self._running = True
         self._wall_start: float | None = None
@@ -231,7 +233,8 @@ class SimulatedDevice:
             self.safe()
         self._tick += n
         self._queued_until = max(self._queued_until, self._tick)
-        self._clock += n / self._rate
+        # Not summed up tick by tick: rounding would make it depend on the size of the blocks.
+        self._clock = self._origin + self._tick / self._rate
         return raw
 
     def _simulate(self, applied: FloatArray, flags: IntArray, noise: FloatArray) -> RawSamples:
@@ -239,12 +242,12 @@ class SimulatedDevice:
         n = len(applied)
         u = np.empty((n + 1, len(self._plant.inputs)))
         u[:n, :2], u[n, :2] = applied, applied[-1]
-        u[:, 2:] = self._hand(self._clock + np.arange(n + 1) / self._rate)
+        u[:, 2:] = self._hand(self._origin + (self._tick + np.arange(n + 1)) / self._rate)
         per_tick = self._stepper.n_steps
         trace, true = self._stepper.advance(self._x, u)
         angles = np.append(trace[:, _THETA], self._x[_THETA])
         counts, rates = self._encoder.latch(
-            angles, self._clock, 1.0 / (self._rate * per_tick), per_tick
+            angles, self._origin, self._tick * per_tick, 1.0 / (self._rate * per_tick), per_tick
         )
         analog = true[:, :3] * self._senses
         if self.options.ideal:

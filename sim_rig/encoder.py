@@ -33,12 +33,13 @@ class EncoderCounter:
         return EncoderCounter(self.counts_per_turn, self._memory.copy(), self._started)
 
     def latch(
-        self, angles: FloatArray, start: float, step: float, per_tick: int
+        self, angles: FloatArray, origin: float, first: int, step: float, per_tick: int
     ) -> tuple[FloatArray, FloatArray]:
         """Counts and their rate [1/s] at every ``per_tick``-th of the angles.
 
-        angles: (n,) [rad] at times start + i * step; the first is a tick, the last only ends
-        the last interval. Edges in between are timed by interpolation.
+        angles: (n,) [rad] at times origin + (first + i) * step; the first is a tick, the last
+        only ends the last interval. Edges in between are timed by interpolation. With a common
+        origin the result does not depend on where a motion is cut into calls.
         """
         positions = angles * (self.counts_per_turn / (2.0 * math.pi))
         if not self._started:
@@ -47,14 +48,15 @@ class EncoderCounter:
         ticks = (len(angles) - 1 + per_tick - 1) // per_tick
         counts = np.empty(ticks)
         rates = np.empty(ticks)
-        _count(positions, start, step, per_tick, self._memory, counts, rates)
+        _count(positions, origin, first, step, per_tick, self._memory, counts, rates)
         return counts, rates
 
 
 @njit(cache=True, nogil=True)
 def _count(
     positions: FloatArray,
-    start: float,
+    origin: float,
+    first: int,
     step: float,
     per_tick: int,
     memory: FloatArray,
@@ -63,7 +65,7 @@ def _count(
 ) -> None:
     count, edge_time, direction, rate = memory[0], memory[1], memory[2], memory[3]
     for i in range(len(positions) - 1):
-        now = start + i * step
+        now = origin + (first + i) * step
         if i % per_tick == 0:
             shown = rate
             if edge_time < 0.0 or now - edge_time > _STANDSTILL:

@@ -7,6 +7,7 @@ gets a new name, and an old kernel is never used for it.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import math
@@ -28,6 +29,9 @@ _OPTIONS: dict[str, Any] = {
     "fastmath": {"contract", "arcp", "nsz"},
 }
 
+# Modules that the compiler knows by itself and that do not change between runs.
+_KNOWN_MODULES = {"builtins", "cmath", "math", "numba", "numpy", "operator"}
+
 
 @dataclass(frozen=True)
 class Kernels:
@@ -37,6 +41,7 @@ class Kernels:
     spectrum: Callable[..., None]
     advance: Callable[..., None]
     work_size: int
+    fewest_steps: int
 
 
 @functools.lru_cache(maxsize=8)
@@ -49,9 +54,13 @@ def kernels(model: ProcessModel) -> Kernels:
     import numba
     import numpy as np
 
+    from sysid._phi import phi_matrices
+
     shape = _kernel.Shape.of(model)
     text = _kernel.source(shape)
-    functions = [model.derivative] + ([model.output] if model.output is not None else [])
+    functions: list[Any] = [model.derivative, phi_matrices]
+    if model.output is not None:
+        functions.append(model.output)
     key = hashlib.sha256(f"{numba.__version__}\n{text}".encode())
     for function in functions:
         _fingerprint(function, key, set())
@@ -60,18 +69,28 @@ def kernels(model: ProcessModel) -> Kernels:
     scope: dict[str, Any] = {
         "np": np,
         "math": math,
+        "phi_matrices": phi_matrices,
         "derivative": _jit(model.derivative, compiled),
         "__name__": __name__,  # a module that exists when Numba loads the kernel from its cache
     }
     if model.output is not None:
         scope["output"] = _jit(model.output, compiled)
     exec(compile(text, str(path or "<kernel>"), "exec"), scope)
-    decorate = numba.njit(nogil=True, cache=path is not None, **_OPTIONS)
+    scope["prepare"] = numba.njit(**_OPTIONS)(scope["prepare"])
+
+    def decorate(function: Any) -> Any:
+        if path is not None:
+            # RuntimeError: neither beside the text nor elsewhere can the compiler write.
+            with contextlib.suppress(RuntimeError):
+                return numba.njit(nogil=True, cache=True, **_OPTIONS)(function)
+        return numba.njit(nogil=True, **_OPTIONS)(function)
+
     return Kernels(
         _guarded(model, decorate(scope["simulate"])),
         _guarded(model, decorate(scope["spectrum"])),
         _guarded(model, decorate(scope["advance"])),
-        _kernel.work_size(shape),
+        shape.work_size,
+        shape.fewest_steps,
     )
 
 
@@ -108,33 +127,47 @@ def _explain(model: ProcessModel, error: Exception) -> str:
     )
 
 
-def _jit(function: Any, done: dict[int, Any]) -> Any:
-    """Compile a function and, first, every plain function it refers to."""
+def _jit(value: Any, done: dict[int, Any]) -> Any:
+    """Compile a function and every plain function it refers to, also through a module."""
     import numba
 
-    if not isinstance(function, types.FunctionType):
-        return function
-    if id(function) in done:
-        return done[id(function)]
-    scope = dict(function.__globals__)
-    for name, value in _referenced(function).items():
-        if isinstance(value, types.FunctionType):
-            scope[name] = _jit(value, done)
-    cells = tuple(
-        types.CellType(_jit(cell.cell_contents, done)) for cell in function.__closure__ or ()
-    )
-    copy = types.FunctionType(
-        function.__code__, scope, function.__name__, function.__defaults__, cells
-    )
-    copy.__kwdefaults__ = function.__kwdefaults__
+    if not isinstance(value, types.FunctionType):
+        return value
+    if id(value) in done:
+        return done[id(value)]
+    scope = dict(value.__globals__)
+    cells = tuple(types.CellType() for _ in value.__closure__ or ())
+    copy = types.FunctionType(value.__code__, scope, value.__name__, value.__defaults__, cells)
+    copy.__kwdefaults__ = value.__kwdefaults__
     copy.__module__ = __name__  # the user's file may be no importable module
-    done[id(function)] = numba.njit(**_OPTIONS)(copy)
-    return done[id(function)]
+    # Noted before its helpers are looked at, so that functions may refer to each other.
+    done[id(value)] = numba.njit(**_OPTIONS)(copy)
+    names = _names(value.__code__)
+    for name in names & scope.keys():
+        if isinstance(scope[name], types.ModuleType):
+            scope[name] = _jit_module(scope[name], names, done)
+        else:
+            scope[name] = _jit(scope[name], done)
+    for cell, original in zip(cells, value.__closure__ or (), strict=True):
+        cell.cell_contents = _jit(original.cell_contents, done)
+    return done[id(value)]
 
 
-def _referenced(function: types.FunctionType) -> dict[str, Any]:
-    scope = function.__globals__
-    return {name: scope[name] for name in function.__code__.co_names if name in scope}
+def _jit_module(module: types.ModuleType, names: set[str], done: dict[int, Any]) -> Any:
+    """The module, or a copy of it in which the functions of the given names are compiled."""
+    if module.__name__.partition(".")[0] in _KNOWN_MODULES:
+        return module
+    copy = types.ModuleType(module.__name__)
+    copy.__dict__.update(module.__dict__)
+    for name in names & module.__dict__.keys():
+        setattr(copy, name, _jit(getattr(module, name), done))
+    return copy
+
+
+def _names(code: types.CodeType) -> set[str]:
+    """All names that code refers to, including code within it."""
+    inner = (item for item in code.co_consts if isinstance(item, types.CodeType))
+    return set(code.co_names).union(*map(_names, inner))
 
 
 def _fingerprint(value: Any, key: Any, seen: set[int]) -> None:
@@ -148,20 +181,33 @@ def _fingerprint(value: Any, key: Any, seen: set[int]) -> None:
         _fingerprint((value.__defaults__, value.__kwdefaults__), key, seen)
         for cell in value.__closure__ or ():
             _fingerprint(cell.cell_contents, key, seen)
-        for name, item in sorted(_referenced(value).items()):
-            key.update(name.encode())
-            _fingerprint(item, key, seen)
+        _fingerprint_names(value.__globals__, _names(value.__code__), key, seen)
     elif isinstance(value, types.CodeType):
         key.update(value.co_code + repr((value.co_names, value.co_varnames)).encode())
-        for constant in value.co_consts:
-            _fingerprint(constant, key, seen)
+        _fingerprint(value.co_consts, key, seen)
     elif isinstance(value, types.ModuleType):
         key.update(value.__name__.encode())
     elif isinstance(value, tuple | list):
+        key.update(f"{type(value).__name__} of {len(value)}:".encode())
         for item in value:
             _fingerprint(item, key, seen)
+    elif type(value).__module__ == "numpy" and hasattr(value, "tobytes"):
+        # The text of an array is rounded, and abridged when it is long.
+        key.update(f"{value.dtype}{value.shape}:".encode() + value.tobytes())
     else:
         key.update(f"{type(value).__name__}:{value!r};".encode())
+
+
+def _fingerprint_names(scope: dict[str, Any], names: set[str], key: Any, seen: set[int]) -> None:
+    for name in sorted(names & scope.keys()):
+        item = scope[name]
+        key.update(f"{name}=".encode())
+        _fingerprint(item, key, seen)
+        if (
+            isinstance(item, types.ModuleType)
+            and item.__name__.partition(".")[0] not in _KNOWN_MODULES
+        ):
+            _fingerprint_names(vars(item), names, key, seen)
 
 
 def _source_file(name: str, text: str) -> Path | None:

@@ -47,8 +47,7 @@ class Dataset:
     @property
     def time(self) -> FloatArray:
         """Sample instants [s], shape (n_samples,)."""
-        instants: FloatArray = np.arange(self.n_samples) * self.dt
-        return instants
+        return self.dt * np.arange(self.n_samples, dtype=np.float64)
 
     def check(self, model: ProcessModel) -> None:
         """Raise ModelError unless the columns match the model's inputs and outputs."""
@@ -86,7 +85,8 @@ def output_scale(datasets: list[Dataset], per_log: bool = False) -> list[FloatAr
     One (n_outputs,) array per dataset: its own maximum with ``per_log``, else the maximum over
     all of them. An output that never leaves zero gets 1.
     """
-    peaks = np.array([np.nanmax(np.abs(data.outputs), axis=0) for data in datasets])
+    measured = [np.where(np.isfinite(d.outputs), np.abs(d.outputs), 0.0) for d in datasets]
+    peaks = np.array([values.max(axis=0) for values in measured])
     if not per_log:
         peaks = np.broadcast_to(peaks.max(axis=0), peaks.shape)
     return [np.where(peak > 0.0, peak, 1.0) for peak in peaks]

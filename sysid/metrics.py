@@ -17,13 +17,13 @@ def rmse(
     measured: FloatArray, simulated: FloatArray, scale: FloatArray | float = 1.0
 ) -> FloatArray:
     """Root of the mean squared error, divided by ``scale`` (max|y| for tables 4.2 and 4.3)."""
-    result: FloatArray = np.sqrt(np.nanmean((simulated - measured) ** 2, axis=0)) / scale
+    result: FloatArray = np.sqrt(_mean((simulated - measured) ** 2, measured)) / scale
     return result
 
 
 def msd(measured: FloatArray, simulated: FloatArray, scale: FloatArray | float = 1.0) -> FloatArray:
     """Mean signed deviation, simulated minus measured, divided by ``scale``."""
-    result: FloatArray = np.nanmean(simulated - measured, axis=0) / scale
+    result: FloatArray = _mean(simulated - measured, measured) / scale
     return result
 
 
@@ -32,10 +32,21 @@ def fit_percent(measured: FloatArray, simulated: FloatArray) -> FloatArray:
 
     An output that never changes has no spread to explain: NaN.
     """
-    residual = np.sqrt(np.nansum((simulated - measured) ** 2, axis=0))
-    spread = np.sqrt(np.nansum((measured - np.nanmean(measured, axis=0)) ** 2, axis=0))
+    residual = np.sqrt(_mean((simulated - measured) ** 2, measured))
+    spread = np.sqrt(_mean((measured - _mean(measured, measured)) ** 2, measured))
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(spread > 0.0, 100.0 * (1.0 - residual / spread), np.nan)
+
+
+def _mean(values: FloatArray, measured: FloatArray) -> FloatArray:
+    """Mean over the samples that were measured; NaN for an output without any.
+
+    A simulation that failed is no lost sample: its NaN stays.
+    """
+    counted = ~np.isnan(measured)
+    with np.errstate(invalid="ignore"):
+        total: FloatArray = np.where(counted, values, 0.0).sum(axis=0) / counted.sum(axis=0)
+    return total
 
 
 @dataclass(frozen=True)
@@ -50,7 +61,7 @@ class Metrics:
 
 def evaluate(measured: FloatArray, simulated: FloatArray) -> Metrics:
     """All metrics of one record; ``scale`` of the result is max|y| of ``measured``."""
-    peak = np.nanmax(np.abs(measured), axis=0)
+    peak = np.max(np.where(np.isnan(measured), 0.0, np.abs(measured)), axis=0)
     scale = np.where(peak > 0.0, peak, 1.0)
     return Metrics(
         rmse=rmse(measured, simulated, scale),

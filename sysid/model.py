@@ -138,6 +138,8 @@ class ProcessModel:
     _output_states: tuple[int, ...] | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
+        for kind in ("states", "inputs", "outputs", "parameters", "constraints"):
+            object.__setattr__(self, kind, tuple(getattr(self, kind)))
         for kind in ("states", "inputs", "outputs", "parameters"):
             _check_names(self.name, kind, [item.name for item in getattr(self, kind)])
         if self.output is None:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sysid.data import Dataset, output_scale
-from sysid.model import FloatArray
+from sysid.model import FloatArray, ModelError
 from sysid.simulation import BatchResult, BatchSimulator
 from sysid.space import SearchSpace
 
@@ -38,6 +38,11 @@ class Objective:
         relative = np.ones(q) if weights is None else np.asarray(weights, dtype=np.float64)
         self.weights = relative / relative.sum()
         self._counts = np.sum([np.isfinite(r.outputs).sum(axis=0) for r in self.records], axis=0)
+        unseen = [
+            o.name for o, n in zip(simulator.model.outputs, self._counts, strict=True) if not n
+        ]
+        if unseen:
+            raise ModelError(f"no record has a measured sample of output {unseen[0]!r}")
         self.simulations = 0
 
     def evaluate(self, chromosomes: FloatArray) -> tuple[FloatArray, BatchResult]:

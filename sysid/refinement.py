@@ -67,7 +67,12 @@ def refine(
             on_iteration(iteration, error)
         if gain <= tolerance * error:
             return Refinement(space.decode(at), error, iteration)
-        steps = _steps(objective, at)
+        needed = _steps(objective, at)
+        if needed != steps:
+            # Differences between step counts would drown the small ones of the sensitivities.
+            steps = needed
+            residual = objective.residuals(space.decode(at)[None], steps)[0]
+            error = float(objective.error_of(residual[None])[0])
     return Refinement(space.decode(at), error, max_iterations)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -43,6 +43,8 @@ class SearchSpace:
         both = sorted(set(ranges) & set(fixed))
         if both:
             raise ModelError(f"parameter {both[0]} has both a range and a fixed value; keep one")
+        for name, value in fixed.items():
+            replace(model.parameter(name), nominal=value, fixed=True)  # checks the value
         base = model.vector(fixed)
         free, index = [], []
         for i, parameter in enumerate(model.parameters):

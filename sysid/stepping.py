@@ -44,7 +44,14 @@ class Stepper:
         trace = np.empty((n * self.n_steps, len(x)))
         outputs = np.empty((n, len(self.model.outputs)))
         self._kernels.advance(
-            np.ascontiguousarray(u), x, self.parameters, self.dt, self.n_steps, trace, outputs
+            np.empty(self._kernels.work_size),
+            np.ascontiguousarray(u),
+            x,
+            self.parameters,
+            self.dt,
+            self.n_steps,
+            trace,
+            outputs,
         )
         return trace, outputs
 

@@ -138,17 +138,19 @@ class GASSI(BaseEstimator):  # type: ignore[misc]
         notify = on_progress or (lambda progress: None)
         self.flagged_: dict[str, int] = {}
         self.stopped_ = "generations"
+        searched = False
         try:
             self._search(search, objective, notify)
             self._take(search.elite, search.elite_error, search.elite_feasible)
             self.search_error_ = self.error_
+            searched = True
             if preset.refine:
                 self._refine(objective, notify)
         except KeyboardInterrupt:
             if search.elite is None:
                 raise
             self.stopped_ = "interrupted"
-            if not hasattr(self, "search_error_"):
+            if not searched:
                 self._take(search.elite, search.elite_error, search.elite_feasible)
                 self.search_error_ = self.error_
         self.history_ = np.array(search.history)

@@ -23,11 +23,13 @@ def infeasibility(violations: FloatArray) -> FloatArray:
     """
     if violations.shape[1] == 0:
         return np.zeros(len(violations))
-    worst = violations.max(axis=0)
+    # An infinite violation is as bad as can be, and must not make the finite ones vanish.
+    finite = np.isfinite(violations)
+    worst = np.where(finite, violations, 0.0).max(axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):
-        relative = np.where(violations > 0.0, violations / worst, 0.0)
-    # An infinite violation is as bad as can be, not an undefined fraction.
-    relative = np.where(np.isnan(relative), 1.0, relative)
+        relative = np.where(finite, violations / worst, 1.0)
+    # However small beside the largest, a violation never rounds to none.
+    relative = np.where(violations > 0.0, np.maximum(relative, np.finfo(np.float64).tiny), 0.0)
     score: FloatArray = relative.mean(axis=1)
     return score
 

@@ -98,7 +98,7 @@ class GeneticSearch:
         draw = operators.stratified if self.preset.stratified else operators.uniform
         self._coded = draw(self.population, self._lower, self._upper, self.rng)
         self._initial_spread = self._coded.std(axis=0)
-        self._elite_score = np.inf
+        self._elite_rank = (True, np.inf)
         self._first_error = np.inf
         self._first_change: int | None = None
 
@@ -132,16 +132,15 @@ class GeneticSearch:
 
     def _save_elite(self, errors: FloatArray, scores: FloatArray, chromosomes: FloatArray) -> None:
         """Keep the best yet: feasible before infeasible, then the lower error (4.9)."""
-        if not self.preset.penalty:
-            scores = np.zeros_like(scores)
         # An infeasibility score is relative to its own generation; between generations only
         # feasible or not, and the error, can be compared.
         usable = np.flatnonzero(np.isfinite(errors))
         if len(usable):
-            best = min(usable, key=lambda j: (scores[j] > 0.0, errors[j]))
-            rank = (scores[best] > 0.0, errors[best])
-            if self.elite is None or rank < (not self.elite_feasible, self.elite_error):
-                self.elite = chromosomes[best].copy()
+            behind = scores > 0.0 if self.preset.penalty else np.zeros(len(scores), dtype=bool)
+            best = min(usable, key=lambda j: (behind[j], errors[j]))
+            rank = (bool(behind[best]), float(errors[best]))
+            if self.elite is None or rank < self._elite_rank:
+                self.elite, self._elite_rank = chromosomes[best].copy(), rank
                 self.elite_error = float(errors[best])
                 self.elite_feasible = bool(scores[best] == 0.0)
         self.history.append(self.elite_error)
@@ -153,8 +152,8 @@ class GeneticSearch:
         undefined in the first generation it applies to.
         """
         i = len(self.history) - 1
-        if i == 0:
-            self._first_error = self.history[0]
+        if not np.isfinite(self._first_error):
+            self._first_error = self.history[i]
             return
         if self._first_change is None and self.history[i] != self.history[i - 1]:
             self._first_change = i
