@@ -28,4 +28,7 @@ class InterlockError(RunError):
 
 
 class Terminated(BaseException):
-    """The process was asked to end (SIGTERM); raised so that the rig is made safe first."""
+    """The process was asked to end by the named signal; raised so that the rig is made safe first.
+
+    ``str`` of it is the signal's name, for example SIGTERM.
+    """

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +12,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 
 from daq.config.yaml_file import suggestion
 from daq.errors import ConfigError, RunError
@@ -45,6 +47,10 @@ UNITS = {
 }
 
 
+_UNEVEN = 0.3  # of a sample that a row may stand off its place
+BoolArray = npt.NDArray[np.bool_]
+
+
 class LogWriter:
     """Appends samples to a log.csv; every ``append`` is with the operating system at once.
 
@@ -55,9 +61,16 @@ class LogWriter:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.n_samples = 0
-        # Unbuffered: what append has written survives the death of this process.
-        self._file = path.open("xb", buffering=0)
-        self._write(",".join(COLUMNS) + "\n")
+        try:
+            # Unbuffered: what append has written survives the death of this process.
+            self._file = path.open("xb", buffering=0)
+        except OSError as error:
+            raise self._refused(error) from None
+        try:
+            self._write(",".join(COLUMNS) + "\n")
+        except BaseException:
+            self._file.close()
+            raise
 
     def __enter__(self) -> LogWriter:
         return self
@@ -75,8 +88,7 @@ class LogWriter:
         names = {"t": "time"}
         columns = [getattr(samples, names.get(name, name)).tolist() for name in COLUMNS]
         rows = [",".join(map(repr, row)) for row in zip(*columns, strict=True)]
-        self._write("\n".join(rows) + "\n")
-        self.n_samples += len(samples)
+        self._write("\n".join(rows) + "\n", counts=True)
 
     def close(self) -> None:
         """Have the log on the disk itself, then let go of it."""
@@ -89,16 +101,22 @@ class LogWriter:
         finally:
             self._file.close()
 
-    def _write(self, text: str) -> None:
-        data = memoryview(text.encode("ascii"))
+    def _write(self, text: str, counts: bool = False) -> None:
+        data = text.encode("ascii")
+        done = 0
         try:
-            while data:
-                data = data[self._file.write(data) or 0 :]
+            while done < len(data):
+                done += self._file.write(data[done:]) or 0
         except OSError as error:
-            raise RunError(
-                f"{self.path}: cannot be written: {error.strerror}; the first {self.n_samples} "
-                "samples are in it. Free space on the disk, or choose another with --out"
-            ) from None
+            self.n_samples += data[:done].count(b"\n") if counts else 0
+            raise self._refused(error) from None
+        self.n_samples += data.count(b"\n") if counts else 0
+
+    def _refused(self, error: OSError) -> RunError:
+        return RunError(
+            f"{self.path}: cannot be written: {error.strerror}; the first {self.n_samples} "
+            "samples are in it. Free space on the disk, or choose another with --out"
+        )
 
 
 @dataclass(frozen=True)
@@ -135,13 +153,23 @@ def read_table(path: Path, columns: Sequence[str] = ()) -> Table:
     import pandas as pd
 
     text, torn = _complete_lines(path)
-    header = [name.strip() for name in text.split("\n", 1)[0].split(",")]
+    header = _names(text)
     _check_header(path, header, columns)
     try:
-        frame = pd.read_csv(
-            io.StringIO(text), skipinitialspace=True, header=0, names=header, index_col=False,
-            dtype=str, keep_default_na=False, skip_blank_lines=False, on_bad_lines="error",
-        )  # fmt: skip
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", pd.errors.ParserWarning)
+            frame = pd.read_csv(
+                io.StringIO(text), skipinitialspace=True, header=0, names=header,
+                index_col=False, dtype=str, keep_default_na=False, skip_blank_lines=False,
+                on_bad_lines="error",
+            )  # fmt: skip
+    except pd.errors.ParserWarning:
+        lines = text.splitlines()
+        line = next((i for i, s in enumerate(lines) if s.count(",") >= len(header)), 0)
+        raise ConfigError(
+            f"{path}:{line + 1}: {lines[line].count(',') + 1} cells, but the first line names "
+            f"{len(header)} columns; separate cells by commas and write decimals with a point"
+        ) from None
     except pd.errors.ParserError as error:
         reason = str(error).removeprefix("Error tokenizing data. C error: ").strip()
         raise ConfigError(f"{path}: not a table: {reason}") from None
@@ -155,58 +183,62 @@ def load_log(path: Path) -> Log:
 
     Raises ConfigError naming the file, line and column of what is wrong with it.
     """
-    first = _complete_lines(path)[0].split("\n", 1)[0]
-    present = [name.strip() for name in first.split(",")]
+    present = _names(_complete_lines(path)[0])
     columns = [name for name in COLUMNS if name in present or name in ORIGINAL_COLUMNS]
     table = read_table(path, columns)
     frame = table.frame
     require_rows(path, len(frame))
     time = frame["t"].to_numpy()
-    tick = frame["tick"].to_numpy().astype(np.int64) if "tick" in frame else None
-    dt = sample_time(path, time, tick)
-    if tick is None:
-        frame["tick"] = ticks_of(path, time, dt)
+    tick = frame["tick"].to_numpy() if "tick" in frame else None
+    frame["tick"], dt = time_base(path, time, tick)
     for channel in ("motor", "brake"):
         # The original program logged only what it asked for.
         if f"applied_voltage_{channel}" not in frame:
             frame[f"applied_voltage_{channel}"] = frame[f"cmd_voltage_{channel}"]
     if "flags" not in frame:
         frame["flags"] = 0
+    _refuse(path, (frame["flags"] % 1.0 != 0.0).to_numpy(), "flags: it must be a whole number", 2)
     frame = frame.astype({"tick": np.int64, "flags": np.int64})
     return Log(path, frame, dt, table.torn)
 
 
-def sample_time(path: Path, time: FloatArray, tick: IntArray | None = None) -> float:
-    """Sample time [s] of a log, from its time column and sequence numbers.
+def time_base(
+    path: Path, time: FloatArray, tick: FloatArray | None = None
+) -> tuple[IntArray, float]:
+    """Sequence numbers and sample time [s] of a log's rows; gaps in time are gaps in number.
 
-    Raises ConfigError, naming the line, when time does not advance.
+    tick: the log's own sequence numbers, where it has them. Raises ConfigError, naming the
+    line, for time that does not advance, or rows that fit no constant rate.
     """
-    steps = np.diff(time) if tick is None else np.diff(time) / np.maximum(np.diff(tick), 1)
-    back = np.flatnonzero(~(np.diff(time) > 0.0))
-    if len(back):
-        line = int(back[0]) + 3
-        raise ConfigError(f"{path}:{line}: t: time does not advance from the line before")
-    return float(np.median(steps))
-
-
-def ticks_of(path: Path, time: FloatArray, dt: float) -> IntArray:
-    """Sequence numbers of samples from their times; a gap in time stays a gap in number.
-
-    Raises ConfigError, naming the line, when the times fit no common rate.
-    """
-    exact = (time - time[0]) / dt
+    steps = np.diff(time)
+    _refuse(path, ~(steps > 0.0), "t: time does not advance from the line before")
+    if tick is not None:
+        _refuse(path, tick != np.round(tick), "tick: it must be a whole number", first=2)
+        _refuse(path, ~(np.diff(tick) > 0.0), "tick: it does not advance from the line before")
+        counted = np.diff(tick)
+        dt = float(np.median(steps / counted))
+    else:
+        dt = float(np.median(steps))
+        counted = np.round(steps / dt)
     # A rate off by its printed digits drifts slowly; jumps between neighbours are what counts.
-    wrong = np.flatnonzero(np.abs(np.diff(exact) - np.round(np.diff(exact))) > 0.3)
-    if len(wrong):
-        line = int(wrong[0]) + 3
+    wrong = np.abs(steps / dt - counted) > _UNEVEN
+    if wrong.any():
+        row = int(np.argmax(wrong))
         raise ConfigError(
-            f"{path}:{line}: t: samples are {dt:g} s apart elsewhere but "
-            f"{time[wrong[0] + 1] - time[wrong[0]]:g} s here; resample the log to a constant rate"
+            f"{path}:{row + 3}: t: samples are {dt:g} s apart elsewhere but {steps[row]:g} s for "
+            f"{counted[row]:g} of them here; resample the log to a constant rate"
         )
-    steps = np.round(np.diff(exact)).astype(np.int64)
-    tick: IntArray = np.zeros(len(time), dtype=np.int64)
-    tick[1:] = np.cumsum(np.maximum(steps, 1))
-    return tick
+    ticks: IntArray = np.zeros(len(time), dtype=np.int64)
+    ticks[1:] = np.cumsum(counted)
+    # Times printed with few digits are each a little off; their ends together are not.
+    dt = float((time[-1] - time[0]) / ticks[-1])
+    return ticks + (0 if tick is None else int(tick[0])), dt
+
+
+def _refuse(path: Path, wrong: BoolArray, what: str, first: int = 3) -> None:
+    """Raise ConfigError at the first wrong row; ``first`` is the line of entry 0."""
+    if wrong.any():
+        raise ConfigError(f"{path}:{int(np.argmax(wrong)) + first}: {what}")
 
 
 def require_rows(path: Path, n: int) -> None:
@@ -223,7 +255,7 @@ def _complete_lines(path: Path) -> tuple[str, bool]:
     try:
         data = path.read_bytes()
     except FileNotFoundError:
-        raise ConfigError(f"{path}: there is no such log") from None
+        raise ConfigError(f"{path}: there is no such log; name a capture folder or a CSV file") from None
     except IsADirectoryError:
         raise ConfigError(f"{path}: this is a folder without a log.csv in it") from None
     except OSError as error:
@@ -240,7 +272,15 @@ def _complete_lines(path: Path) -> tuple[str, bool]:
     tail = text[cut:]
     # A last line without its newline may lack digits even where it has every column.
     complete = text[:cut] if cut else text
+    if "\0" in complete:
+        line = complete[: complete.index("\0")].count("\n") + 1
+        raise ConfigError(f"{path}:{line}: not a text file: it holds bytes of zero")
     return complete.rstrip("\n") + "\n", bool(tail.strip())
+
+
+def _names(text: str) -> list[str]:
+    """Column names in the first line of a table."""
+    return [name.strip().strip('"') for name in text.split("\n", 1)[0].split(",")]
 
 
 def _check_header(path: Path, header: list[str], columns: Sequence[str]) -> None:

@@ -198,7 +198,10 @@ class Rig:
 
 
 def interlock_reason(samples: Samples, config: RigConfig) -> tuple[int, str] | None:
-    """Row and reason of the first sample beyond a current limit, or None."""
+    """Row and reason of the first sample beyond a current limit, or None.
+
+    A device that found one by its own measure has flagged it, and has zeroed its outputs.
+    """
     limits = config.limits.current
     first: tuple[int, str] | None = None
     for name, limit in (("current_motor", limits.motor), ("current_brake", limits.brake)):
@@ -208,6 +211,11 @@ def interlock_reason(samples: Samples, config: RigConfig) -> tuple[int, str] | N
             row = int(np.argmax(beyond))
             if first is None or row < first[0]:
                 first = row, f"{name} is {values[row]:.4g} A, beyond its limit of {limit:g} A"
+    flagged = (samples.flags & int(Flag.INTERLOCK)) != 0
+    if flagged.any():
+        row = int(np.argmax(flagged))
+        if first is None or row < first[0]:
+            first = row, "the device found an input beyond its limit"
     return first
 
 

@@ -123,25 +123,28 @@ def run_experiment(
         {"experiment": experiment.describe(), "rig": rig_config.model_dump(mode="json")},
     )
     run = _Run(experiment, waveform, Rig(device, rig_config), capture, watch)
-    with _sigterm_raises():
+    with _signals_raise():
         return run.execute()
 
 
 @contextlib.contextmanager
-def _sigterm_raises() -> Iterator[None]:
-    """SIGTERM ends the run as Ctrl-C does: by an exception, past every ``finally``."""
+def _signals_raise() -> Iterator[None]:
+    """SIGTERM and SIGHUP end the run as Ctrl-C does: by an exception, past every ``finally``."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
 
     def terminate(number: int, frame: FrameType | None) -> None:
-        raise Terminated
+        raise Terminated(signal.Signals(number).name)
 
-    before = signal.signal(signal.SIGTERM, terminate)
+    # A closed terminal sends SIGHUP, where there is such a signal.
+    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    before = [(number, signal.signal(number, terminate)) for number in numbers]
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before:
+            signal.signal(number, handler)
 
 
 class _Run:
@@ -187,10 +190,15 @@ class _Run:
             self._enter(Phase.RUN)
             self._excite(log)
             self._enter(Phase.SAFE)
-        finally:
+        except BaseException:
             self.rig.safe()
-            self.rig.close()
+            # A device that failed may fail to close as well; why it failed is what counts.
+            with contextlib.suppress(DeviceError):
+                self.rig.close()
+            raise
+        self.rig.safe()
         self.phase = Phase.CLOSE
+        self.rig.close()
 
     def _enter(self, phase: Phase, turns: float = 0.0) -> None:
         self.phase = phase
@@ -285,6 +293,8 @@ class _Run:
                 self.rig.send(sent, chunk)
                 sent += len(chunk)
             samples = _first(self.rig.receive(), total)
+            if len(samples) == 0:
+                break  # the last samples of the run were lost
             trip = interlock_reason(samples, self.rig.config)
             if trip is not None:
                 self.rig.safe()
@@ -325,7 +335,7 @@ def _outcome(error: BaseException, phase: Phase) -> tuple[str, str]:
     if isinstance(error, KeyboardInterrupt):
         return "stopped", f"stopped by Ctrl-C {where}"
     if isinstance(error, Terminated):
-        return "stopped", f"stopped by SIGTERM {where}"
+        return "stopped", f"stopped by {error} {where}"
     if isinstance(error, InterlockError):
         return "interlock", str(error)
     if isinstance(error, RigError):

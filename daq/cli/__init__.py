@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import sys
+from typing import NoReturn
+
+_INTERRUPTED = 130  # what Typer makes of Ctrl-C
 
 
 def main() -> None:
@@ -16,13 +19,19 @@ def main() -> None:
     except RigError as error:
         report_error(str(error))
         sys.exit(error.exit_status)
-    except Terminated:
-        report_error("stopped by SIGTERM; outputs are zero")
+    except Terminated as signal:
+        report_error(f"stopped by {signal}; outputs are zero")
         sys.exit(1)
     except KeyboardInterrupt:
-        report_error("stopped by Ctrl-C")
-        sys.exit(1)
-    except BrokenPipeError:
-        # The reader of our output has gone (``rig models | head``): nothing left to say.
-        sys.stderr.close()
-        sys.exit(0)
+        _stopped()
+    except SystemExit as exit:
+        if exit.code == _INTERRUPTED:
+            _stopped()
+        raise
+
+
+def _stopped() -> NoReturn:
+    from daq.cli.console import report_error
+
+    report_error("stopped by Ctrl-C")
+    sys.exit(1)

@@ -13,7 +13,7 @@ from daq.config.identification import Column, Columns
 from daq.config.yaml_file import YamlFile, suggestion
 from daq.errors import ConfigError
 from daq.hal import FloatArray, IntArray
-from daq.log import Log, read_table, require_rows, sample_time, ticks_of
+from daq.log import Log, read_table, require_rows, time_base
 from sysid.data import Dataset
 from sysid.model import Input, ModelError, Output, ProcessModel
 
@@ -118,7 +118,7 @@ def _load_foreign(path: Path, model: ProcessModel, mapping: Mapping) -> Loaded:
     require_rows(path, len(frame))
     seconds = _factor(mapping, ("columns", "time", "unit"), columns.time.unit, "s")
     time = frame[columns.time.column].to_numpy() * seconds
-    dt = sample_time(path, time)
+    tick, dt = time_base(path, time)
 
     def values(signal: Input | Output, group: str, source: Column) -> FloatArray:
         key = ("columns", group, signal.name, "unit")
@@ -135,7 +135,7 @@ def _load_foreign(path: Path, model: ProcessModel, mapping: Mapping) -> Loaded:
         model,
         np.stack(inputs, axis=1) if inputs else np.zeros((len(frame), 0)),
         np.stack(outputs, axis=1),
-        ticks_of(path, time, dt),
+        tick,
         dt,
         path.stem,
     )

@@ -54,7 +54,7 @@ class Experiment(Section, abc.ABC):
         """Raise ValueError unless the run has a sensible number of samples."""
         if not 2 <= self.n_samples <= _MAX_SAMPLES:
             raise ValueError(
-                f"duration {self.duration:g} s at {self.sample_rate:g} Hz makes "
+                f"duration: {self.duration:g} s at {self.sample_rate:g} Hz makes "
                 f"{self.n_samples} samples; 2 to {_MAX_SAMPLES} are possible"
             )
 

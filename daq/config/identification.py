@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from daq.config.base import Section
+
+
+def _ordered(ends: tuple[float, float]) -> tuple[float, float]:
+    low, high = ends
+    if low >= high:
+        raise ValueError(f"low end {low:g} is not below high end {high:g}; write [low, high]")
+    return ends
+
+
+Range = Annotated[tuple[float, float], AfterValidator(_ordered)]
 
 
 class TimeColumn(Section):
@@ -54,7 +64,7 @@ class IdentificationConfig(Section):
         512, ge=1, le=1_000_000, description="integration steps a sample may take"
     )
     elite_percent: float = Field(0.5, ge=0.0, lt=100.0, description="r_elite [%]")
-    ranges: dict[str, tuple[float, float]] = Field(
+    ranges: dict[str, Range] = Field(
         default_factory=dict, description="search ranges in place of the model's"
     )
     fixed: dict[str, float] = Field(default_factory=dict, description="parameters not searched")
@@ -65,13 +75,3 @@ class IdentificationConfig(Section):
         False, description="normalise each log by its own largest output, not by the overall one"
     )
     columns: Columns | None = Field(None, description="how a foreign CSV's columns are meant")
-
-    @field_validator("ranges")
-    @classmethod
-    def _ordered(cls, ranges: dict[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
-        for name, (low, high) in ranges.items():
-            if low >= high:
-                raise ValueError(
-                    f"{name}: low end {low:g} is not below high end {high:g}; write [low, high]"
-                )
-        return ranges

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import difflib
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar, get_args
+from typing import Any, TypeVar, get_args, get_origin
 
 import yaml
 from pydantic import BaseModel, ValidationError
@@ -17,6 +18,8 @@ from daq.errors import ConfigError
 
 Model = TypeVar("Model", bound=BaseModel)
 Key = tuple[str | int, ...]
+_DEEPEST = 20  # levels of nesting
+_SHOWN = 60  # characters of a value in a message
 
 
 class _Loader(yaml.SafeLoader):
@@ -50,7 +53,25 @@ class YamlFile:
 
     def error(self, key: Key, message: str) -> ConfigError:
         """A ConfigError that points at a key."""
-        return ConfigError(f"{self.where(key)}: {dotted(key)}: {message}")
+        return ConfigError(f"{self.named(key)}: {message}")
+
+    def named(self, key: Key) -> str:
+        """Place and name of a key, as error messages begin."""
+        return f"{self.where(key)}: {dotted(key)}"
+
+
+@dataclass(frozen=True)
+class CommandLine(YamlFile):
+    """Settings given as options of a command."""
+
+    @classmethod
+    def of(cls, given: Mapping[str, Any]) -> CommandLine:
+        """Options by name, without their dashes."""
+        return cls(Path("command line"), dict(given), {})
+
+    def named(self, key: Key) -> str:
+        """The option as it is typed."""
+        return f"--{dotted(key)}"
 
 
 def dotted(key: Key) -> str:
@@ -63,7 +84,7 @@ def load(path: Path) -> YamlFile:
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
-        raise ConfigError(f"{path}: there is no such file") from None
+        raise ConfigError(f"{path}: there is no such file; check its name") from None
     except IsADirectoryError:
         raise ConfigError(f"{path}: this is a folder; name a YAML file") from None
     except UnicodeDecodeError as error:
@@ -118,6 +139,11 @@ def suggestion(name: str, known: Sequence[str]) -> str:
 
 
 def _collect(path: Path, node: yaml.Node, key: Key, places: dict[Key, tuple[int, int]]) -> None:
+    if len(key) > _DEEPEST:
+        raise ConfigError(
+            f"{path}:{node.start_mark.line + 1}: nested too deeply; does an alias (*name) "
+            "stand inside its own anchor (&name)?"
+        )
     places[key] = (node.start_mark.line + 1, node.start_mark.column + 1)
     if isinstance(node, yaml.MappingNode):
         for name, value in node.value:
@@ -149,31 +175,103 @@ def _syntax_error(path: Path, error: yaml.YAMLError) -> str:
 
 def _explain(file: YamlFile, model: type[BaseModel], at: Key, item: ErrorDetails) -> str:
     # pydantic adds the names of union branches and of the key/value side to the location.
-    key: Key = (*at, *(part for part in item["loc"] if part != "[key]"))
+    loc = tuple(part for part in item["loc"] if part != "[key]")
     kind, value = item["type"], item.get("input")
-    parent = _fields(model, item["loc"][:-1])
-    if kind == "extra_forbidden":
-        name = str(item["loc"][-1])
-        return f"{file.where(key)}: {dotted(key)}: unknown key; {suggestion(name, parent)}"
+    if kind == "missing" and isinstance(loc[-1], int):
+        kind, loc = "too_short", loc[:-1]
+    key: Key = (*at, *(str(p) if kind == "invalid_key" else p for p in loc))
+    if kind in {"extra_forbidden", "invalid_key"}:
+        hint = suggestion(str(loc[-1]), _fields(model, loc[:-1]))
+        return f"{file.named(key)}: unknown key; {hint}"
+    description = _description(model, loc)
+    about = f" ({description})" if description else ""
     if kind == "missing":
-        return f"{file.where(key)}: {dotted(key)}: this key is missing"
+        return f"{file.named(key)}: this key is missing; add it{about}"
+    return f"{file.named(key)}: {_complaint(kind, item, value)}{about}"
+
+
+_NUMBER, _WHOLE, _LINES = "expected a number", "expected a whole number", "expected 'key: value' lines"
+_EXPECTED = {
+    "float_parsing": _NUMBER,
+    "float_type": _NUMBER,
+    "finite_number": "expected a finite number",
+    "int_parsing": _WHOLE,
+    "int_parsing_size": _WHOLE,
+    "int_type": _WHOLE,
+    "int_from_float": _WHOLE,
+    "bool_parsing": "expected true or false",
+    "bool_type": "expected true or false",
+    "string_type": "expected text",
+    "dict_type": _LINES,
+    "model_type": _LINES,
+    "tuple_type": "expected two values [low, high]",
+    "too_long": "expected two values [low, high]",
+    "too_short": "expected two values [low, high]",
+    "greater_than": "it must be above {gt:g}",
+    "greater_than_equal": "it must be at least {ge:g}",
+    "less_than": "it must be below {lt:g}",
+    "less_than_equal": "it must be at most {le:g}",
+    "literal_error": "it must be {expected}",
+    "string_too_short": "it must not be empty",
+    "string_too_long": "it must have at most {max_length} characters",
+}
+
+
+def _complaint(kind: str, item: ErrorDetails, value: object) -> str:
+    """What is wrong with a value, in plain English, with the value."""
+    expected = _EXPECTED.get(kind)
+    if expected is not None:
+        return f"{expected.format(**item.get('ctx', {}))}, found {_shown(value)}"
     message = item["msg"].removeprefix("Value error, ")
-    message = message[0].lower() + message[1:]
-    shown = "" if isinstance(value, Mapping) else f" (got {value!r})"
-    return f"{file.where(key)}: {dotted(key)}: {message}{shown}"
+    found = "" if isinstance(value, Mapping) else f"; found {_shown(value)}"
+    return message[0].lower() + message[1:] + found
 
 
-def _fields(model: type[BaseModel], loc: tuple[str | int, ...]) -> list[str]:
-    """Names of the keys allowed at a location."""
+def _shown(value: object) -> str:
+    """A value as it stood in the YAML, shortened."""
+    if value is None:
+        return "nothing"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, float) and not math.isfinite(value):
+        return f"{'-' * (value < 0)}.{'nan' if math.isnan(value) else 'inf'}"
+    text = repr(value)
+    return text if len(text) <= _SHOWN else f"{text[: _SHOWN - 3]}..."
+
+
+def _section(model: type[BaseModel], loc: Key) -> Any:
+    """The configuration model at a location; None where there is none."""
     current: Any = model
     for part in loc:
         fields = getattr(current, "model_fields", None)
-        if not fields or part not in fields:
-            return []
-        current = fields[part].annotation
-        options = [a for a in get_args(current) if hasattr(a, "model_fields")]
-        current = options[0] if options else current
-    return list(getattr(current, "model_fields", {}))
+        if fields:
+            if part not in fields:
+                return None
+            current = fields[part].annotation
+            options = [a for a in get_args(current) if hasattr(a, "model_fields")]
+            # A dict of sections stands for itself until its key has been passed.
+            current = current if get_origin(current) is dict else (options or [current])[0]
+        elif get_origin(current) is dict:
+            current = get_args(current)[1]
+        else:
+            return None
+    return current
+
+
+def _fields(model: type[BaseModel], loc: Key) -> list[str]:
+    """Names of the keys allowed at a location."""
+    return list(getattr(_section(model, loc), "model_fields", {}))
+
+
+def _description(model: type[BaseModel], loc: Key) -> str | None:
+    """What a key means, as its field says."""
+    while loc:
+        fields = getattr(_section(model, loc[:-1]), "model_fields", {})
+        if loc[-1] in fields:
+            text: str | None = fields[loc[-1]].description
+            return text
+        loc = loc[:-1]
+    return None
 
 
 def _kind(content: object) -> str:

@@ -80,8 +80,11 @@ def penalise(errors: FloatArray, violations: FloatArray) -> FloatArray:
     at = find_indicators(errors, scores)
     best, worst, highest = errors[at.best], errors[at.worst_infeasible], errors[at.highest_error]
     span = scores[at.worst_infeasible] - scores[at.best]
-    # (4.17); with every chromosome equally infeasible there is nothing to grade.
+    # (4.17); with every chromosome equally infeasible there is nothing to grade. What is more
+    # infeasible than the worst, which need not be the most infeasible, gets the full penalty:
+    # the exponential of (4.19) would else grow without bound.
     graded = (scores - scores[at.best]) / span if span > 0.0 else np.zeros_like(scores)
+    graded = np.minimum(graded, 1.0)
 
     first = errors.copy()
     if worst < best:
