@@ -22,6 +22,7 @@ from daq.hal import CHANNELS, Device, Flag, FloatArray, Mode, Phase, Samples
 from daq.log import LogWriter
 from daq.rig import Rig, interlock_reason, mark_interlock
 
+_ZEROS_AHEAD = 0.05  # s of zero commands queued while waiting
 _REST_TIME = 1.0  # s that the shaft must stand still to end homing
 _REST_TURNS = 0.01  # turns it may creep meanwhile
 
@@ -266,15 +267,17 @@ class _Run:
 
     def _stream_zeros(self, enough: Callable[[Samples], bool]) -> None:
         """Sample at zero command until ``enough`` says so."""
+        # Sent a little ahead: zeros are safe to hold, and the host need not hurry every tick.
+        ahead = max(1, round(_ZEROS_AHEAD * self.experiment.sample_rate))
         self.rig.start(self.experiment.sample_rate, Mode.CLOSED_LOOP)
-        asked = 1
-        self.rig.send(0, np.zeros((1, len(CHANNELS))))
+        self.rig.send(0, np.zeros((ahead, len(CHANNELS))))
+        asked = ahead
         while True:
             samples = self.rig.receive()
             self._check(samples)
             if enough(samples):
                 break
-            missing = int(samples.tick[-1]) + 2 - asked
+            missing = int(samples.tick[-1]) + 1 + ahead - asked
             if missing > 0:
                 self.rig.send(asked, np.zeros((missing, len(CHANNELS))))
                 asked += missing

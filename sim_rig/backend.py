@@ -138,7 +138,7 @@ class SimulatedDevice:
         return _QUEUE - (self._queued_until - self._tick)
 
     def receive(self) -> RawSamples:
-        """Simulate up to what is queued (open loop) or one tick (closed loop)."""
+        """Simulate what is queued, or one tick when nothing is."""
         if not self._running:
             raise DeviceError("the simulated rig is not sampling; start it first")
         n = self._due()
@@ -172,7 +172,7 @@ class SimulatedDevice:
         queued = self._queued_until - self._tick
         open_loop = self._mode is Mode.OPEN_LOOP and not self._latched
         if self.options.time == "virtual":
-            return min(max(queued, 1), _BLOCK) if open_loop else 1
+            return min(max(queued, 1), _BLOCK)
         if self._wall_start is None:
             self._wall_start = time.perf_counter()
         ticks = max(1, round(_REAL_TIME_BLOCK * self._rate)) if open_loop else 1
