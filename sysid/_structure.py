@@ -7,12 +7,11 @@ for a straight line; where the equations branch on a value, nothing is claimed t
 
 from __future__ import annotations
 
-import math
-import types
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from sysid._substitute import substituted
 from sysid.model import ProcessModel
 
 _NONE: frozenset[int] = frozenset()
@@ -48,7 +47,7 @@ def analyse(model: ProcessModel) -> Structure:
     u = tuple(_Trace(inputs=frozenset((j,))) for j in range(len(model.inputs)))
     p = tuple(_Trace() for _ in model.parameters)
     try:
-        rows = [_lift(row) for row in _traceable(model.derivative, {})(x, u, p)]
+        rows = [_lift(row) for row in substituted(model.derivative, _function)(x, u, p)]
     except Exception:
         # Whatever the equations do that a tracing number cannot follow, plain Runge-Kutta can.
         return Structure((), tuple(range(n)), True)
@@ -143,37 +142,3 @@ def _function(function: Callable[..., Any]) -> Callable[..., Any]:
         return function(*args)
 
     return call
-
-
-class _Math:
-    """Stands in for the math module while tracing."""
-
-    def __getattr__(self, name: str) -> Any:
-        value = getattr(math, name)
-        return _function(value) if callable(value) else value
-
-
-def _traceable(function: Any, done: dict[int, Any]) -> Any:
-    """A copy of a function, and of those it calls, that takes tracing numbers."""
-    if function is math:
-        return _Math()
-    if isinstance(function, types.BuiltinFunctionType) and function.__module__ == "math":
-        return _function(function)
-    if not isinstance(function, types.FunctionType):
-        return function
-    if id(function) in done:
-        return done[id(function)]
-    scope = dict(function.__globals__)
-    scope.update(min=_function(min), max=_function(max))
-    cells = tuple(types.CellType(None) for _ in function.__closure__ or ())
-    copy = types.FunctionType(
-        function.__code__, scope, function.__name__, function.__defaults__, cells
-    )
-    copy.__kwdefaults__ = function.__kwdefaults__
-    done[id(function)] = copy
-    for name in function.__code__.co_names:
-        if name in function.__globals__:
-            scope[name] = _traceable(function.__globals__[name], done)
-    for cell, original in zip(cells, function.__closure__ or (), strict=True):
-        cell.cell_contents = _traceable(original.cell_contents, done)
-    return copy

@@ -71,5 +71,6 @@ class Objective:
             return self._mean_rmse(np.sum(residuals**2, axis=1))
 
     def _mean_rmse(self, sse: FloatArray) -> FloatArray:
-        errors = np.sqrt(sse / self._counts) @ self.weights
+        with np.errstate(invalid="ignore"):  # infinite times a weight of zero
+            errors = np.sqrt(sse / self._counts) @ self.weights
         return np.where(np.isfinite(errors), errors, np.inf)

@@ -1,0 +1,145 @@
+"""Exact Jacobians of any process model, operating points, and linear models at them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sysid._dual import Dual, on_duals
+from sysid._substitute import substituted
+from sysid.model import FloatArray, ModelError, ProcessModel
+
+
+@dataclass(frozen=True)
+class LinearModel:
+    """dx/dt = A x + B u, y = C x + D u for small deviations from an operating point.
+
+    A: (n_states, n_states), B: (n_states, n_inputs), C: (n_outputs, n_states),
+    D: (n_outputs, n_inputs). Unpacks to (A, B, C, D).
+    """
+
+    A: FloatArray
+    B: FloatArray
+    C: FloatArray
+    D: FloatArray
+
+    def __iter__(self) -> Any:
+        return iter((self.A, self.B, self.C, self.D))
+
+
+def linearize(
+    model: ProcessModel, x: FloatArray, u: FloatArray, p: FloatArray | None = None
+) -> LinearModel:
+    """Jacobians of derivative and output at a point, by forward-mode differentiation.
+
+    x: (n_states,), u: (n_inputs,), p: (n_parameters,), default nominal. They are exact to
+    rounding wherever the model is differentiable; at a kink (|x| at zero) the slope of |x| is
+    taken as 0. The result's four matrices are what ``control.ss`` takes. Raises ModelError for
+    wrong shapes or a function that has no known derivative.
+    """
+    x, u, p = _point(model, x, u, p)
+    n, m = len(x), len(u)
+    seeds = np.eye(n + m)
+    states = tuple(Dual(float(v), seeds[i]) for i, v in enumerate(x))
+    inputs = tuple(Dual(float(v), seeds[n + j]) for j, v in enumerate(u))
+    parameters = tuple(float(v) for v in p)
+    slopes = _gradient(model, model.derivative, states, inputs, parameters)
+    if model.output is not None:
+        outputs = _gradient(model, model.output, states, inputs, parameters)
+    else:
+        assert model.output_states is not None
+        outputs = seeds[list(model.output_states)]
+    return LinearModel(slopes[:, :n], slopes[:, n:], outputs[:, :n], outputs[:, n:])
+
+
+def jacobian(
+    model: ProcessModel, x: FloatArray, u: FloatArray, p: FloatArray | None = None
+) -> FloatArray:
+    """df/dx at a point, (n_states, n_states); see ``linearize``."""
+    return linearize(model, x, u, p).A
+
+
+def equilibrium(
+    model: ProcessModel,
+    u: FloatArray,
+    p: FloatArray | None = None,
+    *,
+    guess: FloatArray | None = None,
+    hold: dict[str, float] | None = None,
+) -> FloatArray:
+    """A state at which dx/dt is zero under constant inputs, (n_states,).
+
+    hold: {state: value}, states kept at a value instead of solved for: an angle at a speed, or
+    a speed whose driving torque is asked for; the derivative of a held state need not vanish.
+    guess: where to start, default the declared initial state. Raises ModelError when none is
+    found, with the largest remaining derivative.
+    """
+    from scipy.optimize import least_squares
+
+    start = model.initial_state if guess is None else np.array(guess, dtype=np.float64)
+    x, u, p = _point(model, start, u, p)
+    for name, value in (hold or {}).items():
+        if name not in model.state_names:
+            raise ModelError(f"model {model.name} has no state {name!r} to hold")
+        x[model.state_names.index(name)] = value
+    free = [i for i, name in enumerate(model.state_names) if name not in (hold or {})]
+    inputs, parameters = tuple(float(v) for v in u), tuple(float(v) for v in p)
+
+    def complete(values: FloatArray) -> FloatArray:
+        whole = x.copy()
+        whole[free] = values
+        return whole
+
+    def slopes(values: FloatArray) -> FloatArray:
+        at = tuple(float(v) for v in complete(values))
+        return np.array(model.derivative(at, inputs, parameters))[free]
+
+    def slopes_jacobian(values: FloatArray) -> FloatArray:
+        return jacobian(model, complete(values), u, p)[np.ix_(free, free)]
+
+    solution = least_squares(
+        slopes, x[free], jac=slopes_jacobian, x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-15
+    )
+    scale = np.abs(slopes_jacobian(solution.x)) @ np.maximum(np.abs(solution.x), 1e-6)
+    remaining = np.abs(solution.fun) / np.maximum(scale, 1e-12)
+    if not np.all(remaining < 1e-6):
+        worst = int(np.argmax(remaining))
+        raise ModelError(
+            f"model {model.name}: no equilibrium found; d{model.state_names[free[worst]]}/dt "
+            f"stays at {solution.fun[worst]:.3g}. Give a guess, or hold a state that drifts"
+        )
+    return complete(solution.x)
+
+
+def _gradient(
+    model: ProcessModel,
+    function: Any,
+    x: tuple[Dual, ...],
+    u: tuple[Dual, ...],
+    p: tuple[float, ...],
+) -> FloatArray:
+    try:
+        values = substituted(function, on_duals)(x, u, p)
+    except TypeError as error:
+        raise ModelError(f"model {model.name} cannot be differentiated: {error}") from None
+    width = len(x) + len(u)
+    return np.array([v.slope if isinstance(v, Dual) else np.zeros(width) for v in values])
+
+
+def _point(
+    model: ProcessModel, x: FloatArray, u: FloatArray, p: FloatArray | None
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    p = model.nominal if p is None else np.asarray(p, dtype=np.float64)
+    x, u = np.array(x, dtype=np.float64), np.asarray(u, dtype=np.float64)
+    for what, values, expected in (
+        ("states", x, len(model.states)),
+        ("inputs", u, len(model.inputs)),
+        ("parameters", p, len(model.parameters)),
+    ):
+        if values.shape != (expected,):
+            raise ModelError(
+                f"model {model.name} has {expected} {what}; shape {values.shape} was given"
+            )
+    return x, u, p
