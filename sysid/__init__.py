@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from sysid.data import Dataset, output_scale
+from sysid.linearization import LinearModel, equilibrium, jacobian, linearize
 from sysid.metrics import Metrics, evaluate, fit_percent, msd, rmse
 from sysid.model import (
     Constraint,
@@ -29,6 +30,7 @@ __all__ = [
     "Constraint",
     "Dataset",
     "Input",
+    "LinearModel",
     "Metrics",
     "ModelError",
     "Output",
@@ -38,8 +40,11 @@ __all__ = [
     "State",
     "Status",
     "Stepper",
+    "equilibrium",
     "evaluate",
     "fit_percent",
+    "jacobian",
+    "linearize",
     "msd",
     "output_scale",
     "rmse",

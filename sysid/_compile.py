@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import hashlib
+import importlib
 import math
 import os
 import tempfile
@@ -58,10 +59,10 @@ def kernels(model: ProcessModel) -> Kernels:
 
     shape = _kernel.Shape.of(model)
     text = _kernel.source(shape)
-    functions: list[Any] = [model.derivative, phi_matrices]
-    if model.output is not None:
-        functions.append(model.output)
+    functions = [model.derivative] + ([model.output] if model.output is not None else [])
     key = hashlib.sha256(f"{numba.__version__}\n{text}".encode())
+    for library in ("_phi.py", "_vector_math.py"):
+        key.update(Path(__file__).with_name(library).read_bytes())
     for function in functions:
         _fingerprint(function, key, set())
     path = _source_file(f"{_safe(model.name)}_{key.hexdigest()[:24]}.py", text)
@@ -131,6 +132,8 @@ def _jit(value: Any, done: dict[int, Any]) -> Any:
     """Compile a function and every plain function it refers to, also through a module."""
     import numba
 
+    if isinstance(value, types.BuiltinFunctionType) and value.__module__ == "math":
+        return getattr(_vector_math(), value.__name__)
     if not isinstance(value, types.FunctionType):
         return value
     if id(value) in done:
@@ -155,6 +158,8 @@ def _jit(value: Any, done: dict[int, Any]) -> Any:
 
 def _jit_module(module: types.ModuleType, names: set[str], done: dict[int, Any]) -> Any:
     """The module, or a copy of it in which the functions of the given names are compiled."""
+    if module is math:
+        return _vector_math()
     if module.__name__.partition(".")[0] in _KNOWN_MODULES:
         return module
     copy = types.ModuleType(module.__name__)
@@ -162,6 +167,11 @@ def _jit_module(module: types.ModuleType, names: set[str], done: dict[int, Any])
     for name in names & module.__dict__.keys():
         setattr(copy, name, _jit(getattr(module, name), done))
     return copy
+
+
+def _vector_math() -> types.ModuleType:
+    """The math module's stand-in, imported when first needed because Numba is slow to."""
+    return importlib.import_module("sysid._vector_math")
 
 
 def _names(code: types.CodeType) -> set[str]:
