@@ -131,7 +131,8 @@ def _prepare(folder: Path) -> dict[str, str]:
     (folder / "e.yaml").write_text(_EXPERIMENT)
     options = {"time": "real", "started": str(folder / "started")}
     (folder / "rig.yaml").write_text(json.dumps({"backend": "clocked", "options": options}))
-    return {**os.environ, "PYTHONPATH": str(folder / "plugin")}
+    paths = [str(folder / "plugin"), *filter(None, [os.environ.get("PYTHONPATH")])]
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
 
 
 def _first_row(folder: Path, process: subprocess.Popen[bytes]) -> float:

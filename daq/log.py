@@ -255,7 +255,9 @@ def _complete_lines(path: Path) -> tuple[str, bool]:
     try:
         data = path.read_bytes()
     except FileNotFoundError:
-        raise ConfigError(f"{path}: there is no such log; name a capture folder or a CSV file") from None
+        raise ConfigError(
+            f"{path}: there is no such log; name a capture folder or a CSV file"
+        ) from None
     except IsADirectoryError:
         raise ConfigError(f"{path}: this is a folder without a log.csv in it") from None
     except OSError as error:

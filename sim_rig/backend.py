@@ -126,6 +126,7 @@ class SimulatedDevice:
 
     def send(self, tick: int, commands: FloatArray) -> None:
         """Queue commands; those for ticks already past are too late and dropped."""
+        self._require_running()
         late = max(0, self._tick - tick)
         if late < len(commands):
             self._queue.append(np.array(commands[late:], dtype=np.float64))
@@ -139,8 +140,7 @@ class SimulatedDevice:
 
     def receive(self) -> RawSamples:
         """Simulate what is queued, or one tick when nothing is."""
-        if not self._running:
-            raise DeviceError("the simulated rig is not sampling; start it first")
+        self._require_running()
         n = self._due()
         applied, flags = self._commands(n)
         return self._play(applied, flags)
@@ -161,6 +161,10 @@ class SimulatedDevice:
         """Switch off."""
         self.safe()
         self._open = self._running = False
+
+    def _require_running(self) -> None:
+        if not self._running:
+            raise DeviceError("the simulated rig is not sampling; start it first")
 
     def _reset_queue(self) -> None:
         self._tick = 0

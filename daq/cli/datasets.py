@@ -79,7 +79,7 @@ def check_mapping(model: ProcessModel, mapping: Mapping) -> None:
         for name in needed:
             if name not in given:
                 raise mapping.file.error(
-                    ("columns", group), f"{name!r} of model {model.name} is missing"
+                    ("columns", group), f"{name!r} of model {model.name} is missing; add it"
                 )
     for name, column in mapping.columns.outputs.items():
         if column.constant is not None:

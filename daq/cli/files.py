@@ -10,7 +10,7 @@ from typing import Any
 from daq.config import yaml_file
 from daq.config.experiment import Experiment
 from daq.config.rig import RigConfig
-from daq.config.yaml_file import YamlFile, suggestion
+from daq.config.yaml_file import YamlFile
 from daq.errors import ConfigError
 from daq.hal import Device, FloatArray
 from daq.plugins import load_plugin
@@ -63,7 +63,9 @@ def find(name: str, package: str) -> Path:
             if resource.is_file():
                 return Path(str(resource))
     known = sorted(item.name for item in shipped.iterdir() if item.name.endswith(".yaml"))
-    raise ConfigError(f"{name}: there is no such file; shipped: {suggestion(path.name, known)}")
+    raise ConfigError(
+        f"{name}: there is no such file; check its name, or use a shipped one: {', '.join(known)}"
+    )
 
 
 def load_experiment(name: str) -> LoadedExperiment:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import os
 from collections.abc import Mapping as MappingType
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,10 +15,10 @@ import yaml
 from daq import capture
 from daq.cli import console, datasets
 from daq.cli.datasets import Loaded, Mapping
-from daq.cli.modelling import DEFAULT_MODEL, find_model
+from daq.cli.modelling import DEFAULT_MODEL, find_model, whole_name
 from daq.config import yaml_file
 from daq.config.identification import IdentificationConfig
-from daq.config.yaml_file import YamlFile, suggestion
+from daq.config.yaml_file import CommandLine, YamlFile, suggestion
 from daq.errors import ConfigError
 from sysid import ModelError, SearchSpace, evaluate
 from sysid.gassi import GASSI, PRESETS, Progress
@@ -49,6 +50,7 @@ def identify_command(
     """Identify one parameter set from logs and print it."""
     prepared = prepare(config, overrides)
     folder = out or _default_folder(logs, prepared.model.name)
+    _check_writable(folder)
     report = identify_logs(prepared, logs, validate, folder, as_json)
     if as_json:
         console.print_json(report)
@@ -57,13 +59,12 @@ def identify_command(
 def prepare(config: Path | None, overrides: MappingType[str, Any]) -> Prepared:
     """Read and check settings and model; ConfigError names file, line, key and cure."""
     given = {key: value for key, value in overrides.items() if value is not None}
-    if config is not None:
-        file = yaml_file.load(config)
-    else:
-        file = YamlFile(Path("(command line)"), {}, {})
+    typed = CommandLine.of(given)
+    yaml_file.validate(typed, IdentificationConfig)
+    file = yaml_file.load(config) if config is not None else typed
     settings = yaml_file.validate(file, IdentificationConfig, {**file.content, **given})
     if settings.preset not in PRESETS:
-        raise file.error(
+        raise (typed if "preset" in given else file).error(
             ("preset",), f"unknown preset {settings.preset!r}; "
             f"{suggestion(settings.preset, list(PRESETS))}"
         )  # fmt: skip
@@ -80,7 +81,7 @@ def prepare(config: Path | None, overrides: MappingType[str, Any]) -> Prepared:
     mapping = Mapping(file, settings.columns) if settings.columns else None
     if mapping is not None:
         datasets.check_mapping(model, mapping)
-    return Prepared(model, name, settings, mapping)
+    return Prepared(model, whole_name(name, beside), settings, mapping)
 
 
 def identify_logs(
@@ -107,7 +108,7 @@ def identify_logs(
     path = _write(folder, report)
     report["files"] = {"parameters": str(path)}
     if not as_json:
-        _print_report(estimator, model, scores, train, check, path)
+        _print_report(estimator, model, scores, train, check, path, prepared.mapping)
     return report
 
 
@@ -151,6 +152,18 @@ def _default_folder(logs: list[Path], model: str) -> Path:
         return capture.log_path(logs[0]).parent / "identification"
     now = datetime.datetime.now(datetime.UTC)
     return Path("runs") / f"{now:%Y%m%dT%H%M%SZ}-identify-{model}" / "identification"
+
+
+def _check_writable(folder: Path) -> None:
+    """Raise ConfigError now, not after a long search, when results could not be written."""
+    there = next((path for path in (folder, *folder.absolute().parents) if path.exists()), folder)
+    if not there.is_dir():
+        reason = f"{there} is not a folder"
+    elif not os.access(there, os.W_OK | os.X_OK):
+        reason = "permission denied"
+    else:
+        return
+    raise ConfigError(f"{folder}: cannot be created: {reason}; choose a folder with --out")
 
 
 def _fit(prepared: Prepared, train: list[Loaded], quiet: bool) -> GASSI:
@@ -281,6 +294,7 @@ def _print_report(
     train: list[Loaded],
     check: list[Loaded],
     path: Path,
+    mapping: Mapping | None,
 ) -> None:
     console.print_line()
     console.print_table(
@@ -311,8 +325,9 @@ def _print_report(
             "Set 'ranges' in a file given with --config."
         )
     console.print_line(f"Parameters: {path}")
+    columns = f" --config {mapping.file.path}" if mapping is not None else ""
     console.print_line(f"Next: rig replay {check[-1].path if check else train[0].path} "
-                       f"--parameters {path}")  # fmt: skip
+                       f"--parameters {path}{columns}")  # fmt: skip
 
 
 def _parameter_row(estimator: GASSI, model: ProcessModel, name: str) -> list[str]:

@@ -32,6 +32,14 @@ def find_model(name: str, relative_to: Path | None = None) -> ProcessModel:
     return _as_model(load_plugin("rig.models", name), f"model {name!r}")
 
 
+def whole_name(name: str, relative_to: Path | None = None) -> str:
+    """The name by which ``find_model`` finds the same model from any folder."""
+    file, colon, attribute = name.rpartition(":") if not name.endswith(".py") else (name, "", "")
+    if not file.endswith(".py"):
+        return name
+    return f"{_locate(Path(file), relative_to).resolve()}{colon}{attribute}"
+
+
 def models_command(name: str | None, as_json: bool) -> None:
     """List models, or describe one."""
     if name is not None:
@@ -146,7 +154,7 @@ def _import_file(path: Path) -> ModuleType:
     sys.path.insert(0, folder)
     try:
         spec.loader.exec_module(module)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise ConfigError(f"{_place(path, error)}: the model file does not import: "
                           f"{type(error).__name__}: {error}") from None  # fmt: skip
     finally:
@@ -154,16 +162,20 @@ def _import_file(path: Path) -> ModuleType:
     return module
 
 
-def _place(path: Path, error: Exception) -> str:
+def _place(path: Path, error: BaseException) -> str:
     """``file:line`` of the last line of the user's file that the error passed through."""
-    if isinstance(error, SyntaxError):
+    if isinstance(error, SyntaxError) and _same(error.filename, path):
         return f"{path}:{error.lineno}"
     line, trace = None, error.__traceback__
     while trace is not None:
-        if Path(trace.tb_frame.f_code.co_filename) == path:
+        if _same(trace.tb_frame.f_code.co_filename, path):
             line = trace.tb_lineno
         trace = trace.tb_next
     return f"{path}:{line}" if line is not None else str(path)
+
+
+def _same(file: str | None, path: Path) -> bool:
+    return file is not None and Path(file).resolve() == path.resolve()
 
 
 def _as_model(found: Any, where: str) -> ProcessModel:
@@ -178,7 +190,7 @@ def _as_model(found: Any, where: str) -> ProcessModel:
             ) from None
     if not isinstance(found, ProcessModel):
         raise ConfigError(
-            f"{where} is a {type(found).__name__}, not a sysid.ProcessModel or a function "
+            f"{where} is of type {type(found).__name__}, not a sysid.ProcessModel or a function "
             "without arguments that returns one"
         )
     return found

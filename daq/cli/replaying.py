@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -88,6 +89,8 @@ def _value(file: yaml_file.YamlFile, key: tuple[str, ...], entry: Any) -> float:
     value = entry.get("value") if isinstance(entry, dict) else entry
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise file.error(key, f"expected a number, found {value!r}")
+    if not math.isfinite(value):
+        raise file.error(key, f"expected a finite number, found {value}")
     return float(value)
 
 

@@ -13,6 +13,8 @@ from daq.config.rig import RigConfig
 from daq.hal import CHANNELS, Device, Phase
 from daq.run import PhaseProgress, RunResult, run_experiment
 
+DEFAULT_RIG = "simulated.yaml"
+
 _TITLES = {
     Phase.CALIBRATION: "Offset calibration",
     Phase.HOMING: "Winding the load",
@@ -122,7 +124,8 @@ def check_command(experiment: str, rig: str, as_json: bool) -> None:
         "With --identify a validation run follows." if validation else
         "It has no 'validation' section: rig run --identify will identify without validation."
     )  # fmt: skip
-    console.print_line(f"Next: rig run {experiment} --identify")
+    on = f" --rig {rig}" if rig != DEFAULT_RIG else ""
+    console.print_line(f"Next: rig run {experiment}{on} --identify")
 
 
 def _run(

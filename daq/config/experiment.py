@@ -55,7 +55,8 @@ class Experiment(Section, abc.ABC):
         if not 2 <= self.n_samples <= _MAX_SAMPLES:
             raise ValueError(
                 f"duration: {self.duration:g} s at {self.sample_rate:g} Hz makes "
-                f"{self.n_samples} samples; 2 to {_MAX_SAMPLES} are possible"
+                f"{self.n_samples} samples; 2 to {_MAX_SAMPLES} are possible: "
+                "change duration or sample_rate"
             )
 
     @abc.abstractmethod

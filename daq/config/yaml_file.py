@@ -184,13 +184,18 @@ def _explain(file: YamlFile, model: type[BaseModel], at: Key, item: ErrorDetails
         hint = suggestion(str(loc[-1]), _fields(model, loc[:-1]))
         return f"{file.named(key)}: unknown key; {hint}"
     description = _description(model, loc)
-    about = f" ({description})" if description else ""
+    # A message of the project's own says what it needs to.
+    about = f" ({description})" if description and kind != "value_error" else ""
     if kind == "missing":
         return f"{file.named(key)}: this key is missing; add it{about}"
     return f"{file.named(key)}: {_complaint(kind, item, value)}{about}"
 
 
-_NUMBER, _WHOLE, _LINES = "expected a number", "expected a whole number", "expected 'key: value' lines"
+_NUMBER, _WHOLE, _LINES = (
+    "expected a number",
+    "expected a whole number",
+    "expected 'key: value' lines",
+)
 _EXPECTED = {
     "float_parsing": _NUMBER,
     "float_type": _NUMBER,

@@ -1,0 +1,280 @@
+"""Helpers of the daq tests: the ``rig`` command as a process, and the files it reads."""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import yaml
+
+RIG = (sys.executable, "-m", "daq.cli")
+
+# Short, without homing, so that a run takes no longer than the interpreter's start.
+EXPERIMENT = {
+    "protocol": "prbs",
+    "sample_rate": 800,
+    "duration": 0.5,
+    "calibration": {"samples": 16},
+    "motor": {"amplitude": 0.75, "offset": 0.1, "minimum_period": 0.005, "seed": 4},
+    "brake": {"amplitude": 0.07, "offset": 0.07, "minimum_period": 0.05, "seed": 5},
+}
+RIG_FILE = {"name": "test rig", "backend": "simulated", "options": {"seed": 3}}
+
+
+def merged(base, changes):
+    result = dict(base)
+    for key, value in changes.items():
+        old = result.get(key)
+        both = isinstance(old, dict) and isinstance(value, dict)
+        result[key] = merged(old, value) if both else value
+    return result
+
+
+def write_yaml(path, base, **changes):
+    path.write_text(yaml.safe_dump(merged(base, changes), sort_keys=False))
+    return path
+
+
+def write_experiment(path, **changes):
+    return write_yaml(path, EXPERIMENT, **changes)
+
+
+def write_rig(path, **changes):
+    return write_yaml(path, RIG_FILE, **changes)
+
+
+def environment(**extra):
+    """The environment of a test process: neutral colours, and warnings are errors."""
+    env = {k: v for k, v in os.environ.items() if k not in {"FORCE_COLOR", "COLUMNS"}}
+    return {**env, "PYTHONWARNINGS": "error", "NO_COLOR": "1", **extra}
+
+
+def rig(*args, cwd, env=None, timeout=120, **options):
+    """Run ``rig`` to its end; a CompletedProcess with text output."""
+    return subprocess.run(
+        [*RIG, *map(str, args)],
+        cwd=cwd,
+        env=environment(**(env or {})),
+        capture_output=True,
+        text=True,
+        timeout=timeout,
+        check=False,
+        **options,
+    )
+
+
+def start_rig(*args, cwd, env=None, **options):
+    """Start ``rig`` and leave it running."""
+    return subprocess.Popen(
+        [*RIG, *map(str, args)],
+        cwd=cwd,
+        env=environment(**(env or {})),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        **options,
+    )
+
+
+# Imports what the commands import, then becomes a ``rig`` process per line of standard input.
+_FORKING = """
+import json, os, sys, traceback
+import daq.cli, daq.cli.app, daq.cli.identifying, daq.cli.modelling, daq.cli.replaying
+import daq.cli.running, pandas, pint, protocols.prbs, sim_rig.actuator, sim_rig.backend
+
+for line in sys.stdin:
+    job = json.loads(line)
+    child = os.fork()
+    if child == 0:
+        os.chdir(job["cwd"])
+        for number, name in ((0, os.devnull), (1, job["out"]), (2, job["err"])):
+            os.dup2(os.open(name, os.O_RDWR | os.O_CREAT), number)
+        sys.argv = ["rig", *job["args"]]
+        status = 0
+        try:
+            daq.cli.main()
+        except SystemExit as end:
+            status = end.code or 0
+        except BaseException:
+            traceback.print_exc()
+            status = 1
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status)
+    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
+"""
+
+
+@contextmanager
+def forked_rig():
+    """``rig`` processes without the second that each needs for its imports.
+
+    Gives a function of arguments and folder that returns a CompletedProcess.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        out, err = Path(folder) / "out", Path(folder) / "err"
+        parent = subprocess.Popen(
+            [sys.executable, "-c", _FORKING],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment(),
+        )  # fmt: skip
+
+        def run(args, cwd):
+            out.unlink(missing_ok=True)
+            err.unlink(missing_ok=True)
+            job = {"args": list(map(str, args)), "cwd": str(cwd), "out": str(out), "err": str(err)}
+            parent.stdin.write(json.dumps(job) + "\n")
+            parent.stdin.flush()
+            status = int(parent.stdout.readline())
+            return subprocess.CompletedProcess(args, status, out.read_text(), err.read_text())
+
+        with parent:
+            yield run
+
+
+def until(condition, what, seconds=60.0):
+    """Poll until ``condition`` gives something true, and return it."""
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        result = condition()
+        if result:
+            return result
+        time.sleep(0.005)
+    raise AssertionError(f"not within {seconds:g} s: {what}")
+
+
+def only_capture(root):
+    """The one capture folder under ``root``/runs."""
+    (folder,) = sorted(p for p in (Path(root) / "runs").iterdir() if p.is_dir())
+    return folder
+
+
+def record_of(folder):
+    return json.loads((folder / "run.json").read_text())
+
+
+def rows_in(folder):
+    """Complete data rows in a log, also in one that is being written."""
+    path = folder / "log.csv"
+    return max(0, path.read_bytes().count(b"\n") - 1) if path.exists() else 0
+
+
+def running_capture(root, rows=1):
+    """The capture folder of a run in progress once it holds ``rows`` rows."""
+
+    def found():
+        for folder in (Path(root) / "runs").glob("*"):
+            if rows_in(folder) >= rows:
+                return folder
+        return None
+
+    return until(found, f"a log with {rows} rows under {root}")
+
+
+# A backend of its own distribution, as a lab would install one: the simulated rig with faults
+# on demand. Everything it is asked is written to a journal, one JSON line each.
+_FAULTY = '''
+"""The simulated rig with faults on demand and a journal of what it was asked."""
+import dataclasses
+import json
+import time
+from pathlib import Path
+
+from daq.errors import DeviceError
+from daq.hal import Flag, Mode
+from sim_rig.backend import SimulatedDevice, Simulation
+
+
+class Options(Simulation):
+    journal: str
+    fault: str = ""
+    at: int = 0
+
+
+class FaultyDevice(SimulatedDevice):
+    Options = Options
+
+    def __init__(self, options):
+        super().__init__(options)
+        self._path = Path(options.journal)
+        self._exciting = self._receiving = False
+
+    def note(self, what, **facts):
+        with self._path.open("a") as journal:
+            journal.write(json.dumps({"what": what, "at": time.monotonic(), **facts}) + "\\n")
+
+    def start(self, sample_rate, mode, guard):
+        self._exciting = mode is Mode.OPEN_LOOP
+        self.note("start", mode=mode.value)
+        super().start(sample_rate, mode, guard)
+
+    def announce(self, phase, turns=0.0):
+        self.note("announce", phase=phase.value)
+        if self.options.fault != "no hand":
+            super().announce(phase, turns)
+
+    def receive(self):
+        self._receiving = True
+        try:
+            raw = super().receive()
+        finally:
+            self._receiving = False
+        fault, at = self.options.fault, self.options.at
+        if self._exciting and raw.tick[-1] >= at:
+            if fault == "unplugged":
+                raise DeviceError("the device no longer answers; check its cable")
+            if fault == "bug":
+                raise ZeroDivisionError("a mistake in the backend")
+            if fault == "own interlock":
+                raw.flags[raw.tick == at] |= int(Flag.INTERLOCK)
+                raw.applied[raw.tick >= at] = 0.0
+                super().safe()
+            if fault == "lost":
+                keep = (raw.tick < at) | (raw.tick >= at + 10)
+                raw = self._only(raw, keep)
+            if fault == "lost to the end":
+                keep = raw.tick < at
+                if not keep.any():
+                    keep[-1] = True
+                    raw.tick[-1] += 1_000_000
+                raw = self._only(raw, keep)
+        self.note("receive", until=int(raw.tick[-1]), applied=raw.applied[-1].tolist())
+        return raw
+
+    def _only(self, raw, keep):
+        fields = [field.name for field in dataclasses.fields(raw)]
+        return dataclasses.replace(raw, **{name: getattr(raw, name)[keep] for name in fields})
+
+    def safe(self):
+        super().safe()
+        if hasattr(self, "_path"):
+            self.note("safe")
+            if self._running and not self._receiving:
+                # What the outputs are now, by the device's own account.
+                self.note("outputs", applied=super().receive().applied.ravel().tolist())
+
+    def close(self):
+        super().close()
+        self.note("close")
+        if self.options.fault == "unplugged" and self.options.at > 0:
+            raise DeviceError("cannot disconnect: the device is gone")
+'''
+
+
+def install_faulty(folder):
+    """Make the backend ``faulty`` importable and registered from ``folder`` on PYTHONPATH."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "faulty_backend.py").write_text(_FAULTY)
+    info = folder / "faulty_backend-1.0.dist-info"
+    info.mkdir(exist_ok=True)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: faulty-backend\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[rig.backends]\nfaulty = faulty_backend:FaultyDevice\n")
+    paths = [str(folder), *filter(None, [os.environ.get("PYTHONPATH")])]
+    return {"PYTHONPATH": os.pathsep.join(paths)}
+
+
+def journal_of(path):
+    return [json.loads(line) for line in Path(path).read_text().splitlines()]

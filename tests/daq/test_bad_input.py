@@ -1,0 +1,364 @@
+"""Every mistake a user can make at the command line: what it says, and that nothing was done.
+
+Each case is one wrong file or argument. All of them must end with status 2, name the file, the
+line and the key, say what to do, show no traceback, and leave no folder behind.
+"""
+
+from dataclasses import dataclass, field
+
+import pytest
+
+from tests.daq.support import forked_rig, rig
+from tests.daq.test_log import original_text
+
+EXPERIMENT = """\
+protocol: prbs
+sample_rate: 800
+duration: 0.5
+calibration: {samples: 16}
+motor:
+  amplitude: 0.75
+  offset: 0.1
+  minimum_period: 0.005
+  seed: 4
+brake:
+  amplitude: 0.07
+  offset: 0.07
+  minimum_period: 0.05
+  seed: 5
+"""
+RIG = """\
+name: bench
+backend: simulated
+options:
+  seed: 3
+sensors:
+  torque: {scale: 0.706}
+limits:
+  command:
+    brake: [0.0, 0.38]
+"""
+IDENTIFICATION = """\
+population: 20
+generations: 2
+ranges:
+  K_m: [0.1, 0.2]
+"""
+MODEL = """\
+from sysid import Input, Output, Parameter, ProcessModel, State
+
+
+def derivative(x, u, p):
+    return ((u[0] - x[0]) / p[0],)
+
+
+model = ProcessModel(
+    name="lag",
+    description="a first-order lag",
+    states=(State("y", "m"),),
+    inputs=(Input("u", "m"),),
+    outputs=(Output("y", "m"),),
+    parameters=(Parameter("tau", "s", 0.1, 0.01, 1.0, "log"),),
+    derivative=derivative,
+)
+"""
+
+
+@dataclass
+class Case:
+    """A command in a folder of good files with ``files`` laid over them, and what it must say."""
+
+    name: str
+    args: list
+    said: list
+    files: dict = field(default_factory=dict)
+    kept: tuple = ()
+
+
+def experiment(name, old, new, *said, command="run"):
+    assert EXPERIMENT.count(old) >= 1, old
+    return Case(name, [command, "e.yaml"], list(said), {"e.yaml": EXPERIMENT.replace(old, new, 1)})
+
+
+def rig_file(name, old, new, *said):
+    assert old in RIG, old
+    files = {"rig.yaml": RIG.replace(old, new, 1)}
+    return Case(name, ["run", "e.yaml", "--rig", "rig.yaml"], list(said), files)
+
+
+def settings(name, text, *said, args=()):
+    command = ["identify", "log.csv", "--config", "id.yaml", *args]
+    return Case(name, command, list(said), {"id.yaml": text})
+
+
+def log(name, text, *said):
+    return Case(name, ["identify", "log.csv"], list(said), {"log.csv": text})
+
+
+def model(name, text, *said, of="model.py:model"):
+    return Case(name, ["models", of], list(said), {"model.py": text})
+
+
+COLUMNS = """\
+model: model.py:model
+columns:
+  time: {column: t}
+  inputs:
+    u: {column: cmd_voltage_motor}
+  outputs:
+    y: {column: theta}
+"""
+
+CASES = [
+    # --- experiments
+    experiment("unknown protocol", "prbs", "prbx", "e.yaml:1:1: protocol: unknown protocol 'prbx'",
+               "did you mean 'prbs'?"),
+    experiment("no protocol", "protocol: prbs", "name: x", "e.yaml:1:1: protocol:",
+               "for example 'protocol: prbs'"),
+    experiment("misspelt key", "duration", "duratoin", "e.yaml:3:1: duratoin: unknown key",
+               "did you mean 'duration'?", "duration: this key is missing"),
+    experiment("misspelt nested key", "  offset: 0.1", "  ofset: 0.1",
+               "e.yaml:7:3: motor.ofset: unknown key; did you mean 'offset'?"),
+    experiment("out of range", "seed: 4", "seed: 70000",
+               "e.yaml:9:3: motor.seed: it must be at most 65535, found 70000"),
+    experiment("seed zero", "seed: 4", "seed: 0",
+               "e.yaml:9:3: motor.seed: it must be at least 1, found 0"),
+    experiment("text for a number", "duration: 0.5", "duration: long",
+               "e.yaml:3:1: duration: expected a number, found 'long'", "[s]"),
+    experiment("a fraction for a whole number", "seed: 4", "seed: 4.5",
+               "e.yaml:9:3: motor.seed: expected a whole number, found 4.5"),
+    experiment("yes for a number", "duration: 0.5", "duration: yes",
+               "e.yaml:3:1: duration: yes, no, on, off, true and false are no value"),
+    experiment("a number for a section", "calibration: {samples: 16}", "calibration: 16",
+               "e.yaml:4:1: calibration: expected 'key: value' lines, found 16"),
+    experiment("an empty section", "calibration: {samples: 16}", "calibration:",
+               "e.yaml:4:1: calibration: expected 'key: value' lines, found nothing"),
+    experiment("negative sample rate", "800", "-800",
+               "e.yaml:2:1: sample_rate: it must be above 0, found -800"),
+    experiment("zero sample rate", "800", "0",
+               "e.yaml:2:1: sample_rate: it must be above 0, found 0"),
+    experiment("infinite duration", "duration: 0.5", "duration: .inf",
+               "e.yaml:3:1: duration: expected a finite number, found .inf"),
+    experiment("duration that is no number", "duration: 0.5", "duration: .nan",
+               "e.yaml:3:1: duration: expected a finite number, found .nan"),
+    experiment("a period of no whole samples", "0.005", "0.0051",
+               "e.yaml:8:3: motor.minimum_period: 0.0051 s is 4.08 samples at 800 Hz",
+               "nearest that are: 0.005 or 0.00625 s"),
+    experiment("a plan beyond the limits", "amplitude: 0.07", "amplitude: 0.5",
+               "e.yaml:10:1: brake: the plan asks for 0.57 V in sample 0", "limits [0, 0.38] V",
+               "change amplitude or offset"),
+    experiment("too short a run", "duration: 0.5", "duration: 0.0001",
+               "e.yaml:3:1: duration: 0.0001 s at 800 Hz makes 0 samples; 2 to"),
+    experiment("a validation run with a misspelt key", "  seed: 5",
+               "  seed: 5\nvalidation:\n  motor: {sead: 3}",
+               "e.yaml:16:11: motor.sead: unknown key; did you mean 'seed'?", command="check"),
+    experiment("no YAML", "motor:", "motor: [", "e.yaml:", "not valid YAML", "indentation"),
+    experiment("a tab", "  amplitude: 0.75", "\tamplitude: 0.75", "e.yaml:6:1: not valid YAML"),
+    experiment("duplicate key", "  offset: 0.1", "  amplitude: 0.1",
+               "e.yaml:7:3: motor.amplitude: this key stands twice, first in line 6; keep one"),
+    experiment("a number for a key", "sample_rate: 800", "1: 800", "e.yaml:2:1: 1: unknown key"),
+    experiment("an alias inside its own anchor", "motor:", "motor: &m\n  again: *m",
+               "e.yaml:5: nested too deeply", "alias"),
+    experiment("a control character", "0.75", "0.75\x01", "e.yaml: not valid YAML"),
+    Case("missing experiment", ["run", "absent.yaml"],
+         ["absent.yaml: there is no such file; check its name, or use a shipped one: prbs.yaml"]),
+    Case("an empty experiment", ["run", "e.yaml"],
+         ["e.yaml: the file is empty; it must hold 'key: value' lines"], {"e.yaml": ""}),
+    Case("a list for an experiment", ["run", "e.yaml"],
+         ["e.yaml:1:1: expected 'key: value' lines, found a list"], {"e.yaml": "- a\n- b\n"}),
+    Case("a folder for an experiment", ["run", "folder"],
+         ["folder: this is a folder; name a YAML file"]),
+    Case("binary for an experiment", ["run", "e.yaml"],
+         ["e.yaml: not a text file in UTF-8"], {"e.yaml": b"\xff\xfe\x00p"}),
+    Case("no experiment", ["run"], ["EXPERIMENT.yaml", "--help"]),
+    Case("an unknown option", ["run", "e.yaml", "--identfy"], ["--identfy", "--identify"]),
+    Case("captures below a file", ["run", "e.yaml", "--out", "rig.yaml"],
+         ["rig.yaml/", "cannot be created: Not a directory", "--out"]),
+    Case("captures where nothing can be made", ["run", "e.yaml", "--out", "/proc/none"],
+         ["/proc/none", "cannot be created", "--out"]),
+    # --- rigs
+    rig_file("unknown backend", "simulated", "serail",
+             "rig.yaml:2:1: backend: unknown backend 'serail'; known are", "simulated"),
+    rig_file("misspelt option", "  seed: 3", "  sed: 3",
+             "rig.yaml:4:3: options.sed: unknown key; did you mean 'seed'?"),
+    rig_file("misspelt sensor", "torque", "troque",
+             "rig.yaml:6:3: sensors.troque: unknown key; did you mean 'torque'?"),
+    rig_file("scale of a sensor", "0.706", "none",
+             "rig.yaml:6:12: sensors.torque.scale: expected a number, found 'none'"),
+    rig_file("limits the wrong way round", "[0.0, 0.38]", "[0.38, 0.0]",
+             "rig.yaml:9:5: limits.command.brake: low end 0.38 is not below high end 0"),
+    rig_file("limits without zero", "[0.0, 0.38]", "[0.1, 0.38]",
+             "rig.yaml:9:5: limits.command.brake: the range must include 0 V"),
+    rig_file("one limit", "[0.0, 0.38]", "[0.38]",
+             "rig.yaml:9:5: limits.command.brake: expected two values [low, high], found [0.38]"),
+    rig_file("three limits", "[0.0, 0.38]", "[0, 1, 2]",
+             "rig.yaml:9:5: limits.command.brake: expected two values [low, high]"),
+    rig_file("a number for limits", "[0.0, 0.38]", "0.38",
+             "rig.yaml:9:5: limits.command.brake: expected two values [low, high], found 0.38"),
+    rig_file("an infinite limit", "[0.0, 0.38]", "[0.0, .inf]",
+             "rig.yaml:9:18: limits.command.brake.1: expected a finite number, found .inf"),
+    rig_file("a sign of two", "{scale: 0.706}", "{scale: 0.706, sign: 2}",
+             "rig.yaml:6:26: sensors.torque.sign: it must be -1 or 1, found 2"),
+    Case("missing rig", ["run", "e.yaml", "--rig", "absent.yaml"],
+         ["absent.yaml: there is no such file; check its name, or use a shipped one: simulated"]),
+    # --- identification
+    settings("misspelt setting", "populaton: 20\n",
+             "id.yaml:1:1: populaton: unknown key; did you mean 'population'?"),
+    settings("a range the wrong way round", IDENTIFICATION.replace("[0.1, 0.2]", "[0.2, 0.1]"),
+             "id.yaml:4:3: ranges.K_m: low end 0.2 is not below high end 0.1; write [low, high]"),
+    settings("an unknown parameter", IDENTIFICATION.replace("K_m", "K_n"),
+             "id.yaml:4:3: ranges.K_n: model actuator has no such name; did you mean"),
+    settings("an infinite range", IDENTIFICATION.replace("0.2]", ".inf]"),
+             "id.yaml:4:14: ranges.K_m.1: expected a finite number, found .inf"),
+    settings("an unknown output", "weights: {omga: 2}\n",
+             "id.yaml:1:11: weights.omga: model actuator has no such name; did you mean 'omega'?"),
+    settings("an unknown preset in a file", "preset: thesys\n",
+             "id.yaml:1:1: preset: unknown preset 'thesys'; did you mean 'thesis'?"),
+    settings("an unknown model in a file", "population: 9\nmodel: actuater\n",
+             "id.yaml:2:1: model: unknown model 'actuater'; did you mean 'actuator'?"),
+    settings("population of one", "population: 1\n",
+             "id.yaml:1:1: population: it must be at least 2, found 1"),
+    settings("an empty configuration", "", "id.yaml: the file is empty"),
+    settings("a column without a source",
+             COLUMNS.replace("u: {column: cmd_voltage_motor}", "u: {}"),
+             "id.yaml:5:5: columns.inputs.u: give either 'column'", "or 'constant'"),
+    settings("a misspelt key of a column", COLUMNS.replace("{column: theta}", "{colum: theta}"),
+             "id.yaml:7:9: columns.outputs.y.colum: unknown key; did you mean 'column'?"),
+    settings("an unknown signal", COLUMNS.replace("  u:", "  v:"),
+             "id.yaml:5:5: columns.inputs.v: model lag has no such signal; known are u"),
+    settings("a missing signal", COLUMNS.replace("  outputs:\n    y: {column: theta}\n",
+                                                 "  outputs: {}\n"),
+             "id.yaml:6:3: columns.outputs: 'y' of model lag is missing"),
+    settings("an unknown unit", COLUMNS.replace("column: theta", "column: theta, unit: parrot"),
+             "columns.outputs.y.unit: unit 'parrot' is not understood; write it as in"),
+    settings("a unit of another kind", COLUMNS.replace("column: theta", "column: theta, unit: kg"),
+             "id.yaml:7:24: columns.outputs.y.unit: 'kg' does not convert to 'm'"),
+    settings("a column that is not there", COLUMNS.replace("theta", "thet"),
+             "log.csv:1: column 'thet' is missing; did you mean 'theta'?"),
+    Case("missing configuration", ["identify", "log.csv", "--config", "absent.yaml"],
+         ["absent.yaml: there is no such file; check its name"]),
+    Case("an unknown preset", ["identify", "log.csv", "--preset", "thesys"],
+         ["--preset: unknown preset 'thesys'; did you mean 'thesis'?"]),
+    Case("a population of one", ["identify", "log.csv", "--population", "1"],
+         ["--population: it must be at least 2, found 1"]),
+    Case("an unknown model", ["identify", "log.csv", "--model", "actuater"],
+         ["unknown model 'actuater'; did you mean 'actuator'?"]),
+    Case("an unknown model for a run", ["run", "e.yaml", "--identify", "--model", "actuater"],
+         ["unknown model 'actuater'"]),
+    Case("missing model file", ["run", "e.yaml", "--identify", "--model", "absent.py:model"],
+         ["absent.py: there is no such model file"]),
+    Case("results below a file", ["identify", "log.csv", "--out", "rig.yaml/results"],
+         ["rig.yaml/results: cannot be created", "--out"]),
+    Case("one log for training and validation",
+         ["identify", "log.csv", "--validate", "./log.csv", "--model", "model.py:model",
+          "--config", "id.yaml"],
+         ["log.csv: the same log is given for training and for validation"], {"id.yaml": COLUMNS}),
+    # --- logs
+    Case("missing log", ["identify", "absent.csv"],
+         ["absent.csv: there is no such log; name a capture folder or a CSV file"]),
+    Case("a folder without logs", ["identify", "folder"],
+         ["folder: neither a capture folder (with log.csv) nor a folder of CSV files"]),
+    log("an empty log", "", "log.csv: the log is empty; it must start with a line of column names"),
+    log("a log with one row", original_text(1), "log.csv: it holds 1 sample; at least 2"),
+    log("a log with a column missing", original_text().replace("torque", "torq"),
+        "log.csv:1: column 'torque' is missing; did you mean 'torq'?", "--config"),
+    log("a log with NaN", original_text().replace("0.75", "nan"),
+        "log.csv:5: current_motor: 'nan' is not a finite number", "remove these lines"),
+    log("a binary log", b"\x89PNG\r\n\x1a\n\x00", "log.csv:1: not a text file"),
+    Case("a broken run record", ["identify", "run"],
+         ["run.json: not a readable run record", "move it away"],
+         {"run/log.csv": original_text(), "run/run.json": "{"}),
+    Case("replay of parameters that are none", ["replay", "log.csv", "--parameters", "p.yaml"],
+         ["p.yaml:1:1: model: this key is missing"], {"p.yaml": "a: 1\n"}),
+    Case("replay of an unknown parameter", ["replay", "log.csv", "--parameters", "p.yaml"],
+         ["p.yaml:3:3: parameters.K_n: model actuator has no such parameter"],
+         {"p.yaml": "model: actuator\nparameters:\n  K_n: 1\n"}),
+    Case("replay of a text for a parameter", ["replay", "log.csv", "--parameters", "p.yaml"],
+         ["p.yaml:3:3: parameters.K_m: expected a number, found 'x'"],
+         {"p.yaml": "model: actuator\nparameters:\n  K_m: x\n"}),
+    Case("replay of a number that is none", ["replay", "log.csv", "--parameters", "p.yaml"],
+         ["p.yaml:3:3: parameters.K_m: expected a finite number, found nan"],
+         {"p.yaml": "model: actuator\nparameters:\n  K_m: .nan\n"}),
+    # --- models
+    model("a model with a syntax error", MODEL.replace("(x, u, p):", "(x, u, p)"),
+          "model.py:4: the model file does not import: SyntaxError"),
+    model("a model that imports what is not there", "import no_such_thing\n" + MODEL,
+          "model.py:1: the model file does not import: ModuleNotFoundError", "no_such_thing"),
+    model("a model that fails", MODEL + "\n1 / 0\n",
+          "model.py:18: the model file does not import: ZeroDivisionError"),
+    model("a model that ends the program", MODEL + "\nraise SystemExit(0)\n",
+          "model.py:18: the model file does not import: SystemExit"),
+    model("a model without that object", MODEL, "model.py: it defines no 'modle'",
+          "did you mean 'model'?", of="model.py:modle"),
+    model("an object that is no model", "model = 3\n", "model.py:model is of type int",
+          "not a sysid.ProcessModel"),
+]  # fmt: skip
+
+
+def lay_out(folder, case):
+    good = {
+        "e.yaml": EXPERIMENT, "rig.yaml": RIG, "id.yaml": IDENTIFICATION,
+        "log.csv": original_text(), "model.py": MODEL,
+    }  # fmt: skip
+    (folder / "folder").mkdir(parents=True)
+    for name, text in {**good, **case.files}.items():
+        path = folder / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+
+
+def contents(folder):
+    return {
+        str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None
+        for path in folder.rglob("*")
+        if "__pycache__" not in path.parts
+    }
+
+
+@pytest.fixture(scope="module")
+def outcomes(tmp_path_factory, request):
+    """All selected cases: how the command ended, files before, files after."""
+    chosen = {item.callspec.params["case"].name for item in request.session.items
+              if item.fspath == request.fspath and hasattr(item, "callspec")}  # fmt: skip
+    root = tmp_path_factory.mktemp("bad")
+
+    found = {}
+    with forked_rig() as run:
+        for index, case in enumerate(case for case in CASES if case.name in chosen):
+            folder = root / str(index)
+            lay_out(folder, case)
+            before = contents(folder)
+            found[case.name] = run(case.args, folder), before, contents(folder)
+    return found
+
+
+@pytest.mark.parametrize("case", CASES, ids=[case.name for case in CASES])
+def test_a_mistake_is_refused_with_its_place_and_cure(case, outcomes):
+    result, before, after = outcomes[case.name]
+    print(result.stderr)
+    assert result.returncode == 2
+    for part in case.said:
+        assert part in result.stderr
+    for word in ("Traceback", "pydantic", "Input should", "valid dictionary", "Errno"):
+        assert word not in result.stderr
+    assert result.stdout == ""
+    assert after == before, "nothing may be left behind"
+
+
+def test_the_good_files_are_good(tmp_path):
+    case = Case("good", [], [])
+    lay_out(tmp_path, case)
+    for args in (
+        ["check", "e.yaml", "--rig", "rig.yaml"],
+        ["models", "model.py:model"],
+        ["identify", "log.csv", "--config", "id.yaml", "--help"],
+    ):
+        result = rig(*args, cwd=tmp_path)
+        assert result.returncode == 0, result.stderr
+
+
+def test_several_mistakes_in_one_file_are_told_at_once(tmp_path):
+    text = EXPERIMENT.replace("duration: 0.5", "duration: x").replace("seed: 5", "seed: -5")
+    lay_out(tmp_path, Case("", [], [], {"e.yaml": text}))
+    result = rig("check", "e.yaml", cwd=tmp_path)
+    assert "e.yaml:3:1: duration" in result.stderr and "e.yaml:14:3: brake.seed" in result.stderr

@@ -1,0 +1,327 @@
+"""The ``rig`` command as people, pipes and other programs meet it."""
+
+import json
+import os
+import pty
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from tests.daq.support import (
+    RIG,
+    environment,
+    only_capture,
+    rig,
+    until,
+    write_experiment,
+    write_rig,
+)
+from tests.daq.test_bad_input import MODEL
+
+COMMANDS = ("run", "check", "identify", "replay", "models")
+
+
+@pytest.fixture(scope="module")
+def captured(tmp_path_factory):
+    """A capture of the ideal rig, at the working folder of the tests that only read it."""
+    root = tmp_path_factory.mktemp("captured")
+    write_experiment(root / "e.yaml", validation={"motor": {"seed": 77}})
+    write_rig(root / "rig.yaml", options={"ideal": True})
+    assert rig("run", "e.yaml", "--rig", "rig.yaml", cwd=root).returncode == 0
+    return root, only_capture(root)
+
+
+def files_under(folder):
+    return {path: path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+# --- help ---------------------------------------------------------------------------------
+
+
+def test_help_lists_the_commands_and_where_to_start(tmp_path):
+    result = rig("--help", cwd=tmp_path)
+    assert result.returncode == 0 and result.stderr == ""
+    assert "rig run prbs.yaml --identify" in result.stdout
+    for command in COMMANDS:
+        assert re.search(rf"\b{command}\b", result.stdout)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_of_each_command_has_an_example(tmp_path, command):
+    result = rig(command, "--help", cwd=tmp_path)
+    assert result.returncode == 0 and f"Example:  rig {command}" in result.stdout
+
+
+def test_the_installed_command_is_the_module(tmp_path):
+    script = Path(sys.executable).with_name("rig")
+    installed = subprocess.run(
+        [script, "models"], cwd=tmp_path, env=environment(), capture_output=True, text=True,
+        check=True,
+    )  # fmt: skip
+    assert installed.stdout == rig("models", cwd=tmp_path).stdout
+
+
+# --- JSON ---------------------------------------------------------------------------------
+
+
+def test_json_of_a_run_with_identification_is_one_document(tmp_path):
+    write_experiment(tmp_path / "e.yaml", duration=0.2, validation={"motor": {"seed": 77}})
+    (tmp_path / "id.yaml").write_text("population: 20\ngenerations: 2\n")
+    result = rig("run", "e.yaml", "--identify", "--config", "id.yaml", "--json", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    document = json.loads(result.stdout)
+    assert document["run"]["samples"] == document["validation"]["samples"] == 160
+    assert document["run"]["folder"] != document["validation"]["folder"]
+    found = document["identification"]
+    assert len(found["parameters"]) == 21 and found["search"]["generations"] == 2
+    assert len(found["metrics"]["training"]) == len(found["metrics"]["validation"]) == 1
+    assert (tmp_path / found["files"]["parameters"]).exists()
+
+
+def test_json_of_identify_check_models_and_replay(captured, tmp_path):
+    root, folder = captured
+    out = tmp_path / "out"
+    small = ("--population", 20, "--generations", 2, "--seed", 1, "--out", out)
+    identified = rig("identify", folder, *small, "--json", cwd=root)
+    assert identified.returncode == 0, identified.stderr
+    report = json.loads(identified.stdout)
+    assert report["model"] == "actuator" and report["error"]["value"] > 0.0
+    kept = yaml.safe_load((out / "parameters.yaml").read_text())
+    assert kept["parameters"]["K_m"]["value"] == report["parameters"]["K_m"]["value"]
+
+    replayed = rig("replay", folder, "--parameters", out / "parameters.yaml", "--json", cwd=root)
+    metrics = json.loads(replayed.stdout)["outputs"]
+    trained = report["metrics"]["training"][0]["outputs"]
+    assert metrics["omega"]["rmse"] == pytest.approx(trained["omega"]["rmse"], rel=1e-9)
+
+    checked = json.loads(rig("check", "e.yaml", "--json", cwd=root).stdout)
+    assert checked["samples"] == 400 and checked["channels"]["motor"]["highest_volts"] == 0.85
+    models = json.loads(rig("models", "--json", cwd=root).stdout)
+    assert "actuator" in models and len(models["actuator"]["parameters"]) == 21
+    one = json.loads(rig("models", "actuator", "--json", cwd=root).stdout)
+    assert one == models["actuator"]
+
+
+def test_replay_with_the_rigs_own_parameters_follows_an_ideal_log(captured):
+    root, folder = captured
+    result = rig("replay", folder, "--rig", "rig.yaml", "--json", cwd=root)
+    outputs = json.loads(result.stdout)["outputs"]
+    # The load torque between samples is interpolated; the currents hardly depend on it.
+    assert outputs["current_brake"]["rmse"] < 1e-3
+    assert outputs["current_motor"]["rmse"] < 0.02
+
+
+# --- check --------------------------------------------------------------------------------
+
+
+def test_check_touches_nothing(captured):
+    root, _ = captured
+    before = files_under(root)
+    result = rig("check", "e.yaml", "--rig", "rig.yaml", cwd=root)
+    assert result.returncode == 0 and "Next: rig run e.yaml" in result.stdout
+    assert files_under(root) == before
+
+
+def test_what_check_suggests_next_is_a_command_that_works(captured):
+    root, _ = captured
+    result = rig("check", "e.yaml", "--rig", "rig.yaml", cwd=root)
+    (line,) = [s for s in result.stdout.splitlines() if s.startswith("Next: ")]
+    assert line == "Next: rig run e.yaml --rig rig.yaml --identify"
+
+
+# --- terminals and pipes ------------------------------------------------------------------
+
+
+def on_terminal(args, cwd, answer=None):
+    """Run ``rig`` with its standard error on a terminal.
+
+    answer: called with the text so far and the process, whenever more has come. Returns status,
+    terminal text and standard output.
+    """
+    master, slave = pty.openpty()
+    process = subprocess.Popen(
+        [*RIG, *map(str, args)], cwd=cwd, env=environment(TERM="xterm", COLUMNS="120"),
+        stdin=slave, stdout=subprocess.PIPE, stderr=slave, text=True,
+    )  # fmt: skip
+    os.close(slave)
+    text = ""
+    try:
+        while True:
+            try:
+                data = os.read(master, 65536)
+            except OSError:  # the last process on the terminal has gone
+                break
+            if not data:
+                break
+            text += data.decode(errors="replace")
+            if answer is not None:
+                answer(text, process)
+        out, _ = process.communicate(timeout=60)
+    finally:
+        process.kill()
+        process.wait()
+        os.close(master)
+    return process.returncode, text, out
+
+
+def test_a_terminal_shows_progress_as_it_goes(tmp_path):
+    write_experiment(tmp_path / "e.yaml", duration=1.5)
+    write_rig(tmp_path / "rig.yaml", options={"time": "real"})
+    status, text, out = on_terminal(["run", "e.yaml", "--rig", "rig.yaml"], tmp_path)
+    assert status == 0 and "Log: " in out
+    seen = {int(n) for n in re.findall(r"(\d+)/1200 samples", text)}
+    assert 1200 in seen and len(seen) > 3, "the bar moves while the run goes on"
+    assert "\x1b[" in text
+
+
+def test_a_pipe_shows_one_plain_line_per_phase(tmp_path):
+    write_experiment(tmp_path / "e.yaml", homing={"turns": 0.5, "timeout": 30})
+    result = rig("run", "e.yaml", cwd=tmp_path)
+    lines = result.stderr.splitlines()
+    assert [re.sub(r" \(.*", "", line) for line in lines] == [
+        "rig: note: e on simulated rig",
+        "Offset calibration: 16/16 samples",
+        "Winding the load: 0.5/0.5 turns",
+        "Exciting and logging: 400/400 samples",
+    ]
+    assert "\x1b" not in result.stderr + result.stdout and "\r" not in result.stderr
+
+
+def test_a_reader_that_leaves_early_causes_no_traceback(tmp_path):
+    for args in (["models"], ["models", "actuator"], ["models", "--json"], ["--help"]):
+        reader, writer = os.pipe()
+        os.close(reader)
+        process = subprocess.run(
+            [*RIG, *args], cwd=tmp_path, env=environment(), stdout=writer, stderr=subprocess.PIPE,
+            text=True, check=False,
+        )  # fmt: skip
+        os.close(writer)
+        assert process.stderr == "", args
+
+
+# --- names --------------------------------------------------------------------------------
+
+
+def test_a_bare_name_means_the_shipped_file_unless_there_is_one_here(tmp_path):
+    shipped = json.loads(rig("check", "prbs.yaml", "--json", cwd=tmp_path).stdout)
+    assert shipped["samples"] == 1000 and Path(shipped["experiment"]).parent.name == "protocols"
+    without = json.loads(rig("check", "prbs", "--json", cwd=tmp_path).stdout)
+    assert without == shipped
+    write_experiment(tmp_path / "prbs.yaml")
+    here = json.loads(rig("check", "prbs.yaml", "--json", cwd=tmp_path).stdout)
+    assert here["samples"] == 400 and here["experiment"] == "prbs.yaml"
+
+
+def test_a_rig_file_here_goes_before_the_shipped_one(tmp_path):
+    write_rig(tmp_path / "simulated.yaml", name="my own")
+    assert json.loads(rig("check", "prbs.yaml", "--json", cwd=tmp_path).stdout)["rig"] == "my own"
+
+
+# --- a model and a log of one's own ---------------------------------------------------------
+
+
+def foreign_log(path, tau=0.2, n=400, dt=0.01):
+    """A first-order lag behind -1 * u + 3 mm, in millimetres and milliseconds."""
+    rng = np.random.default_rng(8)
+    u = np.repeat(rng.choice([-1.0, 1.0], n // 20), 20)
+    y = np.zeros(n)
+    for k in range(n - 1):
+        y[k + 1] = u[k] + 0.003 + (y[k] - u[k] - 0.003) * np.exp(-dt / tau)
+    lines = ["Time (ms), Input, Position"]
+    lines += [f"{1e3 * dt * k:.0f}, {-u[k]}, {1e3 * y[k]}" for k in range(n)]
+    path.write_text("\n".join(lines) + "\n")
+
+
+OWN_MODEL = MODEL.replace("(u[0] - x[0])", "(u[0] + u[1] - x[0])").replace(
+    'inputs=(Input("u", "m"),)', 'inputs=(Input("u", "m"), Input("bias", "m"))'
+)
+OWN_CONFIG = """\
+model: lag.py:model
+population: 30
+generations: 8
+columns:
+  time: {column: Time (ms), unit: ms}
+  inputs:
+    u: {column: Input, sign: -1}
+    bias: {constant: 3, unit: mm}
+  outputs:
+    y: {column: Position, unit: mm}
+"""
+
+
+def test_a_model_and_a_csv_of_ones_own_work_like_the_built_in(tmp_path):
+    work = tmp_path / "work"
+    work.mkdir()
+    foreign_log(work / "bench.csv")
+    (tmp_path / "lag.py").write_text(OWN_MODEL)
+    (tmp_path / "id.yaml").write_text(OWN_CONFIG)
+    # The model's file is named relative to the configuration that names it.
+    result = rig("identify", "bench.csv", "--config", "../id.yaml", "--out", "../found", cwd=work)
+    assert result.returncode == 0, result.stderr
+    assert "Parameters of lag" in result.stdout
+    found = yaml.safe_load((tmp_path / "found" / "parameters.yaml").read_text())
+    assert found["parameters"]["tau"]["value"] == pytest.approx(0.2, rel=1e-3)
+    assert found["metrics"]["training"][0]["outputs"]["y"]["max_abs"] == pytest.approx(1.0, rel=0.1)
+    # The command that it suggests works as it stands.
+    (line,) = [s for s in result.stdout.splitlines() if s.startswith("Next: rig ")]
+    replayed = rig(*line.removeprefix("Next: rig ").split(), "--json", cwd=work)
+    assert replayed.returncode == 0, replayed.stderr
+    assert json.loads(replayed.stdout)["outputs"]["y"]["fit_percent"] > 99.0
+
+
+def test_one_seed_gives_one_result(captured, tmp_path):
+    root, folder = captured
+    values = []
+    for index, seed in enumerate((4, 4, 5)):
+        result = rig(
+            "identify", folder, "--population", 20, "--generations", 3, "--seed", seed,
+            "--preset", "thesis", "--out", tmp_path / str(index), "--json", cwd=root,
+        )  # fmt: skip
+        values.append(json.loads(result.stdout)["parameters"]["K_m"]["value"])
+    assert values[0] == values[1] != values[2]
+
+
+# --- Ctrl-C -------------------------------------------------------------------------------
+
+
+def test_ctrl_c_during_a_search_prints_the_parameters_found_so_far(captured, tmp_path):
+    root, folder = captured
+    asked = []
+
+    def interrupt(text, process):
+        done = [int(n) for n in re.findall(r"generation (\d+)/", text)]
+        if done and max(done) >= 2 and not asked:
+            asked.append(max(done))
+            process.send_signal(signal.SIGINT)
+
+    status, text, out = on_terminal(
+        ["identify", folder, "--population", 60, "--generations", 100000, "--out", tmp_path / "o"],
+        root,
+        interrupt,
+    )
+    assert asked and status == 0, text + out
+    assert "Stopped by Ctrl-C after" in out and "Parameters of actuator" in out
+    assert "Traceback" not in text
+    kept = yaml.safe_load((tmp_path / "o" / "parameters.yaml").read_text())
+    assert kept["search"]["stopped"] == "interrupted" and len(kept["parameters"]) == 21
+    assert kept["search"]["generations"] >= asked[0]
+
+
+def test_ctrl_c_before_there_is_any_result_says_so_in_one_line(tmp_path):
+    write_experiment(tmp_path / "e.yaml", homing={"turns": 500, "timeout": 3600})
+    write_rig(tmp_path / "rig.yaml", options={"time": "real"})
+    process = subprocess.Popen(
+        [*RIG, "run", "e.yaml", "--rig", "rig.yaml"], cwd=tmp_path, env=environment(),
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    until(lambda: list((tmp_path / "runs").glob("*/log.csv")), "a log")
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert errors.splitlines()[-1] == "rig: stopped by Ctrl-C"

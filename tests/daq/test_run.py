@@ -1,0 +1,328 @@
+"""``rig run``: phases, capture folders, and every way in which a run can end."""
+
+import hashlib
+import itertools
+import json
+import signal
+
+import numpy as np
+import pytest
+
+from daq import capture
+from daq.errors import ConfigError
+from daq.hal import Flag
+from tests.daq.support import EXPERIMENT as SETTINGS
+from tests.daq.support import (
+    install_faulty,
+    journal_of,
+    merged,
+    only_capture,
+    record_of,
+    rig,
+    rows_in,
+    running_capture,
+    start_rig,
+    until,
+    write_experiment,
+    write_rig,
+)
+
+FAULTY = {"backend": "faulty", "options": {"journal": "journal.jsonl"}}
+
+
+@pytest.fixture(scope="module")
+def plugin(tmp_path_factory):
+    return install_faulty(tmp_path_factory.mktemp("plugin"))
+
+
+@pytest.fixture(scope="module")
+def completed(tmp_path_factory, plugin):
+    """One run with every phase on the journaling backend."""
+    root = tmp_path_factory.mktemp("completed")
+    write_experiment(root / "all.yaml", homing={"turns": 1, "timeout": 30})
+    write_rig(root / "rig.yaml", **FAULTY)
+    result = rig("run", "all.yaml", "--rig", "rig.yaml", cwd=root, env=plugin)
+    assert result.returncode == 0, result.stderr
+    return root, result
+
+
+def run_with(tmp_path, plugin, fault, at=0, experiment=None, rig_changes=None):
+    write_experiment(tmp_path / "e.yaml", **(experiment or {}))
+    options = {"fault": fault, "at": at}
+    write_rig(tmp_path / "rig.yaml", **merged(merged(FAULTY, {"options": options}),
+                                              rig_changes or {}))  # fmt: skip
+    return rig("run", "e.yaml", "--rig", "rig.yaml", cwd=tmp_path, env=plugin)
+
+
+def assert_left_safe(root):
+    """The last that the device applied was zero, and it was closed."""
+    journal = journal_of(root / "journal.jsonl")
+    outputs = [entry for entry in journal if entry["what"] == "outputs"]
+    assert outputs and not np.any(outputs[-1]["applied"])
+    assert journal[-1]["what"] == "close"
+    after = journal[journal.index(outputs[-1]) + 1 :]
+    assert not [e for e in after if e["what"] == "receive" and np.any(e["applied"])]
+
+
+# --- a run that completes -----------------------------------------------------------------
+
+
+def test_phases_come_in_order_and_the_device_is_made_safe_before_it_is_closed(completed):
+    root, _ = completed
+    journal = journal_of(root / "journal.jsonl")
+    steps = [e.get("phase") or e["what"] for e in journal if e["what"] != "outputs"]
+    order = [step for step, _ in itertools.groupby(steps)]
+    wanted = ["calibration", "start", "homing", "start", "run", "start", "safe", "close"]
+    kept = [step for step in order if step in wanted and step != "safe"] + ["safe"]
+    assert kept == [*wanted[:-2], "close", "safe"]
+    assert "safe" in order[order.index("run") :], "announced, or called, at the end"
+    assert_left_safe(root)
+    modes = [e["mode"] for e in journal if e["what"] == "start"]
+    assert modes == ["closed loop", "closed loop", "open loop"]
+
+
+def test_outputs_are_zero_before_the_run_phase(completed):
+    root, _ = completed
+    journal = journal_of(root / "journal.jsonl")
+    begin = next(i for i, e in enumerate(journal) if e.get("phase") == "run")
+    before = [e for e in journal[:begin] if e["what"] == "receive"]
+    assert len(before) > 10 and not any(np.any(e["applied"]) for e in before)
+
+
+def test_the_capture_folder_holds_the_run_as_resolved(completed):
+    root, result = completed
+    folder = only_capture(root)
+    record = record_of(folder)
+    assert sorted(p.name for p in folder.iterdir()) == ["log.csv", "run.json"]
+    assert {
+        "status", "reason", "started", "experiment", "rig", "software", "host", "device",
+        "offsets", "homing", "phase", "timing", "log",
+    } == set(record)  # fmt: skip
+    assert (record["status"], record["reason"], record["phase"]) == ("completed", None, "close")
+    assert record["experiment"] == {
+        **merged(SETTINGS, {"homing": {"turns": 1.0, "timeout": 30.0}}),
+        "name": "",
+        "validation": {},
+    }
+    assert record["rig"]["sensors"]["encoder"] == {"cycles": 2048, "sign": 1}, "defaults too"
+    assert record["rig"]["limits"]["command"]["brake"] == [0.0, 0.38]
+    assert record["rig"]["options"]["journal"] == "journal.jsonl"
+    assert record["software"]["hybrid-rig"] and record["software"]["numpy"] == np.__version__
+    assert record["homing"]["turns"] == pytest.approx(1.0, abs=0.15)
+    assert folder.name.endswith("-all") and str(folder.name) in result.stdout
+
+
+def test_the_log_is_the_one_the_record_fingerprints(completed):
+    root, _ = completed
+    folder = only_capture(root)
+    digest = hashlib.sha256((folder / "log.csv").read_bytes()).hexdigest()
+    assert record_of(folder)["log"] == {"file": "log.csv", "sha256": digest}
+    recording = capture.load(folder)
+    assert recording.warning is None and recording.name == folder.name
+    assert len(recording.log.frame) == 400 and recording.log.dt == pytest.approx(1 / 800, rel=1e-14)
+    assert np.array_equal(recording.log.frame["tick"], np.arange(400))
+
+
+def test_offsets_are_taken_off_the_log(tmp_path):
+    # 1 V of offset would be 0.5 A; the experiment commands nothing, so all that is left is noise.
+    quiet = {"amplitude": 0.0, "offset": 0.0}
+    write_experiment(
+        tmp_path / "e.yaml", motor=quiet, brake=quiet, calibration={"samples": 2000}, duration=2
+    )
+    flaws = {"options": {"imperfections": {"offset": 1.0, "noise": 0.01}}}
+    write_rig(tmp_path / "rig.yaml", **merged(flaws, {"limits": {"current": {"brake": 2.0}}}))
+    result = rig("run", "e.yaml", "--rig", "rig.yaml", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    frame = capture.load(only_capture(tmp_path)).log.frame
+    volts = record_of(only_capture(tmp_path))["offsets"]["volts"]
+    assert np.abs(volts).max() > 0.3
+    for name in ("current_motor", "current_brake", "torque"):
+        # Mean of 2000 at sigma = 7 mA: six standard errors of both means.
+        assert abs(frame[name].mean()) < 2e-3, name
+
+
+def test_one_seed_gives_a_byte_identical_log_and_another_does_not(tmp_path):
+    logs = []
+    for index, seed in enumerate((7, 7, 8)):
+        root = tmp_path / str(index)
+        root.mkdir()
+        write_experiment(root / "e.yaml")
+        write_rig(root / "rig.yaml", options={"seed": seed})
+        assert rig("run", "e.yaml", "--rig", "rig.yaml", cwd=root).returncode == 0
+        logs.append((only_capture(root) / "log.csv").read_bytes())
+    assert logs[0] == logs[1]
+    assert logs[0] != logs[2]
+
+
+def test_two_runs_in_one_second_get_a_folder_each(tmp_path):
+    made = [capture.Capture.create(tmp_path, "same", {}).folder for _ in range(3)]
+    assert len(set(made)) == 3 and all((folder / "run.json").exists() for folder in made)
+
+
+# --- runs that end early ------------------------------------------------------------------
+
+
+def test_homing_that_takes_too_long_ends_the_run(tmp_path, plugin):
+    result = run_with(
+        tmp_path, plugin, "no hand", experiment={"homing": {"turns": 5, "timeout": 1.5}}
+    )
+    assert result.returncode == 1
+    assert "0.00 of 5 turns were wound in 1.5 s" in result.stderr
+    assert "homing.timeout" in result.stderr
+    record = record_of(only_capture(tmp_path))
+    assert (record["status"], record["phase"]) == ("failed", "homing")
+    assert "turns were wound" in record["reason"]
+    assert_left_safe(tmp_path)
+
+
+def test_a_device_that_fails_during_the_run_leaves_zero_outputs_and_says_why(tmp_path, plugin):
+    result = run_with(tmp_path, plugin, "unplugged", at=300)
+    assert result.returncode == 1
+    # The device cannot be closed either; the first cause is the one to report.
+    assert result.stderr.splitlines()[-1] == ("rig: the device no longer answers; check its cable")
+    folder = only_capture(tmp_path)
+    record = record_of(folder)
+    assert (record["status"], record["phase"]) == ("failed", "run")
+    assert record["reason"] == "the device no longer answers; check its cable"
+    assert_left_safe(tmp_path)
+    recording = capture.load(folder)
+    assert 200 < len(recording.log.frame) <= 300
+    assert "ended early: failed: the device no longer answers" in recording.warning
+
+
+def test_a_mistake_in_a_backend_leaves_zero_outputs_and_is_named(tmp_path, plugin):
+    result = run_with(tmp_path, plugin, "bug", at=300)
+    assert result.returncode == 1
+    record = record_of(only_capture(tmp_path))
+    assert record["status"] == "failed"
+    assert record["reason"] == "ZeroDivisionError during run: a mistake in the backend"
+    assert_left_safe(tmp_path)
+
+
+def test_a_current_beyond_its_limit_ends_the_run_with_its_sample_logged(tmp_path, plugin):
+    # The brake's level of 0.14 V is 0.07 A.
+    limits = {"limits": {"current": {"brake": 0.05}}}
+    result = run_with(tmp_path, plugin, "", rig_changes=limits)
+    assert result.returncode == 1
+    assert "interlock in sample" in result.stderr and "limit of 0.05 A" in result.stderr
+    folder = only_capture(tmp_path)
+    record = record_of(folder)
+    assert (record["status"], record["phase"]) == ("interlock", "run")
+    frame = capture.load(folder).log.frame
+    flagged = np.flatnonzero(frame["flags"] & int(Flag.INTERLOCK))
+    assert flagged.tolist() == [len(frame) - 1], "the tripping sample is the last"
+    last = frame.iloc[-1]
+    assert abs(last["current_brake"]) > 0.05
+    assert last["applied_voltage_motor"] == 0.0 and last["applied_voltage_brake"] == 0.0
+    assert f"interlock in sample {len(frame) - 1}:" in record["reason"]
+    assert_left_safe(tmp_path)
+
+
+def test_a_current_beyond_its_limit_before_the_run_is_an_interlock_too(tmp_path):
+    # 0.3 V rms of noise is 0.15 A at the input.
+    write_experiment(tmp_path / "e.yaml", calibration={"samples": 500})
+    write_rig(tmp_path / "rig.yaml", options={"imperfections": {"noise": 0.3}})
+    result = rig("run", "e.yaml", "--rig", "rig.yaml", cwd=tmp_path)
+    assert result.returncode == 1 and "interlock during calibration" in result.stderr
+    record = record_of(only_capture(tmp_path))
+    assert (record["status"], record["phase"]) == ("interlock", "calibration")
+
+
+def test_an_interlock_that_only_the_device_saw_ends_the_run(tmp_path, plugin):
+    result = run_with(tmp_path, plugin, "own interlock", at=150)
+    assert result.returncode == 1
+    assert "interlock in sample 150" in result.stderr
+    assert record_of(only_capture(tmp_path))["status"] == "interlock"
+    frame = capture.load(only_capture(tmp_path)).log.frame
+    assert len(frame) == 151 and frame["flags"].iloc[-1] & int(Flag.INTERLOCK)
+
+
+def test_lost_samples_are_flagged_and_keep_their_place(tmp_path, plugin):
+    result = run_with(tmp_path, plugin, "lost", at=100)
+    assert result.returncode == 0, result.stderr
+    assert "lost" in result.stdout, "the summary says that samples were lost"
+    log = capture.load(only_capture(tmp_path)).log
+    ticks = log.frame["tick"].to_numpy()
+    flagged = ticks[(log.frame["flags"] & int(Flag.LOST)) != 0]
+    assert set(range(400)) - set(ticks) and len(flagged) >= 1
+    np.testing.assert_allclose(log.frame["t"], ticks / 800)
+    for tick in flagged:
+        row = int(np.flatnonzero(ticks == tick)[0])
+        assert ticks[row] > ticks[row - 1] + 1
+
+
+def test_losing_the_last_samples_of_a_run_is_no_crash(tmp_path, plugin):
+    result = run_with(tmp_path, plugin, "lost to the end", at=350)
+    assert "Traceback" not in result.stderr
+    record = record_of(only_capture(tmp_path))
+    assert record["status"] in {"completed", "failed"}
+    ticks = capture.load(only_capture(tmp_path)).log.frame["tick"]
+    assert ticks.max() < 400
+
+
+@pytest.mark.parametrize(("number", "by"), [(signal.SIGINT, "Ctrl-C"), (signal.SIGTERM, "SIGTERM")])
+def test_a_signal_stops_a_run_in_real_time_with_its_log_whole(tmp_path, plugin, number, by):
+    write_experiment(tmp_path / "e.yaml", duration=30)
+    write_rig(tmp_path / "rig.yaml", **merged(FAULTY, {"options": {"time": "real"}}))
+    process = start_rig("run", "e.yaml", "--rig", "rig.yaml", cwd=tmp_path, env=plugin)
+    folder = running_capture(tmp_path, rows=50)
+    process.send_signal(number)
+    _, errors = process.communicate(timeout=30)
+    assert process.returncode == 1, errors
+    assert f"stopped by {by}" in errors and "Traceback" not in errors
+    record = record_of(folder)
+    assert (record["status"], record["reason"]) == ("stopped", f"stopped by {by} during run")
+    recording = capture.load(folder)
+    assert 50 <= len(recording.log.frame) < 24_000
+    assert "ended early: stopped" in recording.warning
+    assert_left_safe(tmp_path)
+
+
+def test_a_closed_terminal_stops_a_run_too(tmp_path, plugin):
+    write_experiment(tmp_path / "e.yaml", duration=30)
+    write_rig(tmp_path / "rig.yaml", **merged(FAULTY, {"options": {"time": "real"}}))
+    process = start_rig("run", "e.yaml", "--rig", "rig.yaml", cwd=tmp_path, env=plugin)
+    folder = running_capture(tmp_path, rows=50)
+    process.send_signal(signal.SIGHUP)
+    process.communicate(timeout=30)
+    assert process.returncode == 1
+    assert record_of(folder)["reason"] == "stopped by SIGHUP during run"
+    assert_left_safe(tmp_path)
+
+
+def test_a_signal_while_the_load_is_wound_is_recorded_with_its_phase(tmp_path):
+    write_experiment(tmp_path / "e.yaml", homing={"turns": 20, "timeout": 60})
+    write_rig(tmp_path / "rig.yaml", options={"time": "real"})
+    process = start_rig("run", "e.yaml", "--rig", "rig.yaml", "--json", cwd=tmp_path)
+    folder = until(lambda: next(iter((tmp_path / "runs").glob("*/log.csv")), None), "a log").parent
+    process.send_signal(signal.SIGINT)
+    out, errors = process.communicate(timeout=30)
+    assert process.returncode == 1 and out == "", errors
+    record = record_of(folder)
+    assert record["status"] == "stopped" and record["phase"] in {"open", "calibration", "homing"}
+    with pytest.raises(ConfigError, match="holds 0 samples"):
+        capture.load(folder)
+
+
+def test_rows_reach_the_file_while_the_run_is_going_on(tmp_path):
+    write_experiment(tmp_path / "e.yaml", duration=30)
+    write_rig(tmp_path / "rig.yaml", options={"time": "real"})
+    process = start_rig("run", "e.yaml", "--rig", "rig.yaml", cwd=tmp_path)
+    try:
+        folder = running_capture(tmp_path, rows=20)
+        for more in (100, 200, 300):
+            until(lambda least=more: rows_in(folder) >= least, f"{more} rows")
+            assert process.poll() is None
+        assert record_of(folder)["status"] == "running"
+        assert "still running" in capture.load(folder).warning
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def test_json_of_a_run_names_folder_and_timing(tmp_path):
+    write_experiment(tmp_path / "e.yaml")
+    result = rig("run", "e.yaml", "--json", cwd=tmp_path)
+    document = json.loads(result.stdout)
+    assert document["run"]["samples"] == 400 and document["validation"] is None
+    assert document["run"]["folder"] == str(only_capture(tmp_path).relative_to(tmp_path))

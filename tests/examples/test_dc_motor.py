@@ -1,0 +1,62 @@
+from __future__ import annotations
+
+import importlib
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sysid import GASSI, BatchSimulator, Dataset, SearchSpace
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+@pytest.fixture
+def dc_motor(monkeypatch):
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    yield importlib.import_module("dc_motor")
+    sys.modules.pop("dc_motor", None)
+
+
+def test_it_is_the_motor_of_section_4_1_4(dc_motor):
+    model = dc_motor.model
+    assert dict(zip(model.parameter_names, model.nominal, strict=True)) == {
+        "resistance": 1.0,
+        "inductance": 6e-4,
+        "inertia": 8e-7,
+        "damping": 1.33e-5,
+        "constant": 2.38e-2,
+    }
+    assert model.output_names == ("current", "omega")
+    assert [signal.hold for signal in model.inputs] == ["foh", "foh"]
+
+
+def test_its_ranges_are_a_decade_either_side(dc_motor):
+    space = SearchSpace.of(dc_motor.model)
+    np.testing.assert_allclose(space.lower, dc_motor.model.nominal / 10.0)
+    np.testing.assert_allclose(space.upper, dc_motor.model.nominal * 10.0)
+    assert space.log.all()
+
+
+def test_its_equations_balance_at_steady_state(dc_motor):
+    # With 1 V and no load: K i = B omega and V = R i + K omega.
+    R, _L, _J, B, K = dc_motor.model.nominal
+    omega = 1.0 / (K + R * B / K)
+    x = (B * omega / K, omega)
+    rates = dc_motor.model.derivative(x, (1.0, 0.0), tuple(dc_motor.model.nominal))
+    np.testing.assert_allclose(np.array(rates) * [6e-4, 8e-7], 0.0, atol=1e-14)
+
+
+def test_simulate_identify_predict(dc_motor):
+    t = np.arange(200) * 0.01
+    inputs = np.column_stack(
+        [np.where(t % 1.0 < 0.5, 1.0, -1.0), 0.01 * np.sin(2 * np.pi * 0.3 * t)]
+    )
+    blank = Dataset(inputs, np.full((200, 2), np.nan), 0.01)
+    model = dc_motor.model
+    outputs = BatchSimulator(model, accuracy=1e-6).trajectories(model.nominal, blank)[0]
+    found = GASSI(model).fit(inputs, outputs, dt=0.01)
+    assert found.error_ < 1e-4
+    assert found.parameters_["resistance"] == pytest.approx(1.0, rel=0.02)
+    assert found.score(inputs, outputs, dt=0.01) > 0.999

@@ -1,0 +1,104 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from sim_rig.encoder import EncoderCounter
+
+PER_TURN = 8192
+RATE = 800.0
+PER_TICK = 16
+STEP = 1.0 / (RATE * PER_TICK)
+COUNT = 2.0 * math.pi / PER_TURN  # rad
+
+
+def latch(angle, duration, cuts=(), origin=0.0):
+    """Counts and rates of a motion angle(t) [rad], latched in one call or several."""
+    ticks = round(duration * RATE)
+    angles = angle(origin + np.arange(ticks * PER_TICK + 1) * STEP)
+    counter = EncoderCounter(PER_TURN)
+    edges = [0, *cuts, ticks]
+    parts = [
+        counter.latch(angles[a * PER_TICK : b * PER_TICK + 1], origin, a * PER_TICK, STEP, PER_TICK)
+        for a, b in zip(edges[:-1], edges[1:], strict=True)
+    ]
+    counts, rates = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return counts, rates, angles[: ticks * PER_TICK : PER_TICK]
+
+
+def wobble(t):
+    return 0.3 * np.sin(9.0 * t) + 0.02 * np.sin(140.0 * t) - 0.1
+
+
+def test_counts_are_the_floor_of_the_angle():
+    counts, _, angles = latch(wobble, 1.0)
+    np.testing.assert_array_equal(counts, np.floor(angles / COUNT))
+    assert counts.min() < 0 < counts.max()
+
+
+@pytest.mark.parametrize("speed", [0.05, 0.5, 3.0, 40.0, -0.05, -0.5, -3.0, -40.0])
+def test_the_rate_is_exact_at_constant_speed(speed):
+    counts, rates, _ = latch(lambda t: 0.123 + speed * t, 0.5)
+    expected = speed / COUNT
+    # Two edges have to pass first.
+    settled = rates[np.arange(len(rates)) / RATE > 2.5 / abs(expected)]
+    assert len(settled) > 100
+    np.testing.assert_allclose(settled, expected, rtol=1e-6)
+    assert np.sign(counts[-1] - counts[0]) == np.sign(speed)
+
+
+def test_a_tenth_of_a_second_without_an_edge_is_standstill():
+    counts, rates, _ = latch(lambda t: 2.0 * np.minimum(t, 0.2), 0.5)
+    t = np.arange(len(rates)) / RATE
+    assert np.all(rates[(t > 0.01) & (t < 0.2)] > 0.9 * 2.0 / COUNT)
+    assert np.all(rates[t > 0.302] == 0.0)
+    # In between it is no more than the wait since the last edge allows.
+    waiting = (t > 0.21) & (t < 0.299)
+    assert np.all(rates[waiting] > 0.0)
+    assert np.all(rates[waiting] <= 1.0 / (t[waiting] - 0.2))
+    assert np.all(np.diff(rates[waiting]) < 0.0)
+    assert np.ptp(counts[t > 0.21]) == 0
+
+
+def test_a_shaft_that_never_moves_has_no_rate():
+    counts, rates, _ = latch(lambda t: 0.7 + 0.0 * t, 0.2)
+    assert np.all(rates == 0.0)
+    assert np.ptp(counts) == 0
+
+
+def test_dithering_on_an_edge_is_no_motion():
+    _, rates, _ = latch(lambda t: 50 * COUNT + 0.3 * COUNT * np.sin(300.0 * t), 0.3)
+    assert np.all(rates == 0.0)
+
+
+def test_the_rate_is_small_after_a_reversal():
+    # Turns at t = 0.2, in the middle of a count.
+    speed = 1.0
+    _, rates, _ = latch(lambda t: 0.5 * COUNT - speed * np.abs(t - 0.2), 0.4)
+    t = np.arange(len(rates)) / RATE
+    full = speed / COUNT
+    np.testing.assert_allclose(rates[(t > 0.01) & (t < 0.19)], full, rtol=1e-6)
+    np.testing.assert_allclose(rates[t > 0.21], -full, rtol=1e-6)
+    # Never the old direction once the first edge of the new one has passed.
+    assert np.all(rates[t > 0.2 + 1.1 / full] <= 0.0)
+
+
+@pytest.mark.parametrize("cuts", [(1,), (7, 8, 9, 300), tuple(range(1, 799))])
+def test_where_a_motion_is_cut_does_not_change_a_bit(cuts):
+    whole, pieces = latch(wobble, 1.0, origin=3.7), latch(wobble, 1.0, cuts, origin=3.7)
+    for a, b in zip(whole, pieces, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_a_copy_is_independent():
+    counter = EncoderCounter(PER_TURN)
+    angles = np.linspace(0.0, 1.0, 5 * PER_TICK + 1)
+    counter.latch(angles, 0.0, 0, STEP, PER_TICK)
+    copy = counter.copy()
+    further = np.linspace(1.0, 2.0, 5 * PER_TICK + 1)
+    one = counter.latch(further, 0.0, 5 * PER_TICK, STEP, PER_TICK)
+    two = copy.latch(further, 0.0, 5 * PER_TICK, STEP, PER_TICK)
+    for a, b in zip(one, two, strict=True):
+        np.testing.assert_array_equal(a, b)

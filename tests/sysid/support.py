@@ -1,0 +1,144 @@
+"""Small models and records that the tests share."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from sysid import Constraint, Dataset, Input, Output, Parameter, ProcessModel, State
+
+
+def lag_derivative(x, u, p):
+    return ((p[0] * u[0] - x[0]) / p[1],)
+
+
+def lag(hold="zoh", **changes):
+    settings = {
+        "name": "lag",
+        "states": (State("y", "1"),),
+        "inputs": (Input("u", "1", hold),),
+        "outputs": (Output("y", "1"),),
+        "parameters": (
+            Parameter("gain", "1", 2.0, 0.2, 20.0, "log"),
+            Parameter("tau", "s", 0.05, 0.005, 0.5, "log"),
+        ),
+        "derivative": lag_derivative,
+    }
+    return ProcessModel(**(settings | changes))
+
+
+def motor_derivative(x, u, p):
+    current, omega = x
+    resistance, inductance, inertia, damping, constant = p
+    return (
+        (u[0] - resistance * current - constant * omega) / inductance,
+        (constant * current - damping * omega - u[1]) / inertia,
+    )
+
+
+MOTOR = {
+    "resistance": 1.0,
+    "inductance": 6e-4,
+    "inertia": 8e-7,
+    "damping": 1.33e-5,
+    "constant": 2.38e-2,
+}
+
+
+def motor(factor=10.0, constraints=()):
+    return ProcessModel(
+        name="motor",
+        states=(State("current", "A"), State("omega", "rad/s")),
+        inputs=(Input("voltage", "V", "foh"), Input("load", "N*m", "foh")),
+        outputs=(Output("current", "A"), Output("omega", "rad/s")),
+        parameters=tuple(
+            Parameter(name, "1", value, value / factor, value * factor, "log")
+            for name, value in MOTOR.items()
+        ),
+        derivative=motor_derivative,
+        constraints=constraints,
+    )
+
+
+def motor_inputs(n=200, dt=0.01, period=1.0, duty=0.5, frequency=0.3, amplitude=0.01):
+    t = np.arange(n) * dt
+    voltage = np.where(np.mod(t + 1e-9, period) < duty * period, 1.0, -1.0)
+    return np.column_stack([voltage, amplitude * np.sin(2 * math.pi * frequency * t)])
+
+
+def motor_matrices(p):
+    resistance, inductance, inertia, damping, constant = p
+    a = np.array(
+        [
+            [-resistance / inductance, -constant / inductance],
+            [constant / inertia, -damping / inertia],
+        ]
+    )
+    return a, np.array([[1.0 / inductance, 0.0], [0.0, -1.0 / inertia]])
+
+
+def motor_record(n=200, dt=0.01, **how):
+    """Noise-free response of the nominal motor, from the matrix exponential."""
+    inputs = motor_inputs(n, dt, **how)
+    outputs = linear_response(*motor_matrices(MOTOR.values()), inputs, dt, hold="foh")
+    return Dataset(inputs, outputs, dt)
+
+
+def linear_response(a, b, inputs, dt, hold, x0=None):
+    """States of x' = Ax + Bu at the samples, exact for held or linearly interpolated inputs."""
+    from scipy.linalg import expm
+
+    n, m = b.shape
+    # Augmented with the inputs and their slope, the system is autonomous.
+    block = np.zeros((n + 2 * m, n + 2 * m))
+    block[:n, :n], block[:n, n : n + m] = a, b
+    block[n : n + m, n + m :] = np.eye(m)
+    step = expm(block * dt)[:n]
+    x = np.zeros((len(inputs), n))
+    if x0 is not None:
+        x[0] = x0
+    for k in range(len(inputs) - 1):
+        slope = (inputs[k + 1] - inputs[k]) / dt if hold == "foh" else np.zeros(m)
+        x[k + 1] = step @ np.concatenate([x[k], inputs[k], slope])
+    return x
+
+
+def blank(model, inputs, dt, **first):
+    """A record with inputs alone; ``first`` gives outputs of the first row."""
+    outputs = np.full((len(inputs), len(model.outputs)), np.nan)
+    for name, value in first.items():
+        outputs[0, model.output_names.index(name)] = value
+    return Dataset(inputs, outputs, dt)
+
+
+def draw(model, rng, n):
+    """Parameter vectors drawn from the model's ranges, on each parameter's scale."""
+    vectors = np.tile(model.nominal, (n, 1))
+    for i, p in enumerate(model.parameters):
+        if p.fixed:
+            continue
+        if p.scale == "log":
+            vectors[:, i] = np.exp(rng.uniform(np.log(p.lower), np.log(p.upper), n))
+        else:
+            vectors[:, i] = rng.uniform(p.lower, p.upper, n)
+    return vectors
+
+
+def prbs(rng, n, low, high, hold=8):
+    """Random levels, each held for a while."""
+    return np.repeat(rng.uniform(low, high, -(-n // hold)), hold)[:n]
+
+
+def normalised_rms(simulated, exact):
+    scale = np.max(np.abs(exact), axis=-2)
+    scale = np.where(scale > 0.0, scale, 1.0)
+    return np.sqrt(np.mean((simulated - exact) ** 2, axis=-2)) / scale
+
+
+def never(p):
+    """A constraint that nothing meets."""
+    return 1.0 + 0.0 * p[0]
+
+
+INFEASIBLE = Constraint("1 <= 0", never)

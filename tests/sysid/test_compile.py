@@ -1,0 +1,153 @@
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PREFIX = """
+import numpy as np
+from sysid import BatchSimulator, Dataset, Input, Output, Parameter, ProcessModel, State
+"""
+
+MODEL = """
+import math
+import shared
+from shared import scaled
+
+FACTOR = np.array([1.0, 0.25])
+
+def make(shift):
+    def derivative(x, u, p):
+        return (scaled(u[0]) * FACTOR[1] - p[0] * (x[0] - shift) + shared.OFFSET,)
+    return derivative
+
+model = ProcessModel(
+    "cached", (State("y", "1"),), (Input("u", "1"),), (Output("y", "1"),),
+    (Parameter("p", "1", 1.0, 0.5, 2.0),), make(0.125),
+)
+record = Dataset(np.ones(20), np.zeros(20), 0.1)
+print(repr(float(BatchSimulator(model, threads=1).trajectories(np.ones((1, 1)), record)[0, -1, 0])))
+"""
+
+SHARED = """
+OFFSET = 0.5
+
+def scaled(value):
+    return 2.0 * value
+"""
+
+
+class Workshop:
+    """A user's folder with a model file, a helper file and a cache folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.cache = folder / "cache"
+        (folder / "shared.py").write_text(SHARED)
+        (folder / "user.py").write_text(PREFIX + MODEL)
+        self.env = os.environ | {
+            "RIG_CACHE_DIR": str(self.cache),
+            "PYTHONPATH": os.pathsep.join([str(folder), os.getcwd()]),
+            "PYTHONDONTWRITEBYTECODE": "1",
+        }
+
+    def start(self, **env: str) -> subprocess.Popen[str]:
+        return subprocess.Popen(
+            [sys.executable, "-W", "error", "user.py"],
+            cwd=self.folder, env=self.env | env, text=True,
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        )  # fmt: skip
+
+    def run(self, **env: str) -> float:
+        return self.result(self.start(**env))
+
+    @staticmethod
+    def result(process: subprocess.Popen[str]) -> float:
+        out, err = process.communicate(timeout=120)
+        assert process.returncode == 0, err
+        return float(out)
+
+    def edit(self, name: str, old: str, new: str) -> None:
+        path = self.folder / name
+        text = path.read_text()
+        assert old in text
+        path.write_text(text.replace(old, new))
+
+    def kernels(self) -> set[Path]:
+        return set(self.cache.glob("*.py"))
+
+    def files(self) -> dict[Path, tuple[int, int]]:
+        found = [p for p in self.cache.rglob("*") if p.is_file()]
+        return {p: (p.stat().st_size, p.stat().st_mtime_ns) for p in found}
+
+
+@pytest.fixture
+def workshop(tmp_path):
+    return Workshop(tmp_path)
+
+
+def settled(drive, rate=1.0, steps=19, dt=0.1):
+    """y' = drive - rate y from 0, exactly."""
+    import math
+
+    return drive / rate * (1.0 - math.exp(-rate * steps * dt))
+
+
+# drive = 2 u FACTOR[1] + p shift + OFFSET
+BEFORE = 2.0 * 0.25 + 0.125 + 0.5
+
+
+def test_a_second_process_loads_what_the_first_compiled(workshop):
+    first = workshop.run()
+    assert first == pytest.approx(settled(BEFORE), rel=1e-3)
+    files = workshop.files()
+    assert len(workshop.kernels()) == 1
+    assert any(path.suffix == ".nbc" for path in files)
+    assert workshop.run() == first
+    assert workshop.files() == files
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "drive"),
+    [
+        ("user.py", "- p[0] * (x", "+ 0.5 - p[0] * (x", BEFORE + 0.5),
+        ("user.py", "make(0.125)", "make(0.25)", BEFORE + 0.125),
+        ("user.py", "[1.0, 0.25]", "[1.0, 0.2500000001]", BEFORE + 2e-10),
+        ("shared.py", "2.0 * value", "3.0 * value", BEFORE + 0.25),
+        ("shared.py", "OFFSET = 0.5", "OFFSET = 0.75", BEFORE + 0.25),
+    ],
+    ids=["equation", "closure constant", "array", "helper", "constant in a module"],
+)
+def test_a_change_is_noticed(workshop, name, old, new, drive):
+    before = workshop.run()
+    kernels = workshop.kernels()
+    workshop.edit(name, old, new)
+    after = workshop.run()
+    assert after != before
+    assert after == pytest.approx(settled(drive), rel=1e-3)
+    assert len(workshop.kernels() - kernels) == 1
+
+
+def test_two_processes_that_start_at_once_both_work(workshop):
+    processes = [workshop.start(), workshop.start()]
+    one, two = [workshop.result(process) for process in processes]
+    assert one == two
+    assert not list(workshop.cache.glob("*.tmp"))
+
+
+def test_a_cache_folder_that_cannot_be_made_is_done_without(workshop):
+    workshop.cache.write_text("a file stands where the folder should be")
+    assert workshop.run() == pytest.approx(settled(BEFORE), rel=1e-3)
+
+
+def test_a_cache_folder_that_takes_no_machine_code_is_done_without(workshop):
+    workshop.cache.mkdir()
+    (workshop.cache / "__pycache__").write_text("in the way")
+    blocked = workshop.folder / "blocked"
+    blocked.write_text("no home either")
+    home = str(blocked / "home")
+    found = workshop.run(HOME=home, XDG_CACHE_HOME=home)
+    assert found == pytest.approx(settled(BEFORE), rel=1e-3)

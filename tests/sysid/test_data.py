@@ -1,0 +1,51 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sysid import Dataset, ModelError, output_scale
+from tests.sysid.support import lag, motor
+
+
+def test_columns_may_be_vectors():
+    data = Dataset(np.zeros(5), np.ones(5), 0.1)
+    assert data.inputs.shape == data.outputs.shape == (5, 1)
+    assert data.n_samples == 5
+    assert np.allclose(data.time, [0.0, 0.1, 0.2, 0.3, 0.4])
+
+
+@pytest.mark.parametrize(
+    ("inputs", "outputs", "dt", "message"),
+    [
+        (np.zeros(4), np.zeros(5), 0.1, "4 rows of inputs, 5 of outputs"),
+        (np.zeros(1), np.zeros(1), 0.1, "at least 2"),
+        (np.zeros(3), np.zeros(3), 0.0, "must be positive"),
+        (np.zeros(3), np.zeros(3), np.nan, "must be positive"),
+        (np.array([0.0, np.nan, 0.0]), np.zeros(3), 0.1, "not finite in row 1"),
+    ],
+)
+def test_bad_records(inputs, outputs, dt, message):
+    with pytest.raises(ModelError, match=message):
+        Dataset(inputs, outputs, dt)
+
+
+def test_columns_are_checked_against_the_model():
+    with pytest.raises(ModelError, match="1 inputs and 1 outputs.*motor has 2 and 2"):
+        Dataset(np.zeros(5), np.zeros(5), 0.1).check(motor())
+
+
+def test_a_run_starts_from_the_first_measured_row_and_else_as_declared():
+    model = motor()
+    outputs = np.zeros((3, 2))
+    outputs[0] = [0.7, np.nan]
+    assert Dataset(np.zeros((3, 2)), outputs, 0.1).initial_state(model).tolist() == [0.7, 0.0]
+    assert Dataset(np.zeros(3), np.array([4.0, 0, 0]), 0.1).initial_state(lag()).tolist() == [4.0]
+
+
+def test_output_scale_is_the_largest_magnitude_over_all_records_or_each():
+    a = Dataset(np.zeros(3), np.array([[1.0, 0.0, 2.0], [-3.0, 0.0, np.nan], [0, 0, 1.0]]), 0.1)
+    b = Dataset(np.zeros(2), np.array([[2.0, 0.0, np.nan], [-1.0, 0.0, np.nan]]), 0.2)
+    together = output_scale([a, b])
+    assert [scale.tolist() for scale in together] == [[3.0, 1.0, 2.0]] * 2
+    each = output_scale([a, b], per_log=True)
+    assert [scale.tolist() for scale in each] == [[3.0, 1.0, 2.0], [2.0, 1.0, 1.0]]

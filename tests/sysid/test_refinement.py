@@ -1,0 +1,150 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sysid import (
+    BatchSimulator,
+    Constraint,
+    Dataset,
+    Input,
+    Output,
+    Parameter,
+    ProcessModel,
+    SearchSpace,
+    State,
+)
+from sysid.objective import Objective
+from sysid.refinement import refine
+from tests.sysid.support import MOTOR, draw, lag, motor, motor_record
+
+
+def objective(model, records, accuracy=1e-6, **how):
+    return Objective(
+        BatchSimulator(model, accuracy=accuracy), SearchSpace.of(model), records, **how
+    )
+
+
+# --- the figure that is minimised -----------------------------------------------------------
+
+
+def test_the_error_is_the_mean_over_outputs_of_the_normalised_rmse():
+    records = [motor_record(60), motor_record(90, amplitude=0.02)]
+    target = objective(motor(), records)
+    vector = motor().nominal * 1.02
+    error, _ = target.evaluate(vector[None])
+    peak = np.maximum(*[np.abs(r.outputs).max(axis=0) for r in records])
+    residual = np.concatenate(
+        [(target.simulator.trajectories(vector, r)[0] - r.outputs) / peak for r in records]
+    )
+    expected = np.mean(np.sqrt(np.mean(residual**2, axis=0)))
+    assert error[0] == pytest.approx(expected, rel=1e-3)
+    weighted, _ = objective(motor(), records, weights=np.array([3.0, 1.0])).evaluate(vector[None])
+    parts = np.sqrt(np.mean(residual**2, axis=0))
+    assert weighted[0] == pytest.approx(0.75 * parts[0] + 0.25 * parts[1], rel=1e-3)
+
+
+def test_the_error_does_not_grow_with_lost_samples():
+    record = motor_record(60)
+    outputs = record.outputs.copy()
+    outputs[1::2] = np.nan
+    vector = motor().nominal[None] * 1.02
+    full, _ = objective(motor(), [record]).evaluate(vector)
+    half, _ = objective(motor(), [Dataset(record.inputs, outputs, record.dt)]).evaluate(vector)
+    assert half[0] == pytest.approx(full[0], rel=0.2)
+
+
+def test_an_output_that_was_never_measured_is_named():
+    record = motor_record(60)
+    outputs = record.outputs.copy()
+    outputs[:, 1] = np.nan
+    with pytest.raises(ValueError, match="no record has a measured sample of output 'omega'"):
+        objective(motor(), [Dataset(record.inputs, outputs, record.dt)])
+
+
+# --- Levenberg-Marquardt --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_it_finds_the_motor_from_nearby(seed):
+    target = objective(motor(), [motor_record()])
+    start = draw(motor(1.15), np.random.default_rng(seed), 1)[0]
+    before, _ = target.evaluate(start[None])
+    seen = []
+    result = refine(target, start, on_iteration=lambda i, e: seen.append(e))
+    assert result.error < 1e-4 * before[0]
+    assert len(seen) == result.iterations
+    np.testing.assert_allclose(result.chromosome, list(MOTOR.values()), rtol=1e-2)
+
+
+def test_it_stays_in_range_and_gains_nonetheless():
+    model = motor(1.2).with_parameters(resistance={"lower": 1.1, "upper": 1.3, "nominal": 1.2})
+    target = objective(model, [motor_record()])
+    start = model.nominal * 1.05
+    before, _ = target.evaluate(start[None])
+    result = refine(target, start)
+    space = target.space
+    assert np.all(result.chromosome >= space.lower * (1 - 1e-12))
+    assert np.all(result.chromosome <= space.upper * (1 + 1e-12))
+    assert result.chromosome[0] == pytest.approx(1.1)
+    assert result.error < before[0]
+
+
+def test_it_keeps_the_constraints():
+    limit = Constraint("resistance >= 1.05", lambda p: 1.05 - p[0])
+    target = objective(motor(1.5, (limit,)), [motor_record()])
+    start = motor().nominal * 1.1
+    before, _ = target.evaluate(start[None])
+    result = refine(target, start)
+    assert result.chromosome[0] >= 1.05
+    assert result.error < before[0]
+
+
+def mass_derivative(x, u, p):
+    return (p[0] * u[0] + p[1] * u[1] + p[2],)
+
+
+def test_it_solves_a_linear_problem_as_lstsq_does():
+    """y' is linear in the parameters, so y is too; the records' noise leaves a residue."""
+    parameters = tuple(Parameter(f"p{i}", "1", 0.0, -5.0, 5.0, minimum=-9.0) for i in range(3))
+    model = ProcessModel(
+        "mass", (State("v", "m/s"),), (Input("a", "1"), Input("b", "1")), (Output("v", "m/s"),),
+        parameters, mass_derivative,
+    )  # fmt: skip
+    rng = np.random.default_rng(3)
+    n, dt = 80, 0.1
+    inputs = rng.uniform(-1.0, 1.0, (n, 2))
+    columns = np.column_stack([inputs, np.ones(n)])
+    design = np.vstack([np.zeros(3), np.cumsum(columns[:-1] * dt, axis=0)])
+    outputs = design @ np.array([1.5, -2.0, 0.3]) + rng.normal(0.0, 0.05, n)
+    outputs[0] = 0.0
+    solution = np.linalg.lstsq(design, outputs, rcond=None)[0]
+    target = objective(model, [Dataset(inputs, outputs, dt)])
+    result = refine(target, np.array([-3.0, 3.0, -1.0]))
+    np.testing.assert_allclose(result.chromosome, solution, atol=1e-4)
+    residue = np.sqrt(np.mean((design @ solution - outputs) ** 2)) / np.abs(outputs).max()
+    assert result.error == pytest.approx(residue, rel=1e-5)
+
+
+def test_two_noisy_outputs_end_at_the_minimum_of_the_mean_rmse():
+    """The figure is a sum of roots, not of squares: the gradient of that sum must vanish."""
+    rng = np.random.default_rng(4)
+    clean = motor_record()
+    noise = rng.normal(size=clean.outputs.shape) * [0.05, 2.0] * [1.0, 3.0]
+    target = objective(motor(2.0), [Dataset(clean.inputs, clean.outputs + noise, clean.dt)], 1e-7)
+    result = refine(target, motor().nominal, tolerance=1e-12)
+    steps = np.diag(np.full(5, 1e-3)) * result.chromosome
+    around, _ = target.evaluate(np.vstack([result.chromosome + steps, result.chromosome - steps]))
+    assert np.all(around >= result.error * (1.0 - 1e-6))
+
+
+def test_a_chromosome_that_cannot_be_simulated_is_returned_as_it_is():
+    record = Dataset(np.ones(300), np.linspace(1.0, 2.0, 300), 0.01)
+    parameters = (
+        Parameter("gain", "1", 1.0, 0.1, 9.0),
+        Parameter("tau", "s", 0.1, -0.01, -0.001, minimum=-1.0),
+    )
+    target = objective(lag(parameters=parameters), [record], 1e-3)
+    result = refine(target, np.array([0.5, -0.001]))
+    assert not np.isfinite(result.error)
+    assert result.iterations == 0
