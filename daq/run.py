@@ -172,9 +172,16 @@ class _Run:
         try:
             with LogWriter(self.capture.log_path) as log:
                 self._phases(log)
-        except BaseException as error:
+        except (RigError, KeyboardInterrupt, Terminated) as error:
             self._finish(*_outcome(error, self.phase))
             raise
+        except Exception as error:
+            reason = (
+                f"the backend failed during {self.phase.value}: {type(error).__name__}: {error}; "
+                "outputs were set to zero. Mend the backend, or report this to who maintains it"
+            )
+            self._finish("failed", reason)
+            raise DeviceError(reason) from error
         self._finish(COMPLETED, None)
         return RunResult(self.capture.folder, log.n_samples, self.capture.record["timing"])
 
@@ -341,6 +348,4 @@ def _outcome(error: BaseException, phase: Phase) -> tuple[str, str]:
         return "stopped", f"stopped by {error} {where}"
     if isinstance(error, InterlockError):
         return "interlock", str(error)
-    if isinstance(error, RigError):
-        return "failed", str(error)
-    return "failed", f"{type(error).__name__} {where}: {error}"
+    return "failed", str(error)
