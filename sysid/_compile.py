@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from sysid import _kernel
-from sysid.model import ModelError, ProcessModel
+from sysid.model import IntArray, ModelError, ProcessModel
 
 _OPTIONS: dict[str, Any] = {
     # IEEE division instead of exceptions, and none of the flags that would let the compiler
@@ -41,6 +41,7 @@ class Kernels:
     simulate: Callable[..., None]
     spectrum: Callable[..., None]
     advance: Callable[..., None]
+    triples: IntArray
     work_size: int
     fewest_steps: int
 
@@ -90,6 +91,7 @@ def kernels(model: ProcessModel) -> Kernels:
         _guarded(model, decorate(scope["simulate"])),
         _guarded(model, decorate(scope["spectrum"])),
         _guarded(model, decorate(scope["advance"])),
+        np.array(shape.structure.products(shape.n_states), dtype=np.int64),
         shape.work_size,
         shape.fewest_steps,
     )

@@ -126,7 +126,7 @@ def source(shape: Shape) -> str:
 
 def _prepare(s: Shape) -> str:
     """Matrices of the scheme for one lane."""
-    lines = ["def prepare(X, u, h, l, J, M):"]
+    lines = ["def prepare(X, u, h, l, triples, J, M):"]
     add = lines.append
     columns = sorted({j for _, j in s.structure.constant})
     if not columns:
@@ -145,7 +145,7 @@ def _prepare(s: Shape) -> str:
         lines += [f"    J[{i}, {j}] = f{i} - k{i}" for i, q in s.structure.constant if q == j]
     for i, j in s.pattern("A"):
         add(f"    X[{_at(s.place('A', i, j))}] = J[{i}, {j}]")
-    add("    phi_matrices(J, h, M)")
+    add("    phi_matrices(J, h, triples, M)")
     values = {
         "Q": "M[0, {0}, {1}]",
         "F": "M[1, {0}, {1}]",
@@ -162,7 +162,7 @@ def _simulate(s: Shape) -> str:
     n, q, lanes = s.n_states, s.n_outputs, LANES
     first_sum = s.place("sum", 0)
     lines = [
-        "def simulate(X, u, y, w, start, p, dt, n_steps, sums, record):",
+        "def simulate(X, triples, u, y, w, start, p, dt, n_steps, sums, record):",
         "    n_samples = u.shape[0]",
         "    store = record.shape[0] > 0",
         *_step_sizes(),
@@ -173,7 +173,7 @@ def _simulate(s: Shape) -> str:
         f"            X[({n} + i) * {lanes} + l] = p[i, l]",
         f"        for i in range({2 * q}):",
         f"            X[({first_sum} + i) * {lanes} + l] = 0.0",
-        "        prepare(X, u, h, l, J, M)",
+        "        prepare(X, u, h, l, triples, J, M)",
         "    for k in range(n_samples):",
     ]
     add = lines.append
@@ -321,44 +321,58 @@ def _lane_outputs(s: Shape) -> list[str]:
 
 
 def _spectrum(s: Shape) -> str:
-    n, m, r = s.n_states, s.n_inputs, s.n_parameters
-    head = [
-        "def spectrum(u, x, p, rate):",
+    """Bound on the fastest rate of N.
+
+    Only the driven rows of its Jacobian are not zero, so that its eigenvalues are those of the
+    block of driven rows and columns.
+    """
+    rows = s.structure.driven
+    r = len(rows)
+    head = ["def spectrum(u, x, p, rate):"]
+    if not rows:
+        return "\n".join([*head, "    pass"])
+    head += [
         # Not a literal: the compiler would unroll the matrix products for seconds.
-        "    n = x.shape[1]",
+        f"    n = min(x.shape[1], {r})",
         "    J = np.empty((n, n))",
         "    T = np.empty((n, n))",
-        f"    X = np.empty({n})",
-        f"    F = np.empty({n})",
+        f"    X = np.empty({s.n_states})",
+        f"    F = np.empty({r})",
         "    for k in range(u.shape[0]):",
         "        for l in range(rate.shape[0]):",
     ]
-    lines = [f"x{i} = x[k, {i}, l]" for i in range(n)]
+    lines = [f"X[{i}] = x[k, {i}, l]" for i in range(s.n_states)]
     add = lines.append
-    finite = " and ".join(f"math.isfinite(x{i})" for i in range(n))
+    finite = " and ".join(f"math.isfinite(X[{i}])" for i in range(s.n_states))
     add(f"if not ({finite}):")
     add("    continue")
-    add(f"uu = {_tuple(f'u[k, {j}]' for j in range(m))}")
-    add(f"pp = {_tuple(f'p[{i}, l]' for i in range(r))}")
-    for i in range(n):
-        add(f"X[{i}] = x{i}")
+    add(f"uu = {_tuple(f'u[k, {j}]' for j in range(s.n_inputs))}")
+    add(f"pp = {_tuple(f'p[{i}, l]' for i in range(s.n_parameters))}")
     # Round -1 evaluates at the point itself; a single call site keeps compilation short.
-    at = _tuple(f"X[{i}]" for i in range(n))
+    at = _tuple(f"X[{i}]" for i in range(s.n_states))
     lines += [
-        f"for j in range(-1, {n}):",
+        f"for j in range(-1, {r}):",
         "    d = 0.0",
+        "    q = 0",
+        "    kept = X[0]",
         "    if j >= 0:",
-        "        kept = X[j]",
+        *[f"        q = {row} if j == {j} else q" for j, row in enumerate(rows)],
+        "        kept = X[q]",
         "        d = 1e-7 * max(abs(kept), 1e-2)",
-        "        X[j] = kept + d",
-        f"    {_targets('a', n)} = derivative({at}, uu, pp)",
+        "        X[q] = kept + d",
+        f"    {_targets('a', s.n_states)} = derivative({at}, uu, pp)",
         "    if j < 0:",
+        *[f"        F[{i}] = a{row}" for i, row in enumerate(rows)],
+        "    else:",
+        "        X[q] = kept",
+        *[f"        J[{i}, j] = (a{row} - F[{i}]) / d" for i, row in enumerate(rows)],
     ]
-    lines += [f"        F[{i}] = a{i}" for i in range(n)]
-    lines += ["    else:", "        X[j] = kept"]
-    lines += [f"        J[{i}, j] = (a{i} - F[{i}]) / d" for i in range(n)]
     # What is integrated exactly does not limit the step.
-    lines += [f"J[{i}, {j}] = 0.0" for i, j in s.structure.constant]
+    lines += [
+        f"J[{rows.index(i)}, {rows.index(j)}] = 0.0"
+        for i, j in s.structure.constant
+        if i in rows and j in rows
+    ]
     lines += [
         "exponent = 0.0",
         f"for squaring in range({_SQUARINGS + 1}):",
@@ -397,14 +411,14 @@ def _advance(s: Shape) -> str:
     """One trajectory, by the same step in lane 0."""
     n = s.n_states
     lines = [
-        "def advance(X, u, x, p, dt, n_steps, trace, outputs):",
+        "def advance(X, triples, u, x, p, dt, n_steps, trace, outputs):",
         "    l = 0",
         *_step_sizes(),
         "    for i in range(x.shape[0]):",
         f"        X[i * {LANES}] = x[i]",
         "    for i in range(p.shape[0]):",
         f"        X[({n} + i) * {LANES}] = p[i]",
-        "    prepare(X, u, h, l, J, M)",
+        "    prepare(X, u, h, l, triples, J, M)",
         "    for k in range(u.shape[0] - 1):",
         *[f"        v{j} = u[k, {j}]" for j in range(s.n_inputs)],
         *[f"        {line}" for line in _lane_outputs(s)],

@@ -13,22 +13,19 @@ import math
 import numpy as np
 from numba import njit
 
-from sysid.model import FloatArray
+from sysid.model import FloatArray, IntArray
 
 _SMALL = 0.5  # norm at which the series takes over
 _TERMS = 10  # leaves 0.5^10/13! = 2e-13
 
 
 @njit(error_model="numpy")
-def multiply(a: FloatArray, b: FloatArray, c: FloatArray) -> None:
-    """C = A B for small square matrices."""
-    n = a.shape[0]
-    for i in range(n):
-        for j in range(n):
-            total = 0.0
-            for k in range(n):
-                total += a[i, k] * b[k, j]
-            c[i, j] = total
+def multiply(a: FloatArray, b: FloatArray, c: FloatArray, triples: IntArray) -> None:
+    """C = A B, where only the products a[i, k] b[k, j] of the triples (i, k, j) are not zero."""
+    c[:] = 0.0
+    for t in range(triples.shape[0]):
+        i, k, j = triples[t, 0], triples[t, 1], triples[t, 2]
+        c[i, j] += a[i, k] * b[k, j]
 
 
 @njit(error_model="numpy")
@@ -54,11 +51,12 @@ def balance(a: FloatArray, d: FloatArray) -> None:
 
 @njit(error_model="numpy")
 def phi_matrices(  # noqa: PLR0912  (one function: each call between them would copy arrays)
-    a: FloatArray, h: float, out: FloatArray
+    a: FloatArray, h: float, triples: IntArray, out: FloatArray
 ) -> None:
     """For Z = h A: h/2 phi_1(Z/2), then h phi_1(Z), h phi_2(Z), h phi_3(Z), into ``out``.
 
-    a: (n, n), overwritten; out: (4, n, n). Not-a-number throughout when A is not finite.
+    a: (n, n), overwritten; out: (4, n, n). triples: (m, 3), see ``multiply``, for the pattern of
+    e^a. Not-a-number throughout when A is not finite.
     """
     n = a.shape[0]
     d = np.empty(n)
@@ -88,18 +86,18 @@ def phi_matrices(  # noqa: PLR0912  (one function: each call between them would 
         p3[i, i] = 1.0 / factorial
     for k in range(_TERMS + 3, 3, -1):  # Horner: sum of Z^m / (m + 3)!
         factorial /= k
-        multiply(z, p3, work)
+        multiply(z, p3, work, triples)
         for i in range(n):
             for j in range(n):
                 p3[i, j] = work[i, j]
             p3[i, i] += 1.0 / factorial
-    multiply(z, p3, p2)
+    multiply(z, p3, p2, triples)
     for i in range(n):
         p2[i, i] += 0.5
-    multiply(z, p2, p1)
+    multiply(z, p2, p1, triples)
     for i in range(n):
         p1[i, i] += 1.0
-    multiply(z, p1, e)
+    multiply(z, p1, e, triples)
     for i in range(n):
         e[i, i] += 1.0
     for doubling in range(halvings):
@@ -107,19 +105,19 @@ def phi_matrices(  # noqa: PLR0912  (one function: each call between them would 
             for i in range(n):
                 for j in range(n):
                     out[0, i, j] = 0.5 * h * p1[i, j] * d[i] / d[j]
-        multiply(e, p3, work)
+        multiply(e, p3, work, triples)
         for i in range(n):
             for j in range(n):
                 p3[i, j] = 0.125 * (work[i, j] + 0.5 * p1[i, j] + p2[i, j] + p3[i, j])
-        multiply(e, p2, work)
+        multiply(e, p2, work, triples)
         for i in range(n):
             for j in range(n):
                 p2[i, j] = 0.25 * (work[i, j] + p1[i, j] + p2[i, j])
-        multiply(e, p1, work)
+        multiply(e, p1, work, triples)
         for i in range(n):
             for j in range(n):
                 p1[i, j] = 0.5 * (work[i, j] + p1[i, j])
-        multiply(e, e, work)
+        multiply(e, e, work, triples)
         for i in range(n):
             for j in range(n):
                 e[i, j] = work[i, j]

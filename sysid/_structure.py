@@ -39,6 +39,11 @@ class Structure:
             reach |= {(i, j) for i in via for j in to}
         return tuple(sorted(reach))
 
+    def products(self, n_states: int) -> tuple[tuple[int, int, int], ...]:
+        """Triples (i, k, j) for which entries (i, k) and (k, j) of the closure both exist."""
+        entries = self.closure(n_states)
+        return tuple((i, k, j) for i, k in entries for row, j in entries if row == k)
+
 
 def analyse(model: ProcessModel) -> Structure:
     """Trace a model's derivative; where it cannot be traced every row counts as nonlinear."""

@@ -291,6 +291,7 @@ class _Runner:
         sums = np.empty((2 * q, LANES))
         self.kernels.simulate(
             _aligned(self.kernels.work_size),
+            self.kernels.triples,
             self.record.inputs,
             self.y,
             self.w,

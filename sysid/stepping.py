@@ -45,6 +45,7 @@ class Stepper:
         outputs = np.empty((n, len(self.model.outputs)))
         self._kernels.advance(
             np.empty(self._kernels.work_size),
+            self._kernels.triples,
             np.ascontiguousarray(u),
             x,
             self.parameters,
