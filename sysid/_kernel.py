@@ -53,6 +53,7 @@ class Shape:
     n_parameters: int
     foh: tuple[bool, ...]
     output_states: tuple[int, ...] | None
+    initial: tuple[float, ...]
     structure: Structure
 
     @classmethod
@@ -65,6 +66,7 @@ class Shape:
             len(model.parameters),
             tuple(signal.hold == "foh" for signal in model.inputs),
             model.output_states,
+            tuple(float(value) for value in model.initial_state),
             analyse(model),
         )
 
@@ -126,15 +128,16 @@ def source(shape: Shape) -> str:
 
 def _prepare(s: Shape) -> str:
     """Matrices of the scheme for one lane."""
-    lines = ["def prepare(X, u, h, l, triples, J, M):"]
+    lines = ["def prepare(X, h, l, triples, J, M):"]
     add = lines.append
     columns = sorted({j for _, j in s.structure.constant})
     if not columns:
         return "\n".join([*lines, "    pass"])
     n = s.n_states
-    add(f"    uu = {_tuple(f'u[0, {j}]' for j in range(s.n_inputs))}")
+    # Always from the same point: A must not differ in its last bits with where a run begins.
+    add(f"    uu = {_tuple('0.0' for _ in range(s.n_inputs))}")
     add(f"    pp = {_parameters(s)}")
-    lines += [f"    x{i} = X[{_at(s.place('state', i))}]" for i in range(n)]
+    lines += [f"    x{i} = {value!r}" for i, value in enumerate(s.initial)]
     add(f"    {_targets('k', n)} = derivative({_tuple(f'x{i}' for i in range(n))}, uu, pp)")
     lines += ["    for i in range(J.shape[0]):", "        for j in range(J.shape[0]):"]
     add("            J[i, j] = 0.0")
@@ -173,7 +176,7 @@ def _simulate(s: Shape) -> str:
         f"            X[({n} + i) * {lanes} + l] = p[i, l]",
         f"        for i in range({2 * q}):",
         f"            X[({first_sum} + i) * {lanes} + l] = 0.0",
-        "        prepare(X, u, h, l, triples, J, M)",
+        "        prepare(X, h, l, triples, J, M)",
         "    for k in range(n_samples):",
     ]
     add = lines.append
@@ -418,7 +421,7 @@ def _advance(s: Shape) -> str:
         f"        X[i * {LANES}] = x[i]",
         "    for i in range(p.shape[0]):",
         f"        X[({n} + i) * {LANES}] = p[i]",
-        "    prepare(X, u, h, l, triples, J, M)",
+        "    prepare(X, h, l, triples, J, M)",
         "    for k in range(u.shape[0] - 1):",
         *[f"        v{j} = u[k, {j}]" for j in range(s.n_inputs)],
         *[f"        {line}" for line in _lane_outputs(s)],

@@ -10,6 +10,7 @@ from sysid._compile import kernels
 from sysid.model import FloatArray, ModelError, ProcessModel
 
 _STEP_LIMIT = 0.3
+_LEAST_STEPS = 16
 
 
 class Stepper:
@@ -64,4 +65,6 @@ class Stepper:
             self.parameters[:, None],
             rate,
         )
-        return max(1, math.ceil(float(rate[0]) * self.dt / _STEP_LIMIT))
+        # A linear model is exact in one step; else fast linear parts feed the nonlinear one.
+        least = 1 if self._kernels.fewest_steps == 1 else _LEAST_STEPS
+        return max(least, math.ceil(float(rate[0]) * self.dt / _STEP_LIMIT))

@@ -70,7 +70,7 @@ model = ProcessModel(
         Parameter("gain", "N/A", **between(300.0, 6000.0, "its rise with a small current")),
         Parameter("saturation", "A", **between(0.5, 20.0, "current that halves that rise")),
         Parameter(
-            "stiffness", "N/m", **between(3e5, 2e7, "rod, joints and fluid column before yield")
+            "stiffness", "N/m", **between(3e5, 1e7, "rod, joints and fluid column before yield")
         ),
         Parameter("spring", "N/m", **between(1e2, 1e4, "accumulator, without current")),
         Parameter("spring_gain", "N/(m*A)", **between(1e2, 1e4, "its rise with current")),

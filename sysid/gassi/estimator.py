@@ -232,7 +232,8 @@ class GASSI(BaseEstimator):  # type: ignore[misc]
         # It rarely needs all the iterations it may take.
         notify(Progress("refine", result.iterations, result.iterations, result.error))
         if result.error < self.error_:
-            self._take(result.chromosome, result.error, True)
+            violations = self.space_.violations(result.chromosome[None])
+            self._take(result.chromosome, result.error, bool(np.all(violations <= 0.0)))
 
     def _take(self, chromosome: FloatArray | None, error: float, feasible: bool) -> None:
         assert chromosome is not None

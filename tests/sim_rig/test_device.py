@@ -95,12 +95,13 @@ def test_an_interlock_cuts_at_the_same_sample_however_commands_are_chunked():
     guard = Guard(
         OPEN_GUARD.command_low, OPEN_GUARD.command_high, np.full(3, -2.2), np.full(3, 2.2)
     )
-    commands = np.column_stack([np.linspace(0.0, 4.0, 600), np.zeros(600)])
+    commands = np.column_stack([np.where(np.arange(600) < 333, 0.2, 4.0), np.zeros(600)])
     whole = play(device(seed=2), commands, None, guard)
     row = np.flatnonzero(whole.flags & Flag.INTERLOCK)
     assert len(row) == 1
     assert np.all(whole.applied[row[0] :] == 0.0)
-    assert np.all(whole.applied[1 : row[0], 0] > 0.0)
+    assert row[0] in (334, 335)  # latched a tick after the command
+    assert np.all(whole.applied[: row[0], 0] > 0.0)
     assert np.all(np.abs(whole.analog[: row[0]]) <= 2.2)
     assert np.any(np.abs(whole.analog[row[0]]) > 2.2)
     pieces = play(device(seed=2), commands, 50, guard)
@@ -228,8 +229,8 @@ def test_current_and_torque_sense():
 def test_an_input_beyond_the_converter_is_flagged_and_clipped():
     found = play(device(current_sense=8.0), np.tile([4.0, 0.0], (80, 1)))
     flagged = (found.flags & Flag.SATURATED) != 0
-    assert flagged[-1]
     assert not flagged[0]
+    assert flagged[1:3].any()
     assert found.analog[flagged, 0].max() == 10.0 - RESOLUTION
 
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -22,7 +23,7 @@ def latch(angle, duration, cuts=(), origin=0.0):
     edges = [0, *cuts, ticks]
     parts = [
         counter.latch(angles[a * PER_TICK : b * PER_TICK + 1], origin, a * PER_TICK, STEP, PER_TICK)
-        for a, b in zip(edges[:-1], edges[1:], strict=True)
+        for a, b in pairwise(edges)
     ]
     counts, rates = (np.concatenate(column) for column in zip(*parts, strict=True))
     return counts, rates, angles[: ticks * PER_TICK : PER_TICK]

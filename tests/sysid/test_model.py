@@ -61,7 +61,7 @@ def test_a_derivative_that_is_no_tuple():
 
 
 def test_a_derivative_that_raises_is_reported_with_its_cause():
-    with pytest.raises(ModelError, match="derivative.*fails.*IndexError"):
+    with pytest.raises(ModelError, match=r"derivative.*fails.*IndexError"):
         build(derivative=lambda x, u, p: (x[5],))
     with pytest.raises(ModelError, match="divides by zero"):
         build(derivative=lambda x, u, p: (1.0 / x[0],))

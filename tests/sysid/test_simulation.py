@@ -32,7 +32,6 @@ from tests.sysid.support import (
     motor_inputs,
     motor_matrices,
     motor_record,
-    normalised_rms,
     prbs,
 )
 
@@ -175,9 +174,11 @@ def test_accuracy_is_held_on_the_dc_motor(accuracy):
 
 
 def test_finer_accuracy_takes_more_steps():
-    record = motor_record()
+    rng, n = np.random.default_rng(8), 200
+    inputs = np.column_stack([prbs(rng, n, -1, 1), prbs(rng, n, 0, 0.14), np.zeros(n)])
+    record = blank(actuator(), inputs, 1.0 / 800.0)
     needed = [
-        BatchSimulator(motor(), accuracy=a).steps_needed(motor().nominal, record)
+        BatchSimulator(actuator(), accuracy=a).steps_needed(actuator().nominal, record)
         for a in (1e-1, 1e-3, 1e-5, 1e-7)
     ]
     assert needed == sorted(needed)

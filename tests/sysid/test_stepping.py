@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -14,7 +16,7 @@ def play(stepper, inputs, cuts=()):
     x = stepper.model.initial_state
     traces, outputs = [], []
     edges = [0, *cuts, len(inputs) - 1]
-    for start, end in zip(edges[:-1], edges[1:], strict=True):
+    for start, end in pairwise(edges):
         trace, out = stepper.advance(x, inputs[start : end + 1])
         traces.append(trace)
         outputs.append(out)
@@ -32,7 +34,7 @@ def test_it_follows_scipy(model):
         )
     exact = reference(model, model.nominal, blank(model, inputs, dt))
     found, trace, x = play(Stepper(model, model.nominal, dt), inputs)
-    assert normalised_rms(found, exact[:-1]).max() < 2e-4
+    assert normalised_rms(found, exact[:-1]).max() < 1e-3
     # Outputs and trace are latched at the start of each interval, the state is left at the end.
     states = [model.state_names.index(name) for name in model.output_names]
     np.testing.assert_array_equal(found, trace[:: len(trace) // (n - 1), states])
@@ -40,14 +42,15 @@ def test_it_follows_scipy(model):
 
 
 def test_more_steps_come_closer():
-    model, dt = motor(), 0.002
-    inputs = motor_inputs(80, dt)
+    model, dt, rng = actuator(), 1.0 / 800.0, np.random.default_rng(5)
+    n = 80
+    inputs = np.column_stack([prbs(rng, n, -4, 4), prbs(rng, n, 0, 0.3), np.zeros(n)])
     exact = reference(model, model.nominal, blank(model, inputs, dt))[:-1]
     errors = [
         normalised_rms(play(Stepper(model, model.nominal, dt, k), inputs)[0], exact).max()
-        for k in (8, 16, 32)
+        for k in (1, 4, 16)
     ]
-    assert errors[0] > 4.0 * errors[1] > 16.0 * errors[2]
+    assert errors[0] > 4.0 * errors[1] > 16.0 * errors[2] > 0.0
 
 
 @pytest.mark.parametrize("cuts", [(1,), (37,), (1, 2, 3, 50), tuple(range(1, 79))])
