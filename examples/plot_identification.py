@@ -1,6 +1,6 @@
 """Draw measured against identified outputs of a capture (needs matplotlib).
 
-    python plot_identification.py runs/<validation run> runs/<run>/identification/parameters.yaml
+python plot_identification.py runs/<validation run> runs/<run>/identification/parameters.yaml
 """
 
 import sys

@@ -119,8 +119,10 @@ def _candidates(
     held = ((at <= lower) & (gradient > 0.0)) | ((at >= upper) & (gradient < 0.0))
     free = np.flatnonzero(~held)
     moves = np.zeros((LANES, len(at)))
-    if len(free):
+    with np.errstate(over="ignore", invalid="ignore"):
         normal = rows[:, free].T @ rows[:, free]
+    # Sensitivities may be too large to square at the edge of instability: then stay.
+    if len(free) and np.all(np.isfinite(normal)):
         values, vectors = np.linalg.eigh(normal)
         values = np.maximum(values, 0.0)
         projected = vectors.T @ gradient[free]

@@ -54,7 +54,7 @@ def print_table(
         # A pipe has no width: nothing may be cut.
         console = Console(file=sys.stdout, highlight=False, width=200, no_color=True)
     table = Table(
-        title=title, title_justify="left", title_style="bold", header_style="bold",
+        header_style="bold",
         box=box.SIMPLE_HEAD if console.is_terminal else box.SIMPLE, pad_edge=False,
     )  # fmt: skip
     for index, name in enumerate(head):
@@ -62,6 +62,8 @@ def print_table(
         table.add_column(name, justify="left" if words else "right", no_wrap=not words)
     for row in rows:
         table.add_row(*row)
+    # Above the table rather than in it, where a long title would wrap to the table's width.
+    console.print(title, style="bold", soft_wrap=True)
     console.print(table)
 
 

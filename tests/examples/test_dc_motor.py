@@ -29,7 +29,7 @@ def test_it_is_the_motor_of_section_4_1_4(dc_motor):
         "constant": 2.38e-2,
     }
     assert model.output_names == ("current", "omega")
-    assert [signal.hold for signal in model.inputs] == ["foh", "foh"]
+    assert model.input_names == ("voltage", "load")
 
 
 def test_its_ranges_are_a_decade_either_side(dc_motor):

@@ -55,7 +55,7 @@ def times(a, b):
 
 def closure(factor, inner):
     def derivative(x, u, p, shift=0.25):
-        return inner(x[1], factor) + shift, u[0] - p[0] * abs(x[1]) ** 1.5 - x[0]
+        return inner(x[1], factor) + shift, u[0] - p[0] * x[1] * abs(x[1]) ** 0.5 - x[0]
 
     return derivative
 
