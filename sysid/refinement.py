@@ -34,7 +34,7 @@ def refine(
     *,
     max_iterations: int = 50,
     tolerance: float = 1e-7,
-    on_iteration: Callable[[int, float], None] | None = None,
+    on_iteration: Callable[[Refinement], None] | None = None,
 ) -> Refinement:
     """Minimise the objective from ``chromosome`` within the ranges and constraints.
 
@@ -64,7 +64,7 @@ def refine(
         if gain > 0.0:
             at, residual, error = candidates[best], tried[best], float(errors[best])
         if on_iteration is not None:
-            on_iteration(iteration, error)
+            on_iteration(Refinement(space.decode(at), error, iteration))
         if gain <= tolerance * error:
             return Refinement(space.decode(at), error, iteration)
         needed = _steps(objective, at)

@@ -15,7 +15,7 @@ from sysid.gassi.search import PRESETS, GeneticSearch, PresetName
 from sysid.metrics import fit_percent
 from sysid.model import FloatArray, ModelError, ProcessModel
 from sysid.objective import Objective
-from sysid.refinement import refine
+from sysid.refinement import Refinement, refine
 from sysid.simulation import BatchSimulator, Status
 from sysid.space import SearchSpace
 
@@ -170,11 +170,15 @@ class GASSI(BaseEstimator):  # type: ignore[misc]
         return outputs
 
     def score(
-        self, X: Dataset | FloatArray, y: FloatArray | None = None, *, dt: float | None = None
+        self,
+        X: Dataset | Sequence[Dataset] | FloatArray,
+        y: FloatArray | None = None,
+        *,
+        dt: float | None = None,
     ) -> float:
-        """Mean fit % over the outputs, divided by 100: 1 is perfect."""
-        (record,) = _records(X, y, dt)
-        return float(np.nanmean(fit_percent(record.outputs, self.predict(record)))) / 100.0
+        """Mean fit % over outputs and records, divided by 100: 1 is perfect."""
+        fits = [fit_percent(record.outputs, self.predict(record)) for record in _records(X, y, dt)]
+        return float(np.nanmean(fits)) / 100.0
 
     def _model(self) -> ProcessModel:
         if self.model is None:
@@ -225,15 +229,16 @@ class GASSI(BaseEstimator):  # type: ignore[misc]
     def _refine(self, objective: Objective, notify: Callable[[Progress], None]) -> None:
         limit = 50
 
-        def watch(iteration: int, error: float) -> None:
-            notify(Progress("refine", iteration, limit, error))
+        def watch(step: Refinement) -> None:
+            # Taken as it goes, so that Ctrl-C keeps what has been gained.
+            if step.error < self.error_:
+                violations = self.space_.violations(step.chromosome[None])
+                self._take(step.chromosome, step.error, bool(np.all(violations <= 0.0)))
+            notify(Progress("refine", step.iterations, limit, self.error_))
 
         result = refine(objective, self.chromosome_, max_iterations=limit, on_iteration=watch)
         # It rarely needs all the iterations it may take.
-        notify(Progress("refine", result.iterations, result.iterations, result.error))
-        if result.error < self.error_:
-            violations = self.space_.violations(result.chromosome[None])
-            self._take(result.chromosome, result.error, bool(np.all(violations <= 0.0)))
+        notify(Progress("refine", result.iterations, result.iterations, self.error_))
 
     def _take(self, chromosome: FloatArray | None, error: float, feasible: bool) -> None:
         assert chromosome is not None

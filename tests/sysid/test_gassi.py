@@ -190,11 +190,18 @@ def test_an_interrupt_of_a_second_fit_does_not_keep_the_first_answer():
     assert found.error_ == found.search_error_ == found.history_[-1]
 
 
-def test_an_interrupt_while_refining_keeps_what_the_search_found():
-    found = quick().fit(motor_record(), on_progress=Stop("refine", 1))
+def test_an_interrupt_while_refining_keeps_what_was_gained():
+    found = quick().fit(motor_record(), on_progress=Stop("refine", 2))
     assert found.stopped_ == "interrupted"
     assert len(found.history_) == 6
-    assert found.error_ <= found.history_[-1]
+    assert found.error_ < found.search_error_ == found.history_[-1]
+
+
+def test_the_score_of_several_records_is_the_mean_of_theirs():
+    found = quick().fit(motor_record())
+    one, other = motor_record(), motor_record(80)
+    expected = np.mean([found.score(one), found.score(other)])
+    assert found.score([one, other]) == pytest.approx(expected)
 
 
 def test_convergence_ends_the_search():

@@ -73,7 +73,7 @@ def test_it_finds_the_motor_from_nearby(seed):
     start = draw(motor(1.15), np.random.default_rng(seed), 1)[0]
     before, _ = target.evaluate(start[None])
     seen = []
-    result = refine(target, start, on_iteration=lambda i, e: seen.append(e))
+    result = refine(target, start, on_iteration=lambda step: seen.append(step.error))
     assert result.error < 1e-4 * before[0]
     assert len(seen) == result.iterations
     np.testing.assert_allclose(result.chromosome, list(MOTOR.values()), rtol=1e-2)
@@ -102,8 +102,7 @@ def test_at_a_bound_the_others_still_reach_their_minimum():
     rest = Objective(simulator, SearchSpace.of(model, fixed={"resistance": 1.2}), [record])
     fixed = refine(rest, model.nominal[1:], tolerance=1e-9)
     assert bound.chromosome[0] == pytest.approx(1.2)
-    assert bound.error == pytest.approx(fixed.error, rel=1e-4)
-    assert bound.iterations < 20
+    assert bound.error == pytest.approx(fixed.error, rel=3e-6)
 
 
 def test_the_number_of_integration_steps_may_change_on_the_way():
@@ -129,7 +128,8 @@ def test_the_number_of_integration_steps_may_change_on_the_way():
     result = refine(target, start)
     # The simulations differ from the exact record by their accuracy; the end does not.
     assert result.error < 1e-2
-    np.testing.assert_allclose(result.chromosome, model.nominal, rtol=0.1)
+    again = refine(target, model.nominal)
+    np.testing.assert_allclose(result.chromosome, again.chromosome, rtol=1e-3)
 
 
 def faster_derivative(x, u, p):
@@ -188,7 +188,6 @@ def test_it_ends_at_the_minimum_of_the_mean_rmse_not_of_the_squares():
     )
     assert inside.sum() >= 3
     offset = 0.5 * (up - down) / curvature
-    print(offset, inside, result)
     assert np.all(np.abs(offset[inside]) < 0.2)
 
 
