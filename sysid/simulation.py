@@ -212,24 +212,27 @@ class _Runner:
     ) -> tuple[IntArray, BoolArray]:
         """Simulate all, filling sse and spent; steps per sample each took, and who is too stiff.
 
-        A simulation that does not stay finite is tried with finer steps as well: only when
-        those fail too is it the model, not the scheme, that is unbounded.
+        A simulation that does not stay finite is tried once more with much finer steps: when
+        those fail too it is the model, not the scheme, that is unbounded.
         """
         limit = self.simulator.max_steps
         steps = _rungs(self._rates(parameters) * self.record.dt / _RATE_LIMIT)
         steps = np.maximum(steps, self.kernels.fewest_steps)
         over = steps > limit
+        blown = np.zeros(len(parameters), dtype=bool)
         todo = np.flatnonzero(~over)
         for _ in range(_MAX_ROUNDS):
             if len(todo) == 0:
                 break
             excess = self._round(parameters, steps, todo, sse, spent)
-            factor = np.where(np.isfinite(excess), excess ** (1.0 / _ESTIMATE_ORDER), 4.0)
+            finite = np.isfinite(excess)
+            factor = np.where(finite, excess ** (1.0 / _ESTIMATE_ORDER), 8.0)
             more = _rungs(1.1 * np.clip(factor, 1.2, 8.0) * steps[todo])
             again = ~(excess <= 1.0)
             # Finite but not accurate within the budget is too stiff; not finite is unbounded.
-            over[todo[again & np.isfinite(excess) & (more > limit)]] = True
-            again &= more <= limit
+            over[todo[again & finite & (more > limit)]] = True
+            again &= (more <= limit) & (finite | ~blown[todo])
+            blown[todo] |= ~finite
             steps[todo[again]] = more[again]
             todo = todo[again]
         return steps, over
