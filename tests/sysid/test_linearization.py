@@ -1,0 +1,127 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sim_rig.actuator import actuator
+from sim_rig.plant import plant
+from sysid import (
+    Input,
+    ModelError,
+    Output,
+    Parameter,
+    ProcessModel,
+    State,
+    equilibrium,
+    jacobian,
+    linearize,
+)
+from tests.sysid.support import motor, motor_matrices
+
+MODELS = {"motor": motor(), "actuator": actuator(), "actuator n=2": actuator(2.0), "plant": plant()}
+
+
+def central_differences(function, point, width):
+    columns = []
+    for i in range(len(point)):
+        step = width * max(1.0, abs(point[i]))
+        ahead, back = point.copy(), point.copy()
+        ahead[i] += step
+        back[i] -= step
+        columns.append((np.array(function(ahead)) - np.array(function(back))) / (2.0 * step))
+    return np.stack(columns, axis=1)
+
+
+@pytest.mark.parametrize("name", MODELS)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_jacobians_agree_with_finite_differences(name, seed):
+    model, rng = MODELS[name], np.random.default_rng(seed)
+    # Away from the kinks of |x| and of the limits, where no derivative exists.
+    x = rng.uniform(0.05, 0.9, len(model.states)) * rng.choice([-1.0, 1.0], len(model.states))
+    u = rng.uniform(-0.9, 0.9, len(model.inputs))
+    p = model.nominal * rng.uniform(0.5, 2.0, len(model.parameters))
+    x, u, p = x.tolist(), u.tolist(), tuple(p.tolist())
+    x, u = np.array(x), np.array(u)
+    found = linearize(model, x, u, np.array(p))
+    for matrix, function, point in (
+        (found.A, lambda v: model.derivative(tuple(v), tuple(u), p), x),
+        (found.B, lambda v: model.derivative(tuple(x), tuple(v), p), u),
+        (found.C, lambda v: model.evaluate_output(tuple(v), tuple(u), p), x),
+        (found.D, lambda v: model.evaluate_output(tuple(x), tuple(v), p), u),
+    ):
+        expected = central_differences(function, point, 1e-6)
+        size = np.abs(expected).max(axis=1, keepdims=True) + 1e-9
+        np.testing.assert_allclose(matrix / size, expected / size, atol=2e-6)
+
+
+def test_the_motor_gives_its_matrices():
+    A, B, C, D = linearize(motor(), np.zeros(2), np.zeros(2))
+    expected = motor_matrices(motor().nominal)
+    for found, exact in zip((A, B), expected[:2], strict=True):
+        np.testing.assert_allclose(found, exact, rtol=1e-14)
+    np.testing.assert_array_equal(C, np.eye(2))
+    np.testing.assert_array_equal(D, np.zeros((2, 2)))
+
+
+def every_function(x, u, p):
+    a = x[0]
+    return (
+        math.exp(a) + math.sin(a) * math.cos(2.0 * a) - math.tanh(3.0 * a)
+        + math.sqrt(a) + math.log(a) + math.atan(a) + a**p[0] + 2.0**a + 1.0 / (1.0 + a * a)
+        + max(a, 0.1) + min(a, 9.0) + abs(-a) + math.hypot(a, 2.0) + math.pow(a, 1.5) + u[0] * a,
+    )  # fmt: skip
+
+
+def test_elementary_functions_are_differentiated():
+    model = ProcessModel(
+        name="functions",
+        states=(State("a", "1", 0.7),),
+        inputs=(Input("b", "1"),),
+        outputs=(Output("a", "1"),),
+        parameters=(Parameter("n", "1", 1.7, 1.0, 2.0),),
+        derivative=every_function,
+    )
+    for value in (0.2, 0.7, 3.0):
+        expected = central_differences(
+            lambda v: every_function(tuple(v), (0.4,), (1.7,)), np.array([value]), 1e-6
+        )
+        found = jacobian(model, np.array([value]), np.array([0.4]))
+        np.testing.assert_allclose(found, expected, rtol=1e-8)
+
+
+def test_an_equilibrium_is_one():
+    model = actuator()
+    u = np.array([0.2, 0.05, 0.0])
+    x = equilibrium(model, u, hold={"omega": 3.0, "theta": 1.0})
+    slopes = np.array(model.derivative(tuple(x), tuple(u), tuple(model.nominal)))
+    free = [0, 1, 2, 3, 5]
+    scale = np.abs(jacobian(model, x, u)) @ np.abs(x)
+    assert np.all(np.abs(slopes[free]) < 1e-9 * scale[free])
+    assert x[4] == 3.0 and x[6] == 1.0
+    # In steady sliding the hysteresis stands at z0 = A / (beta + gamma).
+    A, beta, gamma = (model.parameter(name).nominal for name in ("A", "beta", "gamma"))
+    assert x[5] == pytest.approx(A / (beta + gamma), rel=1e-6)
+
+
+def test_where_nothing_rests_there_is_an_error():
+    model = ProcessModel(
+        name="drift",
+        states=(State("a", "1"),),
+        inputs=(),
+        outputs=(Output("a", "1"),),
+        parameters=(Parameter("k", "1", 1.0, 0.5, 2.0),),
+        derivative=lambda x, u, p: (p[0] + x[0] * x[0],),
+    )
+    with pytest.raises(ModelError, match="no equilibrium found"):
+        equilibrium(model, np.zeros(0))
+
+
+@pytest.mark.parametrize("wrong", [{"x": np.zeros(3)}, {"u": np.zeros(1)}, {"p": np.zeros(2)}])
+def test_wrong_shapes_are_named(wrong):
+    arguments = {"x": np.zeros(2), "u": np.zeros(2), "p": motor().nominal} | wrong
+    with pytest.raises(ModelError, match="shape"):
+        linearize(motor(), **arguments)
