@@ -35,9 +35,12 @@ def run_command(
     loaded = load_experiment(experiment)
     rig_config, device = load_rig(rig)
     loaded.plan(rig_config)
-    validation = loaded.validation() if identify else None
+    validation = loaded.validation()
     if validation is not None:
+        # Checked even where it will not run: a mistake in the file is best heard of early.
         validation.plan(rig_config)
+    if not identify:
+        validation = None
     overrides = {"model": model}
     prepared = None
     if identify:
