@@ -234,7 +234,7 @@ def _derivative(model: ProcessModel) -> Any:
     """The model's derivative compiled, on arrays, with nominal parameters."""
     from sysid._compile import _jit
 
-    compiled = _jit(model.derivative, {})
+    compiled = _jit(model.derivative)
     p = tuple(float(v) for v in model.nominal)
     return lambda x, u: compiled(x, u, p)
 
@@ -247,7 +247,7 @@ def _scipy(
     if compiled:
         from sysid._compile import _jit
 
-        chosen = replace(model, derivative=_jit(model.derivative, {}))
+        chosen = replace(model, derivative=_jit(model.derivative))
 
     def run() -> FloatArray:
         return simulate(chosen, model.nominal, short, method=method, rtol=1e-4, atol=1e-7)

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from sysid import _kernel
+from sysid._substitute import KNOWN_MODULES, names_in, rebuilt
 from sysid.model import IntArray, ModelError, ProcessModel
 
 _OPTIONS: dict[str, Any] = {
@@ -29,9 +30,6 @@ _OPTIONS: dict[str, Any] = {
     "error_model": "numpy",
     "fastmath": {"contract", "arcp", "nsz"},
 }
-
-# Modules that the compiler knows by itself and that do not change between runs.
-_KNOWN_MODULES = {"builtins", "cmath", "math", "numba", "numpy", "operator"}
 
 
 @dataclass(frozen=True)
@@ -67,16 +65,15 @@ def kernels(model: ProcessModel) -> Kernels:
     for function in functions:
         _fingerprint(function, key, set())
     path = _source_file(f"{_safe(model.name)}_{key.hexdigest()[:24]}.py", text)
-    compiled: dict[int, Any] = {}
     scope: dict[str, Any] = {
         "np": np,
         "math": math,
         "phi_matrices": phi_matrices,
-        "derivative": _jit(model.derivative, compiled),
+        "derivative": _jit(model.derivative),
         "__name__": __name__,  # a module that exists when Numba loads the kernel from its cache
     }
     if model.output is not None:
-        scope["output"] = _jit(model.output, compiled)
+        scope["output"] = _jit(model.output)
     exec(compile(text, str(path or "<kernel>"), "exec"), scope)
     scope["prepare"] = numba.njit(**_OPTIONS)(scope["prepare"])
 
@@ -130,56 +127,13 @@ def _explain(model: ProcessModel, error: Exception) -> str:
     )
 
 
-def _jit(value: Any, done: dict[int, Any]) -> Any:
+def _jit(function: Any) -> Any:
     """Compile a function and every plain function it refers to, also through a module."""
     import numba
 
-    if isinstance(value, types.BuiltinFunctionType) and value.__module__ == "math":
-        return getattr(_vector_math(), value.__name__)
-    if not isinstance(value, types.FunctionType):
-        return value
-    if id(value) in done:
-        return done[id(value)]
-    scope = dict(value.__globals__)
-    cells = tuple(types.CellType() for _ in value.__closure__ or ())
-    copy = types.FunctionType(value.__code__, scope, value.__name__, value.__defaults__, cells)
-    copy.__kwdefaults__ = value.__kwdefaults__
-    copy.__module__ = __name__  # the user's file may be no importable module
-    # Noted before its helpers are looked at, so that functions may refer to each other.
-    done[id(value)] = numba.njit(**_OPTIONS)(copy)
-    names = _names(value.__code__)
-    for name in names & scope.keys():
-        if isinstance(scope[name], types.ModuleType):
-            scope[name] = _jit_module(scope[name], names, done)
-        else:
-            scope[name] = _jit(scope[name], done)
-    for cell, original in zip(cells, value.__closure__ or (), strict=True):
-        cell.cell_contents = _jit(original.cell_contents, done)
-    return done[id(value)]
-
-
-def _jit_module(module: types.ModuleType, names: set[str], done: dict[int, Any]) -> Any:
-    """The module, or a copy of it in which the functions of the given names are compiled."""
-    if module is math:
-        return _vector_math()
-    if module.__name__.partition(".")[0] in _KNOWN_MODULES:
-        return module
-    copy = types.ModuleType(module.__name__)
-    copy.__dict__.update(module.__dict__)
-    for name in names & module.__dict__.keys():
-        setattr(copy, name, _jit(getattr(module, name), done))
-    return copy
-
-
-def _vector_math() -> types.ModuleType:
-    """The math module's stand-in, imported when first needed because Numba is slow to."""
-    return importlib.import_module("sysid._vector_math")
-
-
-def _names(code: types.CodeType) -> set[str]:
-    """All names that code refers to, including code within it."""
-    inner = (item for item in code.co_consts if isinstance(item, types.CodeType))
-    return set(code.co_names).union(*map(_names, inner))
+    # Imported here because Numba is slow to.
+    vector_math = importlib.import_module("sysid._vector_math")
+    return rebuilt(function, vector_math, numba.njit(**_OPTIONS))
 
 
 def _fingerprint(value: Any, key: Any, seen: set[int]) -> None:
@@ -193,7 +147,7 @@ def _fingerprint(value: Any, key: Any, seen: set[int]) -> None:
         _fingerprint((value.__defaults__, value.__kwdefaults__), key, seen)
         for cell in value.__closure__ or ():
             _fingerprint(cell.cell_contents, key, seen)
-        _fingerprint_names(value.__globals__, _names(value.__code__), key, seen)
+        _fingerprint_names(value.__globals__, names_in(value.__code__), key, seen)
     elif isinstance(value, types.CodeType):
         key.update(value.co_code + repr((value.co_names, value.co_varnames)).encode())
         _fingerprint(value.co_consts, key, seen)
@@ -217,7 +171,7 @@ def _fingerprint_names(scope: dict[str, Any], names: set[str], key: Any, seen: s
         _fingerprint(item, key, seen)
         if (
             isinstance(item, types.ModuleType)
-            and item.__name__.partition(".")[0] not in _KNOWN_MODULES
+            and item.__name__.partition(".")[0] not in KNOWN_MODULES
         ):
             _fingerprint_names(vars(item), names, key, seen)
 
