@@ -13,7 +13,6 @@ import numpy as np
 
 from benchmarks._common import arguments, report, simulated_logs, timed
 from sim_rig.actuator import actuator
-from sim_rig.plant import actuator_truth
 from sysid import BatchSimulator, Dataset, evaluate
 from sysid.gassi import GASSI
 from sysid.model import ProcessModel
@@ -50,7 +49,7 @@ def identification(model: ProcessModel, training: Dataset, validation: Dataset) 
     GASSI(model, population=16, generations=1).fit(training)
     search, _ = timed(lambda: fit("thesis"))
     whole, estimator = timed(lambda: fit("default"))
-    truth = model.vector(actuator_truth())
+    truth = actuator(parameters="rig").nominal
     simulator = BatchSimulator(model)
     floor = evaluate(validation.outputs, simulator.trajectories(truth, validation)[0])
     found = evaluate(validation.outputs, estimator.predict(validation))

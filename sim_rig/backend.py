@@ -24,7 +24,7 @@ from daq.hal import (
     RawSamples,
 )
 from sim_rig.encoder import EncoderCounter
-from sim_rig.plant import plant
+from sim_rig.plant import Plant
 from sysid import Stepper
 
 _QUEUE = 65_536
@@ -55,6 +55,7 @@ class Simulation(Section):
     time: Literal["virtual", "real"] = Field(
         "virtual", description="as fast as it can, or at the pace of the clock"
     )
+    plant: Plant = Field(Plant(), description="parts of the actuator and what hangs on it")
     imperfections: Imperfections = Field(Imperfections(), description="of the sensing chain")
     current_sense: float = Field(2.0, gt=0.0, description="of both channels [V/A]")
     torque_sense: float = Field(5.0 / 3.53, gt=0.0, description="torque bridge [V per N*m]")
@@ -72,7 +73,8 @@ class SimulatedDevice:
 
     def __init__(self, options: Simulation) -> None:
         self.options = options
-        self._plant = plant()
+        self._plant = options.plant.build()
+        self._held_by_hand = options.plant.load == "hand"
         self._rng = np.random.default_rng(options.seed)
         worst = 0.0 if options.ideal else options.imperfections.offset
         self._offsets = self._rng.uniform(-worst, worst, len(ANALOG_INPUTS))
@@ -84,6 +86,7 @@ class SimulatedDevice:
         self._user_turns = 0.0
         self._user_start: float | None = None
         self._user_from = 0.0
+        self._rest_angle = 0.0
         self._clock = 0.0  # device time since it was switched on [s], at the next tick
         self._origin = 0.0  # and at tick 0
         self._open = False
@@ -105,11 +108,13 @@ class SimulatedDevice:
 
     def announce(self, phase: Phase, turns: float = 0.0) -> None:
         """The simulated user winds the handle when asked to, and otherwise keeps off."""
-        self._user_start = None
+        if self._user_start is not None:
+            self._user_start = None
+            self._rest_angle = self._user_from + 2.0 * math.pi * (self._user_turns + _OVERWIND)
         if phase is Phase.HOMING and turns > 0.0:
             self._user_turns = turns
             self._user_start = self._clock
-            self._user_from = float(self._x[6])
+            self._user_from = float(self._x[_THETA])
 
     def start(self, sample_rate: float, mode: Mode, guard: Guard) -> None:
         """Begin with tick 0; in open loop when the first commands are there."""
@@ -246,7 +251,8 @@ class SimulatedDevice:
         n = len(applied)
         u = np.empty((n + 1, len(self._plant.inputs)))
         u[:n, :2], u[n, :2] = applied, applied[-1]
-        u[:, 2:] = self._hand(self._origin + (self._tick + np.arange(n + 1)) / self._rate)
+        if u.shape[1] > 2:
+            u[:, 2:] = self._hand(self._origin + (self._tick + np.arange(n + 1)) / self._rate)
         per_tick = self._stepper.n_steps
         trace, true = self._stepper.advance(self._x, u)
         angles = np.append(trace[:, _THETA], self._x[_THETA])
@@ -275,8 +281,13 @@ class SimulatedDevice:
         return np.clip(rounded, -_CONVERTER_RANGE, _CONVERTER_RANGE - resolution), flags
 
     def _hand(self, times: FloatArray) -> FloatArray:
-        """Grip, angle and speed of the simulated user's hand at the given times, (n, 3)."""
+        """Grip, angle and speed of the simulated user's hand at the given times, (n, 3).
+
+        A hand that is the load never lets go: it stays where it has wound the handle to.
+        """
         hand = np.zeros((len(times), 3))
+        hand[:, 0] = self._held_by_hand
+        hand[:, 1] = self._rest_angle
         if self._user_start is None:
             return hand
         elapsed = times - self._user_start
@@ -285,7 +296,7 @@ class SimulatedDevice:
         # A raised cosine in speed: the hand starts and stops softly. It winds a little
         # further than asked, as one does against a spring.
         angle = 2.0 * math.pi * (self._user_turns + _OVERWIND)
-        hand[:, 0] = elapsed < length + _REST
+        hand[:, 0] = self._held_by_hand | (elapsed < length + _REST)
         hand[:, 1] = self._user_from + angle * (share - np.sin(2 * math.pi * share) / (2 * math.pi))
         hand[:, 2] = angle / length * (1.0 - np.cos(2.0 * math.pi * share)) * (share < 1.0)
         return hand

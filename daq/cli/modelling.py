@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import importlib.util
+import inspect
+import re
 import sys
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 from daq.cli import console
 from daq.config.yaml_file import suggestion
@@ -17,33 +21,58 @@ from sysid.model import ModelError, ProcessModel
 DEFAULT_MODEL = "actuator"
 
 
+@dataclass(frozen=True)
+class _Name:
+    """``model`` or ``file.py:object``, and ``:option=value,...`` behind either."""
+
+    source: str
+    attribute: str | None
+    options: str
+
+    @classmethod
+    def parse(cls, text: str) -> _Name:
+        # Not at the first colon: a Windows path has one behind its drive.
+        file = re.match(r"^(.*\.py)(?::([^:=]*))?(?::(.*))?$", text)
+        if file:
+            return cls(file[1], file[2] or "model", file[3] or "")
+        source, _, options = text.partition(":")
+        return cls(source, None, options)
+
+
 def find_model(name: str, relative_to: Path | None = None) -> ProcessModel:
     """An installed model, or an object of a Python file given as ``file.py:object``.
 
-    The object is a ProcessModel or a function without arguments that makes one. File names are
-    looked up from the working folder, then from ``relative_to``. Raises ConfigError naming
-    file, line and cause.
+    The object is a ProcessModel or a function that makes one; ``:option=value,...`` behind it
+    are the function's arguments. File names are looked up from the working folder, then from
+    ``relative_to``. Raises ConfigError naming file, line and cause.
     """
-    file, colon, attribute = name.rpartition(":")
-    if colon and file.endswith(".py"):
-        return _from_file(_locate(Path(file), relative_to), attribute)
-    if name.endswith(".py"):
-        return _from_file(_locate(Path(name), relative_to), "model")
-    return _as_model(load_plugin("rig.models", name), f"model {name!r}")
+    parsed = _Name.parse(name)
+    where = f"model {parsed.source!r}"
+    if parsed.attribute is not None:
+        where = f"{_locate(Path(parsed.source), relative_to)}:{parsed.attribute}"
+    return _as_model(_find(parsed, relative_to), where, parsed.options)
+
+
+def _find(name: _Name, relative_to: Path | None = None) -> Any:
+    """The model, or the function that makes it."""
+    if name.attribute is None:
+        return load_plugin("rig.models", name.source)
+    return _from_file(_locate(Path(name.source), relative_to), name.attribute)
 
 
 def whole_name(name: str, relative_to: Path | None = None) -> str:
     """The name by which ``find_model`` finds the same model from any folder."""
-    file, colon, attribute = name.rpartition(":") if not name.endswith(".py") else (name, "", "")
-    if not file.endswith(".py"):
+    parsed = _Name.parse(name)
+    if parsed.attribute is None:
         return name
-    return f"{_locate(Path(file), relative_to).resolve()}{colon}{attribute}"
+    path = _locate(Path(parsed.source), relative_to).resolve()
+    return f"{path}{name.removeprefix(parsed.source)}"
 
 
 def models_command(name: str | None, as_json: bool) -> None:
     """List models, or describe one."""
     if name is not None:
-        _describe(find_model(name), as_json)
+        _describe(name, find_model(name), as_json)
         return
     found = {key: find_model(key) for key in sorted(installed("rig.models"))}
     if as_json:
@@ -96,9 +125,11 @@ def describe(model: ProcessModel) -> dict[str, Any]:
     }
 
 
-def _describe(model: ProcessModel, as_json: bool) -> None:
+def _describe(name: str, model: ProcessModel, as_json: bool) -> None:
+    parsed = _Name.parse(name)
+    choices = model_options(_find(parsed))
     if as_json:
-        console.print_json(describe(model))
+        console.print_json({**describe(model), "options": choices})
         return
     console.print_line(f"{model.name}: {model.description}")
     rows = [["state", s.name, s.unit, f"starts at {s.initial:g}"] for s in model.states]
@@ -125,6 +156,37 @@ def _describe(model: ProcessModel, as_json: bool) -> None:
     )
     for constraint in model.constraints:
         console.print_line(f"Constraint: {constraint.text}")
+    if choices:
+        _print_options(parsed.source, choices)
+
+
+def _print_options(source: str, choices: list[dict[str, Any]]) -> None:
+    console.print_table(
+        "Options",
+        ["name", "default", "choices", "what it is"],
+        [
+            [
+                choice["name"],
+                _as_text(choice["default"]),
+                ", ".join(choice["choices"]),
+                choice["description"],
+            ]
+            for choice in choices
+        ],
+        text=["default", "choices", "what it is"],
+    )
+    last = choices[-1]
+    console.print_line(
+        f"Another combination: rig models {source}:{last['name']}={last['choices'][-1]}, with "
+        "a comma between options; --model takes the same name"
+    )
+
+
+def _as_text(value: Any) -> str:
+    """A default as one would write it."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    return console.number(value) if isinstance(value, float) else str(value)
 
 
 def _locate(path: Path, relative_to: Path | None) -> Path:
@@ -134,7 +196,7 @@ def _locate(path: Path, relative_to: Path | None) -> Path:
     raise ConfigError(f"{path}: there is no such model file")
 
 
-def _from_file(path: Path, attribute: str) -> ProcessModel:
+def _from_file(path: Path, attribute: str) -> Any:
     module = _import_file(path)
     if not hasattr(module, attribute):
         models = [key for key, value in vars(module).items() if isinstance(value, ProcessModel)]
@@ -142,7 +204,7 @@ def _from_file(path: Path, attribute: str) -> ProcessModel:
             f"{path}: it defines no {attribute!r}; {suggestion(attribute, models)} "
             "(--model file.py:object names a ProcessModel in it)"
         )
-    return _as_model(getattr(module, attribute), f"{path}:{attribute}")
+    return getattr(module, attribute)
 
 
 def _import_file(path: Path) -> ModuleType:
@@ -178,19 +240,77 @@ def _same(file: str | None, path: Path) -> bool:
     return file is not None and Path(file).resolve() == path.resolve()
 
 
-def _as_model(found: Any, where: str) -> ProcessModel:
+def _as_model(found: Any, where: str, options: str) -> ProcessModel:
     if callable(found) and not isinstance(found, ProcessModel):
-        try:
-            found = found()
-        except ModelError as error:
-            raise ConfigError(f"{where}: {error}") from None
-        except Exception as error:
-            raise ConfigError(
-                f"{where}: calling it fails: {type(error).__name__}: {error}"
-            ) from None
+        found = _made(found, where, _split(options, where))
+    elif options:
+        raise ConfigError(f"{where} is a finished model; it takes no options ({options!r})")
     if not isinstance(found, ProcessModel):
         raise ConfigError(
             f"{where} is of type {type(found).__name__}, not a sysid.ProcessModel or a function "
-            "without arguments that returns one"
+            "that returns one"
         )
     return found
+
+
+def _split(options: str, where: str) -> dict[str, str]:
+    """``a=1,b=2`` by name."""
+    chosen = {}
+    for item in filter(None, options.split(",")):
+        key, equals, value = (part.strip() for part in item.partition("="))
+        if not (key and equals and value):
+            raise ConfigError(
+                f"{where}: {item!r} is no option; write NAME:option=value,option=value"
+            )
+        chosen[key] = value
+    return chosen
+
+
+def _made(factory: Callable[..., Any], where: str, options: dict[str, str]) -> Any:
+    """The model that a function makes of options given as text."""
+    from pydantic import ValidationError, validate_call
+
+    known = list(inspect.signature(factory).parameters)
+    for key in options:
+        if key not in known:
+            raise ConfigError(f"{where} has no option {key!r}; {suggestion(key, known)}")
+    try:
+        # Turns text into what the function's annotations ask for.
+        return validate_call(factory)(**options) if options else factory()
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = str(first["loc"][0]) if first["loc"] else "its options"
+        raise ConfigError(f"{where}: {key}={options.get(key, '')}: {first['msg']}") from None
+    except ModelError as error:
+        raise ConfigError(f"{where}: {error}") from None
+    except Exception as error:
+        raise ConfigError(f"{where}: calling it fails: {type(error).__name__}: {error}") from None
+
+
+def model_options(factory: Any) -> list[dict[str, Any]]:
+    """Options of a function that makes models: name, default, choices, what it is."""
+    if not callable(factory) or isinstance(factory, ProcessModel):
+        return []
+    hints = get_type_hints(factory, include_extras=True)
+    found = []
+    for key, parameter in inspect.signature(factory).parameters.items():
+        hint: Any = hints.get(key)
+        notes: list[Any] = []
+        if get_origin(hint) is Annotated:
+            hint, *notes = get_args(hint)
+        choices = _choices(hint)
+        if choices and parameter.default is not inspect.Parameter.empty:
+            text = next((t for note in notes if (t := getattr(note, "description", None))), "")
+            found.append(
+                {"name": key, "default": parameter.default, "choices": choices, "description": text}
+            )
+    return found
+
+
+def _choices(hint: Any) -> list[str]:
+    """What may be written for an option; nothing for one that cannot be given as text."""
+    if get_origin(hint) is Literal:
+        return [str(choice) for choice in get_args(hint)]
+    if hint is bool:
+        return ["false", "true"]
+    return {float: ["number"], int: ["whole number"], str: ["text"]}.get(hint, [])

@@ -95,16 +95,17 @@ def _value(file: yaml_file.YamlFile, key: tuple[str, ...], entry: Any) -> float:
 
 
 def _rig_truth(rig: str) -> tuple[ProcessModel, dict[str, float]]:
-    config, _device = load_rig(rig)
+    config, device = load_rig(rig)
     if config.backend != "simulated":
         raise ConfigError(
             f"{rig}: only a simulated rig knows its own parameters; "
             "give those of an identification with --parameters"
         )
-    from sim_rig.actuator import actuator
-    from sim_rig.plant import actuator_truth
+    from sim_rig.backend import SimulatedDevice
 
-    return actuator(), actuator_truth()
+    assert isinstance(device, SimulatedDevice)
+    model = device.options.plant.process_model()
+    return model, dict(zip(model.parameter_names, model.nominal, strict=True))
 
 
 def _mapping(config: Path | None, model: ProcessModel) -> Mapping | None:

@@ -1,0 +1,111 @@
+"""Amplifiers and windings: the linear electrical half of the actuator, and its limits.
+
+Equation numbers here and in the neighbouring files are those of the thesis this project began
+as ("Hybrid Haptic Device Modeling and System Identification").
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from sim_rig.options import DriverKind
+from sim_rig.parts import log_range
+from sysid import Parameter
+
+SUPPLY = 24.0  # V, the amplifier's limit
+MAX_CURRENT = 2.5  # A, the amplifier's limit
+
+# How hard a voltage amplifier gives way beyond its current limit [V/A]. Assumed: about what the
+# current amplifier's own loop does.
+_FOLDBACK = 100.0
+
+# (voltage, current, command, K_v2i, p) -> dv/dt, p the driver's own parameters
+DriverFunction = Callable[[Any, Any, Any, Any, Any], Any]
+
+
+def saturate(value: Any, limit: Any) -> Any:
+    """``value`` kept within +-limit."""
+    return min(max(value, -limit), limit)
+
+
+def excess(value: Any, limit: Any) -> Any:
+    """By how much ``value`` is beyond +-limit."""
+    return max(value - limit, 0.0) + min(value + limit, 0.0)
+
+
+def closed_loop_driver(voltage: Any, current: Any, command: Any, K_v2i: Any, p: Any) -> Any:
+    """dv/dt of an amplifier that controls its current (3.10) [V/s].
+
+    p: gain K [V/A] and cutoff [rad/s]; K_v2i: amperes asked for per volt of command.
+    """
+    gain, cutoff = p
+    return cutoff * (gain * (K_v2i * command - current) - voltage)
+
+
+def open_loop_driver(voltage: Any, current: Any, command: Any, K_v2i: Any, p: Any) -> Any:
+    """dv/dt of an amplifier that gives a voltage (3.7) [V/s]; p: gain [V/V], cutoff [rad/s]."""
+    gain, cutoff = p
+    return cutoff * (gain * command - voltage)
+
+
+def limited_closed_loop_driver(voltage: Any, current: Any, command: Any, K_v2i: Any, p: Any) -> Any:
+    """``closed_loop_driver`` that asks for no more than its rated current."""
+    asked = saturate(command, MAX_CURRENT / K_v2i)
+    return closed_loop_driver(voltage, current, asked, K_v2i, p)
+
+
+def limited_open_loop_driver(voltage: Any, current: Any, command: Any, K_v2i: Any, p: Any) -> Any:
+    """``open_loop_driver`` that gives way beyond its rated current."""
+    _gain, cutoff = p
+    free = open_loop_driver(voltage, current, command, K_v2i, p)
+    return free - cutoff * _FOLDBACK * excess(current, MAX_CURRENT)
+
+
+def winding(current: Any, voltage: Any, back_emf: Any, resistance: Any, inductance: Any) -> Any:
+    """di/dt of a resistor-inductor winding, motor (3.1) or brake coil (3.3) [A/s]."""
+    return (voltage - resistance * current - back_emf) / inductance
+
+
+def limited_winding(
+    current: Any, voltage: Any, back_emf: Any, resistance: Any, inductance: Any
+) -> Any:
+    """``winding`` across which an amplifier puts no more than its supply."""
+    return winding(current, saturate(voltage, SUPPLY), back_emf, resistance, inductance)
+
+
+def driver(kind: DriverKind, limits: bool) -> DriverFunction:
+    """Equation of an amplifier; ``limits``: with the ends of its range."""
+    if kind == "closed":
+        return limited_closed_loop_driver if limits else closed_loop_driver
+    return limited_open_loop_driver if limits else open_loop_driver
+
+
+def motor_driver_parameters(kind: DriverKind) -> tuple[Parameter, ...]:
+    """Gain and cutoff of the motor's amplifier."""
+    cutoff = log_range("omega_dm", "rad/s", 1000.0, 100.0, 5000.0, "motor driver cutoff")
+    if kind == "closed":
+        return (log_range("K_dm", "V/A", 100.0, 10.0, 500.0, "motor driver gain"), cutoff)
+    return (log_range("G_dm", "V/V", 1.0, 0.1, 10.0, "motor driver gain"), cutoff)
+
+
+def brake_driver_parameters(kind: DriverKind) -> tuple[Parameter, ...]:
+    """Gain and cutoff of the brake's amplifier."""
+    if kind == "closed":
+        return (
+            log_range("K_db", "V/A", 10000.0, 1000.0, 40000.0, "brake driver gain"),
+            log_range("omega_db", "rad/s", 20.0, 5.0, 500.0, "brake driver cutoff"),
+        )
+    return (
+        log_range("G_db", "V/V", 50.0, 10.0, 200.0, "brake driver gain"),
+        log_range("omega_db", "rad/s", 500.0, 50.0, 5000.0, "brake driver cutoff"),
+    )
+
+
+WINDINGS = (
+    log_range("R_m", "ohm", 1.0, 0.5, 8.0, "motor resistance"),
+    log_range("L_m", "H", 1e-3, 2e-4, 3e-3, "motor inductance"),
+    log_range("K_m", "N*m/A", 0.14, 0.03, 0.25, "motor constant"),
+    log_range("R_b", "ohm", 120.0, 40.0, 200.0, "brake coil resistance"),
+    log_range("L_b", "H", 0.15, 0.05, 1.0, "brake coil inductance"),
+)

@@ -1,0 +1,150 @@
+"""What hangs on the shaft: nothing, a lock, a mass on a pulley, a hand, or a measured torque."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from sim_rig.options import LoadKind
+from sim_rig.parts import known
+from sysid import Input, Parameter, State
+
+GRAVITY = 9.80665  # m/s^2
+
+# Angle over which the cable changes sides of the pulley when it is wound off past its end:
+# about the angle in which a cable leaves a small drum.
+_CROSSOVER = 0.1  # rad
+
+_RESPONSE_TIME = 0.237  # s, of a hand (A.2)
+_HAND_INERTIA = 1e-3  # kg*m^2, an order of magnitude above the rotors, as (A.2) asks
+_HAND_DAMPING = 0.707  # of critical (A.2)
+
+_MASS = 0.25  # kg, the lab's 250 g
+_CABLE = 5000.0  # N/m, assumed: thin braided cable, half a metre
+
+
+@dataclass(frozen=True)
+class Load:
+    """A load's states, inputs, parameters and equation.
+
+    torque: (theta, omega, x, u, p) -> (torque on the shaft, rates of its own states...), each
+    of its own. inertia: of what turns with the shaft, from its parameters.
+    """
+
+    torque: Callable[[Any, Any, Any, Any, Any], tuple[Any, ...]]
+    states: tuple[State, ...] = ()
+    inputs: tuple[Input, ...] = ()
+    parameters: tuple[Parameter, ...] = ()
+    inertia: Callable[[Any], Any] = lambda p: 0.0
+
+
+def load(kind: LoadKind) -> Load:
+    """A load by name; a locked shaft carries nothing but what holds it."""
+    return {
+        "measured": _MEASURED,
+        "free": _FREE,
+        "locked": _FREE,
+        "pulley": _PULLEY,
+        "hand": _HAND,
+        "pulley+hand": both(_PULLEY, _HAND),
+    }[kind]
+
+
+def both(first: Load, second: Load) -> Load:
+    """Two loads on one shaft."""
+    n, m, q = len(first.states), len(first.inputs), len(first.parameters)
+    first_torque, second_torque = first.torque, second.torque
+    first_inertia, second_inertia = first.inertia, second.inertia
+
+    def torque(theta: Any, omega: Any, x: Any, u: Any, p: Any) -> tuple[Any, ...]:
+        one = first_torque(theta, omega, x[:n], u[:m], p[:q])
+        other = second_torque(theta, omega, x[n:], u[m:], p[q:])
+        return (one[0] + other[0], *one[1:], *other[1:])
+
+    return Load(
+        torque,
+        first.states + second.states,
+        first.inputs + second.inputs,
+        first.parameters + second.parameters,
+        lambda p: first_inertia(p[:q]) + second_inertia(p[q:]),
+    )
+
+
+def pulley_torque(theta: Any, omega: Any, x: Any, u: Any, p: Any) -> tuple[Any, Any, Any]:
+    """Torque of a mass on a cable [N*m], and the rates of its height [m] and speed [m/s].
+
+    The cable pulls and never pushes: beyond slack it carries nothing. It is a spring whose loss
+    grows with its tension (Hunt & Crossley, "Coefficient of restitution interpreted as damping
+    in vibroimpact", Journal of Applied Mechanics 42, 1975), so that the tension has no jump
+    where the cable comes taut. Wound off past its end it winds up on the other side; wound up to
+    its length, the mass meets the pulley and stops. height is zero where the wound-off cable
+    would just be taut.
+    """
+    height, speed = x
+    mass, radius, _J_p, stiffness, loss, length = p
+    root = math.sqrt(theta * theta + _CROSSOVER * _CROSSOVER)
+    lever = radius * theta / root
+    stretch = max(radius * (root - _CROSSOVER) - height, 0.0)
+    tension = stiffness * stretch * max(1.0 + loss * (lever * omega - speed), 0.0)
+    pressed = max(height - length, 0.0)
+    stop = stiffness * pressed * max(1.0 + loss * speed, 0.0)
+    return -tension * lever, speed, (tension - stop) / mass - GRAVITY
+
+
+def hand_torque(theta: Any, omega: Any, x: Any, u: Any, p: Any) -> tuple[Any]:
+    """Torque of a hand's impedance on the shaft (A.1) [N*m]; its wrist moves as it will."""
+    grip, hand_theta, hand_omega = u
+    K_u, B_u = p
+    return (grip * (B_u * (hand_omega - omega) + K_u * (hand_theta - theta)),)
+
+
+def hand_impedance(
+    inertia: float = _HAND_INERTIA,
+    damping: float = _HAND_DAMPING,
+    response_time: float = _RESPONSE_TIME,
+) -> tuple[float, float]:
+    """Stiffness [N*m/rad] and damping [N*m*s/rad] of a hand (A.2)."""
+    omega_n = 3.0 / response_time
+    return omega_n**2 * inertia, 2.0 * damping * omega_n * inertia
+
+
+_FREE = Load(lambda theta, omega, x, u, p: (0.0,))
+
+_MEASURED = Load(
+    lambda theta, omega, x, u, p: (u[0],),
+    inputs=(Input("torque", "N*m", "foh", "load torque on the shaft, as measured"),),
+)
+
+_PULLEY = Load(
+    pulley_torque,
+    (
+        State("height", "m", -_MASS * GRAVITY / _CABLE, "of the hanging mass, cable stretched"),
+        State("speed", "m/s", 0.0, "of the hanging mass"),
+    ),
+    (),
+    (
+        known("mass", "kg", _MASS, "hanging mass"),
+        known("radius", "m", 0.005, "of the pulley; assumed: the brake's residual holds the load"),
+        known("J_p", "kg*m^2", 1e-6, "pulley inertia; assumed: small, of aluminium"),
+        known("k_cable", "N/m", _CABLE, "stiffness; assumed: thin braided cable, half a metre"),
+        known("d_cable", "s/m", 4.0, "loss; assumed: a seventh of critical under the mass"),
+        known("length", "m", 0.5, "of cable that can be wound; assumed: sixteen turns"),
+    ),
+    lambda p: p[2],
+)
+
+_HAND = Load(
+    hand_torque,
+    (),
+    (
+        Input("hand_grip", "1", "zoh", "1 while a hand holds the handle, else 0"),
+        Input("hand_theta", "rad", "foh", "angle of the wrist"),
+        Input("hand_omega", "rad/s", "foh", "speed of the wrist"),
+    ),
+    (
+        known("K_u", "N*m/rad", hand_impedance()[0], "stiffness of the hand (A.2)"),
+        known("B_u", "N*m*s/rad", hand_impedance()[1], "damping of the hand (A.2)"),
+    ),
+)

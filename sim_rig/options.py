@@ -1,0 +1,49 @@
+"""The choices from which an actuator is put together, each with what it means.
+
+The same types stand in the call ``actuator(...)``, in a rig's YAML and in ``rig models``.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+DriverKind = Literal["closed", "open"]
+HysteresisKind = Literal["bouc-wen", "dahl", "lugre"]
+FrictionKind = Literal["none", "stribeck", "cyclic"]
+LoadKind = Literal["measured", "free", "locked", "pulley", "hand", "pulley+hand"]
+SensorPlace = Literal["load", "between"]
+SetName = Literal["nominal", "rig", "A", "B", "C", "D"]
+
+MotorDriver = Annotated[
+    DriverKind,
+    Field(description="motor amplifier: closed controls its current, open gives a voltage"),
+]
+BrakeDriver = Annotated[DriverKind, Field(description="brake amplifier: likewise")]
+Hysteresis = Annotated[HysteresisKind, Field(description="hysteresis model of the brake")]
+Exponent = Annotated[float, Field(ge=1.0, le=50.0, description="n of the Bouc-Wen hysteresis")]
+Smooth = Annotated[
+    bool, Field(description="tanh(rho x) in place of the hysteresis's signs: differentiable")
+]
+Friction = Annotated[
+    FrictionKind,
+    Field(description="brushes of the torque sensor; cyclic: unevenly worn along a turn"),
+]
+Load = Annotated[
+    LoadKind, Field(description="what is on the shaft; measured: a torque known from a sensor")
+]
+PlantLoad = Annotated[
+    Literal["free", "locked", "pulley", "hand"], Field(description="what is on the shaft")
+]
+Sensor = Annotated[
+    SensorPlace, Field(description="torque sensor at the load, or between motor and brake")
+]
+Limits = Annotated[bool, Field(description="ends of the amplifiers' range: 24 V, 2.5 A")]
+ParameterSet = Annotated[
+    SetName,
+    Field(
+        description="values: nominal for a search, of the simulated rig, or of a row of the "
+        "thesis's table 4.1"
+    ),
+]
