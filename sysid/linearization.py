@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from sysid._dual import Dual, on_duals
 from sysid._substitute import substituted
-from sysid.model import FloatArray, ModelError, ProcessModel
+from sysid.model import FloatArray, Function, ModelError, ProcessModel
 
 
 @dataclass(frozen=True)
@@ -41,16 +42,12 @@ def linearize(
     """
     x, u, p = _point(model, x, u, p)
     n, m = len(x), len(u)
-    seeds = np.eye(n + m)
-    states = tuple(Dual(float(v), seeds[i]) for i, v in enumerate(x))
-    inputs = tuple(Dual(float(v), seeds[n + j]) for j, v in enumerate(u))
-    parameters = tuple(float(v) for v in p)
-    slopes = _gradient(model, model.derivative, states, inputs, parameters)
+    slopes = _gradient(model, model.derivative, x, u, p)
     if model.output is not None:
-        outputs = _gradient(model, model.output, states, inputs, parameters)
+        outputs = _gradient(model, model.output, x, u, p)
     else:
         assert model.output_states is not None
-        outputs = seeds[list(model.output_states)]
+        outputs = np.eye(n + m)[list(model.output_states)]
     return LinearModel(slopes[:, :n], slopes[:, n:], outputs[:, :n], outputs[:, n:])
 
 
@@ -58,7 +55,8 @@ def jacobian(
     model: ProcessModel, x: FloatArray, u: FloatArray, p: FloatArray | None = None
 ) -> FloatArray:
     """df/dx at a point, (n_states, n_states); see ``linearize``."""
-    return linearize(model, x, u, p).A
+    x, u, p = _point(model, x, u, p)
+    return _gradient(model, model.derivative, x, u, p)[:, : len(x)]
 
 
 def equilibrium(
@@ -114,18 +112,25 @@ def equilibrium(
 
 
 def _gradient(
-    model: ProcessModel,
-    function: Any,
-    x: tuple[Dual, ...],
-    u: tuple[Dual, ...],
-    p: tuple[float, ...],
+    model: ProcessModel, function: Function, x: FloatArray, u: FloatArray, p: FloatArray
 ) -> FloatArray:
+    """Derivatives of a function of (x, u, p) with respect to x and u, (m, n_x + n_u)."""
+    n, width = len(x), len(x) + len(u)
+    seeds = np.eye(width)
+    states = tuple(Dual(float(v), seeds[i]) for i, v in enumerate(x))
+    inputs = tuple(Dual(float(v), seeds[n + j]) for j, v in enumerate(u))
     try:
-        values = substituted(function, on_duals)(x, u, p)
+        values = _on_duals(function)(states, inputs, tuple(float(v) for v in p))
     except TypeError as error:
         raise ModelError(f"model {model.name} cannot be differentiated: {error}") from None
-    width = len(x) + len(u)
     return np.array([v.slope if isinstance(v, Dual) else np.zeros(width) for v in values])
+
+
+@functools.lru_cache(maxsize=16)
+def _on_duals(function: Function) -> Function:
+    """A copy of a model's function that takes dual numbers."""
+    copy: Function = substituted(function, on_duals)
+    return copy
 
 
 def _point(

@@ -7,9 +7,11 @@ from typing import Literal
 import numpy as np
 
 from sysid.data import Dataset
+from sysid.linearization import jacobian
 from sysid.model import FloatArray, ModelError, ProcessModel
 
 Method = Literal["DOP853", "RK45", "Radau", "BDF", "LSODA"]
+_IMPLICIT = ("Radau", "BDF", "LSODA")
 
 
 def simulate(
@@ -23,8 +25,8 @@ def simulate(
 ) -> FloatArray:
     """Free-run outputs, (n_samples, n_outputs), each sample interval solved on its own.
 
-    The intervals are separate because held inputs jump between them. Raises ModelError when
-    SciPy gives up, naming the instant.
+    The intervals are separate because held inputs jump between them. The implicit methods are
+    given the exact Jacobian. Raises ModelError when SciPy gives up, naming the instant.
     """
     from scipy.integrate import solve_ivp
 
@@ -46,8 +48,19 @@ def simulate(
             u = u0 + slope * t
             return np.array(model.derivative(tuple(state), tuple(u), p))
 
+        def jac(
+            t: float, state: FloatArray, u0: FloatArray = u0, slope: FloatArray = slope
+        ) -> FloatArray:
+            return jacobian(model, state, u0 + slope * t, parameters)
+
         solution = solve_ivp(
-            rhs, (0.0, record.dt), x, method=method, rtol=rtol, atol=atol, first_step=None
+            rhs,
+            (0.0, record.dt),
+            x,
+            method=method,
+            rtol=rtol,
+            atol=atol,
+            jac=jac if method in _IMPLICIT else None,
         )
         if not solution.success:
             raise ModelError(
