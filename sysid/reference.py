@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -30,6 +30,7 @@ def simulate(
     """
     from scipy.integrate import solve_ivp
 
+    solve: Any = solve_ivp  # its types know no option that depends on the method
     record.check(model)
     p = tuple(float(v) for v in parameters)
     x = record.initial_state(model)
@@ -53,14 +54,14 @@ def simulate(
         ) -> FloatArray:
             return jacobian(model, state, u0 + slope * t, parameters)
 
-        solution = solve_ivp(
+        solution = solve(
             rhs,
             (0.0, record.dt),
             x,
             method=method,
             rtol=rtol,
             atol=atol,
-            jac=jac if method in _IMPLICIT else None,
+            **({"jac": jac} if method in _IMPLICIT else {}),
         )
         if not solution.success:
             raise ModelError(
