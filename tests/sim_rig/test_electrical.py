@@ -1,0 +1,166 @@
+"""Amplifiers and windings against transfer functions, and where the amplifiers end."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import signal
+
+from sim_rig.electrical import (
+    MAX_CURRENT,
+    SUPPLY,
+    closed_loop_driver,
+    driver,
+    excess,
+    limited_winding,
+    open_loop_driver,
+    saturate,
+    winding,
+)
+from tests.sim_rig.support import Parts, constant, follow
+
+volts, amperes = st.floats(-60.0, 60.0), st.floats(-6.0, 6.0)
+GAIN = 0.5  # A/V
+
+
+def test_drivers_and_winding_by_hand():
+    # 100 (50 (0.5*2 - 0.4) - 7), 100 (3*2 - 7) and (7 - 3*0.4 - 0.8)/0.02.
+    assert closed_loop_driver(7.0, 0.4, 2.0, 0.5, (50.0, 100.0)) == pytest.approx(2300.0)
+    assert open_loop_driver(7.0, 0.4, 2.0, 0.5, (3.0, 100.0)) == pytest.approx(-100.0)
+    assert winding(0.4, 7.0, 0.8, 3.0, 0.02) == pytest.approx(250.0)
+
+
+def from_command_to_current(kind, q, k):
+    """Numerator and denominator from (3.6) or (3.8) to (3.9) and the winding's 1/(L s + R)."""
+    R, L, cutoff = q[f"R_{k}"], q[f"L_{k}"], q[f"omega_d{k}"]
+    if kind == "closed":
+        K = q[f"K_d{k}"]
+        return [cutoff * K * q["K_v2i"]], [L, R + cutoff * L, cutoff * (R + K)]
+    return [cutoff * q[f"G_d{k}"]], [L, R + cutoff * L, cutoff * R]
+
+
+@pytest.mark.parametrize(
+    ("motor", "brake"), [("closed", "closed"), ("open", "closed"), ("closed", "open")]
+)
+def test_a_step_of_the_command_gives_the_transfer_functions_step_response(motor, brake):
+    model = Parts(driver_motor=motor, driver_brake=brake, load="locked").build(parameters="rig")
+    q = dict(zip(model.parameter_names, model.nominal, strict=True))
+    steps = {"motor": 1.5, "brake": 0.2}
+    inputs = constant(model, **{f"applied_voltage_{k}": v for k, v in steps.items()})
+    times = np.linspace(0.0, 0.02, 401)
+    found = follow(model, inputs, 0.02, rtol=1e-9, times=times)
+    for channel, kind in (("motor", motor), ("brake", brake)):
+        system = signal.lti(*from_command_to_current(kind, q, channel[0]))
+        expected = steps[channel] * signal.step(system, T=times)[1]
+        np.testing.assert_allclose(
+            found[f"current_{channel}"], expected, atol=1e-6 * np.abs(expected).max()
+        )
+
+
+@given(value=volts, limit=st.floats(0.1, 30.0))
+def test_a_value_is_what_is_kept_of_it_and_its_excess(value, limit):
+    kept = saturate(value, limit)
+    assert abs(kept) <= limit
+    assert kept == (value if abs(value) <= limit else math.copysign(limit, value))
+    assert kept + excess(value, limit) == pytest.approx(value, rel=1e-12)
+    assert excess(value, limit) * value >= 0.0
+
+
+@given(
+    voltage=st.floats(-SUPPLY, SUPPLY),
+    current=st.floats(-MAX_CURRENT, MAX_CURRENT),
+    command=st.floats(-MAX_CURRENT / GAIN, MAX_CURRENT / GAIN),
+)
+@pytest.mark.parametrize("kind", ["closed", "open"])
+def test_within_its_range_a_limited_amplifier_is_the_plain_one(kind, voltage, current, command):
+    p = (7.0, 300.0)
+    plain, limited = (driver(kind, limits)(voltage, current, command, GAIN, p) for limits in (0, 1))
+    assert limited == pytest.approx(plain, rel=1e-12, abs=1e-9)
+    assert limited_winding(current, voltage, 0.3, 2.0, 0.01) == winding(
+        current, voltage, 0.3, 2.0, 0.01
+    )
+
+
+@given(voltage=volts, current=amperes, command=st.floats(-12.0, 12.0))
+def test_beyond_its_range_it_gives_way(voltage, current, command):
+    at_end = math.copysign(min(abs(command), MAX_CURRENT / GAIN), command)
+    closed = driver("closed", True)
+    p = (7.0, 300.0)
+    assert closed(voltage, current, command, GAIN, p) == pytest.approx(
+        closed_loop_driver(voltage, current, at_end, GAIN, p), rel=1e-12, abs=1e-9
+    )
+    less = open_loop_driver(voltage, current, command, GAIN, p) - driver("open", True)(
+        voltage, current, command, GAIN, p
+    )
+    # 100 V for each ampere beyond the limit, against the current.
+    beyond = max(abs(current) - MAX_CURRENT, 0.0)
+    assert less == pytest.approx(math.copysign(300.0 * 100.0 * beyond, current), abs=1e-6)
+    across = math.copysign(min(abs(voltage), SUPPLY), voltage)
+    assert limited_winding(current, voltage, 0.3, 2.0, 0.01) == pytest.approx(
+        winding(current, across, 0.3, 2.0, 0.01)
+    )
+
+
+# --- in the actuator ------------------------------------------------------------------------
+
+
+def locked(driver_motor="closed", driver_brake="closed"):
+    """A motor that cannot turn has no back-EMF."""
+    parts = Parts(driver_motor, driver_brake, load="locked", limits=True)
+    return parts.build(parameters="rig")
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_closed_loop_asks_for_no_more_than_the_rated_current(sign):
+    model = locked()
+    far, at_limit = (
+        follow(model, constant(model, applied_voltage_motor=sign * command), 0.02)
+        for command in (50.0, MAX_CURRENT / GAIN)
+    )
+    np.testing.assert_array_equal(far.y, at_limit.y)
+    # 0.99 of the 0.5 A/V remain at rest.
+    assert abs(far["current_motor"][-1]) == pytest.approx(MAX_CURRENT, rel=0.011)
+    # Its loop rings: a step passes the limit for a moment, as in the thesis's figure 4.3.
+    peak = np.abs(far["current_motor"]).max()
+    assert MAX_CURRENT < peak < 2.0 * MAX_CURRENT
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("command", [5.5, 10.0])
+def test_an_open_loop_keeps_to_the_rated_current_within_a_part_of_its_foldback(sign, command):
+    """At rest R i = G u - 100 (i - 2.5): for any command of the converters 1.2 % beyond."""
+    model = locked(driver_motor="open")
+    found = follow(model, constant(model, applied_voltage_motor=sign * command), 0.02)
+    G, R = (model.parameter(name).nominal for name in ("G_dm", "R_m"))
+    expected = (G * command + 100.0 * MAX_CURRENT) / (R + 100.0)
+    assert sign * found["current_motor"][-1] == pytest.approx(expected, rel=1e-4)
+    assert MAX_CURRENT < expected < 1.012 * MAX_CURRENT
+    assert np.abs(found["current_motor"]).max() < 1.7 * MAX_CURRENT
+
+
+@pytest.mark.parametrize("kind", ["closed", "open"])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_no_winding_sees_more_than_the_supply(kind, sign):
+    """A coil that would need 40 V for what is asked of it gets 24 V."""
+    model = locked(driver_brake=kind)
+    resistance = 40.0 / 0.19
+    inputs = constant(model, applied_voltage_brake=sign * 2.0)
+    found = follow(model, inputs, 0.05, {"R_b": resistance})
+    current = sign * found["current_brake"]
+    assert current[-1] == pytest.approx(SUPPLY / resistance, rel=1e-4)
+    assert sign * found["voltage_brake"][-1] > SUPPLY
+    slope = np.diff(current) / np.diff(found.t)
+    assert slope.max() <= SUPPLY / model.parameter("L_b").nominal * 1.001
+
+
+def test_a_free_motor_runs_up_to_the_back_emf_of_the_supply_and_no_further():
+    model = Parts(load="free", limits=True).build(parameters="rig")
+    inputs = constant(model, applied_voltage_motor=5.0)
+    quiet = {"alpha0": 0.0, "alpha1": 0.0, "c0": 0.0, "B_m": 0.0}
+    speed = follow(model, inputs, 1.0, quiet)["omega"]
+    top = SUPPLY / model.parameter("K_m").nominal
+    assert 0.99 * top < speed.max() < top * (1.0 + 1e-6)
