@@ -1,184 +1,258 @@
+"""The assembled actuator: signals, named sets, transmission, torque sensor."""
+
 from __future__ import annotations
+
+import itertools
+import math
+import random
 
 import numpy as np
 import pytest
 
-from sim_rig.actuator import INPUTS, PARAMETERS, STATES, actuator
-from sim_rig.plant import actuator_truth
-from sysid import BatchSimulator, Dataset, SearchSpace
-from sysid.reference import simulate as reference
+from sim_rig.actuator import actuator
+from sysid import ModelError, SearchSpace, equilibrium
+from tests.sim_rig import equations
+from tests.sim_rig.support import HYSTERESES, LOADS, Parts, constant, follow, random_point
+
+ALL_OUTPUTS = ("current_motor", "current_brake", "torque", "theta", "omega")
+
+# --- signals --------------------------------------------------------------------------------
 
 
-def thesis_matrix_form(x, u, p, n=1.0):
-    """(3.23) with (3.1), (3.3), (3.10), (3.14), (3.15) and (3.22), written as matrices.
-
-    x' = F(x) + G u, the linear part as a matrix over the states; the torque with |i_b|.
-    """
-    q = dict(zip([parameter.name for parameter in PARAMETERS], p, strict=True))
-    omega, z, i_b = x[4], x[5], abs(x[3])
-    J = q["n_c"] ** 2 * q["J_m"] + q["J_b"]
-    alpha, c = q["alpha0"] + q["alpha1"] * i_b, q["c0"] + q["c1"] * i_b
-    F = np.zeros((7, 7))
-    F[0, [0, 2]] = -q["omega_dm"], -q["K_dm"] * q["omega_dm"]
-    F[1, [1, 3]] = -q["omega_db"], -q["K_db"] * q["omega_db"]
-    F[2, [0, 2, 4]] = np.array([1.0, -q["R_m"], q["n_c"] * q["K_m"]]) / q["L_m"]
-    F[3, [1, 3]] = np.array([1.0, -q["R_b"]]) / q["L_b"]
-    F[4, [2, 4, 5]] = np.array([-q["n_c"] * q["K_m"], -(q["n_c"] ** 2) * q["B_m"] - c, -alpha]) / J
-    F[5, [4, 5]] = (
-        q["A"] - q["beta"] * abs(z) ** n,
-        -q["gamma"] * abs(omega) * abs(z) ** (n - 1.0),
-    )
-    F[6, 4] = 1.0
-    G = np.zeros((7, 3))
-    G[0, 0] = q["K_v2i"] * q["K_dm"] * q["omega_dm"]
-    G[1, 1] = q["K_v2i"] * q["K_db"] * q["omega_db"]
-    G[4, 2] = 1.0 / J
-    return F @ x + G @ u
+@pytest.mark.parametrize("load", LOADS)
+def test_outputs_are_those_of_the_thesis_for_a_measured_load_and_the_rigs_for_others(load):
+    model = Parts(load=load).build()
+    measured = ("current_motor", "current_brake", "omega")  # (3.24)
+    assert model.output_names == (measured if load == "measured" else ALL_OUTPUTS)
 
 
-@pytest.mark.parametrize("n", [1.0, 2.0, 1.5])
-def test_the_derivative_is_the_equations(n):
-    rng = np.random.default_rng(1)
-    model = actuator(n)
-    for _ in range(200):
-        x = rng.normal(size=7) * [10, 10, 2, 0.2, 20, 1, 3]
-        u = rng.normal(size=3) * [3, 0.4, 0.5]
-        p = model.nominal * np.exp(rng.normal(size=len(PARAMETERS)))
-        p[-1] = rng.choice([-1.0, 2.0, -3.5])
-        expected = thesis_matrix_form(x, u, p, n)
-        found = np.array(model.derivative(tuple(x), tuple(u), tuple(p)))
-        # Terms cancel: compare relative to what they are made of.
-        size = thesis_size(x, u, p, n)
-        assert np.all(np.abs(found - expected) <= 1e-12 * size)
+@pytest.mark.parametrize("load", LOADS)
+def test_inputs_are_held_as_they_are_made(load):
+    """Converters hold their value; what is measured or moves by hand is taken as a line."""
+    model = Parts(load=load).build()
+    holds = {signal.name: signal.hold for signal in model.inputs}
+    expected = {"applied_voltage_motor": "zoh", "applied_voltage_brake": "zoh"}
+    if load == "measured":
+        expected["torque"] = "foh"
+    if "hand" in load:
+        expected |= {"hand_grip": "zoh", "hand_theta": "foh", "hand_omega": "foh"}
+    assert holds == expected
+    assert list(holds)[:2] == ["applied_voltage_motor", "applied_voltage_brake"]
 
 
-def thesis_size(x, u, p, n):
-    """Magnitude of the terms of each equation: the same with all signs positive, roughly."""
-    basis = [thesis_matrix_form(np.where(np.arange(7) == i, x, 0.0), 0 * u, p, n) for i in range(7)]
-    forced = thesis_matrix_form(0 * x, u, p, n)
-    whole = thesis_matrix_form(x, 0 * u, p, n)
-    return np.sum(np.abs(basis), axis=0) + np.abs(forced) + np.abs(whole) + 1e-9
-
-
-def excitation(n=160, dt=1.0 / 800.0):
-    rng = np.random.default_rng(2)
-    inputs = np.column_stack(
-        [
-            np.repeat(rng.uniform(-4, 4, n // 8), 8),
-            np.repeat(rng.choice([0.0, 0.38], n // 16), 16),
-            0.1 * np.sin(np.arange(n) / 10.0),
-        ]
-    )
-    return Dataset(inputs, np.full((n, 3), np.nan), dt)
-
-
-def outputs(changes, exponent=1.0, n_steps=32):
-    """Outputs with some parameters multiplied or set; the steps are given, so that they agree."""
-    model = actuator(exponent)
-    vector = model.vector(actuator_truth() | changes)
-    return BatchSimulator(model).trajectories(vector, excitation(), n_steps)[0]
-
-
-def scaled(factors):
-    truth = actuator_truth()
-    return {name: truth[name] * factor for name, factor in factors.items()}
-
-
-REDUNDANCIES = {
-    # z -> 2z: homogeneous of degree one for n = 1; else |z|^n takes 2^(1-n).
-    "z": (1.0, {"A": 2.0, "alpha0": 0.5, "alpha1": 0.5}, {"z": 2.0}),
-    "z, n=2": (
-        2.0,
-        {"A": 2.0, "alpha0": 0.5, "alpha1": 0.5, "beta": 0.5, "gamma": 0.5},
-        {"z": 2.0},
-    ),
-    # The coil's voltage in other units: only ratios of it act.
-    "coil up": (1.0, {"R_b": 4.0, "L_b": 4.0, "K_db": 4.0}, {"voltage_brake": 4.0}),
-    "coil down": (1.0, {"R_b": 0.5, "L_b": 0.5, "K_db": 0.5}, {"voltage_brake": 0.5}),
-}
-
-
-@pytest.mark.parametrize("case", REDUNDANCIES)
-def test_redundant_parameters_are_another_unit_of_a_hidden_state(case):
-    """To the bit, the factors being powers of two."""
-    exponent, factors, units = REDUNDANCIES[case]
-    model, rng = actuator(exponent), np.random.default_rng(3)
-    unit = np.array([units.get(name, 1.0) for name in model.state_names])
-    p = model.vector(actuator_truth())
-    q = model.vector(actuator_truth() | scaled(factors))
-    for _ in range(50):
-        x = rng.normal(size=7) * [10, 10, 2, 0.2, 20, 1, 3]
-        u = rng.normal(size=3) * [3, 0.4, 0.5]
-        one = np.array(model.derivative(tuple(x), tuple(u), tuple(p)))
-        other = np.array(model.derivative(tuple(unit * x), tuple(u), tuple(q)))
-        np.testing.assert_array_equal(unit * one, other)
-
-
-@pytest.mark.parametrize("case", REDUNDANCIES)
-def test_redundant_parameters_leave_the_outputs_unchanged(case):
-    exponent, factors, _units = REDUNDANCIES[case]
-    one, other = outputs(scaled(factors), exponent), outputs({}, exponent)
-    np.testing.assert_allclose(one, other, atol=1e-9 * np.abs(other).max())
+@pytest.mark.parametrize("load", ["measured", "pulley+hand"])
+def test_outputs_may_be_chosen_in_any_order(load):
+    rng = random.Random(2)
+    whole = Parts(load=load).build()
+    point = random_point(whole, rng).of(whole)
+    values = dict(zip(whole.output_names, whole.evaluate_output(*point), strict=True))
+    values["theta"] = point[0][whole.state_names.index("theta")]
+    for count in (1, 2, 3, len(values)):
+        names = tuple(rng.sample(list(values), count))
+        model = Parts(load=load).build(outputs=names)
+        assert model.output_names == names
+        assert model.evaluate_output(*point) == tuple(values[name] for name in names)
+        assert model.derivative(*point) == whole.derivative(*point)
 
 
 @pytest.mark.parametrize(
-    "changes",
+    ("settings", "message"),
     [
-        {"A": 2.0},
-        {"A": 2.0, "alpha0": 0.5},
-        {"R_b": 4.0, "L_b": 4.0},
-        {"J_m": 1.1},
-        {"c0": 1.5, "B_m": 1.5},
+        ({"outputs": ("omega", "speed")}, "no output 'speed'; it has current_motor"),
+        ({"outputs": ("torque",)}, "the torque is an input"),
+        ({"outputs": ("omega", "omega")}, "outputs repeat the name 'omega'"),
+        ({"sensor": "between"}, "sensor between"),
+        ({"hysteresis": "dahl", "exponent": 2.0}, "not dahl"),
+        ({"exponent": 0.5}, "at least 1"),
     ],
 )
-def test_half_a_redundancy_does_change_them(changes):
-    assert np.max(np.abs(outputs(scaled(changes)) - outputs({}))) > 1e-4
+def test_what_does_not_go_together_is_refused(settings, message):
+    with pytest.raises(ModelError, match=message):
+        actuator(**settings)
 
 
-def test_only_the_sum_of_the_inertias_acts():
-    unit = 2.0**-16
-    one = outputs({"J_m": 5 * unit, "J_b": 1 * unit})
-    geared = {"n_c": -2.0, "J_m": 1.25 * unit, "J_b": unit} | scaled({"K_m": 0.5, "B_m": 0.25})
-    for changes in ({"J_m": 1 * unit, "J_b": 5 * unit}, geared):
-        np.testing.assert_allclose(outputs(changes), one, atol=1e-9 * np.abs(one).max())
+def test_the_description_says_what_was_chosen():
+    text = Parts("open", "closed", "dahl", 1.0, True, "cyclic", "pulley").build().description
+    for word in ("open", "closed", "smooth dahl", "cyclic", "pulley"):
+        assert word in text
+    plain = Parts().build().description
+    assert "closed-loop drivers" in plain
+    assert not any(word in plain for word in ("smooth", "friction", "open", "dahl"))
 
 
-def test_only_the_sum_of_the_viscous_dampings_acts():
-    one = outputs({"B_m": 1e-4, "c0": 3e-4})
-    other = outputs({"B_m": 3e-4, "c0": 1e-4})
-    np.testing.assert_allclose(one, other, atol=1e-10 * np.abs(one).max())
-    assert np.max(np.abs(one - outputs({"B_m": 1e-4, "c0": 4e-4}))) > 1e-3
+# --- named sets -----------------------------------------------------------------------------
+
+TABLE_4_1 = {  # as printed; L_m in mH
+    "A": (10.0, 400, 1.18, 4.80, 0.141),
+    "B": (29.6, 1046, 3.44, 0.912, 0.373),
+    "C": (112, 1828, 6.61, 1.18, 0.0597),
+    "D": (379, 4517, 0.255, 0.768, 0.0985),
+}
 
 
-def test_coil_and_driver_may_swap_their_time_constants():
-    """From command to current they are omega K/L over s^2 + (R/L + omega) s + omega (R + K)/L."""
-    p = actuator_truth()
-    gain, cutoff, R, L = (p[name] for name in ("K_db", "omega_db", "R_b", "L_b"))
-    swapped = {"omega_db": R / L, "R_b": cutoff * L, "K_db": gain * cutoff * L / R}
-    model = actuator()
-    found = [
-        reference(model, model.vector(p | changes), excitation(48)) for changes in ({}, swapped)
-    ]
-    scale = np.abs(found[0]).max(axis=0)
-    np.testing.assert_allclose(found[0] / scale, found[1] / scale, atol=1e-6)
+@pytest.mark.parametrize("row", TABLE_4_1)
+@pytest.mark.parametrize(("kind", "n"), HYSTERESES)
+def test_a_row_of_table_4_1_is_exactly_its_numbers_and_else_the_rig(row, kind, n):
+    parts = Parts(hysteresis=kind, exponent=n, smooth=True, friction="cyclic", load="pulley+hand")
+    model, rig = parts.build(parameters=row), parts.build(parameters="rig")
+    K, cutoff, R, L, K_m = TABLE_4_1[row]
+    expected = dict(zip(rig.parameter_names, rig.nominal, strict=True))
+    expected |= {"K_dm": K, "omega_dm": cutoff, "R_m": R, "L_m": L * 1e-3, "K_m": K_m}
+    found = dict(zip(model.parameter_names, model.nominal, strict=True))
+    assert found == pytest.approx(expected, rel=1e-15)
 
 
-def test_truth_lies_in_the_ranges_and_is_feasible():
-    model = actuator()
-    space = SearchSpace.of(model)
-    truth = model.vector(actuator_truth())[list(space.index)]
-    assert np.all((truth > space.lower) & (truth < space.upper))
-    assert np.all(space.violations(truth[None]) == 0.0)
-    assert set(actuator_truth()) == set(model.parameter_names)
+@pytest.mark.parametrize(("kind", "n"), HYSTERESES)
+@pytest.mark.parametrize("friction", ["none", "cyclic"])
+def test_the_rigs_own_values_are_feasible_and_within_the_ranges_of_a_search(kind, n, friction):
+    for motor, brake in itertools.product(("closed", "open"), repeat=2):
+        model = Parts(motor, brake, kind, n, friction=friction).build(parameters="rig")
+        space = SearchSpace.of(model)
+        values = model.nominal[list(space.index)]
+        assert np.all((values > space.lower) & (values < space.upper))
+        assert np.all(space.violations(values[None]) == 0.0)
+        nominal = Parts(motor, brake, kind, n, friction=friction).build()
+        differing = nominal.nominal != model.nominal
+        assert differing.sum() > 10  # identification does not start from the truth
 
 
-def test_class_1_is_demanded():
-    model = actuator()
-    space = SearchSpace.of(model)
-    row = model.vector({"gamma": 10.0, "beta": 12.0})[list(space.index)]
-    assert space.violations(row[None]).sum() == pytest.approx(2.0)
+def test_a_set_changes_no_range():
+    nominal, rig = Parts().build(), Parts().build(parameters="C")
+    for one, other in zip(nominal.parameters, rig.parameters, strict=True):
+        assert (one.lower, one.upper, one.fixed) == (other.lower, other.upper, other.fixed)
 
 
-def test_inputs_are_held_as_they_are_made():
-    assert [signal.hold for signal in INPUTS] == ["zoh", "zoh", "foh"]
-    assert len(STATES) == 7
+# --- transmission ---------------------------------------------------------------------------
+
+
+def test_a_gear_of_two_is_a_motor_of_half_the_constant_and_a_quarter_of_the_inertia():
+    """To the bit, the factors being powers of two."""
+    rng = random.Random(4)
+    for load, sensor in (("measured", "load"), ("pulley", "between"), ("locked", "between")):
+        model = Parts(load=load, sensor=sensor, friction="cyclic").build()
+        for _ in range(20):
+            point = random_point(model, rng)
+            point.q["n_c"] = -1.0
+            x, u, p = point.of(model)
+            geared = point.q | {"n_c": -2.0}
+            geared |= {"K_m": point.q["K_m"] / 2, "B_m": point.q["B_m"] / 4}
+            geared["J_m"] = point.q["J_m"] / 4
+            q = tuple(geared[name] for name in model.parameter_names)
+            assert model.derivative(x, u, p) == model.derivative(x, u, q)
+            assert model.evaluate_output(x, u, p) == model.evaluate_output(x, u, q)
+
+
+def test_the_sign_of_the_transmission_is_the_sign_of_the_motors_current():
+    rng = random.Random(5)
+    model = Parts(load="pulley+hand", sensor="between").build()
+    for _ in range(20):
+        point = random_point(model, rng)
+        turned = point._replace(
+            x=point.x | {k: -point.x[k] for k in ("voltage_motor", "current_motor")},
+            u=point.u | {"applied_voltage_motor": -point.u["applied_voltage_motor"]},
+            q=point.q | {"n_c": -point.q["n_c"]},
+        )
+        one, other = (model.derivative(*at.of(model)) for at in (point, turned))
+        signs = [-1.0 if "motor" in name else 1.0 for name in model.state_names]
+        assert other == pytest.approx([s * v for s, v in zip(signs, one, strict=True)], rel=1e-12)
+        torque = [model.evaluate_output(*at.of(model))[2] for at in (point, turned)]
+        assert torque[0] == pytest.approx(torque[1], rel=1e-12)
+
+
+@pytest.mark.parametrize("n_c", [-1.0, 2.0, -3.5])
+def test_a_motors_power_is_the_same_on_both_sides_of_the_gap(n_c):
+    """Electrical power taken by the back-EMF and mechanical power: K i omega, from the model."""
+    rng = random.Random(6)
+    model = Parts(load="free").build()
+    i_m, omega = (model.state_names.index(name) for name in ("current_motor", "omega"))
+    for _ in range(20):
+        point = random_point(model, rng)
+        point.q["n_c"] = n_c
+        q = point.q
+        with_current = model.derivative(*point.of(model))
+        still = point._replace(x=point.x | {"omega": 0.0})
+        at_rest = model.derivative(*still.of(model))
+        without = point._replace(x=point.x | {"current_motor": 0.0})
+        unpowered = model.derivative(*without.of(model))
+        back_emf = -q["L_m"] * (with_current[i_m] - at_rest[i_m])
+        J = n_c**2 * q["J_m"] + q["J_b"]
+        torque = J * (with_current[omega] - unpowered[omega])
+        electrical = back_emf * point.x["current_motor"]
+        mechanical = torque * point.x["omega"]
+        assert mechanical == pytest.approx(electrical, rel=1e-7, abs=1e-12)
+        expected = -n_c * q["K_m"] * point.x["current_motor"] * point.x["omega"]
+        assert mechanical == pytest.approx(expected, rel=1e-7, abs=1e-12)
+
+
+# --- torque sensor --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("load", ["free", "pulley", "hand", "pulley+hand"])
+def test_between_motor_and_brake_it_reads_motor_less_its_inertia_which_is_what_is_beyond(load):
+    """Both sides of the cut, each with the model's own acceleration (figure 2.2)."""
+    rng = random.Random(7)
+    for friction in ("none", "stribeck", "cyclic"):
+        parts = Parts(hysteresis="lugre", friction=friction, load=load, sensor="between")
+        model = parts.build()
+        for _ in range(20):
+            x, u, q = point = random_point(model, rng)
+            slopes = dict(zip(model.state_names, model.derivative(*point.of(model)), strict=True))
+            reading = model.evaluate_output(*point.of(model))[2]
+            motor = equations.motor_torque(q, x)
+            own = q["n_c"] ** 2 * q["J_m"] * slopes["omega"]
+            beyond = equations.sensor_reading(parts, q, x, u, slopes["omega"])
+            size = sum(map(abs, [*motor, own, *beyond]))
+            assert reading == pytest.approx(sum(motor) - own, rel=0, abs=1e-12 * size)
+            assert reading == pytest.approx(sum(beyond), rel=0, abs=1e-12 * size)
+
+
+def test_at_the_load_it_reads_what_the_load_gives_less_the_pulleys_inertia():
+    rng = random.Random(8)
+    parts = Parts(friction="cyclic", load="pulley+hand")
+    model = parts.build()
+    for _ in range(50):
+        x, u, q = point = random_point(model, rng)
+        slopes = dict(zip(model.state_names, model.derivative(*point.of(model)), strict=True))
+        terms = [*equations.load_torque(parts, q, x, u), -q["J_p"] * slopes["omega"]]
+        reading = model.evaluate_output(*point.of(model))[2]
+        assert reading == pytest.approx(sum(terms), abs=1e-12 * sum(map(abs, terms)))
+
+
+@pytest.mark.parametrize("direction", [1.0, -1.0])
+def test_brush_friction_is_seen_between_motor_and_brake_and_not_at_the_load(direction):
+    """The motor turns a free shaft: the sensor at the load carries nothing, brushes or not."""
+    speed, readings = direction * 4.0, {}
+    for sensor, friction in itertools.product(("load", "between"), ("none", "stribeck")):
+        model = Parts(load="free", sensor=sensor, friction=friction).build(parameters="rig")
+        p = dict(zip(model.parameter_names, model.nominal, strict=True))
+
+        def steady(voltage, model=model):
+            u = np.array([voltage, 0.0])
+            x = equilibrium(model, u, hold={"omega": speed, "theta": 0.0})
+            slope = model.derivative(tuple(x), tuple(u), tuple(model.nominal))
+            return slope[model.state_names.index("omega")], x, u
+
+        # The command at which it runs steadily; the acceleration is linear in it.
+        a, b = steady(0.0)[0], steady(1.0)[0]
+        rest, x, u = steady(-a / (b - a))
+        assert abs(rest) < 1e-6
+        output = model.evaluate_output(x, u, model.nominal)
+        readings[sensor, friction] = output[model.output_names.index("torque")]
+    assert readings["load", "none"] == readings["load", "stribeck"] == 0.0
+    brake = p["alpha0"] * 60.0 / 48.0 + p["c0"] * 4.0
+    brushes = p["F_c"] + (p["F_s"] - p["F_c"]) * math.exp(-((4.0 / 3.0) ** 2)) + p["B_f"] * 4.0
+    assert readings["between", "none"] == pytest.approx(direction * brake, rel=1e-5)
+    assert readings["between", "stribeck"] == pytest.approx(direction * (brake + brushes), rel=1e-5)
+
+
+def test_a_hand_feels_the_brushes_through_the_sensor_at_the_load():
+    """They rub on the sensor's brake side: whoever turns the shaft from the load carries them."""
+    readings = {}
+    for friction in ("none", "stribeck"):
+        model = Parts(load="hand", friction=friction).build(parameters="rig")
+        changes = {"K_u": 0.0, "B_u": 10.0}
+        inputs = constant(model, hand_grip=1.0, hand_omega=4.0)
+        readings[friction] = follow(model, inputs, 0.1, changes, {"omega": 4.0}).output("torque")
+    p = dict(zip(model.parameter_names, model.nominal, strict=True))
+    brushes = p["F_c"] + (p["F_s"] - p["F_c"]) * math.exp(-((4.0 / 3.0) ** 2)) + p["B_f"] * 4.0
+    assert readings["stribeck"] - readings["none"] == pytest.approx(brushes, rel=0.01)
