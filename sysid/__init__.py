@@ -22,8 +22,11 @@ from sysid.stepping import Stepper
 
 if TYPE_CHECKING:
     from sysid.gassi import GASSI
+    from sysid.linear import ARMAX, ARX, select_orders
 
 __all__ = [
+    "ARMAX",
+    "ARX",
     "GASSI",
     "BatchResult",
     "BatchSimulator",
@@ -48,13 +51,18 @@ __all__ = [
     "msd",
     "output_scale",
     "rmse",
+    "select_orders",
 ]
 
 
 def __getattr__(name: str) -> Any:
-    # scikit-learn takes most of a second to import; only the estimator needs it.
+    # scikit-learn takes most of a second to import; only the estimators need it.
     if name == "GASSI":
         from sysid.gassi import GASSI
 
         return GASSI
+    if name in ("ARMAX", "ARX", "select_orders"):
+        from sysid import linear
+
+        return getattr(linear, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
