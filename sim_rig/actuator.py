@@ -118,7 +118,7 @@ def actuator(
         output=_output(outputs, shaft) if "torque" in outputs else None,
         constraints=_constraints(parts, layout),
     )
-    known_here = values.named(parameters, driver_motor, driver_brake, hysteresis)
+    known_here = values.named(parameters, driver_motor, driver_brake, hysteresis, exponent)
     changes = {k: {"nominal": v} for k, v in known_here.items() if k in model.parameter_names}
     return model.with_parameters(**changes)
 

@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from daq.config.base import Section
 from sim_rig.actuator import actuator
@@ -55,6 +55,14 @@ class Plant(Section):
         default_factory=dict, description="values that differ from the set, by name"
     )
 
+    @field_validator("parameters", mode="before")
+    @classmethod
+    def _truth_is_no_value(cls, values: Any) -> Any:
+        for name, value in values.items() if isinstance(values, dict) else ():
+            if isinstance(value, bool):
+                raise ValueError(f"parameter {name}: yes, no, on, off, true and false are no value")
+        return values
+
     @model_validator(mode="after")
     def _can_be_built(self) -> Plant:
         self.build()
@@ -97,14 +105,28 @@ def state_sizes(plant: ProcessModel) -> FloatArray:
     # The hysteresis variable at which each of the models slides.
     sliding = 1.0
     if "A" in values:
-        sliding = values["A"] / (values["beta"] + values["gamma"])
+        sliding = _ratio(values["A"], values["beta"] + values["gamma"])
     elif "zeta" in values:
-        sliding = 1.0 / values["zeta"]
+        sliding = _ratio(1.0, values["zeta"])
     return np.array([_SIZES.get(name, sliding) for name in plant.state_names])
+
+
+def _ratio(a: float, b: float) -> float:
+    """a / b, or 1 for a brake that never slides."""
+    return a / b if a > 0.0 and b > 0.0 else 1.0
 
 
 def _with_values(model: ProcessModel, values: dict[str, float]) -> ProcessModel:
     for name, value in values.items():
+        model.parameter(name)
         if not math.isfinite(value):
             raise ModelError(f"parameter {name}: {value} is not a finite number")
-    return model.with_parameters(**{name: {"nominal": value} for name, value in values.items()})
+        try:
+            model = model.with_parameters(**{name: {"nominal": value}})
+        except ModelError as error:
+            text, named = str(error), f"parameter {name}:"
+            raise ModelError(text if text.startswith(named) else f"{named} {text}") from None
+    for constraint in model.constraints:
+        if constraint.function(tuple(model.nominal)) > 0.0:
+            raise ModelError(f"the plant's parameters violate {constraint.text}")
+    return model

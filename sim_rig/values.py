@@ -59,7 +59,7 @@ _DRIVERS_BRAKE = {
 
 _RESIDUAL = 0.014  # N*m, assumed: residual torque 2 % of the rated one
 _RATED = 0.6779  # N*m at 0.19 A: rating
-_YIELD = 60.0 / 48.0  # z at which the Bouc-Wen brake slides
+_YIELD = 60.0 / 48.0  # z at which the Bouc-Wen brake slides, whatever its exponent
 
 # The same brake in each of the models: rated and residual torque, stiffness at rest, damping.
 _BRAKES = {
@@ -96,9 +96,12 @@ def named(
     driver_motor: str = "closed",
     driver_brake: str = "closed",
     brake: str = "bouc-wen",
+    exponent: float = 1.0,
 ) -> dict[str, float]:
     """Values of a named set for the given parts, by parameter; "nominal" changes none."""
     if name == "nominal":
         return {}
     rig = RIG | _DRIVERS_MOTOR[driver_motor] | _DRIVERS_BRAKE[driver_brake] | _BRAKES[brake]
+    for shape in {"gamma", "beta"} & set(rig):
+        rig[shape] *= _YIELD ** (1.0 - exponent)
     return rig | TABLE_4_1.get(name, {})

@@ -1,297 +1,228 @@
+"""The simulated rig's plant: ratings, what a rig's YAML may say, what identification gets."""
+
 from __future__ import annotations
 
+import itertools
 import math
+import random
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
+from pydantic import ValidationError
 
-from sim_rig.plant import (
-    GRAVITY,
-    MAX_CURRENT,
-    PARAMETERS,
-    STATES,
-    SUPPLY,
-    actuator_truth,
-    hand_torque,
-    hanging_load,
-    plant,
-    saturate,
-)
-
-P = {parameter.name: parameter.nominal for parameter in PARAMETERS}
-NAMES = [state.name for state in STATES]
-AT = {name: i for i, name in enumerate(NAMES)}
-NO_LOAD = {"k_cable": 0.0, "d_cable": 0.0}
-
-
-def integrate(inputs, duration, changes=None, start=None, max_step=2e-3):
-    """States (9, n) of the plant under inputs(t), by SciPy."""
-    model = plant()
-    p = tuple(model.vector(changes or {}))
-    x0 = model.initial_state if start is None else start
-    found = solve_ivp(
-        lambda t, x: model.derivative(tuple(x), inputs(t), p),
-        (0.0, duration), x0, method="BDF", rtol=1e-6, atol=1e-8, max_step=max_step,
-    )  # fmt: skip
-    assert found.success
-    return found
-
-
-def constant(motor=0.0, brake=0.0):
-    return lambda t: (motor, brake, 0.0, 0.0, 0.0)
-
+from sim_rig.plant import Plant, state_sizes
+from sysid import ModelError
+from tests.sim_rig.support import HYSTERESES, constant, follow, random_point
 
 # --- ratings --------------------------------------------------------------------------------
 
-
-def test_the_motor_holds_its_rated_torque_at_its_rated_current():
-    """At rest the shaft accelerates by what the motor gives: a heavy rotor shows the torque."""
-    inertia = 1e6
-    found = integrate(constant(motor=5.0), 0.1, {"J_m": inertia, **NO_LOAD, "alpha0": 0.0})
-    model = plant()
-    x = tuple(found.y[:, -1])
-    p = tuple(model.vector({"J_m": inertia, **NO_LOAD, "alpha0": 0.0}))
-    torque = model.derivative(x, constant(5.0)(0.1), p)[AT["omega"]] * inertia
-    current = x[AT["current_motor"]]
-    assert torque / current * 2.5 == pytest.approx(0.353, rel=0.01)
-    assert current == pytest.approx(2.5, rel=0.01)
-
-
-@pytest.mark.parametrize("direction", [1.0, -1.0])
-def test_the_brake_slides_at_its_rated_torque(direction):
-    """Driven at a constant slow speed by a heavily damped hand, the coil at 0.19 A."""
-    speed = direction * 1.0
-    changes = {"K_u": 0.0, "B_u": 10.0, "B_m": 0.0} | NO_LOAD
-    # The rating is the coil's at 24 V: hold it there, whatever the amplifier makes of a command.
-    brake = 0.19 / 0.5 / 0.9905
-
-    def inputs(t):
-        return (0.0, brake, 1.0, 0.0, speed)
-
-    start = plant().initial_state.copy()
-    start[AT["omega"]] = speed
-    found = integrate(inputs, 1.0, changes, start)
-    x = found.y[:, -1]
-    assert x[AT["current_brake"]] == pytest.approx(0.19, rel=0.005)
-    assert x[AT["omega"]] * direction > 0.5
-    torque = 10.0 * (speed - x[AT["omega"]])
-    assert abs(torque) == pytest.approx(0.6779, rel=0.01)
-    assert np.sign(torque) == direction
-
-
-@pytest.mark.parametrize(
-    ("channel", "command"), [("motor", 0.4), ("motor", 4.0), ("brake", 0.05), ("brake", 0.3)]
-)
-def test_both_channels_give_half_an_ampere_per_volt(channel, command):
-    # A locked shaft: no back-EMF.
-    found = integrate(constant(**{channel: command}), 1.0, {"J_m": 1e6, **NO_LOAD})
-    current = found.y[AT[f"current_{channel}"], -1]
-    assert current / command == pytest.approx(0.5, rel=0.01)
-
-
-# --- amplifier ------------------------------------------------------------------------------
-
-
-def test_saturate():
-    assert [saturate(v, 2.0) for v in (-3.0, -2.0, -1.0, 0.0, 1.5, 9.0)] == [
-        -2.0, -2.0, -1.0, 0.0, 1.5, 2.0,
-    ]  # fmt: skip
+BRAKES = {
+    "default": {},
+    **{
+        f"{kind} {n:g}{' smooth' * smooth}": {"hysteresis": kind, "exponent": n, "smooth": smooth}
+        for kind, n in HYSTERESES
+        for smooth in (False, True)
+    },
+    "open": {"driver_motor": "open", "driver_brake": "open"},
+    "dahl open": {"driver_motor": "open", "driver_brake": "open", "hysteresis": "dahl"},
+}
+DRIVERS = [
+    {"driver_motor": motor, "driver_brake": brake}
+    for motor, brake in itertools.product(("closed", "open"), repeat=2)
+]
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_a_command_beyond_the_limit_gives_the_current_limit(sign):
-    found = integrate(constant(motor=sign * 50.0), 0.2, {"J_m": 1e6, **NO_LOAD})
-    assert abs(found.y[AT["current_motor"], -1]) == pytest.approx(MAX_CURRENT, rel=0.011)
-    as_much = integrate(constant(motor=sign * 5.0), 0.2, {"J_m": 1e6, **NO_LOAD})
-    np.testing.assert_allclose(found.y[:, -1], as_much.y[:, -1], rtol=1e-6, atol=1e-8)
+@pytest.mark.parametrize("drivers", DRIVERS, ids=lambda d: "-".join(d.values()))
+def test_the_motor_holds_its_rated_torque_at_its_rated_current(drivers, sign):
+    """0.353 N*m at 2.5 A, asked for by 5 V; the lock takes it up, and its sensor shows it."""
+    for sensor in ("load", "between"):
+        model = Plant(load="locked", sensor=sensor, **drivers).build()
+        found = follow(model, constant(model, applied_voltage_motor=sign * 5.0), 0.02)
+        current, torque = found["current_motor"][-1], found.output("torque")
+        assert sign * current == pytest.approx(2.5, rel=0.01)
+        resisting = -1.0 if sensor == "load" else 1.0
+        assert resisting * sign * torque == pytest.approx(0.353, rel=0.01)
+        assert abs(torque / current) == pytest.approx(0.353 / 2.5, rel=1e-6)
 
 
-def test_the_windings_never_see_more_than_the_supply():
-    # A coil that would need 40 V for its command gets 24 V.
-    found = integrate(constant(brake=0.38), 1.0, {"R_b": 40.0 / 0.19, "J_m": 1e6})
-    current = found.y[AT["current_brake"]]
-    assert current[-1] == pytest.approx(SUPPLY / (40.0 / 0.19), rel=1e-6)
-    assert found.y[AT["voltage_brake"], -1] > SUPPLY
-    slope = np.gradient(current, found.t)
-    assert slope.max() <= SUPPLY / P["L_b"] * 1.001
-    # A free motor runs no faster than the supply's back-EMF.
-    free = integrate(constant(motor=5.0), 3.0, {**NO_LOAD, "alpha0": 0.0})
-    speed = free.y[AT["omega"]].max()
-    assert speed < SUPPLY / P["K_m"]
-    assert speed > 0.9 * SUPPLY / P["K_m"]
+@pytest.mark.parametrize("brake", BRAKES)
+@pytest.mark.parametrize("direction", [1.0, -1.0])
+def test_the_brake_slides_slowly_at_its_rated_torque(direction, brake):
+    """0.6779 N*m at 0.19 A, turned by a heavily damped hand; 0.38 V ask for the current.
+
+    The motor is taken out: its bearings, and what it generates into an open-loop driver.
+    """
+    model = Plant(load="hand", **BRAKES[brake]).build()
+    speed = direction * 1.0
+    alone = {"K_u": 0.0, "B_u": 100.0, "B_m": 0.0, "K_m": 0.0}
+    found = []
+    for command in (0.38, 0.0):
+        inputs = constant(model, applied_voltage_brake=command, hand_grip=1.0, hand_omega=speed)
+        found.append(follow(model, inputs, 0.2, alone, {"omega": speed}))
+        assert found[-1]["omega"][-1] == pytest.approx(speed, rel=0.01)
+    current = found[0]["current_brake"][-1]
+    assert current == pytest.approx(0.19, rel=0.01)
+    rated, residual = (direction * trajectory.output("torque") for trajectory in found)
+    assert rated == pytest.approx(0.6779, rel=0.01)
+    assert 0.02 * 0.6779 < residual < 0.022 * 0.6779
 
 
-# --- load -----------------------------------------------------------------------------------
+@pytest.mark.parametrize("drivers", DRIVERS, ids=lambda d: "-".join(d.values()))
+@pytest.mark.parametrize(
+    ("channel", "command"), [("motor", 0.4), ("motor", -4.0), ("brake", 0.05), ("brake", 0.37)]
+)
+def test_both_channels_give_half_an_ampere_per_volt_at_rest(channel, command, drivers):
+    """Open-loop drivers the same as closed-loop ones, into their own windings."""
+    model = Plant(load="locked", **drivers).build()
+    found = follow(model, constant(model, **{f"applied_voltage_{channel}": command}), 0.05)
+    current = found[f"current_{channel}"][-1]
+    assert current / command == pytest.approx(0.5, rel=0.01)
 
 
-def test_the_cable_pulls_and_never_pushes():
-    rng = np.random.default_rng(4)
-    mass = P["mass"]
-    taut = slack = 0
-    for _ in range(500):
-        theta, omega = rng.normal(0, 10), rng.normal(0, 30)
-        height, speed = rng.normal(0, 0.05), rng.normal(0, 0.3)
-        torque, lift = hanging_load(theta, omega, height, speed, mass, 0.005, 5000.0, 10.0)
-        tension = (lift + GRAVITY) * mass
-        assert tension >= -1e-12
-        # The torque is the tension on a lever no longer than the radius, towards less winding.
-        assert torque * theta <= 0.0
-        assert abs(torque) <= 0.005 * tension + 1e-12
-        taut, slack = taut + (tension > 0), slack + (tension == 0)
-    assert taut > 50
-    assert slack > 50
+def test_the_three_models_are_one_brake():
+    """The same torque over angle, loading and turning back, at the same current."""
+    torques = []
+    for hysteresis in ("bouc-wen", "dahl", "lugre"):
+        model = Plant(load="hand", hysteresis=hysteresis).build()
+
+        def inputs(t):
+            return (0.0, 0.2, 1.0, 0.0, 2.0 if t < 0.1 else -2.0)
+
+        times = np.array([0.08, 0.09, 0.103, 0.17, 0.19])
+        changes = {"K_u": 0.0, "B_u": 100.0}
+        found = follow(model, inputs, 0.19, changes, {"omega": 2.0}, max_step=1e-3, times=times)
+        torques.append([found.output("torque", row) for row in range(len(times))])
+    # Sliding they are the same; in between Bouc-Wen unloads along a straighter line.
+    np.testing.assert_allclose(np.array(torques)[:, [0, 1, 3, 4]] / torques[0][0],
+                               [[1.0, 1.0, -1.0, -1.0]] * 3, rtol=0.02)  # fmt: skip
+    assert np.ptp(np.array(torques)[:, 2]) < 0.35 * abs(torques[0][0])
 
 
-def test_the_wound_mass_hangs_in_equilibrium():
-    theta, stretch = 20.0, P["mass"] * GRAVITY / P["k_cable"]
-    root = math.hypot(theta, 0.1)
-    height = 0.005 * (root - 0.1) - stretch
-    torque, lift = hanging_load(theta, 0.0, height, 0.0, P["mass"], 0.005, P["k_cable"], 10.0)
-    assert lift == pytest.approx(0.0, abs=1e-9)
-    assert torque == pytest.approx(-P["mass"] * GRAVITY * 0.005, rel=1e-4)
+# --- the rig's YAML -------------------------------------------------------------------------
 
-
-FREE = {"alpha0": 0.0, "alpha1": 0.0, "c0": 0.0, "c1": 0.0, "B_m": 0.0}
-
-
-def wound(theta, speed=0.0):
-    x = plant().initial_state.copy()
-    x[AT["theta"]], x[AT["omega"]] = theta, speed
-    x[AT["height"]] += 0.005 * (math.hypot(theta, 0.1) - 0.1)
-    return x
-
-
-def test_unwinding_past_the_end_winds_the_other_way_and_swings_back():
-    found = integrate(constant(), 6.0, FREE | {"K_m": 1e-9}, wound(10.0))
-    theta = found.y[AT["theta"]]
-    first_pass = np.flatnonzero(theta < 0.0)[0]
-    turn = first_pass + np.argmin(theta[first_pass:])
-    assert theta.min() < -5.0  # wound up on the other side
-    assert theta[turn:].max() > 2.0  # and back
-    assert np.all(found.y[AT["height"]] <= wound(10.0)[AT["height"]] + 0.01)
-
-
-def test_with_friction_the_residual_torque_holds_the_wound_mass():
-    found = integrate(constant(), 2.0, None, wound(10.0))
-    theta = found.y[AT["theta"]]
-    assert abs(theta[-1] - theta[0]) < 1.0
-    assert abs(found.y[AT["omega"], -1]) < 0.3
-
-
-# --- energy ---------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("case", ["driven", "swinging", "hand"])
-def test_the_mechanical_power_balance_closes(case):
-    """Kinetic and potential energy change by what motor, brake, cable and hand do."""
-    model = plant()
-    p = tuple(model.nominal)
-    inputs = {
-        "driven": lambda t: (3.0 * math.sin(9.0 * t), 0.1, 0.0, 0.0, 0.0),
-        "swinging": constant(),
-        "hand": lambda t: (
-            1.0, 0.05, 1.0, 5.0 * math.sin(4.0 * t), 20.0 * math.cos(4.0 * t),
-        ),
-    }[case]  # fmt: skip
-    start = wound(6.0, speed=-40.0)
-    J = P["n_c"] ** 2 * P["J_m"] + P["J_b"] + P["J_p"]
-
-    def powers(t, x):
-        i_m, i_b, omega, z = (x[AT[n]] for n in ("current_motor", "current_brake", "omega", "z"))
-        theta, height, speed = (x[AT[n]] for n in ("theta", "height", "speed"))
-        motor = -P["n_c"] * P["K_m"] * i_m * omega
-        alpha = P["alpha0"] + P["alpha1"] * abs(i_b)
-        c = P["c0"] + P["c1"] * abs(i_b) + P["n_c"] ** 2 * P["B_m"]
-        brake = (alpha * z + c * omega) * omega
-        _u, _b, grip, hand_theta, hand_omega = inputs(t)
-        hand = grip * (P["B_u"] * (hand_omega - omega) + P["K_u"] * (hand_theta - theta)) * omega
-        # The cable's length past the pulley, and its rate.
-        root = math.sqrt(theta**2 + 0.1**2)
-        stretch = P["radius"] * (root - 0.1) - height
-        rate = P["radius"] * theta / root * omega - speed
-        tension = 0.0
-        if stretch > 0.0:
-            tension = max(P["k_cable"] * stretch + P["d_cable"] * rate, 0.0)
-        return motor - brake + hand, -tension * rate
-
-    def rhs(t, x):
-        return np.append(model.derivative(tuple(x[:9]), inputs(t), p), powers(t, x))
-
-    found = solve_ivp(
-        rhs, (0.0, 1.0), np.append(start, [0.0, 0.0]), method="LSODA", rtol=1e-9, atol=1e-11,
-        max_step=1e-3,
-    )  # fmt: skip
-    omega, speed, height = (found.y[AT[n]] for n in ("omega", "speed", "height"))
-    energy = 0.5 * J * omega**2 + 0.5 * P["mass"] * speed**2 + P["mass"] * GRAVITY * height
-    work = found.y[9] + found.y[10]
-    scale = np.abs(found.y[9]).max() + np.ptp(energy)
-    np.testing.assert_allclose(energy - energy[0], work, atol=1e-5 * scale)
-    # The cable stores and loses, and never gives more than it was stretched by.
-    root = np.hypot(found.y[AT["theta"]], 0.1)
-    stretch = np.maximum(P["radius"] * (root - 0.1) - height, 0.0)
-    stored = 0.5 * P["k_cable"] * stretch**2
-    taken = -found.y[10]
-    assert np.all(np.diff(taken - stored) >= -1e-5 * scale)
-
-
-def test_the_torque_sensor_sees_the_load_and_the_pulleys_inertia():
-    model = plant()
-    x = wound(5.0, 3.0)
-    u = (1.0, 0.1, 1.0, 5.5, 2.0)
-    p = tuple(model.nominal)
-    acceleration = model.derivative(tuple(x), u, p)[AT["omega"]]
-    cable, _ = hanging_load(
-        5.0, 3.0, x[AT["height"]], 0.0, P["mass"], P["radius"], P["k_cable"], P["d_cable"]
+CHOICES = [
+    {"load": load, "friction": friction, "sensor": sensor, "hysteresis": kind, "smooth": smooth}
+    for load, friction, sensor, kind, smooth in itertools.product(
+        ("free", "locked", "pulley", "hand"),
+        ("none", "stribeck", "cyclic"),
+        ("load", "between"),
+        ("bouc-wen", "dahl", "lugre"),
+        (False, True),
     )
-    hand = P["B_u"] * (2.0 - 3.0) + P["K_u"] * (5.5 - 5.0)
-    outputs = model.evaluate_output(x, u, p)
-    assert outputs[2] == pytest.approx(cable + hand - P["J_p"] * acceleration)
-    # What it sees is all that acts on the actuator from outside.
-    rotor = (P["J_m"] + P["J_b"]) * acceleration
-    resisting = P["alpha0"] * x[AT["z"]] + (P["c0"] + P["B_m"]) * 3.0
-    assert rotor == pytest.approx(outputs[2] - resisting)
-    assert outputs[3:] == (5.0, 3.0)
+]
 
 
-# --- hand -----------------------------------------------------------------------------------
+def test_every_choice_is_a_plant_with_the_rigs_signals():
+    for choice in CHOICES:
+        plant = Plant(**choice)
+        model = plant.build()
+        assert model.output_names == (
+            "current_motor", "current_brake", "torque", "theta", "omega",
+        )  # fmt: skip
+        hand = () if choice["load"] == "locked" else ("hand_grip", "hand_theta", "hand_omega")
+        assert model.input_names[2:] == hand
+        assert model.state_names[6] == "theta"
+        assert ("mass" in model.parameter_names) == (choice["load"] == "pulley")
+        sizes = state_sizes(model)
+        assert sizes.shape == (len(model.states),)
+        assert np.all((sizes > 0.0) & np.isfinite(sizes))
 
 
-def test_the_hand_is_a_second_order_system_of_the_given_response():
-    """(A.2): J_u (s^2 + 2 xi omega_n s + omega_n^2), xi = 0.707, omega_n = 3/0.237 s."""
-    inertia = 1e-3
-    poles = np.roots([inertia, P["B_u"], P["K_u"]])
-    omega_n = abs(poles[0])
-    assert omega_n == pytest.approx(3.0 / 0.237)
-    assert -poles[0].real / omega_n == pytest.approx(0.707)
-    assert inertia >= 9.0 * (P["J_m"] + P["J_b"])
+@pytest.mark.parametrize("kind", ["bouc-wen", "dahl", "lugre"])
+def test_the_size_of_z_is_where_the_brake_slides(kind):
+    found = state_sizes(Plant(hysteresis=kind).build())[5]
+    assert found == pytest.approx({"bouc-wen": 1.25, "dahl": 1.0, "lugre": 1.0 / 48.0}[kind])
 
 
-def test_the_hand_pulls_towards_itself():
-    assert hand_torque(1.0, 2.0, 1.5, 2.5, 10.0, 0.1) == pytest.approx(5.05)  # (A.1)
-    assert hand_torque(1.5, 2.5, 1.0, 2.0, 10.0, 0.1) == pytest.approx(-5.05)
+@pytest.mark.parametrize(
+    ("kind", "values"),
+    [
+        ("bouc-wen", {"beta": 0.0, "gamma": 0.0}),
+        ("bouc-wen", {"A": 0.0}),
+        ("lugre", {"zeta": 0.0}),
+    ],
+)
+def test_a_brake_that_never_slides_still_has_sizes(kind, values):
+    sizes = state_sizes(Plant(hysteresis=kind, parameters=values).build())
+    assert np.all((sizes > 0.0) & np.isfinite(sizes))
 
 
-def test_without_grip_the_hand_does_nothing():
-    model = plant()
-    x, p = tuple(wound(3.0, 1.0)), tuple(model.nominal)
-    away = model.derivative(x, (1.0, 0.1, 0.0, 99.0, -50.0), p)
-    assert away == model.derivative(x, (1.0, 0.1, 0.0, 0.0, 0.0), p)
-    assert away != model.derivative(x, (1.0, 0.1, 1.0, 99.0, -50.0), p)
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"parameters": {"R_x": 1.0}}, "no parameter 'R_x'; it has K_dm"),
+        ({"parameters": {"R_m": math.inf}}, r"parameters\.R_m\s+Input should be a finite number"),
+        ({"parameters": {"R_m": math.nan}}, r"parameters\.R_m\s+Input should be a finite number"),
+        ({"parameters": {"R_m": "much"}}, r"parameters\.R_m\s+Input should be a valid number"),
+        ({"parameters": {"R_m": True}}, "parameter R_m: yes, no"),
+        ({"parameters": {"R_m": -1.0}}, r"parameter R_m: .* -1\.0 is outside its physical limits"),
+        ({"parameters": {"mass": -0.1}}, "parameter mass: .* outside its physical limits"),
+        ({"parameters": {"L_m": 0.0}}, "parameter L_m: .* divides by zero"),
+        ({"parameters": {"mass": 0.0}}, "parameter mass: .* divides by zero"),
+        (
+            {"friction": "stribeck", "parameters": {"omega_r": 0.0}},
+            "parameter omega_r: .* divides by zero",
+        ),
+        # Parts that are not there have no values.
+        ({"load": "hand", "parameters": {"mass": 0.2}}, "no parameter 'mass'"),
+        ({"driver_motor": "open", "parameters": {"K_dm": 100.0}}, "no parameter 'K_dm'"),
+        ({"parameters": {"F_c": 0.01}}, "no parameter 'F_c'"),
+        ({"parameters": {"rho": 100.0}}, "no parameter 'rho'"),
+        # No brake gives energy, and no friction drives.
+        ({"parameters": {"gamma": 10.0, "beta": 20.0}}, "violate gamma - beta >= 0"),
+        ({"friction": "stribeck", "parameters": {"F_s": 0.001}}, "violate F_s >= F_c"),
+        ({"friction": "cyclic", "parameters": {"F_cos": 0.3}}, "violate F_c >= "),
+        ({"hysteresis": "dahl", "exponent": 2.0}, "not dahl"),
+        ({"exponent": 0.5}, "exponent"),
+        ({"load": "measured"}, "load"),
+        ({"driver_motor": "both"}, "driver_motor"),
+        ({"parameter_set": "E"}, "parameter_set"),
+        ({"lode": "hand"}, "lode"),
+    ],
+)
+def test_what_is_impossible_is_refused_by_name(settings, message):
+    with pytest.raises(ValidationError, match=message):
+        Plant.model_validate(settings)
 
 
-def test_the_actuator_inside_is_the_actuator_that_is_identified():
-    """With nothing hanging and no limit reached, the plant is the process model."""
-    from sim_rig.actuator import actuator
+def test_values_take_effect():
+    plant = Plant(friction="cyclic", parameter_set="C", parameters={"R_b": 99.0, "cycles": 3.0})
+    for model in (plant.build(), plant.process_model()):
+        values = dict(zip(model.parameter_names, model.nominal, strict=True))
+        assert (values["R_b"], values["cycles"], values["R_m"]) == (99.0, 3.0, 6.61)
+    assert Plant(parameters={"mass": 0.5}).build().parameter("mass").nominal == 0.5
+    with pytest.raises(ModelError, match="mass"):
+        Plant(parameters={"mass": 0.5}).process_model().parameter("mass")
 
-    model, rng = plant(), np.random.default_rng(5)
-    inner = actuator()
-    p = tuple(model.vector({"J_p": 0.0}))
-    q = tuple(inner.vector(actuator_truth()))
+
+# --- what identification gets ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {},
+        {"load": "free", "hysteresis": "lugre", "friction": "cyclic"},
+        {"load": "hand", "driver_motor": "open", "driver_brake": "open", "hysteresis": "dahl"},
+        {"exponent": 2.0, "smooth": True, "friction": "stribeck", "parameters": {"n_c": 2.0}},
+    ],
+)
+def test_the_model_that_is_identified_is_the_actuator_inside_the_plant(settings):
+    """Within the amplifiers' limits, given the torque that the plant's sensor shows."""
+    plant = Plant(**settings)
+    whole, inner = plant.build(), plant.process_model()
+    rng = random.Random(5)
+    assert inner.output_names == ("current_motor", "current_brake", "omega")
     for _ in range(50):
-        x = rng.normal(size=7) * [5, 5, 1, 0.1, 5, 1, 0.01]
-        command = rng.uniform([-4, 0], [4, 0.3])
-        slack = (*x, 1.0, 0.0)  # the mass lies high above
-        found = model.derivative(slack, (*command, 0.0, 0.0, 0.0), p)[:7]
-        expected = inner.derivative(tuple(x), (*command, 0.0), q)
-        np.testing.assert_allclose(found, expected, rtol=1e-12)
+        point = random_point(whole, rng)
+        x = point.x | {"voltage_motor": 9.0, "voltage_brake": -3.0, "current_motor": 1.2}
+        x["current_brake"] = 0.1
+        u = point.u | {"applied_voltage_motor": -2.0, "applied_voltage_brake": 0.3}
+        q = dict(zip(whole.parameter_names, whole.nominal, strict=True))
+        at = point._replace(x=x, u=u, q=q).of(whole)
+        torque = whole.evaluate_output(*at)[2]
+        expected = whole.derivative(*at)[:7]
+        known = point._replace(x=x, u=u | {"torque": torque}, q=q)
+        found = inner.derivative(*known.of(inner))
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
