@@ -6,8 +6,8 @@ from scipy.linalg import expm
 
 from daq.config.rig import RigConfig
 from daq.rig import Offsets, Rig
+from sim_rig.actuator import actuator
 from sim_rig.backend import SimulatedDevice, Simulation
-from sim_rig.plant import actuator_truth
 from tests.daq.hal_contract import RATE, Bench, HalContract, free_currents, levels, plan, play
 
 KINDS = {
@@ -35,7 +35,8 @@ def _exact_currents(applied, omega):
 
     Written out from the equations of driver and winding, without the project's integrators.
     """
-    p = actuator_truth()
+    rig = actuator(parameters="rig")
+    p = dict(zip(rig.parameter_names, rig.nominal, strict=True))
     result = np.zeros((len(applied), 2))
     for j, (K, w, R, L, emf) in enumerate(
         [
