@@ -257,4 +257,5 @@ class PolynomialModel(RegressorMixin, BaseEstimator):  # type: ignore[misc]
 def _fit(measured: FloatArray, simulated: FloatArray) -> FloatArray:
     """Fit %, minus infinity for a simulation that went out of bounds."""
     bounded = np.isfinite(simulated).all(axis=0)
-    return np.where(bounded, fit_percent(measured, simulated), -np.inf)
+    with np.errstate(all="ignore"):
+        return np.where(bounded, fit_percent(measured, simulated), -np.inf)

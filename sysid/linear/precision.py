@@ -9,7 +9,7 @@ import numpy as np
 
 from sysid.linear.prediction_error import RowFit
 from sysid.linear.regression import influence
-from sysid.model import BoolArray, FloatArray, IntArray
+from sysid.model import FloatArray, IntArray
 
 
 class Precision:
@@ -22,6 +22,7 @@ class Precision:
     def __init__(self, positions: Sequence[IntArray], fits: Sequence[RowFit]) -> None:
         self._positions = positions
         self._fits = fits
+        self._influence = [influence(fit.sensitivity) for fit in fits]
         self.shared: IntArray = reduce(
             lambda a, b: np.intersect1d(a, b, assume_unique=True), positions
         )
@@ -34,17 +35,16 @@ class Precision:
         for i in range(q):
             for j in range(i + 1):
                 ours, theirs = self._common(i, j)
-                used = (self._n_parameters(i) + self._n_parameters(j)) / 2.0
+                used = (self._influence[i].rank + self._influence[j].rank) / 2.0
                 product = self._fits[i].residual[ours] @ self._fits[j].residual[theirs]
                 noise[i, j] = noise[j, i] = product / max(len(ours) - used, 1.0)
         return noise
 
     def covariance(self) -> FloatArray:
         """Of all coefficients, (p, p). Infinite where the data do not determine one."""
-        pairs = [influence(fit.sensitivity) for fit in self._fits]
-        blocks = [[self._block(i, j, pairs) for j in range(len(pairs))] for i in range(len(pairs))]
-        result: FloatArray = np.block(blocks)
-        undetermined = np.concatenate([~determined for _, determined in pairs])
+        outputs = range(len(self._fits))
+        result: FloatArray = np.block([[self._block(i, j) for j in outputs] for i in outputs])
+        undetermined = np.concatenate([~found.determined for found in self._influence])
         result[undetermined] = np.nan
         result[:, undetermined] = np.nan
         result[undetermined, undetermined] = np.inf
@@ -66,16 +66,14 @@ class Precision:
             return np.inf
         return float(-0.5 * n * (q * np.log(2.0 * np.pi) + logdet + q))
 
-    def _n_parameters(self, row: int) -> int:
-        return int(self._fits[row].sensitivity.shape[1])
-
     def _common(self, i: int, j: int) -> tuple[IntArray, IntArray]:
         _, ours, theirs = np.intersect1d(
             self._positions[i], self._positions[j], assume_unique=True, return_indices=True
         )
         return ours, theirs
 
-    def _block(self, i: int, j: int, pairs: Sequence[tuple[FloatArray, BoolArray]]) -> FloatArray:
+    def _block(self, i: int, j: int) -> FloatArray:
         ours, theirs = self._common(i, j)
-        block: FloatArray = self.noise[i, j] * pairs[i][0][:, ours] @ pairs[j][0][:, theirs].T
+        one, other = self._influence[i].gain[:, ours], self._influence[j].gain[:, theirs]
+        block: FloatArray = self.noise[i, j] * one @ other.T
         return block

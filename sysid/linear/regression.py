@@ -148,14 +148,26 @@ def least_squares(regressors: FloatArray, target: FloatArray) -> LeastSquares:
     return LeastSquares(solution, target - regressors @ solution, columns, factor)
 
 
-def influence(sensitivity: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """How each parameter follows the noise, (p, n), and which the data determine, (p,)."""
+@dataclass(frozen=True)
+class Influence:
+    """How the parameters follow the noise.
+
+    gain: (p, n), change of each parameter per noise; determined: (p,), whether the data tell a
+    parameter at all; rank: how many combinations of parameters they tell.
+    """
+
+    gain: FloatArray
+    determined: BoolArray
+    rank: int
+
+
+def influence(sensitivity: FloatArray) -> Influence:
+    """Of noise in each row on parameters of a given sensitivity, (n, p)."""
     scale = _lengths(sensitivity)
     U, s, V = np.linalg.svd(sensitivity / scale, full_matrices=False)
     rank = int(np.sum(s > max(sensitivity.shape) * np.finfo(float).eps * s[0])) if len(s) else 0
-    determined = np.linalg.norm(V[rank:], axis=0) < 1e-6
-    gain = (V[:rank].T / s[:rank]) @ U[:, :rank].T
-    return gain / scale[:, None], determined
+    gain = ((V[:rank].T / s[:rank]) @ U[:, :rank].T) / scale[:, None]
+    return Influence(gain, np.linalg.norm(V[rank:], axis=0) < 1e-6, rank)
 
 
 def _lengths(columns: FloatArray) -> FloatArray:

@@ -140,7 +140,8 @@ class _Judge:
         for record in self._validation:
             # The same rows for all, whatever past each of them starts from.
             simulated = model.predict(record)[self._lag :]
-            metrics = evaluate(record.outputs[self._lag :], simulated)
+            with np.errstate(all="ignore"):
+                metrics = evaluate(record.outputs[self._lag :], simulated)
             fits.append(np.where(np.isfinite(simulated).all(axis=0), metrics.fit, -np.inf))
             errors.append(metrics.rmse)
         return Candidate(
