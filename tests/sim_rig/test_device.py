@@ -8,6 +8,9 @@ import pytest
 from daq.errors import DeviceError
 from daq.hal import Flag, Guard, Mode, Phase, RawSamples
 from sim_rig.backend import Imperfections, SimulatedDevice, Simulation
+from sim_rig.plant import Plant
+from sysid import Dataset
+from sysid.reference import simulate as reference
 
 OPEN_GUARD = Guard(
     np.array([-10.0, -10.0]), np.array([10.0, 10.0]), np.full(3, -99.0), np.full(3, 99.0)
@@ -254,3 +257,63 @@ def test_room_shrinks_by_what_is_queued():
     assert found.room() == before - 300
     played = len(found.receive().tick)
     assert found.room() == before - 300 + played
+
+
+# --- other plants ---------------------------------------------------------------------------
+
+PLANTS = {
+    "free": {
+        "load": "free", "friction": "stribeck", "sensor": "between", "hysteresis": "dahl",
+        "driver_motor": "open", "driver_brake": "open",
+    },
+    "locked": {"load": "locked", "friction": "cyclic", "hysteresis": "lugre"},
+    "hand": {"load": "hand", "sensor": "between", "smooth": True, "driver_brake": "open"},
+    "pulley": {
+        "load": "pulley", "friction": "cyclic", "sensor": "between", "exponent": 2.0,
+        "parameter_set": "C", "parameters": {"cycles": 3.0},
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_every_plant_runs_and_shows_what_scipy_computes(name):
+    plant = Plant(**PLANTS[name])
+    n, compared = 200, 100
+    ideal, noisy = (
+        play(device(seed=3, ideal=ideal, plant=plant), waveform(n)) for ideal in (True, False)
+    )
+    for found in (ideal, noisy):
+        np.testing.assert_array_equal(found.tick, np.arange(n))
+        assert np.all(found.flags == 0)
+        for column in (found.analog, found.counts, found.count_rate, found.applied):
+            assert np.all(np.isfinite(column))
+    assert np.all(noisy.counts == np.round(noisy.counts))
+    # 10 mV of noise and up to 20 mV of offset.
+    assert np.abs(noisy.analog - ideal.analog).max() < 0.020 + 5 * 0.010
+    model = plant.build()
+    inputs = np.zeros((compared, len(model.inputs)))
+    inputs[:, :2] = waveform(n)[:compared]
+    if name == "hand":
+        inputs[:, 2] = 1.0  # it never lets go
+    record = Dataset(inputs, np.full((compared, 5), np.nan), 1.0 / RATE)
+    expected = reference(model, model.nominal, record, rtol=1e-7, atol=1e-9)
+    per_radian = 8192 / (2.0 * math.pi)
+    shown = np.column_stack(
+        [ideal.analog / [2.0, 2.0, 5.0 / 3.53], ideal.counts / per_radian,
+         ideal.count_rate / per_radian]
+    )[:compared]  # fmt: skip
+    size = np.maximum(np.abs(expected).max(axis=0), 1e-6)
+    assert np.all(size[:3] > 0.01)
+    np.testing.assert_allclose(shown / size, expected / size, atol=1e-3)
+    moves = np.ptp(ideal.counts) > 20
+    assert moves == (name != "locked")
+
+
+def test_a_hand_that_is_the_load_stays_where_it_has_wound_to():
+    found = device(ideal=True, plant=Plant(**PLANTS["hand"]))
+    found.announce(Phase.HOMING, 1.0)
+    turns = play(found, np.zeros((2000, 2))).counts / 8192
+    assert turns[-1] == pytest.approx(1.1, abs=0.02)
+    found.announce(Phase.RUN)
+    turns = play(found, np.zeros((400, 2))).counts / 8192
+    np.testing.assert_allclose(turns, 1.1, atol=0.02)
