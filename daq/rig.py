@@ -19,7 +19,6 @@ from daq.hal import (
     Flag,
     FloatArray,
     Guard,
-    IntArray,
     Mode,
     Phase,
     RawSamples,
@@ -50,11 +49,15 @@ class Rig:
         self.config = config
         self.offsets = Offsets.zero()
         self._device = device
-        self._asked: list[FloatArray] = []
+        # Commands asked for, and whether they were clamped, by tick modulo the length.
+        self._asked = np.zeros((1, len(CHANNELS)))
+        self._clamped = np.zeros(1, dtype=bool)
         self._asked_until = 0
-        self._first_asked = 0
         self._last_tick = -1
         self._rate = 1.0
+        self._low, self._high = self._command_limits()
+        self._scale = self._scales()
+        self._radians = 0.0
         self._info: DeviceInfo | None = None
 
     def __enter__(self) -> Rig:
@@ -92,10 +95,16 @@ class Rig:
                 f"{self.info.name} samples at up to {self.info.max_rate:g} Hz; "
                 f"sample_rate {sample_rate:g} Hz is too fast for it"
             )
-        self._asked.clear()
-        self._asked_until = self._first_asked = 0
+        # Twice what the device can hold ahead: as much may be on its way back.
+        self._asked = np.zeros((2 * self.info.queue, len(CHANNELS)))
+        self._clamped = np.zeros(len(self._asked), dtype=bool)
+        self._asked_until = 0
         self._last_tick = -1
         self._rate = sample_rate
+        self._low, self._high = self._command_limits()
+        self._scale = self._scales()
+        encoder = self.config.sensors.encoder
+        self._radians = encoder.sign * 2.0 * np.pi / (4.0 * encoder.cycles)
         self._device.start(sample_rate, mode, self._guard())
 
     def send(self, tick: int, commands: FloatArray) -> None:
@@ -108,10 +117,12 @@ class Rig:
         commands = np.asarray(commands, dtype=np.float64)
         if not np.all(np.isfinite(commands)):
             raise DeviceError(f"a command from tick {tick} on is not a finite number of volts")
-        self._asked.append(commands)
+        limited = np.minimum(np.maximum(commands, self._low), self._high)
+        places = np.arange(tick, tick + len(commands)) % len(self._asked)
+        self._asked[places] = commands
+        self._clamped[places] = (limited != commands).any(axis=1)
         self._asked_until += len(commands)
-        low, high = self._command_limits()
-        self._device.send(tick, np.clip(commands, low, high))
+        self._device.send(tick, limited)
 
     def take_offsets(self, means: Mapping[str, float]) -> None:
         """Make what the inputs read now, in SI units by name, their zero."""
@@ -158,16 +169,17 @@ class Rig:
         return np.array([item.sign * item.scale for item in inputs])
 
     def _to_si(self, raw: RawSamples) -> Samples:
-        encoder = self.config.sensors.encoder
-        radians = encoder.sign * 2.0 * np.pi / (4.0 * encoder.cycles)
-        analog = (raw.analog - self.offsets.volts) * self._scales()
-        low, high = self._command_limits()
-        asked = self._take_asked(raw.tick)
-        flags = raw.flags.copy()
-        flags[np.any((asked < low) | (asked > high), axis=1)] |= int(Flag.CLAMPED)
-        before = np.concatenate([[self._last_tick], raw.tick[:-1]])
-        flags[raw.tick != before + 1] |= int(Flag.LOST)
-        self._last_tick = int(raw.tick[-1])
+        analog = (raw.analog - self.offsets.volts) * self._scale
+        # A tick never asked for counts as the one before.
+        places = np.minimum(raw.tick, max(self._asked_until - 1, 0)) % len(self._asked)
+        asked = self._asked[places]
+        flags = raw.flags | (self._clamped[places] * int(Flag.CLAMPED))
+        first, last, n = int(raw.tick[0]), int(raw.tick[-1]), len(raw.tick)
+        if first != self._last_tick + 1:
+            flags[0] |= int(Flag.LOST)
+        if last - first != n - 1:
+            flags[1:][np.diff(raw.tick) != 1] |= int(Flag.LOST)
+        self._last_tick = last
         return Samples(
             tick=raw.tick,
             time=raw.tick / self._rate,
@@ -178,23 +190,10 @@ class Rig:
             current_motor=analog[:, 0],
             current_brake=analog[:, 1],
             torque=analog[:, 2],
-            theta=raw.counts * radians,
-            omega=raw.count_rate * radians,
+            theta=raw.counts * self._radians,
+            omega=raw.count_rate * self._radians,
             flags=flags,
         )
-
-    def _take_asked(self, ticks: IntArray) -> FloatArray:
-        """What was asked for these ticks; a tick never asked for counts as the one before."""
-        known = np.concatenate(self._asked) if self._asked else np.zeros((0, 2))
-        if len(known) == 0:
-            return np.zeros((len(ticks), 2))
-        rows = np.clip(ticks - self._first_asked, 0, len(known) - 1)
-        asked: FloatArray = known[rows]
-        # Keep the last row taken: it is what a held tick refers to.
-        keep = max(int(rows[-1]), 0)
-        self._first_asked += keep
-        self._asked = [known[keep:]]
-        return asked
 
 
 def interlock_reason(samples: Samples, config: RigConfig) -> tuple[int, str] | None:

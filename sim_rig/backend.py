@@ -23,18 +23,19 @@ from daq.hal import (
     Phase,
     RawSamples,
 )
+from sim_rig import command_queue, converters
+from sim_rig.command_queue import CommandQueue
+from sim_rig.converters import Converters
 from sim_rig.encoder import EncoderCounter
-from sim_rig.plant import Plant
+from sim_rig.plant import Plant, state_sizes
+from sim_rig.user import SimulatedUser
 from sysid import Stepper
 
-_QUEUE = 65_536
 _BLOCK = 256  # ticks simulated at once in open loop
 _REAL_TIME_BLOCK = 0.02  # s between deliveries of a device in real time
-_TURN_TIME = 1.0  # s, the simulated user's pace at the handle
-_REST = 0.5  # s, holding still before letting go
-_OVERWIND = 0.1  # turns
-_CONVERTER_RANGE = 10.0  # V, either side of zero
 _THETA = 6  # the plant's state
+_ACCURACY = 1e-4  # of the plant's states in parts of what matters: a tenth of the noise and below
+_INTERLOCK = int(Flag.INTERLOCK)
 
 
 class Imperfections(Section):
@@ -74,24 +75,17 @@ class SimulatedDevice:
     def __init__(self, options: Simulation) -> None:
         self.options = options
         self._plant = options.plant.build()
-        self._held_by_hand = options.plant.load == "hand"
+        self._user = SimulatedUser(options.plant.load == "hand")
         self._rng = np.random.default_rng(options.seed)
-        worst = 0.0 if options.ideal else options.imperfections.offset
-        self._offsets = self._rng.uniform(-worst, worst, len(ANALOG_INPUTS))
-        self._senses = np.array(
-            [options.current_sense, options.current_sense, options.torque_sense]
-        )
+        self._converters = self._make_converters()
+        self._noise, self._noise_used = np.empty((0, len(ANALOG_INPUTS))), 0
+        self._n_inputs = len(self._plant.inputs)
         self._steppers: dict[float, Stepper] = {}
-        self._p = self._plant.nominal
-        self._user_turns = 0.0
-        self._user_start: float | None = None
-        self._user_from = 0.0
-        self._rest_angle = 0.0
+        self._queue = CommandQueue()
         self._clock = 0.0  # device time since it was switched on [s], at the next tick
         self._origin = 0.0  # and at tick 0
         self._open = False
         self._running = False
-        self._reset_queue()
 
     def open(self) -> DeviceInfo:
         """Switch on, the load let down since the last time; sampling starts with ``start``."""
@@ -101,54 +95,55 @@ class SimulatedDevice:
         return DeviceInfo(
             name="simulated rig",
             max_rate=20_000.0,
-            queue=_QUEUE,
-            volts_in=(-_CONVERTER_RANGE, _CONVERTER_RANGE),
+            queue=command_queue.SIZE,
+            volts_in=(-converters.RANGE, converters.RANGE),
             virtual_time=self.options.time == "virtual",
         )
 
     def announce(self, phase: Phase, turns: float = 0.0) -> None:
         """The simulated user winds the handle when asked to, and otherwise keeps off."""
-        if self._user_start is not None:
-            self._user_start = None
-            self._rest_angle = self._user_from + 2.0 * math.pi * (self._user_turns + _OVERWIND)
+        self._user.stop()
         if phase is Phase.HOMING and turns > 0.0:
-            self._user_turns = turns
-            self._user_start = self._clock
-            self._user_from = float(self._x[_THETA])
+            self._user.wind(turns, self._clock, float(self._x[_THETA]))
 
     def start(self, sample_rate: float, mode: Mode, guard: Guard) -> None:
         """Begin with tick 0; in open loop when the first commands are there."""
         if not self._open:
             raise DeviceError("the simulated rig is not open; open it before starting")
         if sample_rate not in self._steppers:
-            self._steppers[sample_rate] = Stepper(self._plant, self._p, 1.0 / sample_rate)
+            self._steppers[sample_rate] = Stepper(
+                self._plant,
+                self._plant.nominal,
+                1.0 / sample_rate,
+                scale=state_sizes(self._plant),
+                accuracy=_ACCURACY,
+            )
         self._stepper = self._steppers[sample_rate]
-        self._rate, self._mode, self._guard = sample_rate, mode, guard
+        self._rate, self._guard = sample_rate, guard
+        self._waits_for_commands = mode is Mode.OPEN_LOOP
         self._origin = self._clock
-        self._reset_queue()
+        self._queue.restart(mode)
         self._running = True
         self._wall_start: float | None = None
 
     def send(self, tick: int, commands: FloatArray) -> None:
         """Queue commands; those for ticks already past are too late and dropped."""
         self._require_running()
-        late = max(0, self._tick - tick)
-        if late < len(commands):
-            self._queue.append(np.array(commands[late:], dtype=np.float64))
-            self._queued_until = tick + len(commands)
+        volts = np.ascontiguousarray(commands, dtype=np.float64)
+        self._queue.put(tick, self._converters.commands(volts, self._guard))
         if self._wall_start is None:
             self._wall_start = time.perf_counter()
 
     def room(self) -> int:
         """Commands that still fit the queue."""
-        return _QUEUE - (self._queued_until - self._tick)
+        return command_queue.SIZE - self._queue.queued
 
     def receive(self) -> RawSamples:
         """Simulate what is queued, or one tick when nothing is."""
         self._require_running()
-        n = self._due()
-        applied, flags = self._commands(n)
-        return self._play(applied, flags)
+        guarded = not self._queue.latched
+        applied, flags = self._queue.take(self._due())
+        return self._play(applied, flags, guarded)
 
     def stop(self) -> None:
         """End sampling."""
@@ -157,10 +152,7 @@ class SimulatedDevice:
 
     def safe(self) -> None:
         """Forget all commands; the outputs are zero from the next tick on."""
-        self._queue: list[FloatArray] = []
-        self._queued_until = self._tick
-        self._held = np.zeros(len(CHANNELS))
-        self._latched = True
+        self._queue.latch()
 
     def close(self) -> None:
         """Switch off."""
@@ -171,132 +163,90 @@ class SimulatedDevice:
         if not self._running:
             raise DeviceError("the simulated rig is not sampling; start it first")
 
-    def _reset_queue(self) -> None:
-        self._tick = 0
-        self.safe()
-        self._latched = False
+    def _make_converters(self) -> Converters:
+        options, flaws = self.options, self.options.imperfections
+        worst = 0.0 if options.ideal else flaws.offset
+        return Converters(
+            np.array([options.current_sense, options.current_sense, options.torque_sense]),
+            self._rng.uniform(-worst, worst, len(ANALOG_INPUTS)),
+            flaws.noise,
+            0.0 if options.ideal else 2.0 * converters.RANGE / 2**flaws.bits,
+        )
 
     def _due(self) -> int:
         """How many ticks to play now; waits for them in real time."""
-        queued = self._queued_until - self._tick
-        open_loop = self._mode is Mode.OPEN_LOOP and not self._latched
         if self.options.time == "virtual":
-            return min(max(queued, 1), _BLOCK)
+            return min(max(self._queue.queued, 1), _BLOCK)
         if self._wall_start is None:
             self._wall_start = time.perf_counter()
-        ticks = max(1, round(_REAL_TIME_BLOCK * self._rate)) if open_loop else 1
+        in_blocks = self._waits_for_commands and not self._queue.latched
+        ticks = max(1, round(_REAL_TIME_BLOCK * self._rate)) if in_blocks else 1
         # Tick k is latched at k/rate; it can be delivered from then on.
-        until = self._wall_start + (self._tick + ticks - 1) / self._rate
+        until = self._wall_start + (self._queue.tick + ticks - 1) / self._rate
         while (wait := until - time.perf_counter()) > 0.0:
             time.sleep(wait)
         elapsed = math.floor((time.perf_counter() - self._wall_start) * self._rate) + 1
-        return max(1, min(elapsed - self._tick, _BLOCK))
+        return max(1, min(elapsed - self._queue.tick, _BLOCK))
 
-    def _commands(self, n: int) -> tuple[FloatArray, IntArray]:
-        """What will be applied in the next n ticks, before interlocks, and why."""
-        applied = np.zeros((n, len(CHANNELS)))
-        flags = np.zeros(n, dtype=np.int64)
-        filled = 0
-        while filled < n and self._queue:
-            head = self._queue[0]
-            take = min(n - filled, len(head))
-            applied[filled : filled + take] = head[:take]
-            self._queue[0] = head[take:]
-            if take == len(head):
-                self._queue.pop(0)
-            filled += take
-        if self._latched:
-            applied[:] = 0.0
-            return applied, flags
-        if filled:
-            self._held = applied[filled - 1].copy()
-        if filled < n:
-            if self._mode is Mode.CLOSED_LOOP:
-                applied[filled:] = self._held
-                flags[filled:] |= int(Flag.HELD)
-            elif self._tick + filled > 0:
-                flags[filled:] |= int(Flag.UNDERFLOW)
-                self._latched = True
-        if not self.options.ideal:
-            resolution = 2.0 * _CONVERTER_RANGE / 2**self.options.imperfections.bits
-            applied = np.round(applied / resolution) * resolution
-        return np.clip(applied, self._guard.command_low, self._guard.command_high), flags
-
-    def _play(self, applied: FloatArray, flags: IntArray) -> RawSamples:
+    def _play(self, applied: FloatArray, flags: IntArray, guarded: bool) -> RawSamples:
         """Simulate the ticks; where an input passes its guard, again with zeros from there."""
         n = len(applied)
-        noise = self._rng.standard_normal((n, len(ANALOG_INPUTS)))
-        before, encoder = self._x.copy(), self._encoder.copy()
-        raw = self._simulate(applied, flags, noise)
-        beyond = np.any(
-            (raw.analog < self._guard.analog_low) | (raw.analog > self._guard.analog_high), axis=1
-        )
-        if beyond.any() and not self._latched:
-            row = int(np.argmax(beyond))
-            applied, flags = applied.copy(), flags.copy()
-            applied[row:] = 0.0
-            flags[row:] = 0
-            flags[row] = int(Flag.INTERLOCK)
-            self._x, self._encoder = before, encoder
-            raw = self._simulate(applied, flags, noise)
-            self.safe()
-        self._tick += n
-        self._queued_until = max(self._queued_until, self._tick)
+        noise = self._unit_noise(n)
+        if not guarded:
+            raw, _ = self._simulate(applied, flags, noise)
+        else:
+            before, encoder = self._x.copy(), self._encoder.copy()
+            raw, row = self._simulate(applied, flags, noise)
+            if row < n:
+                applied[row:] = 0.0
+                flags[row:] = 0
+                flags[row] = _INTERLOCK
+                self._x, self._encoder = before, encoder
+                raw, _ = self._simulate(applied, flags, noise)
+                self._queue.latch()
+        self._queue.advance(n)
         # Not summed up tick by tick: rounding would make it depend on the size of the blocks.
-        self._clock = self._origin + self._tick / self._rate
+        self._clock = self._origin + self._queue.tick / self._rate
         return raw
 
-    def _simulate(self, applied: FloatArray, flags: IntArray, noise: FloatArray) -> RawSamples:
-        """Latch, apply, advance: n ticks of plant and sensing chain."""
-        n = len(applied)
-        u = np.empty((n + 1, len(self._plant.inputs)))
-        u[:n, :2], u[n, :2] = applied, applied[-1]
-        if u.shape[1] > 2:
-            u[:, 2:] = self._hand(self._origin + (self._tick + np.arange(n + 1)) / self._rate)
-        per_tick = self._stepper.n_steps
-        trace, true = self._stepper.advance(self._x, u)
-        angles = np.append(trace[:, _THETA], self._x[_THETA])
+    def _simulate(
+        self, applied: FloatArray, flags: IntArray, noise: FloatArray
+    ) -> tuple[RawSamples, int]:
+        """Latch, apply, advance: n ticks of plant and sensing chain; the first beyond the guard."""
+        n, tick, per_tick = len(applied), self._queue.tick, self._stepper.n_steps
+        trace, true = self._stepper.advance(self._x, self._inputs(applied))
         counts, rates = self._encoder.latch(
-            angles, self._origin, self._tick * per_tick, 1.0 / (self._rate * per_tick), per_tick
+            trace[:, _THETA],
+            self._x[_THETA],
+            self._origin,
+            tick * per_tick,
+            1.0 / (self._rate * per_tick),
+            per_tick,
         )
-        analog = true[:, :3] * self._senses
         if self.options.ideal:
             per_radian = self._encoder.counts_per_turn / (2.0 * math.pi)
             counts, rates = true[:, 3] * per_radian, true[:, 4] * per_radian
-        else:
-            analog, flags = self._convert(analog, noise, flags)
-        ticks = self._tick + np.arange(n, dtype=np.int64)
-        return RawSamples(ticks, analog, counts, rates, applied, flags)
+        volts = np.empty((n, len(ANALOG_INPUTS)))
+        row = self._converters.read(true, noise, flags, self._guard, volts)
+        ticks = np.arange(tick, tick + n, dtype=np.int64)
+        return RawSamples(ticks, volts, counts, rates, applied, flags), row
 
-    def _convert(
-        self, volts: FloatArray, noise: FloatArray, flags: IntArray
-    ) -> tuple[FloatArray, IntArray]:
-        """What the converters make of the volts at the analog inputs."""
-        flaws = self.options.imperfections
-        resolution = 2.0 * _CONVERTER_RANGE / 2**flaws.bits
-        volts = volts + self._offsets + flaws.noise * noise
-        beyond = np.any(np.abs(volts) >= _CONVERTER_RANGE, axis=1)
-        flags = np.where(beyond, flags | int(Flag.SATURATED), flags)
-        rounded = np.round(volts / resolution) * resolution
-        return np.clip(rounded, -_CONVERTER_RANGE, _CONVERTER_RANGE - resolution), flags
+    def _inputs(self, applied: FloatArray) -> FloatArray:
+        """The plant's inputs at the ticks and at the one that follows, (n + 1, n_inputs)."""
+        n = len(applied)
+        u = np.zeros((n + 1, self._n_inputs))
+        u[:n, : len(CHANNELS)] = applied
+        if self._n_inputs > len(CHANNELS) and not self._user.away:
+            times = self._origin + (self._queue.tick + np.arange(n + 1)) / self._rate
+            u[:, len(CHANNELS) :] = self._user.motion(times)
+        return u
 
-    def _hand(self, times: FloatArray) -> FloatArray:
-        """Grip, angle and speed of the simulated user's hand at the given times, (n, 3).
-
-        A hand that is the load never lets go: it stays where it has wound the handle to.
-        """
-        hand = np.zeros((len(times), 3))
-        hand[:, 0] = self._held_by_hand
-        hand[:, 1] = self._rest_angle
-        if self._user_start is None:
-            return hand
-        elapsed = times - self._user_start
-        length = max(self._user_turns * _TURN_TIME, _TURN_TIME)
-        share = np.clip(elapsed / length, 0.0, 1.0)
-        # A raised cosine in speed: the hand starts and stops softly. It winds a little
-        # further than asked, as one does against a spring.
-        angle = 2.0 * math.pi * (self._user_turns + _OVERWIND)
-        hand[:, 0] = self._held_by_hand | (elapsed < length + _REST)
-        hand[:, 1] = self._user_from + angle * (share - np.sin(2 * math.pi * share) / (2 * math.pi))
-        hand[:, 2] = angle / length * (1.0 - np.cos(2.0 * math.pi * share)) * (share < 1.0)
-        return hand
+    def _unit_noise(self, n: int) -> FloatArray:
+        """The next n rows of the noise, (n, 3); drawn ahead, which does not change them."""
+        if self._noise_used + n > len(self._noise):
+            left = self._noise[self._noise_used :]
+            more = self._rng.standard_normal((max(n, _BLOCK), len(ANALOG_INPUTS)))
+            self._noise, self._noise_used = np.concatenate([left, more]), 0
+        first = self._noise_used
+        self._noise_used += n
+        return self._noise[first : self._noise_used]

@@ -33,28 +33,37 @@ class EncoderCounter:
         return EncoderCounter(self.counts_per_turn, self._memory.copy(), self._started)
 
     def latch(
-        self, angles: FloatArray, origin: float, first: int, step: float, per_tick: int
+        self,
+        angles: FloatArray,
+        last: float,
+        origin: float,
+        first: int,
+        step: float,
+        per_tick: int,
     ) -> tuple[FloatArray, FloatArray]:
         """Counts and their rate [1/s] at every ``per_tick``-th of the angles.
 
-        angles: (n,) [rad] at times origin + (first + i) * step; the first is a tick, the last
-        only ends the last interval. Edges in between are timed by interpolation. With a common
-        origin the result does not depend on where a motion is cut into calls.
+        angles: (n,) [rad] at times origin + (first + i) * step, the first at a tick; last: the
+        angle one step behind them, which ends the last interval. Edges in between are timed by
+        interpolation. With a common origin the result does not depend on where a motion is cut
+        into calls.
         """
-        positions = angles * (self.counts_per_turn / (2.0 * math.pi))
+        per_radian = self.counts_per_turn / (2.0 * math.pi)
         if not self._started:
-            self._memory[0] = math.floor(positions[0])
+            self._memory[0] = math.floor(angles[0] * per_radian)
             self._started = True
-        ticks = (len(angles) - 1 + per_tick - 1) // per_tick
+        ticks = -(-len(angles) // per_tick)
         counts = np.empty(ticks)
         rates = np.empty(ticks)
-        _count(positions, origin, first, step, per_tick, self._memory, counts, rates)
+        _count(angles, last, per_radian, origin, first, step, per_tick, self._memory, counts, rates)
         return counts, rates
 
 
 @njit(cache=True, nogil=True)
 def _count(
-    positions: FloatArray,
+    angles: FloatArray,
+    last: float,
+    per_radian: float,
     origin: float,
     first: int,
     step: float,
@@ -64,8 +73,11 @@ def _count(
     rates: FloatArray,
 ) -> None:
     count, edge_time, direction, rate = memory[0], memory[1], memory[2], memory[3]
-    for i in range(len(positions) - 1):
+    n = len(angles)
+    there = angles[0] * per_radian
+    for i in range(n):
         now = origin + (first + i) * step
+        here, there = there, (angles[i + 1] if i + 1 < n else last) * per_radian
         if i % per_tick == 0:
             shown = rate
             if edge_time < 0.0 or now - edge_time > _STANDSTILL:
@@ -74,7 +86,6 @@ def _count(
                 shown = math.copysign(1.0 / (now - edge_time), rate)
             counts[i // per_tick] = count
             rates[i // per_tick] = shown
-        here, there = positions[i], positions[i + 1]
         moved = math.floor(there) - count
         if moved == 0.0:
             continue

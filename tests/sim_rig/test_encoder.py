@@ -22,7 +22,14 @@ def latch(angle, duration, cuts=(), origin=0.0):
     counter = EncoderCounter(PER_TURN)
     edges = [0, *cuts, ticks]
     parts = [
-        counter.latch(angles[a * PER_TICK : b * PER_TICK + 1], origin, a * PER_TICK, STEP, PER_TICK)
+        counter.latch(
+            angles[a * PER_TICK : b * PER_TICK],
+            angles[b * PER_TICK],
+            origin,
+            a * PER_TICK,
+            STEP,
+            PER_TICK,
+        )
         for a, b in pairwise(edges)
     ]
     counts, rates = (np.concatenate(column) for column in zip(*parts, strict=True))
@@ -96,10 +103,10 @@ def test_where_a_motion_is_cut_does_not_change_a_bit(cuts):
 def test_a_copy_is_independent():
     counter = EncoderCounter(PER_TURN)
     angles = np.linspace(0.0, 1.0, 5 * PER_TICK + 1)
-    counter.latch(angles, 0.0, 0, STEP, PER_TICK)
+    counter.latch(angles[:-1], angles[-1], 0.0, 0, STEP, PER_TICK)
     copy = counter.copy()
     further = np.linspace(1.0, 2.0, 5 * PER_TICK + 1)
-    one = counter.latch(further, 0.0, 5 * PER_TICK, STEP, PER_TICK)
-    two = copy.latch(further, 0.0, 5 * PER_TICK, STEP, PER_TICK)
+    one = counter.latch(further[:-1], further[-1], 0.0, 5 * PER_TICK, STEP, PER_TICK)
+    two = copy.latch(further[:-1], further[-1], 0.0, 5 * PER_TICK, STEP, PER_TICK)
     for a, b in zip(one, two, strict=True):
         np.testing.assert_array_equal(a, b)

@@ -1,0 +1,87 @@
+"""Commands that wait for their ticks."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from daq.hal import CHANNELS, Flag, FloatArray, IntArray, Mode
+
+SIZE = 65_536
+
+_HELD, _UNDERFLOW = int(Flag.HELD), int(Flag.UNDERFLOW)
+
+
+class CommandQueue:
+    """Commands by tick; what to do when one is missing depends on the mode.
+
+    In closed loop the last one is held and flagged; in open loop the outputs are latched at
+    zero. ``latched`` outputs stay zero, whatever is queued, until the next ``restart``.
+    """
+
+    def __init__(self, mode: Mode = Mode.CLOSED_LOOP) -> None:
+        self.restart(mode)
+
+    def restart(self, mode: Mode) -> None:
+        """Forget everything; the next tick is 0."""
+        self._closed = mode is Mode.CLOSED_LOOP
+        self.tick = 0
+        self.latch()
+        self.latched = False
+
+    def latch(self) -> None:
+        """Forget all commands; the outputs are zero from the next tick on."""
+        self._waiting: deque[FloatArray] = deque()
+        self._until = self.tick
+        self._last = np.zeros((1, len(CHANNELS)))
+        self.latched = True
+
+    @property
+    def queued(self) -> int:
+        """Ticks for which commands are waiting."""
+        return self._until - self.tick
+
+    def put(self, tick: int, commands: FloatArray) -> None:
+        """Append commands (n, 2); those for ticks already past are too late and dropped."""
+        late = max(0, self.tick - tick)
+        if late < len(commands):
+            if not self.latched:
+                self._waiting.append(commands[late:] if late else commands)
+            self._until = tick + len(commands)
+
+    def take(self, n: int) -> tuple[FloatArray, IntArray]:
+        """Commands for the next n ticks and their flags; the ticks pass with ``advance``."""
+        flags = np.zeros(n, dtype=np.int64)
+        if self.latched:
+            return np.zeros((n, len(CHANNELS))), flags
+        if self._waiting and len(self._waiting[0]) == n:
+            self._last = self._waiting.popleft()
+            return self._last.copy(), flags
+        applied = np.zeros((n, len(CHANNELS)))
+        filled = 0
+        while filled < n and self._waiting:
+            head = self._waiting.popleft()
+            count = min(n - filled, len(head))
+            applied[filled : filled + count] = head[:count]
+            if count < len(head):
+                self._waiting.appendleft(head[count:])
+            filled += count
+        if filled:
+            self._last = applied[filled - 1 : filled].copy()
+        if filled < n:
+            self._missing(applied, flags, filled)
+        return applied, flags
+
+    def advance(self, n: int) -> None:
+        """Let n ticks pass."""
+        self.tick += n
+        self._until = max(self._until, self.tick)
+
+    def _missing(self, applied: FloatArray, flags: IntArray, first: int) -> None:
+        if self._closed:
+            applied[first:] = self._last[-1]
+            flags[first:] |= _HELD
+        elif self.tick + first > 0:
+            flags[first:] |= _UNDERFLOW
+            self.latched = True
