@@ -49,7 +49,9 @@ def innovations(
     out, errors = np.empty_like(y), np.empty_like(y)
     for start in range(0, len(y), _BLOCK):
         rows = slice(start, start + _BLOCK)
-        out[rows], errors[rows] = _block(A, C, w[rows], y[rows], past_y, past_e)
+        # What an unstable model overflows to shows in the result.
+        with np.errstate(all="ignore"):
+            out[rows], errors[rows] = _block(A, C, w[rows], y[rows], past_y, past_e)
         past_y = np.concatenate((past_y, out[rows]))[-len(past_y) :]
         past_e = np.concatenate((past_e, errors[rows]))[-len(past_e) :]
     return out, errors
@@ -70,10 +72,9 @@ def _block(
     nothing = np.zeros_like(y)
     right = w - filtered(A, measured, past_y) + filtered(noise, nothing, past_e)
     bands = np.where(lost.reshape(1, -1), _bands(A, noise, len(y)), _bands(noise, A, len(y)))
-    with np.errstate(all="ignore"):
-        solution = blas.dtbsv(
-            len(bands) - 1, np.asfortranarray(bands), right.ravel(), lower=1, diag=1
-        ).reshape(y.shape)
+    solution = blas.dtbsv(
+        len(bands) - 1, np.asfortranarray(bands), right.ravel(), lower=1, diag=1
+    ).reshape(y.shape)
     return np.where(lost, solution, measured), np.where(lost, 0.0, -solution)
 
 
