@@ -256,3 +256,29 @@ def test_a_hand_feels_the_brushes_through_the_sensor_at_the_load():
     p = dict(zip(model.parameter_names, model.nominal, strict=True))
     brushes = p["F_c"] + (p["F_s"] - p["F_c"]) * math.exp(-((4.0 / 3.0) ** 2)) + p["B_f"] * 4.0
     assert readings["stribeck"] - readings["none"] == pytest.approx(brushes, rel=0.01)
+
+
+# --- smooth forms ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["bouc-wen", "dahl", "lugre"])
+def test_the_smooth_actuator_approaches_the_exact_one_as_rho_grows(kind):
+    """Speed of a free shaft swung to and fro by its motor against the brake."""
+    times = np.linspace(0.0, 0.08, 80)
+
+    def speeds(smooth, **changes):
+        model = Parts(hysteresis=kind, smooth=smooth, load="free").build(parameters="rig")
+
+        def inputs(t):
+            return 2.0 * math.sin(80.0 * t), 0.05
+
+        return follow(model, inputs, times[-1], changes, times=times, rtol=1e-8)["omega"]
+
+    exact = speeds(False)
+    distances = []
+    for rho in (0.1, 1.0, 10.0):
+        distance = speeds(True, rho=rho) - exact
+        distances.append(np.sqrt(np.mean(distance**2)) / np.sqrt(np.mean(exact**2)))
+    assert all(after < before / 3.0 for before, after in itertools.pairwise(distances))
+    assert distances[0] > 0.1
+    assert distances[-1] < 0.01

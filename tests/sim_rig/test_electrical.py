@@ -142,6 +142,19 @@ def test_an_open_loop_keeps_to_the_rated_current_within_a_part_of_its_foldback(s
     assert np.abs(found["current_motor"]).max() < 1.7 * MAX_CURRENT
 
 
+@pytest.mark.parametrize("speed", [50.0, -150.0])
+def test_a_motor_turned_by_hand_drives_no_more_than_its_foldback_through_an_open_loop(speed):
+    """Short-circuited it would drive 6 A and 18 A: the amplifier holds against it, by 100 V/A."""
+    model = Parts("open", load="hand", limits=True).build(parameters="rig")
+    inputs = constant(model, hand_grip=1.0, hand_omega=speed)
+    found = follow(model, inputs, 0.05, {"K_u": 0.0, "B_u": 1e3}, {"omega": speed})
+    K, R = (model.parameter(name).nominal for name in ("K_m", "R_m"))
+    current = found["current_motor"][-1]
+    expected = (K * abs(speed) + 100.0 * MAX_CURRENT) / (R + 100.0)
+    assert current == pytest.approx(-math.copysign(expected, speed), rel=1e-3)
+    assert expected < 1.1 * MAX_CURRENT < K * abs(speed) / R
+
+
 @pytest.mark.parametrize("kind", ["closed", "open"])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_no_winding_sees_more_than_the_supply(kind, sign):
