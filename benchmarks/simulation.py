@@ -24,7 +24,7 @@ import numpy as np
 from benchmarks._common import arguments, report
 from sim_rig.actuator import actuator
 from sysid import BatchSimulator, Dataset
-from sysid._structure import Structure
+from sysid._compile import kernels
 from sysid.model import FloatArray, ProcessModel
 from sysid.reference import simulate
 from sysid.space import SearchSpace
@@ -186,14 +186,8 @@ def _ours(model: ProcessModel, record: Dataset, accuracy: float) -> tuple[float,
 
 def _ours_rk4(model: ProcessModel, record: Dataset) -> tuple[float, FloatArray]:
     """Our kernel with nothing integrated exactly: the same scheme as the C code."""
-    import sysid._kernel as kernel
-
-    exact = kernel.analyse
-    kernel.analyse = lambda m: Structure((), tuple(range(len(m.states))), True)
-    try:
-        simulator = BatchSimulator(replace(model, name="actuator_rk4"), threads=1)
-    finally:
-        kernel.analyse = exact
+    simulator = BatchSimulator(model, threads=1)
+    simulator._kernels = kernels(model, exact=False)
     parameters = np.repeat(model.nominal[None], 16, axis=0)
     simulator.trajectories(parameters, record, 32)
     seconds = _best(lambda: simulator.trajectories(parameters, record, 32), 10) / len(parameters)

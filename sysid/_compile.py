@@ -1,8 +1,8 @@
 """From a model's plain Python to machine code, kept on disk between runs.
 
-The compiled kernels live in the user's cache folder under a name that is a fingerprint of the
-model's functions, everything they call and the kernel's text. A changed model file therefore
-gets a new name, and an old kernel is never used for it.
+The compiled kernels live in the user's cache folder under a name that is a fingerprint of their
+text and of those of the model's functions that it calls, with all that these call in turn. A
+changed model file therefore gets a new name, and an old kernel is never used for it.
 """
 
 from __future__ import annotations
@@ -11,16 +11,17 @@ import contextlib
 import functools
 import hashlib
 import importlib
-import math
 import os
 import tempfile
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sysid import _kernel
+from sysid import _kernel, _trajectory_kernel
+from sysid._kernel_text import Shape
+from sysid._structure import analyse
 from sysid._substitute import KNOWN_MODULES, names_in, rebuilt
 from sysid.model import IntArray, ModelError, ProcessModel
 
@@ -32,66 +33,126 @@ _OPTIONS: dict[str, Any] = {
 }
 
 
+Tables = tuple[IntArray, IntArray, IntArray]
+
+
+class Guarded:
+    """A compiled function that turns the compiler's complaints into a ModelError.
+
+    compiled: the function itself, for those who have called it before and count microseconds.
+    """
+
+    def __init__(self, model: ProcessModel, compiled: Callable[..., None]) -> None:
+        self.compiled = compiled
+        self._model = model
+
+    def __call__(self, *args: Any) -> None:
+        from numba.core.errors import NumbaError
+
+        try:
+            self.compiled(*args)
+        except NumbaError as error:
+            raise ModelError(_explain(self._model, error)) from None
+
+
 @dataclass(frozen=True)
 class Kernels:
-    """Compiled functions of one model (see ``_kernel`` for their arguments)."""
+    """Compiled functions of one model, the floats of the work areas and the tables they need.
 
-    simulate: Callable[..., None]
-    spectrum: Callable[..., None]
-    advance: Callable[..., None]
-    triples: IntArray
-    work_size: int
+    simulate, spectrum, work_rows and tables: see ``_kernel``; levels, advance, levels_size and
+    levels_tables: see ``_trajectory_kernel``. fewest_steps: see ``_kernel_text.Shape``.
+    """
+
+    simulate: Guarded
+    spectrum: Guarded
+    work_rows: int
+    tables: Tables
+    levels: Guarded
+    advance: Guarded
+    levels_size: int
+    levels_tables: Tables
     fewest_steps: int
 
 
 @functools.lru_cache(maxsize=8)
-def kernels(model: ProcessModel) -> Kernels:
+def kernels(model: ProcessModel, *, exact: bool = True) -> Kernels:
     """Compile a model's kernels, or load them from the cache folder.
 
-    Compilation itself happens at the first call. Raises ModelError when the model's functions
-    use something that cannot be compiled.
+    Compilation itself happens at the first call. Without ``exact`` nothing is integrated
+    exactly. Raises ModelError when the model's functions use something that cannot be compiled.
     """
-    import numba
+    shape = Shape.of(model, analyse(model, exact=exact))
+    program = shape.structure.program
+    texts = program.text, _kernel.source(shape), _trajectory_kernel.source(shape)
+    text = "\n\n".join(texts)
+    called = {name: getattr(model, name) for name in sorted(program.calls)}
+    path = _source_file(f"{_safe(model.name)}_{_key(text, called)}.py", text)
+    scope = _scope(called)
+    exec(compile(text, str(path or "<kernel>"), "exec"), scope)
+    for name in ("constants", "remainder", "observe", "margins"):
+        if name in scope:
+            scope[name] = _njit(scope[name])
+    guarded = {
+        name: Guarded(model, _njit(scope[name], nogil=True, cache=path is not None))
+        for name in ("simulate", "spectrum", "levels", "advance")
+    }
+    return Kernels(
+        **guarded,
+        work_rows=_kernel.work_rows(shape),
+        tables=_tables(shape, _kernel.first_entry(shape)),
+        levels_size=_trajectory_kernel.work_size(shape),
+        levels_tables=_tables(shape, 0),
+        fewest_steps=shape.fewest_steps,
+    )
+
+
+def _tables(shape: Shape, first: int) -> Tables:
+    """Tables of ``scheme_matrices`` for matrices that stand from row ``first`` on."""
     import numpy as np
 
-    from sysid._phi import phi_matrices
+    entries = np.array(shape.structure.closure(shape.n_states), dtype=np.int64)
+    triples = np.array(shape.structure.products(shape.n_states), dtype=np.int64)
+    return entries, triples, np.array(shape.places(first), dtype=np.int64)
 
-    shape = _kernel.Shape.of(model)
-    text = _kernel.source(shape)
-    functions = [model.derivative] + ([model.output] if model.output is not None else [])
+
+def _key(text: str, called: Mapping[str, Any]) -> str:
+    """Fingerprint of all that decides what the kernels do."""
+    import numba
+
     key = hashlib.sha256(f"{numba.__version__}\n{text}".encode())
-    for library in ("_phi.py", "_vector_math.py"):
+    for library in ("_intrinsics.py", "_phi.py", "_vector_math.py"):
         key.update(Path(__file__).with_name(library).read_bytes())
-    for function in functions:
+    for function in called.values():
         _fingerprint(function, key, set())
-    path = _source_file(f"{_safe(model.name)}_{key.hexdigest()[:24]}.py", text)
-    scope: dict[str, Any] = {
+    return key.hexdigest()[:24]
+
+
+def _scope(called: Mapping[str, Any]) -> dict[str, Any]:
+    """Globals of the kernels' text."""
+    import numpy as np
+
+    from sysid import _intrinsics
+    from sysid._phi import scheme_matrices
+
+    return {
         "np": np,
-        "math": math,
-        "phi_matrices": phi_matrices,
-        "derivative": _jit(model.derivative),
+        "math": _vector_math(),
+        "scheme_matrices": scheme_matrices,
+        "wide_vectors": _intrinsics.wide_vectors,
+        "always_inline": _intrinsics.always_inline,
         "__name__": __name__,  # a module that exists when Numba loads the kernel from its cache
+        **{name: _jit(function) for name, function in called.items()},
     }
-    if model.output is not None:
-        scope["output"] = _jit(model.output)
-    exec(compile(text, str(path or "<kernel>"), "exec"), scope)
-    scope["prepare"] = numba.njit(**_OPTIONS)(scope["prepare"])
 
-    def decorate(function: Any) -> Any:
-        if path is not None:
-            # RuntimeError: neither beside the text nor elsewhere can the compiler write.
-            with contextlib.suppress(RuntimeError):
-                return numba.njit(nogil=True, cache=True, **_OPTIONS)(function)
-        return numba.njit(nogil=True, **_OPTIONS)(function)
 
-    return Kernels(
-        _guarded(model, decorate(scope["simulate"])),
-        _guarded(model, decorate(scope["spectrum"])),
-        _guarded(model, decorate(scope["advance"])),
-        np.array(shape.structure.products(shape.n_states), dtype=np.int64),
-        shape.work_size,
-        shape.fewest_steps,
-    )
+def _njit(function: Any, *, nogil: bool = False, cache: bool = False) -> Any:
+    import numba
+
+    if cache:
+        # RuntimeError: neither beside the text nor elsewhere can the compiler write.
+        with contextlib.suppress(RuntimeError):
+            return numba.njit(nogil=nogil, cache=True, **_OPTIONS)(function)
+    return numba.njit(nogil=nogil, **_OPTIONS)(function)
 
 
 def cache_folder() -> Path:
@@ -100,20 +161,6 @@ def cache_folder() -> Path:
 
     chosen = os.environ.get("RIG_CACHE_DIR")
     return Path(chosen) if chosen else Path(platformdirs.user_cache_dir("hybrid-rig", False))
-
-
-def _guarded(model: ProcessModel, function: Any) -> Callable[..., Any]:
-    """Turn the compiler's complaint about the user's function into a ModelError."""
-
-    def call(*args: Any) -> Any:
-        from numba.core.errors import NumbaError
-
-        try:
-            return function(*args)
-        except NumbaError as error:
-            raise ModelError(_explain(model, error)) from None
-
-    return call
 
 
 def _explain(model: ProcessModel, error: Exception) -> str:
@@ -129,11 +176,12 @@ def _explain(model: ProcessModel, error: Exception) -> str:
 
 def _jit(function: Any) -> Any:
     """Compile a function and every plain function it refers to, also through a module."""
-    import numba
+    return rebuilt(function, _vector_math(), _njit)
 
+
+def _vector_math() -> Any:
     # Imported here because Numba is slow to.
-    vector_math = importlib.import_module("sysid._vector_math")
-    return rebuilt(function, vector_math, numba.njit(**_OPTIONS))
+    return importlib.import_module("sysid._vector_math")
 
 
 def _fingerprint(value: Any, key: Any, seen: set[int]) -> None:

@@ -1,38 +1,77 @@
-"""Which parts of a model are linear: found by running its equations on tracing numbers.
+"""A model's equations taken apart: dx/dt = A x + N(x, u), and what depends on parameters alone.
 
-The batch simulator integrates the linear parts exactly. Tracing decides from the equations
-themselves, not from samples of their values, so a saturation or a dead zone is never mistaken
-for a straight line; where the equations branch on a value, nothing is claimed to be linear.
+The batch simulator integrates A exactly, so that only N limits its steps. The parts are found
+by running the equations on numbers that write down what is done to them, not from samples of
+their values: a dead zone is never mistaken for a straight line, and the coefficients are exact.
+A value limited from both sides counts with its straight piece in A, which makes its row exact
+while it is not at a limit; N is what is left, zero until then. Where the equations branch on a
+value nothing is claimed to be linear, and N is the user's function itself.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
-from sysid._substitute import substituted
-from sysid.model import ProcessModel
+from sysid._trace import Clamp, Line, Tape, Trace, traced
+from sysid.model import Function, ProcessModel
 
-_NONE: frozenset[int] = frozenset()
+Entry = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Program:
+    """Python text of the equations, in which what parameters fix is worked out once.
+
+    text: functions of tuples, ``constants(p)``, ``remainder(x, u, c)`` for N, ``observe(x, u,
+    c)`` where the model has an output function and ``margins(x, u, c)``, how far each guarded
+    number is above each of its limits; c is what ``constants`` returned. They need math and
+    always_inline.
+    n_constants: its length. calls: which of ``derivative`` and ``output`` the text refers to.
+    """
+
+    text: str
+    n_constants: int
+    calls: frozenset[str]
+
+
+@dataclass(frozen=True)
+class Guard:
+    """A number within a straight piece of which the equations have limits.
+
+    n_limits: how many of the program's ``margins`` are its own. slopes: its coefficients by
+    state. gains: by row, what the number counts for there. Coefficients are text as in Structure.
+    """
+
+    n_limits: int
+    slopes: Mapping[int, str]
+    gains: Mapping[int, str]
 
 
 @dataclass(frozen=True)
 class Structure:
-    """What is linear in dx/dt = f(x, u, p).
+    """What is linear in dx/dt = A x + N(x, u).
 
-    constant: entries (i, j) of the Jacobian that depend on the parameters alone and are not
-    always zero. driven: rows that need more than the linear part within a sample: a nonlinear
-    term, or an input that changes between samples. nonlinear: whether any row has such a term.
+    coefficients: of the entries (i, j) of A that are not always zero, each as Python text in
+    terms of the constants ``c[..]`` of the program. driven: rows whose N changes within a
+    sample: nonlinear ones, and those with an input that is not held. nonlinear: whether any row
+    of N depends on a state. guards: limits that fast linear parts may run into.
     """
 
-    constant: tuple[tuple[int, int], ...]
+    coefficients: Mapping[Entry, str]
     driven: tuple[int, ...]
     nonlinear: bool
+    guards: tuple[Guard, ...]
+    program: Program
 
-    def closure(self, n_states: int) -> tuple[tuple[int, int], ...]:
+    @property
+    def constant(self) -> tuple[Entry, ...]:
+        """Entries of A, in order."""
+        return tuple(sorted(self.coefficients))
+
+    def closure(self, n_states: int) -> tuple[Entry, ...]:
         """Entries of exp(A t) that can differ from zero for this pattern of A."""
-        reach = {(i, i) for i in range(n_states)} | set(self.constant)
+        reach = {(i, i) for i in range(n_states)} | set(self.coefficients)
         for k in range(n_states):
             via = [i for i in range(n_states) if (i, k) in reach]
             to = [j for j in range(n_states) if (k, j) in reach]
@@ -40,110 +79,160 @@ class Structure:
         return tuple(sorted(reach))
 
     def products(self, n_states: int) -> tuple[tuple[int, int, int], ...]:
-        """Triples (i, k, j) for which entries (i, k) and (k, j) of the closure both exist."""
+        """Products in the square of such a matrix: two entries of the closure and their sum's."""
         entries = self.closure(n_states)
-        return tuple((i, k, j) for i, k in entries for row, j in entries if row == k)
+        place = {entry: k for k, entry in enumerate(entries)}
+        return tuple(
+            (place[i, k], place[k, j], place[i, j])
+            for i, k in entries
+            for row, j in entries
+            if row == k
+        )
 
 
-def analyse(model: ProcessModel) -> Structure:
-    """Trace a model's derivative; where it cannot be traced every row counts as nonlinear."""
-    n = len(model.states)
-    x = tuple(_Trace(linear=frozenset((i,))) for i in range(n))
-    u = tuple(_Trace(inputs=frozenset((j,))) for j in range(len(model.inputs)))
-    p = tuple(_Trace() for _ in model.parameters)
-    try:
-        rows = [_lift(row) for row in substituted(model.derivative, _function)(x, u, p)]
-    except Exception:
-        # Whatever the equations do that a tracing number cannot follow, plain Runge-Kutta can.
-        return Structure((), tuple(range(n)), True)
+def analyse(model: ProcessModel, *, exact: bool = True) -> Structure:
+    """Take a model's equations apart; without ``exact`` all of them are left in N."""
+    tape = Tape()
+    rows = _followed(tape, model, model.derivative)
+    outputs = None if model.output is None else _followed(tape, model, model.output)
+    clamps = _clamps(tape, rows or ())
+    parts = [_split(row) if exact else ({}, row.total) for row in rows or ()]
+    linear = {(i, j): name for i, (piece, _) in enumerate(parts) for j, name in piece.items()}
+    functions: dict[str, _Function] = {
+        "remainder": ("derivative", None if rows is None else [rest for _, rest in parts])
+    }
+    if model.output is not None:
+        totals = None if outputs is None else [value.total for value in outputs]
+        functions["observe"] = ("output", totals)
+    if clamps:
+        margins = [
+            tape.emit("{} - {}", clamp.base.total, limit)
+            for clamp in clamps.values()
+            for limit in clamp.limits
+        ]
+        functions["margins"] = ("", margins)
+    used = {*linear.values()}
+    for k, clamp in clamps.items():
+        used |= {
+            *clamp.base.linear.values(),
+            *(row.kinks[k] for row in rows or () if k in row.kinks),
+        }
+    writer = _Writer(tape, len(model.parameters), functions, used)
+    guards = tuple(
+        Guard(
+            len(clamp.limits),
+            {j: writer.place(name) for j, name in clamp.base.linear.items()},
+            {i: writer.place(row.kinks[k]) for i, row in enumerate(rows or ()) if k in row.kinks},
+        )
+        for k, clamp in clamps.items()
+    )
+    coefficients = {entry: writer.place(name) for entry, name in linear.items()}
+    driven, nonlinear = _driven(model, rows if exact else None, clamps)
+    return Structure(coefficients, driven, nonlinear, guards, writer.program())
+
+
+def _driven(
+    model: ProcessModel, rows: Sequence[Trace] | None, clamps: Mapping[int, Clamp]
+) -> tuple[tuple[int, ...], bool]:
+    """Rows of N that change within a sample, and whether any depends on a state."""
+    if rows is None:
+        return tuple(range(len(model.states))), True
     moving = {j for j, signal in enumerate(model.inputs) if signal.hold == "foh"}
-    constant = [(i, j) for i, row in enumerate(rows) for j in sorted(row.linear)]
-    driven = [i for i, row in enumerate(rows) if row.nonlinear or row.inputs & moving]
-    return Structure(tuple(constant), tuple(driven), any(row.nonlinear for row in rows))
+    bent = [bool(row.nonlinear or row.kinks.keys() & clamps.keys()) for row in rows]
+    driven = (i for i, row in enumerate(rows) if bent[i] or row.inputs & moving)
+    return tuple(driven), any(bent)
 
 
-class _UntraceableError(Exception):
-    """The equations need the value of a number, not just its dependence."""
+def _clamps(tape: Tape, rows: Sequence[Trace]) -> dict[int, Clamp]:
+    """Limits on straight pieces that the rows are sums of, by their place on the tape."""
+    found = sorted({k for row in rows for k in row.kinks})
+    return {k: tape.clamps[k] for k in found if tape.clamps[k].base.linear}
 
 
-@dataclass(frozen=True, eq=False)
-class _Trace:
-    """A number of unknown value: on which states and inputs it depends, and how."""
-
-    linear: frozenset[int] = _NONE
-    nonlinear: frozenset[int] = _NONE
-    inputs: frozenset[int] = _NONE
-
-    @property
-    def varies(self) -> bool:
-        return bool(self.linear or self.nonlinear or self.inputs)
-
-    def __add__(self, other: Any) -> _Trace:
-        b = _lift(other)
-        nonlinear = self.nonlinear | b.nonlinear
-        return _Trace((self.linear | b.linear) - nonlinear, nonlinear, self.inputs | b.inputs)
-
-    def __mul__(self, other: Any) -> _Trace:
-        b = _lift(other)
-        if not b.varies:
-            return self
-        if not self.varies:
-            return b
-        return _mix(self, b)
-
-    def __truediv__(self, other: Any) -> _Trace:
-        b = _lift(other)
-        return _mix(self, b) if b.varies else self
-
-    def __rtruediv__(self, other: Any) -> _Trace:
-        return _lift(other) / self
-
-    def __pow__(self, other: Any) -> _Trace:
-        return _mix(self, _lift(other))
-
-    def __rpow__(self, other: Any) -> _Trace:
-        return _mix(self, _lift(other))
-
-    def __neg__(self) -> _Trace:
-        return self
-
-    def __pos__(self) -> _Trace:
-        return self
-
-    def __abs__(self) -> _Trace:
-        return _mix(self)
-
-    def _value(self, *others: Any) -> Any:
-        raise _UntraceableError
-
-    __radd__ = __sub__ = __rsub__ = __add__
-    __rmul__ = __mul__
-    __lt__ = __le__ = __gt__ = __ge__ = __bool__ = __float__ = __int__ = __index__ = _value
-    __mod__ = __rmod__ = __floordiv__ = __rfloordiv__ = __round__ = _value
-    __eq__ = __ne__ = _value
+def _followed(tape: Tape, model: ProcessModel, function: Function) -> tuple[Trace, ...] | None:
+    """A function's values on the tape; None where it cannot be followed."""
+    counts = len(model.states), len(model.inputs), len(model.parameters)
+    try:
+        return traced(tape, function, *counts)
+    except Exception:
+        # Whatever it does that a trace cannot follow, the compiler may well be able to.
+        return None
 
 
-def _lift(value: Any) -> _Trace:
-    if isinstance(value, _Trace):
-        return value
-    if isinstance(value, int | float):
-        return _Trace()
-    raise _UntraceableError
+def _split(row: Trace) -> tuple[Mapping[int, str], str]:
+    """Straight piece of a row, without the states it depends on in other ways, and the rest."""
+    linear = {j: c for j, c in row.linear.items() if j not in row.nonlinear}
+    if not linear:
+        return {}, row.total
+    other = row.tape.straight({j: c for j, c in row.linear.items() if j in row.nonlinear})
+    return linear, row.tape.join("+", row.rest, other) or "0.0"
 
 
-def _mix(*values: Any) -> _Trace:
-    """Some function of the values: nonlinear in every state that any of them depends on."""
-    traces = [_lift(value) for value in values]
-    states = frozenset().union(*(t.linear | t.nonlinear for t in traces))
-    return _Trace(_NONE, states, frozenset().union(*(t.inputs for t in traces)))
+# Which of the model's functions a function of the program stands for, and its values where that
+# could be followed.
+_Function = tuple[str, Sequence[str] | None]
 
 
-def _function(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A library function that passes plain numbers on and mixes tracing ones."""
+class _Writer:
+    """Writes functions on a tape as Python text; what parameters fix goes into ``constants``."""
 
-    def call(*args: Any) -> Any:
-        if any(isinstance(a, _Trace) for a in args):
-            return _mix(*args)
-        return function(*args)
+    def __init__(
+        self,
+        tape: Tape,
+        n_parameters: int,
+        functions: Mapping[str, _Function],
+        coefficients: Iterable[str],
+    ) -> None:
+        self._tape = tape
+        self._functions = functions
+        self._parameters = [f"p{i}" for i in range(n_parameters)]
+        used = set(coefficients)
+        for _, values in functions.values():
+            used |= self._used(self._varying(values), values) if values else {*self._parameters}
+        known = [name for name in used if tape.named(name) and tape.fixed(name)]
+        self._constants = sorted(known, key=lambda name: (name[0], int(name[1:])))
+        self._places = {name: f"c[{k}]" for k, name in enumerate(self._constants)}
 
-    return call
+    def place(self, name: str) -> str:
+        """Text by which other code finds a number that the parameters fix."""
+        return self._places.get(name, name)
+
+    def program(self) -> Program:
+        """All functions."""
+        texts = [
+            self._text("constants(p)", self._tape.needed(self._constants), self._constants, {})
+        ]
+        for name, (model_function, values) in self._functions.items():
+            if values:
+                lines = self._varying(values)
+                texts.append(self._text(f"{name}(x, u, c)", lines, values, self._places))
+            else:
+                p = listed(self._places[name] for name in self._parameters)
+                body = f"    always_inline()\n    return {model_function}(x, u, {p})"
+                texts.append(f"def {name}(x, u, c):\n{body}")
+        calls = frozenset(called for called, values in self._functions.values() if not values)
+        return Program("\n\n".join([*texts, ""]), len(self._constants), calls)
+
+    def _varying(self, values: Sequence[str]) -> list[Line]:
+        return [line for line in self._tape.needed(values) if not line.fixed]
+
+    @staticmethod
+    def _used(lines: Iterable[Line], values: Iterable[str]) -> set[str]:
+        return set(values).union(*(line.operands for line in lines))
+
+    def _text(
+        self, head: str, lines: list[Line], values: Sequence[str], places: Mapping[str, str]
+    ) -> str:
+        text = [f"def {head}:", "    always_inline()"]
+        own = {line.name for line in lines}
+        for name in sorted(self._used(lines, values) - own):
+            if self._tape.named(name):
+                text.append(f"    {name} = {places.get(name) or f'{name[0]}[{name[1:]}]'}")
+        text += [f"    {line.name} = {line.text}" for line in lines]
+        return "\n".join([*text, f"    return {listed(values)}"])
+
+
+def listed(items: Iterable[str]) -> str:
+    """Text of a tuple."""
+    texts = list(items)
+    return "(" + ", ".join(texts) + ("," if len(texts) == 1 else "") + ")"

@@ -12,9 +12,9 @@ from __future__ import annotations
 from math import *  # noqa: F403
 from typing import Any
 
-from llvmlite import ir
 from numba import njit, types
-from numba.core.extending import intrinsic
+
+from sysid._intrinsics import from_bits, to_int32
 
 _OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract", "nsz", "arcp"}}
 
@@ -25,26 +25,6 @@ _LN2_LOW = 1.9082149292705877e-10
 _PIO2_HIGH = 1.5707963267341256
 _PIO2_MIDDLE = 6.077100506303966e-11
 _PIO2_LOW = 2.0222662487959506e-21
-
-
-@intrinsic
-def _from_bits(context: Any, bits: Any) -> Any:
-    """The float whose 64 bits are those of an integer."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.bitcast(args[0], ir.DoubleType())
-
-    return types.float64(types.int64), generate
-
-
-@intrinsic
-def _to_int32(context: Any, value: Any) -> Any:
-    """A float cut to a 32-bit integer, the conversion that vector units have."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.fptosi(args[0], ir.IntType(32))
-
-    return types.int32(types.float64), generate
 
 
 @njit(**_OPTIONS)
@@ -65,7 +45,7 @@ def _split(y: float) -> tuple[float, float]:
     s = 1.0 + r * (1.0 / 4.0) * s
     s = 1.0 + r * (1.0 / 3.0) * s
     s = 1.0 + r * 0.5 * s
-    return _from_bits((types.int64(_to_int32(k)) + 1023) << 52), r * s
+    return from_bits((types.int64(to_int32(k)) + 1023) << 52), r * s
 
 
 @njit(**_OPTIONS)
@@ -73,8 +53,8 @@ def exp(x: float) -> float:
     """e^x; above 709 infinite, below -708 within 1e-307 of zero."""
     y = min(max(x, -708.0), 709.0)
     power, rest = _split(y)
-    over = inf if x > 709.0 else 0.0  # noqa: F405
-    return power + power * rest + over + (x - y) * 0.0
+    over = inf if x > 709.0 else 0.0 if x == x else nan  # noqa: F405, PLR0124
+    return power + power * rest + over
 
 
 @njit(**_OPTIONS)
@@ -84,7 +64,7 @@ def tanh(x: float) -> float:
     power, rest = _split(-2.0 * a)
     less = power * rest + (power - 1.0)  # e^(-2a) - 1 without cancellation
     size = -less / (less + 2.0)
-    return (size if x >= 0.0 else -size) + x * 0.0
+    return (size if x >= 0.0 else -size) + (0.0 if x == x else nan)  # noqa: F405, PLR0124
 
 
 @njit(**_OPTIONS)

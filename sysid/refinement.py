@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sysid._kernel import LANES
+from sysid._lanes import LANES
 from sysid.model import BoolArray, FloatArray
 from sysid.objective import Objective
 

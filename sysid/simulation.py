@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sysid._compile import kernels
-from sysid._kernel import LANES
+from sysid._lanes import LANES, work_area
 from sysid.data import Dataset
 from sysid.model import BoolArray, FloatArray, IntArray, ModelError, ProcessModel
 
@@ -87,11 +87,13 @@ class BatchSimulator:
         parameters: FloatArray,
         records: Sequence[Dataset],
         scales: Sequence[FloatArray] | None = None,
+        starts: Sequence[FloatArray] | None = None,
     ) -> BatchResult:
         """Sum of squared residuals of every parameter vector on every record.
 
         parameters: (n, n_parameters). scales: per record, (n_outputs,) divisors of the
-        residuals, default 1. Never raises for a chromosome that fails; see ``status``.
+        residuals, default 1. starts: per record, (n, n_states), initial states; default the
+        record's own. Never raises for a chromosome that fails; see ``status``.
         """
         parameters = self._check(parameters, records)
         scales = scales or [np.ones(len(self.model.outputs))] * len(records)
@@ -101,8 +103,9 @@ class BatchSimulator:
         steps = np.zeros(n, dtype=np.int64)
         with ThreadPoolExecutor(self.threads) as pool:
             for r, record in enumerate(records):
-                runner = _Runner(self, record, pool, scales[r])
                 todo = np.flatnonzero(status == Status.OK)
+                start = None if starts is None else starts[r][todo]
+                runner = _Runner(self, record, pool, scales[r], start)
                 result = runner.population(parameters[todo])
                 sse[todo, r] = result.sse[:, 0]
                 status[todo] = result.status
@@ -111,18 +114,23 @@ class BatchSimulator:
         return BatchResult(sse, status, steps)
 
     def trajectories(
-        self, parameters: FloatArray, record: Dataset, n_steps: int | None = None
+        self,
+        parameters: FloatArray,
+        record: Dataset,
+        n_steps: int | None = None,
+        starts: FloatArray | None = None,
     ) -> FloatArray:
         """Simulated outputs, (n, n_samples, n_outputs), not finite where a simulation failed.
 
         n_steps: integration steps per sample, the same for all; default what the most
-        demanding of them needs, so that outputs differ by their parameters alone.
+        demanding of them needs, so that outputs differ by their parameters alone. starts:
+        (n, n_states), initial states; default the record's own.
         """
         parameters = self._check(parameters, [record])
         n, q = len(parameters), len(self.model.outputs)
         outputs = np.full((n, record.n_samples, q), np.nan)
         with ThreadPoolExecutor(self.threads) as pool:
-            runner = _Runner(self, record, pool)
+            runner = _Runner(self, record, pool, starts=starts)
             n_steps = n_steps or runner.common_steps(parameters)
             list(
                 pool.map(
@@ -162,13 +170,19 @@ class _Runner:
         record: Dataset,
         pool: ThreadPoolExecutor,
         scale: FloatArray | None = None,
+        starts: FloatArray | None = None,
     ) -> None:
-        """With a scale residuals count; without, the simulated outputs are all that is wanted."""
+        """With a scale residuals count; without, the simulated outputs are all that is wanted.
+
+        starts: (n, n_states), rows as those of the parameters; default the record's own.
+        """
         self.simulator = simulator
         self.record = record
         self.pool = pool
         self.kernels = simulator._kernels
-        self.x0 = record.initial_state(simulator.model)
+        own = record.initial_state(simulator.model)
+        # One row stands for all.
+        self.starts = own[None] if starts is None else np.asarray(starts, dtype=np.float64)
         missing = ~np.isfinite(record.outputs)
         self.y = np.where(missing, 0.0, record.outputs)
         if scale is None:
@@ -289,12 +303,14 @@ class _Runner:
         """Error sums and estimate sums of up to LANES chromosomes, (n, n_outputs) each."""
         padded = np.resize(lanes, LANES)
         p = np.ascontiguousarray(parameters[padded].T)
-        start = np.repeat(self.x0[:, None], LANES, axis=1)
+        start = self._start(padded)
         q = self.y.shape[1]
         sums = np.empty((2 * q, LANES))
+        work = work_area(self.kernels.work_rows * LANES)
         self.kernels.simulate(
-            _aligned(self.kernels.work_size),
-            self.kernels.triples,
+            work,
+            work.reshape(-1, LANES),
+            self.kernels.tables,
             self.record.inputs,
             self.y,
             self.w,
@@ -307,15 +323,20 @@ class _Runner:
         )
         return sums[:q].T[: len(lanes)], sums[q:].T[: len(lanes)]
 
+    def _start(self, lanes: IntArray) -> FloatArray:
+        """Initial states of some chromosomes, (n_states, n_lanes)."""
+        rows = lanes if len(self.starts) > 1 else np.zeros_like(lanes)
+        return np.ascontiguousarray(self.starts[rows].T)
+
     def _rates(self, parameters: FloatArray) -> FloatArray:
         """Fastest rate at the start of the record, under its largest inputs [1/s]."""
         rates = np.zeros(len(parameters))
         inputs = self.record.inputs[self.extremes]
-        states = np.broadcast_to(self.x0[:, None], (len(self.extremes), len(self.x0), LANES))
-        states = np.ascontiguousarray(states)
 
         def run(lanes: IntArray) -> None:
             rate = np.zeros(len(lanes))
+            start = self._start(lanes)
+            states = np.broadcast_to(start, (len(self.extremes), *start.shape)).copy()
             p = np.ascontiguousarray(parameters[lanes].T)
             self.kernels.spectrum(inputs, states, p, rate)
             rates[lanes] = rate
@@ -329,13 +350,6 @@ def _rungs(steps: FloatArray) -> IntArray:
     wanted = np.where(np.isfinite(steps), np.maximum(steps, 1.0), np.inf)
     rung = np.searchsorted(_LADDER, np.minimum(wanted, _LADDER[-1]) - 1e-9)
     return np.where(wanted > _LADDER[-1], np.iinfo(np.int64).max, _LADDER[rung])
-
-
-def _aligned(size: int) -> FloatArray:
-    """Floats starting on a cache line: vector loads that straddle lines take twice as long."""
-    raw = np.empty(size + 8)
-    start = (-raw.ctypes.data % 64) // 8
-    return raw[start : start + size]
 
 
 def _blocks(lanes: IntArray) -> list[IntArray]:

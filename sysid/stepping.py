@@ -2,69 +2,87 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
 from sysid._compile import kernels
+from sysid._lanes import work_area
 from sysid.model import FloatArray, ModelError, ProcessModel
 
-_STEP_LIMIT = 0.3
-_LEAST_STEPS = 16
+# Error estimate of one step, of all states together, in parts of what the trajectory's error may
+# be. The largest error of the simulated rig is then between a half and twice what was asked for.
+_ESTIMATE_LIMIT = 0.3
 
 
 class Stepper:
     """Advances the state of one model with one parameter vector.
 
-    dt: sample time [s]. n_steps: integration steps per sample; default from the model's fastest
-    rate at its initial state, fine enough for about 1e-5 of normalised error.
+    dt: sample time [s]. n_steps: equal base steps per sample, each of which is halved as often
+    as the accuracy asks for. accuracy: error, in parts of ``scale``, that the trajectory is to
+    keep. scale: (n_states,), magnitudes that matter; default the larger of 1 and the state's
+    initial value. Raises ModelError for settings that do not fit the model.
     """
 
     def __init__(
-        self, model: ProcessModel, parameters: FloatArray, dt: float, n_steps: int | None = None
+        self,
+        model: ProcessModel,
+        parameters: FloatArray,
+        dt: float,
+        *,
+        n_steps: int = 4,
+        scale: FloatArray | None = None,
+        accuracy: float = 1e-5,
     ) -> None:
-        if len(parameters) != len(model.parameters):
+        self.parameters = np.ascontiguousarray(parameters, dtype=np.float64)
+        if self.parameters.shape != (len(model.parameters),):
             raise ModelError(
                 f"model {model.name} has {len(model.parameters)} parameters, not {len(parameters)}"
             )
+        if scale is None:
+            scale = np.maximum(np.abs(model.initial_state), 1.0)
+        self.scale = np.ascontiguousarray(scale, dtype=np.float64)
+        if self.scale.shape != (len(model.states),) or not np.all(self.scale > 0.0):
+            raise ModelError(f"scale must be {len(model.states)} positive numbers, not {scale}")
+        if n_steps < 1:
+            raise ModelError(f"n_steps is {n_steps}; it must be at least 1")
+        if not 1e-12 <= accuracy <= 0.1:
+            raise ModelError(f"accuracy {accuracy:g} is outside [1e-12, 0.1]")
         self.model = model
-        self.parameters = np.ascontiguousarray(parameters, dtype=np.float64)
         self.dt = dt
+        self.n_steps = n_steps
+        self.accuracy = accuracy
         self._kernels = kernels(model)
-        self.n_steps = n_steps or self._enough_steps()
+        self._inputs, self._n_outputs = (len(model.inputs),), len(model.outputs)
+        self._base = dt / self.n_steps
+        self._limit = (_ESTIMATE_LIMIT * accuracy) ** 2
+        self._work = work_area(self._kernels.levels_size)
+        self._run: Callable[..., None] = self._first_run
 
     def advance(self, x: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Move the state x (n_states,), in place, over the intervals between the rows of u.
 
         u: (n + 1, n_inputs), the inputs at n + 1 sample instants; held inputs use the earlier
-        row of each interval. Returns the states at the start of every integration step,
+        row of each interval. Returns the states at the start of every base step,
         (n * n_steps, n_states), and the outputs at the start of every interval,
         (n, n_outputs).
         """
-        n = len(u) - 1
-        trace = np.empty((n * self.n_steps, len(x)))
-        outputs = np.empty((n, len(self.model.outputs)))
-        self._kernels.advance(
-            np.empty(self._kernels.work_size),
-            self._kernels.triples,
-            np.ascontiguousarray(u),
-            x,
-            self.parameters,
-            self.dt,
-            self.n_steps,
-            trace,
-            outputs,
-        )
+        if x.shape != self.scale.shape or u.shape[1:] != self._inputs:
+            raise ModelError(
+                f"model {self.model.name} has {len(self.scale)} states and {self._inputs[0]} "
+                f"inputs; arrays of shape {x.shape} and {u.shape} were given"
+            )
+        n = u.shape[0] - 1
+        trace = np.empty((n * self.n_steps, x.shape[0]))
+        outputs = np.empty((n, self._n_outputs))
+        u = np.ascontiguousarray(u, dtype=np.float64)
+        self._run(self._work, u, x, self._base, self.n_steps, self._limit, trace, outputs)
         return trace, outputs
 
-    def _enough_steps(self) -> int:
-        rate = np.zeros(1)
-        self._kernels.spectrum(
-            np.zeros((1, len(self.model.inputs))),
-            self.model.initial_state[None, :, None],
-            self.parameters[:, None],
-            rate,
-        )
-        # A linear model is exact in one step; else fast linear parts feed the nonlinear one.
-        least = 1 if self._kernels.fewest_steps == 1 else _LEAST_STEPS
-        return max(least, math.ceil(float(rate[0]) * self.dt / _STEP_LIMIT))
+    def _first_run(self, work: FloatArray, *args: Any) -> None:
+        """Fill the work area, once for all runs; from then on no more is checked."""
+        made = self._kernels
+        made.levels(work, made.levels_tables, self.parameters, self.scale, self._base)
+        made.advance(work, *args)
+        self._run = made.advance.compiled

@@ -1,4 +1,4 @@
-"""The pieces the batch kernel is made of: structure, matrix functions, vector functions."""
+"""The pieces the kernels are made of: matrix functions, vector functions."""
 
 from __future__ import annotations
 
@@ -8,91 +8,75 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from sim_rig.actuator import actuator
-from sysid import Input, Output, Parameter, ProcessModel, State, _vector_math
-from sysid._phi import phi_matrices
-from sysid._structure import analyse
+from sysid import _vector_math
+from sysid._lanes import LANES
+from sysid._phi import scheme_matrices
 
 
-def structure(derivative, hold="zoh"):
-    model = ProcessModel(
-        name="traced",
-        states=(State("a", "1", 0.5), State("b", "1", 0.25)),
-        inputs=(Input("u", "1", hold),),
-        outputs=(Output("a", "1"),),
-        parameters=(Parameter("p", "1", 2.0, 1.0, 3.0), Parameter("q", "1", 2.0, 1.0, 3.0)),
-        derivative=derivative,
+def tables(pattern):
+    """Arguments of ``scheme_matrices`` for a pattern that is its own closure."""
+    m = len(pattern)
+    triples = [
+        (pattern.index((i, k)), pattern.index((k, j)), pattern.index((i, j)))
+        for i, k in pattern
+        for row, j in pattern
+        if row == k
+    ]
+    return np.array(pattern), np.array(triples), np.arange(4 * m).reshape(4, m)
+
+
+def scheme(a, h):
+    """Q, F, G, H, from the exponential of a block matrix."""
+    n = len(a)
+    blocks = np.zeros((4 * n, 4 * n))
+    blocks[:n, :n] = h * a
+    for k in range(3):
+        blocks[k * n : (k + 1) * n, (k + 1) * n : (k + 2) * n] = np.eye(n)
+    whole = expm(blocks)
+    half = np.zeros((2 * n, 2 * n))
+    half[:n, :n], half[:n, n:] = h / 2.0 * a, np.eye(n)
+    phi = [h * whole[:n, k * n : (k + 1) * n] for k in (1, 2, 3)]
+    return (
+        h / 2.0 * expm(half)[:n, n:],
+        phi[0],
+        2.0 * phi[1] - 4.0 * phi[2],
+        4.0 * phi[2] - phi[1],
     )
-    return analyse(model)
 
 
-def limited(x):
-    return min(max(x, -1.0), 1.0)
-
-
-CASES = {
-    # name: (derivative, constant entries, driven rows, nonlinear)
-    "linear": (lambda x, u, p: (x[1], -p[0] * x[0] / p[1] + u[0]), ((0, 1), (1, 0)), (), False),
-    "product of states": (lambda x, u, p: (x[0] * x[1], -x[1]), ((1, 1),), (0,), True),
-    "state times input": (lambda x, u, p: (x[0] * u[0], -x[1]), ((1, 1),), (0,), True),
-    "absolute": (lambda x, u, p: (x[1] - abs(x[0]), x[0]), ((0, 1), (1, 0)), (0,), True),
-    "square": (lambda x, u, p: (x[1] ** 2, -x[1]), ((1, 1),), (0,), True),
-    "saturation": (lambda x, u, p: (limited(x[0]), -x[1]), ((1, 1),), (0,), True),
-    "math": (lambda x, u, p: (math.tanh(x[0]), math.exp(p[0]) * x[0]), ((1, 0),), (0,), True),
-    "a branch": (lambda x, u, p: (x[1] if x[0] > 0 else -x[1], x[0]), (), (0, 1), True),
-    "division by state": (lambda x, u, p: (1.0 / x[0], x[0] - x[1]), ((1, 0), (1, 1)), (0,), True),
-    "input squared": (lambda x, u, p: (u[0] * u[0] - x[0], x[0]), ((0, 0), (1, 0)), (), False),
-}
-
-
-@pytest.mark.parametrize("name", CASES)
-def test_linear_parts_are_recognised(name):
-    derivative, constant, driven, nonlinear = CASES[name]
-    found = structure(derivative)
-    assert found.constant == constant
-    assert found.driven == driven
-    assert found.nonlinear is nonlinear
-
-
-def test_an_interpolated_input_drives_its_row():
-    found = structure(lambda x, u, p: (x[1], u[0] - x[0]), hold="foh")
-    assert found.driven == (1,)
-    assert not found.nonlinear
-
-
-def test_the_actuator_is_linear_but_for_its_mechanics():
-    model = actuator()
-    found = analyse(model)
-    assert [model.state_names[i] for i in found.driven] == ["omega", "z"]
-
-
-def test_matrix_functions_agree_with_the_exponential_of_a_block_matrix():
+@pytest.mark.parametrize("triangular", [False, True])
+def test_matrix_functions_agree_with_the_exponential_of_a_block_matrix(triangular):
+    """Lanes of very different size side by side."""
     rng = np.random.default_rng(0)
-    n, h = 5, 3e-4
-    triples = np.array([(i, k, j) for i in range(n) for k in range(n) for j in range(n)])
-    for size in (1.0, 1e3, 1e5):
-        a = size * rng.standard_normal((n, n)) * 10.0 ** rng.uniform(-1, 1, (n, 1)) - size * np.eye(
-            n
-        )
-        blocks = np.zeros((4 * n, 4 * n))
-        blocks[:n, :n] = h * a
-        for k in range(3):
-            blocks[k * n : (k + 1) * n, (k + 1) * n : (k + 2) * n] = np.eye(n)
-        whole = expm(blocks)
-        half = np.zeros((2 * n, 2 * n))
-        half[:n, :n], half[:n, n:] = h / 2.0 * a, np.eye(n)
-        expected = [h / 2.0 * expm(half)[:n, n:]]
-        expected += [h * whole[:n, k * n : (k + 1) * n] for k in (1, 2, 3)]
-        found = np.empty((4, n, n))
-        phi_matrices(a.copy(), h, triples, found)
-        for got, exact in zip(found, expected, strict=True):
-            np.testing.assert_allclose(got, exact, atol=1e-11 * np.abs(exact).max())
+    n = 5
+    pattern = [(i, j) for i in range(n) for j in range(n) if i <= j or not triangular]
+    steps = 3e-4 * rng.uniform(0.5, 2.0, LANES)
+    lanes = np.zeros((LANES, n, n))
+    for lane in range(LANES):
+        size = 10.0 ** rng.uniform(0.0, 5.0)
+        full = size * (rng.standard_normal((n, n)) * 10.0 ** rng.uniform(-1, 1, (n, 1)) - np.eye(n))
+        lanes[lane] = np.triu(full) if triangular else full
+    stored = np.array([[a[entry] for a in lanes] for entry in pattern])
+    found = np.empty((4 * len(pattern), LANES))
+    scheme_matrices(stored, steps, *tables(pattern), found)
+    for lane in range(LANES):
+        for k, exact in enumerate(scheme(lanes[lane], steps[lane])):
+            got = np.zeros((n, n))
+            for entry, value in zip(pattern, found[k * len(pattern) :, lane], strict=False):
+                got[entry] = value
+            np.testing.assert_allclose(got, exact, atol=3e-11 * np.abs(exact).max())
 
 
-def test_a_matrix_that_is_not_finite_gives_not_a_number():
-    found = np.empty((4, 1, 1))
-    phi_matrices(np.array([[math.inf]]), 1.0, np.array([(0, 0, 0)]), found)
-    assert np.isnan(found).all()
+def test_a_lane_that_is_not_finite_gives_not_a_number_and_disturbs_no_other():
+    pattern = [(0, 0), (0, 1), (1, 1)]
+    stored = np.tile([[-1.0], [2.0], [-3.0]], LANES)
+    clean, found = np.empty((12, LANES)), np.empty((12, LANES))
+    scheme_matrices(stored.copy(), np.ones(LANES), *tables(pattern), clean)
+    stored[1, 2], stored[0, 5], stored[2, 7] = math.inf, math.nan, 1e200
+    scheme_matrices(stored, np.ones(LANES), *tables(pattern), found)
+    assert np.isnan(found[:, [2, 5, 7]]).all()
+    others = np.delete(np.arange(LANES), [2, 5, 7])
+    np.testing.assert_array_equal(found[:, others], clean[:, others])
 
 
 @pytest.mark.parametrize(

@@ -128,7 +128,7 @@ GAIN = Gain()
 
 
 def on_an_object(x, u, p):
-    return (GAIN.factor * x[1], -p[0] * x[1])
+    return (GAIN.factor * x[1], -p[0] * x[1] if x[1] > 0.0 else 0.0)
 
 
 @pytest.mark.parametrize("derivative", [on_a_list, on_an_object])
