@@ -141,7 +141,12 @@ def _states(parts: _Parts) -> tuple[State, ...]:
         State("current_motor", "A"),
         State("current_brake", "A"),
         State("omega", "rad/s", description="shaft speed"),
-        State("z", parts.hysteresis.z_unit, description="hysteresis variable"),
+        State(
+            "z",
+            parts.hysteresis.z_unit,
+            description="hysteresis variable",
+            initial_range=parts.hysteresis.z_range,
+        ),
         State("theta", "rad", description="shaft angle"),
         *parts.load.states,
     )

@@ -30,13 +30,15 @@ class Hysteresis:
     """Equations and parameters of one hysteresis model.
 
     constraints: texts and functions g(p) <= 0 of its own parameters (section 3.4.2); that all
-    are positive is in their physical minimum. z_unit: of the hysteresis variable.
+    are positive is in their physical minimum. z_unit: of the hysteresis variable. z_range: where
+    it may stand when a record begins; a load that friction holds leaves it away from zero.
     """
 
     parameters: tuple[Parameter, ...]
     rate: Rate
     torque: Torque
     z_unit: str
+    z_range: tuple[float, float]
     constraints: tuple[tuple[str, Callable[[Any], Any]], ...] = ()
 
 
@@ -103,6 +105,7 @@ def _bouc_wen(smooth: bool, exponent: float) -> Hysteresis:
         smooth_rate if smooth else exact_rate,
         torque,
         "1",
+        (-10.0, 10.0),
         (
             ("gamma - beta >= 0 (Bouc-Wen class 1)", lambda p: p[1] - p[0]),
             ("gamma + beta >= 0 (Bouc-Wen class 1)", lambda p: -p[1] - p[0]),
@@ -132,6 +135,7 @@ def _dahl(smooth: bool) -> Hysteresis:
         smooth_rate if smooth else exact_rate,
         torque,
         "1",
+        (-1.0, 1.0),
         _positive_torque(1),
     )
 
@@ -160,6 +164,7 @@ def _lugre(smooth: bool) -> Hysteresis:
         smooth_rate if smooth else exact_rate,
         torque,
         "rad",
+        (-0.2, 0.2),
         (
             *_positive_torque(1),
             ("epsilon(i_b) >= 0 for every current", lambda p: _lowest(p[5], p[6])),

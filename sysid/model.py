@@ -31,12 +31,20 @@ class ModelError(ValueError):
 
 @dataclass(frozen=True)
 class State:
-    """One state: name, unit and the value it starts from when no measurement gives it."""
+    """One state: name, unit and the value it starts from when no measurement gives it.
+
+    initial_range: (low, high) where that value is unknown and to be estimated from each record.
+    """
 
     name: str
     unit: str
     initial: float = 0.0
     description: str = ""
+    initial_range: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        if self.initial_range is not None:
+            check_range(f"{self.name}(0)", *self.initial_range)
 
 
 @dataclass(frozen=True)

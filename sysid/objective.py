@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 
 import numpy as np
@@ -39,16 +40,33 @@ class Objective:
         self.weights = relative / relative.sum()
         self._counts = np.sum([np.isfinite(r.outputs).sum(axis=0) for r in self.records], axis=0)
         unseen = [
-            o.name for o, n in zip(simulator.model.outputs, self._counts, strict=True) if not n
+            output.name
+            for output, count, weight in zip(
+                simulator.model.outputs, self._counts, self.weights, strict=True
+            )
+            if weight > 0.0 and not count
         ]
         if unseen:
             raise ModelError(f"no record has a measured sample of output {unseen[0]!r}")
-        self.simulations = 0
+        self._counter = [0]
+
+    @property
+    def simulations(self) -> int:
+        """Simulations of one chromosome on all records until now."""
+        return self._counter[0]
+
+    def over(self, space: SearchSpace) -> Objective:
+        """The same objective over another space of the same model; counts go on together."""
+        other = copy.copy(self)
+        other.space = space
+        return other
 
     def evaluate(self, chromosomes: FloatArray) -> tuple[FloatArray, BatchResult]:
         """Error of each chromosome, (n,), infinite where its simulation failed; and the batch."""
-        result = self.simulator.errors(self.space.full(chromosomes), self.records, self.scales)
-        self.simulations += len(chromosomes)
+        result = self.simulator.errors(
+            self.space.full(chromosomes), self.records, self.scales, self._starts(chromosomes)
+        )
+        self._counter[0] += len(chromosomes)
         return self._mean_rmse(result.sse.sum(axis=1)), result
 
     def residuals(self, chromosomes: FloatArray, n_steps: Sequence[int]) -> FloatArray:
@@ -56,13 +74,15 @@ class Objective:
 
         The records follow one another; lost samples leave 0.
         """
-        vectors = self.space.full(chromosomes)
+        vectors, starts = self.space.full(chromosomes), self._starts(chromosomes)
         parts = []
-        for record, scale, steps in zip(self.records, self.scales, n_steps, strict=True):
-            simulated = self.simulator.trajectories(vectors, record, steps)
+        for record, scale, steps, start in zip(
+            self.records, self.scales, n_steps, starts, strict=True
+        ):
+            simulated = self.simulator.trajectories(vectors, record, steps, start)
             missing = ~np.isfinite(record.outputs)
             parts.append(np.where(missing, 0.0, (simulated - record.outputs) / scale))
-        self.simulations += len(vectors)
+        self._counter[0] += len(vectors)
         return np.concatenate(parts, axis=1)
 
     def error_of(self, residuals: FloatArray) -> FloatArray:
@@ -70,7 +90,15 @@ class Objective:
         with np.errstate(over="ignore", invalid="ignore"):
             return self._mean_rmse(np.sum(residuals**2, axis=1))
 
+    def _starts(self, chromosomes: FloatArray) -> list[FloatArray]:
+        """Initial states of every chromosome for each record."""
+        model = self.simulator.model
+        return [
+            self.space.starts(chromosomes, k, record.initial_state(model))
+            for k, record in enumerate(self.records)
+        ]
+
     def _mean_rmse(self, sse: FloatArray) -> FloatArray:
         with np.errstate(invalid="ignore"):  # infinite times a weight of zero
-            errors = np.sqrt(sse / self._counts) @ self.weights
+            errors = np.sqrt(sse / np.maximum(self._counts, 1)) @ self.weights
         return np.where(np.isfinite(errors), errors, np.inf)

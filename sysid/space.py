@@ -11,11 +11,20 @@ from sysid.model import BoolArray, FloatArray, ModelError, Parameter, ProcessMod
 
 
 @dataclass(frozen=True)
+class Start:
+    """A state whose initial value is estimated, and the record whose it is."""
+
+    record: int
+    state: int
+
+
+@dataclass(frozen=True)
 class SearchSpace:
     """The free parameters of a model between their ranges; the rest stay fixed.
 
-    A chromosome is a row of free parameters in their own units, (n_free,). ``encode`` maps it
-    to search coordinates (logarithm where the scale is log), ``decode`` back.
+    A chromosome is a row of free parameters in their own units, (n_free,), behind which stand
+    the initial states that are estimated, record by record. ``encode`` maps it to search
+    coordinates (logarithm where the scale is log), ``decode`` back.
     """
 
     model: ProcessModel
@@ -23,6 +32,7 @@ class SearchSpace:
     base: FloatArray
     index: tuple[int, ...]
     use_log: bool = True
+    estimated: tuple[Start, ...] = ()
 
     @classmethod
     def of(
@@ -75,6 +85,57 @@ class SearchSpace:
             raise ModelError(f"model {model.name}: every parameter is fixed; free at least one")
         return cls(model, tuple(free), base, tuple(index), use_log)
 
+    @classmethod
+    def of_starts(cls, model: ProcessModel, vector: FloatArray, n_records: int) -> SearchSpace:
+        """Only the initial states of some records, the model's parameters being ``vector``."""
+        return cls(model, (), np.asarray(vector), ()).with_starts(n_records)
+
+    def with_starts(self, n_records: int) -> SearchSpace:
+        """The same space and the initial states that the model leaves to be estimated."""
+        parameters, starts = list(self.parameters), list(self.estimated)
+        for record in range(n_records):
+            for i, state in enumerate(self.model.states):
+                if state.initial_range is None:
+                    continue
+                name = f"{state.name}(0)" if n_records == 1 else f"{state.name}(0) {record + 1}"
+                low, high = state.initial_range
+                about = f"initial {state.description or state.name}"
+                parameters.append(
+                    Parameter(
+                        name, state.unit, state.initial, low, high,
+                        minimum=-np.inf, description=about,
+                    )
+                )  # fmt: skip
+                starts.append(Start(record, i))
+        return replace(self, parameters=tuple(parameters), estimated=tuple(starts))
+
+    def with_declared_starts(self, chromosomes: FloatArray) -> FloatArray:
+        """Chromosomes of the parameters alone, completed by the declared initial states."""
+        declared = [self.model.states[start.state].initial for start in self.estimated]
+        return np.concatenate(
+            [chromosomes, np.broadcast_to(declared, (*chromosomes.shape[:-1], len(declared)))],
+            axis=-1,
+        )
+
+    def starts(self, chromosomes: FloatArray, record: int, own: FloatArray) -> FloatArray:
+        """Initial states of one record for each chromosome, (n, n_states).
+
+        own: (n_states,), those that the record and the model themselves give.
+        """
+        states = np.repeat(own[None], len(chromosomes), axis=0)
+        for place, start in enumerate(self.estimated, len(self.index)):
+            if start.record == record:
+                states[:, start.state] = chromosomes[:, place]
+        return states
+
+    def named_starts(self, chromosome: FloatArray) -> list[dict[str, float]]:
+        """The estimated initial states in a chromosome (n_free,), by state, for each record."""
+        found: list[dict[str, float]] = []
+        for place, start in enumerate(self.estimated, len(self.index)):
+            found += [{} for _ in range(start.record + 1 - len(found))]
+            found[start.record][self.model.states[start.state].name] = float(chromosome[place])
+        return found
+
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the free parameters, in order."""
@@ -122,7 +183,7 @@ class SearchSpace:
         """Complete parameter vectors of chromosomes, (..., n_parameters)."""
         chromosomes = np.asarray(chromosomes)
         vectors = np.broadcast_to(self.base, (*chromosomes.shape[:-1], len(self.base))).copy()
-        vectors[..., list(self.index)] = chromosomes
+        vectors[..., list(self.index)] = chromosomes[..., : len(self.index)]
         return vectors
 
     def violations(self, chromosomes: FloatArray) -> FloatArray:

@@ -18,6 +18,7 @@ from sysid.objective import Objective
 from sysid.refinement import Refinement, refine
 from sysid.simulation import BatchSimulator, Status
 from sysid.space import SearchSpace
+from sysid.starting import estimate_start
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,8 @@ class GASSI(BaseEstimator):  # type: ignore[misc]
     parameters_ : dict of all the model's parameters after ``fit``.
     vector_ : (n_parameters,), the same in the model's order.
     chromosome_ : (n_free,), the free ones in ``space_.names`` order.
-    space_ : SearchSpace that was searched.
+    initial_states_ : for each record a dict of the initial states that were estimated.
+    space_ : SearchSpace that was searched; estimated initial states stand behind the parameters.
     error_ : mean over outputs of the RMSE normalised by max|y| (see ``Objective``).
     search_error_ : the error before local refinement.
     feasible_ : whether all constraints hold.
@@ -145,6 +147,7 @@ class GASSI(BaseEstimator):  # type: ignore[misc]
             self.search_error_ = self.error_
             searched = True
             if preset.refine:
+                objective = self._with_starts(objective)
                 self._refine(objective, notify)
         except KeyboardInterrupt:
             if search.elite is None:
@@ -160,13 +163,16 @@ class GASSI(BaseEstimator):  # type: ignore[misc]
     def predict(self, X: Dataset | FloatArray, *, dt: float | None = None) -> FloatArray:
         """Free-run outputs of the identified model, (n_samples, n_outputs).
 
-        An array X starts from the declared initial states; a Dataset from its first sample.
+        An array X starts from the declared initial states; a Dataset from its first sample, and
+        initial states that the model leaves open are estimated from its outputs.
         """
         check_is_fitted(self, "vector_")
         if not isinstance(X, Dataset):
             unknown = np.full((len(X), len(self._model().outputs)), np.nan)
             X = Dataset(X, unknown, _sample_time(dt))
-        outputs: FloatArray = self._simulator().trajectories(self.vector_, X)[0]
+        simulator = self._simulator()
+        start = estimate_start(simulator, self.vector_, X)
+        outputs: FloatArray = simulator.trajectories(self.vector_, X, starts=start[None])[0]
         return outputs
 
     def score(
@@ -240,13 +246,24 @@ class GASSI(BaseEstimator):  # type: ignore[misc]
         # It rarely needs all the iterations it may take.
         notify(Progress("refine", result.iterations, result.iterations, self.error_))
 
+    def _with_starts(self, objective: Objective) -> Objective:
+        """The objective over the parameters and the initial states left to be estimated."""
+        space = self.space_.with_starts(len(objective.records))
+        if not space.estimated:
+            return objective
+        self.space_ = space
+        chromosome = space.with_declared_starts(self.chromosome_)
+        self._take(chromosome, self.error_, self.feasible_)
+        return objective.over(space)
+
     def _take(self, chromosome: FloatArray | None, error: float, feasible: bool) -> None:
         assert chromosome is not None
-        self.chromosome_ = chromosome
+        self.chromosome_: FloatArray = chromosome
         self.vector_ = self.space_.full(chromosome)
         names = self._model().parameter_names
         self.parameters_ = {n: float(v) for n, v in zip(names, self.vector_, strict=True)}
-        self.error_ = error
+        self.initial_states_ = self.space_.named_starts(chromosome)
+        self.error_: float = error
         self.feasible_ = feasible
 
     def __sklearn_is_fitted__(self) -> bool:

@@ -1,0 +1,32 @@
+"""Where a free run starts when the record does not say."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sysid.data import Dataset
+from sysid.model import FloatArray
+from sysid.objective import Objective
+from sysid.refinement import refine
+from sysid.simulation import BatchSimulator
+from sysid.space import SearchSpace
+
+
+def estimate_start(simulator: BatchSimulator, vector: FloatArray, record: Dataset) -> FloatArray:
+    """Initial states of one record under known parameters, (n_states,).
+
+    States with an ``initial_range`` are fitted to the record's outputs by least squares; the
+    others come from the first sample or as declared. Without a single measured sample nothing
+    is fitted.
+    """
+    model = simulator.model
+    own = record.initial_state(model)
+    space = SearchSpace.of_starts(model, vector, 1)
+    weights = np.asarray(np.isfinite(record.outputs).any(axis=0), dtype=np.float64)
+    if not (space.estimated and weights.any()):
+        return own
+    objective = Objective(simulator, space, [record], weights=weights)
+    declared = space.with_declared_starts(np.empty(0))
+    found = refine(objective, declared).chromosome
+    start: FloatArray = space.starts(found[None], 0, own)[0]
+    return start
