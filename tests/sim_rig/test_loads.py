@@ -10,9 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 
-from sim_rig.loads import GRAVITY, hand_impedance, hand_torque, load, pulley_torque
+from sim_rig.loads import hand_impedance, hand_torque, load, pulley_torque
 from tests.sim_rig.support import Parts, constant, follow
 
+GRAVITY = 9.80665
 PULLEY = {p.name: p.nominal for p in load("pulley").parameters}
 MASS, RADIUS, STIFFNESS, LENGTH = (PULLEY[k] for k in ("mass", "radius", "k_cable", "length"))
 HANGING = MASS * GRAVITY / STIFFNESS  # stretch under the mass at rest

@@ -80,6 +80,14 @@ def test_both_channels_give_half_an_ampere_per_volt_at_rest(channel, command, dr
     assert current / command == pytest.approx(0.5, rel=0.01)
 
 
+def test_the_plants_amplifiers_end_at_24_volts_and_at_the_rated_current():
+    model = Plant(load="locked", parameters={"R_b": 250.0}).build()
+    inputs = constant(model, applied_voltage_motor=9.0, applied_voltage_brake=0.4)
+    found = follow(model, inputs, 0.05)
+    assert found["current_motor"][-1] == pytest.approx(2.5, rel=0.011)
+    assert found["current_brake"][-1] == pytest.approx(24.0 / 250.0, rel=1e-3)
+
+
 def test_the_three_models_are_one_brake():
     """The same torque over angle, loading and turning back, at the same current."""
     torques = []
