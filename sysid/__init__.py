@@ -18,6 +18,7 @@ from sysid.model import (
 )
 from sysid.simulation import BatchResult, BatchSimulator, Status
 from sysid.space import SearchSpace
+from sysid.starting import free_run
 from sysid.stepping import Stepper
 
 if TYPE_CHECKING:
@@ -46,6 +47,7 @@ __all__ = [
     "equilibrium",
     "evaluate",
     "fit_percent",
+    "free_run",
     "jacobian",
     "linearize",
     "msd",

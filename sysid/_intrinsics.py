@@ -25,6 +25,7 @@ def wide_vectors(context: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         # The set knows LLVM's keywords only, and this attribute is a string.
         set.add(builder.function.attributes, '"prefer-vector-width"="512"')
+        set.add(builder.function.attributes, '"stackrealign"')
         return context.get_dummy_value()
 
     return types.none(), generate

@@ -12,6 +12,16 @@ from sysid.simulation import BatchSimulator
 from sysid.space import SearchSpace
 
 
+def free_run(simulator: BatchSimulator, vector: FloatArray, record: Dataset) -> FloatArray:
+    """Outputs of a record's inputs, (n_samples, n_outputs), from where the record starts.
+
+    Initial states that the model leaves open are estimated from the record's outputs.
+    """
+    start = estimate_start(simulator, vector, record)
+    outputs: FloatArray = simulator.trajectories(vector, record, starts=start[None])[0]
+    return outputs
+
+
 def estimate_start(simulator: BatchSimulator, vector: FloatArray, record: Dataset) -> FloatArray:
     """Initial states of one record under known parameters, (n_states,).
 

@@ -16,7 +16,7 @@ from daq.cli import console
 from daq.config.yaml_file import suggestion
 from daq.errors import ConfigError
 from daq.plugins import installed, load_plugin
-from sysid.model import ModelError, ProcessModel
+from sysid.model import ModelError, ProcessModel, State
 
 DEFAULT_MODEL = "actuator"
 
@@ -76,7 +76,12 @@ def models_command(name: str | None, as_json: bool) -> None:
         return
     found = {key: find_model(key) for key in sorted(installed("rig.models"))}
     if as_json:
-        console.print_json({key: describe(model) for key, model in found.items()})
+        console.print_json(
+            {
+                key: {**describe(model), "options": model_options(_find(_Name.parse(key)))}
+                for key, model in found.items()
+            }
+        )
         return
     console.print_table(
         "Process models",
@@ -100,7 +105,10 @@ def models_command(name: str | None, as_json: bool) -> None:
 def describe(model: ProcessModel) -> dict[str, Any]:
     """All that a model declares, for machines."""
     signals = {
-        "states": [{"name": s.name, "unit": s.unit, "initial": s.initial} for s in model.states],
+        "states": [
+            {"name": s.name, "unit": s.unit, "initial": s.initial, "estimated": s.initial_range}
+            for s in model.states
+        ],
         "inputs": [{"name": s.name, "unit": s.unit, "hold": s.hold} for s in model.inputs],
         "outputs": [{"name": s.name, "unit": s.unit} for s in model.outputs],
     }
@@ -132,7 +140,7 @@ def _describe(name: str, model: ProcessModel, as_json: bool) -> None:
         console.print_json({**describe(model), "options": choices})
         return
     console.print_line(f"{model.name}: {model.description}")
-    rows = [["state", s.name, s.unit, f"starts at {s.initial:g}"] for s in model.states]
+    rows = [["state", s.name, s.unit, _start(s)] for s in model.states]
     rows += [["input", s.name, s.unit, s.hold] for s in model.inputs]
     rows += [["output", s.name, s.unit, s.description] for s in model.outputs]
     console.print_table(
@@ -180,6 +188,13 @@ def _print_options(source: str, choices: list[dict[str, Any]]) -> None:
         f"Another combination: rig models {source}:{last['name']}={last['choices'][-1]}, with "
         "a comma between options; --model takes the same name"
     )
+
+
+def _start(state: State) -> str:
+    if state.initial_range is None:
+        return f"starts at {state.initial:g}"
+    low, high = state.initial_range
+    return f"start estimated from each log, {low:g} .. {high:g}"
 
 
 def _as_text(value: Any) -> str:

@@ -14,7 +14,7 @@ from daq.cli.modelling import find_model
 from daq.config import yaml_file
 from daq.config.yaml_file import suggestion
 from daq.errors import ConfigError
-from sysid import BatchSimulator, ModelError, evaluate
+from sysid import BatchSimulator, ModelError, evaluate, free_run
 from sysid.model import ProcessModel
 
 
@@ -33,7 +33,7 @@ def replay_command(
     if loaded.warning is not None:
         console.report_note(loaded.warning)
     try:
-        simulated = BatchSimulator(model).trajectories(model.vector(values), loaded.dataset)[0]
+        simulated = free_run(BatchSimulator(model), model.vector(values), loaded.dataset)
     except ModelError as error:
         raise ConfigError(str(error)) from None
     metrics = evaluate(loaded.dataset.outputs, simulated)

@@ -18,7 +18,7 @@ from sysid.objective import Objective
 from sysid.refinement import Refinement, refine
 from sysid.simulation import BatchSimulator, Status
 from sysid.space import SearchSpace
-from sysid.starting import estimate_start
+from sysid.starting import free_run
 
 
 @dataclass(frozen=True)
@@ -170,10 +170,7 @@ class GASSI(BaseEstimator):  # type: ignore[misc]
         if not isinstance(X, Dataset):
             unknown = np.full((len(X), len(self._model().outputs)), np.nan)
             X = Dataset(X, unknown, _sample_time(dt))
-        simulator = self._simulator()
-        start = estimate_start(simulator, self.vector_, X)
-        outputs: FloatArray = simulator.trajectories(self.vector_, X, starts=start[None])[0]
-        return outputs
+        return free_run(self._simulator(), self.vector_, X)
 
     def score(
         self,

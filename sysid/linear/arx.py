@@ -34,8 +34,8 @@ class ARX(PolynomialModel):
     theta_, names_, covariance_ : all coefficients (n,), their names (``a2[0,1]`` weighs
         y_1(t-2) in the equation of y_0) and covariance (n, n).
     noise_covariance_ : (n_outputs, n_outputs) of e.
-    loss_ : (n_outputs,) mean squared one-step prediction error.
-    residuals_ : per output, the one-step prediction errors of the ``fit``.
+    residuals_ : per output (n_rows,), the estimate of e in each equation that was fitted.
+    loss_ : (n_outputs,) mean square of e, that before each record included.
     log_likelihood_, aic_, bic_ : Gaussian, over the n_rows_ instants known for every output.
     n_lags_ : rows of a record that have no complete past.
     poles_, radius_, stable_ : roots of det A, the largest one's size, whether that is below 1.

@@ -167,9 +167,9 @@ class PolynomialModel(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         spread = Coefficients.of(orders, errors, leading=0.0)
         self.A_std_, self.B_std_ = spread.A, spread.B
         self.C_std_, self.offset_std_ = spread.C, spread.offset
-        self.residuals_ = found.residuals
+        self.residuals_ = found.errors
         self.noise_covariance_ = found.noise_covariance
-        self.loss_ = np.array([np.mean(errors**2) for errors in found.residuals])
+        self.loss_ = found.loss
         self.log_likelihood_ = found.log_likelihood
         self.n_rows_ = found.n_rows
         self.aic_ = 2.0 * len(found.theta) - 2.0 * found.log_likelihood

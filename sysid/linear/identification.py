@@ -54,15 +54,16 @@ class Coefficients:
 class Estimate:
     """What ``identify`` found.
 
-    theta: (p,) all coefficients, output after output; covariance: (p, p); residuals: per output
-    the one-step prediction errors; noise_covariance: (q, q); log_likelihood: Gaussian, of the
+    theta: (p,) all coefficients, output after output; covariance: (p, p); errors: per output the
+    estimate of e; loss: (q,) mean squares; noise_covariance: (q, q); log_likelihood: Gaussian, of the
     n_rows instants that are known for every output; reflected: whether poles were moved.
     """
 
     coefficients: Coefficients
     theta: FloatArray
     covariance: FloatArray
-    residuals: tuple[FloatArray, ...]
+    errors: tuple[FloatArray, ...]
+    loss: FloatArray
     noise_covariance: FloatArray
     log_likelihood: float
     n_rows: int
@@ -102,7 +103,8 @@ def identify(
         coefficients,
         theta,
         _spread(orders, precision.covariance(), reflected),
-        tuple(fit.residual for fit in fits),
+        tuple(fit.errors for fit in fits),
+        np.array([np.mean(fit.residual**2) for fit in fits]),
         precision.noise,
         precision.log_likelihood(),
         len(precision.shared),

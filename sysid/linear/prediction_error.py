@@ -12,13 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from sysid.linear.polynomials import reflect_noise
-from sysid.linear.regression import (
-    Equations,
-    LeastSquares,
-    delayed,
-    least_squares,
-    whitened,
-)
+from sysid.linear.regression import Equations, LeastSquares, least_squares
+from sysid.linear.whitening import Whitener
 from sysid.model import FloatArray
 
 # An iteration is not worth it when it promises to move the coefficients by less than this share
@@ -32,12 +27,15 @@ _ROUNDING = 1e-11
 class RowFit:
     """Estimate of one equation.
 
-    theta: (p,) the linear coefficients; c: (nc,); residual: (n,) one-step prediction errors;
-    sensitivity: (n, p + nc), minus the derivative of the errors by (theta, c).
+    theta: (p,) the linear coefficients; c: (nc,); errors: (n,) estimate of e; residual: (n,)
+    what the sum of squares is taken of: the errors with the unknown past factored out (see
+    ``Whitener``); sensitivity: (n, p + nc), minus its derivative by (theta, c), but for a
+    rotation.
     """
 
     theta: FloatArray
     c: FloatArray
+    errors: FloatArray
     residual: FloatArray
     sensitivity: FloatArray
     iterations: int
@@ -49,26 +47,27 @@ class _Point:
 
     def __init__(self, rows: Equations, c: FloatArray) -> None:
         self.c = c
-        self._position = rows.position
-        columns = whitened(np.column_stack((rows.regressors, rows.target)), c, rows.position)
+        self._whitener = Whitener(c, rows.position)
+        self._filtered = self._whitener.inverse(np.column_stack((rows.regressors, rows.target)))
+        columns = self._whitener.standardised(self._filtered)
         self.regressors = columns[:, :-1]
         self.linear: LeastSquares = least_squares(self.regressors, columns[:, -1])
         self.loss = float(self.linear.residual @ self.linear.residual)
 
-    def noise_sensitivity(self) -> FloatArray:
-        """Minus the derivative of the errors by C's coefficients at fixed theta, (n, nc).
+    def errors(self) -> tuple[FloatArray, FloatArray]:
+        """Estimate of e, (n,), and minus its derivatives by C's coefficients, (n, nc).
 
-        From C(q) e = w: C(q) de/dc_l = -q^-l e (Ljung, section 10.3).
+        At fixed theta and past: from C(q) e = w, C(q) de/dc_l = -q^-l e (Ljung, section 10.3).
         """
-        errors = self.linear.residual
-        shifted = [delayed(errors, self._position, lag + 1) for lag in range(len(self.c))]
-        return whitened(np.column_stack(shifted), self.c, self._position)
+        left = self._filtered[:, -1] - self._filtered[:, :-1] @ self.linear.solution
+        errors, past = self._whitener.errors(left)
+        return errors, self._whitener.standardised(self._whitener.inverse(past))
 
 
 def fit_row(
     rows: Equations, nc: int, starts: list[FloatArray] | None = None, max_iterations: int = 50
 ) -> RowFit:
-    """Minimise the sum of squared one-step prediction errors of one equation.
+    """Minimise the sum of squared errors e of one equation, those before it included.
 
     starts: coefficients of C to try first beside C = 1; the best becomes the start of a
     Levenberg-Marquardt search that keeps C's roots inside the unit circle.
@@ -89,7 +88,7 @@ def _search(rows: Equations, point: _Point, max_iterations: int) -> RowFit:
     # The loss rises by this share of itself one standard error off the minimum.
     significant = 1.0 / len(rows.target)
     for iteration in range(max_iterations):
-        J = point.linear.unexplained(point.noise_sensitivity())
+        J = point.linear.unexplained(point.errors()[1])
         gradient, H = J.T @ point.linear.residual, J.T @ J
         # What the undamped step promises.
         promise = float(gradient @ np.linalg.lstsq(H, gradient)[0])
@@ -110,14 +109,13 @@ def _search(rows: Equations, point: _Point, max_iterations: int) -> RowFit:
 
 
 def _result(point: _Point, iterations: int, converged: bool) -> RowFit:
-    sensitivity = point.regressors
-    if len(point.c):
-        sensitivity = np.hstack((sensitivity, point.noise_sensitivity()))
+    errors, slopes = point.errors()
     return RowFit(
         point.linear.solution,
         point.c,
+        errors,
         point.linear.residual,
-        sensitivity,
+        np.hstack((point.regressors, slopes)),
         iterations,
         converged,
     )

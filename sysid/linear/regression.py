@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import scipy.linalg
-from scipy.linalg import lapack
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
 from sysid.data import Dataset
@@ -82,24 +81,6 @@ def delayed(values: FloatArray, position: IntArray, lag: int) -> FloatArray:
     if lag < len(values):
         unbroken = position[lag:] - position[: len(position) - lag] == lag
         result[lag:] = np.where(unbroken, values[: len(values) - lag], 0.0)
-    return result
-
-
-def whitened(columns: FloatArray, c: FloatArray, position: IntArray) -> FloatArray:
-    """1/C(q) applied to each column, starting anew after every gap; (n, k).
-
-    c: (nc,), the coefficients of C after the leading 1.
-    """
-    if len(c) == 0 or len(columns) == 0:
-        return columns
-    n = len(columns)
-    bands = np.zeros((len(c) + 1, n), order="F")
-    bands[0] = 1.0
-    for lag, value in enumerate(c, start=1):
-        if lag < n:
-            unbroken = position[lag:] - position[: n - lag] == lag
-            bands[lag, : n - lag] = np.where(unbroken, value, 0.0)
-    result: FloatArray = lapack.dtbtrs(bands, np.asfortranarray(columns), uplo="L", diag="U")[0]
     return result
 
 

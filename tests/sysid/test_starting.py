@@ -1,0 +1,152 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sysid import (
+    GASSI,
+    BatchSimulator,
+    Dataset,
+    Input,
+    ModelError,
+    Output,
+    Parameter,
+    ProcessModel,
+    SearchSpace,
+    State,
+)
+from sysid.objective import Objective
+from sysid.refinement import refine
+from sysid.starting import estimate_start
+
+
+def chain(hidden_range=(-5.0, 5.0)):
+    """A hidden first-order lag that drives a measured one."""
+
+    def derivative(x, u, p):
+        hidden, seen = x
+        slow, fast = p
+        return slow * (u[0] - hidden), fast * (hidden - seen)
+
+    return ProcessModel(
+        name="chain",
+        states=(State("hidden", "1", 0.0, initial_range=hidden_range), State("seen", "1")),
+        inputs=(Input("push", "1"),),
+        outputs=(Output("seen", "1"),),
+        parameters=(
+            Parameter("slow", "1/s", 1.0, 0.2, 5.0, "log"),
+            Parameter("fast", "1/s", 10.0, 2.0, 50.0, "log"),
+        ),
+        derivative=derivative,
+    )
+
+
+def record(start, seed, n=200, noise=0.0):
+    """The chain's response from a hidden start, by its closed form in matrices."""
+    from scipy.linalg import expm
+
+    rng = np.random.default_rng(seed)
+    push = np.repeat(rng.uniform(-1, 1, n // 10), 10)
+    slow, fast, dt = 1.7, 12.0, 0.01
+    whole = expm(dt * np.array([[-slow, 0, slow], [fast, -fast, 0], [0, 0, 0]]))
+    x, seen = np.array([start, 0.0]), []
+    for u in push:
+        seen.append(x[1])
+        x = (whole @ [*x, u])[:2]
+    return Dataset(push[:, None], np.array(seen)[:, None] + noise * rng.normal(size=(n, 1)), dt)
+
+
+def test_a_hidden_start_is_found_for_every_record():
+    starts = (2.0, -3.0, 0.5)
+    records = [record(start, seed, 200 + 50 * seed) for seed, start in enumerate(starts)]
+    found = GASSI(chain(), population=24, generations=6).fit(records)
+    assert found.parameters_ == pytest.approx({"slow": 1.7, "fast": 12.0}, rel=1e-4)
+    for states, start in zip(found.initial_states_, starts, strict=True):
+        assert states == {"hidden": pytest.approx(start, abs=1e-3)}
+    assert found.error_ < 1e-5
+
+
+def test_without_a_range_the_start_stays_as_declared():
+    found = GASSI(chain(None), population=24, generations=6).fit(record(2.0, 0))
+    assert found.initial_states_ == []
+    assert found.error_ > 1e-2
+
+
+def test_a_prediction_finds_the_start_of_its_own_record():
+    found = GASSI(chain(), population=24, generations=6).fit(record(2.0, 0))
+    other = record(-4.0, 7)
+    np.testing.assert_allclose(found.predict(other), other.outputs, atol=1e-3)
+    # An array has no outputs to tell the start from.
+    from_rest = record(0.0, 7)
+    np.testing.assert_allclose(
+        found.predict(other.inputs, dt=other.dt), from_rest.outputs, atol=1e-3
+    )
+
+
+def test_the_start_is_the_least_squares_one():
+    model, noisy = chain(), record(2.0, 3, noise=0.05)
+    vector = np.array([1.7, 12.0])
+    simulator = BatchSimulator(model, accuracy=1e-6)
+    found = estimate_start(simulator, vector, noisy)[0]
+    # The output is affine in the start: two simulations give the least-squares one.
+    both = np.array([[0.0, noisy.outputs[0, 0]], [1.0, noisy.outputs[0, 0]]])
+    base, moved = simulator.trajectories(np.stack([vector, vector]), noisy, None, both)[:, :, 0]
+    slope, rest = moved - base, noisy.outputs[:, 0] - base
+    assert found == pytest.approx(float(slope @ rest / (slope @ slope)), abs=1e-4)
+
+
+def test_a_start_outside_its_range_ends_on_it():
+    found = estimate_start(
+        BatchSimulator(chain((-1.0, 1.0))), np.array([1.7, 12.0]), record(3.0, 1)
+    )
+    assert found[0] == pytest.approx(1.0)
+
+
+def test_outputs_never_measured_leave_the_declared_start():
+    blank = Dataset(np.zeros((20, 1)), np.full((20, 1), np.nan), 0.01)
+    np.testing.assert_array_equal(
+        estimate_start(BatchSimulator(chain()), np.array([1.7, 12.0]), blank), [0.0, 0.0]
+    )
+
+
+def test_starts_belong_to_their_records():
+    model = chain()
+    space = SearchSpace.of(model).with_starts(2)
+    assert space.names == ("slow", "fast", "hidden(0) 1", "hidden(0) 2")
+    rows = np.array([[1.0, 10.0, 3.0, 4.0], [2.0, 20.0, 5.0, 6.0]])
+    own = np.array([0.5, 0.25])
+    np.testing.assert_array_equal(space.full(rows), rows[:, :2])
+    np.testing.assert_array_equal(space.starts(rows, 0, own), [[3.0, 0.25], [5.0, 0.25]])
+    np.testing.assert_array_equal(space.starts(rows, 1, own), [[4.0, 0.25], [6.0, 0.25]])
+    assert space.named_starts(rows[1]) == [{"hidden": 5.0}, {"hidden": 6.0}]
+    assert SearchSpace.of(chain(None)).with_starts(2).names == ("slow", "fast")
+
+
+def test_each_chromosome_starts_where_it_says():
+    """One batch with different starts is the same as one simulation after another."""
+    model, data = chain(), record(2.0, 0)
+    simulator = BatchSimulator(model)
+    rng = np.random.default_rng(1)
+    vectors = rng.uniform([0.5, 5.0], [3.0, 30.0], (37, 2))
+    starts = rng.normal(size=(37, 2))
+    together = simulator.errors(vectors, [data], None, [starts]).sse
+    for i in (0, 15, 16, 36):
+        alone = simulator.errors(vectors[i : i + 1], [data], None, [starts[i : i + 1]]).sse
+        np.testing.assert_array_equal(together[i], alone[0])
+    outputs = simulator.trajectories(vectors, data, 2, starts)
+    np.testing.assert_array_equal(outputs[:, 0, 0], starts[:, 1])
+
+
+def test_the_refinement_moves_parameters_and_starts_together():
+    model, data = chain(), record(2.0, 0)
+    space = SearchSpace.of(model).with_starts(1)
+    objective = Objective(BatchSimulator(model, accuracy=1e-6), space, [data])
+    found = refine(objective, np.array([1.0, 10.0, 0.0]))
+    np.testing.assert_allclose(found.chromosome, [1.7, 12.0, 2.0], rtol=1e-4)
+
+
+def test_a_range_of_starts_that_is_no_range_is_refused():
+    with pytest.raises(ModelError, match=r"hidden\(0\).*\[low, high\]"):
+        replace(chain().states[0], initial_range=(1.0, 1.0))
