@@ -19,6 +19,7 @@ from daq.hal import (
     Flag,
     FloatArray,
     Guard,
+    IntArray,
     Mode,
     Phase,
     RawSamples,
@@ -115,12 +116,14 @@ class Rig:
         if tick != self._asked_until:
             raise DeviceError(f"commands for tick {tick} follow those until {self._asked_until}")
         commands = np.asarray(commands, dtype=np.float64)
-        if not np.all(np.isfinite(commands)):
-            raise DeviceError(f"a command from tick {tick} on is not a finite number of volts")
         limited = np.minimum(np.maximum(commands, self._low), self._high)
-        places = np.arange(tick, tick + len(commands)) % len(self._asked)
+        changed = limited != commands
+        # Whatever is not finite is changed by the limits, or is NaN and differs from itself.
+        if changed.any() and not np.isfinite(commands).all():
+            raise DeviceError(f"a command from tick {tick} on is not a finite number of volts")
+        places = self._places(tick, len(commands))
         self._asked[places] = commands
-        self._clamped[places] = (limited != commands).any(axis=1)
+        self._clamped[places] = changed.any(axis=1) if changed.any() else False
         self._asked_until += len(commands)
         self._device.send(tick, limited)
 
@@ -168,13 +171,24 @@ class Rig:
         inputs = [getattr(self.config.sensors, name) for name in ANALOG_INPUTS]
         return np.array([item.sign * item.scale for item in inputs])
 
+    def _places(self, tick: int, n: int) -> slice | IntArray:
+        """Where the commands of n ticks are kept."""
+        start = tick % len(self._asked)
+        if start + n <= len(self._asked):
+            return slice(start, start + n)
+        return np.arange(tick, tick + n) % len(self._asked)
+
     def _to_si(self, raw: RawSamples) -> Samples:
         analog = (raw.analog - self.offsets.volts) * self._scale
-        # A tick never asked for counts as the one before.
-        places = np.minimum(raw.tick, max(self._asked_until - 1, 0)) % len(self._asked)
-        asked = self._asked[places]
-        flags = raw.flags | (self._clamped[places] * int(Flag.CLAMPED))
         first, last, n = int(raw.tick[0]), int(raw.tick[-1]), len(raw.tick)
+        if last - first == n - 1 and last < self._asked_until:
+            places = self._places(first, n)
+        else:
+            # A tick never asked for counts as the one before.
+            places = np.minimum(raw.tick, max(self._asked_until - 1, 0)) % len(self._asked)
+        asked, flags = self._asked[places].copy(), raw.flags.copy()
+        if self._clamped[places].any():
+            flags |= self._clamped[places] * int(Flag.CLAMPED)
         if first != self._last_tick + 1:
             flags[0] |= int(Flag.LOST)
         if last - first != n - 1:
