@@ -17,15 +17,16 @@ intrinsic: Any = _intrinsic
 
 @intrinsic
 def wide_vectors(context: Any) -> Any:
-    """Let the calling function use the widest vectors there are.
+    """Let the calling function use the widest vectors there are, and keep them aligned.
 
-    Where the processor has 512 bits LLVM keeps to 256 by itself, for code with few vectors in it.
+    Where the processor has 512 bits LLVM keeps to 256 by itself, for code with few vectors in
+    it; and what does not fit the registers it would store across cache lines.
     """
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        # The set knows LLVM's keywords only, and this attribute is a string.
-        set.add(builder.function.attributes, '"prefer-vector-width"="512"')
-        set.add(builder.function.attributes, '"stackrealign"')
+        for attribute in ('"prefer-vector-width"="512"', '"stackrealign"'):
+            # The set knows LLVM's keywords only, and these are strings.
+            set.add(builder.function.attributes, attribute)
         return context.get_dummy_value()
 
     return types.none(), generate

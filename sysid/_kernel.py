@@ -8,6 +8,7 @@ stages give scalar code, about five times slower (docs/decisions/0003-batch-kern
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 
 from sysid._kernel_text import (
@@ -102,8 +103,8 @@ def _simulate(s: Shape) -> str:
         *[f"        {line}" for line in _input_slopes(s)],
         "        for step in range(n_steps):",
         *[f"            {line}" for line in _stage_inputs(s)],
-        f"            for l in range({LANES}):",
-        *[f"                {line}" for line in _lane_step(s)],
+        f"            for l in range({LANES // 2}):",
+        *[f"                {line}" for line in _paired(_lane_step(s))],
         f"    for j in range({2 * q}):",
         f"        for l in range({LANES}):",
         f"            sums[j, l] = X[({rows.sums} + j) * {LANES} + l]",
@@ -153,6 +154,27 @@ def _lane_step(s: Shape) -> list[str]:
         *[f"{_at(i)} = n{i}" for i in range(s.n_states)],
         *_estimate(s, place),
     ]
+
+
+def _paired(lines: list[str]) -> list[str]:
+    """Each line for lane l and for the lane half a block on.
+
+    A step is one long chain of operations that wait for each other; a second chain beside it
+    fills the waits, which the processor does not look far enough ahead to do by itself.
+    """
+    assigned = {
+        name.strip()
+        for line in lines
+        for name in line.partition(" = ")[0].split(",")
+        if name.strip().isidentifier()
+    }
+    second = f"+ l + {LANES // 2}]"
+
+    def moved(line: str) -> str:
+        renamed = re.sub(r"\w+", lambda m: m[0] + "_" * (m[0] in assigned), line)
+        return renamed.replace("+ l]", second)
+
+    return [both for line in lines for both in (line, moved(line))]
 
 
 def _estimate(s: Shape, place: Place) -> list[str]:

@@ -129,14 +129,15 @@ def step(s: Shape, place: Place) -> list[str]:
     lines += _stage(s, "b", "ub", [_second(s, i, place) for i in range(s.n_states)])
     lines += [f"g{i} = x{i}{product(s, 'F', i, 'k', place)}" for i in range(s.n_states)]
     lines += _stage(s, "c", "uc", [_third(s, i, place) for i in range(s.n_states)])
-    lines += [f"s{i} = da{i} + db{i}" for i in s.structure.driven]
+    for i in s.structure.driven:
+        lines += [f"s{i} = da{i} + db{i}", f"v_{i} = ra{i} + rb{i}", f"w_{i} = m{i} + rc{i}"]
     lines += [f"n{i} = {_last(s, i, place)}" for i in range(s.n_states)]
     return lines
 
 
 def error_of_n(s: Shape) -> list[str]:
     """After a step, t: by how much the change of N was not linear; G t estimates the error."""
-    return [f"t{i} = s{i} - dc{i}" for i in s.structure.driven]
+    return [f"t{i} = v_{i} - w_{i}" for i in s.structure.driven]
 
 
 def margins(s: Shape, x: str, u: str, target: str) -> list[str]:
@@ -272,4 +273,4 @@ def _last(s: Shape, i: int, place: Place) -> str:
         return f"g{i}{product(s, 'G', i, 's', place)}{product(s, 'H', i, 'dc', place)}"
     if i not in s.structure.driven:
         return f"x{i} + h * k{i}"
-    return f"x{i} + h6 * (k{i} + rc{i} + 2.0 * (ra{i} + rb{i}))"
+    return f"x{i} + h6 * (w_{i} + 2.0 * v_{i})"

@@ -18,6 +18,8 @@ from sysid.model import Function, ProcessModel
 
 Entry = tuple[int, int]
 
+_LONGEST = 25  # items of a tuple display
+
 
 @dataclass(frozen=True)
 class Program:
@@ -235,4 +237,6 @@ class _Writer:
 def listed(items: Iterable[str]) -> str:
     """Text of a tuple."""
     texts = list(items)
-    return "(" + ", ".join(texts) + ("," if len(texts) == 1 else "") + ")"
+    # Python builds longer displays by way of a list, which Numba does not always follow.
+    parts = [texts[i : i + _LONGEST] for i in range(0, len(texts), _LONGEST)] or [[]]
+    return " + ".join(f"({', '.join(part)}{',' * (len(part) == 1)})" for part in parts)

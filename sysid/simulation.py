@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import enum
 import os
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -25,6 +27,8 @@ _ESTIMATE_LIMIT = 0.1
 # The estimate falls with the third power of the step where the equations are smooth.
 _ESTIMATE_ORDER = 3.0
 _MAX_ROUNDS = 6
+_PILOT_PART = 8  # of the record
+_PILOT_LEAST = 32  # samples
 _MAX_STEPS = 512
 # Steps per sample come from a ladder so that chromosomes of like need share a block, while
 # each one's result depends on nothing but itself.
@@ -132,11 +136,9 @@ class BatchSimulator:
         with ThreadPoolExecutor(self.threads) as pool:
             runner = _Runner(self, record, pool, starts=starts)
             n_steps = n_steps or runner.common_steps(parameters)
-            list(
-                pool.map(
-                    lambda lanes: runner.record_block(parameters, lanes, n_steps, outputs),
-                    _blocks(np.arange(n)),
-                )
+            runner.each(
+                lambda lanes: runner.record_block(parameters, lanes, n_steps, outputs),
+                _blocks(np.arange(n)),
             )
         return outputs
 
@@ -190,6 +192,7 @@ class _Runner:
             self.y = np.zeros_like(self.y)
         else:
             self.w = np.where(missing, 0.0, 1.0 / scale)
+        self.weight = np.max(self.w, axis=0)
         # What an error is small against: the largest measured value, or the output's own size.
         self.peak = np.where(missing, 0.0, np.abs(record.outputs)).max(axis=0)
         # Where an input is largest is where a model driven through it is fastest.
@@ -221,6 +224,21 @@ class _Runner:
         self._run(parameters, lanes, n_steps, record)
         outputs[lanes] = np.moveaxis(record, 2, 0)[: len(lanes)]
 
+    def each(self, function: Callable[[Any], None], tasks: Sequence[Any]) -> None:
+        """Run a function on every task, each thread taking the next one when it is free."""
+        queue = iter(tasks)  # hands each task out once, to whichever thread
+
+        def work() -> None:
+            for task in queue:
+                function(task)
+
+        workers = [self.pool.submit(work) for _ in range(self.simulator.threads)]
+        try:
+            for worker in workers:
+                worker.result()
+        finally:
+            deque(queue, maxlen=0)  # after an interrupt nothing more is begun
+
     def _choose(
         self, parameters: FloatArray, sse: FloatArray, spent: IntArray
     ) -> tuple[IntArray, BoolArray]:
@@ -235,13 +253,20 @@ class _Runner:
         over = steps > limit
         blown = np.zeros(len(parameters), dtype=bool)
         todo = np.flatnonzero(~over)
+        # The record's start tells cheaply what most of them need; whether it is enough the whole
+        # record says.
+        pilot = self.record.n_samples // _PILOT_PART
+        if pilot >= _PILOT_LEAST:
+            excess = self._round(parameters, steps, todo, sse, spent, pilot)
+            more = _finer(steps[todo], excess)
+            raised = np.isfinite(excess) & (excess > 1.0) & (more <= limit)
+            steps[todo[raised]] = more[raised]
         for _ in range(_MAX_ROUNDS):
             if len(todo) == 0:
                 break
             excess = self._round(parameters, steps, todo, sse, spent)
             finite = np.isfinite(excess)
-            factor = np.where(finite, excess ** (1.0 / _ESTIMATE_ORDER), 8.0)
-            more = _rungs(1.1 * np.clip(factor, 1.2, 8.0) * steps[todo])
+            more = _finer(steps[todo], excess)
             again = ~(excess <= 1.0)
             # Finite but not accurate within the budget is too stiff; not finite is unbounded.
             over[todo[again & finite & (more > limit)]] = True
@@ -258,31 +283,32 @@ class _Runner:
         todo: IntArray,
         sse: FloatArray,
         spent: IntArray,
+        n_samples: int | None = None,
     ) -> FloatArray:
-        """Simulate some; their error estimates in parts of what the accuracy allows."""
-        excess = np.zeros(len(parameters))
+        """Simulate some; their error estimates in parts of what the accuracy allows.
+
+        n_samples: of the record's start, default the whole record.
+        """
         tasks = [
             (lanes, int(rung))
             for rung in np.unique(steps[todo])[::-1]
             for lanes in _blocks(todo[steps[todo] == rung])
         ]
-        intervals = self.record.n_samples - 1
+        estimates = np.zeros((len(parameters), self.y.shape[1]))
 
         def run(task: tuple[IntArray, int]) -> None:
             lanes, rung = task
-            errors, estimates = self._run(parameters, lanes, rung, np.empty((0, 0, 0)))
-            sse[lanes, 0] = errors
-            per_step = np.sqrt(estimates / (intervals * rung))
-            worst = np.max(per_step / self._size(errors), axis=1)
-            excess[lanes] = np.where(
-                np.isfinite(errors).all(axis=1),
-                worst / (_ESTIMATE_LIMIT * self.simulator.accuracy),
-                np.inf,
-            )
-            spent[lanes] += rung * intervals
+            sums = self._run(parameters, lanes, rung, np.empty((0, 0, 0)), n_samples)
+            sse[lanes, 0], estimates[lanes] = sums
 
-        list(self.pool.map(run, tasks))
-        return excess[todo]
+        self.each(run, tasks)
+        taken = steps[todo] * ((n_samples or self.record.n_samples) - 1)
+        spent[todo] += taken
+        errors = sse[todo, 0]
+        with np.errstate(all="ignore"):
+            per_step = np.sqrt(estimates[todo] / taken[:, None]) / self._size(errors)
+        excess = np.max(per_step, axis=1) / (_ESTIMATE_LIMIT * self.simulator.accuracy)
+        return np.where(np.isfinite(errors).all(axis=1), excess, np.inf)
 
     def _size(self, errors: FloatArray) -> FloatArray:
         """What is large for each output of each chromosome, (n, n_outputs).
@@ -290,18 +316,21 @@ class _Runner:
         Where nothing but zeros was measured it is the RMS of the simulated output, and where
         nothing was measured at all no error matters.
         """
-        weight = np.max(self.w, axis=0)
-        with np.errstate(all="ignore"):
-            own = np.sqrt(errors / self.record.n_samples) / weight
-        size = np.where(self.peak > 0.0, self.peak, np.where(weight > 0.0, own, np.inf))
+        own = np.sqrt(errors / self.record.n_samples) / self.weight
+        size = np.where(self.peak > 0.0, self.peak, np.where(self.weight > 0.0, own, np.inf))
         filled: FloatArray = np.where(size > 0.0, size, 1.0)
         return filled
 
     def _run(
-        self, parameters: FloatArray, lanes: IntArray, n_steps: int, record: FloatArray
+        self,
+        parameters: FloatArray,
+        lanes: IntArray,
+        n_steps: int,
+        record: FloatArray,
+        n_samples: int | None = None,
     ) -> tuple[FloatArray, FloatArray]:
         """Error sums and estimate sums of up to LANES chromosomes, (n, n_outputs) each."""
-        padded = np.resize(lanes, LANES)
+        padded = lanes if len(lanes) == LANES else np.resize(lanes, LANES)
         p = np.ascontiguousarray(parameters[padded].T)
         start = self._start(padded)
         q = self.y.shape[1]
@@ -311,9 +340,9 @@ class _Runner:
             work,
             work.reshape(-1, LANES),
             self.kernels.tables,
-            self.record.inputs,
-            self.y,
-            self.w,
+            self.record.inputs[:n_samples],
+            self.y[:n_samples],
+            self.w[:n_samples],
             start,
             p,
             self.record.dt,
@@ -341,8 +370,15 @@ class _Runner:
             self.kernels.spectrum(inputs, states, p, rate)
             rates[lanes] = rate
 
-        list(self.pool.map(run, _blocks(np.arange(len(parameters)))))
+        self.each(run, _blocks(np.arange(len(parameters))))
         return rates
+
+
+def _finer(steps: IntArray, excess: FloatArray) -> IntArray:
+    """Steps per sample for those whose error estimates exceed what is allowed."""
+    finite = np.isfinite(excess)
+    factor = np.where(finite, excess ** (1.0 / _ESTIMATE_ORDER), 8.0)
+    return _rungs(1.1 * np.clip(factor, 1.2, 8.0) * steps)
 
 
 def _rungs(steps: FloatArray) -> IntArray:

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sim_rig.actuator import actuator
-from sim_rig.plant import plant
+from sim_rig.plant import Plant
 from sysid import (
     Input,
     ModelError,
@@ -22,7 +22,12 @@ from sysid import (
 )
 from tests.sysid.support import motor, motor_matrices
 
-MODELS = {"motor": motor(), "actuator": actuator(), "actuator n=2": actuator(2.0), "plant": plant()}
+MODELS = {
+    "motor": motor(),
+    "actuator": actuator(),
+    "actuator n=2": actuator(exponent=2.0),
+    "plant": Plant().build(),
+}
 
 
 def central_differences(function, point, width):
