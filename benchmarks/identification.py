@@ -13,7 +13,7 @@ import numpy as np
 
 from benchmarks._common import arguments, report, simulated_logs, timed
 from sim_rig.actuator import actuator
-from sysid import BatchSimulator, Dataset, evaluate
+from sysid import BatchSimulator, Dataset, evaluate, free_run
 from sysid.gassi import GASSI
 from sysid.model import ProcessModel
 from sysid.reference import simulate
@@ -51,13 +51,13 @@ def identification(model: ProcessModel, training: Dataset, validation: Dataset) 
     whole, estimator = timed(lambda: fit("default"))
     truth = actuator(parameters="rig").nominal
     simulator = BatchSimulator(model)
-    floor = evaluate(validation.outputs, simulator.trajectories(truth, validation)[0])
+    floor = evaluate(validation.outputs, free_run(simulator, truth, validation))
     found = evaluate(validation.outputs, estimator.predict(validation))
     return {
         "generations": GENERATIONS,
         "population": POPULATION,
         "samples": training.n_samples,
-        "free_parameters": len(estimator.space_.names),
+        "free_parameters": len(estimator.space_.index),
         "thesis_preset_seconds": search,
         "default_preset_seconds": whole,
         "validation": {
