@@ -10,10 +10,12 @@ from sysid.model import ModelError
 class ARMAX(PolynomialModel):
     """Identify A(q) y = B(q) u + offset + C(q) e by minimising one-step prediction errors.
 
-    A and B are full, C is diagonal, so that each output's equation is a problem of its own: the
-    sum of squares of its innovations e, over its coefficients. Each C has its roots inside the
-    unit circle. Innovations start at zero in the first complete row of every record and after
-    every gap. Ljung, System Identification, sections 4.2, 7.2 and 10.2.
+    A and B are full, C is diagonal, so that each output's equation is a problem of its own: to
+    maximise the Gaussian likelihood of its one-step prediction errors. Each C has its roots
+    inside the unit circle. The noise before the first complete row of a record, and before the
+    first one after a gap, is unknown and counts as such: taken for zero, as is common, it
+    biases a C that forgets slowly. Ljung, System Identification, sections 4.2, 7.2 to 7.4
+    and 10.2.
 
     Parameters
     ----------

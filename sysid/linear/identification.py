@@ -55,8 +55,8 @@ class Estimate:
     """What ``identify`` found.
 
     theta: (p,) all coefficients, output after output; covariance: (p, p); errors: per output the
-    estimate of e; loss: (q,) mean squares; noise_covariance: (q, q); log_likelihood: Gaussian, of the
-    n_rows instants that are known for every output; reflected: whether poles were moved.
+    estimate of e; loss: (q,) mean squares; noise_covariance: (q, q); log_likelihood: Gaussian,
+    of the n_rows instants known for every output; reflected: whether poles were moved.
     """
 
     coefficients: Coefficients

@@ -6,6 +6,8 @@ is the lag.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import numpy.typing as npt
 import scipy.linalg
@@ -41,14 +43,25 @@ def companion(A: FloatArray) -> FloatArray:
 def reflect_noise(c: FloatArray) -> FloatArray:
     """C(q) with the same spectrum and all roots inside the unit circle.
 
-    c: (nc,), the coefficients after the leading 1. A root on the circle moves to radius
-    ``NOISE_RADIUS``. The predictor is stable only with C's roots inside.
+    c: (nc,), the coefficients after the leading 1. Roots outside are mirrored, and none is left
+    beyond ``NOISE_RADIUS``. The predictor is stable only with C's roots inside.
     """
-    roots = np.roots(np.concatenate(([1.0], c))).astype(np.complex128)
-    if len(roots) == 0 or np.abs(roots).max() <= NOISE_RADIUS:
+    return _with_roots(c, lambda size: np.minimum(1.0 / size, NOISE_RADIUS))
+
+
+def limit_noise(c: FloatArray) -> FloatArray:
+    """C(q) with roots beyond ``NOISE_RADIUS`` moved back to it along their direction."""
+    return _with_roots(c, lambda size: np.full_like(size, NOISE_RADIUS))
+
+
+def _with_roots(c: FloatArray, radius: Callable[[FloatArray], FloatArray]) -> FloatArray:
+    roots = np.roots(np.concatenate(([1.0], c)))
+    size = np.maximum(np.abs(roots), np.finfo(float).tiny)
+    if len(roots) == 0 or size.max() <= NOISE_RADIUS:
         return c
-    reflected: FloatArray = np.real(np.poly(_inside(roots, NOISE_RADIUS)))[1:]
-    return reflected
+    moved = np.where(size > NOISE_RADIUS, roots / size * radius(size), roots)
+    result: FloatArray = np.real(np.poly(moved))[1:]
+    return result
 
 
 def reflect_poles(A: FloatArray) -> FloatArray:
@@ -90,8 +103,3 @@ def _blocks(T: FloatArray) -> list[tuple[slice, float]]:
 
 def _eigenvalues(matrix: FloatArray) -> ComplexArray:
     return np.linalg.eigvals(matrix).astype(np.complex128)
-
-
-def _inside(roots: ComplexArray, radius: float) -> ComplexArray:
-    size = np.maximum(np.abs(roots), np.finfo(float).tiny)
-    return np.where(size > radius, roots / size * np.minimum(1.0 / size, radius), roots)

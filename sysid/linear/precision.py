@@ -64,7 +64,8 @@ class Precision:
         sign, logdet = np.linalg.slogdet(errors.T @ errors / n)
         if sign <= 0:
             return np.inf
-        return float(-0.5 * n * (q * np.log(2.0 * np.pi) + logdet + q))
+        unknown_past = sum(fit.log_det for fit in self._fits)
+        return float(-0.5 * (n * (q * np.log(2.0 * np.pi) + logdet + q) + unknown_past))
 
     def _common(self, i: int, j: int) -> tuple[IntArray, IntArray]:
         _, ours, theirs = np.intersect1d(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 from scipy.linalg import lapack
 
@@ -12,12 +14,13 @@ class Whitener:
     """Turns noise C(q) e into errors of equal variance, uncorrelated with each other.
 
     1/C(q) started at zero leaves r = e + K h, where h are the values of e at the nc instants
-    before the first, as large as any other. Their covariance I + K K' is factored out: the sum
-    of squares of what results is that of the likeliest e and h together. The first row of a
-    record, or after a gap, has a past of its own. Box & Jenkins, Time Series Analysis, section
-    7.1 (unconditional sum of squares).
+    before the first, as large as any other. Their covariance I + K K' is factored out: what
+    results has the sum of squares of the likeliest e and h together, and the Gaussian likelihood
+    is exact. The first row of a record, or after a gap, has a past of its own. Box & Jenkins, Time
+    Series Analysis, chapter 7.
 
-    c: (nc,), the coefficients of C after the leading 1; position: (n,), instants.
+    c: (nc,), the coefficients of C after the leading 1; position: (n,), instants. log_det: of
+    I + K K'.
     """
 
     def __init__(self, c: FloatArray, position: IntArray) -> None:
@@ -37,11 +40,15 @@ class Whitener:
         grams = [self._K[run].T @ self._K[run] for run in self._runs]
         self._estimate = [np.linalg.inv(np.eye(nc) + gram) for gram in grams]
         self._root = [_root(gram) for gram in grams]
+        self.log_det = float(sum(np.linalg.slogdet(np.eye(nc) + gram)[1] for gram in grams))
 
     def inverse(self, columns: FloatArray) -> FloatArray:
         """1/C(q) of each column, from zero at the start of each run; (n, k)."""
+        return self._solve(columns, "N")
+
+    def _solve(self, columns: FloatArray, trans: Literal["N", "T"]) -> FloatArray:
         result: FloatArray = lapack.dtbtrs(
-            self._bands, np.asfortranarray(columns), uplo="L", diag="U"
+            self._bands, np.asfortranarray(columns), uplo="L", trans=trans, diag="U"
         )[0]
         return result
 
@@ -55,16 +62,37 @@ class Whitener:
 
     def errors(self, r: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The likeliest e, (n,), and its own past, (n, nc): e(t-1), e(t-2), ... in each row."""
-        nc = self._K.shape[1]
         e, past = np.empty_like(r), np.empty_like(self._K)
         for run, estimate in zip(self._runs, self._estimate, strict=True):
             K = self._K[run]
             before = estimate @ (K.T @ r[run])
             e[run] = r[run] - K @ before
-            joined = np.concatenate((before[::-1], e[run]))
-            for lag in range(1, nc + 1):
-                past[run, lag - 1] = joined[nc - lag : len(joined) - lag]
+            for lag in range(1, len(before) + 1):
+                past[run, lag - 1] = _earlier(before, e[run], lag)
         return e, past
+
+    def log_det_slope(self) -> FloatArray:
+        """Derivative of ``log_det`` by C's coefficients, (nc,).
+
+        It is 2 tr((I + K'K)^-1 K' dK/dc_l), and K are the errors that unit errors before the
+        first row leave, so that it follows from the same recursion.
+        """
+        nc = self._K.shape[1]
+        weights = np.empty_like(self._K)
+        for run, estimate in zip(self._runs, self._estimate, strict=True):
+            weights[run] = self._K[run] @ estimate
+        weights = self._solve(weights, "T")
+        slope = np.zeros(nc)
+        for run in self._runs:
+            for lag in range(1, nc + 1):
+                past = _earlier(np.eye(nc), -self._K[run], lag)
+                slope[lag - 1] += 2.0 * np.sum(weights[run] * past)
+        return slope
+
+
+def _earlier(before: FloatArray, values: FloatArray, lag: int) -> FloatArray:
+    """Values ``lag`` rows earlier; before: (nc, ...), those 1, 2, ... rows before the first."""
+    return np.concatenate((before[:lag][::-1], values))[: len(values)]
 
 
 def _root(gram: FloatArray) -> FloatArray:

@@ -383,6 +383,29 @@ def test_stable_on_request():
     assert_array_equal(found.theta_[found.names_.index("a1[1,0]")], found.A_[1, 1, 0])
 
 
+@pytest.mark.filterwarnings("ignore:the ARX model is unstable")
+@pytest.mark.parametrize("na", [2, [[2, 1], [1, 2]]])
+def test_the_rest_is_estimated_again_for_the_mended_model(na):
+    rng = np.random.default_rng(0)
+    u = rng.normal(size=(60, 1))
+    a = np.array([np.eye(2), [[-1.5, 0.1], [0.4, -0.9]], [[0.45, 0.0], [0.0, 0.3]]])
+    y = recursion(a, np.ones((3, 2, 1)), [1.0, 0.0], u, 0.1 * rng.normal(size=(60, 2)))
+    wild, found = ARX(na, 2).fit(u, y), ARX(na, 2, stable=True).fit(u, y)
+    assert wild.radius_ > 1.0
+    assert found.radius_ < 1.0
+    # The stable modes keep their poles and their directions among the outputs.
+    for pole in wild.poles_[np.abs(wild.poles_) < 1.0]:
+        direction = np.linalg.svd(sum(wild.A_ * pole ** -np.arange(3)[:, None, None]))[2][-1]
+        left = sum(found.A_ * pole ** -np.arange(3)[:, None, None]) @ direction.conj()
+        assert_allclose(left, 0.0, atol=1e-7)
+    target = y[2:] + y[1:-1] @ found.A_[1].T + y[:-2] @ found.A_[2].T
+    phi = np.hstack((u[1:-1], u[:-2], np.ones((58, 1))))
+    theta = np.linalg.lstsq(phi, target)[0]
+    assert_allclose(found.B_[1:, :, 0], theta[:2], rtol=1e-7)
+    assert_allclose(found.offset_, theta[2], rtol=1e-7)
+    assert_allclose(np.column_stack(found.residuals_), target - phi @ theta, rtol=1e-6, atol=1e-8)
+
+
 def test_stable_models_are_left_alone():
     assert_array_equal(
         ARX(2, 2, stable=True).fit(record(noise=1.0)).theta_,
