@@ -74,6 +74,20 @@ def combinations(**kept):
 
 ALL = tuple(combinations())
 
+# Plants of simulated rigs besides the default one: few, as each takes seconds to compile.
+PLANTS = {
+    "free": {
+        "load": "free", "friction": "stribeck", "sensor": "between", "hysteresis": "dahl",
+        "driver_motor": "open", "driver_brake": "open",
+    },
+    "locked": {"load": "locked", "friction": "cyclic", "hysteresis": "lugre"},
+    "hand": {"load": "hand", "sensor": "between", "smooth": True, "driver_brake": "open"},
+    "pulley": {
+        "load": "pulley", "friction": "cyclic", "sensor": "between", "exponent": 2.0,
+        "parameter_set": "C", "parameters": {"cycles": 3.0},
+    },
+}  # fmt: skip
+
 
 class Point(NamedTuple):
     """States, inputs and parameters by name."""

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from sim_rig.actuator import actuator
-from sysid import ModelError
+from sysid import BatchSimulator, Dataset, ModelError, SearchSpace
+from sysid.reference import simulate as reference
 from tests.sim_rig import equations
-from tests.sim_rig.support import ALL, HYSTERESES, LOADS, combinations, random_point
+from tests.sim_rig.support import ALL, HYSTERESES, LOADS, PLANTS, Parts, combinations, random_point
 
 
 @pytest.mark.parametrize("load", LOADS)
@@ -85,3 +86,82 @@ def test_every_combination_takes_every_named_set(name):
 def test_a_measured_load_has_its_sensor_at_the_load():
     with pytest.raises(ModelError, match="sensor between"):
         actuator(load="measured", sensor="between")
+
+
+# --- compiled ------------------------------------------------------------------------------
+
+# A machine-code model takes seconds to build. These few have, with the plants of the simulated
+# device's tests, every part and the pairs below.
+COMPILED = (
+    Parts("open", "closed", "bouc-wen", 1.5, True, "cyclic", "measured", "load", False),
+    Parts("closed", "closed", "lugre", 1.0, False, "stribeck", "measured", "load", False),
+    Parts("closed", "open", "dahl", 1.0, True, "none", "free", "between", False),
+    Parts("open", "closed", "lugre", 1.0, True, "stribeck", "pulley", "load", True),
+)
+PAIRS = (
+    ("driver_motor", "driver_brake"),
+    ("driver_motor", "limits"),
+    ("driver_brake", "limits"),
+    ("driver_motor", "smooth"),
+    ("driver_brake", "smooth"),
+    ("smooth", "friction"),
+    ("sensor", "friction"),
+    ("sensor", "limits"),
+    ("smooth", "sensor"),
+)
+
+
+def of_device(settings):
+    """The parts of a simulated rig's plant; a handle is always there, unless it is locked."""
+    load = {"locked": "locked", "pulley": "pulley+hand"}.get(settings.get("load", "pulley"), "hand")
+    kept = {k: v for k, v in settings.items() if not k.startswith("parameter")}
+    return Parts(**(kept | {"load": load, "limits": True}))
+
+
+def test_the_compiled_ones_have_every_part_and_the_pairs_that_meet_in_an_equation():
+    compiled = [*COMPILED, of_device({}), *map(of_device, PLANTS.values())]
+    for choices in [("exponent",), ("load",), ("hysteresis", "smooth"), *PAIRS]:
+        there, possible = (
+            {tuple(getattr(parts, name) for name in choices) for parts in which}
+            for which in (compiled, ALL)
+        )
+        assert there == possible, choices
+
+
+def excitation(model, n=100, dt=1.0 / 800.0):
+    """Steps of the commands, and a load or a hand that moves; the hand lets go for a while."""
+    rng = np.random.default_rng(11)
+    t = dt * np.arange(n)
+    signals = {
+        "applied_voltage_motor": np.repeat(rng.uniform(-3.0, 3.0, n // 5), 5),
+        "applied_voltage_brake": np.repeat(rng.choice([0.0, 0.1, 0.25], n // 10), 10),
+        "torque": 0.08 * np.sin(60.0 * t) + 0.03,
+        "hand_grip": (t % 0.05 < 0.035).astype(float),
+        "hand_theta": 0.8 * np.sin(20.0 * t),
+        "hand_omega": 16.0 * np.cos(20.0 * t),
+    }
+    inputs = np.column_stack([signals[name] for name in model.input_names])
+    return Dataset(inputs, np.full((n, len(model.outputs)), np.nan), dt)
+
+
+def feasible_rows(model, count, seed):
+    """Parameters drawn from the search space, as a population is, those within constraints."""
+    space, rng = SearchSpace.of(model), np.random.default_rng(seed)
+    low, high = space.encode(space.lower), space.encode(space.upper)
+    drawn = space.decode(rng.uniform(low, high, (200, len(low))))
+    return space.full(drawn[space.violations(drawn).sum(axis=1) == 0.0][:count])
+
+
+@pytest.mark.parametrize("parts", COMPILED, ids=str)
+def test_machine_code_simulates_what_scipy_does(parts):
+    model = parts.build(parameters="rig")
+    record = excitation(model)
+    rows = np.vstack([model.nominal, feasible_rows(model, 1, seed=6)])
+    found = BatchSimulator(model, accuracy=1e-4).trajectories(rows, record)
+    for row, trajectory in zip(rows, found, strict=True):
+        expected = reference(model, row, record, rtol=1e-7, atol=1e-9)
+        for j, name in enumerate(model.output_names):
+            peak = np.abs(expected[:, j]).max()
+            error = np.sqrt(np.mean((trajectory[:, j] - expected[:, j]) ** 2))
+            assert error <= 1e-4 * peak, f"{parts}: {name} by {error / peak}"
+            assert peak > 1e-5, name

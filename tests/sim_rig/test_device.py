@@ -11,6 +11,7 @@ from sim_rig.backend import Imperfections, SimulatedDevice, Simulation
 from sim_rig.plant import Plant
 from sysid import Dataset
 from sysid.reference import simulate as reference
+from tests.sim_rig.support import PLANTS
 
 OPEN_GUARD = Guard(
     np.array([-10.0, -10.0]), np.array([10.0, 10.0]), np.full(3, -99.0), np.full(3, 99.0)
@@ -261,24 +262,11 @@ def test_room_shrinks_by_what_is_queued():
 
 # --- other plants ---------------------------------------------------------------------------
 
-PLANTS = {
-    "free": {
-        "load": "free", "friction": "stribeck", "sensor": "between", "hysteresis": "dahl",
-        "driver_motor": "open", "driver_brake": "open",
-    },
-    "locked": {"load": "locked", "friction": "cyclic", "hysteresis": "lugre"},
-    "hand": {"load": "hand", "sensor": "between", "smooth": True, "driver_brake": "open"},
-    "pulley": {
-        "load": "pulley", "friction": "cyclic", "sensor": "between", "exponent": 2.0,
-        "parameter_set": "C", "parameters": {"cycles": 3.0},
-    },
-}  # fmt: skip
-
 
 @pytest.mark.parametrize("name", PLANTS)
 def test_every_plant_runs_and_shows_what_scipy_computes(name):
     plant = Plant(**PLANTS[name])
-    n, compared = 200, 100
+    n, compared = 200, 60
     ideal, noisy = (
         play(device(seed=3, ideal=ideal, plant=plant), waveform(n)) for ideal in (True, False)
     )

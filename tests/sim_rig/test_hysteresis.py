@@ -8,7 +8,7 @@ import random
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
@@ -115,6 +115,7 @@ def test_the_smooth_rates_by_hand():
 
 
 @pytest.mark.parametrize(("kind", "n", "smooth"), FORMS)
+@settings(max_examples=50)
 @given(omega=st.floats(-30.0, 30.0), z=st.floats(-2.0, 2.0), current=st.floats(-0.3, 0.3))
 def test_the_brake_is_the_same_in_both_directions_and_for_both_signs_of_the_current(
     kind, n, smooth, omega, z, current
@@ -127,6 +128,7 @@ def test_the_brake_is_the_same_in_both_directions_and_for_both_signs_of_the_curr
 
 
 @pytest.mark.parametrize(("kind", "n"), HYSTERESES)
+@settings(max_examples=50)
 @given(omega=st.floats(-30.0, 30.0), z=st.floats(-2.0, 2.0), faster=st.floats(0.01, 100.0))
 def test_the_exact_hysteresis_depends_on_the_path_and_not_on_the_rate(kind, n, omega, z, faster):
     brake = Brake(kind, n)
@@ -211,6 +213,7 @@ def feasible(draw, kind, n, smooth):
 
 
 @pytest.mark.parametrize(("kind", "n", "smooth"), FORMS)
+@settings(max_examples=50)
 @given(data=st.data())
 def test_at_constant_current_the_brake_never_gives_more_than_it_stored(kind, n, smooth, data):
     """Bouc-Wen and Dahl for every z, LuGre for those it can reach: |z| <= 1/zeta.
