@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from scipy.signal import lfilter
+from scipy.signal import cont2discrete, lfilter
 from sklearn.base import clone
 from sklearn.exceptions import NotFittedError
 from sklearn.utils.estimator_checks import parametrize_with_checks
@@ -80,6 +80,24 @@ def test_inputs_alone_and_outputs_alone():
     assert fir.radius_ == 0.0
     decay = recursion(A, 0 * B, [0.0, 0.0], u[:60], past_y=np.array([[3.0, 100.0], [4.0, -50.0]]))
     close(ARX(2, 0, offset=False).fit(u[:60], decay), A, np.zeros((1, 2, 2)), [0.0, 0.0])
+
+
+def test_a_sampled_motor_has_the_poles_of_the_motor():
+    resistance, inductance, inertia, damping, constant = 1.0, 6e-4, 8e-7, 1.33e-5, 2.38e-2
+    F = np.array([[-resistance / inductance, -constant / inductance],
+                  [constant / inertia, -damping / inertia]])  # fmt: skip
+    G = np.array([[1.0 / inductance, 0.0], [0.0, -1.0 / inertia]])
+    sampled = cont2discrete((F, G, np.eye(2), np.zeros((2, 2))), 1e-3)
+    rng = np.random.default_rng(0)
+    u = telegraph(rng, 500) * [1.0, 0.01]
+    y = np.zeros((500, 2))
+    for t in range(1, 500):
+        y[t] = sampled[0] @ y[t - 1] + sampled[1] @ u[t - 1]
+    found = ARX(1, 1).fit(u, y, dt=1e-3)
+    assert_allclose(-found.A_[1], sampled[0], rtol=1e-8)
+    assert_allclose(found.B_[1], sampled[1], rtol=1e-8)
+    poles = np.log(found.poles_) / found.dt_
+    assert_allclose(np.sort_complex(poles), np.sort_complex(np.linalg.eigvals(F)), rtol=1e-7)
 
 
 def test_more_lags_than_the_system_has_do_no_harm():

@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -146,6 +149,16 @@ def test_orders_not_given_are_the_estimators():
     assert not hasattr(estimator, "A_")
     tables = select_orders(ARX(), TRAINING, VALIDATION, na=([[1, 0], [0, 1]], [[2, 2], [2, 2]]))
     assert tables.best.orders["na"] == [[2, 2], [2, 2]]
+
+
+def test_the_example_of_the_documentation_runs(capsys):
+    text = (Path(__file__).parents[2] / "docs" / "armax.md").read_text()
+    names = {}
+    exec(re.search(r"```python\n(.*?)```", text, re.DOTALL).group(1), names)
+    assert names["found"].best.score > 0.7
+    assert names["model"].A_[1, 0, 0] == pytest.approx(-0.9, abs=0.01)
+    assert names["ahead"].shape == names["free_run"].shape == (800, 1)
+    assert "+-" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
