@@ -155,12 +155,14 @@ def _states(parts: _Parts) -> tuple[State, ...]:
 def _derivative(parts: _Parts, layout: Layout, shaft: _Shaft) -> Callable[..., tuple[Any, ...]]:
     driver_m, driver_b, winding = parts.driver_motor, parts.driver_brake, parts.winding
     rate = parts.hysteresis.rate
-    own = layout.slices
+    own, locked = layout.slices, parts.locked
     of_driver_m, of_driver_b = own["driver_motor"], own["driver_brake"]
     of_windings, of_hysteresis, of_constants = own["windings"], own["hysteresis"], own["constants"]
 
     def derivative(x: Any, u: Any, p: Any) -> tuple[Any, ...]:
         v_m, v_b, i_m, i_b, omega, z, _theta = x[:7]
+        if locked:
+            omega = 0.0  # also where noise in a first sample says otherwise
         command_m, command_b = u[:2]
         R_m, L_m, K_m, R_b, L_b = p[of_windings]
         K_v2i, n_c = p[of_constants]
@@ -198,6 +200,8 @@ def _shaft(parts: _Parts, layout: Layout, sensor: SensorPlace) -> _Shaft:
 
     def shaft(x: Any, u: Any, p: Any) -> tuple[Any, Any, tuple[Any, ...]]:
         i_m, i_b, omega, z, theta = x[2:7]
+        if locked:
+            omega = 0.0
         J_m, B_m, J_b = p[of_rotors]
         K_m = p[motor_constant]
         _K_v2i, n_c = p[of_constants]

@@ -82,8 +82,20 @@ class Plant(Section):
         return _with_values(model, self.parameters)
 
     def process_model(self) -> ProcessModel:
-        """What identification fits to such a plant's logs, at the plant's own values."""
-        model = actuator(**self._parts())
+        """What identification fits to such a plant's logs, at the plant's own values.
+
+        With the torque sensor between motor and brake the load's torque is not in the log: the
+        model then has the load itself. Raises ModelError for a hand, whose motion no log holds.
+        """
+        if self.sensor == "load":
+            model = actuator(**self._parts())
+        elif self.load == "hand":
+            raise ModelError(
+                "a hand moves as it will, and with the torque sensor between motor and brake its "
+                "torque is not measured: no model can follow such a log; put the sensor at the load"
+            )
+        else:
+            model = actuator(**self._parts(), load=self.load, sensor=self.sensor)
         own = {k: v for k, v in self.parameters.items() if k in model.parameter_names}
         return _with_values(model, own)
 

@@ -12,6 +12,9 @@ from sysid._dual import Dual, on_duals
 from sysid._substitute import substituted
 from sysid.model import FloatArray, Function, ModelError, ProcessModel
 
+# How far beside the guess an equilibrium is looked for in turn, in the states' own units.
+_NUDGES = (0.0, 0.1, -0.1, 1.0, -1.0)
+
 
 @dataclass(frozen=True)
 class LinearModel:
@@ -97,18 +100,25 @@ def equilibrium(
     def slopes_jacobian(values: FloatArray) -> FloatArray:
         return jacobian(model, complete(values), u, p)[np.ix_(free, free)]
 
-    solution = least_squares(
-        slopes, x[free], jac=slopes_jacobian, x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-15
+    def solve(nudge: float) -> tuple[FloatArray, FloatArray]:
+        """A stationary point of the search, and its derivatives in parts of their terms."""
+        found = least_squares(
+            slopes, x[free] + nudge, jac=slopes_jacobian,
+            x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-15,
+        )  # fmt: skip
+        size = np.abs(slopes_jacobian(found.x)) @ np.maximum(np.abs(found.x), 1e-6)
+        return found.x, np.abs(found.fun) / np.maximum(size, 1e-12)
+
+    # A start at which an equation has no slope is no help: then from beside it.
+    for nudge in _NUDGES:
+        solution, remaining = solve(nudge)
+        if np.all(remaining < 1e-6):
+            return complete(solution)
+    worst = int(np.argmax(remaining))
+    raise ModelError(
+        f"model {model.name}: no equilibrium found; d{model.state_names[free[worst]]}/dt "
+        f"stays at {slopes(solution)[worst]:.3g}. Give a guess, or hold a state that drifts"
     )
-    scale = np.abs(slopes_jacobian(solution.x)) @ np.maximum(np.abs(solution.x), 1e-6)
-    remaining = np.abs(solution.fun) / np.maximum(scale, 1e-12)
-    if not np.all(remaining < 1e-6):
-        worst = int(np.argmax(remaining))
-        raise ModelError(
-            f"model {model.name}: no equilibrium found; d{model.state_names[free[worst]]}/dt "
-            f"stays at {solution.fun[worst]:.3g}. Give a guess, or hold a state that drifts"
-        )
-    return complete(solution.x)
 
 
 def _gradient(

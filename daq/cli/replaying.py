@@ -104,7 +104,10 @@ def _rig_truth(rig: str) -> tuple[ProcessModel, dict[str, float]]:
     from sim_rig.backend import SimulatedDevice
 
     assert isinstance(device, SimulatedDevice)
-    model = device.options.plant.process_model()
+    try:
+        model = device.options.plant.process_model()
+    except ModelError as error:
+        raise ConfigError(f"{rig}: {error}") from None
     return model, dict(zip(model.parameter_names, model.nominal, strict=True))
 
 

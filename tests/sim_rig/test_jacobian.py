@@ -275,11 +275,6 @@ def test_an_operating_point_is_found_at_which_all_that_is_free_rests(parts, inpu
         assert at["z"] == pytest.approx(math.copysign(slide, hold["omega"]), rel=1e-6)
 
 
-@pytest.mark.xfail(
-    reason="equilibrium() starts at z = 0, where dz/dt has no slope in z, and stays there",
-    raises=ModelError,
-    strict=True,
-)
 @pytest.mark.parametrize("parts", [Parts(smooth=True), Parts(exponent=2.0)], ids=str)
 def test_sliding_is_found_from_the_declared_state_too(parts):
     model = parts.build(parameters="rig")

@@ -214,13 +214,6 @@ def test_values_take_effect():
         {"load": "free", "hysteresis": "lugre", "friction": "cyclic"},
         {"load": "hand", "driver_motor": "open", "driver_brake": "open", "hysteresis": "dahl"},
         {"exponent": 2.0, "smooth": True, "friction": "stribeck", "parameters": {"n_c": 2.0}},
-        pytest.param(
-            {"load": "free", "sensor": "between"},
-            marks=pytest.mark.xfail(
-                reason="process_model() takes the torque for the load's wherever the sensor is",
-                strict=True,
-            ),
-        ),
     ],
 )
 def test_the_model_that_is_identified_is_the_actuator_inside_the_plant(settings):
@@ -241,3 +234,39 @@ def test_the_model_that_is_identified_is_the_actuator_inside_the_plant(settings)
         known = point._replace(x=x, u=u | {"torque": torque}, q=q)
         found = inner.derivative(*known.of(inner))
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("load", ["free", "pulley", "locked"])
+def test_without_the_loads_torque_in_the_log_the_model_has_the_load_itself(load):
+    plant = Plant(load=load, sensor="between", friction="stribeck")
+    whole, inner = plant.build(), plant.process_model()
+    assert inner.input_names == ("applied_voltage_motor", "applied_voltage_brake")
+    assert "torque" in inner.output_names
+    rng = random.Random(6)
+    for _ in range(20):
+        point = random_point(whole, rng)
+        x = point.x | {"voltage_motor": 9.0, "voltage_brake": -3.0, "current_motor": 1.2}
+        x["current_brake"] = 0.1
+        u = point.u | {"applied_voltage_motor": -2.0, "applied_voltage_brake": 0.3}
+        u |= {"hand_grip": 0.0} if "hand_grip" in u else {}
+        q = dict(zip(whole.parameter_names, whole.nominal, strict=True))
+        at = point._replace(x=x, u=u, q=q)
+        expected, found = whole.derivative(*at.of(whole)), inner.derivative(*at.of(inner))
+        np.testing.assert_allclose(found, expected[: len(found)], rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(
+            inner.evaluate_output(*at.of(inner)), whole.evaluate_output(*at.of(whole)), rtol=1e-9
+        )
+
+
+def test_no_model_follows_a_hand_that_is_not_measured():
+    with pytest.raises(ModelError, match="put the sensor at the load"):
+        Plant(load="hand", sensor="between").process_model()
+
+
+def test_a_locked_shaft_stays_where_noise_says_it_turns():
+    model = Plant(load="locked").build()
+    x = model.initial_state
+    x[model.state_names.index("omega")] = 0.3
+    rates = model.derivative(tuple(x), (0.0, 0.0), tuple(model.nominal))
+    assert rates[model.state_names.index("theta")] == 0.0
+    assert rates[model.state_names.index("z")] == 0.0
