@@ -1,53 +1,58 @@
-"""One simulation of the actuator: ours beside what else a lab could use.
+"""Simulation of the actuator: ours beside what else a lab could use, and how its cost grows.
 
-python -m benchmarks.simulation [--json] [--chromosomes 1000]
+python -m benchmarks.simulation [--json] [--chromosomes 1000] [--figure FILE]
+python -m benchmarks.simulation --memory
 
 Seven states, 1000 samples at 800 Hz, held commands. Peers that are not installed
 (`pip install -e ".[bench]"`), or a missing C compiler, are left out and named. Times are per
 simulation on one core; errors are normalised RMS of the worst output against a tight solution.
+The figure needs matplotlib (`pip install -e ".[plot]"`). ``--memory`` runs nothing but a large
+population on a long record, which takes minutes, and says how much memory that took.
 """
 
 from __future__ import annotations
 
-import ctypes
-import shutil
-import subprocess
-import tempfile
+import resource
 import time
+import tracemalloc
 from collections.abc import Callable
-from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks._common import arguments, report
+from benchmarks._common import arguments, report, timed
+from benchmarks._peers import engines, fixed_steps
 from sim_rig.actuator import actuator
 from sysid import BatchSimulator, Dataset
-from sysid._compile import kernels
 from sysid.model import FloatArray, ProcessModel
-from sysid.reference import simulate
 from sysid.space import SearchSpace
 
 SAMPLES, RATE = 1000, 800.0
 TIGHT_STEPS = 256  # of the exponential scheme: within 1e-8 of DOP853 at 1e-10
-PEER_SAMPLES = 100  # slow peers run the record's start; their time per sample is constant
+LARGE = (100_000, 60_000)  # chromosomes, samples
 
 
 def main() -> None:
     parser = arguments(__doc__ or "")
     parser.add_argument("--chromosomes", type=int, default=1000, help="drawn from the box")
+    parser.add_argument("--figure", metavar="FILE", help="draw cost against problem size")
+    parser.add_argument("--memory", action="store_true", help="only a large population's memory")
     options = parser.parse_args()
     model = actuator()
+    if options.memory:
+        report(memory(model), options.json, show_memory)
+        return
     record = excitation(model)
     table, missing = engines(model, record)
     figures = {
         "engines": table,
         "missing": missing,
         "box": box(model, record, options.chromosomes),
-        "linearity": linearity(model),
+        "scaling": scaling(model),
     }
     report(figures, options.json, show)
+    if options.figure:
+        draw(figures["scaling"], options.figure)
 
 
 def excitation(model: ProcessModel, samples: int = SAMPLES) -> Dataset:
@@ -61,42 +66,17 @@ def excitation(model: ProcessModel, samples: int = SAMPLES) -> Dataset:
     return Dataset(inputs, outputs, 1.0 / RATE)
 
 
-def engines(model: ProcessModel, record: Dataset) -> tuple[list[dict[str, Any]], list[str]]:
-    """Every engine on the nominal parameters: milliseconds, error, ratio to ours."""
-    rows: list[dict[str, Any]] = []
-    missing: list[str] = []
-    candidates: list[tuple[str, Callable[[], tuple[float, FloatArray | None]]]] = [
-        ("ours, accuracy 1e-3", lambda: _ours(model, record, 1e-3)),
-        ("ours, accuracy 1e-5", lambda: _ours(model, record, 1e-5)),
-        ("our lanes, RK4 x32", lambda: _ours_rk4(model, record)),
-        ("C, explicit vectors, RK4 x32", lambda: _c_vectors(record, model)),
-        ("SciPy LSODA, compiled derivative", lambda: _scipy(model, record, "LSODA", True)),
-        ("SciPy Radau, compiled derivative", lambda: _scipy(model, record, "Radau", True)),
-        ("SciPy Radau, Python derivative", lambda: _scipy(model, record, "Radau", False)),
-        ("scikit-sundae CVODE BDF", lambda: _sundae(model, record)),
-        ("CasADi CVODES", lambda: _casadi(model, record)),
-        ("diffrax Tsit5", lambda: _diffrax(model, record)),
-    ]
-    for name, engine in candidates:
-        try:
-            seconds, outputs = engine()
-        except (ImportError, FileNotFoundError) as error:
-            missing.append(f"{name}: {error}")
-            continue
-        row = {"engine": name, "milliseconds": seconds * 1e3, "error": None}
-        if outputs is not None:
-            row["error"] = _error(outputs, record.outputs[: len(outputs)])
-        rows.append(row)
-    for row in rows:
-        row["ratio"] = row["milliseconds"] / rows[0]["milliseconds"]
-    return rows, missing
+def draws(space: SearchSpace, n: int) -> FloatArray:
+    """Parameter vectors drawn from the shipped ranges."""
+    low, high = space.encode(np.stack([space.lower, space.upper]))
+    drawn = np.random.default_rng(11).uniform(low, high, (n, len(low)))
+    return space.full(space.decode(drawn))
 
 
 def box(model: ProcessModel, record: Dataset, n: int) -> dict[str, Any]:
     """Distribution of the error over chromosomes drawn from the shipped ranges."""
     space = SearchSpace.of(model)
-    low, high = space.encode(np.stack([space.lower, space.upper]))
-    drawn = space.full(space.decode(np.random.default_rng(11).uniform(low, high, (n, len(low)))))
+    drawn = draws(space, n)
     simulator = BatchSimulator(model)
     tight = simulator.trajectories(drawn, record, TIGHT_STEPS)
     errors = np.empty(n)
@@ -133,25 +113,93 @@ def box(model: ProcessModel, record: Dataset, n: int) -> dict[str, Any]:
     }
 
 
-def linearity(model: ProcessModel) -> list[dict[str, float]]:
-    """Cost against samples and chromosomes: CPU microseconds per sample and chromosome."""
-    rows = []
-    simulator = BatchSimulator(model)
-    for samples, chromosomes in ((500, 320), (1000, 320), (4000, 320), (1000, 80), (1000, 1280)):
-        record = excitation(model, samples)
-        parameters = np.repeat(model.nominal[None], chromosomes, axis=0)
-        simulator.errors(parameters, [record])
-        start = time.process_time()
-        simulator.errors(parameters, [record])
-        seconds = time.process_time() - start
-        rows.append(
-            {
-                "samples": samples,
-                "chromosomes": chromosomes,
-                "microseconds": seconds / samples / chromosomes * 1e6,
-            }
+def scaling(model: ProcessModel) -> dict[str, list[dict[str, float]]]:
+    """CPU milliseconds against samples, chromosomes and integration steps per sample."""
+    simulator, record = BatchSimulator(model), excitation(model)
+
+    def population(n: int) -> float:
+        parameters = np.repeat(model.nominal[None], n, axis=0)
+        return _cpu(lambda: simulator.errors(parameters, [record]))
+
+    samples = [
+        (n, fixed_steps(simulator, excitation(model, n), 8))
+        for n in (250, 500, 1000, 2000, 4000, 8000, 16_000)
+    ]
+    chromosomes = [(n, population(n)) for n in (80, 160, 320, 640, 1280, 2560)]
+    substeps = [(n, fixed_steps(simulator, record, n)) for n in (1, 2, 4, 8, 16, 32, 64)]
+    return {
+        name: [{"size": size, "milliseconds": seconds * 1e3} for size, seconds in rows]
+        for name, rows in (
+            ("samples (one chromosome, 8 steps each)", samples),
+            ("chromosomes (of 1000 samples)", chromosomes),
+            ("steps per sample (one chromosome, 1000 samples)", substeps),
         )
-    return rows
+    }
+
+
+def memory(model: ProcessModel) -> dict[str, Any]:
+    """Arrays of small populations, and the whole process's memory with a large one."""
+    space = SearchSpace.of(model)
+    simulator = BatchSimulator(model)
+    simulator.errors(model.nominal, [excitation(model)])  # compiled before anything is counted
+    rows = []
+    for chromosomes, samples in ((1000, 5000), (4000, 5000), (1000, 20_000), (4000, 20_000)):
+        parameters, record = draws(space, chromosomes), excitation(model, samples)
+        tracemalloc.start()
+        simulator.errors(parameters, [record])
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        rows.append({"chromosomes": chromosomes, "samples": samples, "megabytes": peak / 1e6})
+    before = _resident()
+    parameters, record = draws(space, LARGE[0]), excitation(model, LARGE[1])
+    seconds, _ = timed(lambda: simulator.errors(parameters, [record]))
+    return {
+        "arrays": rows,
+        "chromosomes": LARGE[0],
+        "samples": LARGE[1],
+        "minutes": seconds / 60.0,
+        "megabytes_before": before,
+        "peak_megabytes": _resident(),
+    }
+
+
+def _resident() -> float:
+    """Largest resident memory of this process so far [MB]."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6
+
+
+def _cpu(function: Callable[[], Any], repeats: int = 3) -> float:
+    """CPU seconds of all threads, the least of several runs after one that does not count."""
+    function()
+    times = []
+    for _ in range(repeats):
+        start = time.process_time()
+        function()
+        times.append(time.process_time() - start)
+    return min(times)
+
+
+def draw(scaling_: dict[str, list[dict[str, float]]], path: str) -> None:
+    """One panel per size, both axes logarithmic, beside a straight line through the last point."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, panels = plt.subplots(1, len(scaling_), figsize=(12.0, 4.0), constrained_layout=True)
+    for panel, (name, rows) in zip(panels, scaling_.items(), strict=True):
+        sizes = np.array([row["size"] for row in rows])
+        costs = np.array([row["milliseconds"] for row in rows])
+        panel.loglog(sizes, costs[-1] * sizes / sizes[-1], "--", color="0.6", label="proportional")
+        panel.loglog(sizes, costs, "o-", label="measured")
+        panel.set_xlabel(name)
+        panel.set_xticks(sizes, [f"{size:g}" for size in sizes])
+        panel.set_xticks([], minor=True)
+        panel.grid(True, which="both", alpha=0.2)
+    panels[0].set_ylabel("CPU time [ms]")
+    panels[0].legend()
+    figure.savefig(path, dpi=150)
+    plt.close(figure)
 
 
 def _fastest(model: ProcessModel, p: FloatArray) -> float:
@@ -159,171 +207,6 @@ def _fastest(model: ProcessModel, p: FloatArray) -> float:
 
     rates = np.linalg.eigvals(jacobian(model, model.initial_state, np.zeros(3), p))
     return float(np.abs(rates).max())
-
-
-def _error(outputs: FloatArray, tight: FloatArray) -> float:
-    scale = np.abs(tight).max(axis=0)
-    return float(np.max(np.sqrt(np.mean((outputs - tight) ** 2, axis=0)) / scale))
-
-
-def _best(function: Callable[[], Any], repeats: int = 5) -> float:
-    """Shortest of several runs: what the machine does when nothing else interferes."""
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        function()
-        times.append(time.perf_counter() - start)
-    return min(times)
-
-
-def _ours(model: ProcessModel, record: Dataset, accuracy: float) -> tuple[float, FloatArray]:
-    simulator = BatchSimulator(model, threads=1, accuracy=accuracy)
-    parameters = np.repeat(model.nominal[None], 256, axis=0)
-    simulator.errors(parameters, [record])
-    seconds = _best(lambda: simulator.errors(parameters, [record])) / len(parameters)
-    return seconds, simulator.trajectories(model.nominal, record)[0]
-
-
-def _ours_rk4(model: ProcessModel, record: Dataset) -> tuple[float, FloatArray]:
-    """Our kernel with nothing integrated exactly: the same scheme as the C code."""
-    simulator = BatchSimulator(model, threads=1)
-    simulator._kernels = kernels(model, exact=False)
-    parameters = np.repeat(model.nominal[None], 16, axis=0)
-    simulator.trajectories(parameters, record, 32)
-    seconds = _best(lambda: simulator.trajectories(parameters, record, 32), 10) / len(parameters)
-    return seconds, simulator.trajectories(model.nominal, record, 32)[0]
-
-
-def _c_vectors(record: Dataset, model: ProcessModel) -> tuple[float, None]:
-    compiler = shutil.which("cc") or shutil.which("gcc")
-    if compiler is None:
-        raise FileNotFoundError("no C compiler on this machine")
-    source = Path(__file__).with_name("_actuator_rk4.c")
-    pointer = ctypes.POINTER(ctypes.c_double)
-    best = np.inf
-    with tempfile.TemporaryDirectory() as folder:
-        for lanes in (4, 8, 16):  # whichever width suits this processor best
-            library = Path(folder) / f"rk4_{lanes}.so"
-            command = [compiler, "-O3", "-march=native", "-ffast-math", "-Wno-psabi"]
-            command += [f"-DLANES={lanes}", "-shared", "-fPIC", str(source), "-o", str(library)]
-            subprocess.run(command, check=True)
-            simulate_c = ctypes.CDLL(str(library)).simulate
-            parameters = np.repeat(model.nominal[:19, None], lanes, axis=1)
-            sse = np.zeros((3, lanes))
-            arguments_ = (
-                record.inputs.ctypes.data_as(pointer), SAMPLES,
-                np.ascontiguousarray(parameters).ctypes.data_as(pointer),
-                ctypes.c_double(record.dt), 32, sse.ctypes.data_as(pointer),
-            )  # fmt: skip
-            seconds = _best(lambda f=simulate_c, a=arguments_: f(*a), 20)
-            best = min(best, seconds / lanes)
-    return float(best), None
-
-
-def _short(record: Dataset) -> Dataset:
-    return Dataset(record.inputs[:PEER_SAMPLES], record.outputs[:PEER_SAMPLES], record.dt)
-
-
-def _derivative(model: ProcessModel) -> Any:
-    """The model's derivative compiled, on arrays, with nominal parameters."""
-    from sysid._compile import _jit
-
-    compiled = _jit(model.derivative)
-    p = tuple(float(v) for v in model.nominal)
-    return lambda x, u: compiled(x, u, p)
-
-
-def _scipy(
-    model: ProcessModel, record: Dataset, method: Any, compiled: bool
-) -> tuple[float, FloatArray]:
-    short = _short(record)
-    chosen = model
-    if compiled:
-        from sysid._compile import _jit
-
-        chosen = replace(model, derivative=_jit(model.derivative))
-
-    def run() -> FloatArray:
-        return simulate(chosen, model.nominal, short, method=method, rtol=1e-4, atol=1e-7)
-
-    outputs = run()
-    return _best(run, 2) * SAMPLES / PEER_SAMPLES, outputs
-
-
-def _held(derivative: Any, u: tuple[float, ...]) -> Callable[..., None]:
-    def rhs(t: float, y: FloatArray, yp: FloatArray) -> None:
-        yp[:] = derivative(tuple(y), u)
-
-    return rhs
-
-
-def _sundae(model: ProcessModel, record: Dataset) -> tuple[float, FloatArray]:
-    import sksundae
-
-    derivative = _derivative(model)
-    short = _short(record)
-
-    def run() -> FloatArray:
-        x, rows = model.initial_state, []
-        for u in short.inputs:
-            rows.append(x[[2, 3, 4]])
-            rhs = _held(derivative, tuple(u))
-            solver = sksundae.cvode.CVODE(rhs, method="BDF", rtol=1e-4, atol=1e-7)
-            x = solver.solve(np.array([0.0, short.dt]), x).y[-1]
-        return np.array(rows)
-
-    outputs = run()
-    return _best(run, 2) * SAMPLES / PEER_SAMPLES, outputs
-
-
-def _casadi(model: ProcessModel, record: Dataset) -> tuple[float, FloatArray]:
-    import casadi
-
-    x, u = casadi.SX.sym("x", 7), casadi.SX.sym("u", 3)
-    slope = model.derivative(
-        tuple(x[i] for i in range(7)), tuple(u[j] for j in range(3)), tuple(model.nominal)
-    )
-    problem = {"x": x, "p": u, "ode": casadi.vertcat(*slope)}
-    options = {"reltol": 1e-4, "abstol": 1e-7}
-    solver = casadi.integrator("solver", "cvodes", problem, 0.0, record.dt, options)
-    short = _short(record)
-
-    def run() -> FloatArray:
-        state, rows = model.initial_state, []
-        for held in short.inputs:
-            rows.append(np.asarray(state)[[2, 3, 4]])
-            state = np.array(solver(x0=state, p=held)["xf"]).ravel()
-        return np.array(rows)
-
-    outputs = run()
-    return _best(run, 2) * SAMPLES / PEER_SAMPLES, outputs
-
-
-def _diffrax(model: ProcessModel, record: Dataset) -> tuple[float, FloatArray]:
-    import diffrax
-    import jax
-
-    jax.config.update("jax_enable_x64", True)
-    jnp = jax.numpy
-    p = tuple(float(v) for v in model.nominal)
-
-    def field(t: Any, y: Any, u: Any) -> Any:
-        return jnp.stack(model.derivative(tuple(y), tuple(u), p))
-
-    def one(y: Any, u: Any) -> tuple[Any, Any]:
-        solution = diffrax.diffeqsolve(
-            diffrax.ODETerm(field), diffrax.Tsit5(), 0.0, record.dt, 1e-5, y, args=u,
-            stepsize_controller=diffrax.PIDController(rtol=1e-4, atol=1e-7),
-        )  # fmt: skip
-        return solution.ys[-1], y
-
-    @jax.jit
-    def run(inputs: Any) -> Any:
-        return jax.lax.scan(one, jnp.asarray(model.initial_state), inputs)[1]
-
-    inputs = jnp.asarray(record.inputs)
-    outputs = np.asarray(run(inputs))[:, [2, 3, 4]]
-    return _best(lambda: run(inputs).block_until_ready(), 3), outputs
 
 
 def show(figures: dict[str, Any]) -> None:
@@ -351,12 +234,28 @@ def show(figures: dict[str, Any]) -> None:
             f"  worst of these: error {row['error']:.1e}, "
             f"fastest rate {row['fastest_rate']:.0f} rad/s"
         )
-    print("\nCPU microseconds per sample and chromosome")
-    for row in figures["linearity"]:
+    for name, rows in figures["scaling"].items():
+        print(f"\nCPU time against {name}")
+        for row in rows:
+            each = row["milliseconds"] / row["size"]
+            print(
+                f"  {row['size']:>6.0f}: {row['milliseconds']:10.4f} ms, "
+                f"{each * 1e3:10.4f} us for each"
+            )
+
+
+def show_memory(figures: dict[str, Any]) -> None:
+    print("\nLargest size of all arrays during a simulation")
+    for row in figures["arrays"]:
         print(
-            f"  {row['samples']:>6} samples, {row['chromosomes']:>5} chromosomes: "
-            f"{row['microseconds']:.4f}"
+            f"  {row['chromosomes']:>6} chromosomes, {row['samples']:>6} samples: "
+            f"{row['megabytes']:7.2f} MB"
         )
+    print(
+        f"\n{figures['chromosomes']} chromosomes of the shipped ranges on {figures['samples']} "
+        f"samples: {figures['minutes']:.1f} minutes, {figures['peak_megabytes']:.0f} MB resident "
+        f"at most ({figures['megabytes_before']:.0f} MB before)"
+    )
 
 
 if __name__ == "__main__":

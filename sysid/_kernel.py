@@ -26,7 +26,7 @@ from sysid._kernel_text import (
     step_sizes,
 )
 from sysid._lanes import LANES
-from sysid._structure import listed
+from sysid._program import listed
 
 # ||J^16||^(1/16) is an upper bound of the spectral radius that is tight to a few per cent.
 _SQUARINGS = 4

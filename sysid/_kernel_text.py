@@ -25,7 +25,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
-from sysid._structure import Entry, Structure, analyse, listed
+from sysid._program import listed
+from sysid._structure import Entry, Structure, analyse
 from sysid.model import ProcessModel
 
 MATRICES = "QFGH"

@@ -13,28 +13,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from sysid._trace import Clamp, Line, Tape, Trace, traced
+from sysid._program import Followed, Program, Writer
+from sysid._trace import Clamp, Tape, Trace, traced
 from sysid.model import Function, ProcessModel
 
 Entry = tuple[int, int]
-
-_LONGEST = 25  # items of a tuple display
-
-
-@dataclass(frozen=True)
-class Program:
-    """Python text of the equations, in which what parameters fix is worked out once.
-
-    text: functions of tuples, ``constants(p)``, ``remainder(x, u, c)`` for N, ``observe(x, u,
-    c)`` where the model has an output function and ``margins(x, u, c)``, how far each guarded
-    number is above each of its limits; c is what ``constants`` returned. They need math and
-    always_inline.
-    n_constants: its length. calls: which of ``derivative`` and ``output`` the text refers to.
-    """
-
-    text: str
-    n_constants: int
-    calls: frozenset[str]
 
 
 @dataclass(frozen=True)
@@ -96,41 +79,38 @@ def analyse(model: ProcessModel, *, exact: bool = True) -> Structure:
     """Take a model's equations apart; without ``exact`` all of them are left in N."""
     tape = Tape()
     rows = _followed(tape, model, model.derivative)
-    outputs = None if model.output is None else _followed(tape, model, model.output)
     clamps = _clamps(tape, rows or ())
     parts = [_split(row) if exact else ({}, row.total) for row in rows or ()]
     linear = {(i, j): name for i, (piece, _) in enumerate(parts) for j, name in piece.items()}
-    functions: dict[str, _Function] = {
+    gains = {
+        k: {i: row.kinks[k] for i, row in enumerate(rows or ()) if k in row.kinks} for k in clamps
+    }
+    functions: dict[str, Followed] = {
         "remainder": ("derivative", None if rows is None else [rest for _, rest in parts])
     }
     if model.output is not None:
+        outputs = _followed(tape, model, model.output)
         totals = None if outputs is None else [value.total for value in outputs]
         functions["observe"] = ("output", totals)
     if clamps:
-        margins = [
-            tape.emit("{} - {}", clamp.base.total, limit)
-            for clamp in clamps.values()
-            for limit in clamp.limits
-        ]
-        functions["margins"] = ("", margins)
-    used = {*linear.values()}
+        functions["margins"] = ("", _margins(tape, clamps.values()))
+    names = {*linear.values()}
     for k, clamp in clamps.items():
-        used |= {
-            *clamp.base.linear.values(),
-            *(row.kinks[k] for row in rows or () if k in row.kinks),
-        }
-    writer = _Writer(tape, len(model.parameters), functions, used)
+        names |= {*clamp.base.linear.values(), *gains[k].values()}
+    writer = Writer(tape, len(model.parameters), functions, names)
     guards = tuple(
-        Guard(
-            len(clamp.limits),
-            {j: writer.place(name) for j, name in clamp.base.linear.items()},
-            {i: writer.place(row.kinks[k]) for i, row in enumerate(rows or ()) if k in row.kinks},
-        )
+        Guard(len(clamp.limits), writer.placed(clamp.base.linear), writer.placed(gains[k]))
         for k, clamp in clamps.items()
     )
-    coefficients = {entry: writer.place(name) for entry, name in linear.items()}
     driven, nonlinear = _driven(model, rows if exact else None, clamps)
-    return Structure(coefficients, driven, nonlinear, guards, writer.program())
+    return Structure(writer.placed(linear), driven, nonlinear, guards, writer.program())
+
+
+def _margins(tape: Tape, clamps: Iterable[Clamp]) -> list[str]:
+    """How far each limited number is above each of its limits."""
+    return [
+        tape.emit("{} - {}", clamp.base.total, limit) for clamp in clamps for limit in clamp.limits
+    ]
 
 
 def _driven(
@@ -168,75 +148,3 @@ def _split(row: Trace) -> tuple[Mapping[int, str], str]:
         return {}, row.total
     other = row.tape.straight({j: c for j, c in row.linear.items() if j in row.nonlinear})
     return linear, row.tape.join("+", row.rest, other) or "0.0"
-
-
-# Which of the model's functions a function of the program stands for, and its values where that
-# could be followed.
-_Function = tuple[str, Sequence[str] | None]
-
-
-class _Writer:
-    """Writes functions on a tape as Python text; what parameters fix goes into ``constants``."""
-
-    def __init__(
-        self,
-        tape: Tape,
-        n_parameters: int,
-        functions: Mapping[str, _Function],
-        coefficients: Iterable[str],
-    ) -> None:
-        self._tape = tape
-        self._functions = functions
-        self._parameters = [f"p{i}" for i in range(n_parameters)]
-        used = set(coefficients)
-        for _, values in functions.values():
-            used |= self._used(self._varying(values), values) if values else {*self._parameters}
-        known = [name for name in used if tape.named(name) and tape.fixed(name)]
-        self._constants = sorted(known, key=lambda name: (name[0], int(name[1:])))
-        self._places = {name: f"c[{k}]" for k, name in enumerate(self._constants)}
-
-    def place(self, name: str) -> str:
-        """Text by which other code finds a number that the parameters fix."""
-        return self._places.get(name, name)
-
-    def program(self) -> Program:
-        """All functions."""
-        texts = [
-            self._text("constants(p)", self._tape.needed(self._constants), self._constants, {})
-        ]
-        for name, (model_function, values) in self._functions.items():
-            if values:
-                lines = self._varying(values)
-                texts.append(self._text(f"{name}(x, u, c)", lines, values, self._places))
-            else:
-                p = listed(self._places[name] for name in self._parameters)
-                body = f"    always_inline()\n    return {model_function}(x, u, {p})"
-                texts.append(f"def {name}(x, u, c):\n{body}")
-        calls = frozenset(called for called, values in self._functions.values() if not values)
-        return Program("\n\n".join([*texts, ""]), len(self._constants), calls)
-
-    def _varying(self, values: Sequence[str]) -> list[Line]:
-        return [line for line in self._tape.needed(values) if not line.fixed]
-
-    @staticmethod
-    def _used(lines: Iterable[Line], values: Iterable[str]) -> set[str]:
-        return set(values).union(*(line.operands for line in lines))
-
-    def _text(
-        self, head: str, lines: list[Line], values: Sequence[str], places: Mapping[str, str]
-    ) -> str:
-        text = [f"def {head}:", "    always_inline()"]
-        own = {line.name for line in lines}
-        for name in sorted(self._used(lines, values) - own):
-            if self._tape.named(name):
-                text.append(f"    {name} = {places.get(name) or f'{name[0]}[{name[1:]}]'}")
-        text += [f"    {line.name} = {line.text}" for line in lines]
-        return "\n".join([*text, f"    return {listed(values)}"])
-
-
-def listed(items: Iterable[str]) -> str:
-    """Text of a tuple."""
-    texts = list(items)
-    # Python builds longer displays by way of a list, which Numba does not always follow.
-    parts = [texts[i : i + _LONGEST] for i in range(0, len(texts), _LONGEST)] or [[]]
-    return " + ".join(f"({', '.join(part)}{',' * (len(part) == 1)})" for part in parts)

@@ -23,7 +23,7 @@ from sysid._kernel_text import (
     step_sizes,
 )
 from sysid._lanes import LANES
-from sysid._structure import listed
+from sysid._program import listed
 
 LEVELS = 10
 

@@ -35,6 +35,8 @@ from tests.sysid.support import (
     prbs,
 )
 
+DT = 1.0 / 800.0
+
 
 def parameters_of(count):
     return tuple(Parameter(f"p{i}", "1", 1.0, -9.0, 9.0, minimum=-99.0) for i in range(count))
@@ -260,6 +262,23 @@ def test_a_chromosome_does_not_depend_on_its_population():
     for size in (1, 2, 16, 17, 33):
         chosen = rng.permutation(50)[:size]
         part = simulator.errors(vectors[chosen], [record])
+        np.testing.assert_array_equal(part.sse, whole.sse[chosen])
+        np.testing.assert_array_equal(part.status, whole.status[chosen])
+        np.testing.assert_array_equal(part.steps, whole.steps[chosen])
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_steps_that_a_record_asks_for_do_not_depend_on_the_population(threads):
+    rng, n = np.random.default_rng(13), 300
+    model = actuator()
+    inputs = np.column_stack([prbs(rng, n, -1, 1), prbs(rng, n, 0, 0.14), np.zeros(n)])
+    outputs = BatchSimulator(model).trajectories(model.nominal, blank(model, inputs, DT))[0]
+    record, vectors = Dataset(inputs, outputs, DT), draw(model, rng, 40)
+    whole = BatchSimulator(model, threads=2).errors(vectors, [record])
+    assert len(np.unique(whole.steps)) > 3
+    for size in (1, 16, 23):
+        chosen = rng.permutation(40)[:size]
+        part = BatchSimulator(model, threads=threads).errors(vectors[chosen], [record])
         np.testing.assert_array_equal(part.sse, whole.sse[chosen])
         np.testing.assert_array_equal(part.status, whole.status[chosen])
         np.testing.assert_array_equal(part.steps, whole.steps[chosen])
