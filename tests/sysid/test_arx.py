@@ -424,6 +424,21 @@ def test_the_rest_is_estimated_again_for_the_mended_model(na):
     assert_allclose(np.column_stack(found.residuals_), target - phi @ theta, rtol=1e-6, atol=1e-8)
 
 
+def test_a_model_mended_in_spite_of_gaps():
+    u, y = growing()
+    y[20, 0] = np.nan
+    # The mended A lets the first output's equation depend on the second too: a row more is lost.
+    found = ARX([[1, 0], [0, 1]], 1, stable=True).fit(u, y)
+    y[30, 1] = np.nan
+    fewer = ARX([[1, 0], [0, 1]], 1, stable=True).fit(u, y)
+    assert found.reflected_
+    assert fewer.reflected_
+    assert [len(e) for e in fewer.residuals_] == [
+        len(e) - n for e, n in zip(found.residuals_, (1, 2), strict=True)
+    ]
+    assert np.all(np.isfinite(fewer.B_std_))
+
+
 def test_stable_models_are_left_alone():
     assert_array_equal(
         ARX(2, 2, stable=True).fit(record(noise=1.0)).theta_,
