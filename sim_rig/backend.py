@@ -80,6 +80,7 @@ class SimulatedDevice:
         self._converters = self._make_converters()
         self._noise, self._noise_used = np.empty((0, len(ANALOG_INPUTS))), 0
         self._n_inputs = len(self._plant.inputs)
+        self._single = np.zeros((2, self._n_inputs))
         self._steppers: dict[float, Stepper] = {}
         self._queue = CommandQueue()
         self._clock = 0.0  # device time since it was switched on [s], at the next tick
@@ -191,19 +192,16 @@ class SimulatedDevice:
     def _play(self, applied: FloatArray, flags: IntArray, guarded: bool) -> RawSamples:
         """Simulate the ticks; where an input passes its guard, again with zeros from there."""
         n = len(applied)
-        noise = self._unit_noise(n)
-        if not guarded:
-            raw, _ = self._simulate(applied, flags, noise)
-        else:
-            before, encoder = self._x.copy(), self._encoder.copy()
-            raw, row = self._simulate(applied, flags, noise)
-            if row < n:
-                applied[row:] = 0.0
-                flags[row:] = 0
-                flags[row] = _INTERLOCK
-                self._x, self._encoder = before, encoder
-                raw, _ = self._simulate(applied, flags, noise)
-                self._queue.latch()
+        noise, encoder = self._unit_noise(n), self._encoder.copy()
+        raw, row, trace = self._simulate(applied, flags, noise)
+        if guarded and row < n:
+            applied[row:] = 0.0
+            flags[row:] = 0
+            flags[row] = _INTERLOCK
+            # The trace begins with where the ticks began.
+            self._x, self._encoder = trace[0].copy(), encoder
+            raw, _, _ = self._simulate(applied, flags, noise)
+            self._queue.latch()
         self._queue.advance(n)
         # Not summed up tick by tick: rounding would make it depend on the size of the blocks.
         self._clock = self._origin + self._queue.tick / self._rate
@@ -211,8 +209,11 @@ class SimulatedDevice:
 
     def _simulate(
         self, applied: FloatArray, flags: IntArray, noise: FloatArray
-    ) -> tuple[RawSamples, int]:
-        """Latch, apply, advance: n ticks of plant and sensing chain; the first beyond the guard."""
+    ) -> tuple[RawSamples, int, FloatArray]:
+        """Latch, apply, advance: n ticks of plant and sensing chain.
+
+        Returns the samples, the first row beyond the guard or n, and the plant's trace.
+        """
         n, tick, per_tick = len(applied), self._queue.tick, self._stepper.n_steps
         trace, true = self._stepper.advance(self._x, self._inputs(applied))
         counts, rates = self._encoder.latch(
@@ -229,11 +230,15 @@ class SimulatedDevice:
         volts = np.empty((n, len(ANALOG_INPUTS)))
         row = self._converters.read(true, noise, flags, self._guard, volts)
         ticks = np.arange(tick, tick + n, dtype=np.int64)
-        return RawSamples(ticks, volts, counts, rates, applied, flags), row
+        return RawSamples(ticks, volts, counts, rates, applied, flags), row, trace
 
     def _inputs(self, applied: FloatArray) -> FloatArray:
         """The plant's inputs at the ticks and at the one that follows, (n + 1, n_inputs)."""
         n = len(applied)
+        if n == 1 and self._user.away:
+            u = self._single  # saves a closed loop an allocation every tick
+            u[0, 0], u[0, 1] = applied[0, 0], applied[0, 1]
+            return u
         u = np.zeros((n + 1, self._n_inputs))
         u[:n, : len(CHANNELS)] = applied
         if self._n_inputs > len(CHANNELS) and not self._user.away:

@@ -54,7 +54,8 @@ class Stepper:
         self.n_steps = n_steps
         self.accuracy = accuracy
         self._kernels = kernels(model)
-        self._inputs, self._n_outputs = (len(model.inputs),), len(model.outputs)
+        self._n_states, self._n_inputs = len(model.states), len(model.inputs)
+        self._n_outputs = len(model.outputs)
         self._base = dt / self.n_steps
         self._limit = (_ESTIMATE_LIMIT * accuracy) ** 2
         self._work = work_area(self._kernels.levels_size)
@@ -68,15 +69,16 @@ class Stepper:
         (n * n_steps, n_states), and the outputs at the start of every interval,
         (n, n_outputs).
         """
-        if x.shape != self.scale.shape or u.shape[1:] != self._inputs:
+        n = len(u) - 1
+        if len(x) != self._n_states or u.shape[1] != self._n_inputs:
             raise ModelError(
-                f"model {self.model.name} has {len(self.scale)} states and {self._inputs[0]} "
+                f"model {self.model.name} has {self._n_states} states and {self._n_inputs} "
                 f"inputs; arrays of shape {x.shape} and {u.shape} were given"
             )
-        n = u.shape[0] - 1
-        trace = np.empty((n * self.n_steps, x.shape[0]))
+        trace = np.empty((n * self.n_steps, self._n_states))
         outputs = np.empty((n, self._n_outputs))
-        u = np.ascontiguousarray(u, dtype=np.float64)
+        if not (u.flags.c_contiguous and u.dtype == np.float64):
+            u = np.ascontiguousarray(u, dtype=np.float64)
         self._run(self._work, u, x, self._base, self.n_steps, self._limit, trace, outputs)
         return trace, outputs
 
