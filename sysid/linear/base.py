@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from sklearn.base import BaseEstimator, RegressorMixin
@@ -37,7 +37,7 @@ class PolynomialModel(RegressorMixin, BaseEstimator):  # type: ignore[misc]
 
     def fit(
         self, X: Data, y: FloatArray | None = None, *, records: Any = None, dt: float | None = None
-    ) -> Any:
+    ) -> Self:
         """Estimate the coefficients from one record or several.
 
         X: one Dataset, several of any lengths, or an (n_samples, n_inputs) array with
@@ -67,9 +67,7 @@ class PolynomialModel(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         check_is_fitted(self)
         datasets = given_datasets(X)
         if datasets is not None:
-            if len(datasets) > 1:
-                raise ModelError("predict takes one Dataset at a time; call it for each")
-            return self._follow(datasets[0])
+            return self._follow(_only(datasets))
         inputs = self._inputs(X, reset=False)
         parts = [self._predictor.run(inputs[rows]) for rows in split(len(inputs), records)]
         return self._shaped(np.concatenate(parts))
@@ -103,7 +101,7 @@ class PolynomialModel(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         if isinstance(k, bool) or not isinstance(k, int | np.integer) or k < 1:
             raise ModelError(f"k is {k!r}; predict 1 or more whole samples ahead")
         given = given_datasets(X)
-        record = self._arrays(X, y, None, None, reset=False)[0] if given is None else given[0]
+        record = _only(self._arrays(X, y, None, None, reset=False) if given is None else given)
         self._check(record)
         result = self._predictor.ahead(record.inputs, record.outputs, int(k))
         return self._shaped(result) if given is None else result
@@ -252,6 +250,12 @@ class PolynomialModel(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         tags.target_tags.multi_output = True
         tags.target_tags.single_output = True
         return tags
+
+
+def _only(records: list[Dataset]) -> Dataset:
+    if len(records) > 1:
+        raise ModelError("predictions take one Dataset at a time; call for each")
+    return records[0]
 
 
 def _fit(measured: FloatArray, simulated: FloatArray) -> FloatArray:

@@ -19,6 +19,8 @@ from sysid.model import FloatArray
 # An iteration is not worth it when it promises to move the coefficients by less than this share
 # of their standard errors.
 _TOLERANCE = 1e-2
+# Nor when it gains less than this in the logarithm of the likelihood.
+_LEAST_GAIN = 1e-4
 # A step this short that still does not help ends the search.
 _MOST_DAMPING = 1e8
 # Below this share of the signal a residual is rounding; there is no noise to model.
@@ -109,6 +111,9 @@ def _search(rows: Equations, point: _Point, max_iterations: int) -> RowFit:
             trial = _Point(rows, limit_noise(point.c + curvature.step(damping)))
             damping *= 10.0
         damping = max(damping / 100.0, 1e-9)
+        gain = 0.5 * n * np.log(point.loss / trial.loss)
+        if gain < _LEAST_GAIN:
+            return _result(trial, iteration + 1, True)
         curvature.move(trial, trial.c - point.c)
         point = trial
     return _result(point, max_iterations, False)

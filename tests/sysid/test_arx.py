@@ -545,8 +545,9 @@ def test_use_that_makes_no_sense():
         model.predict(Dataset(u, y, 0.02))
     with pytest.raises(ModelError, match="2 inputs and 1 outputs, but the model has 2 and 2"):
         model.score(Dataset(u, y[:, 0], 0.01))
-    with pytest.raises(ModelError, match="one Dataset at a time"):
-        model.predict([record(), record()])
+    for call in (model.predict, model.predict_ahead):
+        with pytest.raises(ModelError, match="one Dataset at a time"):
+            call([record(), record()])
     for k in (0, -1, 1.5, True):
         with pytest.raises(ModelError, match=f"k is {k}; predict 1 or more"):
             model.predict_ahead(record(), k=k)
