@@ -10,7 +10,7 @@ import matplotlib.pyplot as plt
 
 from daq.cli import datasets
 from daq.cli.replaying import read_parameters
-from sysid import BatchSimulator, evaluate
+from sysid import BatchSimulator, evaluate, free_run
 
 MEASURED, IDENTIFIED = "#4d4d4d", "#d55e00"  # distinguishable without colour vision
 
@@ -19,7 +19,7 @@ def draw(capture: Path, parameters: Path, picture: Path) -> None:
     """One panel per output: the log's samples and the free-run simulation over them."""
     model, values = read_parameters(parameters)
     data = datasets.load(capture, model, None).dataset
-    simulated = BatchSimulator(model).trajectories(model.vector(values), data)[0]
+    simulated = free_run(BatchSimulator(model), model.vector(values), data)
     fits = evaluate(data.outputs, simulated).fit
     figure, panels = plt.subplots(
         len(model.outputs), 1, sharex=True, figsize=(7.0, 4.6), layout="constrained"
