@@ -19,6 +19,7 @@ def within(value, limit):
 
 def rates(parts, q, x, u):
     """Terms of each state's derivative, by name."""
+    x = at_rest(parts, x)
     found = electrical_rates(parts, q, x, u)
     found["z"] = hysteresis_rate(parts, q, x["omega"], x["z"])
     found["theta"] = [x["omega"]]
@@ -33,6 +34,11 @@ def rates(parts, q, x, u):
     if parts.load == "locked":
         found["omega"] = [0.0]
     return found
+
+
+def at_rest(parts, x):
+    """A locked shaft does not turn, whatever its state says."""
+    return x | {"omega": 0.0} if parts.load == "locked" else x
 
 
 def electrical_rates(parts, q, x, u):
@@ -183,6 +189,7 @@ def sensor_reading(parts, q, x, u, acceleration):
     A sensor at the load carries what the motor, brake and brushes leave over; one between motor
     and brake what brake, brushes and load need, or on a locked shaft the motor's torque.
     """
+    x = at_rest(parts, x)
     resisting = brake_torque(parts, q, x) + brush_torque(parts, q, x)
     if parts.sensor == "load":
         left = [-term for term in motor_torque(q, x)] + resisting
