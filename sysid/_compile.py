@@ -60,7 +60,8 @@ class Kernels:
     """Compiled functions of one model, the floats of the work areas and the tables they need.
 
     simulate, spectrum, work_rows and tables: see ``_kernel``; levels, advance, levels_size and
-    levels_tables: see ``_trajectory_kernel``. fewest_steps: see ``_kernel_text.Shape``.
+    levels_tables: see ``_trajectory_kernel``. fewest_steps: see ``_kernel_text.Shape``. guarded:
+    whether there are limits that fast linear parts may run into.
     """
 
     simulate: Guarded
@@ -72,6 +73,7 @@ class Kernels:
     levels_size: int
     levels_tables: Tables
     fewest_steps: int
+    guarded: bool
 
 
 @functools.lru_cache(maxsize=8)
@@ -81,10 +83,13 @@ def kernels(model: ProcessModel, *, exact: bool = True) -> Kernels:
     Compilation itself happens at the first call. Without ``exact`` nothing is integrated
     exactly. Raises ModelError when the model's functions use something that cannot be compiled.
     """
+    # Numba is slow to import.
+    from sysid._intrinsics import many_registers
+
     shape = Shape.of(model, analyse(model, exact=exact))
     program = shape.structure.program
-    texts = program.text, _kernel.source(shape), _trajectory_kernel.source(shape)
-    text = "\n\n".join(texts)
+    batch = _kernel.source(shape, many_registers=many_registers())
+    text = "\n\n".join((program.text, batch, _trajectory_kernel.source(shape)))
     called = {name: getattr(model, name) for name in sorted(program.calls)}
     path = _source_file(f"{_safe(model.name)}_{_key(text, called)}.py", text)
     scope = _scope(called)
@@ -103,6 +108,7 @@ def kernels(model: ProcessModel, *, exact: bool = True) -> Kernels:
         levels_size=_trajectory_kernel.work_size(shape),
         levels_tables=_tables(shape, 0),
         fewest_steps=shape.fewest_steps,
+        guarded=bool(shape.structure.guards),
     )
 
 

@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
+import platform
 from typing import Any
 
-from llvmlite import ir
+from llvmlite import binding, ir
 from numba import types
 from numba.core.extending import intrinsic as _intrinsic
 
@@ -13,6 +14,12 @@ from sysid._lanes import LANES
 
 # What it makes is called without the context that its functions take first.
 intrinsic: Any = _intrinsic
+
+
+def many_registers() -> bool:
+    """Whether the processor has 32 vector registers, room for two vectors of everything."""
+    arm = platform.machine() in ("aarch64", "arm64")
+    return arm or binding.get_host_cpu_features().get("avx512f", False)
 
 
 @intrinsic

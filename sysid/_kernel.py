@@ -32,13 +32,15 @@ from sysid._program import listed
 _SQUARINGS = 4
 
 
-def source(shape: Shape) -> str:
+def source(shape: Shape, *, many_registers: bool) -> str:
     """Python text of the kernels; needs math, np, scheme_matrices, wide_vectors and the program.
 
     ``simulate`` runs lanes of chromosomes over a record, ``spectrum`` bounds the fastest rate
     of what is not integrated exactly.
     """
-    return "\n\n".join((_simulate(shape), _spectrum(shape), ""))
+    # Plain Runge-Kutta keeps so much at hand that two lanes at once need room for it.
+    paired = many_registers or bool(shape.structure.coefficients)
+    return "\n\n".join((_simulate(shape, paired), _spectrum(shape), ""))
 
 
 def work_rows(s: Shape) -> int:
@@ -71,7 +73,7 @@ def _constants(s: Shape) -> str:
     return "c = " + listed(_at(first + i) for i in range(s.n_constants))
 
 
-def _simulate(s: Shape) -> str:
+def _simulate(s: Shape, paired: bool) -> str:
     q, rows = s.n_outputs, _Rows(s)
     lines = [
         "def simulate(X, rows, tables, u, y, w, start, p, dt, n_steps, sums, record):",
@@ -103,8 +105,7 @@ def _simulate(s: Shape) -> str:
         *[f"        {line}" for line in _input_slopes(s)],
         "        for step in range(n_steps):",
         *[f"            {line}" for line in _stage_inputs(s)],
-        f"            for l in range({LANES // 2}):",
-        *[f"                {line}" for line in _paired(_lane_step(s))],
+        *[f"            {line}" for line in _all_lanes(s, paired)],
         f"    for j in range({2 * q}):",
         f"        for l in range({LANES}):",
         f"            sums[j, l] = X[({rows.sums} + j) * {LANES} + l]",
@@ -154,6 +155,14 @@ def _lane_step(s: Shape) -> list[str]:
         *[f"{_at(i)} = n{i}" for i in range(s.n_states)],
         *_estimate(s, place),
     ]
+
+
+def _all_lanes(s: Shape, paired: bool) -> list[str]:
+    """One step of all lanes."""
+    lines = _lane_step(s)
+    if paired:
+        return [f"for l in range({LANES // 2}):", *[f"    {line}" for line in _paired(lines)]]
+    return [f"for l in range({LANES}):", *[f"    {line}" for line in lines]]
 
 
 def _paired(lines: list[str]) -> list[str]:

@@ -4,6 +4,9 @@ Every sample interval is a number of equal base steps. A base step is taken whol
 2^-level of it where the error estimate is too large; each level's matrices are stored once. A
 level that was found is kept until a coarser one fits again, and forgotten at the end of the
 interval: what happens in one depends on nothing but the state it starts from.
+
+``least`` is the level that no step is coarser than: a swing of several periods within a step may
+look the same at both its ends and in its middle, and run into limits in between.
 """
 
 from __future__ import annotations
@@ -50,14 +53,15 @@ def _first_entry(s: Shape) -> int:
 
 
 def _levels(s: Shape) -> str:
-    """Fill the work area; each level is a lane while its matrices are made."""
+    """Fill the work area, and A; each level is a lane while its matrices are made."""
     closure = s.structure.closure(s.n_states)
     lines = [
-        "def levels(X, tables, p, scale, h):",
+        "def levels(X, tables, p, scale, h, a):",
         f"    c = constants({listed(f'p[{i}]' for i in range(s.n_parameters))})",
         *[f"    X[{i}] = c[{i}]" for i in range(s.n_constants)],
         f"    for i in range({s.n_states}):",
         f"        X[{s.n_constants} + i] = 1.0 / scale[i]",
+        *[f"    a[{i}, {j}] = {text}" for (i, j), text in s.structure.coefficients.items()],
     ]
     if s.n_entries:
         lines += [
@@ -78,7 +82,7 @@ def _levels(s: Shape) -> str:
 def _advance(s: Shape) -> str:
     n, whole = s.n_states, 2**LEVELS
     lines = [
-        "def advance(X, u, x, base, n_steps, limit, trace, outputs):",
+        "def advance(X, u, x, base, n_steps, least, limit, trace, outputs):",
         f"    c = {listed(f'X[{i}]' for i in range(s.n_constants))}",
         *[f"    z{i} = X[{s.n_constants + i}]" for i in range(n)],
         *[f"    x{i} = x[{i}]" for i in range(n)],
@@ -88,12 +92,12 @@ def _advance(s: Shape) -> str:
         *[f"        i{j} = (u[k + 1, {j}] - v{j}) / n_steps" for j, foh in enumerate(s.foh) if foh],
         *[f"        {line}" for line in slope(s, "x", "v", "m", "k")],
         *[f"        {line}" for line in margins(s, "x", "v", "q")],
-        "        level = 0",
+        "        level = least",
         "        for step in range(n_steps):",
         *[f"            trace[k * n_steps + step, {i}] = x{i}" for i in range(n)],
         # What is not finite any more gets no better by halving.
         f"            finite = math.isfinite({' + '.join(numbered('k', n))})",
-        f"            deepest = {LEVELS} if finite else 0",
+        f"            deepest = {LEVELS} if finite else least",
         "            level = min(level, deepest)",
         "            done = 0",
         f"            while done < {whole}:",
@@ -127,7 +131,7 @@ def _part(s: Shape) -> list[str]:
         *[f"    k{i} = kn{i}" for i in range(s.n_states)],
         *[f"    q{i} = r{i}" for i in range(s.n_margins)],
         "    done += part",
-        f"    if level > 0 and error <= {_COARSER!r} * limit and done % (2 * part) == 0:",
+        f"    if level > least and error <= {_COARSER!r} * limit and done % (2 * part) == 0:",
         "        level -= 1",
         "else:",
         "    level += 1",

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
 from sysid._compile import kernels
 from sysid._lanes import work_area
+from sysid._trajectory_kernel import LEVELS
 from sysid.model import FloatArray, ModelError, ProcessModel
 
 # Error estimate of one step, of all states together, in parts of what the trajectory's error may
@@ -59,7 +60,8 @@ class Stepper:
         self._base = dt / self.n_steps
         self._limit = (_ESTIMATE_LIMIT * accuracy) ** 2
         self._work = work_area(self._kernels.levels_size)
-        self._run: Callable[..., None] = self._first_run
+        self._least = 0
+        self._run: Callable[..., None] | None = None
 
     def advance(self, x: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Move the state x (n_states,), in place, over the intervals between the rows of u.
@@ -79,12 +81,22 @@ class Stepper:
         outputs = np.empty((n, self._n_outputs))
         if not (u.flags.c_contiguous and u.dtype == np.float64):
             u = np.ascontiguousarray(u, dtype=np.float64)
-        self._run(self._work, u, x, self._base, self.n_steps, self._limit, trace, outputs)
+        run = self._run or self._prepare(x, u)
+        run(self._work, u, x, self._base, self.n_steps, self._least, self._limit, trace, outputs)
         return trace, outputs
 
-    def _first_run(self, work: FloatArray, *args: Any) -> None:
-        """Fill the work area, once for all runs; from then on no more is checked."""
-        made = self._kernels
-        made.levels(work, made.levels_tables, self.parameters, self.scale, self._base)
-        made.advance(work, *args)
+    def _prepare(self, x: FloatArray, u: FloatArray) -> Callable[..., None]:
+        """Fill the work area, once for all runs, and compile what advances."""
+        made, n = self._kernels, len(x)
+        a = np.zeros((n, n))
+        made.levels(self._work, made.levels_tables, self.parameters, self.scale, self._base, a)
+        if made.guarded and np.isfinite(a).all():
+            periods = np.abs(np.linalg.eigvals(a)).max() * self._base / (2.0 * math.pi)
+            self._least = min(math.ceil(math.log2(max(periods, 1.0))), LEVELS)
+        # A call over no interval, by which the compiler's complaints are explained.
+        nothing = np.empty((0, n)), np.empty((0, self._n_outputs))
+        made.advance(
+            self._work, u[:1], x, self._base, self.n_steps, self._least, self._limit, *nothing
+        )
         self._run = made.advance.compiled
+        return self._run

@@ -4,6 +4,7 @@ import math
 import os
 import subprocess
 import sys
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -301,6 +302,19 @@ def test_another_process_gets_the_same_bits():
         capture_output=True, text=True, check=True, env=os.environ, cwd=os.curdir,
     ).stdout.strip()  # fmt: skip
     assert there == here
+
+
+def test_memory_does_not_grow_with_samples_times_chromosomes():
+    n, samples = 2000, 5000  # 80 MB if trajectories were kept
+    simulator, inputs = BatchSimulator(lag(), threads=1), np.ones((samples, 1))
+    record = Dataset(inputs, np.zeros((samples, 1)), 0.01)
+    simulator.errors(lag().nominal, [record])
+    vectors = draw(lag(), np.random.default_rng(14), n)
+    tracemalloc.start()
+    simulator.errors(vectors, [record])
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 2e6
 
 
 # --- failures -------------------------------------------------------------------------------
