@@ -132,7 +132,7 @@ def scaling(model: ProcessModel) -> dict[str, list[dict[str, float]]]:
         for name, rows in (
             ("samples (one chromosome, 8 steps each)", samples),
             ("chromosomes (of 1000 samples)", chromosomes),
-            ("steps per sample (one chromosome, 1000 samples)", substeps),
+            ("steps per sample (one chromosome)", substeps),
         )
     }
 
@@ -168,11 +168,11 @@ def _resident() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6
 
 
-def _cpu(function: Callable[[], Any], repeats: int = 3) -> float:
-    """CPU seconds of all threads, the least of several runs after one that does not count."""
-    function()
+def _cpu(function: Callable[[], Any]) -> float:
+    """CPU seconds of all threads, the least of several runs."""
     times = []
-    for _ in range(repeats):
+    until = time.perf_counter() + 1.0
+    while len(times) < 4 or time.perf_counter() < until:
         start = time.process_time()
         function()
         times.append(time.process_time() - start)
