@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from sysid.campaigns import Campaign, Outcome, Run, Spread, campaign, combinations
 from sysid.data import Dataset, output_scale
 from sysid.linearization import LinearModel, equilibrium, jacobian, linearize
 from sysid.metrics import Metrics, evaluate, fit_percent, msd, rmse
@@ -31,19 +32,25 @@ __all__ = [
     "GASSI",
     "BatchResult",
     "BatchSimulator",
+    "Campaign",
     "Constraint",
     "Dataset",
     "Input",
     "LinearModel",
     "Metrics",
     "ModelError",
+    "Outcome",
     "Output",
     "Parameter",
     "ProcessModel",
+    "Run",
     "SearchSpace",
+    "Spread",
     "State",
     "Status",
     "Stepper",
+    "campaign",
+    "combinations",
     "equilibrium",
     "evaluate",
     "fit_percent",
