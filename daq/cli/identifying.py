@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 import os
 from collections.abc import Mapping as MappingType
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -49,8 +50,8 @@ def identify_command(
 ) -> None:
     """Identify one parameter set from logs and print it."""
     prepared = prepare(config, overrides)
-    folder = out or _default_folder(logs, prepared.model.name)
-    _check_writable(folder)
+    folder = out or default_folder(logs, prepared.model.name)
+    check_writable(folder)
     report = identify_logs(prepared, logs, validate, folder, as_json)
     if as_json:
         console.print_json(report)
@@ -58,6 +59,17 @@ def identify_command(
 
 def prepare(config: Path | None, overrides: MappingType[str, Any]) -> Prepared:
     """Read and check settings and model; ConfigError names file, line, key and cure."""
+    return prepare_models(config, overrides, [overrides.get("model")])[0]
+
+
+def prepare_models(
+    config: Path | None, overrides: MappingType[str, Any], names: Sequence[str | None]
+) -> list[Prepared]:
+    """The same settings for each of several models.
+
+    Each takes the ranges, fixed values and weights that it has a name for; names that none has
+    are mistakes.
+    """
     given = {key: value for key, value in overrides.items() if value is not None}
     typed = CommandLine.of(given)
     yaml_file.validate(typed, IdentificationConfig)
@@ -68,20 +80,49 @@ def prepare(config: Path | None, overrides: MappingType[str, Any]) -> Prepared:
             ("preset",), f"unknown preset {settings.preset!r}; "
             f"{suggestion(settings.preset, list(PRESETS))}"
         )  # fmt: skip
+    found = [_find(config, file, settings, name) for name in names]
+    _check_names(file, settings, [model for model, _ in found])
+    mapping = Mapping(file, settings.columns) if settings.columns else None
+    prepared = []
+    for model, name in found:
+        own = _own_settings(settings, model)
+        _check_space(file, own, model)
+        if mapping is not None:
+            datasets.check_mapping(model, mapping)
+        prepared.append(Prepared(model, name, own, mapping))
+    return prepared
+
+
+def gassi_settings(settings: IdentificationConfig) -> dict[str, Any]:
+    """Arguments of ``GASSI``, all but the model."""
+    return {
+        "preset": settings.preset,
+        "population": settings.population,
+        "generations": settings.generations,
+        "ranges": settings.ranges,
+        "fixed": settings.fixed,
+        "elite_percent": settings.elite_percent,
+        "weights": settings.weights or None,
+        "per_log": settings.per_log,
+        "accuracy": settings.accuracy,
+        "max_steps": settings.max_steps,
+        "random_state": settings.seed,
+    }
+
+
+def _find(
+    config: Path | None, file: YamlFile, settings: IdentificationConfig, typed: str | None
+) -> tuple[ProcessModel, str]:
+    """A model and its whole name, from the command line or else the configuration."""
     # A name on the command line is relative to where it is typed, one in a file to that file.
-    beside = config.parent if config is not None and "model" not in given else None
-    name = settings.model or DEFAULT_MODEL
+    beside = config.parent if config is not None and typed is None else None
+    name = typed or settings.model or DEFAULT_MODEL
     try:
-        model = find_model(name, beside)
+        return find_model(name, beside), whole_name(name, beside)
     except ConfigError as error:
-        if config is None or "model" in given or settings.model is None:
+        if config is None or typed is not None or settings.model is None:
             raise
         raise file.error(("model",), str(error)) from None
-    _check_names(file, settings, model)
-    mapping = Mapping(file, settings.columns) if settings.columns else None
-    if mapping is not None:
-        datasets.check_mapping(model, mapping)
-    return Prepared(model, whole_name(name, beside), settings, mapping)
 
 
 def identify_logs(
@@ -95,7 +136,7 @@ def identify_logs(
     model = prepared.model
     train = [datasets.load(p, model, prepared.mapping) for p in datasets.expand(training)]
     check = [datasets.load(p, model, prepared.mapping) for p in datasets.expand(validation)]
-    _no_overlap(train, check)
+    no_overlap(train, check)
     for log in (*train, *check):
         if log.warning is not None:
             console.report_note(log.warning)
@@ -112,19 +153,38 @@ def identify_logs(
     return report
 
 
-def _check_names(file: YamlFile, settings: IdentificationConfig, model: ProcessModel) -> None:
+def _check_names(
+    file: YamlFile, settings: IdentificationConfig, models: Sequence[ProcessModel]
+) -> None:
+    names = " or ".join(dict.fromkeys(model.name for model in models))
+    parameters = tuple(dict.fromkeys(n for model in models for n in model.parameter_names))
+    outputs = tuple(dict.fromkeys(n for model in models for n in model.output_names))
     groups: tuple[tuple[str, dict[str, Any], tuple[str, ...]], ...] = (
-        ("ranges", settings.ranges, model.parameter_names),
-        ("fixed", settings.fixed, model.parameter_names),
-        ("weights", settings.weights, model.output_names),
+        ("ranges", settings.ranges, parameters),
+        ("fixed", settings.fixed, parameters),
+        ("weights", settings.weights, outputs),
     )
     for group, given, known in groups:
         for name in given:
             if name not in known:
                 raise file.error(
                     (group, name),
-                    f"model {model.name} has no such name; {suggestion(name, known)}",
+                    f"model {names} has no such name; {suggestion(name, known)}",
                 )
+
+
+def _own_settings(settings: IdentificationConfig, model: ProcessModel) -> IdentificationConfig:
+    """The settings without what is meant for other models."""
+    known = set(model.parameter_names)
+    own: dict[str, Any] = {
+        "ranges": {k: v for k, v in settings.ranges.items() if k in known},
+        "fixed": {k: v for k, v in settings.fixed.items() if k in known},
+        "weights": {k: v for k, v in settings.weights.items() if k in model.output_names},
+    }
+    return settings.model_copy(update=own)
+
+
+def _check_space(file: YamlFile, settings: IdentificationConfig, model: ProcessModel) -> None:
     for name in settings.ranges:
         try:
             SearchSpace.of(model, {name: settings.ranges[name]}, {})
@@ -136,7 +196,8 @@ def _check_names(file: YamlFile, settings: IdentificationConfig, model: ProcessM
         raise file.error(("fixed",), str(error)) from None
 
 
-def _no_overlap(train: list[Loaded], check: list[Loaded]) -> None:
+def no_overlap(train: list[Loaded], check: list[Loaded]) -> None:
+    """Raise ConfigError when a log is given for training and for validation."""
     known = {log.path.resolve() for log in train}
     for log in check:
         if log.path.resolve() in known:
@@ -146,7 +207,7 @@ def _no_overlap(train: list[Loaded], check: list[Loaded]) -> None:
             )
 
 
-def _default_folder(logs: list[Path], model: str) -> Path:
+def default_folder(logs: list[Path], model: str) -> Path:
     """Beside a single capture's log; otherwise a new folder under runs/."""
     if len(logs) == 1 and capture.log_path(logs[0]).name == capture.LOG_NAME:
         return capture.log_path(logs[0]).parent / "identification"
@@ -154,7 +215,7 @@ def _default_folder(logs: list[Path], model: str) -> Path:
     return Path("runs") / f"{now:%Y%m%dT%H%M%SZ}-identify-{model}" / "identification"
 
 
-def _check_writable(folder: Path) -> None:
+def check_writable(folder: Path) -> None:
     """Raise ConfigError now, not after a long search, when results could not be written."""
     there = next((path for path in (folder, *folder.absolute().parents) if path.exists()), folder)
     if not there.is_dir():
@@ -167,21 +228,7 @@ def _check_writable(folder: Path) -> None:
 
 
 def _fit(prepared: Prepared, train: list[Loaded], quiet: bool) -> GASSI:
-    settings = prepared.settings
-    estimator = GASSI(
-        prepared.model,
-        preset=settings.preset,  # type: ignore[arg-type]
-        population=settings.population,
-        generations=settings.generations,
-        ranges=settings.ranges,
-        fixed=settings.fixed,
-        elite_percent=settings.elite_percent,
-        weights=settings.weights or None,
-        per_log=settings.per_log,
-        accuracy=settings.accuracy,
-        max_steps=settings.max_steps,
-        random_state=settings.seed,
-    )
+    estimator = GASSI(prepared.model, **gassi_settings(prepared.settings))
     with console.progress(quiet) as bar:
 
         def watch(step: Progress) -> None:
