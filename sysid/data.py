@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -15,6 +15,10 @@ class Dataset:
 
     inputs: (n_samples, n_inputs); outputs: (n_samples, n_outputs), NaN where a sample was
     lost, so that a gap keeps its length in time. SI units, columns in the model's order.
+    input_zero, output_zero: (n_inputs,) and (n_outputs,), standard deviation of a constant error
+    that the channel may have had throughout, as an offset calibration leaves it; input_noise:
+    (n_inputs,), standard deviation of the white noise on measured inputs. Default none; they
+    widen the intervals of what is identified.
 
     Raises ModelError for mismatched shapes, fewer than two rows, or inputs that are not finite.
     """
@@ -23,6 +27,9 @@ class Dataset:
     outputs: FloatArray
     dt: float
     name: str = "data"
+    input_zero: FloatArray = field(default_factory=lambda: np.zeros(0))
+    output_zero: FloatArray = field(default_factory=lambda: np.zeros(0))
+    input_noise: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "inputs", _matrix(self.inputs))
@@ -38,6 +45,20 @@ class Dataset:
         if not np.all(np.isfinite(self.inputs)):
             row = int(np.argmax(~np.all(np.isfinite(self.inputs), axis=1)))
             raise ModelError(f"{self.name}: an input is not finite in row {row}")
+        for name in ("input_zero", "output_zero", "input_noise"):
+            object.__setattr__(self, name, self._deviations(name))
+
+    def _deviations(self, name: str) -> FloatArray:
+        """One standard deviation for each channel of a side; none given are zeros."""
+        n = (self.inputs if name.startswith("input") else self.outputs).shape[1]
+        given = np.asarray(getattr(self, name), dtype=np.float64)
+        deviations = given if given.size else np.zeros(n)
+        if deviations.shape != (n,) or not np.all(np.isfinite(deviations) & (deviations >= 0.0)):
+            raise ModelError(
+                f"{self.name}: {name} must hold {n} finite numbers, 0 or more: one standard "
+                "deviation for each channel"
+            )
+        return deviations
 
     @property
     def n_samples(self) -> int:

@@ -1,0 +1,248 @@
+"""What the data say about identified parameters, how surely, and what they cannot say.
+
+The singular values of the scaled output sensitivity tell how far each direction of parameter
+space can move before the outputs show it. Directions that move the outputs less than the noise
+hides are not determined: the parameters in them get no interval, but the combinations that the
+data do determine (products, sums) do.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+
+from sysid.model import BoolArray, FloatArray, IntArray
+from sysid.objective import Objective
+from sysid.space import SearchSpace
+from sysid.uncertainty.directions import PART, Directions, directions
+from sysid.uncertainty.estimate import Z95, Estimate, Why, product_text, sum_text
+from sysid.uncertainty.relations import Kind, Relation, overlapping, relations
+from sysid.uncertainty.sensitivity import common_steps, coordinate_units, sensitivity
+
+_ON_BOUND = 1e-3  # a search value this close to an end of its range stands on it
+_SHARE = 0.1  # entries of a vague direction below this share of its largest are not worth naming
+_WHOLE = 1e-3  # a factor this close to a whole number is meant to be one
+
+# Units of what a lab measures with a meter, a scale or a data sheet, easiest first.
+_MEASURABLE = ("ohm", "H", "kg", "m", "N*m/A", "V*s/rad", "kg*m^2", "N/m")
+
+
+@dataclass(frozen=True)
+class Ambiguity:
+    """Parameters of which only combinations act on the outputs.
+
+    kind: ``product`` and ``sum`` are exact, tried by moving the parameters along them; ``vague``
+    is a direction that the noise hides. determined: the combinations that have an interval.
+    measure: the parameters whose measurement by other means would resolve it, as many as there
+    are directions to resolve, what is easiest to measure first.
+    """
+
+    kind: Kind
+    parameters: tuple[str, ...]
+    determined: tuple[Estimate, ...]
+    measure: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """All that the residuals and sensitivities tell about a chromosome.
+
+    parameters: one estimate for each free parameter (and estimated initial state). covariance:
+    (n_free, n_free) of the coordinates (logarithms where searched so, else parts of the value),
+    undetermined directions and parameters on a bound left out. singular_values: of the scaled
+    sensitivity, falling. rank: how many directions the data determine.
+    """
+
+    parameters: tuple[Estimate, ...]
+    ambiguities: tuple[Ambiguity, ...]
+    covariance: FloatArray
+    singular_values: FloatArray
+    rank: int
+
+    def correlation(self) -> FloatArray:
+        """Correlation of the free parameters, NaN where there is no variance."""
+        deviation = np.sqrt(np.diag(self.covariance))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            correlation: FloatArray = self.covariance / np.outer(deviation, deviation)
+        return correlation
+
+    def determined(self) -> tuple[Estimate, ...]:
+        """Every quantity with an interval: parameters of their own, then combinations."""
+        combined = itertools.chain(*(a.determined for a in self.ambiguities))
+        return (*(p for p in self.parameters if not p.why), *combined)
+
+
+def uncertainty(objective: Objective, chromosome: FloatArray) -> Uncertainty:
+    """Intervals, ambiguities and what is determined at an identified chromosome, (n_free,).
+
+    The estimate is taken as the minimum of the objective; the colour of its residuals and the
+    records' zero errors enter the covariance.
+    """
+    steps = common_steps(objective, chromosome)
+    found = sensitivity(objective, chromosome, steps)
+    ends = on_bound(objective.space, chromosome)
+    told = directions(objective, chromosome, steps, found, ends)
+    units = coordinate_units(objective, chromosome)
+    slope = np.where(objective.space.log, chromosome, units)
+    hidden = relations(objective, chromosome, steps, slope, told.lost)
+    return _Teller(objective.space, chromosome, slope, told, hidden).result()
+
+
+def on_bound(space: SearchSpace, chromosome: FloatArray) -> BoolArray:
+    """Parameters at an end of their range, (n_free,)."""
+    low, high = space.encode(np.stack([space.lower, space.upper]))
+    place = (space.encode(chromosome) - low) / (high - low)
+    at: BoolArray = (place < _ON_BOUND) | (place > 1.0 - _ON_BOUND)
+    return at
+
+
+@dataclass(frozen=True)
+class _Teller:
+    """Turns directions into statements about parameters.
+
+    slope: (n_free,), change of each parameter per unit of its coordinate.
+    """
+
+    space: SearchSpace
+    chromosome: FloatArray
+    slope: FloatArray
+    told: Directions
+    hidden: list[Relation]
+
+    def result(self) -> Uncertainty:
+        """Everything together."""
+        n = len(self.chromosome)
+        return Uncertainty(
+            tuple(self._parameter(j) for j in range(n)),
+            tuple(self._ambiguities()),
+            self.told.covariance,
+            self.told.singular_values,
+            self.told.rank,
+        )
+
+    def _parameter(self, j: int) -> Estimate:
+        one = np.zeros(len(self.chromosome))
+        one[j] = 1.0
+        why: Why = ""
+        if self.told.held[j]:
+            why = "bound"
+        elif np.sum(self.told.lost[:, j] ** 2) > PART:
+            why = "tied" if any(r.exact and r.support[j] for r in self.hidden) else "vague"
+        if why:
+            parameter = self.space.parameters[j]
+            value = float(self.chromosome[j])
+            terms = ((parameter.name, 1.0),)
+            return Estimate(parameter.name, parameter.unit, value, terms, "product", why=why)
+        return self._product(one) if self.space.log[j] else self._sum(one)
+
+    def _product(self, exponents: FloatArray) -> Estimate:
+        """Estimate of a product of powers of the parameters."""
+        used = np.flatnonzero(exponents)
+        value = float(np.prod(self.chromosome[used] ** exponents[used]))
+        deviation = self._deviation(exponents * self.slope / self.chromosome)
+        terms = self._terms(exponents)
+        ends = value * np.exp(-Z95 * deviation), value * np.exp(Z95 * deviation)
+        unit = self.space.parameters[used[0]].unit if len(used) == 1 else ""
+        return Estimate(
+            product_text(terms), unit, value, terms, "product",
+            abs(value) * deviation, min(ends), max(ends),
+        )  # fmt: skip
+
+    def _sum(self, factors: FloatArray) -> Estimate:
+        """Estimate of a weighted sum of the parameters."""
+        used = np.flatnonzero(factors)
+        value = float(factors @ self.chromosome)
+        deviation = self._deviation(factors * self.slope)
+        terms = self._terms(factors)
+        return Estimate(
+            sum_text(terms), self.space.parameters[used[0]].unit, value, terms, "sum",
+            deviation, value - Z95 * deviation, value + Z95 * deviation,
+        )  # fmt: skip
+
+    def _terms(self, weights: FloatArray) -> tuple[tuple[str, float], ...]:
+        used = np.flatnonzero(weights)
+        return tuple((self.space.parameters[i].name, float(weights[i])) for i in used)
+
+    def _deviation(self, direction: FloatArray) -> float:
+        return float(np.sqrt(max(float(direction @ self.told.covariance @ direction), 0.0)))
+
+    def _ambiguities(self) -> list[Ambiguity]:
+        """Exact relations that share parameters as one, each vague direction by itself."""
+        exact = [relation for relation in self.hidden if relation.exact]
+        groups = overlapping([relation.support for relation in exact])
+        found = [self._exact([exact[i] for i in members]) for members in groups]
+        for relation in self.hidden:
+            if not relation.exact:
+                size = np.abs(relation.vector)
+                group = np.flatnonzero(size > _SHARE * size.max())
+                found.append(self._ambiguity("vague", group, [relation], []))
+        return found
+
+    def _exact(self, members: list[Relation]) -> Ambiguity:
+        group = np.flatnonzero(np.any([relation.support for relation in members], axis=0))
+        sums = all(relation.kind == "sum" for relation in members)
+        if sums and len(group) == 2:
+            determined = [self._total(group, members[0].vector[group])]
+        else:
+            determined = self._products(group, len(group) - len(members))
+        return self._ambiguity("sum" if sums else "product", group, members, determined)
+
+    def _ambiguity(
+        self, kind: Kind, group: IntArray, members: list[Relation], determined: list[Estimate]
+    ) -> Ambiguity:
+        own = sorted(group, key=lambda i: _effort(self.space.parameters[i].unit))
+        vectors = np.stack([relation.vector for relation in members])
+        measure: list[int] = []
+        for i in own:
+            if np.linalg.matrix_rank(vectors[:, [*measure, i]]) > len(measure):
+                measure.append(int(i))
+        names = self.space.names
+        return Ambiguity(
+            kind,
+            tuple(names[i] for i in own),
+            tuple(determined),
+            tuple(names[i] for i in measure),
+        )
+
+    def _total(self, group: IntArray, vector: FloatArray) -> Estimate:
+        """The sum of two parameters that a direction leaves alone."""
+        step = vector * self.slope[group]
+        factors = np.zeros(len(self.chromosome))
+        factors[group] = np.array([step[1], -step[0]])
+        factors /= factors[group][np.argmin(np.abs(factors[group]))]
+        whole = np.round(factors)
+        return self._sum(np.where(np.abs(factors - whole) < _WHOLE, whole, factors))
+
+    def _products(self, group: IntArray, count: int) -> list[Estimate]:
+        """Simple products of the group's parameters that the data determine, at most count."""
+        chosen: list[FloatArray] = []
+        for exponents in _simple_exponents(len(group)):
+            if len(chosen) == count:
+                break
+            whole = np.zeros(len(self.chromosome))
+            whole[group] = exponents
+            direction = whole * self.slope / self.chromosome
+            outside = np.sum((self.told.lost @ direction) ** 2) / np.sum(direction**2)
+            independent = np.linalg.matrix_rank(np.array([*chosen, whole])) > len(chosen)
+            if outside < PART and independent:
+                chosen.append(whole)
+        return [self._product(exponents) for exponents in chosen]
+
+
+def _effort(unit: str) -> int:
+    """Rank of a unit by how easily a lab measures what has it."""
+    return _MEASURABLE.index(unit) if unit in _MEASURABLE else len(_MEASURABLE)
+
+
+def _simple_exponents(n: int) -> list[FloatArray]:
+    """Exponents of simple products of n factors, the simplest first."""
+    found = []
+    for size in (1, 2, 3):
+        for places in itertools.combinations(range(n), size):
+            for signs in itertools.product((1.0, -1.0), repeat=size - 1):
+                exponents = np.zeros(n)
+                exponents[list(places)] = (1.0, *signs)
+                found.append(exponents)
+    return found
