@@ -274,11 +274,16 @@ def _spectrum(s: Shape) -> str:
 
 
 def _jacobian(s: Shape) -> list[str]:
-    """J of the driven rows and columns of N at X, by differences."""
+    """J of the driven rows and columns of N beside X, by differences.
+
+    Beside, because what switches most often does so where a model starts: dry friction at rest.
+    A difference across the switch would be taken for an endlessly fast rate.
+    """
     rows = s.structure.driven
     x = [f"X[{i}]" for i in range(s.n_states)]
     u = [f"u[k, {j}]" for j in range(s.n_inputs)]
     return [
+        *[f"X[{i}] += 1e-7 * max(abs(X[{i}]), 1e-2)" for i in rows],
         # Round -1 evaluates at the point itself; a single call site keeps compilation short.
         f"for j in range(-1, {len(rows)}):",
         "    d = 0.0",

@@ -1,7 +1,9 @@
 """Local refinement of a chromosome: Levenberg-Marquardt with batched simulations.
 
 Sensitivities come from one batch of perturbed simulations; the candidates of sixteen damping
-values from another, so that the lanes of the batch simulator are never idle.
+values from another, so that the lanes of the batch simulator are never idle. Sensitivities that
+do not keep what they promise are taken anew from larger perturbations: equations that switch,
+such as dry friction, are steps and plateaus to small ones.
 """
 
 from __future__ import annotations
@@ -16,7 +18,15 @@ from sysid.model import BoolArray, FloatArray
 from sysid.objective import Objective
 
 _DAMPING = 10.0 ** np.linspace(2.0, -8.0, LANES)
-_PERTURBATION = 1e-6
+# Parts of the ranges by which coordinates are moved to see what that does. The first is for what
+# is smooth. Where something switches (dry friction, an overflow) the instant of switching moves in
+# steps of the integration, and only a larger move shows what it depends on.
+_PERTURBATIONS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
+# Sensitivities promise a gain. They are too fine, or too coarse, where less than this share of it
+# comes; a promise of less than _NOTHING of the error says that there is nothing to be gained.
+_KEPT = 0.02
+_NOTHING = 1e-3
+_COARSEST = len(_PERTURBATIONS) - 1
 
 
 @dataclass(frozen=True)
@@ -38,7 +48,8 @@ def refine(
 ) -> Refinement:
     """Minimise the objective from ``chromosome`` within the ranges and constraints.
 
-    Ends when an iteration improves the error by less than ``tolerance`` of it. The outputs are
+    Ends when an iteration improves the error by less than ``tolerance`` of it and larger
+    perturbations promise no more. The outputs are
     re-weighted by the inverse root of their current error, whose fixed point is the minimum of
     the mean RMSE rather than of the plain sum of squares.
     """
@@ -49,11 +60,14 @@ def refine(
     steps = _steps(objective, at)
     residual = objective.residuals(space.decode(at)[None], steps)[0]
     error = float(objective.error_of(residual[None])[0])
+    level, error_of_round = 0, error
     for iteration in range(1, max_iterations + 1):
         if not np.isfinite(error) or error == 0.0:
             return Refinement(space.decode(at), error, iteration - 1)
-        jacobian = _sensitivities(objective, at, residual, steps, lower, upper)
-        candidates = _candidates(at, jacobian, residual, objective, lower, upper)
+        jacobian = _sensitivities(
+            objective, at, residual, steps, lower, upper, _PERTURBATIONS[level]
+        )
+        candidates, promise = _candidates(at, jacobian, residual, objective, lower, upper)
         candidates = candidates[_feasible(objective, candidates)]
         if len(candidates) == 0:
             return Refinement(space.decode(at), error, iteration)
@@ -65,8 +79,13 @@ def refine(
             at, residual, error = candidates[best], tried[best], float(errors[best])
         if on_iteration is not None:
             on_iteration(Refinement(space.decode(at), error, iteration))
-        if gain <= tolerance * error:
-            return Refinement(space.decode(at), error, iteration)
+        if promise > _NOTHING and gain < _KEPT * promise * error and level < _COARSEST:
+            level += 1
+        elif gain <= tolerance * error:
+            if error > (1.0 - _NOTHING) * error_of_round:
+                return Refinement(space.decode(at), error, iteration)
+            # What coarse sensitivities have gained, fine ones may go on from.
+            level, error_of_round = 0, error
         needed = _steps(objective, at)
         if needed != steps:
             # Differences between step counts would drown the small ones of the sensitivities.
@@ -88,14 +107,15 @@ def _sensitivities(
     steps: list[int],
     lower: FloatArray,
     upper: FloatArray,
+    perturbation: float,
 ) -> FloatArray:
     """d residual / d search coordinate in units of the range, (n_residuals, n_outputs, n_free)."""
     width = upper - lower
     # Away from the nearer bound, so that the perturbed chromosome stays in range.
-    sign = np.where(at + _PERTURBATION * width > upper, -1.0, 1.0)
-    moved = at + np.diag(sign * _PERTURBATION * width)
+    sign = np.where(at + perturbation * width > upper, -1.0, 1.0)
+    moved = at + np.diag(sign * perturbation * width)
     shifted = objective.residuals(objective.space.decode(moved), steps)
-    slopes = (shifted - residual) / (sign * _PERTURBATION)[:, None, None]
+    slopes = (shifted - residual) / (sign * perturbation)[:, None, None]
     slopes = np.where(np.isfinite(slopes), slopes, 0.0)
     return np.moveaxis(slopes, 0, 2)
 
@@ -107,8 +127,11 @@ def _candidates(
     objective: Objective,
     lower: FloatArray,
     upper: FloatArray,
-) -> FloatArray:
-    """Damped Gauss-Newton steps clipped to the ranges, one for each damping, (LANES, n_free)."""
+) -> tuple[FloatArray, float]:
+    """Damped Gauss-Newton steps clipped to the ranges, one for each damping, (LANES, n_free).
+
+    And the part of the error that the longest of them would take away, were all linear.
+    """
     rms = np.sqrt(np.mean(residual**2, axis=0))
     weight = np.sqrt(objective.weights / np.maximum(rms, 1e-12))
     rows = (jacobian * weight[None, :, None]).reshape(-1, len(at))
@@ -119,6 +142,7 @@ def _candidates(
     held = ((at <= lower) & (gradient > 0.0)) | ((at >= upper) & (gradient < 0.0))
     free = np.flatnonzero(~held)
     moves = np.zeros((LANES, len(at)))
+    promise = 0.0
     with np.errstate(over="ignore", invalid="ignore"):
         normal = rows[:, free].T @ rows[:, free]
     # Sensitivities may be too large to square at the edge of instability: then stay.
@@ -128,8 +152,8 @@ def _candidates(
         projected = vectors.T @ gradient[free]
         damping = _DAMPING * max(values.max(), 1e-300)
         moves[:, free] = -(projected / (values + damping[:, None])) @ vectors.T
-    clipped: FloatArray = np.clip(at + moves * width, lower, upper)
-    return clipped
+        promise = float(np.sum(projected**2 / (values + damping[-1])) / (2.0 * right @ right))
+    return np.clip(at + moves * width, lower, upper), promise
 
 
 def _feasible(objective: Objective, candidates: FloatArray) -> BoolArray:
