@@ -54,8 +54,8 @@ def refine(
     the mean RMSE rather than of the plain sum of squares.
     """
     space = objective.space
-    encoded_box = space.encode(np.stack([space.lower, space.upper]))
-    lower, upper = encoded_box
+    lower, upper = space.coded_bounds()
+    width = space.encode(space.upper) - space.encode(space.lower)
     at = np.clip(space.encode(chromosome), lower, upper)
     steps = _steps(objective, at)
     residual = objective.residuals(space.decode(at)[None], steps)[0]
@@ -65,9 +65,9 @@ def refine(
         if not np.isfinite(error) or error == 0.0:
             return Refinement(space.decode(at), error, iteration - 1)
         jacobian = _sensitivities(
-            objective, at, residual, steps, lower, upper, _PERTURBATIONS[level]
+            objective, at, residual, steps, width, upper, _PERTURBATIONS[level]
         )
-        candidates, promise = _candidates(at, jacobian, residual, objective, lower, upper)
+        candidates, promise = _candidates(at, jacobian, residual, objective, width, lower, upper)
         candidates = candidates[_feasible(objective, candidates)]
         if len(candidates) == 0:
             return Refinement(space.decode(at), error, iteration)
@@ -105,12 +105,11 @@ def _sensitivities(
     at: FloatArray,
     residual: FloatArray,
     steps: list[int],
-    lower: FloatArray,
+    width: FloatArray,
     upper: FloatArray,
     perturbation: float,
 ) -> FloatArray:
     """d residual / d search coordinate in units of the range, (n_residuals, n_outputs, n_free)."""
-    width = upper - lower
     # Away from the nearer bound, so that the perturbed chromosome stays in range.
     sign = np.where(at + perturbation * width > upper, -1.0, 1.0)
     moved = at + np.diag(sign * perturbation * width)
@@ -125,6 +124,7 @@ def _candidates(
     jacobian: FloatArray,
     residual: FloatArray,
     objective: Objective,
+    width: FloatArray,
     lower: FloatArray,
     upper: FloatArray,
 ) -> tuple[FloatArray, float]:
@@ -138,7 +138,6 @@ def _candidates(
     right = (residual * weight).reshape(-1)
     # A direction held by a bound and pushed against it would only shorten the step.
     gradient = rows.T @ right
-    width = upper - lower
     held = ((at <= lower) & (gradient > 0.0)) | ((at >= upper) & (gradient < 0.0))
     free = np.flatnonzero(~held)
     moves = np.zeros((LANES, len(at)))

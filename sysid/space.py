@@ -7,7 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sysid.model import BoolArray, FloatArray, ModelError, Parameter, ProcessModel, check_range
+from sysid.model import BoolArray, FloatArray, ModelError, Parameter, ProcessModel, Scale
+from sysid.ranges import Range, Tie, one_sided, searched, ties
+
+# A search value this close to an end of its range, in parts of the range, stands on it.
+_ON_BOUND = 1e-3
 
 
 @dataclass(frozen=True)
@@ -25,65 +29,65 @@ class SearchSpace:
     A chromosome is a row of free parameters in their own units, (n_free,), behind which stand
     the initial states that are estimated, record by record. ``encode`` maps it to search
     coordinates (logarithm where the scale is log), ``decode`` back.
+
+    lower, upper: where the search starts. hard_lower, hard_upper: what it keeps within; for a
+    range with one end given these are that end and the physical limit, else lower and upper.
     """
 
     model: ProcessModel
     parameters: tuple[Parameter, ...]
     base: FloatArray
     index: tuple[int, ...]
-    use_log: bool = True
     estimated: tuple[Start, ...] = ()
+    ties: tuple[Tie, ...] = ()
+    one_sided: frozenset[str] = frozenset()
 
     @classmethod
     def of(
         cls,
         model: ProcessModel,
-        ranges: Mapping[str, tuple[float, float]] | None = None,
+        ranges: Mapping[str, Range] | None = None,
         fixed: Mapping[str, float] | None = None,
         use_log: bool = True,
+        *,
+        tied: Mapping[str, str] | None = None,
+        scale: Mapping[str, Scale] | None = None,
     ) -> SearchSpace:
-        """Space from the model's own ranges, overridden by ``ranges`` and ``fixed``.
+        """Space from the model's own ranges and what is said in their place.
 
-        A parameter given a range becomes free; one given a value becomes fixed. Raises
-        ModelError for an unknown name, a bad range, or when nothing is left to search.
+        ranges: {name: (low, high)}, frees a parameter; either end may be None. fixed: {name:
+        value}. tied: {name: "0.5 * other"}. scale: {name: "log" or "linear"}; use_log: whether
+        the model's own log scales count. Raises ModelError for an unknown name, a bad range,
+        contradictions, or when nothing is left to search.
         """
         ranges, fixed = dict(ranges or {}), dict(fixed or {})
-        for name in (*ranges, *fixed):
+        tied, scale = dict(tied or {}), dict(scale or {})
+        for name in (*ranges, *fixed, *tied, *scale):
             model.parameter(name)
-        both = sorted(set(ranges) & set(fixed))
-        if both:
-            raise ModelError(f"parameter {both[0]} has both a range and a fixed value; keep one")
+        _check_conflicts(ranges, fixed, tied, scale)
         for name, value in fixed.items():
             replace(model.parameter(name), nominal=value, fixed=True)  # checks the value
-        base = model.vector(fixed)
+        followers = ties(model, tied)
         free, index = [], []
         for i, parameter in enumerate(model.parameters):
-            if parameter.name in fixed or (parameter.fixed and parameter.name not in ranges):
+            name = parameter.name
+            if name in fixed or name in tied or (parameter.fixed and name not in ranges):
+                if name in scale:
+                    raise ModelError(f"parameter {name} has a scale but is not searched; free it "
+                                     "with a range, or leave the scale out")  # fmt: skip
                 continue
-            lower, upper = ranges.get(parameter.name, (parameter.lower, parameter.upper))
-            # A range that touches zero cannot be searched by logarithm.
-            scale = parameter.scale if lower > 0.0 else "linear"
-            check_range(parameter.name, lower, upper, scale)
-            _check_limits(parameter, lower, upper)
-            nominal = min(max(parameter.nominal, parameter.minimum), parameter.maximum)
-            free.append(
-                Parameter(
-                    parameter.name,
-                    parameter.unit,
-                    nominal,
-                    lower,
-                    upper,
-                    scale,
-                    False,
-                    parameter.minimum,
-                    parameter.maximum,
-                    parameter.description,
-                )
-            )
+            own = parameter if use_log else replace(parameter, scale="linear")
+            free.append(searched(own, ranges.get(name), scale.get(name)))
             index.append(i)
         if not free:
             raise ModelError(f"model {model.name}: every parameter is fixed; free at least one")
-        return cls(model, tuple(free), base, tuple(index), use_log)
+        open_ended = frozenset(name for name, given in ranges.items() if one_sided(given))
+        space = cls(
+            model, tuple(free), model.vector(fixed), tuple(index),
+            ties=followers, one_sided=open_ended,
+        )  # fmt: skip
+        space._check_ties()
+        return space
 
     @classmethod
     def of_starts(cls, model: ProcessModel, vector: FloatArray, n_records: int) -> SearchSpace:
@@ -152,6 +156,31 @@ class SearchSpace:
         return np.array([parameter.upper for parameter in self.parameters])
 
     @property
+    def hard_lower(self) -> FloatArray:
+        """Low ends that the search keeps to, (n_free,); -inf where there is none."""
+        # A logarithm cannot pass zero, wherever the physical limit is.
+        least = np.where(self.log, np.maximum(self.minimum, 0.0), self.minimum)
+        return np.where(self._open_ended, least, self.lower)
+
+    @property
+    def hard_upper(self) -> FloatArray:
+        """High ends that the search keeps to, (n_free,); inf where there is none."""
+        return np.where(self._open_ended, self.maximum, self.upper)
+
+    def coded_bounds(self) -> tuple[FloatArray, FloatArray]:
+        """``hard_lower`` and ``hard_upper`` in search coordinates, (n_free,) each."""
+        with np.errstate(divide="ignore"):  # the logarithm of zero is the bound -inf
+            return self.encode(self.hard_lower), self.encode(self.hard_upper)
+
+    def on_bound(self, chromosome: FloatArray) -> BoolArray:
+        """Which values of a chromosome (n_free,) stand on a bound of their range."""
+        lower, upper = self.coded_bounds()
+        near = _ON_BOUND * (self.encode(self.upper) - self.encode(self.lower))
+        at = self.encode(chromosome)
+        mask: BoolArray = (at < lower + near) | (at > upper - near)
+        return mask
+
+    @property
     def minimum(self) -> FloatArray:
         """Physical minima, (n_free,)."""
         return np.array([parameter.minimum for parameter in self.parameters])
@@ -164,8 +193,11 @@ class SearchSpace:
     @property
     def log(self) -> BoolArray:
         """Mask of the parameters searched by logarithm, (n_free,)."""
-        flags = [self.use_log and parameter.scale == "log" for parameter in self.parameters]
-        return np.array(flags, dtype=bool)
+        return np.array([parameter.scale == "log" for parameter in self.parameters], dtype=bool)
+
+    @property
+    def _open_ended(self) -> BoolArray:
+        return np.array([parameter.name in self.one_sided for parameter in self.parameters], bool)
 
     def encode(self, chromosomes: FloatArray) -> FloatArray:
         """Search coordinates of chromosomes, (..., n_free)."""
@@ -176,26 +208,48 @@ class SearchSpace:
     def decode(self, coded: FloatArray) -> FloatArray:
         """Chromosomes of search coordinates, (..., n_free)."""
         chromosomes = np.array(coded, dtype=np.float64)
-        chromosomes[..., self.log] = np.exp(chromosomes[..., self.log])
+        with np.errstate(over="ignore"):  # beyond an open end there is no limit
+            chromosomes[..., self.log] = np.exp(chromosomes[..., self.log])
         return chromosomes
+
+    def _check_ties(self) -> None:
+        """Raise ModelError for a tie that nowhere gives a physically possible value."""
+        low, high = self.full(self.lower), self.full(self.upper)
+        for tie in self.ties:
+            parameter = self.model.parameters[tie.index]
+            ends = sorted((low[tie.index], high[tie.index]))
+            if ends[1] < parameter.minimum or ends[0] > parameter.maximum:
+                raise ModelError(
+                    f"parameter {parameter.name}: tied to "
+                    f"{self.model.parameter_names[tie.source]} it would be {ends[0]:g} .. "
+                    f"{ends[1]:g}, outside its physical limits [{parameter.minimum:g}, "
+                    f"{parameter.maximum:g}]"
+                )
 
     def full(self, chromosomes: FloatArray) -> FloatArray:
         """Complete parameter vectors of chromosomes, (..., n_parameters)."""
         chromosomes = np.asarray(chromosomes)
         vectors = np.broadcast_to(self.base, (*chromosomes.shape[:-1], len(self.base))).copy()
         vectors[..., list(self.index)] = chromosomes[..., : len(self.index)]
+        for tie in self.ties:
+            vectors[..., tie.index] = tie.factor * vectors[..., tie.source]
         return vectors
 
     def violations(self, chromosomes: FloatArray) -> FloatArray:
         """Inequality violations max(0, g) of (4.15), (n_chromosomes, n_constraints).
 
-        First the physical limits of each free parameter, then the model's constraints.
+        First the physical limits of each free parameter, then those of the tied ones, then the
+        model's constraints.
         """
         vectors = self.full(chromosomes)
         columns = tuple(vectors[:, i] for i in range(vectors.shape[1]))
         below = np.maximum(0.0, self.minimum - chromosomes)
         above = np.maximum(0.0, chromosomes - self.maximum)
         rows = [below, above]
+        for tie in self.ties:
+            parameter, values = self.model.parameters[tie.index], columns[tie.index]
+            outside = np.maximum(parameter.minimum - values, values - parameter.maximum)
+            rows.append(np.maximum(0.0, outside)[:, None])
         for constraint in self.model.constraints:
             values = np.broadcast_to(constraint.function(columns), (len(chromosomes),))
             rows.append(np.maximum(0.0, values)[:, None])
@@ -204,9 +258,17 @@ class SearchSpace:
         return np.where(np.isnan(violations), np.inf, violations)
 
 
-def _check_limits(parameter: Parameter, lower: float, upper: float) -> None:
-    if lower < parameter.minimum or upper > parameter.maximum:
-        raise ModelError(
-            f"parameter {parameter.name}: range [{lower:g}, {upper:g}] leaves what is physically "
-            f"possible, [{parameter.minimum:g}, {parameter.maximum:g}]"
-        )
+def _check_conflicts(*groups: Mapping[str, object]) -> None:
+    """Raise ModelError where a parameter has been said to be two things."""
+    ranges, fixed, tied, scale = groups
+    pairs = (
+        (ranges, fixed, "both a range and a fixed value"),
+        (ranges, tied, "a range but is tied to another"),
+        (fixed, tied, "a fixed value but is tied to another"),
+        (scale, fixed, "a scale but is fixed"),
+        (scale, tied, "a scale but is tied to another"),
+    )
+    for one, other, what in pairs:
+        both = sorted(set(one) & set(other))
+        if both:
+            raise ModelError(f"parameter {both[0]} has {what}; keep one")

@@ -107,19 +107,27 @@ def identify(
         int | None, typer.Option("--generations", help="Generations evaluated.")
     ] = None,
     seed: Annotated[int | None, typer.Option("--seed", help="One seed gives one result.")] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="KEY=VALUE",
+            help="Any key of the configuration file, such as fixed.R_m=1.18; may be repeated.",
+        ),
+    ] = None,
     json: AsJson = False,
 ) -> None:
     """Identify a model's parameters from logs: one parameter set for all of them."""
     from daq.cli.identifying import identify_command
 
-    overrides = {
+    options = {
         "model": model,
         "preset": preset,
         "population": population,
         "generations": generations,
         "seed": seed,
     }
-    identify_command(logs, validate or [], config, out, overrides, json)
+    identify_command(logs, validate or [], config, out, options, settings or [], json)
 
 
 @app.command(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import os
+import re
 from collections.abc import Mapping as MappingType
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,20 +25,22 @@ from daq.errors import ConfigError
 from sysid import ModelError, SearchSpace, evaluate
 from sysid.gassi import GASSI, PRESETS, Progress
 from sysid.metrics import Metrics
-from sysid.model import ProcessModel
-
-# A search value this close to an end of its range, in parts of the range, stands on it.
-_ON_BOUND = 1e-3
+from sysid.model import Parameter, ProcessModel
+from sysid.ranges import Range
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """Settings of an identification, checked before any log is read or rig moved."""
+    """Settings of an identification, checked before any log is read or rig moved.
+
+    sources: where each parameter's range or value stands that is not the model's own.
+    """
 
     model: ProcessModel
     model_name: str
     settings: IdentificationConfig
     mapping: Mapping | None
+    sources: MappingType[str, str]
 
 
 def identify_command(
@@ -45,11 +48,12 @@ def identify_command(
     validate: list[Path],
     config: Path | None,
     out: Path | None,
-    overrides: MappingType[str, Any],
+    options: MappingType[str, Any],
+    settings: list[str],
     as_json: bool,
 ) -> None:
     """Identify one parameter set from logs and print it."""
-    prepared = prepare(config, overrides)
+    prepared = prepare(config, options, settings)
     folder = out or default_folder(logs, prepared.model.name)
     check_writable(folder)
     report = identify_logs(prepared, logs, validate, folder, as_json)
@@ -57,26 +61,32 @@ def identify_command(
         console.print_json(report)
 
 
-def prepare(config: Path | None, overrides: MappingType[str, Any]) -> Prepared:
-    """Read and check settings and model; ConfigError names file, line, key and cure."""
-    return prepare_models(config, overrides, [overrides.get("model")])[0]
+def prepare(
+    config: Path | None, options: MappingType[str, Any], more: Sequence[str] = ()
+) -> Prepared:
+    """Read and check settings and model; ConfigError names file, line, key and cure.
+
+    options: by name, None for those not given. more: any setting as ``key=value``.
+    """
+    return prepare_models(config, options, [options.get("model")], more)[0]
 
 
 def prepare_models(
-    config: Path | None, overrides: MappingType[str, Any], names: Sequence[str | None]
+    config: Path | None,
+    options: MappingType[str, Any],
+    names: Sequence[str | None],
+    more: Sequence[str] = (),
 ) -> list[Prepared]:
     """The same settings for each of several models.
 
-    Each takes the ranges, fixed values and weights that it has a name for; names that none has
+    Each takes the ranges, fixed values and the like that it has a name for; names that none has
     are mistakes.
     """
-    given = {key: value for key, value in overrides.items() if value is not None}
-    typed = CommandLine.of(given)
-    yaml_file.validate(typed, IdentificationConfig)
-    file = yaml_file.load(config) if config is not None else typed
-    settings = yaml_file.validate(file, IdentificationConfig, {**file.content, **given})
+    given = {key: value for key, value in options.items() if value is not None}
+    file = CommandLine.of(given, more, yaml_file.load(config) if config is not None else None)
+    settings = yaml_file.validate(file, IdentificationConfig)
     if settings.preset not in PRESETS:
-        raise (typed if "preset" in given else file).error(
+        raise file.error(
             ("preset",), f"unknown preset {settings.preset!r}; "
             f"{suggestion(settings.preset, list(PRESETS))}"
         )  # fmt: skip
@@ -89,7 +99,7 @@ def prepare_models(
         _check_space(file, own, model)
         if mapping is not None:
             datasets.check_mapping(model, mapping)
-        prepared.append(Prepared(model, name, own, mapping))
+        prepared.append(Prepared(model, name, own, mapping, _range_sources(file)))
     return prepared
 
 
@@ -101,6 +111,8 @@ def gassi_settings(settings: IdentificationConfig) -> dict[str, Any]:
         "generations": settings.generations,
         "ranges": settings.ranges,
         "fixed": settings.fixed,
+        "tied": settings.tied,
+        "scale": settings.scale,
         "elite_percent": settings.elite_percent,
         "weights": settings.weights or None,
         "per_log": settings.per_log,
@@ -111,18 +123,30 @@ def gassi_settings(settings: IdentificationConfig) -> dict[str, Any]:
 
 
 def _find(
-    config: Path | None, file: YamlFile, settings: IdentificationConfig, typed: str | None
+    config: Path | None, file: CommandLine, settings: IdentificationConfig, typed: str | None
 ) -> tuple[ProcessModel, str]:
     """A model and its whole name, from the command line or else the configuration."""
     # A name on the command line is relative to where it is typed, one in a file to that file.
+    if typed is None and "model" in file.typed:
+        typed = settings.model
     beside = config.parent if config is not None and typed is None else None
     name = typed or settings.model or DEFAULT_MODEL
     try:
         return find_model(name, beside), whole_name(name, beside)
     except ConfigError as error:
-        if config is None or typed is not None or settings.model is None:
+        if beside is None or settings.model is None:
             raise
         raise file.error(("model",), str(error)) from None
+
+
+def _range_sources(file: CommandLine) -> dict[str, str]:
+    """Where the range or value of each parameter was given, for those not left to the model."""
+    found = {}
+    for group in ("ranges", "fixed", "tied"):
+        for name in file.content.get(group) or {}:
+            # Without the column: the line is what one looks for.
+            found[str(name)] = re.sub(r"(:\d+):\d+$", r"\1", file.where((group, str(name))))
+    return found
 
 
 def identify_logs(
@@ -149,7 +173,7 @@ def identify_logs(
     path = _write(folder, report)
     report["files"] = {"parameters": str(path)}
     if not as_json:
-        _print_report(estimator, model, scores, train, check, path, prepared.mapping)
+        _print_report(estimator, prepared, scores, train, check, path)
     return report
 
 
@@ -162,6 +186,8 @@ def _check_names(
     groups: tuple[tuple[str, dict[str, Any], tuple[str, ...]], ...] = (
         ("ranges", settings.ranges, parameters),
         ("fixed", settings.fixed, parameters),
+        ("tied", settings.tied, parameters),
+        ("scale", settings.scale, parameters),
         ("weights", settings.weights, outputs),
     )
     for group, given, known in groups:
@@ -175,25 +201,39 @@ def _check_names(
 
 def _own_settings(settings: IdentificationConfig, model: ProcessModel) -> IdentificationConfig:
     """The settings without what is meant for other models."""
-    known = set(model.parameter_names)
-    own: dict[str, Any] = {
-        "ranges": {k: v for k, v in settings.ranges.items() if k in known},
-        "fixed": {k: v for k, v in settings.fixed.items() if k in known},
-        "weights": {k: v for k, v in settings.weights.items() if k in model.output_names},
+    known = dict.fromkeys(("ranges", "fixed", "tied", "scale"), model.parameter_names)
+    known["weights"] = model.output_names
+    own = {
+        group: {name: value for name, value in getattr(settings, group).items() if name in names}
+        for group, names in known.items()
     }
     return settings.model_copy(update=own)
 
 
 def _check_space(file: YamlFile, settings: IdentificationConfig, model: ProcessModel) -> None:
-    for name in settings.ranges:
-        try:
-            SearchSpace.of(model, {name: settings.ranges[name]}, {})
-        except ModelError as error:
-            raise file.error(("ranges", name), str(error)) from None
+    ranges, fixed, tied, scale = (
+        settings.ranges, settings.fixed, settings.tied, settings.scale,
+    )  # fmt: skip
+    # One parameter at a time first, so that the message can point at it.
+    for name in ranges:
+        _try_space(file, ("ranges", name), model, {name: ranges[name]})
+    for name in scale:
+        own = {name: ranges[name]} if name in ranges else {}
+        if name not in fixed and name not in tied:
+            _try_space(file, ("scale", name), model, own, scale={name: scale[name]})
+    for name in tied:
+        _try_space(file, ("tied", name), model, tied={name: tied[name]})
+    groups = ("tied", "fixed", "scale", "ranges")
+    group = next((key for key in groups if file.content.get(key)), "ranges")
+    _try_space(file, (group,), model, ranges, fixed, tied=tied, scale=scale)
+
+
+def _try_space(file: YamlFile, key: tuple[str, ...], *args: Any, **more: Any) -> None:
+    """Raise ConfigError at a key where the search space that it is part of makes no sense."""
     try:
-        SearchSpace.of(model, settings.ranges, settings.fixed)
+        SearchSpace.of(*args, **more)
     except ModelError as error:
-        raise file.error(("fixed",), str(error)) from None
+        raise file.error(key, str(error)) from None
 
 
 def no_overlap(train: list[Loaded], check: list[Loaded]) -> None:
@@ -265,9 +305,13 @@ def _report(
         if parameter.name in free:
             searched = free[parameter.name]
             entry["range"] = [searched.lower, searched.upper]
+            entry["scale"] = searched.scale
             entry["on_bound"] = _on_bound(estimator, parameter.name)
+        elif parameter.name in prepared.settings.tied:
+            entry["tied"] = prepared.settings.tied[parameter.name]
         else:
             entry["fixed"] = True
+        entry["source"] = _source(prepared, parameter.name)
         parameters[parameter.name] = entry
     logs = {
         part: [
@@ -299,6 +343,11 @@ def _report(
     }
 
 
+def _source(prepared: Prepared, name: str) -> str:
+    """Where a parameter's range or value comes from."""
+    return prepared.sources.get(name, "model")
+
+
 def _metrics(model: ProcessModel, metrics: Metrics) -> dict[str, Any]:
     return {
         "outputs": {
@@ -315,10 +364,7 @@ def _metrics(model: ProcessModel, metrics: Metrics) -> dict[str, Any]:
 
 def _on_bound(estimator: GASSI, name: str) -> bool:
     space = estimator.space_
-    at = space.names.index(name)
-    ends = space.encode(np.stack([space.lower, space.upper]))[:, at]
-    place = (space.encode(estimator.chromosome_)[at] - ends[0]) / (ends[1] - ends[0])
-    return bool(place < _ON_BOUND or place > 1.0 - _ON_BOUND)
+    return bool(space.on_bound(estimator.chromosome_)[space.names.index(name)])
 
 
 def _write(folder: Path, report: dict[str, Any]) -> Path:
@@ -336,19 +382,19 @@ def _write(folder: Path, report: dict[str, Any]) -> Path:
 
 def _print_report(
     estimator: GASSI,
-    model: ProcessModel,
+    prepared: Prepared,
     scores: dict[str, list[Metrics]],
     train: list[Loaded],
     check: list[Loaded],
     path: Path,
-    mapping: Mapping | None,
 ) -> None:
+    model, mapping = prepared.model, prepared.mapping
     console.print_line()
     console.print_table(
         f"Parameters of {model.name}",
-        ["parameter", "value", "unit", "searched in", ""],
-        [_parameter_row(estimator, model, p.name) for p in model.parameters],
-        text=["unit", ""],
+        ["parameter", "value", "unit", "searched in", "from", ""],
+        [_parameter_row(estimator, prepared, p.name) for p in model.parameters],
+        text=["unit", "from", ""],
     )
     single = len(train) == 1 and len(check) <= 1
     if single:
@@ -377,15 +423,23 @@ def _print_report(
                        f"--parameters {path}{columns}")  # fmt: skip
 
 
-def _parameter_row(estimator: GASSI, model: ProcessModel, name: str) -> list[str]:
-    parameter = model.parameter(name)
-    value = console.number(estimator.parameters_[name])
+def _parameter_row(estimator: GASSI, prepared: Prepared, name: str) -> list[str]:
+    parameter = prepared.model.parameter(name)
+    value, source = console.number(estimator.parameters_[name]), _source(prepared, name)
     searched = dict(zip(estimator.space_.names, estimator.space_.parameters, strict=True))
     if name not in searched:
-        return [name, value, parameter.unit, "fixed", ""]
-    low, high = searched[name].lower, searched[name].upper
-    span = f"{low:g} .. {high:g}"
-    return [name, value, parameter.unit, span, "at its end" if _on_bound(estimator, name) else ""]
+        how = f"= {prepared.settings.tied[name]}" if name in prepared.settings.tied else "fixed"
+        return [name, value, parameter.unit, how, source, ""]
+    span = _span(searched[name], prepared.settings.ranges.get(name))
+    note = "at its end" if _on_bound(estimator, name) else ""
+    return [name, value, parameter.unit, span, source, note]
+
+
+def _span(parameter: Parameter, given: Range | None) -> str:
+    """A range; in brackets an end that is only where the search starts."""
+    ends = (parameter.lower, parameter.upper)
+    bounds = zip(ends, given or ends, strict=True)
+    return " .. ".join(f"({end:g})" if bound is None else f"{end:g}" for end, bound in bounds)
 
 
 def print_metrics(

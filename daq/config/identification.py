@@ -9,14 +9,16 @@ from pydantic import AfterValidator, Field, model_validator
 from daq.config.base import Section
 
 
-def _ordered(ends: tuple[float, float]) -> tuple[float, float]:
+def _ordered(ends: tuple[float | None, float | None]) -> tuple[float | None, float | None]:
     low, high = ends
-    if low >= high:
+    if low is None and high is None:
+        raise ValueError("a range needs at least one end; write [low, high] or [low, null]")
+    if low is not None and high is not None and low >= high:
         raise ValueError(f"low end {low:g} is not below high end {high:g}; write [low, high]")
     return ends
 
 
-Range = Annotated[tuple[float, float], AfterValidator(_ordered)]
+Range = Annotated[tuple[float | None, float | None], AfterValidator(_ordered)]
 
 
 class TimeColumn(Section):
@@ -68,6 +70,12 @@ class IdentificationConfig(Section):
         default_factory=dict, description="search ranges in place of the model's"
     )
     fixed: dict[str, float] = Field(default_factory=dict, description="parameters not searched")
+    tied: dict[str, str] = Field(
+        default_factory=dict, description="multiples of other parameters, as '0.5 * R_m'"
+    )
+    scale: dict[str, Literal["log", "linear"]] = Field(
+        default_factory=dict, description="scales to search on in place of the model's"
+    )
     weights: dict[str, float] = Field(
         default_factory=dict, description="relative importance of the outputs"
     )

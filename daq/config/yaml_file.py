@@ -6,7 +6,7 @@ import difflib
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin
 
@@ -62,16 +62,67 @@ class YamlFile:
 
 @dataclass(frozen=True)
 class CommandLine(YamlFile):
-    """Settings given as options of a command."""
+    """Settings given as options of a command, over those of a file if there is one.
+
+    content: both together. typed: what the command line gave; its keys below ``named_options``
+    have options of their own, the others were given with ``--set``.
+    """
+
+    typed: Mapping[str, Any] = field(default_factory=dict)
+    named_options: frozenset[str] = frozenset()
 
     @classmethod
-    def of(cls, given: Mapping[str, Any]) -> CommandLine:
-        """Options by name, without their dashes."""
-        return cls(Path("command line"), dict(given), {})
+    def of(
+        cls, options: Mapping[str, Any], settings: Sequence[str] = (), file: YamlFile | None = None
+    ) -> CommandLine:
+        """Options by name without their dashes, and settings as ``key.key=value``.
+
+        Raises ConfigError for a setting that is not of that form.
+        """
+        typed: dict[str, Any] = dict(options)
+        for text in settings:
+            typed = merge(typed, _setting(text))
+        path = file.path if file else Path("command line")
+        content = merge(file.content if file else {}, typed)
+        places = file.places if file else {}
+        return cls(path, content, places, typed, frozenset(options))
+
+    def where(self, key: Key) -> str:
+        """``command line``, or the place in the file."""
+        return "command line" if self._is_typed(key) else super().where(key)
 
     def named(self, key: Key) -> str:
-        """The option as it is typed."""
-        return f"--{dotted(key)}"
+        """The option as it is typed, or the key in the file."""
+        if not self._is_typed(key):
+            return super().named(key)
+        return f"--{dotted(key)}" if key[0] in self.named_options else f"--set {dotted(key)}"
+
+    def _is_typed(self, key: Key) -> bool:
+        """Whether a key, or all there is of the section it belongs in, was typed."""
+        level: Any = self.typed
+        for depth, part in enumerate(key):
+            if not isinstance(level, Mapping):
+                return True
+            if part not in level:
+                return depth > 0 and key[:depth] not in self.places
+            level = level[part]
+        return not isinstance(level, Mapping) or key not in self.places
+
+
+def _setting(text: str) -> dict[str, Any]:
+    """``a.b=value`` as {a: {b: value}}, the value read as YAML."""
+    name, equals, value = text.partition("=")
+    keys = [part.strip() for part in name.split(".")]
+    if not equals or not all(keys):
+        raise ConfigError(f"--set {text}: write KEY=VALUE, for example ranges.K_m=[0.1,0.2]")
+    try:
+        content: Any = yaml.load(value, Loader=_Loader)
+    except yaml.YAMLError:
+        raise ConfigError(f"--set {text}: {value!r} is not valid YAML") from None
+    for key in reversed(keys):
+        content = {key: content}
+    found: dict[str, Any] = content
+    return found
 
 
 def dotted(key: Key) -> str:

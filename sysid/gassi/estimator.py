@@ -13,8 +13,9 @@ from sklearn.utils.validation import check_is_fitted
 from sysid.data import Dataset
 from sysid.gassi.search import PRESETS, GeneticSearch, PresetName
 from sysid.metrics import fit_percent
-from sysid.model import FloatArray, ModelError, ProcessModel
+from sysid.model import FloatArray, ModelError, ProcessModel, Scale
 from sysid.objective import Objective
+from sysid.ranges import Range
 from sysid.refinement import Refinement, refine
 from sysid.simulation import BatchSimulator, Status
 from sysid.space import SearchSpace
@@ -40,8 +41,11 @@ class GASSI(BaseEstimator):  # type: ignore[misc]
     preset : ``default``, ``thesis`` (Algorithms 2 to 5 with the penalty (4.13)-(4.20), as
         written), ``cega`` (the same without penalty) or ``classic`` (Algorithm 1).
     population, generations : chromosomes per generation, generations evaluated.
-    ranges : {name: (lower, upper)}, search ranges in place of the model's.
+    ranges : {name: (lower, upper)}, search ranges in place of the model's. One of the ends may
+        be None: then the other is a bound, and this one only where the search starts.
     fixed : {name: value}, parameters not searched.
+    tied : {name: "0.5 * other"}, parameters that are multiples of others.
+    scale : {name: "log" or "linear"}, scales to search on in place of the model's.
     elite_percent : share of the population replaced by the elite, r_elite.
     minimum_generations, termination_ratio : i_min and r_termination of (4.11).
     weights : {output: weight}, relative importance of the outputs.
@@ -74,8 +78,10 @@ class GASSI(BaseEstimator):  # type: ignore[misc]
         preset: PresetName = "default",
         population: int = 300,
         generations: int = 40,
-        ranges: Mapping[str, tuple[float, float]] | None = None,
+        ranges: Mapping[str, Range] | None = None,
         fixed: Mapping[str, float] | None = None,
+        tied: Mapping[str, str] | None = None,
+        scale: Mapping[str, Scale] | None = None,
         elite_percent: float = 0.5,
         minimum_generations: int = 0,
         termination_ratio: float = 0.0,
@@ -92,6 +98,8 @@ class GASSI(BaseEstimator):  # type: ignore[misc]
         self.generations = generations
         self.ranges = ranges
         self.fixed = fixed
+        self.tied = tied
+        self.scale = scale
         self.elite_percent = elite_percent
         self.minimum_generations = minimum_generations
         self.termination_ratio = termination_ratio
@@ -122,7 +130,9 @@ class GASSI(BaseEstimator):  # type: ignore[misc]
         preset = PRESETS.get(self.preset)
         if preset is None:
             raise ModelError(f"unknown preset {self.preset!r}; choose from {', '.join(PRESETS)}")
-        self.space_ = SearchSpace.of(model, self.ranges, self.fixed, preset.log_scale)
+        self.space_ = SearchSpace.of(
+            model, self.ranges, self.fixed, preset.log_scale, tied=self.tied, scale=self.scale
+        )
         simulator = self._simulator()
         objective = Objective(
             simulator, self.space_, records, per_log=self.per_log, weights=self._weights(model)

@@ -25,10 +25,10 @@ class Preset:
 
     operators: ``adaptive`` (Algorithms 2 to 5) or ``classic`` (Algorithm 1). penalty: whether
     infeasible chromosomes are penalised (4.13)-(4.20). log_scale: search parameters marked
-    ``log`` by their logarithm. keep_in_range: clip to the ranges; else a range is only where
-    the search starts. spread: mutation noise from the ``initial`` population, as written, or
-    from the ``current`` one. stratified: Latin-hypercube start. refine: finish with local
-    least squares.
+    ``log`` by their logarithm. keep_in_range: clip to the ranges' bounds; else a range
+    is only where the search starts. spread: mutation noise from the ``initial`` population, as
+    written, or from the ``current`` one. stratified: Latin-hypercube start. refine: finish with
+    local least squares.
     """
 
     operators: Literal["adaptive", "classic"]
@@ -92,9 +92,9 @@ class GeneticSearch:
             raise ModelError(f"generations is {self.generations}; it must be at least 1")
         if not 0.0 <= self.elite_percent < 100.0:
             raise ModelError(f"elite_percent is {self.elite_percent}; it must be in [0, 100)")
-        log = self.space.log
-        self._lower, self._upper = self.space.lower.copy(), self.space.upper.copy()
-        self._lower[log], self._upper[log] = np.log(self._lower[log]), np.log(self._upper[log])
+        self._lower = self.space.encode(self.space.lower)
+        self._upper = self.space.encode(self.space.upper)
+        self._bounds = self.space.coded_bounds()
         draw = operators.stratified if self.preset.stratified else operators.uniform
         self._coded = draw(self.population, self._lower, self._upper, self.rng)
         self._initial_spread = self._coded.std(axis=0)
@@ -128,7 +128,7 @@ class GeneticSearch:
         else:
             self._breed_classic(fitness)
         if self.preset.keep_in_range:
-            np.clip(self._coded, self._lower, self._upper, out=self._coded)
+            np.clip(self._coded, *self._bounds, out=self._coded)
 
     def _save_elite(self, errors: FloatArray, scores: FloatArray, chromosomes: FloatArray) -> None:
         """Keep the best yet: feasible before infeasible, then the lower error (4.9)."""

@@ -21,7 +21,6 @@ from sysid.uncertainty.estimate import Z95, Estimate, Why, product_text, sum_tex
 from sysid.uncertainty.relations import Kind, Relation, overlapping, relations
 from sysid.uncertainty.sensitivity import common_steps, coordinate_units, sensitivity
 
-_ON_BOUND = 1e-3  # a search value this close to an end of its range stands on it
 _SHARE = 0.1  # entries of a vague direction below this share of its largest are not worth naming
 _WHOLE = 1e-3  # a factor this close to a whole number is meant to be one
 
@@ -92,10 +91,7 @@ def uncertainty(objective: Objective, chromosome: FloatArray) -> Uncertainty:
 
 def on_bound(space: SearchSpace, chromosome: FloatArray) -> BoolArray:
     """Parameters at an end of their range, (n_free,)."""
-    low, high = space.encode(np.stack([space.lower, space.upper]))
-    place = (space.encode(chromosome) - low) / (high - low)
-    at: BoolArray = (place < _ON_BOUND) | (place > 1.0 - _ON_BOUND)
-    return at
+    return space.on_bound(chromosome)
 
 
 @dataclass(frozen=True)

@@ -69,9 +69,7 @@ def overlapping(supports: list[BoolArray]) -> list[list[int]]:
     return groups
 
 
-def _kind(
-    objective: Objective, chromosome: FloatArray, steps: list[int], step: FloatArray
-) -> Kind:
+def _kind(objective: Objective, chromosome: FloatArray, steps: list[int], step: FloatArray) -> Kind:
     """Follow a direction as a product and as a sum; what leaves the outputs alone."""
     with np.errstate(divide="ignore", invalid="ignore"):
         relative = np.where(step != 0.0, step / chromosome, 0.0)

@@ -275,6 +275,31 @@ def test_a_model_and_a_csv_of_ones_own_work_like_the_built_in(tmp_path):
     assert json.loads(replayed.stdout)["outputs"]["y"]["fit_percent"] > 99.0
 
 
+def test_the_report_says_where_every_range_came_from(tmp_path):
+    foreign_log(tmp_path / "bench.csv")
+    two = OWN_MODEL.replace("1.0, \"log\"),)", "1.0, \"log\"), "
+                            "Parameter(\"a\", \"1\", 1, 0, 2), Parameter(\"b\", \"1\", 1, 0, 2),"
+                            "Parameter(\"c\", \"1\", 1, 0, 2))")  # fmt: skip
+    (tmp_path / "lag.py").write_text(two.replace("p[0],)", "p[0] * p[1] / p[2] * p[3],)"))
+    (tmp_path / "id.yaml").write_text(OWN_CONFIG + "ranges:\n  tau: [0.1, null]\ntied: {b: a}\n")
+    result = rig(
+        "identify", "bench.csv", "--config", "id.yaml", "--set", "fixed.a=1.5", "--set",
+        "population=20", "--out", "found", cwd=tmp_path,
+    )  # fmt: skip
+    assert result.returncode == 0, result.stderr
+    found = yaml.safe_load((tmp_path / "found" / "parameters.yaml").read_text())
+    assert found["search"]["population"] == 20
+    parameters = found["parameters"]
+    assert {name: entry["source"] for name, entry in parameters.items()} == {
+        "tau": "id.yaml:12", "a": "command line", "b": "id.yaml:13", "c": "model",
+    }  # fmt: skip
+    assert parameters["tau"]["range"] == [0.1, 1.0] and parameters["tau"]["scale"] == "log"
+    assert parameters["a"]["value"] == parameters["b"]["value"] == 1.5
+    assert parameters["a"]["fixed"] is True and parameters["b"]["tied"] == "a"
+    for line in ("0.1 .. (1)", "= a", "id.yaml:13", "command line"):
+        assert line in result.stdout
+
+
 def test_one_seed_gives_one_result(captured, tmp_path):
     root, folder = captured
     values = []

@@ -82,9 +82,39 @@ def test_ranges_and_fixed_values_are_kept():
     np.testing.assert_array_equal(found.vector_, list(found.parameters_.values()))
 
 
+def test_a_search_passes_an_open_end_but_not_a_given_one():
+    for given, expected in (
+        ((2.0, None), 2.0),  # the truth is below
+        ((0.4, 0.7), 0.7),  # and above
+        ((None, 0.3), 0.3),
+    ):
+        found = quick(ranges={"resistance": given}).fit(motor_record())
+        assert found.parameters_["resistance"] == pytest.approx(expected, rel=1e-6)
+        assert found.space_.on_bound(found.chromosome_).tolist()[0]
+    # 0.05 .. 0.5 is only where this one starts.
+    model = motor().with_parameters(resistance={"lower": 0.05, "upper": 0.5, "nominal": 0.1})
+    found = quick(population=100, generations=20, ranges={"resistance": (0.02, None)})
+    found.set_params(model=model).fit(motor_record())
+    assert found.parameters_["resistance"] == pytest.approx(1.0, rel=0.02)
+    assert not found.space_.on_bound(found.chromosome_).any()
+
+
+def test_tied_parameters_stay_tied_and_a_scale_is_taken():
+    true = MOTOR["damping"] / MOTOR["inertia"]
+    found = quick(
+        population=100, generations=10, tied={"damping": f"{true} * inertia"},
+        scale={"resistance": "linear"},
+    ).fit(motor_record())  # fmt: skip
+    assert found.space_.names == ("resistance", "inductance", "inertia", "constant")
+    assert found.space_.log.tolist() == [False, True, True, True]
+    np.testing.assert_allclose(found.vector_, TRUE, rtol=0.02)
+    assert found.parameters_["damping"] == pytest.approx(true * found.parameters_["inertia"])
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
+        ({"tied": {"damping": "inertai"}}, "no parameter 'inertai'"),
         ({"ranges": {"speed": (0.0, 1.0)}}, "no parameter 'speed'"),
         ({"ranges": {"resistance": (2.0, 1.0)}}, "low end"),
         ({"ranges": {"resistance": (-2.0, 1.0)}}, "physically possible"),
