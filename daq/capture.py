@@ -6,6 +6,7 @@ import datetime
 import hashlib
 import importlib.metadata
 import json
+import math
 import platform
 import subprocess
 import sys
@@ -84,6 +85,24 @@ class Recording:
         """Folder name of a capture, or file name of a lone log."""
         path = self.log.path
         return path.parent.name if path.name == LOG_NAME else path.stem
+
+    def noise(self, channel: str) -> tuple[float, float]:
+        """Standard deviations of a channel's noise and of its zero, as the calibration found them.
+
+        Zeros for a channel that was not calibrated, and without a run record.
+        """
+        found = (self.record or {}).get("calibration", {})
+        try:
+            deviation = float(found.get("noise", {}).get(channel, 0.0))
+            samples = int(found.get("samples", 1))
+            if not (math.isfinite(deviation) and deviation >= 0.0 and samples > 0):
+                raise ValueError
+        except (AttributeError, TypeError, ValueError):
+            raise ConfigError(
+                f"{self.log.path.parent / RUN_NAME}: 'calibration' must hold 'samples' and, for "
+                f"{channel}, a 'noise' of 0 or more; delete it to go without"
+            ) from None
+        return deviation, deviation / math.sqrt(samples)
 
 
 def load(path: Path) -> Recording:

@@ -233,11 +233,17 @@ class _Run:
             return done >= wanted
 
         self._stream_zeros(enough)
-        means = {
-            name: float(np.concatenate([getattr(block, name) for block in blocks]).mean())
+        read = {
+            name: np.concatenate([getattr(block, name) for block in blocks])
             for name in ("current_motor", "current_brake", "torque")
         }
+        means = {name: float(values.mean()) for name, values in read.items()}
         self.rig.take_offsets(means)
+        # How far the offsets, and every later sample, may be trusted.
+        self.capture.record["calibration"] = {
+            "samples": len(read["torque"]),
+            "noise": {name: float(values.std()) for name, values in read.items()},
+        }
         self.capture.record["offsets"] = {
             **means,
             "volts": self.rig.offsets.volts.tolist(),

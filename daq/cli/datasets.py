@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +57,7 @@ def load(path: Path, model: ProcessModel, mapping: Mapping | None) -> Loaded:
         if mapping is not None:
             return _load_foreign(capture.log_path(path), model, mapping)
         recording = capture.load(path)
-        dataset = _from_log(recording.log, model, recording.name)
+        dataset = _with_noise(_from_log(recording.log, model, recording.name), recording, model)
         return Loaded(dataset, recording.log.path, recording.warning)
     except ModelError as error:
         raise ConfigError(f"{path}: {error}") from None
@@ -107,6 +107,15 @@ def _from_log(log: Log, model: ProcessModel, title: str) -> Dataset:
     outputs = log.frame[list(model.output_names)].to_numpy(dtype=np.float64)
     tick = log.frame["tick"].to_numpy()
     return _dataset(log.path, model, inputs, outputs, tick, log.dt, title)
+
+
+def _with_noise(dataset: Dataset, recording: capture.Recording, model: ProcessModel) -> Dataset:
+    """The record with what its offset calibration told of noise and zeros."""
+    inputs = np.array([recording.noise(name) for name in model.input_names]).reshape(-1, 2)
+    outputs = np.array([recording.noise(name) for name in model.output_names]).reshape(-1, 2)
+    return replace(
+        dataset, input_noise=inputs[:, 0], input_zero=inputs[:, 1], output_zero=outputs[:, 1]
+    )
 
 
 def _load_foreign(path: Path, model: ProcessModel, mapping: Mapping) -> Loaded:

@@ -17,7 +17,7 @@ _MAX_SAMPLES = 20_000_000
 class OffsetCalibration(Section):
     """Mean of the analog inputs at zero command, taken off all later samples."""
 
-    samples: int = Field(400, ge=1, le=1_000_000, description="samples averaged")
+    samples: int = Field(3200, ge=1, le=1_000_000, description="samples averaged")
 
 
 class Homing(Section):
