@@ -195,7 +195,7 @@ def campaign(
     threads = _threads(n_jobs, len(runs))
     packed = _Packed()
     jobs = [
-        joblib.delayed(_identify)(place, *packed.arguments(runs[place], threads))
+        joblib.delayed(_identify)(place, *packed.arguments(runs[place]), runs[place].seed, threads)
         for place in _order(runs)
     ]
     found: dict[int, Outcome] = {}
@@ -224,22 +224,18 @@ def campaign(
 
 
 class _Packed:
-    """Parcels of models and records, each packed once however many runs share it."""
+    """Parcels of what runs share, each packed once."""
 
     def __init__(self) -> None:
         self._parcels: dict[tuple[int, ...], bytes] = {}
 
-    def arguments(self, run: Run, threads: int) -> tuple[Any, ...]:
-        """Arguments of ``_identify`` behind the first."""
-        settings = {"threads": threads, **run.settings, "random_state": run.seed}
+    def arguments(self, run: Run) -> tuple[bytes, bytes, bytes]:
+        """Model, records and settings."""
+        records = tuple(map(id, (*run.records, None, *run.validation)))
         return (
             self._parcel(f"model {run.name}", (id(run.model),), run.model),
-            self._parcel(
-                "records",
-                tuple(map(id, (*run.records, None, *run.validation))),
-                (run.records, run.validation),
-            ),
-            pack(f"settings of {run.name}", settings),
+            self._parcel("the records", records, (run.records, run.validation)),
+            self._parcel(f"settings of {run.name}", (id(run.settings),), dict(run.settings)),
         )
 
     def _parcel(self, what: str, key: tuple[int, ...], value: Any) -> bytes:
@@ -248,7 +244,9 @@ class _Packed:
         return self._parcels[key]
 
 
-def _identify(place: int, model: bytes, data: bytes, settings: bytes) -> bytes:
+def _identify(
+    place: int, model: bytes, data: bytes, settings: bytes, seed: int, threads: int
+) -> bytes:
     """What a worker does: fit, judge, and send back all but the model, which needs no journey."""
     from sysid.gassi import GASSI
 
@@ -258,7 +256,8 @@ def _identify(place: int, model: bytes, data: bytes, settings: bytes) -> bytes:
     problem = ""
     try:
         groups = unpack(data)
-        estimator = GASSI(_model(model), **unpack(settings))
+        given = {"threads": threads, **unpack(settings), "random_state": seed}
+        estimator = GASSI(_model(model), **given)
         fitted = estimator.fit(groups[0])
         scores = [
             tuple(evaluate(record.outputs, estimator.predict(record)) for record in group)

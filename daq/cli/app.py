@@ -43,6 +43,31 @@ ConfigFile = Annotated[
     Path | None,
     typer.Option("--config", metavar="ID.yaml", help="Search settings and column names."),
 ]
+ModelNames = Annotated[
+    list[str] | None,
+    typer.Option("--model", metavar="NAME|FILE.py:OBJECT", help="Process model; may be repeated."),
+]
+Validation = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--validate", metavar="RUN_OR_CSV", help="Log kept for validation; may be repeated."
+    ),
+]
+Preset = Annotated[str | None, typer.Option("--preset", help="default, thesis, cega or classic.")]
+Population = Annotated[int | None, typer.Option("--population", help="Chromosomes per generation.")]
+Generations = Annotated[int | None, typer.Option("--generations", help="Generations evaluated.")]
+Seeds = Annotated[
+    str | None,
+    typer.Option("--seeds", metavar="FIRST:END|LIST", help="0:10 for 0 to 9, or 3,5,8."),
+]
+Jobs = Annotated[
+    int | None,
+    typer.Option("--jobs", metavar="N", help="Runs at a time; default as many as cores."),
+]
+Dask = Annotated[
+    str | None,
+    typer.Option("--dask", metavar="tcp://HOST:PORT", help="Compute on this dask cluster."),
+]
 AsJson = Annotated[bool, typer.Option("--json", help="One JSON document on standard output.")]
 
 
@@ -86,26 +111,14 @@ def identify(
     logs: Logs,
     model: ModelName = None,
     config: ConfigFile = None,
-    validate: Annotated[
-        list[Path] | None,
-        typer.Option(
-            "--validate", metavar="RUN_OR_CSV", help="Log kept for validation; may be repeated."
-        ),
-    ] = None,
+    validate: Validation = None,
     out: Annotated[
         Path | None,
         typer.Option("--out", metavar="DIR", help="Where results go; default beside the log."),
     ] = None,
-    preset: Annotated[
-        str | None,
-        typer.Option("--preset", help="default, thesis, cega or classic."),
-    ] = None,
-    population: Annotated[
-        int | None, typer.Option("--population", help="Chromosomes per generation.")
-    ] = None,
-    generations: Annotated[
-        int | None, typer.Option("--generations", help="Generations evaluated.")
-    ] = None,
+    preset: Preset = None,
+    population: Population = None,
+    generations: Generations = None,
     seed: Annotated[int | None, typer.Option("--seed", help="One seed gives one result.")] = None,
     settings: Annotated[
         list[str] | None,
@@ -128,6 +141,40 @@ def identify(
         "seed": seed,
     }
     identify_command(logs, validate or [], config, out, options, settings or [], json)
+
+
+@app.command(
+    epilog="Example:  rig campaign runs/* --model actuator --model actuator:hysteresis=dahl "
+    "--seeds 0:5"
+)
+def campaign(
+    logs: Logs,
+    model: ModelNames = None,
+    config: ConfigFile = None,
+    validate: Validation = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="DIR", help="Where results go; default under campaigns/."),
+    ] = None,
+    seeds: Seeds = None,
+    together: Annotated[
+        bool, typer.Option("--together", help="One parameter set for all logs, not one for each.")
+    ] = False,
+    preset: Preset = None,
+    population: Population = None,
+    generations: Generations = None,
+    jobs: Jobs = None,
+    dask: Dask = None,
+    json: AsJson = False,
+) -> None:
+    """Identify every log with every model and seed, over all cores or a dask cluster."""
+    from daq.cli.campaigning import Workers, campaign_command
+
+    overrides = {"preset": preset, "population": population, "generations": generations}
+    campaign_command(
+        logs, validate or [], model or [], config, out, overrides, seeds, together,
+        Workers(jobs, dask), json,
+    )  # fmt: skip
 
 
 @app.command(

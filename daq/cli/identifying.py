@@ -169,8 +169,8 @@ def identify_logs(
         "training": [_score(estimator, log) for log in train],
         "validation": [_score(estimator, log) for log in check],
     }
-    report = _report(prepared, estimator, scores, train, check)
-    path = _write(folder, report)
+    report = report_of(prepared, estimator, scores, train, check)
+    path = write_parameters(folder, report)
     report["files"] = {"parameters": str(path)}
     if not as_json:
         _print_report(estimator, prepared, scores, train, check, path)
@@ -287,13 +287,14 @@ def _score(estimator: GASSI, log: Loaded) -> Metrics:
     return evaluate(log.dataset.outputs, estimator.predict(log.dataset))
 
 
-def _report(
+def report_of(
     prepared: Prepared,
     estimator: GASSI,
     scores: dict[str, list[Metrics]],
     train: list[Loaded],
     check: list[Loaded],
 ) -> dict[str, Any]:
+    """An identification for machines: parameters, metrics, search, versions."""
     model = prepared.model
     free = dict(zip(estimator.space_.names, estimator.space_.parameters, strict=True))
     parameters = {}
@@ -367,7 +368,8 @@ def _on_bound(estimator: GASSI, name: str) -> bool:
     return bool(space.on_bound(estimator.chromosome_)[space.names.index(name)])
 
 
-def _write(folder: Path, report: dict[str, Any]) -> Path:
+def write_parameters(folder: Path, report: dict[str, Any]) -> Path:
+    """Write a report as ``parameters.yaml``; ConfigError when the folder cannot be made."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

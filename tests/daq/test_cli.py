@@ -24,7 +24,7 @@ from tests.daq.support import (
 )
 from tests.daq.test_bad_input import MODEL
 
-COMMANDS = ("run", "check", "identify", "replay", "models")
+COMMANDS = ("run", "check", "identify", "campaign", "replay", "models")
 
 
 @pytest.fixture(scope="module")

@@ -113,7 +113,7 @@ def test_a_dask_cluster_gives_the_serial_result_to_the_bit(serial):
         warnings.simplefilter("ignore")
         with (
             distributed.LocalCluster(
-                n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
+                n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0"
             ) as cluster,
             distributed.Client(cluster) as client,
             joblib.parallel_config(backend="dask"),
