@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import io
 import os
-import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -14,9 +11,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from daq.config.yaml_file import suggestion
 from daq.errors import ConfigError, RunError
 from daq.hal import FloatArray, IntArray, Samples
+from daq.table import column_names, read_table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -120,15 +117,6 @@ class LogWriter:
 
 
 @dataclass(frozen=True)
-class Table:
-    """Columns of a CSV as numbers; ``torn`` when its last line was cut and left out."""
-
-    path: Path
-    frame: pd.DataFrame
-    torn: bool
-
-
-@dataclass(frozen=True)
 class Log:
     """A log in SI units.
 
@@ -143,78 +131,47 @@ class Log:
     torn: bool
 
 
-def read_table(path: Path, columns: Sequence[str] = ()) -> Table:
-    """Read a CSV of numbers with a header line.
-
-    Separators may be followed by blanks. A cut last line is left out. Raises ConfigError that
-    names file, line and column for anything else that is not a table of finite numbers with
-    the given columns.
-    """
-    import pandas as pd
-
-    text, torn = _complete_lines(path)
-    header = _names(text)
-    _check_header(path, header, columns)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", pd.errors.ParserWarning)
-            frame = pd.read_csv(
-                io.StringIO(text), skipinitialspace=True, header=0, names=header,
-                index_col=False, dtype=str, keep_default_na=False, skip_blank_lines=False,
-                on_bad_lines="error",
-            )  # fmt: skip
-    except pd.errors.ParserWarning:
-        lines = text.splitlines()
-        line = next((i for i, s in enumerate(lines) if s.count(",") >= len(header)), 0)
-        raise ConfigError(
-            f"{path}:{line + 1}: {lines[line].count(',') + 1} cells, but the first line names "
-            f"{len(header)} columns; separate cells by commas and write decimals with a point"
-        ) from None
-    except pd.errors.ParserError as error:
-        reason = str(error).removeprefix("Error tokenizing data. C error: ").strip()
-        raise ConfigError(f"{path}: not a table: {reason}") from None
-    wanted = list(columns) or header
-    numbers = {name: _numbers(path, name, frame[name]) for name in wanted}
-    return Table(path, pd.DataFrame(numbers), torn)
-
-
 def load_log(path: Path) -> Log:
     """Read a log of this or of the original program.
 
     Raises ConfigError naming the file, line and column of what is wrong with it.
     """
-    present = _names(_complete_lines(path)[0])
+    present = column_names(path)
     columns = [name for name in COLUMNS if name in present or name in ORIGINAL_COLUMNS]
     table = read_table(path, columns)
     frame = table.frame
     require_rows(path, len(frame))
     time = frame["t"].to_numpy()
     tick = frame["tick"].to_numpy() if "tick" in frame else None
-    frame["tick"], dt = time_base(path, time, tick)
+    frame["tick"], dt = time_base(path, time, tick, first_line=table.first_line)
     for channel in ("motor", "brake"):
         # The original program logged only what it asked for.
         if f"applied_voltage_{channel}" not in frame:
             frame[f"applied_voltage_{channel}"] = frame[f"cmd_voltage_{channel}"]
     if "flags" not in frame:
         frame["flags"] = 0
-    _refuse(path, (frame["flags"] % 1.0 != 0.0).to_numpy(), "flags: it must be a whole number", 2)
+    uneven = (frame["flags"] % 1.0 != 0.0).to_numpy()
+    _refuse(path, uneven, "flags: it must be a whole number", table.first_line)
     frame = frame.astype({"tick": np.int64, "flags": np.int64})
     return Log(path, frame, dt, table.torn)
 
 
 def time_base(
-    path: Path, time: FloatArray, tick: FloatArray | None = None
+    path: Path, time: FloatArray, tick: FloatArray | None = None, *, first_line: int = 2
 ) -> tuple[IntArray, float]:
     """Sequence numbers and sample time [s] of a log's rows; gaps in time are gaps in number.
 
-    tick: the log's own sequence numbers, where it has them. Raises ConfigError, naming the
-    line, for time that does not advance, or rows that fit no constant rate.
+    tick: the log's own sequence numbers, where it has them. first_line: line of the first row.
+    Raises ConfigError, naming the line, for time that does not advance, or rows that fit no
+    constant rate.
     """
-    steps = np.diff(time)
-    _refuse(path, ~(steps > 0.0), "t: time does not advance from the line before")
+    steps, second = np.diff(time), first_line + 1
+    _refuse(path, ~(steps > 0.0), "t: time does not advance from the line before", second)
     if tick is not None:
-        _refuse(path, tick != np.round(tick), "tick: it must be a whole number", first=2)
-        _refuse(path, ~(np.diff(tick) > 0.0), "tick: it does not advance from the line before")
+        _refuse(path, tick != np.round(tick), "tick: it must be a whole number", first_line)
+        _refuse(
+            path, ~(np.diff(tick) > 0.0), "tick: it does not advance from the line before", second
+        )
         counted = np.diff(tick)
         dt = float(np.median(steps / counted))
     else:
@@ -225,8 +182,8 @@ def time_base(
     if wrong.any():
         row = int(np.argmax(wrong))
         raise ConfigError(
-            f"{path}:{row + 3}: t: samples are {dt:g} s apart elsewhere but {steps[row]:g} s for "
-            f"{counted[row]:g} of them here; resample the log to a constant rate"
+            f"{path}:{row + second}: t: samples are {dt:g} s apart elsewhere but {steps[row]:g} s "
+            f"for {counted[row]:g} of them here; resample the log to a constant rate"
         )
     ticks: IntArray = np.zeros(len(time), dtype=np.int64)
     ticks[1:] = np.cumsum(counted)
@@ -235,7 +192,7 @@ def time_base(
     return ticks + (0 if tick is None else int(tick[0])), dt
 
 
-def _refuse(path: Path, wrong: BoolArray, what: str, first: int = 3) -> None:
+def _refuse(path: Path, wrong: BoolArray, what: str, first: int) -> None:
     """Raise ConfigError at the first wrong row; ``first`` is the line of entry 0."""
     if wrong.any():
         raise ConfigError(f"{path}:{int(np.argmax(wrong)) + first}: {what}")
@@ -248,76 +205,3 @@ def require_rows(path: Path, n: int) -> None:
             f"{path}: it holds {n} sample{'s' * (n != 1)}; at least 2 are needed. "
             "Was the run stopped before it began?"
         )
-
-
-def _complete_lines(path: Path) -> tuple[str, bool]:
-    """The file's text up to its last complete line, and whether something was cut off."""
-    try:
-        data = path.read_bytes()
-    except FileNotFoundError:
-        raise ConfigError(
-            f"{path}: there is no such log; name a capture folder or a CSV file"
-        ) from None
-    except IsADirectoryError:
-        raise ConfigError(f"{path}: this is a folder without a log.csv in it") from None
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = data[: error.start].count(b"\n") + 1
-        raise ConfigError(f"{path}:{line}: not a text file (byte {error.start})") from None
-    text = text.replace("\r\n", "\n")
-    if not text.strip():
-        raise ConfigError(f"{path}: the log is empty; it must start with a line of column names")
-    cut = text.rfind("\n") + 1
-    tail = text[cut:]
-    # A last line without its newline may lack digits even where it has every column.
-    complete = text[:cut] if cut else text
-    if "\0" in complete:
-        line = complete[: complete.index("\0")].count("\n") + 1
-        raise ConfigError(f"{path}:{line}: not a text file: it holds bytes of zero")
-    return complete.rstrip("\n") + "\n", bool(tail.strip())
-
-
-def _names(text: str) -> list[str]:
-    """Column names in the first line of a table."""
-    return [name.strip().strip('"') for name in text.split("\n", 1)[0].split(",")]
-
-
-def _check_header(path: Path, header: list[str], columns: Sequence[str]) -> None:
-    if all(_is_number(name) for name in header):
-        raise ConfigError(f"{path}:1: the first line holds numbers; it must hold the column names")
-    twice = sorted({name for name in header if header.count(name) > 1})
-    if twice:
-        raise ConfigError(f"{path}:1: column {twice[0]!r} stands twice")
-    for name in columns:
-        if name not in header:
-            raise ConfigError(
-                f"{path}:1: column {name!r} is missing; {suggestion(name, header)} "
-                f"(the file has {', '.join(header)}). Columns of other programs are named in "
-                "the 'columns' section of a file given with --config"
-            )
-
-
-def _numbers(path: Path, name: str, column: pd.Series) -> FloatArray:
-    import pandas as pd
-
-    values = pd.to_numeric(column.str.strip(), errors="coerce").to_numpy(dtype=np.float64)
-    bad = np.flatnonzero(~np.isfinite(values))
-    if len(bad):
-        row = int(bad[0])
-        more = f", and in {len(bad) - 1} more lines" if len(bad) > 1 else ""
-        raise ConfigError(
-            f"{path}:{row + 2}: {name}: {column.iloc[row]!r} is not a finite number{more}; "
-            "mend or remove these lines (removed lines count as lost samples)"
-        )
-    return values
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True

@@ -13,7 +13,8 @@ from daq.config.identification import Column, Columns
 from daq.config.yaml_file import YamlFile, suggestion
 from daq.errors import ConfigError
 from daq.hal import FloatArray, IntArray
-from daq.log import Log, read_table, require_rows, time_base
+from daq.log import Log, require_rows, time_base
+from daq.table import Table, read_table
 from sysid.data import Dataset
 from sysid.model import Input, ModelError, Output, ProcessModel
 
@@ -121,13 +122,11 @@ def _with_noise(dataset: Dataset, recording: capture.Recording, model: ProcessMo
 def _load_foreign(path: Path, model: ProcessModel, mapping: Mapping) -> Loaded:
     columns = mapping.columns
     sources = {**columns.inputs, **columns.outputs}
-    names = [columns.time.column, *(c.column for c in sources.values() if c.column is not None)]
-    table = read_table(path, list(dict.fromkeys(names)))
+    used = (columns.time.column, *(c.column for c in sources.values()))
+    table = read_table(path, list(dict.fromkeys(name for name in used if name is not None)))
     frame = table.frame
     require_rows(path, len(frame))
-    seconds = _factor(mapping, ("columns", "time", "unit"), columns.time.unit, "s")
-    time = frame[columns.time.column].to_numpy() * seconds
-    tick, dt = time_base(path, time)
+    tick, dt = _foreign_time(table, mapping)
 
     def values(signal: Input | Output, group: str, source: Column) -> FloatArray:
         key = ("columns", group, signal.name, "unit")
@@ -149,6 +148,17 @@ def _load_foreign(path: Path, model: ProcessModel, mapping: Mapping) -> Loaded:
         path.stem,
     )
     return Loaded(dataset, path, capture.describe_end(path, table.torn))
+
+
+def _foreign_time(table: Table, mapping: Mapping) -> tuple[IntArray, float]:
+    """Sequence numbers and sample time [s] of a foreign table's rows."""
+    time = mapping.columns.time
+    if time.column is None:
+        assert time.sample_rate is not None
+        return np.arange(len(table.frame), dtype=np.int64), 1.0 / time.sample_rate
+    seconds = _factor(mapping, ("columns", "time", "unit"), time.unit, "s")
+    values = table.frame[time.column].to_numpy() * seconds
+    return time_base(table.path, values, first_line=table.first_line)
 
 
 def _dataset(

@@ -22,10 +22,19 @@ Range = Annotated[tuple[float | None, float | None], AfterValidator(_ordered)]
 
 
 class TimeColumn(Section):
-    """The column that holds time."""
+    """The column that holds time, or the rate of the rows in a file without one."""
 
-    column: str = Field(min_length=1, description="name in the CSV's header")
+    column: str | None = Field(None, min_length=1, description="name in the CSV's header")
     unit: str = Field("s", min_length=1, description="unit of the numbers")
+    sample_rate: float | None = Field(None, gt=0.0, description="rows per second [Hz]")
+
+    @model_validator(mode="after")
+    def _one_source(self) -> TimeColumn:
+        if (self.column is None) == (self.sample_rate is None):
+            raise ValueError(
+                "give either 'column' (a name in the CSV) or 'sample_rate' (rows per second)"
+            )
+        return self
 
 
 class Column(Section):

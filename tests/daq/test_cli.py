@@ -300,6 +300,20 @@ def test_the_report_says_where_every_range_came_from(tmp_path):
         assert line in result.stdout
 
 
+def test_a_log_without_time_has_its_rate_in_the_configuration(tmp_path):
+    foreign_log(tmp_path / "bench.csv")
+    text = (tmp_path / "bench.csv").read_text()
+    lines = [line.split(", ", 1)[1] for line in text.splitlines()]
+    (tmp_path / "bench.csv").write_text("\n".join(lines) + "\n")
+    (tmp_path / "lag.py").write_text(OWN_MODEL)
+    config = OWN_CONFIG.replace("{column: Time (ms), unit: ms}", "{sample_rate: 100}")
+    (tmp_path / "id.yaml").write_text(config)
+    result = rig("identify", "bench.csv", "--config", "id.yaml", "--json", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    found = json.loads(result.stdout)["parameters"]["tau"]["value"]
+    assert found == pytest.approx(0.2, rel=1e-3)
+
+
 def test_one_seed_gives_one_result(captured, tmp_path):
     root, folder = captured
     values = []

@@ -15,7 +15,8 @@ from daq import capture
 from daq.cli import datasets
 from daq.errors import ConfigError, RunError
 from daq.hal import Flag, Samples
-from daq.log import COLUMNS, ORIGINAL_COLUMNS, LogWriter, load_log, read_table
+from daq.log import COLUMNS, ORIGINAL_COLUMNS, LogWriter, load_log
+from daq.table import read_table
 from sim_rig.actuator import actuator
 from tests.daq.support import (
     install_faulty,
@@ -134,6 +135,13 @@ def test_the_original_programs_format_loads(tmp_path):
             id="quoted header",
         ),
         pytest.param(lambda text: text.replace("\n", ", \n"), id="a separator at each line's end"),
+        pytest.param(lambda text: text.replace("\n", ",,\n"), id="two of them"),
+        pytest.param(lambda text: text.replace(", ", "\t"), id="tabs"),
+        pytest.param(
+            lambda text: text.replace(", ", ";").replace(".", ","), id="semicolons, decimal commas"
+        ),
+        pytest.param(lambda text: "# Bench 3\n\n% 1 kHz, held\n" + text, id="comments before"),
+        pytest.param(lambda text: "# Bench 3, held\n# " + text, id="a header as NumPy writes it"),
     ],
 )
 def test_harmless_variants_of_a_table_load_alike(tmp_path, change):
@@ -342,6 +350,25 @@ def test_a_table_keeps_only_the_columns_asked_for(tmp_path):
     path.write_text("time;x\n".replace(";", ",") + "0,1\n1,2\n2,3\n")
     table = read_table(path, ["x"])
     assert list(table.frame) == ["x"] and table.frame["x"].tolist() == [1.0, 2.0, 3.0]
+
+
+def test_a_table_in_a_german_programs_character_set(tmp_path):
+    path = tmp_path / "messung.csv"
+    path.write_bytes(
+        "Zeit [s];Drehzahl [1/min];Übertemperatur [°C]\n0;1,5;2\n1;-3e2;4\n".encode("cp1252")
+    )
+    table = read_table(path, ["Drehzahl [1/min]", "Übertemperatur [°C]"])
+    assert table.frame.to_numpy().tolist() == [[1.5, 2.0], [-300.0, 4.0]]
+
+
+def test_lines_are_counted_from_the_files_start(tmp_path):
+    path = tmp_path / "noted.csv"
+    path.write_text("# a\n# b\nt,x\n0,1\n1,oops\n")
+    with pytest.raises(ConfigError, match=r"noted.csv:5: x: 'oops' is not a finite number"):
+        read_table(path, ["x"])
+    path.write_text("# a\n# b\n" + original_text().replace("0.004,", "0.0001,"))
+    with pytest.raises(ConfigError, match=r"noted.csv:8: t: time does not advance"):
+        load_log(path)
 
 
 def test_columns_that_are_not_asked_for_may_hold_anything(tmp_path):

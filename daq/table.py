@@ -1,0 +1,206 @@
+"""Tables of numbers in text files, as rigs and other people's programs write them."""
+
+from __future__ import annotations
+
+import io
+import itertools
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daq.config.yaml_file import suggestion
+from daq.errors import ConfigError
+from daq.hal import FloatArray
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+_COMMENTS = ("#", "%", "//")
+_TEXT_CONTROLS = b"\t\n\r\f"
+
+
+@dataclass(frozen=True)
+class Table:
+    """Columns of a CSV as numbers.
+
+    first_line: the line of the first row. torn: the last line was cut and is left out.
+    """
+
+    path: Path
+    frame: pd.DataFrame
+    first_line: int
+    torn: bool
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """How a table is written: the line of its header, the names in it, what is between them."""
+
+    line: int
+    names: list[str]
+    separator: str
+
+
+def column_names(path: Path) -> list[str]:
+    """Names in a table's header; raises ConfigError for a file that is no text."""
+    return _layout(_complete_lines(path)[0]).names
+
+
+def read_table(path: Path, columns: Sequence[str] = ()) -> Table:
+    """Read a CSV of numbers with a header line.
+
+    Cells are separated by commas, semicolons or tabs (then decimals may have a comma), and
+    separators may be followed by blanks. Lines of comments may stand before the header, or the
+    header in the last of them, as NumPy writes it. A cut last line is left out. Raises
+    ConfigError that names file, line and column for anything else that is not a table of finite
+    numbers with the given columns.
+    """
+    import pandas as pd
+
+    text, torn = _complete_lines(path)
+    layout = _layout(text)
+    header, separator = layout.names, layout.separator
+    _check_header(path, layout, columns)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", pd.errors.ParserWarning)
+            frame = pd.read_csv(
+                io.StringIO(text), sep=separator, skipinitialspace=True, header=None,
+                skiprows=layout.line, names=_apart(header), index_col=False, dtype=str,
+                keep_default_na=False, skip_blank_lines=False, on_bad_lines="error",
+            )  # fmt: skip
+    except pd.errors.ParserWarning:
+        lines = text.splitlines()
+        rows = range(layout.line, len(lines))
+        line = next((i for i in rows if lines[i].count(separator) >= len(header)), 0)
+        raise ConfigError(
+            f"{path}:{line + 1}: {lines[line].count(separator) + 1} cells, but line "
+            f"{layout.line} names {len(header)} columns; separate cells by commas and write "
+            "decimals with a point, or separate them by semicolons"
+        ) from None
+    except pd.errors.ParserError as error:
+        reason = str(error).removeprefix("Error tokenizing data. C error: ").strip()
+        raise ConfigError(f"{path}: not a table: {reason}") from None
+    wanted = list(columns) or [name for name in header if name]
+    first = layout.line + 1
+    numbers = {name: _numbers(path, name, frame[name], first, separator) for name in wanted}
+    return Table(path, pd.DataFrame(numbers), first, torn)
+
+
+def _layout(text: str) -> _Layout:
+    lines = text.split("\n")
+    leading = list(
+        itertools.takewhile(lambda s: not s.strip() or s.lstrip().startswith(_COMMENTS), lines)
+    )
+    at = len(leading)
+    if at == len(lines):
+        return _Layout(1, [lines[0]], ",")
+    header = lines[at]
+    numbers = _cells(header, _separator(header))
+    if leading and all(map(_is_number, numbers)):
+        named = leading[-1].strip().lstrip("#%/").strip()
+        if len(_cells(named, _separator(header))) == len(numbers):
+            at, header = at - 1, named
+    separator = _separator(header)
+    return _Layout(at + 1, _cells(header, separator), separator)
+
+
+def _separator(line: str) -> str:
+    return next((s for s in ("\t", ";") if s in line), ",")
+
+
+def _cells(line: str, separator: str) -> list[str]:
+    return [name.strip().strip('"').strip() for name in line.split(separator)]
+
+
+def _apart(header: list[str]) -> list[str | int]:
+    """Columns without a name, as a separator at each line's end makes them, told apart."""
+    return [name or place for place, name in enumerate(header)]
+
+
+def _complete_lines(path: Path) -> tuple[str, bool]:
+    """The file's text up to its last complete line, and whether something was cut off."""
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise ConfigError(
+            f"{path}: there is no such log; name a capture folder or a CSV file"
+        ) from None
+    except IsADirectoryError:
+        raise ConfigError(f"{path}: this is a folder without a log.csv in it") from None
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+    text = _decoded(path, data).replace("\r\n", "\n")
+    if not text.strip():
+        raise ConfigError(f"{path}: the log is empty; it must start with a line of column names")
+    cut = text.rfind("\n") + 1
+    tail = text[cut:]
+    # A last line without its newline may lack digits even where it has every column.
+    complete = text[:cut] if cut else text
+    if "\0" in complete:
+        line = complete[: complete.index("\0")].count("\n") + 1
+        raise ConfigError(f"{path}:{line}: not a text file: it holds bytes of zero")
+    return complete.rstrip("\n") + "\n", bool(tail.strip())
+
+
+def _decoded(path: Path, data: bytes) -> str:
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        # Measuring programs on Windows write names and units in its older character set.
+        controls = bytes(byte for byte in range(32) if byte not in _TEXT_CONTROLS)
+        if data.translate(None, controls) != data:
+            line = data[: error.start].count(b"\n") + 1
+            raise ConfigError(f"{path}:{line}: not a text file (byte {error.start})") from None
+        return data.decode("cp1252", errors="replace")
+
+
+def _check_header(path: Path, layout: _Layout, columns: Sequence[str]) -> None:
+    line, header = layout.line, layout.names
+    if all(_is_number(name) for name in header):
+        raise ConfigError(
+            f"{path}:{line}: the first line holds numbers; it must hold the column names"
+        )
+    named = [name for name in header if name]
+    twice = sorted({name for name in named if header.count(name) > 1})
+    if twice:
+        raise ConfigError(f"{path}:{line}: column {twice[0]!r} stands twice")
+    for name in columns:
+        if name not in header:
+            raise ConfigError(
+                f"{path}:{line}: column {name!r} is missing; {suggestion(name, named)} "
+                f"(the file has {', '.join(named)}). Columns of other programs are named in "
+                "the 'columns' section of a file given with --config"
+            )
+
+
+def _numbers(
+    path: Path, name: str, column: pd.Series, first_line: int, separator: str
+) -> FloatArray:
+    import pandas as pd
+
+    text = column.str.strip()
+    if separator != ",":
+        text = text.str.replace(",", ".", regex=False)
+    values = pd.to_numeric(text, errors="coerce").to_numpy(dtype=np.float64)
+    bad = np.flatnonzero(~np.isfinite(values))
+    if len(bad):
+        row = int(bad[0])
+        more = f", and in {len(bad) - 1} more lines" if len(bad) > 1 else ""
+        raise ConfigError(
+            f"{path}:{row + first_line}: {name}: {column.iloc[row]!r} is not a finite "
+            f"number{more}; mend or remove these lines (removed lines count as lost samples)"
+        )
+    return values
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text.replace(",", "."))
+    except ValueError:
+        return False
+    return True
