@@ -20,6 +20,7 @@ from sysid.refinement import Refinement, refine
 from sysid.simulation import BatchSimulator, Status
 from sysid.space import SearchSpace
 from sysid.starting import free_run
+from sysid.uncertainty import Uncertainty, uncertainty
 
 
 @dataclass(frozen=True)
@@ -133,10 +134,7 @@ class GASSI(BaseEstimator):  # type: ignore[misc]
         self.space_ = SearchSpace.of(
             model, self.ranges, self.fixed, preset.log_scale, tied=self.tied, scale=self.scale
         )
-        simulator = self._simulator()
-        objective = Objective(
-            simulator, self.space_, records, per_log=self.per_log, weights=self._weights(model)
-        )
+        objective = self._objective(records)
         search = GeneticSearch(
             self.space_,
             preset,
@@ -192,6 +190,35 @@ class GASSI(BaseEstimator):  # type: ignore[misc]
         """Mean fit % over outputs and records, divided by 100: 1 is perfect."""
         fits = [fit_percent(record.outputs, self.predict(record)) for record in _records(X, y, dt)]
         return float(np.nanmean(fits)) / 100.0
+
+    def uncertainty(
+        self,
+        X: Dataset | Sequence[Dataset] | FloatArray,
+        y: FloatArray | None = None,
+        *,
+        dt: float | None = None,
+    ) -> Uncertainty:
+        """Intervals of the parameters, and what the records cannot tell of them.
+
+        X, y, dt: what ``fit`` was given. Raises ModelError where the local refinement did not
+        run to its end: only at a minimum of the error do its sensitivities tell.
+        """
+        check_is_fitted(self, "vector_")
+        if not PRESETS[self.preset].refine:
+            raise ModelError(f"preset {self.preset} has no local refinement, so no intervals")
+        if self.stopped_ == "interrupted":
+            raise ModelError("the identification was interrupted, so there are no intervals")
+        return uncertainty(self._objective(_records(X, y, dt)), self.chromosome_)
+
+    def _objective(self, records: Sequence[Dataset]) -> Objective:
+        """The figure that ``fit`` minimises over ``space_``."""
+        return Objective(
+            self._simulator(),
+            self.space_,
+            records,
+            per_log=self.per_log,
+            weights=self._weights(self._model()),
+        )
 
     def _model(self) -> ProcessModel:
         if self.model is None:

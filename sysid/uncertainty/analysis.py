@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sysid.model import BoolArray, FloatArray, IntArray
+from sysid.model import FloatArray, IntArray
 from sysid.objective import Objective
 from sysid.space import SearchSpace
 from sysid.uncertainty.directions import PART, Directions, directions
@@ -81,17 +81,12 @@ def uncertainty(objective: Objective, chromosome: FloatArray) -> Uncertainty:
     """
     steps = common_steps(objective, chromosome)
     found = sensitivity(objective, chromosome, steps)
-    ends = on_bound(objective.space, chromosome)
+    ends = objective.space.on_bound(chromosome)
     told = directions(objective, chromosome, steps, found, ends)
     units = coordinate_units(objective, chromosome)
     slope = np.where(objective.space.log, chromosome, units)
     hidden = relations(objective, chromosome, steps, slope, told.lost)
     return _Teller(objective.space, chromosome, slope, told, hidden).result()
-
-
-def on_bound(space: SearchSpace, chromosome: FloatArray) -> BoolArray:
-    """Parameters at an end of their range, (n_free,)."""
-    return space.on_bound(chromosome)
 
 
 @dataclass(frozen=True)

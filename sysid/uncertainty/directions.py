@@ -51,10 +51,11 @@ def directions(
 ) -> Directions:
     """Singular value decomposition of the sensitivity, its directions weighed by their variance.
 
-    on_bound: (n_free,), parameters at an end of their range. The estimate minimises the mean of the outputs'
-    RMSEs, where each output weighs by the inverse of its own; its covariance is the sandwich of
-    the curvature and the covariance of the score, in which the residuals' colour and the
-    sensors' zero errors enter (Ljung, "System Identification", sections 9.2 and 9.4).
+    on_bound: (n_free,), parameters at an end of their range. The estimate minimises the mean of
+    the outputs' RMSEs, where each output weighs by the inverse of its own; its covariance is the
+    sandwich of the curvature and the covariance of the score, in which the residuals' colour,
+    the noise of the inputs and the sensors' zero errors enter (Ljung, "System Identification",
+    sections 9.2 and 9.4).
     """
     n = found.slopes.shape[2]
     rms = np.sqrt(np.mean(found.residual**2, axis=0))

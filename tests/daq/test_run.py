@@ -96,7 +96,7 @@ def test_the_capture_folder_holds_the_run_as_resolved(completed):
     assert sorted(p.name for p in folder.iterdir()) == ["log.csv", "run.json"]
     assert {
         "status", "reason", "started", "experiment", "rig", "software", "host", "device",
-        "offsets", "homing", "phase", "timing", "log",
+        "calibration", "offsets", "homing", "phase", "timing", "log",
     } == set(record)  # fmt: skip
     assert (record["status"], record["reason"], record["phase"]) == ("completed", None, "close")
     assert record["experiment"] == {
