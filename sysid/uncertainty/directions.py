@@ -66,9 +66,18 @@ def directions(
     causes = (objective, chromosome, steps, found)
     score = _larger(score, _pushes(weighted, input_noises(*causes)))
     score += _pushes(weighted, zero_errors(*causes))
-    # One that acts only together with others is not held: all of them may move together.
-    held = on_bound & (np.sum(_null(rows) ** 2, axis=0) < PART)
-    kept = np.flatnonzero(~held)
+    told = _decompose(rows, score, np.zeros(n, dtype=bool))
+    # What the data hardly feel, or feel only together with others, is not held by its bound.
+    held = on_bound & (np.sum(told.lost**2, axis=0) < PART)
+    return _decompose(rows, score, held) if held.any() else told
+
+
+def _decompose(rows: FloatArray, score: FloatArray, held: BoolArray) -> Directions:
+    """Directions of the parameters that are not held.
+
+    rows: (n_rows, n_free), weighted sensitivity. score: its covariance, (n_free, n_free).
+    """
+    n, kept = rows.shape[1], np.flatnonzero(~held)
     _, values, vectors = np.linalg.svd(rows[:, kept], full_matrices=False)
     exact = values > _EXACT * values[0] if len(values) else np.zeros(0, dtype=bool)
     back = vectors / np.where(exact, values, np.inf)[:, None] ** 2
@@ -80,13 +89,6 @@ def directions(
     lost = np.zeros((int((~determined).sum()), n))
     lost[:, kept] = vectors[~determined]
     return Directions(inverse @ score @ inverse, lost, values, held)
-
-
-def _null(rows: FloatArray) -> FloatArray:
-    """Directions that do nothing at all, orthonormal rows."""
-    _, values, vectors = np.linalg.svd(rows, full_matrices=False)
-    nothing: FloatArray = vectors[values <= _EXACT * values[0]]
-    return nothing
 
 
 def _pushes(weighted: FloatArray, changes: Iterable[FloatArray]) -> FloatArray:

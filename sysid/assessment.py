@@ -1,0 +1,140 @@
+"""How far an identified model may be trusted: its errors, residuals, intervals, in one verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from sysid.data import Dataset
+from sysid.metrics import Metrics, evaluate
+from sysid.model import FloatArray, ProcessModel
+from sysid.residual_tests import ResidualTest, residual_test
+from sysid.uncertainty import Uncertainty
+
+Trust = Literal["good", "limited", "poor"]
+
+# Validation errors in parts of the training errors: what chance does, and what is not the same
+# system any more.
+_HARDLY_WORSE, _FAR_WORSE = 1.3, 2.0
+_INDEPENDENT = 0.75  # share of lags inside a 95 % band below which something is left
+_FITTED = 50.0  # fit [%] below which a model explains little
+
+
+@dataclass(frozen=True)
+class RecordResult:
+    """How a model does on one record."""
+
+    name: str
+    metrics: Metrics
+    residuals: ResidualTest
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """How far to trust, and why: one sentence each, the gravest first."""
+
+    trust: Trust
+    reasons: tuple[str, ...]
+
+
+def examine(
+    records: Sequence[Dataset], predict: Callable[[Dataset], FloatArray]
+) -> list[RecordResult]:
+    """Errors and residual tests of a model's free run on each record.
+
+    predict: outputs (n_samples, n_outputs) of a record, as estimators' ``predict``.
+    """
+    results = []
+    for record in records:
+        simulated = predict(record)
+        results.append(
+            RecordResult(
+                record.name,
+                evaluate(record.outputs, simulated),
+                residual_test(record.outputs - simulated, record.inputs, record.input_noise),
+            )
+        )
+    return results
+
+
+def judge(
+    model: ProcessModel,
+    training: Sequence[RecordResult],
+    validation: Sequence[RecordResult],
+    uncertainty: Uncertainty | None,
+    feasible: bool = True,
+) -> Verdict:
+    """A verdict from all that is known of an identification."""
+    grave = [] if feasible else ["No parameters were found that satisfy all the constraints."]
+    light: list[str] = []
+    for name, ratio, fit in _progress(model, training, validation):
+        if fit < _FITTED:
+            grave.append(f"{name} is explained poorly on the validation data (fit {fit:.0f} %).")
+        elif ratio > _FAR_WORSE:
+            grave.append(f"{name} errs {ratio:.1f} times as much in validation as in training.")
+        elif ratio > _HARDLY_WORSE:
+            light.append(f"{name} errs {ratio:.1f} times as much in validation as in training.")
+    if not validation:
+        light.append("No data were held back for validation: the errors are those of the fit.")
+    light += _left_over(model, validation or training)
+    if uncertainty is not None:
+        light += _open(uncertainty)
+    if grave:
+        return Verdict("poor", (*grave, *light))
+    return Verdict("limited", tuple(light)) if light else Verdict("good", _praise(validation))
+
+
+def _progress(
+    model: ProcessModel, training: Sequence[RecordResult], validation: Sequence[RecordResult]
+) -> list[tuple[str, float, float]]:
+    """Each output's error in validation in parts of that in training, and its fit [%]."""
+    if not validation:
+        return []
+    errors = [
+        # Absolute, because each record has its own largest output.
+        np.sqrt(np.nanmean([(r.metrics.rmse * r.metrics.scale) ** 2 for r in part], axis=0))
+        for part in (training, validation)
+    ]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratios = errors[1] / errors[0]
+        fits = np.nanmean([r.metrics.fit for r in validation], axis=0)
+    return list(zip(model.output_names, ratios.tolist(), fits.tolist(), strict=True))
+
+
+def _left_over(model: ProcessModel, results: Sequence[RecordResult]) -> list[str]:
+    """Outputs whose residuals still follow an input."""
+    shares = np.array([result.residuals.independent for result in results])
+    found = []
+    for j, output in enumerate(model.output_names):
+        least = [
+            (float(np.nanmin(shares[:, j, i])), signal)
+            for i, signal in enumerate(model.input_names)
+            if np.isfinite(shares[:, j, i]).any()
+        ]
+        follows = [signal for share, signal in least if share < _INDEPENDENT]
+        if follows:
+            found.append(
+                f"Residuals of {output} still follow {' and '.join(follows)}: the model lacks "
+                "dynamics there."
+            )
+    return found
+
+
+def _open(uncertainty: Uncertainty) -> list[str]:
+    """What the data leave open, as far as it limits what may be done with the numbers."""
+    held = [p.name for p in uncertainty.parameters if p.why == "bound"]
+    if not held:
+        return []
+    verb = "stands" if len(held) == 1 else "stand"
+    return [f"{', '.join(held)} {verb} on an end of the range: widen it, or fix the value."]
+
+
+def _praise(validation: Sequence[RecordResult]) -> tuple[str, ...]:
+    fit = float(np.nanmean([result.metrics.fit for result in validation]))
+    return (
+        f"Data not used in the fit are explained as well as those that were (mean fit {fit:.1f} "
+        "%), and nothing of the inputs is left in the residuals.",
+    )
