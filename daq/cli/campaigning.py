@@ -17,13 +17,14 @@ from daq.cli import console, datasets
 from daq.cli.datasets import Loaded
 from daq.cli.identifying import (
     Prepared,
+    assemble,
     check_writable,
     gassi_settings,
     no_overlap,
     prepare_models,
-    report_of,
     write_parameters,
 )
+from daq.cli.reporting import document
 from daq.errors import ConfigError
 from sysid import Campaign, Outcome, Run, Spread, campaign
 
@@ -84,13 +85,8 @@ class Group:
         """What ``rig identify`` would have reported of it."""
         assert outcome.estimator is not None
         settings = self.prepared.settings.model_copy(update={"seed": outcome.run.seed})
-        return report_of(
-            dataclasses.replace(self.prepared, settings=settings),
-            outcome.estimator,
-            {"training": list(outcome.training), "validation": list(outcome.validation)},
-            self.training,
-            self.validation,
-        )
+        prepared = dataclasses.replace(self.prepared, settings=settings)
+        return document(assemble(prepared, outcome.estimator, self.training, self.validation))
 
 
 def campaign_command(

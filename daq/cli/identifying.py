@@ -11,22 +11,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import yaml
 
 from daq import capture
-from daq.cli import console, datasets
+from daq.cli import console, datasets, reporting
 from daq.cli.datasets import Loaded, Mapping
 from daq.cli.modelling import DEFAULT_MODEL, find_model, whole_name
+from daq.cli.reporting import Identified
 from daq.config import yaml_file
 from daq.config.identification import IdentificationConfig
 from daq.config.yaml_file import CommandLine, YamlFile, suggestion
 from daq.errors import ConfigError
-from sysid import ModelError, SearchSpace, evaluate
+from sysid import ModelError, SearchSpace
+from sysid.assessment import examine
 from sysid.gassi import GASSI, PRESETS, Progress
-from sysid.metrics import Metrics
-from sysid.model import Parameter, ProcessModel
-from sysid.ranges import Range
+from sysid.model import ProcessModel
 
 
 @dataclass(frozen=True)
@@ -165,15 +164,12 @@ def identify_logs(
         if log.warning is not None:
             console.report_note(log.warning)
     estimator = _fit(prepared, train, as_json)
-    scores = {
-        "training": [_score(estimator, log) for log in train],
-        "validation": [_score(estimator, log) for log in check],
-    }
-    report = report_of(prepared, estimator, scores, train, check)
+    result = assemble(prepared, estimator, train, check)
+    report = reporting.document(result)
     path = write_parameters(folder, report)
     report["files"] = {"parameters": str(path)}
     if not as_json:
-        _print_report(estimator, prepared, scores, train, check, path)
+        reporting.show(result, path)
     return report
 
 
@@ -283,89 +279,25 @@ def _fit(prepared: Prepared, train: list[Loaded], quiet: bool) -> GASSI:
             raise ConfigError(str(error)) from None
 
 
-def _score(estimator: GASSI, log: Loaded) -> Metrics:
-    return evaluate(log.dataset.outputs, estimator.predict(log.dataset))
-
-
-def report_of(
-    prepared: Prepared,
-    estimator: GASSI,
-    scores: dict[str, list[Metrics]],
-    train: list[Loaded],
-    check: list[Loaded],
-) -> dict[str, Any]:
-    """An identification for machines: parameters, metrics, search, versions."""
-    model = prepared.model
-    free = dict(zip(estimator.space_.names, estimator.space_.parameters, strict=True))
-    parameters = {}
-    for parameter in model.parameters:
-        entry: dict[str, Any] = {
-            "value": estimator.parameters_[parameter.name],
-            "unit": parameter.unit,
-        }
-        if parameter.name in free:
-            searched = free[parameter.name]
-            entry["range"] = [searched.lower, searched.upper]
-            entry["scale"] = searched.scale
-            entry["on_bound"] = _on_bound(estimator, parameter.name)
-        elif parameter.name in prepared.settings.tied:
-            entry["tied"] = prepared.settings.tied[parameter.name]
-        else:
-            entry["fixed"] = True
-        entry["source"] = _source(prepared, parameter.name)
-        parameters[parameter.name] = entry
-    logs = {
-        part: [
-            {"log": str(log.path), "name": log.dataset.name, **_metrics(model, metrics)}
-            for log, metrics in zip(group, scores[part], strict=True)
-        ]
-        for part, group in (("training", train), ("validation", check))
-    }
-    return {
-        "model": prepared.model_name,
-        "parameters": parameters,
-        "error": {
-            "value": estimator.error_,
-            "meaning": "mean over outputs of the RMSE on outputs normalised by max|y|",
-            "before_refinement": estimator.search_error_,
-        },
-        "metrics": logs,
-        "search": {
-            "preset": prepared.settings.preset,
-            "seed": prepared.settings.seed,
-            "population": prepared.settings.population,
-            "generations": len(estimator.history_),
-            "simulations": estimator.n_simulations_,
-            "stopped": estimator.stopped_,
-            "flagged": estimator.flagged_,
-            "feasible": estimator.feasible_,
-        },
-        "software": capture.software_versions(),
-    }
-
-
-def _source(prepared: Prepared, name: str) -> str:
-    """Where a parameter's range or value comes from."""
-    return prepared.sources.get(name, "model")
-
-
-def _metrics(model: ProcessModel, metrics: Metrics) -> dict[str, Any]:
-    return {
-        "outputs": {
-            name: {
-                "rmse": float(metrics.rmse[j]),
-                "msd": float(metrics.msd[j]),
-                "fit_percent": float(metrics.fit[j]),
-                "max_abs": float(metrics.scale[j]),
-            }
-            for j, name in enumerate(model.output_names)
-        }
-    }
-
-
-def _on_bound(estimator: GASSI, name: str) -> bool:
-    space = estimator.space_
-    return bool(space.on_bound(estimator.chromosome_)[space.names.index(name)])
+def assemble(
+    prepared: Prepared, estimator: GASSI, train: Sequence[Loaded], check: Sequence[Loaded]
+) -> Identified:
+    """A fitted estimator with its intervals, and how it does on every log."""
+    records = [log.dataset for log in train]
+    refined = PRESETS[estimator.preset].refine and estimator.stopped_ != "interrupted"
+    return Identified(
+        model=prepared.model,
+        model_name=prepared.model_name,
+        settings=prepared.settings,
+        sources=prepared.sources,
+        columns_file=Path(prepared.mapping.file.path) if prepared.mapping is not None else None,
+        estimator=estimator,
+        uncertainty=estimator.uncertainty(records) if refined else None,
+        training=examine(records, estimator.predict),
+        validation=examine([log.dataset for log in check], estimator.predict),
+        training_paths=[log.path for log in train],
+        validation_paths=[log.path for log in check],
+    )
 
 
 def write_parameters(folder: Path, report: dict[str, Any]) -> Path:
@@ -380,106 +312,3 @@ def write_parameters(folder: Path, report: dict[str, Any]) -> Path:
     text = yaml.safe_dump(report, sort_keys=False, allow_unicode=True)
     capture.write_whole(path, text)
     return path
-
-
-def _print_report(
-    estimator: GASSI,
-    prepared: Prepared,
-    scores: dict[str, list[Metrics]],
-    train: list[Loaded],
-    check: list[Loaded],
-    path: Path,
-) -> None:
-    model, mapping = prepared.model, prepared.mapping
-    console.print_line()
-    console.print_table(
-        f"Parameters of {model.name}",
-        ["parameter", "value", "unit", "searched in", "from", ""],
-        [_parameter_row(estimator, prepared, p.name) for p in model.parameters],
-        text=["unit", "from", ""],
-    )
-    single = len(train) == 1 and len(check) <= 1
-    if single:
-        print_metrics(model, scores["training"][0], scores["validation"])
-    else:
-        _print_logs("Training logs", model, train, scores["training"])
-        if check:
-            _print_logs("Validation logs", model, check, scores["validation"])
-    if estimator.stopped_ == "interrupted":
-        console.print_line(
-            f"Stopped by Ctrl-C after {len(estimator.history_)} generations: "
-            "these are the best parameters until then."
-        )
-    if not estimator.feasible_:
-        console.print_line(
-            "Warning: no parameters were found that satisfy all of the model's constraints."
-        )
-    if any(_on_bound(estimator, name) for name in estimator.space_.names):
-        console.print_line(
-            "At the end of its range: the data want more room there, or cannot tell.\n"
-            "Set 'ranges' in a file given with --config."
-        )
-    console.print_line(f"Parameters: {path}")
-    columns = f" --config {mapping.file.path}" if mapping is not None else ""
-    console.print_line(f"Next: rig replay {check[-1].path if check else train[0].path} "
-                       f"--parameters {path}{columns}")  # fmt: skip
-
-
-def _parameter_row(estimator: GASSI, prepared: Prepared, name: str) -> list[str]:
-    parameter = prepared.model.parameter(name)
-    value, source = console.number(estimator.parameters_[name]), _source(prepared, name)
-    searched = dict(zip(estimator.space_.names, estimator.space_.parameters, strict=True))
-    if name not in searched:
-        how = f"= {prepared.settings.tied[name]}" if name in prepared.settings.tied else "fixed"
-        return [name, value, parameter.unit, how, source, ""]
-    span = _span(searched[name], prepared.settings.ranges.get(name))
-    note = "at its end" if _on_bound(estimator, name) else ""
-    return [name, value, parameter.unit, span, source, note]
-
-
-def _span(parameter: Parameter, given: Range | None) -> str:
-    """A range; in brackets an end that is only where the search starts."""
-    ends = (parameter.lower, parameter.upper)
-    bounds = zip(ends, given or ends, strict=True)
-    return " .. ".join(f"({end:g})" if bound is None else f"{end:g}" for end, bound in bounds)
-
-
-def print_metrics(
-    model: ProcessModel, training: Metrics, validation: list[Metrics], label: str = "training"
-) -> None:
-    """Table of RMSE, MSD and fit of each output, on one log or on two."""
-    head = ["output", f"RMSE, {label}", "MSD", "fit [%]"]
-    if validation:
-        head += ["RMSE, validation", "MSD", "fit [%]"]
-    rows = []
-    for j, name in enumerate(model.output_names):
-        row = [name]
-        for metrics in (training, *validation):
-            row += [
-                console.number(float(metrics.rmse[j]), 3),
-                console.number(float(metrics.msd[j]), 2),
-                f"{metrics.fit[j]:.1f}",
-            ]
-        rows.append(row)
-    console.print_table("Free-run simulation, RMSE and MSD in parts of max|y|", head, rows)
-
-
-def _print_logs(
-    title: str, model: ProcessModel, logs: list[Loaded], metrics: list[Metrics]
-) -> None:
-    head = ["log", *(f"fit of {name} [%]" for name in model.output_names)]
-    head += [f"RMSE of {name}" for name in model.output_names]
-    rows = [
-        [
-            log.dataset.name,
-            *(f"{value:.1f}" for value in result.fit),
-            *(console.number(float(value), 3) for value in result.rmse),
-        ]
-        for log, result in zip(logs, metrics, strict=True)
-    ]
-    fits = np.nanmean([result.fit for result in metrics], axis=0)
-    errors = np.mean([result.rmse for result in metrics], axis=0)
-    rows.append(
-        ["mean", *(f"{v:.1f}" for v in fits), *(console.number(float(v), 3) for v in errors)]
-    )
-    console.print_table(title, head, rows)

@@ -9,8 +9,9 @@ from typing import Any
 from daq.cli import console, datasets
 from daq.cli.datasets import Mapping
 from daq.cli.files import load_rig
-from daq.cli.identifying import prepare, print_metrics
+from daq.cli.identifying import prepare
 from daq.cli.modelling import find_model
+from daq.cli.reporting import print_metrics
 from daq.config import yaml_file
 from daq.config.yaml_file import suggestion
 from daq.errors import ConfigError

@@ -1,0 +1,403 @@
+"""What an identification tells: one document for machines, tables and sentences for people."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from daq import capture
+from daq.cli import console
+from daq.config.identification import IdentificationConfig
+from sysid.assessment import RecordResult, judge
+from sysid.gassi import GASSI
+from sysid.metrics import Metrics
+from sysid.model import Parameter, ProcessModel
+from sysid.ranges import Range
+from sysid.uncertainty import Ambiguity, Estimate, Uncertainty
+
+_STRONG = 0.95  # correlation above which two parameters are named together
+_NOTES = {
+    "tied": "only with others",
+    "vague": "hardly felt",
+    "bound": "at its end",
+    "": "",
+}
+
+
+@dataclass(frozen=True)
+class Identified:
+    """A finished identification and what it was made of.
+
+    sources: where each parameter's range or value stands that is not the model's own.
+    uncertainty: None where the search was not refined to a minimum. training, validation: one
+    result for each log, in the order of the paths.
+    """
+
+    model: ProcessModel
+    model_name: str
+    settings: IdentificationConfig
+    sources: Mapping[str, str]
+    columns_file: Path | None
+    estimator: GASSI
+    uncertainty: Uncertainty | None
+    training: Sequence[RecordResult]
+    validation: Sequence[RecordResult]
+    training_paths: Sequence[Path]
+    validation_paths: Sequence[Path]
+
+    def source(self, name: str) -> str:
+        """Where a parameter's range or value comes from."""
+        return self.sources.get(name, "model")
+
+    def estimate(self, name: str) -> Estimate | None:
+        """What is known of a free parameter's uncertainty."""
+        found = self.uncertainty.parameters if self.uncertainty is not None else ()
+        return next((e for e in found if e.name == name), None)
+
+    def on_bound(self, name: str) -> bool:
+        """Whether a free parameter is held by an end of its range."""
+        if (estimate := self.estimate(name)) is not None:
+            return estimate.why == "bound"
+        space = self.estimator.space_
+        return bool(space.on_bound(self.estimator.chromosome_)[space.names.index(name)])
+
+
+def document(result: Identified) -> dict[str, Any]:
+    """All of it for machines; what ``parameters.yaml`` holds."""
+    estimator, settings = result.estimator, result.settings
+    verdict = judge(
+        result.model, result.training, result.validation, result.uncertainty, estimator.feasible_
+    )
+    parts = (
+        ("training", result.training, result.training_paths),
+        ("validation", result.validation, result.validation_paths),
+    )
+    return {
+        "model": result.model_name,
+        "verdict": {"trust": verdict.trust, "reasons": list(verdict.reasons)},
+        "parameters": {p.name: _parameter(result, p) for p in result.model.parameters},
+        **_initial_states(result),
+        **_uncertainty(result.uncertainty),
+        "error": {
+            "value": estimator.error_,
+            "meaning": "mean over outputs of the RMSE on outputs normalised by max|y|",
+            "before_refinement": estimator.search_error_,
+        },
+        "metrics": {
+            part: [
+                {"log": str(path), "name": record.name, **_record(result.model, record)}
+                for record, path in zip(records, paths, strict=True)
+            ]
+            for part, records, paths in parts
+        },
+        "search": {
+            "preset": settings.preset,
+            "seed": settings.seed,
+            "population": settings.population,
+            "generations": len(estimator.history_),
+            "simulations": estimator.n_simulations_,
+            "stopped": estimator.stopped_,
+            "flagged": estimator.flagged_,
+            "feasible": estimator.feasible_,
+        },
+        "software": capture.software_versions(),
+    }
+
+
+def _parameter(result: Identified, parameter: Parameter) -> dict[str, Any]:
+    name = parameter.name
+    entry: dict[str, Any] = {"value": result.estimator.parameters_[name], "unit": parameter.unit}
+    space = result.estimator.space_
+    if name in space.names:
+        searched = space.parameters[space.names.index(name)]
+        entry["range"] = [searched.lower, searched.upper]
+        entry["scale"] = searched.scale
+        entry["on_bound"] = result.on_bound(name)
+        if (estimate := result.estimate(name)) is not None:
+            entry |= _interval(estimate)
+    elif name in result.settings.tied:
+        entry["tied"] = result.settings.tied[name]
+    else:
+        entry["fixed"] = True
+    entry["source"] = result.source(name)
+    return entry
+
+
+def _interval(estimate: Estimate) -> dict[str, Any]:
+    if estimate.why:
+        return {"undetermined": estimate.why}
+    assert estimate.std is not None and estimate.low is not None and estimate.high is not None
+    return {"std": float(estimate.std), "interval": [float(estimate.low), float(estimate.high)]}
+
+
+def _initial_states(result: Identified) -> dict[str, Any]:
+    """Initial states that were estimated, log by log."""
+    found = result.estimator.initial_states_
+    return {"initial_states": found} if any(found) else {}
+
+
+def _uncertainty(found: Uncertainty | None) -> dict[str, Any]:
+    if found is None:
+        return {}
+    names = [parameter.name for parameter in found.parameters]
+    correlation = found.correlation()
+    pairs = [
+        {"parameters": [names[i], names[j]], "correlation": round(float(correlation[i, j]), 4)}
+        for i, j in itertools.combinations(range(len(names)), 2)
+        if np.isfinite(correlation[i, j])
+        and not (found.parameters[i].why or found.parameters[j].why)
+    ]
+    return {
+        "determined_directions": found.rank,
+        "singular_values": [float(f"{value:.4g}") for value in found.singular_values],
+        "ambiguities": [
+            {
+                "kind": ambiguity.kind,
+                "parameters": list(ambiguity.parameters),
+                "determined": [
+                    {"name": e.name, "unit": e.unit, "value": e.value, **_interval(e)}
+                    for e in ambiguity.determined
+                ],
+                "measure": list(ambiguity.measure),
+            }
+            for ambiguity in found.ambiguities
+        ],
+        "correlations": pairs,
+    }
+
+
+def _record(model: ProcessModel, record: RecordResult) -> dict[str, Any]:
+    metrics, residuals = record.metrics, record.residuals
+    return {
+        "outputs": {
+            name: {
+                "rmse": float(metrics.rmse[j]),
+                "msd": float(metrics.msd[j]),
+                "fit_percent": float(metrics.fit[j]),
+                "max_abs": float(metrics.scale[j]),
+                "residual_autocorrelation_in_band": float(residuals.white[j]),
+                "residual_independent_of": {
+                    signal: float(residuals.independent[j, i])
+                    for i, signal in enumerate(model.input_names)
+                    if residuals.tested[i]
+                },
+            }
+            for j, name in enumerate(model.output_names)
+        }
+    }
+
+
+def show(result: Identified, path: Path) -> None:
+    """Tables and sentences on standard output."""
+    console.print_line()
+    _show_parameters(result)
+    if result.uncertainty is not None:
+        _show_open_questions(result.uncertainty)
+    _show_metrics(result)
+    _show_residuals(result)
+    _show_notes(result)
+    console.print_line(f"Parameters: {path}")
+    columns = f" --config {result.columns_file}" if result.columns_file is not None else ""
+    log = (*result.validation_paths, *result.training_paths)[0]
+    console.print_line(f"Next: rig replay {log} --parameters {path}{columns}")
+
+
+def _show_parameters(result: Identified) -> None:
+    head = ["parameter", "value", "95 % interval", "unit", "searched in", "from", ""]
+    rows = [_parameter_row(result, p) for p in result.model.parameters]
+    # Ranges that all come from the model need no column that says so.
+    hidden = set() if result.sources else {head.index("from")}
+    if result.uncertainty is None:
+        hidden.add(head.index("95 % interval"))
+    kept = [i for i in range(len(head)) if i not in hidden]
+    console.print_table(
+        f"Parameters of {result.model.name}",
+        [head[i] for i in kept],
+        [[row[i] for i in kept] for row in rows],
+        text=["unit", "from", ""],
+    )
+
+
+def _parameter_row(result: Identified, parameter: Parameter) -> list[str]:
+    name, space = parameter.name, result.estimator.space_
+    value, unit = result.estimator.parameters_[name], parameter.unit
+    source = result.source(name)
+    if name not in space.names:
+        how = f"= {result.settings.tied[name]}" if name in result.settings.tied else "fixed"
+        return [name, console.number(value), "", unit, how, source, ""]
+    span = _span(space.parameters[space.names.index(name)], result.settings.ranges.get(name))
+    estimate = result.estimate(name)
+    if estimate is None:
+        note = _NOTES["bound" if result.on_bound(name) else ""]
+        return [name, console.number(value), "", unit, span, source, note]
+    digits = _digits(estimate)
+    return [
+        name, console.number(value, digits), _interval_text(estimate), unit, span, source,
+        _NOTES[estimate.why],
+    ]  # fmt: skip
+
+
+def _span(parameter: Parameter, given: Range | None) -> str:
+    """A range; in brackets an end that is only where the search starts."""
+    ends = (parameter.lower, parameter.upper)
+    bounds = zip(ends, given or ends, strict=True)
+    return " .. ".join(f"({end:g})" if bound is None else f"{end:g}" for end, bound in bounds)
+
+
+def _digits(estimate: Estimate) -> int:
+    """As many significant digits as the uncertainty supports; few where there is no telling."""
+    if estimate.std is None:
+        return 2
+    if estimate.std <= 0.0 or estimate.value == 0.0:
+        return 4
+    ratio = abs(estimate.value) / estimate.std
+    return int(np.clip(np.floor(np.log10(max(ratio, 1e-3))) + 2, 2, 7))
+
+
+def _interval_text(estimate: Estimate) -> str:
+    if estimate.why:
+        return "-"
+    assert estimate.low is not None and estimate.high is not None
+    digits = _digits(estimate)
+    return f"{console.number(estimate.low, digits)} .. {console.number(estimate.high, digits)}"
+
+
+def _show_open_questions(found: Uncertainty) -> None:
+    """What the data do not tell, what they tell instead, and what measurement would."""
+    exact = [a for a in found.ambiguities if a.kind != "vague"]
+    if exact:
+        console.print_line("What these data cannot tell apart:")
+    for ambiguity in exact:
+        for line in _exact_lines(ambiguity):
+            console.print_line(line)
+    vague = [a for a in found.ambiguities if a.kind == "vague"]
+    if vague:
+        names = "; ".join(" with ".join(a.parameters) for a in vague)
+        console.print_line(f"Hardly felt by these data: {names}.")
+    close = _close_pairs(found)
+    if close:
+        console.print_line(f"Known mostly together (correlation above {_STRONG:g}): "
+                           f"{'; '.join(close)}.")  # fmt: skip
+    if exact or vague or close:
+        console.print_line()
+
+
+def _exact_lines(ambiguity: Ambiguity) -> list[str]:
+    lines = [f"  {', '.join(ambiguity.parameters)} act only together."]
+    for estimate in ambiguity.determined:
+        value = console.number(estimate.value, _digits(estimate))
+        unit = f" {estimate.unit}" if estimate.unit else ""
+        lines.append(
+            f"    {estimate.name} = {value}{unit}, 95 % interval {_interval_text(estimate)}"
+        )
+    lines.append(
+        f"    To tell them apart, measure {' and '.join(ambiguity.measure)} by other means (or "
+        "choose a value) and give it under 'fixed'."
+    )
+    return lines
+
+
+def _close_pairs(found: Uncertainty) -> list[str]:
+    own = [j for j, p in enumerate(found.parameters) if not p.why]
+    correlation = found.correlation()
+    return [
+        f"{found.parameters[i].name} and {found.parameters[j].name}"
+        for i, j in itertools.combinations(own, 2)
+        if abs(correlation[i, j]) > _STRONG
+    ]
+
+
+def _show_metrics(result: Identified) -> None:
+    model, training, validation = result.model, result.training, result.validation
+    if len(training) == 1 and len(validation) <= 1:
+        print_metrics(model, training[0].metrics, [record.metrics for record in validation])
+        return
+    _print_logs("Training logs", model, training)
+    if validation:
+        _print_logs("Validation logs", model, validation)
+
+
+def _show_residuals(result: Identified) -> None:
+    """Residual tests on the validation data, or else on the training data."""
+    records, part = (result.validation, "validation") if result.validation else (
+        result.training, "training",
+    )  # fmt: skip
+    model = result.model
+    tested = [i for i in range(len(model.inputs)) if any(r.residuals.tested[i] for r in records)]
+    head = ["residual of", "with itself", *(f"with {model.input_names[i]}" for i in tested)]
+    rows = []
+    for j, name in enumerate(model.output_names):
+        white = float(np.mean([r.residuals.white[j] for r in records]))
+        shares = np.array([[r.residuals.independent[j, i] for i in tested] for r in records])
+        own = [float(np.nanmean(shares[:, k])) for k in range(len(tested))]
+        rows.append([name, *(f"{100.0 * share:.0f} %" for share in (white, *own))])
+    console.print_table(
+        f"Residuals, {part}: share of correlations inside their 95 % band", head, rows
+    )
+
+
+def _show_notes(result: Identified) -> None:
+    estimator = result.estimator
+    if estimator.stopped_ == "interrupted":
+        console.print_line(
+            f"Stopped by Ctrl-C after {len(estimator.history_)} generations: "
+            "these are the best parameters until then."
+        )
+    if any(result.on_bound(name) for name in estimator.space_.names):
+        console.print_line(
+            "At the end of its range: the data want more room there. Set 'ranges' in a file "
+            "given with --config."
+        )
+    verdict = judge(
+        result.model, result.training, result.validation, result.uncertainty, estimator.feasible_
+    )
+    console.print_line(f"Trust: {verdict.trust}. {' '.join(verdict.reasons)}")
+    if (found := result.uncertainty) is not None:
+        own = sum(not estimate.why for estimate in found.parameters)
+        together = len(found.determined()) - own
+        also = f", and {together} combinations" if together else ""
+        console.print_line(f"Determined: {own} of {len(found.parameters)} by themselves{also}.")
+
+
+def print_metrics(
+    model: ProcessModel, training: Metrics, validation: list[Metrics], label: str = "training"
+) -> None:
+    """Table of RMSE, MSD and fit of each output, on one log or on two."""
+    head = ["output", f"RMSE, {label}", "MSD", "fit [%]"]
+    if validation:
+        head += ["RMSE, validation", "MSD", "fit [%]"]
+    rows = []
+    for j, name in enumerate(model.output_names):
+        row = [name]
+        for metrics in (training, *validation):
+            row += [
+                console.number(float(metrics.rmse[j]), 3),
+                console.number(float(metrics.msd[j]), 2),
+                f"{metrics.fit[j]:.1f}",
+            ]
+        rows.append(row)
+    console.print_table("Free-run simulation, RMSE and MSD in parts of max|y|", head, rows)
+
+
+def _print_logs(title: str, model: ProcessModel, records: Sequence[RecordResult]) -> None:
+    head = ["log", *(f"fit of {name} [%]" for name in model.output_names)]
+    head += [f"RMSE of {name}" for name in model.output_names]
+    rows = [
+        [
+            record.name,
+            *(f"{value:.1f}" for value in record.metrics.fit),
+            *(console.number(float(value), 3) for value in record.metrics.rmse),
+        ]
+        for record in records
+    ]
+    fits = np.nanmean([record.metrics.fit for record in records], axis=0)
+    errors = np.mean([record.metrics.rmse for record in records], axis=0)
+    rows.append(
+        ["mean", *(f"{v:.1f}" for v in fits), *(console.number(float(v), 3) for v in errors)]
+    )
+    console.print_table(title, head, rows)
