@@ -86,6 +86,7 @@ class _Rebuilder:
         copy.__module__ = __name__  # the user's file may be no importable module
         # Noted before its helpers are looked at, so that functions may refer to each other.
         self._done[id(function)] = self._finish(copy)
+        copy.__defaults__ = tuple(map(self.value, function.__defaults__ or ())) or None
         names = names_in(function.__code__)
         for name in names & function.__globals__.keys():
             item = function.__globals__[name]

@@ -16,6 +16,7 @@ from typing import Any
 from sysid._substitute import substituted
 
 _NONE: frozenset[int] = frozenset()
+_WHOLE = 64  # whole powers up to this one are products
 _BOTH_SIDES = frozenset({"min", "max"})
 
 
@@ -205,10 +206,15 @@ class Trace:
         return self.lift(other) / self
 
     def __pow__(self, other: Any) -> Trace:
-        return mix("{} ** {}", self, other)
+        exponent = float(other) if isinstance(other, numbers.Real) else math.nan
+        if exponent.is_integer() and abs(exponent) <= _WHOLE:
+            return mix("{} ** {}", self, int(exponent))
+        if exponent == 0.5:
+            return mix("math.sqrt({})", self)
+        return mix("math.pow({}, {})", self, other)
 
     def __rpow__(self, other: Any) -> Trace:
-        return mix("{} ** {}", self.lift(other), self)
+        return mix("math.pow({}, {})", self.lift(other), self)
 
     def __mod__(self, other: Any) -> Trace:
         return mix("{} % {}", self, other)

@@ -14,7 +14,7 @@ from typing import Any
 
 from numba import njit, types
 
-from sysid._intrinsics import from_bits, to_int32
+from sysid._intrinsics import always_inline, from_bits, to_bits, to_int32
 
 _OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract", "nsz", "arcp"}}
 
@@ -65,6 +65,46 @@ def tanh(x: float) -> float:
     less = power * rest + (power - 1.0)  # e^(-2a) - 1 without cancellation
     size = -less / (less + 2.0)
     return (size if x >= 0.0 else -size) + (0.0 if x == x else nan)  # noqa: F405, PLR0124
+
+
+@njit(**_OPTIONS)
+def log(x: float) -> float:
+    """Natural logarithm; of zero minus infinity, of a negative number not a number."""
+    always_inline()
+    tiny = x < 1e-290
+    bits = to_bits(x * 1.8446744073709552e19 if tiny else x)  # 2^64
+    k = float(types.int32((bits >> 52) & 0x7FF)) - (1087.0 if tiny else 1023.0)
+    m = from_bits((bits & 0xFFFFFFFFFFFFF) | 0x3FF0000000000000)
+    above = m > 1.4142135623730951
+    m = 0.5 * m if above else m
+    k = k + 1.0 if above else k
+    # log m = 2 artanh s with |s| < 0.172, to the power 21.
+    s = (m - 1.0) / (m + 1.0)
+    q = s * s
+    t = q * (1.0 / 19.0 + q * (1.0 / 21.0))
+    t = q * (1.0 / 15.0 + q * (1.0 / 17.0) + q * t)
+    t = q * (1.0 / 11.0 + q * (1.0 / 13.0) + q * t)
+    t = q * (1.0 / 7.0 + q * (1.0 / 9.0) + q * t)
+    t = q * (1.0 / 3.0 + q * (1.0 / 5.0) + q * t)
+    value = k * _LN2_HIGH + (2.0 * s + (2.0 * s * t + k * _LN2_LOW))
+    value = inf if x == inf else value  # noqa: F405
+    value = -inf if x == 0.0 else value  # noqa: F405
+    return value if x >= 0.0 else nan  # noqa: F405
+
+
+@njit(**_OPTIONS)
+def pow(x: float, y: float) -> float:
+    """x^y; relative errors grow with |y log x|, to 1e-14 where that is 50.
+
+    Of a negative x only whole powers are numbers.
+    """
+    always_inline()
+    size = exp(y * log(abs(x)))
+    size = 0.0 if x == 0.0 and y > 0.0 else size
+    odd = y - 2.0 * floor(0.5 * y) == 1.0  # noqa: F405
+    size = -size if x < 0.0 and odd else size
+    size = nan if x < 0.0 and floor(y) != y else size  # noqa: F405
+    return 1.0 if y == 0.0 else size
 
 
 @njit(**_OPTIONS)

@@ -147,7 +147,7 @@ class ProcessModel:
 
     def __post_init__(self) -> None:
         for kind in ("states", "inputs", "outputs", "parameters", "constraints"):
-            object.__setattr__(self, kind, tuple(getattr(self, kind)))
+            object.__setattr__(self, kind, _several(self.name, kind, getattr(self, kind)))
         for kind in ("states", "inputs", "outputs", "parameters"):
             _check_names(self.name, kind, [item.name for item in getattr(self, kind)])
         if self.output is None:
@@ -247,6 +247,16 @@ class ProcessModel:
             raise ModelError(f"{where} must return a tuple, not {type(values).__name__}")
         if len(values) != expected:
             raise ModelError(f"{where} returns {len(values)} values, expected {expected}")
+
+
+def _several(model: str, kind: str, items: Any) -> tuple[Any, ...]:
+    try:
+        return tuple(items)
+    except TypeError:
+        raise ModelError(
+            f"model {model}: {kind} is one {type(items).__name__}, not several; "
+            f"write ({type(items).__name__}(...),) with a comma before the bracket"
+        ) from None
 
 
 def _call(where: str, function: Callable[..., Any], *args: Any) -> Any:

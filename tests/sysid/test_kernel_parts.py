@@ -88,6 +88,9 @@ def test_a_lane_that_is_not_finite_gives_not_a_number_and_disturbs_no_other():
         ("tanh", -1e-6, 1e-6, 1e-15),
         ("sin", -1e5, 1e5, 1e-15),
         ("cos", -1e5, 1e5, 1e-15),
+        ("log", 0.0, 1e9, 1e-15),
+        ("log", 0.9, 1.1, 1e-15),
+        ("log", 0.0, 1e-300, 1e-15),
     ],
 )
 def test_vector_functions_are_as_exact_as_the_library(name, low, high, tolerance):
@@ -99,6 +102,30 @@ def test_vector_functions_are_as_exact_as_the_library(name, low, high, tolerance
     assert np.max(np.abs(found - exact) / size) < tolerance
 
 
-@pytest.mark.parametrize("name", ["exp", "tanh", "sin", "cos"])
+def test_powers_are_as_exact_as_the_library():
+    rng = np.random.default_rng(2)
+    x, y = np.exp(rng.uniform(-8.0, 8.0, 3000)), rng.uniform(-5.0, 5.0, 3000)
+    found = np.array([_vector_math.pow(a, b) for a, b in zip(x, y, strict=True)])
+    np.testing.assert_allclose(found, x**y, rtol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "expected"),
+    [
+        (0.0, 0.5, 0.0), (0.0, 0.0, 1.0), (0.0, -1.5, math.inf), (-2.0, 3.0, -8.0),
+        (-2.0, -2.0, 0.25), (-2.0, 0.5, math.nan), (math.inf, 0.5, math.inf),
+        (1e300, 2.0, math.inf), (math.nan, 2.0, math.nan), (2.0, math.nan, math.nan),
+    ],
+)  # fmt: skip
+def test_powers_at_the_edges(x, y, expected):
+    assert _vector_math.pow(x, y) == pytest.approx(expected, rel=1e-14, nan_ok=True)
+
+
+def test_logarithms_at_the_edges():
+    found = [_vector_math.log(x) for x in (0.0, -1.0, math.inf, 1.0)]
+    assert found == pytest.approx([-math.inf, math.nan, math.inf, 0.0], nan_ok=True)
+
+
+@pytest.mark.parametrize("name", ["exp", "tanh", "sin", "cos", "log"])
 def test_vector_functions_pass_not_a_number_on(name):
     assert math.isnan(getattr(_vector_math, name)(math.nan))

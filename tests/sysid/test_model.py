@@ -30,6 +30,11 @@ def test_repeated_names_are_named_in_the_error(kind, items):
         build(**{kind: items})
 
 
+def test_a_forgotten_comma_is_named():
+    with pytest.raises(ModelError, match=r"outputs is one Output, not several; write \(Output\("):
+        lag(outputs=(Output("y", "m")))
+
+
 @pytest.mark.parametrize("kind", ["states", "outputs", "parameters"])
 def test_a_model_needs_states_outputs_and_parameters(kind):
     with pytest.raises(ModelError, match=f"it has no {kind}"):

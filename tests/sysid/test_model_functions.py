@@ -49,8 +49,19 @@ def mathematics(x, u, p):
     )
 
 
+def powers(x, u, p):
+    return (
+        x[1] - abs(x[0]) ** (p[0] - 1.0) * x[0] + math.log(1.0 + x[1] * x[1]),
+        u[0] - 1.7 ** x[1] - math.pow(abs(x[0]), 0.5 * p[0]) - x[1] ** 3.0,
+    )
+
+
 def times(a, b):
     return a * b
+
+
+def by_default(x, u, p, product=times):
+    return product(x[1], 0.7), u[0] - p[0] * x[1] - x[0]
 
 
 def closure(factor, inner):
@@ -77,6 +88,8 @@ def double(x, u, p):
 MODELS = {
     "one_state_no_inputs": {"derivative": one_state, "states": 1, "inputs": 0},
     "mathematics and conditions": {"derivative": mathematics},
+    "powers and logarithms": {"derivative": powers},
+    "a helper as a default": {"derivative": by_default},
     "closure, defaults and powers": {"derivative": closure(1.5, times)},
     "module": {"derivative": through_a_module},
     "helpers and output": {"derivative": helpers, "output": double, "outputs": 3},
