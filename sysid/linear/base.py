@@ -60,8 +60,9 @@ class PolynomialModel(RegressorMixin, BaseEstimator):  # type: ignore[misc]
     def predict(self, X: Data, *, records: Any = None, dt: float | None = None) -> FloatArray:
         """Free-run outputs of the identified model, (n_samples, n_outputs).
 
-        A Dataset starts from its first ``n_lags_`` measured rows, which are returned as they are
-        (a lost sample as the one before it). An array X starts from rest like ``simulate``, each
+        A Dataset starts from the values of its first ``n_lags_`` rows that make the whole record
+        fit best, by least squares with each output in units of its residual, so that noise in
+        those rows does no harm. An array X starts from rest like ``simulate``, each
         of its ``records`` anew; the outputs are (n_samples,) if those of ``fit`` were.
         """
         check_is_fitted(self)
@@ -111,7 +112,7 @@ class PolynomialModel(RegressorMixin, BaseEstimator):  # type: ignore[misc]
     ) -> float:
         """Mean free-run fit % over outputs and records, divided by 100: 1 is perfect.
 
-        Each record starts from its first measured rows, like ``predict`` of a Dataset.
+        Each record starts where it fits best, like ``predict`` of a Dataset.
         """
         check_is_fitted(self)
         data = given_datasets(X)

@@ -9,6 +9,9 @@ import numpy as np
 from sysid.linear import recursion
 from sysid.model import FloatArray
 
+# A response to a start beyond this many times the start is that of an unstable model.
+_GROWN = 1e6
+
 
 @dataclass(frozen=True)
 class Predictor:
@@ -39,8 +42,47 @@ class Predictor:
         return np.concatenate((initial, recursion.free_run(self.A, w[len(initial) :], past)))
 
     def follow(self, inputs: FloatArray, measured: FloatArray) -> FloatArray:
-        """Free run that starts from the first ``lag`` measured rows, (n, q)."""
-        return self.run(inputs, held(measured[: self.lag], self.rest_y) if self.lag else None)
+        """Free run whose first ``lag`` rows are those that explain the record best, (n, q)."""
+        if not self.lag:
+            return self.run(inputs)
+        first = held(measured[: self.lag], self.rest_y)
+        plain = self.run(inputs, first)
+        return plain + self._better_start(measured - plain)
+
+    def _better_start(self, residual: FloatArray) -> FloatArray:
+        """What a free run gains by starting elsewhere than at its measured first rows, (n, q).
+
+        residual: (n, q), NaN where an output was lost. The outputs depend linearly on the last
+        rows before the recursion begins: least squares, each output in units of its residual.
+        A model whose response to them grows out of proportion starts where it was measured.
+        """
+        if len(residual) <= self.lag:
+            return np.zeros_like(residual)
+        seen = np.isfinite(residual)
+        with np.errstate(over="ignore", invalid="ignore"):
+            unit = np.sqrt(np.mean(np.where(seen, residual, 0.0)[self.lag :] ** 2, axis=0))
+        if not (np.all(np.isfinite(unit)) and np.all(unit > 0.0)):
+            return np.zeros_like(residual)
+        responses = self._responses(unit, len(residual))
+        if not np.all(np.abs(responses) < _GROWN):
+            return np.zeros_like(residual)
+        move = np.linalg.lstsq(responses[:, seen].T, (residual / unit)[seen])[0]
+        better: FloatArray = unit * np.tensordot(move, responses, axes=1)
+        return better
+
+    def _responses(self, unit: FloatArray, n: int) -> FloatArray:
+        """Free runs from one unit in each value of the rows that the recursion begins with.
+
+        unit: (q,). The result, (n_lags q, n, q), is in these units; without inputs and offset.
+        """
+        na, q = len(self.A) - 1, len(unit)
+        start = self.lag
+        found = np.zeros((na * q, n, q))
+        for i, response in enumerate(found):
+            response[start - 1 - i // q, i % q] = unit[i % q]
+            past = np.concatenate((np.zeros((na, q)), response[:start]))
+            response[start:] = recursion.free_run(self.A, np.zeros((n - start, q)), past)
+        return found / unit
 
     def ahead(self, inputs: FloatArray, measured: FloatArray, k: int) -> FloatArray:
         """Row t predicted from the outputs up to row t-k and the inputs up to row t; (n, q)."""
