@@ -2,5 +2,6 @@
 
 from sysid.uncertainty.analysis import Ambiguity, Uncertainty, uncertainty
 from sysid.uncertainty.estimate import Estimate
+from sysid.uncertainty.profile import Profile, profile
 
-__all__ = ["Ambiguity", "Estimate", "Uncertainty", "uncertainty"]
+__all__ = ["Ambiguity", "Estimate", "Profile", "Uncertainty", "profile", "uncertainty"]

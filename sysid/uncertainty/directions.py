@@ -28,13 +28,25 @@ class Directions:
     Coordinates are those of ``Sensitivity``. covariance: (n_free, n_free), undetermined
     directions and parameters held by a bound left out. lost: (n_lost, n_free), orthonormal.
     singular_values: of the weighted sensitivity, falling. held: (n_free,), parameters that a
-    bound holds.
+    bound holds. curvature: (n_free, n_free), inverse of the curvature in the determined
+    directions, what the covariance would be of white residuals of unit weight.
     """
 
     covariance: FloatArray
     lost: FloatArray
     singular_values: FloatArray
     held: BoolArray
+    curvature: FloatArray
+
+    def inflation(self, place: int | None) -> float:
+        """Variance of a coordinate in parts of what the curvature alone says; of all for None."""
+        ratio = np.diag(self.covariance) / np.where(
+            np.diag(self.curvature) > 0.0, np.diag(self.curvature), np.inf
+        )
+        if place is not None:
+            return float(ratio[place])
+        positive = ratio[ratio > 0.0]
+        return float(np.median(positive)) if len(positive) else 1.0
 
     @property
     def rank(self) -> int:
@@ -88,7 +100,7 @@ def _decompose(rows: FloatArray, score: FloatArray, held: BoolArray) -> Directio
     inverse[np.ix_(kept, kept)] = (strong.T / values[determined] ** 2) @ strong
     lost = np.zeros((int((~determined).sum()), n))
     lost[:, kept] = vectors[~determined]
-    return Directions(inverse @ score @ inverse, lost, values, held)
+    return Directions(inverse @ score @ inverse, lost, values, held, inverse)
 
 
 def _pushes(weighted: FloatArray, changes: Iterable[FloatArray]) -> FloatArray:
