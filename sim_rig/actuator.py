@@ -29,6 +29,7 @@ from sim_rig.options import (
 )
 from sim_rig.parts import Layout, known, log_range
 from sysid import Constraint, Input, ModelError, Output, ProcessModel, State
+from sysid.model import picker
 
 OUTPUTS = (
     Output("current_motor", "A"),
@@ -239,22 +240,13 @@ def _chosen(names: tuple[str, ...], measured: bool) -> tuple[Output, ...]:
 
 def _output(names: tuple[str, ...], shaft: _Shaft) -> Callable[..., tuple[Any, ...]]:
     everything = [output.name for output in OUTPUTS]
-    pick = _picker([everything.index(name) for name in names])
+    pick = picker([everything.index(name) for name in names])
 
     def output(x: Any, u: Any, p: Any) -> tuple[Any, ...]:
         torque = shaft(x, u, p)[1]
         return pick((x[2], x[3], torque, x[_THETA], x[_OMEGA]))
 
     return output
-
-
-def _picker(places: list[int]) -> Callable[[Any], tuple[Any, ...]]:
-    """A function of a tuple that returns some of its values, in a form that compiles."""
-    first = places[0]
-    if len(places) == 1:
-        return lambda values: (values[first],)
-    rest = _picker(places[1:])
-    return lambda values: (values[first], *rest(values))
 
 
 def _constraints(parts: _Parts, layout: Layout) -> tuple[Constraint, ...]:

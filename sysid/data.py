@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from sysid.model import FloatArray, ModelError, ProcessModel
+from sysid.model import AROUND_FIRST_SAMPLE, FloatArray, ModelError, ProcessModel
 
 
 @dataclass(frozen=True)
@@ -70,6 +70,11 @@ class Dataset:
         """Sample instants [s], shape (n_samples,)."""
         return self.dt * np.arange(self.n_samples, dtype=np.float64)
 
+    def part(self, begin: int, end: int, name: str) -> Dataset:
+        """The rows from ``begin`` up to ``end`` as a record of their own."""
+        rows = slice(begin, end)
+        return replace(self, inputs=self.inputs[rows], outputs=self.outputs[rows], name=name)
+
     def check(self, model: ProcessModel) -> None:
         """Raise ModelError unless the columns match the model's inputs and outputs."""
         expected = (len(model.inputs), len(model.outputs))
@@ -83,14 +88,25 @@ class Dataset:
     def initial_state(self, model: ProcessModel) -> FloatArray:
         """Start of a free run: states that are outputs from the first row, others as declared.
 
-        Shape (n_states,).
+        Shape (n_states,). A state with ``first_sample`` off starts as declared all the same.
         """
         x0 = model.initial_state
         first = dict(zip(model.output_names, self.outputs[0], strict=True))
-        for i, name in enumerate(model.state_names):
-            if np.isfinite(first.get(name, np.nan)):
-                x0[i] = first[name]
+        for i, state in enumerate(model.states):
+            if state.first_sample and np.isfinite(first.get(state.name, np.nan)):
+                x0[i] = first[state.name]
         return x0
+
+    def initial_range(self, model: ProcessModel, state: int) -> tuple[float, float] | None:
+        """Where the start of a state of the model is to be estimated; None where it is not."""
+        declared = model.states[state].initial_range
+        if declared != AROUND_FIRST_SAMPLE:
+            return declared
+        values = self.outputs[:, model.output_names.index(model.state_names[state])]
+        values = values[np.isfinite(values)]
+        middle = float(self.initial_state(model)[state])
+        span = (float(np.ptp(values)) if len(values) else 0.0) or 1.0
+        return middle - span, middle + span
 
 
 def _matrix(values: FloatArray) -> FloatArray:

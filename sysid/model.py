@@ -7,7 +7,7 @@ simulator compiles it to vector code, SciPy integrates it as the reference.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -23,6 +23,10 @@ Function = Callable[..., tuple[Any, ...]]
 
 Scale = Literal["linear", "log"]
 Hold = Literal["zoh", "foh"]
+# A value, a range to estimate it in, or a word.
+Start = float | tuple[float, float] | Literal["first", "estimate"]
+
+AROUND_FIRST_SAMPLE = (-math.inf, math.inf)
 
 
 class ModelError(ValueError):
@@ -33,7 +37,10 @@ class ModelError(ValueError):
 class State:
     """One state: name, unit and the value it starts from when no measurement gives it.
 
-    initial_range: (low, high) where that value is unknown and to be estimated from each record.
+    initial_range: (low, high) where that value is unknown and to be estimated from each record;
+    ``AROUND_FIRST_SAMPLE`` for as far from the first sample of the output of the same name as
+    that output spans in the record. first_sample: whether that sample, where there is one, goes
+    before ``initial``.
     """
 
     name: str
@@ -41,9 +48,10 @@ class State:
     initial: float = 0.0
     description: str = ""
     initial_range: tuple[float, float] | None = None
+    first_sample: bool = True
 
     def __post_init__(self) -> None:
-        if self.initial_range is not None:
+        if self.initial_range is not None and self.initial_range != AROUND_FIRST_SAMPLE:
             check_range(f"{self.name}(0)", *self.initial_range)
 
 
@@ -212,6 +220,86 @@ class ProcessModel:
         parameters = tuple(replace(p, **changes.get(p.name, {})) for p in self.parameters)
         return replace(self, parameters=parameters)
 
+    def with_outputs(self, names: Sequence[str]) -> ProcessModel:
+        """A copy with these outputs, in this order: outputs of the model, or states of it.
+
+        Raises ModelError for a name that is neither, one given twice, or none at all.
+        """
+        own = {signal.name: signal for signal in self.outputs}
+        states = {s.name: Output(s.name, s.unit, s.description) for s in self.states}
+        known = states | own
+        for name in names:
+            if name not in known:
+                raise ModelError(
+                    f"model {self.name} has no output or state {name!r}; it has {', '.join(known)}"
+                )
+        outputs = tuple(known[name] for name in names)
+        if self.output is None:
+            return replace(self, outputs=outputs)
+        everything = [*own, *self.state_names]
+        pick = picker([everything.index(name) for name in names]) if names else tuple
+        output = self.output
+        return replace(
+            self, outputs=outputs, output=lambda x, u, p: pick(output(x, u, p) + tuple(x))
+        )
+
+    def with_initial(self, starts: Mapping[str, Start]) -> ProcessModel:
+        """A copy in which the named states start as told, in every record.
+
+        ``"first"``: at the first sample of the output of the same name. A number: there,
+        whatever was measured. ``"estimate"``: fitted to each record, within the state's own
+        range or around its first sample. ``(low, high)``: the same within this range. Raises
+        ModelError for an unknown state, or a word that its outputs do not allow.
+        """
+        for name in starts:
+            if name not in self.state_names:
+                raise ModelError(
+                    f"model {self.name} has no state {name!r}; it has {', '.join(self.state_names)}"
+                )
+        states = tuple(
+            self._started(state, starts[state.name]) if state.name in starts else state
+            for state in self.states
+        )
+        return replace(self, states=states)
+
+    def with_holds(self, holds: Mapping[str, Hold]) -> ProcessModel:
+        """A copy in which the named inputs are held (``zoh``) or interpolated (``foh``).
+
+        Raises ModelError for an unknown input.
+        """
+        for name in holds:
+            if name not in self.input_names:
+                raise ModelError(
+                    f"model {self.name} has no input {name!r}; it has {', '.join(self.input_names)}"
+                )
+        inputs = tuple(replace(u, hold=holds.get(u.name, u.hold)) for u in self.inputs)
+        return replace(self, inputs=inputs)
+
+    def _started(self, state: State, start: Start) -> State:
+        measured = state.name in self.output_names
+        if start == "first":
+            if not measured:
+                raise ModelError(
+                    f"state {state.name} of model {self.name} is no output, so no sample tells its "
+                    "start; give a value, 'estimate' or [low, high]"
+                )
+            return replace(state, initial_range=None, first_sample=True)
+        if start == "estimate":
+            if state.initial_range is None and not measured:
+                raise ModelError(
+                    f"state {state.name} of model {self.name} is no output and has no range of its "
+                    "own to estimate its start in; give one as [low, high]"
+                )
+            return replace(state, initial_range=state.initial_range or AROUND_FIRST_SAMPLE)
+        if isinstance(start, tuple):
+            return replace(state, initial_range=start)
+        if isinstance(start, str) or not math.isfinite(start):
+            raise ModelError(
+                f"state {state.name}: {start!r} is no start; give 'first', 'estimate', a number or "
+                "(low, high)"
+            )
+        return replace(state, initial=float(start), initial_range=None, first_sample=False)
+
     def evaluate_output(
         self, x: Sequence[Any], u: Sequence[Any], p: Sequence[Any]
     ) -> tuple[Any, ...]:
@@ -257,6 +345,15 @@ def _several(model: str, kind: str, items: Any) -> tuple[Any, ...]:
             f"model {model}: {kind} is one {type(items).__name__}, not several; "
             f"write ({type(items).__name__}(...),) with a comma before the bracket"
         ) from None
+
+
+def picker(places: Sequence[int]) -> Callable[[Any], tuple[Any, ...]]:
+    """A function of a tuple that returns some of its values, in a form that compiles."""
+    first = places[0]
+    if len(places) == 1:
+        return lambda values: (values[first],)
+    rest = picker(places[1:])
+    return lambda values: (values[first], *rest(values))
 
 
 def _call(where: str, function: Callable[..., Any], *args: Any) -> Any:

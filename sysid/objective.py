@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
 
 from sysid.data import Dataset, output_scale
-from sysid.model import FloatArray, ModelError
+from sysid.model import FloatArray, IntArray, ModelError
 from sysid.simulation import BatchResult, BatchSimulator
 from sysid.space import SearchSpace
+
+# Whether logs count by their samples or each alike.
+Balance = Literal["samples", "logs"]
 
 
 class Objective:
@@ -18,8 +22,11 @@ class Objective:
 
     This is (4.22) with the sum inside each root divided by the number of samples, so that it
     does not grow with the record's length; for one record the two rank chromosomes alike, (4.22)
-    being sqrt(n_samples) times this. Several records count as one long one. ``weights``:
-    (n_outputs,), relative importance of the outputs, default equal.
+    being sqrt(n_samples) times this. Several records count as one long one, or with ``balance``
+    "logs" each alike whatever its length: the mean under the root is then one of the records'
+    means. ``weights``: (n_outputs,), relative importance of the outputs, default equal.
+    ``scales``: what residuals are divided by, per record (n_outputs,): max|y|, times what
+    balances the records.
     """
 
     def __init__(
@@ -29,16 +36,18 @@ class Objective:
         records: Sequence[Dataset],
         *,
         per_log: bool = False,
+        balance: Balance = "samples",
         weights: FloatArray | None = None,
     ) -> None:
         self.simulator = simulator
         self.space = space
         self.records = list(records)
-        self.scales = output_scale(self.records, per_log)
         q = len(simulator.model.outputs)
         relative = np.ones(q) if weights is None else np.asarray(weights, dtype=np.float64)
         self.weights = relative / relative.sum()
-        self._counts = np.sum([np.isfinite(r.outputs).sum(axis=0) for r in self.records], axis=0)
+        counts = np.array([np.isfinite(record.outputs).sum(axis=0) for record in self.records])
+        self._counts = counts.sum(axis=0)
+        self.scales = _balanced(output_scale(self.records, per_log), counts, balance)
         unseen = [
             output.name
             for output, count, weight in zip(
@@ -102,3 +111,19 @@ class Objective:
         with np.errstate(invalid="ignore"):  # infinite times a weight of zero
             errors = np.sqrt(sse / np.maximum(self._counts, 1)) @ self.weights
         return np.where(np.isfinite(errors), errors, np.inf)
+
+
+def _balanced(scales: list[FloatArray], counts: IntArray, balance: Balance) -> list[FloatArray]:
+    """Divisors of residuals under which the mean over all samples is the one asked for.
+
+    counts: (n_records, n_outputs), measured samples.
+    """
+    if balance == "samples":
+        return scales
+    if balance != "logs":
+        raise ModelError(f"unknown balance {balance!r}; choose samples or logs")
+    # A log's share of the samples over its share of the logs that saw the output.
+    share = counts * np.sum(counts > 0, axis=0) / np.maximum(counts.sum(axis=0), 1)
+    return [
+        scale * np.sqrt(np.where(n > 0.0, n, 1.0)) for scale, n in zip(scales, share, strict=True)
+    ]

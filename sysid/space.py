@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sysid.data import Dataset
 from sysid.model import BoolArray, FloatArray, ModelError, Parameter, ProcessModel, Scale
 from sysid.ranges import Range, Tie, one_sided, searched, ties
 
@@ -90,35 +91,33 @@ class SearchSpace:
         return space
 
     @classmethod
-    def of_starts(cls, model: ProcessModel, vector: FloatArray, n_records: int) -> SearchSpace:
-        """Only the initial states of some records, the model's parameters being ``vector``."""
-        return cls(model, (), np.asarray(vector), ()).with_starts(n_records)
+    def of_starts(cls, model: ProcessModel, vector: FloatArray, record: Dataset) -> SearchSpace:
+        """Only the initial states of a record, the model's parameters being ``vector``."""
+        return cls(model, (), np.asarray(vector), ()).with_starts([record])
 
-    def with_starts(self, n_records: int) -> SearchSpace:
-        """The same space and the initial states that the model leaves to be estimated."""
+    def with_starts(self, records: Sequence[Dataset]) -> SearchSpace:
+        """The same space and the initial states that are to be estimated, record by record."""
         parameters, starts = list(self.parameters), list(self.estimated)
-        for record in range(n_records):
+        for k, record in enumerate(records):
+            own = record.initial_state(self.model)
             for i, state in enumerate(self.model.states):
-                if state.initial_range is None:
+                ends = record.initial_range(self.model, i)
+                if ends is None:
                     continue
-                name = f"{state.name}(0)" if n_records == 1 else f"{state.name}(0) {record + 1}"
-                low, high = state.initial_range
+                name = f"{state.name}(0)" if len(records) == 1 else f"{state.name}(0) {k + 1}"
                 about = f"initial {state.description or state.name}"
+                begin = min(max(float(own[i]), ends[0]), ends[1])
                 parameters.append(
-                    Parameter(
-                        name, state.unit, state.initial, low, high,
-                        minimum=-np.inf, description=about,
-                    )
-                )  # fmt: skip
-                starts.append(Start(record, i))
+                    Parameter(name, state.unit, begin, *ends, minimum=-np.inf, description=about)
+                )
+                starts.append(Start(k, i))
         return replace(self, parameters=tuple(parameters), estimated=tuple(starts))
 
-    def with_declared_starts(self, chromosomes: FloatArray) -> FloatArray:
-        """Chromosomes of the parameters alone, completed by the declared initial states."""
-        declared = [self.model.states[start.state].initial for start in self.estimated]
+    def with_nominal_starts(self, chromosomes: FloatArray) -> FloatArray:
+        """Chromosomes of the parameters alone, completed by where the states start otherwise."""
+        begin = [parameter.nominal for parameter in self.parameters[len(self.index) :]]
         return np.concatenate(
-            [chromosomes, np.broadcast_to(declared, (*chromosomes.shape[:-1], len(declared)))],
-            axis=-1,
+            [chromosomes, np.broadcast_to(begin, (*chromosomes.shape[:-1], len(begin)))], axis=-1
         )
 
     def starts(self, chromosomes: FloatArray, record: int, own: FloatArray) -> FloatArray:

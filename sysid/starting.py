@@ -15,7 +15,7 @@ from sysid.space import SearchSpace
 def free_run(simulator: BatchSimulator, vector: FloatArray, record: Dataset) -> FloatArray:
     """Outputs of a record's inputs, (n_samples, n_outputs), from where the record starts.
 
-    Initial states that the model leaves open are estimated from the record's outputs.
+    Initial states that the model leaves to be estimated are, from the record's outputs.
     """
     start = estimate_start(simulator, vector, record)
     outputs: FloatArray = simulator.trajectories(vector, record, starts=start[None])[0]
@@ -31,12 +31,12 @@ def estimate_start(simulator: BatchSimulator, vector: FloatArray, record: Datase
     """
     model = simulator.model
     own = record.initial_state(model)
-    space = SearchSpace.of_starts(model, vector, 1)
+    space = SearchSpace.of_starts(model, vector, record)
     weights = np.asarray(np.isfinite(record.outputs).any(axis=0), dtype=np.float64)
     if not (space.estimated and weights.any()):
         return own
     objective = Objective(simulator, space, [record], weights=weights)
-    declared = space.with_declared_starts(np.empty(0))
-    found = refine(objective, declared).chromosome
+    begin = space.with_nominal_starts(np.empty(0))
+    found = refine(objective, begin).chromosome
     start: FloatArray = space.starts(found[None], 0, own)[0]
     return start

@@ -120,6 +120,12 @@ def identify(
     population: Population = None,
     generations: Generations = None,
     seed: Annotated[int | None, typer.Option("--seed", help="One seed gives one result.")] = None,
+    hold_back: Annotated[
+        float | None,
+        typer.Option(
+            "--hold-back", metavar="PART", help="Part of each log, its end, kept for validation."
+        ),
+    ] = None,
     settings: Annotated[
         list[str] | None,
         typer.Option(
@@ -139,6 +145,7 @@ def identify(
         "population": population,
         "generations": generations,
         "seed": seed,
+        "hold_back": hold_back,
     }
     identify_command(logs, validate or [], config, out, options, settings or [], json)
 

@@ -165,7 +165,7 @@ def run_all(
 def groups_of(
     prepared: Prepared, logs: list[Path], validate: list[Path], together: bool
 ) -> list[Group]:
-    """The logs for one model, each by itself or all together."""
+    """The logs for one model, each by itself or all together, less what is held back of them."""
 
     def loaded(paths: list[Path]) -> list[Loaded]:
         return [
@@ -174,12 +174,13 @@ def groups_of(
 
     training, validation = loaded(logs), loaded(validate)
     no_overlap(training, validation)
-    if together:
-        return [Group(prepared, _together(training), training, validation)]
-    names = _log_names(training)
-    return [
-        Group(prepared, name, [log], validation) for name, log in zip(names, training, strict=True)
-    ]
+    names = [_together(training)] if together else _log_names(training)
+    groups = [training] if together else [[log] for log in training]
+    part, made = prepared.settings.hold_back, []
+    for name, group in zip(names, groups, strict=True):
+        begins, ends = datasets.hold_back(group, part)
+        made.append(Group(prepared, name, begins, [*ends, *validation]))
+    return made
 
 
 def note_warnings(groups: Sequence[Group]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -64,15 +65,50 @@ def load(path: Path, model: ProcessModel, mapping: Mapping | None) -> Loaded:
         raise ConfigError(f"{path}: {error}") from None
 
 
-def check_mapping(model: ProcessModel, mapping: Mapping) -> None:
-    """Raise ConfigError unless every signal of the model, and no other, has its column."""
+def hold_back(logs: list[Loaded], part: float) -> tuple[list[Loaded], list[Loaded]]:
+    """The beginnings of logs, to train on, and the last ``part`` of each, to validate by.
+
+    An end starts where every output was measured, so that its first sample tells where it
+    starts. Raises ConfigError when a beginning or an end holds too little.
+    """
+    if part == 0.0:
+        return logs, []
+    halves = [_halves(log, part) for log in logs]
+    return [half[0] for half in halves], [half[1] for half in halves]
+
+
+def _halves(log: Loaded, part: float) -> tuple[Loaded, Loaded]:
+    whole = log.dataset
+    cut = round(whole.n_samples * (1.0 - part))
+    complete = np.flatnonzero(np.all(np.isfinite(whole.outputs[cut:]), axis=1))
+    begin = cut + int(complete[0]) if len(complete) else cut
+    shares = (f"first {100 * (1 - part):.3g} %", f"last {100 * part:.3g} %")
+    halves = []
+    for (first, last), share in zip(((0, cut), (begin, whole.n_samples)), shares, strict=True):
+        measured = np.isfinite(whole.outputs[first:last]).any(axis=0)
+        if last - first < 2 or not measured.all():
+            raise ConfigError(
+                f"{log.path}: with hold_back {part:g} the {share} of it hold {last - first} "
+                f"samples{'' if measured.all() else ' and miss an output'}; hold back another "
+                "part, or validate with another log"
+            )
+        dataset = whole.part(first, last, f"{whole.name} ({share})")
+        halves.append(replace(log, dataset=dataset))
+    return halves[0], halves[1]
+
+
+def check_mapping(model: ProcessModel, mapping: Mapping, spare: Sequence[str] = ()) -> None:
+    """Raise ConfigError unless every signal of the model, and no other, has its column.
+
+    spare: outputs that may have one as well though the model is used without them.
+    """
     groups = (
         ("inputs", mapping.columns.inputs, model.input_names),
         ("outputs", mapping.columns.outputs, model.output_names),
     )
     for group, given, needed in groups:
         for name in given:
-            if name not in needed:
+            if name not in needed and not (group == "outputs" and name in spare):
                 raise mapping.file.error(
                     ("columns", group, name),
                     f"model {model.name} has no such signal; {suggestion(name, needed)}",
@@ -121,8 +157,9 @@ def _with_noise(dataset: Dataset, recording: capture.Recording, model: ProcessMo
 
 def _load_foreign(path: Path, model: ProcessModel, mapping: Mapping) -> Loaded:
     columns = mapping.columns
-    sources = {**columns.inputs, **columns.outputs}
-    used = (columns.time.column, *(c.column for c in sources.values()))
+    sources = [columns.inputs[name] for name in model.input_names]
+    sources += [columns.outputs[name] for name in model.output_names]
+    used = (columns.time.column, *(c.column for c in sources))
     table = read_table(path, list(dict.fromkeys(name for name in used if name is not None)))
     frame = table.frame
     require_rows(path, len(frame))

@@ -19,7 +19,7 @@ from daq.cli.datasets import Loaded, Mapping
 from daq.cli.modelling import DEFAULT_MODEL, find_model, whole_name
 from daq.cli.reporting import Identified
 from daq.config import yaml_file
-from daq.config.identification import IdentificationConfig
+from daq.config.identification import IdentificationConfig, Signals
 from daq.config.yaml_file import CommandLine, YamlFile, suggestion
 from daq.errors import ConfigError
 from sysid import ModelError, SearchSpace
@@ -90,16 +90,23 @@ def prepare_models(
             f"{suggestion(settings.preset, list(PRESETS))}"
         )  # fmt: skip
     found = [_find(config, file, settings, name) for name in names]
-    _check_names(file, settings, [model for model, _ in found])
+    models = [_with_outputs(file, settings, model) for model, _ in found]
+    _check_names(file, settings, models)
     mapping = Mapping(file, settings.columns) if settings.columns else None
     prepared = []
-    for model, name in found:
+    for (whole, name), model in zip(found, models, strict=True):
         own = _own_settings(settings, model)
         _check_space(file, own, model)
         if mapping is not None:
-            datasets.check_mapping(model, mapping)
-        prepared.append(Prepared(model, name, own, mapping, _range_sources(file)))
+            datasets.check_mapping(model, mapping, (*whole.output_names, *whole.state_names))
+        used = _with_starts(file, own, model)
+        prepared.append(Prepared(used, name, own, mapping, _range_sources(file)))
     return prepared
+
+
+def as_told(file: YamlFile, signals: Signals, model: ProcessModel) -> ProcessModel:
+    """The model with outputs, starts and holds as a file has them; ConfigError names the key."""
+    return _with_starts(file, signals, _with_outputs(file, signals, model))
 
 
 def gassi_settings(settings: IdentificationConfig) -> dict[str, Any]:
@@ -115,6 +122,7 @@ def gassi_settings(settings: IdentificationConfig) -> dict[str, Any]:
         "elite_percent": settings.elite_percent,
         "weights": settings.weights or None,
         "per_log": settings.per_log,
+        "balance": settings.balance,
         "accuracy": settings.accuracy,
         "max_steps": settings.max_steps,
         "random_state": settings.seed,
@@ -136,6 +144,27 @@ def _find(
         if beside is None or settings.model is None:
             raise
         raise file.error(("model",), str(error)) from None
+
+
+def _with_outputs(file: YamlFile, signals: Signals, model: ProcessModel) -> ProcessModel:
+    if not signals.outputs:
+        return model
+    try:
+        return model.with_outputs(signals.outputs)
+    except ModelError as error:
+        raise file.error(("outputs",), str(error)) from None
+
+
+def _with_starts(file: YamlFile, signals: Signals, model: ProcessModel) -> ProcessModel:
+    for name, start in signals.initial.items():
+        try:
+            model = model.with_initial({name: start})
+        except ModelError as error:
+            raise file.error(("initial", name), str(error)) from None
+    try:
+        return model.with_holds(signals.hold)
+    except ModelError as error:
+        raise file.error(("hold",), str(error)) from None
 
 
 def _range_sources(file: CommandLine) -> dict[str, str]:
@@ -163,6 +192,8 @@ def identify_logs(
     for log in (*train, *check):
         if log.warning is not None:
             console.report_note(log.warning)
+    train, ends = datasets.hold_back(train, prepared.settings.hold_back)
+    check = [*ends, *check]
     estimator = _fit(prepared, train, as_json)
     result = assemble(prepared, estimator, train, check)
     report = reporting.document(result)
@@ -177,14 +208,15 @@ def _check_names(
     file: YamlFile, settings: IdentificationConfig, models: Sequence[ProcessModel]
 ) -> None:
     names = " or ".join(dict.fromkeys(model.name for model in models))
-    parameters = tuple(dict.fromkeys(n for model in models for n in model.parameter_names))
-    outputs = tuple(dict.fromkeys(n for model in models for n in model.output_names))
+    parameters, outputs = _all_names(models, "parameter_names"), _all_names(models, "output_names")
     groups: tuple[tuple[str, dict[str, Any], tuple[str, ...]], ...] = (
         ("ranges", settings.ranges, parameters),
         ("fixed", settings.fixed, parameters),
         ("tied", settings.tied, parameters),
         ("scale", settings.scale, parameters),
         ("weights", settings.weights, outputs),
+        ("initial", settings.initial, _all_names(models, "state_names")),
+        ("hold", settings.hold, _all_names(models, "input_names")),
     )
     for group, given, known in groups:
         for name in given:
@@ -195,10 +227,15 @@ def _check_names(
                 )
 
 
+def _all_names(models: Sequence[ProcessModel], kind: str) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(name for model in models for name in getattr(model, kind)))
+
+
 def _own_settings(settings: IdentificationConfig, model: ProcessModel) -> IdentificationConfig:
     """The settings without what is meant for other models."""
     known = dict.fromkeys(("ranges", "fixed", "tied", "scale"), model.parameter_names)
-    known["weights"] = model.output_names
+    known |= {"weights": model.output_names, "initial": model.state_names}
+    known["hold"] = model.input_names
     own = {
         group: {name: value for name, value in getattr(settings, group).items() if name in names}
         for group, names in known.items()

@@ -257,7 +257,7 @@ def _same(file: str | None, path: Path) -> bool:
 
 def _as_model(found: Any, where: str, options: str) -> ProcessModel:
     if callable(found) and not isinstance(found, ProcessModel):
-        found = _made(found, where, _split(options, where))
+        found = _made(found, where, _split(options, where, _lists(found)))
     elif options:
         raise ConfigError(f"{where} is a finished model; it takes no options ({options!r})")
     if not isinstance(found, ProcessModel):
@@ -268,20 +268,31 @@ def _as_model(found: Any, where: str, options: str) -> ProcessModel:
     return found
 
 
-def _split(options: str, where: str) -> dict[str, str]:
-    """``a=1,b=2`` by name."""
-    chosen = {}
+def _split(options: str, where: str, lists: frozenset[str]) -> dict[str, Any]:
+    """``a=1,b=2`` by name; an option among ``lists`` takes values up to the next one's name."""
+    chosen: dict[str, Any] = {}
+    last = ""
     for item in filter(None, options.split(",")):
         key, equals, value = (part.strip() for part in item.partition("="))
+        if not equals and last in lists:
+            chosen[last] = (*chosen[last], key)
+            continue
         if not (key and equals and value):
             raise ConfigError(
                 f"{where}: {item!r} is no option; write NAME:option=value,option=value"
             )
-        chosen[key] = value
+        chosen[key] = (value,) if key in lists else value
+        last = key
     return chosen
 
 
-def _made(factory: Callable[..., Any], where: str, options: dict[str, str]) -> Any:
+def _lists(factory: Callable[..., Any]) -> frozenset[str]:
+    """Options of a function that take several values."""
+    hints = get_type_hints(factory)
+    return frozenset(key for key, hint in hints.items() if get_origin(hint) is tuple)
+
+
+def _made(factory: Callable[..., Any], where: str, options: dict[str, Any]) -> Any:
     """The model that a function makes of options given as text."""
     from pydantic import ValidationError, validate_call
 

@@ -9,10 +9,11 @@ from typing import Any
 from daq.cli import console, datasets
 from daq.cli.datasets import Mapping
 from daq.cli.files import load_rig
-from daq.cli.identifying import prepare
-from daq.cli.modelling import find_model
+from daq.cli.identifying import as_told
+from daq.cli.modelling import DEFAULT_MODEL, find_model
 from daq.cli.reporting import print_metrics
 from daq.config import yaml_file
+from daq.config.identification import IdentificationConfig, Signals
 from daq.config.yaml_file import suggestion
 from daq.errors import ConfigError
 from sysid import BatchSimulator, ModelError, evaluate, free_run
@@ -72,6 +73,8 @@ def read_parameters(path: Path) -> tuple[ProcessModel, dict[str, float]]:
         model = find_model(name, path.parent)
     except ConfigError as error:
         raise file.error(("model",), str(error)) from None
+    chosen = {key: file.content[key] for key in Signals.model_fields if key in file.content}
+    model = as_told(file, yaml_file.validate(file, Signals, chosen), model)
     entries = file.content.get("parameters")
     if not isinstance(entries, dict):
         raise file.error(("parameters",), "this key is missing; it holds 'name: value' lines")
@@ -113,12 +116,19 @@ def _rig_truth(rig: str) -> tuple[ProcessModel, dict[str, float]]:
 
 
 def _mapping(config: Path | None, model: ProcessModel) -> Mapping | None:
+    """The columns of a configuration, for the model as the parameters are of."""
     if config is None:
         return None
-    prepared = prepare(config, {})
-    if prepared.mapping is not None and prepared.model.name != model.name:
+    file = yaml_file.load(config)
+    settings = yaml_file.validate(file, IdentificationConfig)
+    if settings.columns is None:
+        return None
+    name = find_model(settings.model or DEFAULT_MODEL, config.parent).name
+    if name != model.name:
         raise ConfigError(
-            f"{config}: its columns are those of model {prepared.model.name}, "
+            f"{config}: its columns are those of model {name}, "
             f"but the parameters are of {model.name}"
         )
-    return prepared.mapping
+    mapping = Mapping(file, settings.columns)
+    datasets.check_mapping(model, mapping, spare=list(settings.columns.outputs))
+    return mapping

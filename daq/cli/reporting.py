@@ -12,7 +12,7 @@ import numpy as np
 
 from daq import capture
 from daq.cli import console
-from daq.config.identification import IdentificationConfig
+from daq.config.identification import IdentificationConfig, Signals
 from sysid.assessment import RecordResult, judge
 from sysid.gassi import GASSI
 from sysid.metrics import Metrics
@@ -79,6 +79,7 @@ def document(result: Identified) -> dict[str, Any]:
     )
     return {
         "model": result.model_name,
+        **_signals(settings),
         "verdict": {"trust": verdict.trust, "reasons": list(verdict.reasons)},
         "parameters": {p.name: _parameter(result, p) for p in result.model.parameters},
         **_initial_states(result),
@@ -107,6 +108,19 @@ def document(result: Identified) -> dict[str, Any]:
         },
         "software": capture.software_versions(),
     }
+
+
+def _signals(signals: Signals) -> dict[str, Any]:
+    """How the model was used where not as it declares; ``rig replay`` uses it likewise."""
+    chosen = {
+        "outputs": list(signals.outputs),
+        "initial": {
+            name: list(start) if isinstance(start, tuple) else start
+            for name, start in signals.initial.items()
+        },
+        "hold": dict(signals.hold),
+    }
+    return {key: value for key, value in chosen.items() if value}
 
 
 def _parameter(result: Identified, parameter: Parameter) -> dict[str, Any]:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+import math
+from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from daq.config.base import Section
 
@@ -19,6 +20,23 @@ def _ordered(ends: tuple[float | None, float | None]) -> tuple[float | None, flo
 
 
 Range = Annotated[tuple[float | None, float | None], AfterValidator(_ordered)]
+
+
+def _start(value: Any) -> Any:
+    if isinstance(value, list):
+        if len(value) == 2 and all(_is_number(end) for end in value):
+            low, high = _ordered((value[0], value[1]))
+            return low, high
+    elif value in ("first", "estimate") or _is_number(value):
+        return value
+    raise ValueError("it must be first, estimate, a number, or [low, high] to estimate it in")
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+StartSetting = Annotated[Any, BeforeValidator(_start)]
 
 
 class TimeColumn(Section):
@@ -57,10 +75,25 @@ class Columns(Section):
 
     time: TimeColumn
     inputs: dict[str, Column] = Field(description="for each input of the model")
-    outputs: dict[str, Column] = Field(description="for each output of the model")
+    outputs: dict[str, Column] = Field(description="for each output that counts")
 
 
-class IdentificationConfig(Section):
+class Signals(Section):
+    """How a model is used where not as it declares."""
+
+    outputs: list[str] = Field(
+        default_factory=list, description="outputs or states of the model that count; default its"
+    )
+    initial: dict[str, StartSetting] = Field(
+        default_factory=dict,
+        description="where states start: first, estimate, a number, or [low, high]",
+    )
+    hold: dict[str, Literal["zoh", "foh"]] = Field(
+        default_factory=dict, description="inputs held (zoh) or interpolated (foh) between samples"
+    )
+
+
+class IdentificationConfig(Signals):
     """Settings of ``rig identify``; each may be left out."""
 
     model: str | None = Field(None, description="built-in model, or file.py:object")
@@ -90,5 +123,11 @@ class IdentificationConfig(Section):
     )
     per_log: bool = Field(
         False, description="normalise each log by its own largest output, not by the overall one"
+    )
+    balance: Literal["samples", "logs"] = Field(
+        "samples", description="logs count by their samples, or each alike"
+    )
+    hold_back: float = Field(
+        0.0, ge=0.0, lt=1.0, description="part of each log, its end, that validates"
     )
     columns: Columns | None = Field(None, description="how a foreign CSV's columns are meant")

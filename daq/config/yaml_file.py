@@ -95,7 +95,9 @@ class CommandLine(YamlFile):
         """The option as it is typed, or the key in the file."""
         if not self._is_typed(key):
             return super().named(key)
-        return f"--{dotted(key)}" if key[0] in self.named_options else f"--set {dotted(key)}"
+        if key[0] in self.named_options:
+            return f"--{dotted(key).replace('_', '-')}"
+        return f"--set {dotted(key)}"
 
     def _is_typed(self, key: Key) -> bool:
         """Whether a key, or all there is of the section it belongs in, was typed."""
@@ -260,6 +262,7 @@ _EXPECTED = {
     "string_type": "expected text",
     "dict_type": _LINES,
     "model_type": _LINES,
+    "list_type": "expected a list [a, b]",
     "tuple_type": "expected two values [low, high]",
     "too_long": "expected two values [low, high]",
     "too_short": "expected two values [low, high]",

@@ -14,7 +14,7 @@ from sysid.data import Dataset
 from sysid.gassi.search import PRESETS, GeneticSearch, PresetName
 from sysid.metrics import fit_percent
 from sysid.model import FloatArray, ModelError, ProcessModel, Scale
-from sysid.objective import Objective
+from sysid.objective import Balance, Objective
 from sysid.ranges import Range
 from sysid.refinement import Refinement, refine
 from sysid.simulation import BatchSimulator, Status
@@ -38,7 +38,8 @@ class GASSI(BaseEstimator):  # type: ignore[misc]
 
     Parameters
     ----------
-    model : ProcessModel
+    model : ProcessModel; its ``with_outputs``, ``with_initial`` and ``with_holds`` choose which
+        outputs count, where its states start, and how inputs run between samples.
     preset : ``default``, ``thesis`` (Algorithms 2 to 5 with the penalty (4.13)-(4.20), as
         written), ``cega`` (the same without penalty) or ``classic`` (Algorithm 1).
     population, generations : chromosomes per generation, generations evaluated.
@@ -51,6 +52,7 @@ class GASSI(BaseEstimator):  # type: ignore[misc]
     minimum_generations, termination_ratio : i_min and r_termination of (4.11).
     weights : {output: weight}, relative importance of the outputs.
     per_log : normalise each record by its own max|y| instead of the maximum over all.
+    balance : ``samples``, several records count as one long one; ``logs``, each alike.
     accuracy : normalised RMS error that a simulation aims at.
     max_steps : integration steps a sample may take before a chromosome is flagged.
     threads : default all cores; the result does not depend on it.
@@ -88,6 +90,7 @@ class GASSI(BaseEstimator):  # type: ignore[misc]
         termination_ratio: float = 0.0,
         weights: Mapping[str, float] | None = None,
         per_log: bool = False,
+        balance: Balance = "samples",
         accuracy: float = 1e-3,
         max_steps: int = 512,
         threads: int | None = None,
@@ -106,6 +109,7 @@ class GASSI(BaseEstimator):  # type: ignore[misc]
         self.termination_ratio = termination_ratio
         self.weights = weights
         self.per_log = per_log
+        self.balance = balance
         self.accuracy = accuracy
         self.max_steps = max_steps
         self.threads = threads
@@ -217,6 +221,7 @@ class GASSI(BaseEstimator):  # type: ignore[misc]
             self.space_,
             records,
             per_log=self.per_log,
+            balance=self.balance,
             weights=self._weights(self._model()),
         )
 
@@ -282,11 +287,11 @@ class GASSI(BaseEstimator):  # type: ignore[misc]
 
     def _with_starts(self, objective: Objective) -> Objective:
         """The objective over the parameters and the initial states left to be estimated."""
-        space = self.space_.with_starts(len(objective.records))
+        space = self.space_.with_starts(objective.records)
         if not space.estimated:
             return objective
         self.space_ = space
-        chromosome = space.with_declared_starts(self.chromosome_)
+        chromosome = space.with_nominal_starts(self.chromosome_)
         self._take(chromosome, self.error_, self.feasible_)
         return objective.over(space)
 

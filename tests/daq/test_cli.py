@@ -275,6 +275,72 @@ def test_a_model_and_a_csv_of_ones_own_work_like_the_built_in(tmp_path):
     assert json.loads(replayed.stdout)["outputs"]["y"]["fit_percent"] > 99.0
 
 
+@pytest.mark.parametrize(
+    "chosen",
+    [
+        ("--model", "actuator:outputs=current_motor,theta,hysteresis=dahl"),
+        ("--model", "actuator:hysteresis=dahl", "--set", "outputs=[current_motor,theta]"),
+    ],
+)
+def test_theta_in_place_of_omega(captured, tmp_path, chosen):
+    root, folder = captured
+    out = tmp_path / "out"
+    result = rig("identify", folder, *chosen, "--set", "initial.omega=[-1,1]", "--population", 100,
+                 "--generations", 10, "--out", out, "--json", cwd=root)  # fmt: skip
+    assert result.returncode == 0, result.stderr
+    report = json.loads(result.stdout)
+    (trained,) = report["metrics"]["training"]
+    assert list(trained["outputs"]) == ["current_motor", "theta"]
+    assert trained["outputs"]["theta"]["fit_percent"] > 90.0
+    # What was chosen is in the parameters' file, and replay keeps to it.
+    replayed = rig("replay", folder, "--parameters", out / "parameters.yaml", "--json", cwd=root)
+    metrics = json.loads(replayed.stdout)["outputs"]
+    assert metrics["theta"]["rmse"] == pytest.approx(trained["outputs"]["theta"]["rmse"], rel=1e-6)
+    assert list(metrics) == ["current_motor", "theta"]
+
+
+def test_an_output_that_does_not_count_needs_no_column(tmp_path):
+    foreign_log(tmp_path / "bench.csv")
+    two = OWN_MODEL.replace('Output("y", "m"),)', 'Output("y", "m"), Output("half", "m"))')
+    two = two.replace("derivative=derivative", "derivative=derivative, output=output")
+    two = two.replace("model = ", "def output(x, u, p):\n    return x[0], 0.5 * x[0]\n\n\nmodel = ")
+    (tmp_path / "lag.py").write_text(two)
+    (tmp_path / "id.yaml").write_text(OWN_CONFIG)
+    missing = rig("identify", "bench.csv", "--config", "id.yaml", cwd=tmp_path)
+    assert missing.returncode == 2 and "'half' of model lag is missing" in missing.stderr
+    result = rig("identify", "bench.csv", "--config", "id.yaml", "--set", "outputs=[y]",
+                 "--set", "initial={y: 0.0}", "--set", "hold={u: zoh}", "--out", "found",
+                 cwd=tmp_path)  # fmt: skip
+    assert result.returncode == 0, result.stderr
+    found = yaml.safe_load((tmp_path / "found" / "parameters.yaml").read_text())
+    assert found["outputs"] == ["y"] and found["initial"] == {"y": 0.0}
+    assert found["parameters"]["tau"]["value"] == pytest.approx(0.2, rel=1e-3)
+    (line,) = [s for s in result.stdout.splitlines() if s.startswith("Next: rig ")]
+    replayed = rig(*line.removeprefix("Next: rig ").split(), "--json", cwd=tmp_path)
+    assert replayed.returncode == 0, replayed.stderr
+
+
+def test_the_end_of_each_log_is_held_back(captured, tmp_path):
+    root, folder = captured
+    whole = np.genfromtxt(folder / "log.csv", delimiter=",", names=True)
+    small = ("--population", 20, "--generations", 2, "--json", "--out", tmp_path / "out")
+    result = rig("identify", folder, "--hold-back", 0.25, *small, cwd=root)
+    assert result.returncode == 0, result.stderr
+    metrics = json.loads(result.stdout)["metrics"]
+    for part, rows, share in (
+        ("training", whole[:300], "first 75 %"), ("validation", whole[300:], "last 25 %"),
+    ):  # fmt: skip
+        (entry,) = metrics[part]
+        assert entry["name"] == f"{folder.name} ({share})"
+        assert entry["outputs"]["omega"]["max_abs"] == np.abs(rows["omega"]).max()
+    # The same as a log that ends there: what is held back has no part in the search.
+    head = (folder / "log.csv").read_text().splitlines(keepends=True)[:301]
+    (tmp_path / "head.csv").write_text("".join(head))
+    alone = rig("identify", tmp_path / "head.csv", *small, cwd=root)
+    values = [json.loads(r.stdout)["error"]["value"] for r in (result, alone)]
+    assert values[0] == values[1]
+
+
 def test_the_report_says_where_every_range_came_from(tmp_path):
     foreign_log(tmp_path / "bench.csv")
     two = OWN_MODEL.replace("1.0, \"log\"),)", "1.0, \"log\"), "

@@ -49,3 +49,12 @@ def test_output_scale_is_the_largest_magnitude_over_all_records_or_each():
     assert [scale.tolist() for scale in together] == [[3.0, 1.0, 2.0]] * 2
     each = output_scale([a, b], per_log=True)
     assert [scale.tolist() for scale in each] == [[3.0, 1.0, 2.0], [2.0, 1.0, 1.0]]
+
+
+def test_a_part_is_a_record_of_its_own():
+    whole = Dataset(np.arange(6.0), np.arange(6.0) + 0.5, 0.1, input_noise=[0.2])
+    part = whole.part(2, 5, "middle")
+    assert (part.name, part.dt, part.n_samples) == ("middle", 0.1, 3)
+    assert part.inputs.ravel().tolist() == [2.0, 3.0, 4.0]
+    assert part.outputs.ravel().tolist() == [2.5, 3.5, 4.5]
+    assert part.input_noise.tolist() == [0.2]

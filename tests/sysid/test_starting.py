@@ -113,7 +113,7 @@ def test_outputs_never_measured_leave_the_declared_start():
 
 def test_starts_belong_to_their_records():
     model = chain()
-    space = SearchSpace.of(model).with_starts(2)
+    space = SearchSpace.of(model).with_starts([record(0.0, 0), record(0.0, 1)])
     assert space.names == ("slow", "fast", "hidden(0) 1", "hidden(0) 2")
     rows = np.array([[1.0, 10.0, 3.0, 4.0], [2.0, 20.0, 5.0, 6.0]])
     own = np.array([0.5, 0.25])
@@ -121,7 +121,7 @@ def test_starts_belong_to_their_records():
     np.testing.assert_array_equal(space.starts(rows, 0, own), [[3.0, 0.25], [5.0, 0.25]])
     np.testing.assert_array_equal(space.starts(rows, 1, own), [[4.0, 0.25], [6.0, 0.25]])
     assert space.named_starts(rows[1]) == [{"hidden": 5.0}, {"hidden": 6.0}]
-    assert SearchSpace.of(chain(None)).with_starts(2).names == ("slow", "fast")
+    assert SearchSpace.of(chain(None)).with_starts([record(0.0, 0)]).names == ("slow", "fast")
 
 
 def test_each_chromosome_starts_where_it_says():
@@ -141,7 +141,7 @@ def test_each_chromosome_starts_where_it_says():
 
 def test_the_refinement_moves_parameters_and_starts_together():
     model, data = chain(), record(2.0, 0)
-    space = SearchSpace.of(model).with_starts(1)
+    space = SearchSpace.of(model).with_starts([data])
     objective = Objective(BatchSimulator(model, accuracy=1e-6), space, [data])
     found = refine(objective, np.array([1.0, 10.0, 0.0]))
     np.testing.assert_allclose(found.chromosome, [1.7, 12.0, 2.0], rtol=1e-4)
@@ -150,3 +150,73 @@ def test_the_refinement_moves_parameters_and_starts_together():
 def test_a_range_of_starts_that_is_no_range_is_refused():
     with pytest.raises(ModelError, match=r"hidden\(0\).*\[low, high\]"):
         replace(chain().states[0], initial_range=(1.0, 1.0))
+
+
+# --- where states start, as told ---------------------------------------------------------------
+
+
+def test_a_told_value_goes_before_the_first_sample():
+    data = record(2.0, 0)
+    shifted = Dataset(data.inputs, data.outputs + 0.3, data.dt)
+    model = chain().with_initial({"seen": 0.1, "hidden": 0.7})
+    np.testing.assert_array_equal(shifted.initial_state(model), [0.7, 0.1])
+    assert SearchSpace.of(model).with_starts([shifted]).names == ("slow", "fast")
+    again = model.with_initial({"seen": "first"})
+    np.testing.assert_array_equal(shifted.initial_state(again), [0.7, 0.3])
+    np.testing.assert_array_equal(shifted.initial_state(chain()), [0.0, 0.3])
+
+
+def test_a_noisy_first_sample_is_estimated_around():
+    """The first sample is far off; the truth is within the output's span."""
+    data = record(0.0, 3, noise=0.002)
+    data.outputs[0] += 0.15
+    model = chain(None).with_initial({"seen": "estimate"})
+    space = SearchSpace.of(model).with_starts([data, data])
+    assert space.names == ("slow", "fast", "seen(0) 1", "seen(0) 2")
+    span = float(np.ptp(data.outputs))
+    first = data.outputs[0, 0]
+    assert space.lower[2:] == pytest.approx([first - span] * 2)
+    assert space.upper[2:] == pytest.approx([first + span] * 2)
+    np.testing.assert_allclose(space.with_nominal_starts(np.ones(2)), [1.0, 1.0, first, first])
+    found = GASSI(model, population=24, generations=6).fit(data)
+    # The wrong sample is one of the dozen that tell the start.
+    assert found.initial_states_ == [{"seen": pytest.approx(0.0, abs=0.05)}]
+    plain = GASSI(chain(None), population=24, generations=6).fit(data)
+    assert plain.error_ > found.error_
+    # A prediction follows the same rule on its own record.
+    np.testing.assert_allclose(found.predict(data)[0], 0.0, atol=0.05)
+    np.testing.assert_allclose(plain.predict(data)[0], first)
+
+
+def test_a_told_range_bounds_the_estimate():
+    model = chain().with_initial({"hidden": (-1.0, 1.0)})
+    found = estimate_start(BatchSimulator(model), np.array([1.7, 12.0]), record(3.0, 1))
+    assert found[0] == pytest.approx(1.0)
+    whole = chain((-5.0, 5.0)).with_initial({"hidden": "estimate"})
+    assert whole.states[0].initial_range == (-5.0, 5.0)
+
+
+def test_the_span_of_a_still_or_unmeasured_output():
+    model = chain(None).with_initial({"seen": "estimate"})
+    still = Dataset(np.zeros(4), np.full(4, 3.0), 0.1)
+    assert still.initial_range(model, 1) == (2.0, 4.0)
+    blank = Dataset(np.zeros(4), np.full(4, np.nan), 0.1)
+    assert blank.initial_range(model, 1) == (-1.0, 1.0)
+    assert still.initial_range(model, 0) is None
+
+
+@pytest.mark.parametrize(
+    ("starts", "message"),
+    [
+        ({"hiden": 1.0}, "no state 'hiden'; it has hidden, seen"),
+        ({"hidden": "first"}, "hidden of model chain is no output.*'estimate' or \\[low, high\\]"),
+        ({"hidden": "estimate"}, "no range of its own.*\\[low, high\\]"),
+        ({"hidden": (1.0, 0.0)}, r"hidden\(0\): range"),
+        ({"hidden": (0.0, np.inf)}, "not finite"),
+        ({"hidden": np.nan}, "nan is no start"),
+        ({"hidden": "last"}, "'last' is no start"),
+    ],
+)
+def test_starts_that_make_no_sense(starts, message):
+    with pytest.raises(ModelError, match=message):
+        chain(None).with_initial(starts)
