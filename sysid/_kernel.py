@@ -245,7 +245,7 @@ def _outputs(s: Shape) -> list[str]:
 
 
 def _spectrum(s: Shape) -> str:
-    """Bound on the fastest rate of N.
+    """Bound on the fastest rate of N, also beyond limits that no output would show.
 
     Only the driven rows of its Jacobian are not zero, so that its eigenvalues are those of the
     block of driven rows and columns.
@@ -264,6 +264,7 @@ def _spectrum(s: Shape) -> str:
         f"    N = np.empty({len(rows)})",
         "    for l in range(rate.shape[0]):",
         f"        c = constants({listed(f'p[{i}, l]' for i in range(s.n_parameters))})",
+        *[f"        rate[l] = max(rate[l], abs({text}))" for text in _hidden_limits(s)],
         "        for k in range(u.shape[0]):",
         *[f"            X[{i}] = x[k, {i}, l]" for i in range(s.n_states)],
         f"            if not ({finite}):",
@@ -271,6 +272,20 @@ def _spectrum(s: Shape) -> str:
         *[f"            {line}" for line in [*_jacobian(s), *_radius()]],
     ]
     return "\n".join(head)
+
+
+def _hidden_limits(s: Shape) -> list[str]:
+    """What a limited state's straight piece makes of itself in its own row.
+
+    Beyond a limit N takes the straight piece back, as fast as A has it. Where an output shows
+    the state the error estimate sees that; an error in a hidden one only adds up.
+    """
+    return [
+        f"({gain}) * ({guard.slopes[row]})"
+        for guard in s.structure.guards
+        for row, gain in guard.gains.items()
+        if row in guard.slopes and row not in s.structure.shown
+    ]
 
 
 def _jacobian(s: Shape) -> list[str]:

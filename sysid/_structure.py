@@ -40,13 +40,15 @@ class Structure:
     coefficients: of the entries (i, j) of A that are not always zero, each as Python text in
     terms of the constants ``c[..]`` of the program. driven: rows whose N changes within a
     sample: nonlinear ones, and those with an input that is not held. nonlinear: whether any row
-    of N depends on a state. guards: limits that fast linear parts may run into.
+    of N depends on a state. guards: limits that fast linear parts may run into. shown: states
+    that an output depends on directly, so that it shows when one of them is wrong.
     """
 
     coefficients: Mapping[Entry, str]
     driven: tuple[int, ...]
     nonlinear: bool
     guards: tuple[Guard, ...]
+    shown: frozenset[int]
     program: Program
 
     @property
@@ -88,10 +90,13 @@ def analyse(model: ProcessModel, *, exact: bool = True) -> Structure:
     functions: dict[str, Followed] = {
         "remainder": ("derivative", None if rows is None else [rest for _, rest in parts])
     }
+    shown = frozenset(model.output_states or range(len(model.states)))
     if model.output is not None:
         outputs = _followed(tape, model, model.output)
         totals = None if outputs is None else [value.total for value in outputs]
         functions["observe"] = ("output", totals)
+        if outputs is not None:
+            shown = frozenset[int]().union(*(value.states for value in outputs))
     if clamps:
         functions["margins"] = ("", _margins(tape, clamps.values()))
     names = {*linear.values()}
@@ -103,7 +108,7 @@ def analyse(model: ProcessModel, *, exact: bool = True) -> Structure:
         for k, clamp in clamps.items()
     )
     driven, nonlinear = _driven(model, rows if exact else None, clamps)
-    return Structure(writer.placed(linear), driven, nonlinear, guards, writer.program())
+    return Structure(writer.placed(linear), driven, nonlinear, guards, shown, writer.program())
 
 
 def _margins(tape: Tape, clamps: Iterable[Clamp]) -> list[str]:

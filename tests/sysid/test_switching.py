@@ -24,6 +24,10 @@ def copied(v):
     return math.copysign(1.0, v)
 
 
+def limited(v):
+    return max(-1.0, min(1.0, v / 1e-5))
+
+
 def sledge(sign):
     """A mass on rails, pushed by a held force; only its position is measured."""
 
@@ -80,6 +84,14 @@ def test_a_sign_that_jumps_at_the_start_is_no_endless_rate(sign):
     rms = math.sqrt(result.sse[0, 0, 0] / record.n_samples)
     assert rms < 2e-3 * np.abs(record.outputs).max()
     assert result.steps[0] <= 4 * record.n_samples
+
+
+def test_beyond_a_narrow_limit_of_a_hidden_state_the_position_is_right():
+    record = pushed()
+    truth = np.array([[MASS, FRICTION, OFFSET]])
+    result = BatchSimulator(sledge(limited)).errors(truth, [record])
+    rms = math.sqrt(result.sse[0, 0, 0] / record.n_samples)
+    assert rms < 2e-3 * np.abs(record.outputs).max()
 
 
 def test_refinement_sees_past_the_steps_that_switching_makes():
