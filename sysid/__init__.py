@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from sysid.campaigns import Campaign, Outcome, Run, Spread, campaign, combinations
+from sysid.comparison import Candidate, Comparison, compare
 from sysid.data import Dataset, output_scale
 from sysid.linearization import LinearModel, equilibrium, jacobian, linearize
 from sysid.metrics import Metrics, evaluate, fit_percent, msd, rmse
@@ -33,6 +34,8 @@ __all__ = [
     "BatchResult",
     "BatchSimulator",
     "Campaign",
+    "Candidate",
+    "Comparison",
     "Constraint",
     "Dataset",
     "Input",
@@ -51,6 +54,7 @@ __all__ = [
     "Stepper",
     "campaign",
     "combinations",
+    "compare",
     "equilibrium",
     "evaluate",
     "fit_percent",
