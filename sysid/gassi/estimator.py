@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from sklearn.base import BaseEstimator
 from sklearn.utils.validation import check_is_fitted
 
 from sysid.data import Dataset
@@ -16,6 +15,7 @@ from sysid.metrics import fit_percent
 from sysid.model import FloatArray, ModelError, ProcessModel, Scale
 from sysid.objective import Balance, Objective
 from sysid.ranges import Range
+from sysid.recording import Data, RecordEstimator, split
 from sysid.refinement import Refinement, refine
 from sysid.simulation import BatchSimulator, Status
 from sysid.space import SearchSpace
@@ -33,7 +33,7 @@ class Progress:
     error: float
 
 
-class GASSI(BaseEstimator):  # type: ignore[misc]
+class GASSI(RecordEstimator):
     """Identify a process model's parameters with a genetic algorithm.
 
     Parameters
@@ -57,6 +57,7 @@ class GASSI(BaseEstimator):  # type: ignore[misc]
     max_steps : integration steps a sample may take before a chromosome is flagged.
     threads : default all cores; the result does not depend on it.
     random_state : seed; one seed gives one result.
+    dt : sample time [s] of arrays; Datasets bring their own.
 
     Attributes
     ----------
@@ -95,6 +96,7 @@ class GASSI(BaseEstimator):  # type: ignore[misc]
         max_steps: int = 512,
         threads: int | None = None,
         random_state: int = 0,
+        dt: float | None = None,
     ) -> None:
         self.model = model
         self.preset = preset
@@ -114,31 +116,33 @@ class GASSI(BaseEstimator):  # type: ignore[misc]
         self.max_steps = max_steps
         self.threads = threads
         self.random_state = random_state
+        self.dt = dt
 
     def fit(
         self,
-        X: Dataset | Sequence[Dataset] | FloatArray,
+        X: Data,
         y: FloatArray | None = None,
         *,
-        dt: float | None = None,
+        records: Any = None,
         on_progress: Callable[[Progress], None] | None = None,
     ) -> GASSI:
         """Search the parameters that make the model follow the records.
 
         X: one Dataset, several of any lengths and rates, or an (n_samples, n_inputs) array
-        with y (n_samples, n_outputs) and the sample time dt [s]. Ctrl-C stops the search and
-        keeps the best so far. Raises ModelError when every simulation of the first generation
-        fails, or for settings that make no sense.
+        with y (n_samples,) or (n_samples, n_outputs), NaN where a sample was lost. records:
+        (n_samples,), which record each row of the arrays belongs to, default one record. Ctrl-C
+        stops the search and keeps the best so far. Raises ModelError when every simulation of
+        the first generation fails, or for settings that make no sense.
         """
+        data = self._records(X, y, records, None, reset=True)
         model = self._model()
-        records = _records(X, y, dt)
         preset = PRESETS.get(self.preset)
         if preset is None:
             raise ModelError(f"unknown preset {self.preset!r}; choose from {', '.join(PRESETS)}")
         self.space_ = SearchSpace.of(
             model, self.ranges, self.fixed, preset.log_scale, tied=self.tied, scale=self.scale
         )
-        objective = self._objective(records)
+        objective = self._objective(data)
         search = GeneticSearch(
             self.space_,
             preset,
@@ -172,47 +176,58 @@ class GASSI(BaseEstimator):  # type: ignore[misc]
         self.n_simulations_ = objective.simulations
         return self
 
-    def predict(self, X: Dataset | FloatArray, *, dt: float | None = None) -> FloatArray:
+    def predict(self, X: Dataset | FloatArray, *, records: Any = None) -> FloatArray:
         """Free-run outputs of the identified model, (n_samples, n_outputs).
 
-        An array X starts from the declared initial states; a Dataset from its first sample, and
-        initial states that the model leaves open are estimated from its outputs.
+        An array X starts from the declared initial states, each of its ``records`` anew, and the
+        outputs are (n_samples,) if those of ``fit`` were; a Dataset starts from its first sample,
+        and initial states that the model leaves open are estimated from its outputs.
         """
         check_is_fitted(self, "vector_")
-        if not isinstance(X, Dataset):
-            unknown = np.full((len(X), len(self._model().outputs)), np.nan)
-            X = Dataset(X, unknown, _sample_time(dt))
-        return free_run(self._simulator(), self.vector_, X)
+        simulator = self._simulator()
+        if isinstance(X, Dataset):
+            return free_run(simulator, self.vector_, X)
+        inputs = self._inputs(X, reset=False)
+        q = len(self._model().outputs)
+        parts = []
+        for rows in split(len(inputs), records):
+            # A simulation needs two rows; of a single one only the start is wanted.
+            driven = np.concatenate([inputs[rows], inputs[rows][-1:]])
+            unknown = np.full((len(driven), q), np.nan)
+            record = Dataset(driven, unknown, self._step(None))
+            parts.append(free_run(simulator, self.vector_, record)[:-1])
+        return self._shaped(np.concatenate(parts))
 
-    def score(
-        self,
-        X: Dataset | Sequence[Dataset] | FloatArray,
-        y: FloatArray | None = None,
-        *,
-        dt: float | None = None,
-    ) -> float:
+    def score(self, X: Data, y: FloatArray | None = None, *, records: Any = None) -> float:
         """Mean fit % over outputs and records, divided by 100: 1 is perfect."""
-        fits = [fit_percent(record.outputs, self.predict(record)) for record in _records(X, y, dt)]
+        check_is_fitted(self, "vector_")
+        data = self._records(X, y, records, None, reset=False)
+        fits = [fit_percent(record.outputs, self.predict(record)) for record in data]
         return float(np.nanmean(fits)) / 100.0
 
     def uncertainty(
-        self,
-        X: Dataset | Sequence[Dataset] | FloatArray,
-        y: FloatArray | None = None,
-        *,
-        dt: float | None = None,
+        self, X: Data, y: FloatArray | None = None, *, records: Any = None
     ) -> Uncertainty:
         """Intervals of the parameters, and what the records cannot tell of them.
 
-        X, y, dt: what ``fit`` was given. Raises ModelError where the local refinement did not
-        run to its end: only at a minimum of the error do its sensitivities tell.
+        X, y, records: what ``fit`` was given. Raises ModelError where the local refinement did
+        not run to its end: only at a minimum of the error do its sensitivities tell.
         """
         check_is_fitted(self, "vector_")
         if not PRESETS[self.preset].refine:
             raise ModelError(f"preset {self.preset} has no local refinement, so no intervals")
         if self.stopped_ == "interrupted":
             raise ModelError("the identification was interrupted, so there are no intervals")
-        return uncertainty(self._objective(_records(X, y, dt)), self.chromosome_)
+        data = self._records(X, y, records, None, reset=False)
+        return uncertainty(self._objective(data), self.chromosome_)
+
+    def _step(self, dt: float | None) -> float:
+        if self.dt is None:
+            raise ModelError(
+                "arrays carry no time: give the sample time, GASSI(model, dt=...) in seconds, or "
+                "Datasets"
+            )
+        return self.dt
 
     def _objective(self, records: Sequence[Dataset]) -> Objective:
         """The figure that ``fit`` minimises over ``space_``."""
@@ -307,22 +322,3 @@ class GASSI(BaseEstimator):  # type: ignore[misc]
 
     def __sklearn_is_fitted__(self) -> bool:
         return hasattr(self, "vector_")
-
-
-def _records(
-    X: Dataset | Sequence[Dataset] | FloatArray, y: FloatArray | None, dt: float | None
-) -> list[Dataset]:
-    if isinstance(X, Dataset):
-        return [X]
-    items: list[Any] = list(X)
-    if items and all(isinstance(item, Dataset) for item in items):
-        return items
-    if y is None:
-        raise ModelError("fit needs Datasets, or arrays X and y with the sample time dt")
-    return [Dataset(np.asarray(X), np.asarray(y), _sample_time(dt))]
-
-
-def _sample_time(dt: float | None) -> float:
-    if dt is None:
-        raise ModelError("arrays carry no time: give the sample time as dt=... in seconds")
-    return dt

@@ -7,29 +7,21 @@ from collections.abc import Sequence
 from typing import Any, Self
 
 import numpy as np
-from sklearn.base import BaseEstimator, RegressorMixin
-from sklearn.utils.validation import check_array, check_is_fitted, validate_data
+from sklearn.utils.validation import check_is_fitted
 
 from sysid.data import Dataset
 from sysid.linear.identification import Coefficients, Estimate, identify
 from sysid.linear.orders import Orders
 from sysid.linear.polynomials import poles
 from sysid.linear.predictor import Predictor
-from sysid.linear.records import (
-    check_alike,
-    check_columns,
-    check_sample_time,
-    given_datasets,
-    split,
-)
+from sysid.linear.records import check_alike, check_columns, check_sample_time
 from sysid.linear.regression import one_thread
 from sysid.metrics import fit_percent
 from sysid.model import FloatArray, ModelError
+from sysid.recording import Data, RecordEstimator, given_datasets, split
 
-Data = Dataset | Sequence[Dataset] | FloatArray
 
-
-class PolynomialModel(RegressorMixin, BaseEstimator):  # type: ignore[misc]
+class PolynomialModel(RecordEstimator):
     """A(q) y = B(q) u + offset + C(q) e, identified equation by equation."""
 
     offset: bool
@@ -177,48 +169,15 @@ class PolynomialModel(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         self.converged_ = found.converged
 
     def _training_data(self, X: Any, y: Any, records: Any, dt: float | None) -> list[Dataset]:
-        data = given_datasets(X)
-        self._flat = False
-        if data is None:
-            self.dt_ = dt
-            return self._arrays(X, y, records, dt, reset=True)
-        if y is not None:
-            raise ModelError("Datasets bring their outputs: leave y out")
-        check_alike(data)
-        self.dt_ = data[0].dt
-        self._inputs(data[0].inputs, reset=True)
+        self.dt_ = dt
+        data = self._records(X, y, records, dt, reset=True)
+        if given_datasets(X) is not None:
+            check_alike(data)
+            self.dt_ = data[0].dt
         return data
 
-    def _arrays(self, X: Any, y: Any, records: Any, dt: float | None, reset: bool) -> list[Dataset]:
-        inputs = self._inputs(X, reset)
-        name = type(self).__name__
-        if y is None:
-            raise ModelError(
-                f"{name} requires y to be passed, but the target y is None: give Datasets, or "
-                "the outputs as y"
-            )
-        outputs = check_array(
-            y, ensure_2d=False, ensure_all_finite="allow-nan", dtype=np.float64, input_name="y",
-            estimator=name,
-        )  # fmt: skip
-        if reset:
-            self._flat = outputs.ndim == 1
-        if len(inputs) != len(outputs):
-            raise ModelError(
-                f"{len(inputs)} rows of inputs, {len(outputs)} of outputs: row k of both must "
-                "belong to the same instant"
-            )
-        step = dt if dt is not None else self.dt_ if self.dt_ is not None else 1.0
-        return [
-            Dataset(inputs[rows], outputs[rows], step, f"record {number}")
-            for number, rows in enumerate(split(len(inputs), records))
-        ]
-
-    def _inputs(self, X: Any, reset: bool) -> FloatArray:
-        inputs: FloatArray = validate_data(
-            self, X, reset=reset, dtype=np.float64, ensure_min_samples=2 if reset else 1
-        )
-        return inputs
+    def _step(self, dt: float | None) -> float:
+        return dt if dt is not None else self.dt_ if self.dt_ is not None else 1.0
 
     def _initial(self, initial: FloatArray, n: int) -> FloatArray:
         outputs = np.asarray(initial, dtype=np.float64)
@@ -242,15 +201,6 @@ class PolynomialModel(RegressorMixin, BaseEstimator):  # type: ignore[misc]
     def _follow(self, record: Dataset) -> FloatArray:
         self._check(record)
         return self._predictor.follow(record.inputs, record.outputs)
-
-    def _shaped(self, outputs: FloatArray) -> FloatArray:
-        return outputs[:, 0] if self._flat else outputs
-
-    def __sklearn_tags__(self) -> Any:
-        tags = super().__sklearn_tags__()
-        tags.target_tags.multi_output = True
-        tags.target_tags.single_output = True
-        return tags
 
 
 def _only(records: list[Dataset]) -> Dataset:

@@ -1,23 +1,13 @@
-"""From what a user hands over to a list of records."""
+"""What the records of a difference equation must have in common."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
 from sysid.data import Dataset
 from sysid.model import ModelError
-
-
-def given_datasets(X: Any) -> list[Dataset] | None:
-    """The records if X is one Dataset or several, None if it is an array."""
-    if isinstance(X, Dataset):
-        return [X]
-    if isinstance(X, list | tuple) and X and all(isinstance(item, Dataset) for item in X):
-        return list(X)
-    return None
 
 
 def check_alike(records: Sequence[Dataset]) -> None:
@@ -50,23 +40,3 @@ def check_sample_time(record: Dataset, dt: float, other: str) -> None:
             f"{record.name}: its sample time is {record.dt} s, that of {other} {dt} s; a "
             "difference equation holds for one sample time, so resample the record"
         )
-
-
-def split(n: int, labels: Any) -> list[slice]:
-    """Rows of each record. labels: (n,), one for each row, default all of one record.
-
-    Raises ModelError for another length, or for a label that returns after another one.
-    """
-    if labels is None:
-        return [slice(0, n)]
-    values = np.asarray(labels)
-    if values.shape != (n,):
-        raise ModelError(
-            f"records has shape {values.shape} for {n} rows; give the record of each row: ({n},)"
-        )
-    starts = [0, *(np.flatnonzero(values[1:] != values[:-1]) + 1).tolist()]
-    if len(np.unique(values)) != len(starts):
-        raise ModelError(
-            "the rows of a record must follow each other: sort the rows by record, then by time"
-        )
-    return [slice(a, b) for a, b in zip(starts, [*starts[1:], n], strict=True)]

@@ -265,15 +265,13 @@ def test_an_unfitted_one_cannot_predict():
 def test_arrays_serve_as_well_as_records():
     record = motor_record()
     a = quick().fit(record)
-    b = quick().fit(record.inputs, record.outputs, dt=record.dt)
+    b = quick(dt=record.dt).fit(record.inputs, record.outputs)
     np.testing.assert_array_equal(a.vector_, b.vector_)
-    assert a.score(record) == b.score(record.inputs, record.outputs, dt=record.dt)
-    np.testing.assert_allclose(
-        a.predict(record), a.predict(record.inputs, dt=record.dt), rtol=1e-6, atol=1e-9
-    )
+    assert a.score(record) == b.score(record.inputs, record.outputs)
+    np.testing.assert_allclose(a.predict(record), b.predict(record.inputs), rtol=1e-6, atol=1e-9)
     with pytest.raises(ModelError, match="dt="):
         quick().fit(record.inputs, record.outputs)
-    with pytest.raises(ModelError, match="Datasets, or arrays"):
+    with pytest.raises(ModelError, match="give Datasets, or the outputs as y"):
         quick().fit(record.inputs)
 
 
