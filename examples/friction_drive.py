@@ -13,7 +13,7 @@ FORCE_PER_VOLT = 35.0  # N/V
 
 
 def derivative(x, u, p):
-    position, velocity = x
+    _position, velocity = x
     (voltage,) = u
     mass, viscous, dry, offset = p
     friction = viscous * velocity + dry * math.copysign(1.0, velocity)

@@ -5,7 +5,7 @@ rig identify drive_training.csv --validate drive_validation.csv --config frictio
 
 The motion is worked out in closed form from one stop to the next, not by integrating the model
 that is to be found: where the force does not overcome dry friction, the carriage stands. A
-controller makes it follow smooth strokes; its encoder counts 2 micrometres.
+controller makes it follow smooth strokes; its encoder counts 10 micrometres.
 """
 
 import math
@@ -16,7 +16,7 @@ import numpy as np
 TRUTH = {"mass": 95.0, "viscous": 200.0, "dry": 20.0, "offset": -3.0}
 FORCE_PER_VOLT = 35.0  # N/V
 SAMPLE_TIME = 1e-3  # s
-ENCODER = 2e-6  # m
+ENCODER = 1e-5  # m
 STIFFNESS, DAMPING = 600.0, 45.0  # of the controller, V/m and V*s/m
 
 
@@ -61,8 +61,8 @@ def training():
 
 
 def validation():
-    """Five seconds of shorter strokes."""
-    return record(0.07, 0.7, 5_000)
+    """Five seconds of shorter and slower strokes."""
+    return record(0.09, 1.3, 5_000)
 
 
 def save(path, rows):
