@@ -5,7 +5,7 @@ rig identify drive_training.csv --validate drive_validation.csv --config frictio
 
 The motion is worked out in closed form from one stop to the next, not by integrating the model
 that is to be found: where the force does not overcome dry friction, the carriage stands. A
-controller makes it follow smooth strokes; its encoder counts 10 micrometres.
+controller makes it follow smooth strokes; a noisy sensor beside it measures the position.
 """
 
 import math
@@ -16,7 +16,7 @@ import numpy as np
 TRUTH = {"mass": 95.0, "viscous": 200.0, "dry": 20.0, "offset": -3.0}
 FORCE_PER_VOLT = 35.0  # N/V
 SAMPLE_TIME = 1e-3  # s
-ENCODER = 1e-5  # m
+NOISE = 1e-4  # m
 STIFFNESS, DAMPING = 600.0, 45.0  # of the controller, V/m and V*s/m
 
 
@@ -38,31 +38,31 @@ def advance(position, velocity, force, left):
     return position, velocity
 
 
-def record(stroke, duration, samples):
-    """Time [s], voltage [V] and encoder position [m] of strokes forth and back."""
+def record(stroke, duration, samples, seed):
+    """Time [s], voltage [V] and measured position [m] of strokes forth and back."""
+    noise = np.random.default_rng(seed).normal(0.0, NOISE, samples)
     time = np.arange(samples) * SAMPLE_TIME
     phase = np.mod(time / duration, 2.0)
     share = np.where(phase < 1.0, phase, 2.0 - phase)
     wanted = stroke * share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
     position = velocity = 0.0
     rows = []
-    for t, target in zip(time, wanted, strict=True):
-        seen = ENCODER * round(position / ENCODER)
-        voltage = STIFFNESS * (target - seen) - DAMPING * velocity
+    for t, target, error in zip(time, wanted, noise, strict=True):
+        voltage = STIFFNESS * (target - position) - DAMPING * velocity
         voltage = round(min(max(voltage, -10.0), 10.0), 4)
-        rows.append((t, voltage, seen))
+        rows.append((t, voltage, position + error))
         position, velocity = advance(position, velocity, FORCE_PER_VOLT * voltage, SAMPLE_TIME)
     return np.array(rows)
 
 
 def training():
     """Ten seconds of strokes of 120 mm."""
-    return record(0.12, 1.0, 10_000)
+    return record(0.12, 1.0, 10_000, seed=1)
 
 
 def validation():
     """Five seconds of shorter and slower strokes."""
-    return record(0.09, 1.3, 5_000)
+    return record(0.09, 1.3, 5_000, seed=2)
 
 
 def save(path, rows):
