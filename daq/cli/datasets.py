@@ -230,13 +230,28 @@ def _factor(mapping: Mapping, key: tuple[str, ...], unit: str | None, wanted: st
 
     registry: Any = pint.UnitRegistry()
     try:
-        return float(registry.Quantity(1.0, _spelt(unit)).to(_spelt(wanted)).magnitude)
+        given, model = (registry.Quantity(1.0, _spelt(u)) for u in (unit, wanted))
+        factor = float(given.to(model.units).magnitude)
     except pint.DimensionalityError:
         raise mapping.file.error(key, f"{unit!r} does not convert to {wanted!r}") from None
     except Exception:
         raise mapping.file.error(
             key, f"unit {unit!r} is not understood; write it as in 'mm/s' or 'N*m'"
         ) from None
+    if _angles(given) != _angles(model):
+        # A number per minute may count turns or radians, and so may hertz.
+        raise mapping.file.error(
+            key,
+            f"{unit!r} does not say whether it counts turns or radians, as {wanted!r} of the model "
+            "does, or the other way round; write 'rpm', 'turn/s', 'deg' or 'rad/s'",
+        )
+    return factor
+
+
+def _angles(quantity: Any) -> float:
+    """Power of the angle in a quantity's unit."""
+    powers = dict(quantity.to_root_units().unit_items())
+    return float(powers.get("radian", 0.0))
 
 
 def _spelt(unit: str) -> str:

@@ -306,6 +306,8 @@ CASES = [
              "id.yaml:6:3: columns.outputs: 'y' of model lag is missing"),
     settings("an unknown unit", COLUMNS.replace("column: theta", "column: theta, unit: parrot"),
              "columns.outputs.y.unit: unit 'parrot' is not understood; write it as in"),
+    settings("turns or radians", COLUMNS.replace("column: theta", "column: theta, unit: rad*m"),
+             "id.yaml:7:24: columns.outputs.y.unit: 'rad*m' does not say whether it counts turns"),
     settings("a unit of another kind", COLUMNS.replace("column: theta", "column: theta, unit: kg"),
              "id.yaml:7:24: columns.outputs.y.unit: 'kg' does not convert to 'm'"),
     settings("a column that is not there", COLUMNS.replace("theta", "thet"),
