@@ -39,6 +39,13 @@ def test_it_stands_where_the_force_does_not_overcome_friction(data):
     assert data.advance(position, velocity, 18.0, 1.0)[1] > 0.0
 
 
+def test_the_tutorial_shows_the_example_as_it_is():
+    tutorial = (EXAMPLES.parent / "docs" / "own-model.md").read_text(encoding="utf-8")
+    for name, language in (("friction_drive.py", "python"), ("friction_drive.yaml", "yaml")):
+        shown = tutorial.split(f"```{language}\n")[1].split("```")[0]
+        assert shown in (EXAMPLES / name).read_text(encoding="utf-8")
+
+
 def test_identification_finds_the_drive(data, tmp_path):
     data.save(tmp_path / "training.csv", data.training()[:6000])
     data.save(tmp_path / "validation.csv", data.validation())
