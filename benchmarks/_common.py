@@ -16,6 +16,7 @@ from daq import capture
 from daq.cli import datasets
 from daq.cli.files import load_experiment, load_rig
 from daq.run import run_experiment
+from sim_rig.backend import SimulatedDevice
 from sysid import Dataset
 from sysid.model import ProcessModel
 from sysid.simulation import available_cores
@@ -56,12 +57,18 @@ def timed(function: Callable[[], Any]) -> tuple[float, Any]:
     return time.perf_counter() - start, result
 
 
-def simulated_logs(model: ProcessModel) -> tuple[Dataset, Dataset]:
-    """Training and validation record of the shipped experiment on the simulated rig."""
+def simulated_logs(model: ProcessModel, seed: int | None = None) -> tuple[Dataset, Dataset]:
+    """Training and validation record of the shipped experiment on the simulated rig.
+
+    seed: of the rig's noise and offsets, default its own.
+    """
     loaded = load_experiment("prbs.yaml")
     validation = loaded.validation()
     assert validation is not None
     rig, device = load_rig("simulated.yaml")
+    if seed is not None:
+        assert isinstance(device, SimulatedDevice)
+        device = SimulatedDevice(device.options.model_copy(update={"seed": seed}))
     with tempfile.TemporaryDirectory() as folder:
         records = []
         for item in (loaded, validation):

@@ -70,6 +70,12 @@ class Objective:
         other.space = space
         return other
 
+    def weighed(self, weights: FloatArray) -> Objective:
+        """The same objective with other weights of the outputs, (n_outputs,)."""
+        other = copy.copy(self)
+        other.weights = weights / weights.sum()
+        return other
+
     def evaluate(self, chromosomes: FloatArray) -> tuple[FloatArray, BatchResult]:
         """Error of each chromosome, (n,), infinite where its simulation failed; and the batch."""
         result = self.simulator.errors(
@@ -77,6 +83,12 @@ class Objective:
         )
         self._counter[0] += len(chromosomes)
         return self._mean_rmse(result.sse.sum(axis=1)), result
+
+    def rms(self, chromosomes: FloatArray) -> FloatArray:
+        """RMSE of each output in parts of its scale, (n, n_outputs), infinite where it failed."""
+        result = self.evaluate(chromosomes)[1]
+        roots: FloatArray = np.sqrt(result.sse.sum(axis=1) / np.maximum(self._counts, 1))
+        return roots
 
     def residuals(self, chromosomes: FloatArray, n_steps: Sequence[int]) -> FloatArray:
         """Normalised residuals at common step counts, (n, n_residuals, n_outputs).

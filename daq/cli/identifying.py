@@ -27,6 +27,12 @@ from sysid.assessment import examine
 from sysid.gassi import GASSI, PRESETS, Progress
 from sysid.model import ProcessModel
 
+_STAGES = {
+    "search": ("Genetic search", "generation"),
+    "refine": ("Local refinement", "iteration"),
+    "weigh": ("Weighing by noise", "iteration"),
+}
+
 
 @dataclass(frozen=True)
 class Prepared:
@@ -123,6 +129,7 @@ def gassi_settings(settings: IdentificationConfig) -> dict[str, Any]:
         "weights": settings.weights or None,
         "per_log": settings.per_log,
         "balance": settings.balance,
+        "criterion": settings.criterion,
         "accuracy": settings.accuracy,
         "max_steps": settings.max_steps,
         "random_state": settings.seed,
@@ -305,8 +312,7 @@ def _fit(prepared: Prepared, train: list[Loaded], quiet: bool) -> GASSI:
     with console.progress(quiet) as bar:
 
         def watch(step: Progress) -> None:
-            title = "Genetic search" if step.stage == "search" else "Local refinement"
-            unit = "generation" if step.stage == "search" else "iteration"
+            title, unit = _STAGES[step.stage]
             note = f"{unit} {step.done}/{step.total}, best error {step.error:.3g}"
             bar.update(title, step.done, step.total, note)
 

@@ -124,6 +124,11 @@ class IdentificationConfig(Signals):
     per_log: bool = Field(
         False, description="normalise each log by its own largest output, not by the overall one"
     )
+    criterion: Literal["likelihood", "error"] = Field(
+        "likelihood",
+        description="likelihood: in the end each output weighs by its own error; "
+        "error: the mean RMSE decides to the end",
+    )
     balance: Literal["samples", "logs"] = Field(
         "samples", description="logs count by their samples, or each alike"
     )

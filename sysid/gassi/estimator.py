@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 from sklearn.utils.validation import check_is_fitted
@@ -17,10 +17,13 @@ from sysid.objective import Balance, Objective
 from sysid.ranges import Range
 from sysid.recording import Data, RecordEstimator, split
 from sysid.refinement import Refinement, refine
+from sysid.settling import settle
 from sysid.simulation import BatchSimulator, Status
 from sysid.space import SearchSpace
 from sysid.starting import free_run
 from sysid.uncertainty import Uncertainty, uncertainty
+
+Criterion = Literal["likelihood", "error"]
 
 
 @dataclass(frozen=True)
@@ -52,6 +55,9 @@ class GASSI(RecordEstimator):
     minimum_generations, termination_ratio : i_min and r_termination of (4.11).
     weights : {output: weight}, relative importance of the outputs.
     per_log : normalise each record by its own max|y| instead of the maximum over all.
+    criterion : what the default preset ends with: ``likelihood`` weighs every output by its own
+        error, so that a noisy one does not decide what a clean one tells better; ``error`` stays
+        with the mean RMSE that the search minimises.
     balance : ``samples``, several records count as one long one; ``logs``, each alike.
     accuracy : normalised RMS error that a simulation aims at.
     max_steps : integration steps a sample may take before a chromosome is flagged.
@@ -66,6 +72,7 @@ class GASSI(RecordEstimator):
     chromosome_ : (n_free,), the free ones in ``space_.names`` order.
     initial_states_ : for each record a dict of the initial states that were estimated.
     space_ : SearchSpace that was searched; estimated initial states stand behind the parameters.
+    output_weights_ : (n_outputs,), what the outputs counted in the end.
     error_ : mean over outputs of the RMSE normalised by max|y| (see ``Objective``).
     search_error_ : the error before local refinement.
     feasible_ : whether all constraints hold.
@@ -92,6 +99,7 @@ class GASSI(RecordEstimator):
         weights: Mapping[str, float] | None = None,
         per_log: bool = False,
         balance: Balance = "samples",
+        criterion: Criterion = "likelihood",
         accuracy: float = 1e-3,
         max_steps: int = 512,
         threads: int | None = None,
@@ -112,6 +120,7 @@ class GASSI(RecordEstimator):
         self.weights = weights
         self.per_log = per_log
         self.balance = balance
+        self.criterion = criterion
         self.accuracy = accuracy
         self.max_steps = max_steps
         self.threads = threads
@@ -136,6 +145,11 @@ class GASSI(RecordEstimator):
         """
         data = self._records(X, y, records, None, reset=True)
         model = self._model()
+        if self.criterion not in get_args(Criterion):
+            raise ModelError(
+                f"unknown criterion {self.criterion!r}; choose from "
+                + ", ".join(get_args(Criterion))
+            )
         preset = PRESETS.get(self.preset)
         if preset is None:
             raise ModelError(f"unknown preset {self.preset!r}; choose from {', '.join(PRESETS)}")
@@ -143,6 +157,7 @@ class GASSI(RecordEstimator):
             model, self.ranges, self.fixed, preset.log_scale, tied=self.tied, scale=self.scale
         )
         objective = self._objective(data)
+        self.output_weights_: FloatArray = objective.weights
         search = GeneticSearch(
             self.space_,
             preset,
@@ -165,6 +180,8 @@ class GASSI(RecordEstimator):
             if preset.refine:
                 objective = self._with_starts(objective)
                 self._refine(objective, notify)
+                if self.criterion == "likelihood":
+                    self._settle(objective, notify)
         except KeyboardInterrupt:
             if search.elite is None:
                 raise
@@ -219,7 +236,8 @@ class GASSI(RecordEstimator):
         if self.stopped_ == "interrupted":
             raise ModelError("the identification was interrupted, so there are no intervals")
         data = self._records(X, y, records, None, reset=False)
-        return uncertainty(self._objective(data), self.chromosome_)
+        objective = self._objective(data).weighed(self.output_weights_)
+        return uncertainty(objective, self.chromosome_)
 
     def _step(self, dt: float | None) -> float:
         if self.dt is None:
@@ -299,6 +317,18 @@ class GASSI(RecordEstimator):
         result = refine(objective, self.chromosome_, max_iterations=limit, on_iteration=watch)
         # It rarely needs all the iterations it may take.
         notify(Progress("refine", result.iterations, result.iterations, self.error_))
+
+    def _settle(self, objective: Objective, notify: Callable[[Progress], None]) -> None:
+        """Go on to the likeliest parameters, each output weighed by its own error."""
+
+        def watch(step: Refinement) -> None:
+            notify(Progress("weigh", step.iterations, max(step.iterations, 10), self.error_))
+
+        settled = settle(objective, [self.chromosome_], watch)
+        error = float(objective.evaluate(settled.chromosome[None])[0][0])
+        violations = self.space_.violations(settled.chromosome[None])
+        self._take(settled.chromosome, error, bool(np.all(violations <= 0.0)))
+        self.output_weights_ = settled.objective.weights
 
     def _with_starts(self, objective: Objective) -> Objective:
         """The objective over the parameters and the initial states left to be estimated."""
