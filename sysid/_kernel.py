@@ -28,6 +28,7 @@ from sysid._kernel_text import (
 from sysid._lanes import LANES
 from sysid._program import listed
 
+_STAGES = {"a": "0.0", "b": "0.5", "c": "1.0"}  # and how much of a step has passed
 # ||J^16||^(1/16) is an upper bound of the spectral radius that is tight to a few per cent.
 _SQUARINGS = 4
 
@@ -221,7 +222,12 @@ def _shown(s: Shape, place: Place, vector: str, known: Sequence[int]) -> list[st
 
 def _input_slopes(s: Shape) -> list[str]:
     """Change per step of the interpolated inputs in the interval from sample k."""
-    return [f"i{j} = (u[k + 1, {j}] - v{j}) / n_steps" for j, foh in enumerate(s.foh) if foh]
+    lines = [f"i{j} = (u[k + 1, {j}] - v{j}) / n_steps" for j, foh in enumerate(s.foh) if foh]
+    # Behind the inputs stand what squares and cubes count for in the splines (``bends``).
+    for place, j in enumerate(j for j, spline in enumerate(s.spline) if spline):
+        column = s.n_inputs + 2 * place
+        lines += [f"square{j} = u[k, {column}]", f"cube{j} = u[k, {column + 1}]"]
+    return lines
 
 
 def _stage_inputs(s: Shape) -> list[str]:
@@ -233,6 +239,12 @@ def _stage_inputs(s: Shape) -> list[str]:
             lines.append(f"uc{j} = ua{j} + i{j}")
         else:
             lines += [f"u{stage}{j} = v{j}" for stage in "abc"]
+    if any(s.spline):
+        lines += [f"r{stage} = (step + {part}) / n_steps" for stage, part in _STAGES.items()]
+    for j in (j for j, spline in enumerate(s.spline) if spline):
+        for stage in _STAGES:
+            away = f"r{stage} * (r{stage} - 1.0)"
+            lines.append(f"u{stage}{j} += {away} * (square{j} + cube{j} * (r{stage} + 1.0))")
     return lines
 
 

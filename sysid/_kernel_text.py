@@ -44,6 +44,7 @@ class Shape:
     n_outputs: int
     n_parameters: int
     foh: tuple[bool, ...]
+    spline: tuple[bool, ...]
     output_states: tuple[int, ...] | None
     structure: Structure
 
@@ -55,7 +56,8 @@ class Shape:
             len(model.inputs),
             len(model.outputs),
             len(model.parameters),
-            tuple(signal.hold == "foh" for signal in model.inputs),
+            tuple(signal.hold != "zoh" for signal in model.inputs),
+            tuple(signal.hold == "spline" for signal in model.inputs),
             model.output_states,
             structure or analyse(model),
         )

@@ -124,7 +124,7 @@ def _driven(
     """Rows of N that change within a sample, and whether any depends on a state."""
     if rows is None:
         return tuple(range(len(model.states))), True
-    moving = {j for j, signal in enumerate(model.inputs) if signal.hold == "foh"}
+    moving = {j for j, signal in enumerate(model.inputs) if signal.hold != "zoh"}
     bent = [bool(row.nonlinear or row.kinks.keys() & clamps.keys()) for row in rows]
     driven = (i for i, row in enumerate(rows) if bent[i] or row.inputs & moving)
     return tuple(driven), any(bent)

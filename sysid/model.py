@@ -22,7 +22,7 @@ IntArray = npt.NDArray[np.int64]
 Function = Callable[..., tuple[Any, ...]]
 
 Scale = Literal["linear", "log"]
-Hold = Literal["zoh", "foh"]
+Hold = Literal["zoh", "foh", "spline"]
 # A value, a range to estimate it in, or a word.
 Start = float | tuple[float, float] | Literal["first", "estimate"]
 
@@ -57,7 +57,12 @@ class State:
 
 @dataclass(frozen=True)
 class Input:
-    """One input: ``zoh`` holds each sample until the next, ``foh`` interpolates linearly."""
+    """One input and how it runs between samples.
+
+    ``zoh`` holds each sample until the next, ``foh`` interpolates linearly, ``spline`` runs a
+    cubic spline through all samples of a record (where a model is advanced sample by sample,
+    without knowing what comes, linearly).
+    """
 
     name: str
     unit: str
@@ -263,7 +268,7 @@ class ProcessModel:
         return replace(self, states=states)
 
     def with_holds(self, holds: Mapping[str, Hold]) -> ProcessModel:
-        """A copy in which the named inputs are held (``zoh``) or interpolated (``foh``).
+        """A copy in which the named inputs are held or interpolated, see ``Input``.
 
         Raises ModelError for an unknown input.
         """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Literal
 
 import numpy as np
@@ -34,25 +35,19 @@ def simulate(
     record.check(model)
     p = tuple(float(v) for v in parameters)
     x = record.initial_state(model)
-    foh = np.array([signal.hold == "foh" for signal in model.inputs], dtype=bool)
+    between = _between(model, record)
     outputs = np.empty((record.n_samples, len(model.outputs)))
     for k in range(record.n_samples):
         u0 = record.inputs[k]
         outputs[k] = model.evaluate_output(tuple(x), tuple(u0), p)
         if k == record.n_samples - 1:
             break
-        slope = np.where(foh, record.inputs[k + 1] - u0, 0.0) / record.dt
 
-        def rhs(
-            t: float, state: FloatArray, u0: FloatArray = u0, slope: FloatArray = slope
-        ) -> FloatArray:
-            u = u0 + slope * t
-            return np.array(model.derivative(tuple(state), tuple(u), p))
+        def rhs(t: float, state: FloatArray, k: int = k) -> FloatArray:
+            return np.array(model.derivative(tuple(state), tuple(between(k, t)), p))
 
-        def jac(
-            t: float, state: FloatArray, u0: FloatArray = u0, slope: FloatArray = slope
-        ) -> FloatArray:
-            return jacobian(model, state, u0 + slope * t, parameters)
+        def jac(t: float, state: FloatArray, k: int = k) -> FloatArray:
+            return jacobian(model, state, between(k, t), parameters)
 
         solution = solve(
             rhs,
@@ -69,3 +64,19 @@ def simulate(
             )
         x = solution.y[:, -1]
     return outputs
+
+
+def _between(model: ProcessModel, record: Dataset) -> Callable[[int, float], FloatArray]:
+    """Inputs at a time after sample k, as each is declared to run between samples."""
+    from scipy.interpolate import CubicSpline
+
+    holds = np.array([signal.hold for signal in model.inputs])
+    foh, splined = holds == "foh", holds == "spline"
+    spline = CubicSpline(record.time, record.inputs) if splined.any() else None
+
+    def between(k: int, t: float) -> FloatArray:
+        slope = np.where(foh, record.inputs[k + 1] - record.inputs[k], 0.0) / record.dt
+        u: FloatArray = record.inputs[k] + slope * t
+        return u if spline is None else np.where(splined, spline(record.time[k] + t), u)
+
+    return between

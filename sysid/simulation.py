@@ -187,6 +187,7 @@ class _Runner:
         own = record.initial_state(simulator.model)
         # One row stands for all.
         self.starts = own[None] if starts is None else np.asarray(starts, dtype=np.float64)
+        self.inputs = _with_bends(simulator.model, record.inputs)
         missing = ~np.isfinite(record.outputs)
         self.y = np.where(missing, 0.0, record.outputs)
         if scale is None:
@@ -342,7 +343,7 @@ class _Runner:
             work,
             work.reshape(-1, LANES),
             self.kernels.tables,
-            self.record.inputs[:n_samples],
+            self.inputs[:n_samples],
             self.y[:n_samples],
             self.w[:n_samples],
             start,
@@ -374,6 +375,22 @@ class _Runner:
 
         self.each(run, _blocks(np.arange(len(parameters))))
         return rates
+
+
+def _with_bends(model: ProcessModel, inputs: FloatArray) -> FloatArray:
+    """Inputs, and behind them the squares' and cubes' coefficients of those that are splines.
+
+    From sample k a spline is u_k + (u_k+1 - u_k) r + a (r^2 - r) + b (r^3 - r), 0 <= r <= 1.
+    """
+    splines = [j for j, signal in enumerate(model.inputs) if signal.hold == "spline"]
+    if not splines:
+        return inputs
+    from scipy.interpolate import CubicSpline
+
+    pieces = CubicSpline(np.arange(len(inputs)), inputs[:, splines]).c
+    bends = np.zeros((len(inputs), 2 * len(splines)))
+    bends[:-1, 0::2], bends[:-1, 1::2] = pieces[1], pieces[0]
+    return np.ascontiguousarray(np.hstack([inputs, bends]))
 
 
 def _finer(steps: IntArray, excess: FloatArray) -> IntArray:

@@ -88,8 +88,9 @@ class Signals(Section):
         default_factory=dict,
         description="where states start: first, estimate, a number, or [low, high]",
     )
-    hold: dict[str, Literal["zoh", "foh"]] = Field(
-        default_factory=dict, description="inputs held (zoh) or interpolated (foh) between samples"
+    hold: dict[str, Literal["zoh", "foh", "spline"]] = Field(
+        default_factory=dict,
+        description="how inputs run between samples: held (zoh), linear (foh), spline",
     )
 
 

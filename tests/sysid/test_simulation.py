@@ -78,6 +78,31 @@ def test_a_run_starts_from_the_first_measured_sample():
     np.testing.assert_allclose(y, 4.0 * np.exp(-np.arange(20) * 0.01 / 0.1), rtol=1e-7)
 
 
+@pytest.mark.parametrize("n", [2, 3, 4, 40])
+def test_a_spline_input_follows_scipy_through_all_samples(n):
+    model = lag("spline", inputs=(Input("u", "1", "spline"),))
+    rng = np.random.default_rng(n)
+    record = blank(model, rng.normal(size=(n, 1)), 0.3)
+    found = BatchSimulator(model, accuracy=1e-8).trajectories(model.nominal, record)[0]
+    exact = reference(model, model.nominal, record)
+    np.testing.assert_allclose(found, exact, atol=1e-6 * np.abs(exact).max())
+
+
+def test_a_spline_keeps_a_sine_of_five_samples_a_period():
+    """Linear interpolation takes away an eighth of it."""
+    dt, omega, n = 0.1, 2.0 * np.pi / 0.5, 400
+    inputs = np.sin(omega * dt * np.arange(n))
+    swings = {}
+    for hold in ("foh", "spline"):
+        model = lag(hold)
+        gain, tau = model.nominal
+        record = blank(model, inputs[:, None], dt)
+        late = BatchSimulator(model, accuracy=1e-6).trajectories(model.nominal, record)[0, 100:, 0]
+        swings[hold] = np.sqrt(2.0) * late.std() * np.hypot(1.0, omega * tau) / gain
+    assert swings["spline"] == pytest.approx(1.0, abs=0.02)
+    assert swings["foh"] == pytest.approx(np.sinc(0.2) ** 2, abs=0.02)
+
+
 def oscillator_derivative(x, u, p):
     return x[1], -p[0] * p[0] * x[0]
 
