@@ -126,6 +126,14 @@ def identify(
             "--hold-back", metavar="PART", help="Part of each log, its end, kept for validation."
         ),
     ] = None,
+    profile: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--profile",
+            metavar="PARAMETER",
+            help="Trace how the fit worsens as this one moves; may be repeated.",
+        ),
+    ] = None,
     settings: Annotated[
         list[str] | None,
         typer.Option(
@@ -146,6 +154,7 @@ def identify(
         "generations": generations,
         "seed": seed,
         "hold_back": hold_back,
+        "profile": profile,
     }
     identify_command(logs, validate or [], config, out, options, settings or [], json)
 

@@ -86,7 +86,7 @@ class Group:
         assert outcome.estimator is not None
         settings = self.prepared.settings.model_copy(update={"seed": outcome.run.seed})
         prepared = dataclasses.replace(self.prepared, settings=settings)
-        return document(assemble(prepared, outcome.estimator, self.training, self.validation))
+        return document(assemble(prepared, outcome.estimator, self.training, self.validation, True))
 
 
 def campaign_command(

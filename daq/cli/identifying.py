@@ -22,10 +22,11 @@ from daq.config import yaml_file
 from daq.config.identification import IdentificationConfig, Signals
 from daq.config.yaml_file import CommandLine, YamlFile, suggestion
 from daq.errors import ConfigError
-from sysid import ModelError, SearchSpace
+from sysid import Dataset, ModelError, SearchSpace
 from sysid.assessment import examine
 from sysid.gassi import GASSI, PRESETS, Progress
 from sysid.model import ProcessModel
+from sysid.uncertainty import Profile
 
 _STAGES = {
     "search": ("Genetic search", "generation"),
@@ -202,7 +203,7 @@ def identify_logs(
     train, ends = datasets.hold_back(train, prepared.settings.hold_back)
     check = [*ends, *check]
     estimator = _fit(prepared, train, as_json)
-    result = assemble(prepared, estimator, train, check)
+    result = assemble(prepared, estimator, train, check, as_json)
     report = reporting.document(result)
     path = write_parameters(folder, report)
     report["files"] = {"parameters": str(path)}
@@ -224,13 +225,15 @@ def _check_names(
         ("weights", settings.weights, outputs),
         ("initial", settings.initial, _all_names(models, "state_names")),
         ("hold", settings.hold, _all_names(models, "input_names")),
+        ("profile", dict.fromkeys(settings.profile), parameters),
     )
     for group, given, known in groups:
         for name in given:
             if name not in known:
+                # A list has no keys of its own.
+                key = (group, name) if isinstance(file.content.get(group), dict) else (group,)
                 raise file.error(
-                    (group, name),
-                    f"model {names} has no such name; {suggestion(name, known)}",
+                    key, f"model {names} has no such name {name!r}; {suggestion(name, known)}"
                 )
 
 
@@ -265,13 +268,18 @@ def _check_space(file: YamlFile, settings: IdentificationConfig, model: ProcessM
         _try_space(file, ("tied", name), model, tied={name: tied[name]})
     groups = ("tied", "fixed", "scale", "ranges")
     group = next((key for key in groups if file.content.get(key)), "ranges")
-    _try_space(file, (group,), model, ranges, fixed, tied=tied, scale=scale)
+    space = _try_space(file, (group,), model, ranges, fixed, tied=tied, scale=scale)
+    for name in settings.profile:
+        if name not in space.names:
+            raise file.error(
+                ("profile",), f"{name} is not searched, so it has no profile; free it by a range"
+            )
 
 
-def _try_space(file: YamlFile, key: tuple[str, ...], *args: Any, **more: Any) -> None:
-    """Raise ConfigError at a key where the search space that it is part of makes no sense."""
+def _try_space(file: YamlFile, key: tuple[str, ...], *args: Any, **more: Any) -> SearchSpace:
+    """A search space; ConfigError at the key that makes none."""
     try:
-        SearchSpace.of(*args, **more)
+        return SearchSpace.of(*args, **more)
     except ModelError as error:
         raise file.error(key, str(error)) from None
 
@@ -323,7 +331,11 @@ def _fit(prepared: Prepared, train: list[Loaded], quiet: bool) -> GASSI:
 
 
 def assemble(
-    prepared: Prepared, estimator: GASSI, train: Sequence[Loaded], check: Sequence[Loaded]
+    prepared: Prepared,
+    estimator: GASSI,
+    train: Sequence[Loaded],
+    check: Sequence[Loaded],
+    quiet: bool,
 ) -> Identified:
     """A fitted estimator with its intervals, and how it does on every log."""
     records = [log.dataset for log in train]
@@ -336,11 +348,25 @@ def assemble(
         columns_file=Path(prepared.mapping.file.path) if prepared.mapping is not None else None,
         estimator=estimator,
         uncertainty=estimator.uncertainty(records) if refined else None,
+        profiles=_profiles(prepared, estimator, records, quiet) if refined else [],
         training=examine(records, estimator.predict),
         validation=examine([log.dataset for log in check], estimator.predict),
         training_paths=[log.path for log in train],
         validation_paths=[log.path for log in check],
     )
+
+
+def _profiles(
+    prepared: Prepared, estimator: GASSI, records: Sequence[Dataset], quiet: bool
+) -> list[Profile]:
+    wanted = prepared.settings.profile
+    found = []
+    with console.progress(quiet) as bar:
+        for k, name in enumerate(wanted):
+            bar.update("Profiles", k, len(wanted), f"of {name}")
+            found.append(estimator.profile(name, list(records)))
+            bar.update("Profiles", k + 1, len(wanted), f"of {name}")
+    return found
 
 
 def write_parameters(folder: Path, report: dict[str, Any]) -> Path:

@@ -18,7 +18,7 @@ from sysid.gassi import GASSI
 from sysid.metrics import Metrics
 from sysid.model import Parameter, ProcessModel
 from sysid.ranges import Range
-from sysid.uncertainty import Ambiguity, Estimate, Uncertainty
+from sysid.uncertainty import Ambiguity, Estimate, Profile, Uncertainty
 
 _STRONG = 0.95  # correlation above which two parameters are named together
 _NOTES = {
@@ -45,6 +45,7 @@ class Identified:
     columns_file: Path | None
     estimator: GASSI
     uncertainty: Uncertainty | None
+    profiles: Sequence[Profile]
     training: Sequence[RecordResult]
     validation: Sequence[RecordResult]
     training_paths: Sequence[Path]
@@ -84,6 +85,7 @@ def document(result: Identified) -> dict[str, Any]:
         "parameters": {p.name: _parameter(result, p) for p in result.model.parameters},
         **_initial_states(result),
         **_uncertainty(result.uncertainty),
+        **_profiles(result.profiles),
         "error": {
             "value": estimator.error_,
             "meaning": "mean over outputs of the RMSE on outputs normalised by max|y|",
@@ -185,6 +187,21 @@ def _uncertainty(found: Uncertainty | None) -> dict[str, Any]:
     }
 
 
+def _profiles(found: Sequence[Profile]) -> dict[str, Any]:
+    if not found:
+        return {}
+    return {
+        "profiles": {
+            one.name: {
+                "interval": [one.low, one.high],
+                "values": one.values.tolist(),
+                "statistic": one.statistic.tolist(),
+            }
+            for one in found
+        }
+    }
+
+
 def _record(model: ProcessModel, record: RecordResult) -> dict[str, Any]:
     metrics, residuals = record.metrics, record.residuals
     return {
@@ -212,6 +229,7 @@ def show(result: Identified, path: Path) -> None:
     _show_parameters(result)
     if result.uncertainty is not None:
         _show_open_questions(result.uncertainty)
+    _show_profiles(result.profiles)
     _show_metrics(result)
     _show_residuals(result)
     _show_notes(result)
@@ -324,6 +342,26 @@ def _close_pairs(found: Uncertainty) -> list[str]:
         for i, j in itertools.combinations(own, 2)
         if abs(correlation[i, j]) > _STRONG
     ]
+
+
+def _show_profiles(profiles: Sequence[Profile]) -> None:
+    if not profiles:
+        return
+    console.print_table(
+        "Profile likelihood",
+        ["parameter", "value", "95 % interval", "unit"],
+        [
+            [one.name, console.number(one.value), " .. ".join(map(_end, (one.low, one.high))),
+             one.unit]
+            for one in profiles
+        ],
+        text=["unit"],
+    )  # fmt: skip
+
+
+def _end(value: float | None) -> str:
+    """An end of an interval; the data set none where the profile stays low."""
+    return "open" if value is None else console.number(value)
 
 
 def _show_metrics(result: Identified) -> None:

@@ -136,4 +136,7 @@ class IdentificationConfig(Signals):
     hold_back: float = Field(
         0.0, ge=0.0, lt=1.0, description="part of each log, its end, that validates"
     )
+    profile: list[str] = Field(
+        default_factory=list, description="free parameters whose profile likelihood is wanted"
+    )
     columns: Columns | None = Field(None, description="how a foreign CSV's columns are meant")

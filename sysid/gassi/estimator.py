@@ -21,7 +21,7 @@ from sysid.settling import settle
 from sysid.simulation import BatchSimulator, Status
 from sysid.space import SearchSpace
 from sysid.starting import free_run
-from sysid.uncertainty import Uncertainty, uncertainty
+from sysid.uncertainty import Profile, Uncertainty, profile, uncertainty
 
 Criterion = Literal["likelihood", "error"]
 
@@ -230,14 +230,27 @@ class GASSI(RecordEstimator):
         X, y, records: what ``fit`` was given. Raises ModelError where the local refinement did
         not run to its end: only at a minimum of the error do its sensitivities tell.
         """
+        return uncertainty(self._settled(X, y, records), self.chromosome_)
+
+    def profile(
+        self, name: str, X: Data, y: FloatArray | None = None, *, records: Any = None
+    ) -> Profile:
+        """How much worse the best fit becomes as one parameter is moved, others fitted anew.
+
+        X, y, records: what ``fit`` was given. Raises ModelError as ``uncertainty``, and for a
+        parameter that is not free.
+        """
+        return profile(self._settled(X, y, records), self.chromosome_, name)
+
+    def _settled(self, X: Data, y: FloatArray | None, records: Any) -> Objective:
+        """The objective at whose minimum ``fit`` ended."""
         check_is_fitted(self, "vector_")
         if not PRESETS[self.preset].refine:
             raise ModelError(f"preset {self.preset} has no local refinement, so no intervals")
         if self.stopped_ == "interrupted":
             raise ModelError("the identification was interrupted, so there are no intervals")
         data = self._records(X, y, records, None, reset=False)
-        objective = self._objective(data).weighed(self.output_weights_)
-        return uncertainty(objective, self.chromosome_)
+        return self._objective(data).weighed(self.output_weights_)
 
     def _step(self, dt: float | None) -> float:
         if self.dt is None:
