@@ -230,11 +230,10 @@ def _check_names(
     for group, given, known in groups:
         for name in given:
             if name not in known:
-                # A list has no keys of its own.
-                key = (group, name) if isinstance(file.content.get(group), dict) else (group,)
-                raise file.error(
-                    key, f"model {names} has no such name {name!r}; {suggestion(name, known)}"
-                )
+                hint = f"model {names} has no such name; {suggestion(name, known)}"
+                if isinstance(file.content.get(group), dict):
+                    raise file.error((group, name), hint)
+                raise file.error((group,), f"{name}: {hint}")  # a list has no keys of its own
 
 
 def _all_names(models: Sequence[ProcessModel], kind: str) -> tuple[str, ...]:
