@@ -244,7 +244,7 @@ CASES = [
     settings("a hold of nothing", "hold: {troque: zoh}\n",
              "id.yaml:1:8: hold.troque: model actuator has no such name; did you mean 'torque'?"),
     settings("a hold that is none", "hold: {torque: soh}\n",
-             "id.yaml:1:8: hold.torque: it must be 'zoh' or 'foh', found 'soh'"),
+             "id.yaml:1:8: hold.torque: it must be 'zoh', 'foh' or 'spline', found 'soh'"),
     settings("a range without ends", IDENTIFICATION.replace("[0.1, 0.2]", "[null, null]"),
              "id.yaml:4:3: ranges.K_m: a range needs at least one end; write [low, high] or"),
     settings("a one-sided range beyond what is possible",
