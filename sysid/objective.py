@@ -111,6 +111,17 @@ class Objective:
         with np.errstate(over="ignore", invalid="ignore"):
             return self._mean_rmse(np.sum(residuals**2, axis=1))
 
+    def least_squares_weights(self, residual: FloatArray) -> FloatArray:
+        """Weights of squared residuals whose sum is least where the error is, (n_outputs,).
+
+        residual: (n_residuals, n_outputs), at that minimum. Half the second derivative of the
+        error is that of the weighted mean square.
+        """
+        counts = np.maximum(self._counts, 1)
+        rms = np.sqrt(np.sum(residual**2, axis=0) / counts)
+        weights: FloatArray = self.weights * len(residual) / counts / np.maximum(rms, 1e-12)
+        return weights
+
     def _starts(self, chromosomes: FloatArray) -> list[FloatArray]:
         """Initial states of every chromosome for each record."""
         model = self.simulator.model

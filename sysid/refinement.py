@@ -132,8 +132,7 @@ def _candidates(
 
     And the part of the error that the longest of them would take away, were all linear.
     """
-    rms = np.sqrt(np.mean(residual**2, axis=0))
-    weight = np.sqrt(objective.weights / np.maximum(rms, 1e-12))
+    weight = np.sqrt(objective.least_squares_weights(residual))
     rows = (jacobian * weight[None, :, None]).reshape(-1, len(at))
     right = (residual * weight).reshape(-1)
     # A direction held by a bound and pushed against it would only shorten the step.

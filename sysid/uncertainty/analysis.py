@@ -12,16 +12,16 @@ import itertools
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import null_space
 
 from sysid.model import FloatArray, IntArray
 from sysid.objective import Objective
 from sysid.space import SearchSpace
 from sysid.uncertainty.directions import PART, Directions, directions
 from sysid.uncertainty.estimate import Z95, Estimate, Why, product_text, sum_text
-from sysid.uncertainty.relations import Kind, Relation, overlapping, relations
+from sysid.uncertainty.relations import Kind, Relation, named, overlapping, relations, sparse
 from sysid.uncertainty.sensitivity import common_steps, coordinate_units, sensitivity
 
-_SHARE = 0.1  # entries of a vague direction below this share of its largest are not worth naming
 _WHOLE = 1e-3  # a factor this close to a whole number is meant to be one
 
 # Units of what a lab measures with a meter, a scale or a data sheet, easiest first.
@@ -85,7 +85,7 @@ def uncertainty(objective: Objective, chromosome: FloatArray) -> Uncertainty:
     told = directions(objective, chromosome, steps, found, ends)
     units = coordinate_units(objective, chromosome)
     slope = np.where(objective.space.log, chromosome, units)
-    hidden = relations(objective, chromosome, steps, slope, told.lost)
+    hidden = relations(objective, chromosome, steps, slope, told.lost, told.still)
     return _Teller(objective.space, chromosome, slope, told, hidden).result()
 
 
@@ -113,6 +113,12 @@ class _Teller:
             self.told.rank,
         )
 
+    @property
+    def _relative_slope(self) -> FloatArray:
+        """Relative change of each parameter per unit of its coordinate; none of what is zero."""
+        nonzero = self.chromosome != 0.0
+        return np.divide(self.slope, self.chromosome, out=np.zeros(len(nonzero)), where=nonzero)
+
     def _parameter(self, j: int) -> Estimate:
         one = np.zeros(len(self.chromosome))
         one[j] = 1.0
@@ -132,7 +138,7 @@ class _Teller:
         """Estimate of a product of powers of the parameters."""
         used = np.flatnonzero(exponents)
         value = float(np.prod(self.chromosome[used] ** exponents[used]))
-        deviation = self._deviation(exponents * self.slope / self.chromosome)
+        deviation = self._deviation(exponents * self._relative_slope)
         terms = self._terms(exponents)
         ends = value * np.exp(-Z95 * deviation), value * np.exp(Z95 * deviation)
         unit = self.space.parameters[used[0]].unit if len(used) == 1 else ""
@@ -166,16 +172,15 @@ class _Teller:
         found = [self._exact([exact[i] for i in members]) for members in groups]
         for relation in self.hidden:
             if not relation.exact:
-                size = np.abs(relation.vector)
-                group = np.flatnonzero(size > _SHARE * size.max())
+                group = named(relation.vector)
                 found.append(self._ambiguity("vague", group, [relation], []))
         return found
 
     def _exact(self, members: list[Relation]) -> Ambiguity:
         group = np.flatnonzero(np.any([relation.support for relation in members], axis=0))
         sums = all(relation.kind == "sum" for relation in members)
-        if sums and len(group) == 2:
-            determined = [self._total(group, members[0].vector[group])]
+        if sums:
+            determined = self._sums(group, np.stack([r.vector[group] for r in members]))
         else:
             determined = self._products(group, len(group) - len(members))
         return self._ambiguity("sum" if sums else "product", group, members, determined)
@@ -197,14 +202,29 @@ class _Teller:
             tuple(names[i] for i in measure),
         )
 
-    def _total(self, group: IntArray, vector: FloatArray) -> Estimate:
-        """The sum of two parameters that a direction leaves alone."""
-        step = vector * self.slope[group]
-        factors = np.zeros(len(self.chromosome))
-        factors[group] = np.array([step[1], -step[0]])
-        factors /= factors[group][np.argmin(np.abs(factors[group]))]
-        whole = np.round(factors)
-        return self._sum(np.where(np.abs(factors - whole) < _WHOLE, whole, factors))
+    def _sums(self, group: IntArray, vectors: FloatArray) -> list[Estimate]:
+        """Sums of the group's parameters that the data determine.
+
+        vectors: (n_relations, n_group), directions that leave them alone.
+        """
+        chosen = []
+        for direction in sparse(null_space(vectors).T):
+            factors = np.zeros(len(self.chromosome))
+            factors[group] = direction / self.slope[group]
+            used = np.flatnonzero(factors)
+            # Factors in parts of the smallest, the first of them positive.
+            smallest = np.min(np.abs(factors[used])) * np.sign(factors[used[0]])
+            factors /= smallest
+            whole = np.round(factors)
+            factors = np.where(np.abs(factors - whole) < _WHOLE, whole, factors)
+            if self._determined(factors * self.slope):
+                chosen.append(factors)
+        return [self._sum(factors) for factors in chosen]
+
+    def _determined(self, direction: FloatArray) -> bool:
+        """Whether the data determine what changes so with the coordinates."""
+        outside = np.sum((self.told.lost @ direction) ** 2) / np.sum(direction**2)
+        return bool(outside < PART)
 
     def _products(self, group: IntArray, count: int) -> list[Estimate]:
         """Simple products of the group's parameters that the data determine, at most count."""
@@ -214,10 +234,10 @@ class _Teller:
                 break
             whole = np.zeros(len(self.chromosome))
             whole[group] = exponents
-            direction = whole * self.slope / self.chromosome
-            outside = np.sum((self.told.lost @ direction) ** 2) / np.sum(direction**2)
-            independent = np.linalg.matrix_rank(np.array([*chosen, whole])) > len(chosen)
-            if outside < PART and independent:
+            direction = whole * self._relative_slope
+            if not self._determined(direction):
+                continue
+            if np.linalg.matrix_rank(np.array([*chosen, whole])) > len(chosen):
                 chosen.append(whole)
         return [self._product(exponents) for exponents in chosen]
 
@@ -228,12 +248,14 @@ def _effort(unit: str) -> int:
 
 
 def _simple_exponents(n: int) -> list[FloatArray]:
-    """Exponents of simple products of n factors, the simplest first."""
+    """Exponents of simple products of n factors, the simplest first: squares after all others."""
     found = []
-    for size in (1, 2, 3):
-        for places in itertools.combinations(range(n), size):
-            for signs in itertools.product((1.0, -1.0), repeat=size - 1):
-                exponents = np.zeros(n)
-                exponents[list(places)] = (1.0, *signs)
-                found.append(exponents)
+    for powers in ((1.0, -1.0), (1.0, -1.0, 2.0, -2.0)):
+        for size in (1, 2, 3):
+            for places in itertools.combinations(range(n), size):
+                for chosen in itertools.product(powers, repeat=size):
+                    if chosen[0] > 0.0 and min(map(abs, chosen)) == 1.0:
+                        exponents = np.zeros(n)
+                        exponents[list(places)] = chosen
+                        found.append(exponents)
     return found

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import lapack
 
-from sysid.model import FloatArray
+from sysid.model import BoolArray, FloatArray
 
 _LARGEST_ORDER = 12
 
@@ -27,20 +27,30 @@ class Autoregression:
     noise: FloatArray
 
 
-def colour(residual: FloatArray, lengths: Sequence[int]) -> Autoregression:
-    """Autoregression of residuals (n, q) of records of the given lengths, by least squares."""
+def colour(residual: FloatArray, seen: BoolArray, lengths: Sequence[int]) -> Autoregression:
+    """Autoregression of residuals (n, q) of records of the given lengths, by least squares.
+
+    seen: (n, q), which samples were measured; only equations without a lost one count.
+    """
     q = residual.shape[1]
-    largest = max(0, min(_LARGEST_ORDER, min(lengths) // (4 * q) - 1))
-    y, past = _regression(residual, lengths, largest)
-    best, lowest = _fit(y, past[:, :0], q), np.inf
+    whole = np.all(seen[:, seen.any(axis=0)], axis=1)
+    if not whole.any():
+        # Outputs that are never measured together: of each its own variance.
+        variance = np.sum(residual**2, axis=0) / np.maximum(seen.sum(axis=0), 1)
+        return Autoregression(np.zeros((0, q, q)), np.diag(variance))
+    largest = _largest_order(whole, lengths, q)
+    y, past = _regression(residual, whole, lengths, largest)
+    basis = np.linalg.qr(past)[0]
+    best, lowest = 0, np.inf
     for order in range(largest + 1):
-        fitted = _fit(y, past[:, : order * q], q)
+        part = basis[:, : order * q]
+        noise = _covariance(y - part @ (part.T @ y), order)
         # A tiny part of its own: an output that never errs has no logarithm.
-        sign, size = np.linalg.slogdet(fitted.noise + 1e-300 * np.eye(q))
+        sign, size = np.linalg.slogdet(noise + 1e-300 * np.eye(q))
         criterion = len(y) * size + np.log(max(len(y), 2)) * order * q * q
         if sign > 0 and criterion < lowest:
-            best, lowest = fitted, criterion
-    return best
+            best, lowest = order, criterion
+    return _fit(*_regression(residual, whole, lengths, best), q)
 
 
 def score_covariance(
@@ -80,24 +90,43 @@ def _response(slopes: FloatArray, model: Autoregression) -> FloatArray:
     return response
 
 
-def _regression(
-    residual: FloatArray, lengths: Sequence[int], order: int
-) -> tuple[FloatArray, FloatArray]:
-    """Residuals behind the first ``order`` of each record, and their pasts, nearest first."""
-    targets, pasts = [], []
+def _largest_order(whole: BoolArray, lengths: Sequence[int], q: int) -> int:
+    """Highest order that the shortest record bears and that lost samples leave equations for."""
+    order = max(0, min(_LARGEST_ORDER, min(lengths) // (4 * q) - 1))
+    while order and 2 * _usable(whole, lengths, order).sum() < whole.sum():
+        order -= 1
+    return order
+
+
+def _usable(whole: BoolArray, lengths: Sequence[int], order: int) -> BoolArray:
+    """Samples that were measured, as were as many before them in their record, (n,)."""
+    usable = whole.copy()
     start = 0
     for length in lengths:
-        part = residual[start : start + length]
+        part = whole[start : start + length]
+        for k in range(1, order + 1):
+            usable[start + k : start + length] &= part[: max(length - k, 0)]
+        usable[start : start + order] = False
         start += length
-        targets.append(part[order:])
-        past = [part[order - k : length - k] for k in range(1, order + 1)]
-        pasts.append(np.hstack(past) if past else np.zeros((length - order, 0)))
-    return np.vstack(targets), np.vstack(pasts)
+    return usable
+
+
+def _regression(
+    residual: FloatArray, whole: BoolArray, lengths: Sequence[int], order: int
+) -> tuple[FloatArray, FloatArray]:
+    """Residuals whose past of ``order`` samples is known, and that past, nearest first."""
+    rows = np.flatnonzero(_usable(whole, lengths, order))
+    past = residual[rows[:, None] - np.arange(1, order + 1)]
+    return residual[rows], past.reshape(len(rows), -1)
 
 
 def _fit(y: FloatArray, past: FloatArray, q: int) -> Autoregression:
     order = past.shape[1] // q
     solution = np.asarray(np.linalg.lstsq(past, y, rcond=None)[0], dtype=np.float64)
-    e = y - past @ solution
-    noise = e.T @ e / max(len(y) - order * q, 1)
+    noise = _covariance(y - past @ solution, order)
     return Autoregression(np.moveaxis(solution.reshape(order, q, q), 1, 2), noise)
+
+
+def _covariance(e: FloatArray, order: int) -> FloatArray:
+    covariance: FloatArray = e.T @ e / max(len(e) - order * e.shape[1], 1)
+    return covariance

@@ -26,14 +26,16 @@ class Directions:
     """The determined directions' covariance and a basis of the others.
 
     Coordinates are those of ``Sensitivity``. covariance: (n_free, n_free), undetermined
-    directions and parameters held by a bound left out. lost: (n_lost, n_free), orthonormal.
-    singular_values: of the weighted sensitivity, falling. held: (n_free,), parameters that a
-    bound holds. curvature: (n_free, n_free), inverse of the curvature in the determined
-    directions, what the covariance would be of white residuals of unit weight.
+    directions and parameters held by a bound left out. lost: (n_lost, n_free), orthonormal;
+    still: (n_lost,), which of them do not move the outputs at all. singular_values: of the
+    weighted sensitivity, falling. held: (n_free,), parameters that a bound holds. curvature:
+    (n_free, n_free), inverse of the curvature in the determined directions, what the covariance
+    would be of white residuals of unit weight.
     """
 
     covariance: FloatArray
     lost: FloatArray
+    still: BoolArray
     singular_values: FloatArray
     held: BoolArray
     curvature: FloatArray
@@ -70,11 +72,11 @@ def directions(
     sections 9.2 and 9.4).
     """
     n = found.slopes.shape[2]
-    rms = np.sqrt(np.mean(found.residual**2, axis=0))
-    weight = objective.weights / np.maximum(rms, 1e-9)
+    weight = objective.least_squares_weights(found.residual)
     rows = (found.slopes * np.sqrt(weight)[:, None]).reshape(-1, n)
     weighted = found.slopes * weight[:, None]
-    score = score_covariance(weighted, found.lengths, colour(found.residual, found.lengths))
+    noise = colour(found.residual, found.seen, found.lengths)
+    score = score_covariance(weighted, found.lengths, noise)
     causes = (objective, chromosome, steps, found)
     score = _larger(score, _pushes(weighted, input_noises(*causes)))
     score += _pushes(weighted, zero_errors(*causes))
@@ -91,16 +93,16 @@ def _decompose(rows: FloatArray, score: FloatArray, held: BoolArray) -> Directio
     """
     n, kept = rows.shape[1], np.flatnonzero(~held)
     _, values, vectors = np.linalg.svd(rows[:, kept], full_matrices=False)
-    exact = values > _EXACT * values[0] if len(values) else np.zeros(0, dtype=bool)
-    back = vectors / np.where(exact, values, np.inf)[:, None] ** 2
+    moving = values > _EXACT * values[0] if len(values) else np.zeros(0, dtype=bool)
+    back = vectors / np.where(moving, values, np.inf)[:, None] ** 2
     variance = np.einsum("kj,jl,kl->k", back, score[np.ix_(kept, kept)], back)
-    determined = exact & (variance < _VAGUE**2)
+    determined = moving & (variance < _VAGUE**2)
     strong = vectors[determined]
     inverse = np.zeros((n, n))
     inverse[np.ix_(kept, kept)] = (strong.T / values[determined] ** 2) @ strong
     lost = np.zeros((int((~determined).sum()), n))
     lost[:, kept] = vectors[~determined]
-    return Directions(inverse @ score @ inverse, lost, values, held, inverse)
+    return Directions(inverse @ score @ inverse, lost, ~moving[~determined], values, held, inverse)
 
 
 def _pushes(weighted: FloatArray, changes: Iterable[FloatArray]) -> FloatArray:

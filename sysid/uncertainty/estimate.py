@@ -40,9 +40,9 @@ class Estimate:
 
 
 def product_text(terms: Sequence[tuple[str, float]]) -> str:
-    """``a b / c`` of exponents 1 and -1."""
-    above = [name for name, exponent in terms if exponent > 0.0]
-    below = [name for name, exponent in terms if exponent < 0.0]
+    """``a b^2 / c`` of exponents 1, 2 and -1."""
+    above = [_power(name, exponent) for name, exponent in terms if exponent > 0.0]
+    below = [_power(name, -exponent) for name, exponent in terms if exponent < 0.0]
     text = " ".join(above) or "1"
     if below:
         bottom = " ".join(below)
@@ -51,6 +51,14 @@ def product_text(terms: Sequence[tuple[str, float]]) -> str:
 
 
 def sum_text(terms: Sequence[tuple[str, float]]) -> str:
-    """``a + 2 b``."""
-    parts = [name if factor == 1.0 else f"{factor:.4g} {name}" for name, factor in terms]
-    return " + ".join(parts).replace("+ -", "- ")
+    """``a + 2 b - c`` of factors 1, 2 and -1."""
+    parts: list[str] = []
+    for name, factor in terms:
+        size = name if abs(factor) == 1.0 else f"{abs(factor):.4g} {name}"
+        sign = "-" if factor < 0.0 else "+"
+        parts.append(f" {sign} {size}" if parts else size if factor > 0.0 else f"-{size}")
+    return "".join(parts)
+
+
+def _power(name: str, exponent: float) -> str:
+    return name if exponent == 1.0 else f"{name}^{exponent:g}"

@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from sysid.model import BoolArray, FloatArray
+from sysid.model import BoolArray, FloatArray, IntArray
 from sysid.objective import Objective
 
 Kind = Literal["product", "sum", "vague"]
@@ -18,6 +18,7 @@ Kind = Literal["product", "sum", "vague"]
 _FOLLOW = 0.2
 _UNMOVED = 1e-3
 _NOTHING = 3e-3  # entries of a direction below this are rounding
+_SHARE = 0.1  # entries of a vague direction below this share of its largest are not worth naming
 
 
 @dataclass(frozen=True)
@@ -49,14 +50,19 @@ def relations(
     steps: list[int],
     slope: FloatArray,
     lost: FloatArray,
+    still: BoolArray,
 ) -> list[Relation]:
     """The undetermined directions as simple ones, each followed to see what it is.
 
-    slope: (n_free,), change of each parameter per unit of its coordinate.
+    slope: (n_free,), change of each parameter per unit of its coordinate. lost: (n_lost, n_free);
+    still: (n_lost,), which of them do not move the outputs at all. These are made simple by
+    themselves, the others up to them.
     """
+    hidden = sparse(lost[still])
+    felt = [_simplest(vector, hidden) for vector in sparse(lost[~still])]
     return [
         Relation(vector, _kind(objective, chromosome, steps, vector * slope))
-        for vector in _sparse(lost)
+        for vector in (*hidden, *felt)
     ]
 
 
@@ -87,7 +93,24 @@ def _kind(objective: Objective, chromosome: FloatArray, steps: list[int], step: 
     return "sum" if change[1] < _UNMOVED * change[2] else "vague"
 
 
-def _sparse(basis: FloatArray) -> FloatArray:
+def named(vector: FloatArray) -> IntArray:
+    """Parameters that a vague direction is about: those of no small share in it."""
+    size = np.abs(vector)
+    return np.flatnonzero(size > _SHARE * size.max())
+
+
+def _simplest(vector: FloatArray, hidden: FloatArray) -> FloatArray:
+    """A direction about as few parameters as moves along hidden ones, which do nothing, allow."""
+    for relation in hidden:
+        ways = [vector]
+        for j in np.flatnonzero(relation):
+            way = vector - vector[j] / relation[j] * relation
+            ways.append(np.where(np.abs(way) < _NOTHING * np.max(np.abs(way)), 0.0, way))
+        vector = min(ways, key=lambda way: len(named(way)))
+    return vector
+
+
+def sparse(basis: FloatArray) -> FloatArray:
     """The same space spanned by rows with as many zeros as elimination gives."""
     rows = basis.copy()
     left = list(range(len(rows)))

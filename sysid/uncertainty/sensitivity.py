@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sysid.data import Dataset
-from sysid.model import FloatArray
+from sysid.model import BoolArray, FloatArray
 from sysid.objective import Objective
 
 # Central differences in search coordinates: truncation and rounding both near 1e-8.
@@ -22,12 +22,14 @@ class Sensitivity:
     """Residuals and their slopes at a chromosome.
 
     residual: (n_residuals, n_outputs), simulated minus measured in parts of the output's scale,
-    0 where a sample was lost. slopes: (n_residuals, n_outputs, n_free), with respect to the
-    natural logarithm of a parameter searched by logarithm, else to the parameter in units of
-    ``coordinate_units``. lengths: residuals of each record, one after another.
+    0 where a sample was lost; seen: of the same shape, where none was. slopes: (n_residuals,
+    n_outputs, n_free), with respect to the natural logarithm of a parameter searched by
+    logarithm, else to the parameter in units of ``coordinate_units``. lengths: residuals of each
+    record, one after another.
     """
 
     residual: FloatArray
+    seen: BoolArray
     slopes: FloatArray
     lengths: tuple[int, ...]
 
@@ -52,7 +54,8 @@ def sensitivity(objective: Objective, chromosome: FloatArray, steps: list[int]) 
     slopes = (residuals[1 : n + 1] - residuals[n + 1 :]) / (2.0 * _PERTURBATION)
     slopes = np.where(np.isfinite(slopes), slopes, 0.0)
     lengths = tuple(record.n_samples for record in objective.records)
-    return Sensitivity(residuals[0], np.moveaxis(slopes, 0, 2), lengths)
+    seen = np.concatenate([np.isfinite(record.outputs) for record in objective.records])
+    return Sensitivity(residuals[0], seen, np.moveaxis(slopes, 0, 2), lengths)
 
 
 def coordinate_units(objective: Objective, chromosome: FloatArray) -> FloatArray:

@@ -142,3 +142,22 @@ def never(p):
 
 
 INFEASIBLE = Constraint("1 <= 0", never)
+
+
+class Formula:
+    """A simulator of outputs that are a formula of parameters and inputs.
+
+    formula: (p, u) -> (n_samples, n_outputs), p a mapping of names to values.
+    """
+
+    def __init__(self, model, formula):
+        self.model, self.formula = model, formula
+
+    def steps_needed(self, vectors, record):
+        return 1
+
+    def trajectories(self, vectors, record, n_steps=None, starts=None):
+        names = self.model.parameter_names
+        return np.stack(
+            [self.formula(dict(zip(names, v, strict=True)), record.inputs) for v in vectors]
+        )

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize_scalar
 
 from sysid import (
     BatchSimulator,
@@ -18,7 +19,7 @@ from sysid import (
 )
 from sysid.objective import Objective
 from sysid.refinement import refine
-from tests.sysid.support import MOTOR, draw, lag, motor, motor_record
+from tests.sysid.support import MOTOR, Formula, draw, lag, motor, motor_record
 
 
 def objective(model, records, accuracy=1e-6, **how):
@@ -201,3 +202,29 @@ def test_a_chromosome_that_cannot_be_simulated_is_returned_as_it_is():
     result = refine(target, np.array([0.5, -0.001]))
     assert not np.isfinite(result.error)
     assert result.iterations == 0
+
+
+def test_an_output_that_lost_most_of_its_samples_counts_as_the_error_counts_it():
+    """Two outputs that disagree on one gain: the compromise is the minimum of the mean RMSE."""
+    rng = np.random.default_rng(6)
+    u = rng.standard_normal(400)
+    outputs = np.column_stack([1.0 * u, 1.3 * u]) + 0.2 * rng.standard_normal((400, 2))
+    outputs[rng.random(400) < 0.9, 1] = np.nan
+    model = ProcessModel(
+        name="gains",
+        states=(State("x", "1"),),
+        inputs=(Input("u", "1"),),
+        outputs=(Output("one", "1"), Output("other", "1")),
+        parameters=(Parameter("gain", "1", 1.0, 0.1, 10.0, "log"),),
+        derivative=lambda x, u, p: (-x[0],),
+        output=lambda x, u, p: (x[0], x[0]),
+    )
+    simulator = Formula(model, lambda p, u: p["gain"] * np.column_stack([u, u]))
+    target = Objective(simulator, SearchSpace.of(model), [Dataset(u, outputs, 0.01)])
+
+    def error(gain):
+        return float(target.error_of(target.residuals(np.array([[gain]]), [1]))[0])
+
+    exact = minimize_scalar(error, bounds=(0.5, 2.0), method="bounded", options={"xatol": 1e-9})
+    found = refine(target, np.array([2.0]), tolerance=1e-12).chromosome[0]
+    assert found == pytest.approx(exact.x, abs=1e-5)

@@ -1,0 +1,837 @@
+"""Intervals and ambiguities against dense covariances, closed forms and repeated experiments.
+
+Most models here are formulas simulated by NumPy: the analysis sees nothing but outputs.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.linalg import block_diag, toeplitz
+from scipy.signal import lfilter
+from threadpoolctl import threadpool_limits
+
+from benchmarks._common import simulated_logs
+from sim_rig.actuator import actuator
+from sysid import (
+    GASSI,
+    BatchSimulator,
+    Dataset,
+    Input,
+    ModelError,
+    Output,
+    Parameter,
+    ProcessModel,
+    SearchSpace,
+    State,
+)
+from sysid.objective import Objective
+from sysid.refinement import refine
+from sysid.uncertainty import uncertainty
+from sysid.uncertainty.colour import Autoregression, colour, score_covariance
+from tests.sysid.support import Formula, lag, linear_response, prbs
+
+Z = 1.959963984540054
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    """Threads that share a small matrix wait for each other more than they compute."""
+    with threadpool_limits(1, user_api="blas"):
+        yield
+
+
+# --- covariance of a score ----------------------------------------------------------------------
+
+AR1 = np.array([[[0.8]]])
+VAR2 = np.array([[[0.5, 0.2], [-0.3, 0.4]], [[-0.2, 0.1], [0.15, 0.1]]])
+
+
+def dense_response(coefficients, n):
+    """H of e = H eps for n samples behind rest, as one matrix."""
+    q = coefficients.shape[1]
+    system = np.eye(n * q)
+    for k, matrix in enumerate(coefficients, start=1):
+        system -= np.kron(np.eye(n, k=-k), matrix)
+    return np.linalg.inv(system)
+
+
+@pytest.mark.parametrize("lengths", [(40,), (25, 3, 30)])
+@pytest.mark.parametrize("coefficients", [np.zeros((0, 2, 2)), AR1, VAR2], ids=len)
+def test_score_covariance_is_that_of_the_dense_residuals(coefficients, lengths):
+    rng = np.random.default_rng(1)
+    q = coefficients.shape[1]
+    mixing = rng.standard_normal((q, q))
+    noise = mixing @ mixing.T
+    slopes = rng.standard_normal((sum(lengths), q, 4))
+    responses = [dense_response(coefficients, n) for n in lengths]
+    covariance = block_diag(*(h @ np.kron(np.eye(n), noise) @ h.T
+                              for h, n in zip(responses, lengths, strict=True)))  # fmt: skip
+    rows = slopes.reshape(-1, 4)
+    expected = rows.T @ covariance @ rows
+    found = score_covariance(slopes, lengths, Autoregression(coefficients, noise))
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
+
+
+def test_of_a_long_record_it_is_the_stationary_one():
+    n, a, sigma = 1500, 0.8, 0.3
+    slopes = np.stack([np.ones(n), np.sin(np.arange(n) / 40.0)], axis=1)
+    covariance = sigma**2 / (1.0 - a**2) * toeplitz(a ** np.arange(n))
+    expected = slopes.T @ covariance @ slopes
+    model = Autoregression(AR1, np.array([[sigma**2]]))
+    found = score_covariance(slopes[:, None, :], (n,), model)
+    np.testing.assert_allclose(np.diag(found), np.diag(expected), rtol=0.02)
+
+
+def seen(n, q=1):
+    return np.ones((n, q), dtype=bool)
+
+
+def simulated_noise(rng, n, coefficients, mixing):
+    """A vector autoregression behind a run-in, (n, q)."""
+    q = coefficients.shape[1]
+    eps = rng.standard_normal((n + 200, q)) @ mixing.T
+    e = np.zeros_like(eps)
+    for t in range(len(e)):
+        e[t] = eps[t] + sum(a @ e[t - k] for k, a in enumerate(coefficients, 1) if t >= k)
+    return e[200:]
+
+
+@pytest.mark.parametrize("coefficients", [np.zeros((0, 2, 2)), AR1, VAR2], ids=len)
+def test_the_autoregression_of_simulated_noise_is_found(coefficients):
+    q = coefficients.shape[1]
+    mixing = np.array([[1.0, 0.0], [0.6, 0.5]])[:q, :q]
+    orders = []
+    for seed in range(12):
+        parts = [simulated_noise(np.random.default_rng([seed, k]), 1000, coefficients, mixing)
+                 for k in range(2)]  # fmt: skip
+        found = colour(np.vstack(parts), seen(2000, q), (1000, 1000))
+        orders.append(len(found.coefficients))
+        if orders[-1] == len(coefficients):
+            np.testing.assert_allclose(found.coefficients, coefficients, atol=0.1)
+        np.testing.assert_allclose(found.noise, mixing @ mixing.T, atol=0.15)
+    assert orders.count(len(coefficients)) >= 11
+
+
+def test_a_record_does_not_continue_the_one_before():
+    a, lengths = 0.9, (60, 80, 70)
+    parts = [start * a ** np.arange(n) for start, n in zip((1.0, -50.0, 30.0), lengths,
+                                                           strict=True)]  # fmt: skip
+    noise = 1e-3 * np.random.default_rng(0).standard_normal(sum(lengths))
+    found = colour((np.concatenate(parts) + noise)[:, None], seen(210), lengths)
+    # The pairs across the joints would err by tens.
+    assert found.noise[0, 0] < 1e-5
+
+
+def test_of_white_residuals_it_is_sigma_squared_s_s():
+    rng = np.random.default_rng(3)
+    residual = 0.2 * rng.standard_normal((500, 1))
+    slopes = rng.standard_normal((500, 1, 3))
+    found = score_covariance(slopes, (300, 200), colour(residual, seen(500), (300, 200)))
+    expected = np.mean(residual**2) * slopes[:, 0].T @ slopes[:, 0]
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+# --- models that are formulas -------------------------------------------------------------------
+
+
+def unknown(name, nominal, scale="log", unit="1", lower=None, upper=None):
+    span = (nominal / 10.0, nominal * 10.0) if scale == "log" else (nominal - 50.0, nominal + 50.0)
+    lower = span[0] if lower is None else lower
+    upper = span[1] if upper is None else upper
+    return Parameter(name, unit, nominal, lower, upper, scale, minimum=-np.inf)
+
+
+class Problem:
+    """A formula, its parameters and records of it with white noise."""
+
+    def __init__(self, formula, parameters, sigma=0.05, n=400, inputs=3, seed=0, records=1):
+        self.formula, self.sigma, rng = formula, sigma, np.random.default_rng(seed)
+        self.truth = {p.name: p.nominal for p in parameters}
+        us = [1.0 + rng.standard_normal((n, inputs)) for _ in range(records)]
+        clean = [formula(self.truth, u) for u in us]
+        q = clean[0].shape[1]
+        self.model = ProcessModel(
+            name="formula",
+            states=(State("x", "1"),),
+            inputs=tuple(Input(f"u{i}", "1") for i in range(inputs)),
+            outputs=tuple(Output(f"y{j}", "1") for j in range(q)),
+            parameters=tuple(parameters),
+            derivative=lambda x, u, p: (-x[0],),
+            output=lambda x, u, p: (x[0],) * q,
+        )
+        self.records = [
+            Dataset(u, y + sigma * rng.standard_normal(y.shape), 0.01)
+            for u, y in zip(us, clean, strict=True)
+        ]
+
+    def objective(self, records=None, model=None, **space):
+        model = model or self.model
+        return Objective(
+            Formula(model, self.formula), SearchSpace.of(model, **space), records or self.records
+        )
+
+    def tell(self, records=None, **space):
+        """What is said of the minimum next to the truth, or at it for what stands on a bound."""
+        objective = self.objective(records, **space)
+        start = np.array([self.truth[name] for name in objective.space.names])
+        return uncertainty(objective, refine(objective, start).chromosome)
+
+
+def columns(*outputs):
+    return np.stack(outputs, axis=1)
+
+
+def estimates(found):
+    return {e.name: e for e in found.parameters}
+
+
+def combinations(found):
+    return {e.name: e for a in found.ambiguities for e in a.determined}
+
+
+# --- intervals of a model that is linear in its parameters --------------------------------------
+
+TRUTH = np.array([2.0, -0.7, 0.4])
+
+
+def linear_formula(p, u):
+    return columns(u @ np.array(list(p.values())))
+
+
+LINEAR = Problem(linear_formula, [unknown(f"b{i}", v, "linear") for i, v in enumerate(TRUTH)])
+
+
+def least_squares(records):
+    X = np.vstack([r.inputs for r in records])
+    y = np.vstack([r.outputs for r in records])[:, 0]
+    return X, np.linalg.lstsq(X, y, rcond=None)[0]
+
+
+def told_of(records):
+    """Estimates of the linear model at the exact least-squares solution."""
+    return uncertainty(LINEAR.objective(records), least_squares(records)[1]).parameters
+
+
+def slow(rng, n, cutoff=0.97):
+    """Inputs whose energy is at low frequencies, where coloured noise is."""
+    white = rng.standard_normal((n + 300, 3))
+    return (lfilter([1.0], [1.0, -cutoff], white, axis=0)[300:] + 1.0) / 3.0
+
+
+def coverage(record_of, seeds=200):
+    """Share of 95 % intervals that hold the truth, over fresh noise; one list of records a seed.
+
+    And the share that intervals of white residuals would.
+    """
+    inside, naive = [], []
+    for seed in range(seeds):
+        records = record_of(np.random.default_rng([77, seed]))
+        X, best = least_squares(records)
+        inside += [e.low < v < e.high for e, v in zip(told_of(records), TRUTH, strict=True)]
+        sigma = np.std(np.vstack([r.outputs for r in records])[:, 0] - X @ best)
+        white = sigma * np.sqrt(np.diag(np.linalg.inv(X.T @ X)))
+        naive += list(np.abs(best - TRUTH) < Z * white)
+    return np.mean(inside), np.mean(naive)
+
+
+def test_white_noise_gives_the_closed_form():
+    X, best = least_squares(LINEAR.records)
+    y = LINEAR.records[0].outputs[:, 0]
+    variance = np.mean((y - X @ best) ** 2) * np.linalg.inv(X.T @ X)
+    found = uncertainty(LINEAR.objective(), best)
+    deviation = np.sqrt(np.diag(variance))
+    for parameter, value, std in zip(found.parameters, best, deviation, strict=True):
+        assert (parameter.why, parameter.form) == ("", "sum")
+        assert parameter.value == value
+        assert parameter.std == pytest.approx(std, rel=1e-6)
+        assert parameter.low == pytest.approx(value - Z * std, rel=1e-6)
+        assert parameter.high == pytest.approx(value + Z * std, rel=1e-6)
+    expected = variance / np.outer(deviation, deviation)
+    np.testing.assert_allclose(found.correlation(), expected, atol=1e-6)
+    assert found.rank == 3 and not found.ambiguities
+    assert found.determined() == found.parameters
+
+
+def test_intervals_cover_under_white_noise():
+    def record(rng):
+        u = 1.0 + rng.standard_normal((150, 3))
+        return [Dataset(u, u @ TRUTH + 0.1 * rng.standard_normal(150), 0.01)]
+
+    assert 0.92 < coverage(record)[0] < 0.98
+
+
+def test_intervals_cover_under_coloured_noise_where_white_ones_would_not():
+    def record(rng):
+        u = slow(rng, 500)
+        noise = lfilter([1.0], [1.0, -0.9], 0.05 * rng.standard_normal(700))[200:]
+        return [Dataset(u, u @ TRUTH + noise, 0.01)]
+
+    found, naive = coverage(record)
+    assert 0.90 < found < 0.98
+    assert naive < 0.7
+
+
+def test_a_zero_error_of_an_output_has_the_closed_form_and_covers():
+    zero, sigma = 0.2, 0.05
+
+    def record(rng):
+        records = []
+        for length in (120, 80):
+            u = 1.0 + rng.standard_normal((length, 3))
+            error = zero * rng.standard_normal()
+            y = u @ TRUTH + error + sigma * rng.standard_normal(length)
+            records.append(Dataset(u, y, 0.01, output_zero=np.array([zero])))
+        return records
+
+    # A zero that is known to err, but did not: what is left is exactly as white as the noise.
+    rng = np.random.default_rng(5)
+    us = [1.0 + rng.standard_normal((n, 3)) for n in (120, 80)]
+    still = [Dataset(u, u @ TRUTH + sigma * rng.standard_normal(len(u)), 0.01,
+                     output_zero=np.array([zero])) for u in us]  # fmt: skip
+    X, best = least_squares(still)
+    rest = np.vstack([r.outputs for r in still])[:, 0] - X @ best
+    pushes = sum(np.outer(u.sum(axis=0), u.sum(axis=0)) for u in us)
+    inverse = np.linalg.inv(X.T @ X)
+    variance = inverse @ (np.mean(rest**2) * X.T @ X + zero**2 * pushes) @ inverse
+    found = [e.std for e in told_of(still)]
+    np.testing.assert_allclose(found, np.sqrt(np.diag(variance)), rtol=1e-5)
+
+    share, naive = coverage(record)
+    assert 0.92 < share < 0.99
+    assert naive < 0.85
+
+
+def test_a_zero_error_of_an_input_has_the_closed_form_and_covers():
+    zero = np.array([0.1, 0.0, 0.0])
+
+    def record(rng):
+        u = 1.0 + rng.standard_normal((150, 3))
+        y = u @ TRUTH + 0.05 * rng.standard_normal(150)
+        return [Dataset(u + zero * rng.standard_normal(), y, 0.01, input_zero=zero)]
+
+    plain = LINEAR.records[0]
+    known = Dataset(plain.inputs, plain.outputs, plain.dt, input_zero=zero)
+    X, best = least_squares([known])
+    rest = known.outputs[:, 0] - X @ best
+    push = zero[0] * best[0] * X.sum(axis=0)
+    inverse = np.linalg.inv(X.T @ X)
+    variance = inverse @ (np.mean(rest**2) * X.T @ X + np.outer(push, push)) @ inverse
+    found = [e.std for e in told_of([known])]
+    np.testing.assert_allclose(found, np.sqrt(np.diag(variance)), rtol=1e-5)
+
+    share, naive = coverage(record)
+    assert 0.92 < share < 0.99
+    assert naive < 0.85
+
+
+# --- noise on measured inputs -------------------------------------------------------------------
+
+
+def filtered(u):
+    """The response of a known lag, from rest."""
+    return lfilter([0.05], [1.0, -0.95], u)
+
+
+def through_a_lag(p, u):
+    return columns(p["k"] * filtered(u[:, 0]) + p["c"] * u[:, 1])
+
+
+NOISY = Problem(through_a_lag, [unknown("k", 3.0), unknown("c", 1.0)], n=300, inputs=2)
+
+
+def noisy_record(rng, sigma_in, sigma_out, n=300):
+    u = columns(prbs(rng, n, -1.0, 1.0, hold=30), rng.standard_normal(n))
+    y = 3.0 * filtered(u[:, 0]) + u[:, 1] + sigma_out * rng.standard_normal(n)
+    measured = u + columns(sigma_in * rng.standard_normal(n), np.zeros(n))
+    return Dataset(measured, y, 0.01, input_noise=np.array([sigma_in, 0.0]))
+
+
+def test_noise_of_an_input_does_what_the_dense_filter_does():
+    # Hardly any noise was seen, but the input is known to carry it.
+    record = noisy_record(np.random.default_rng(2), 0.0, 1e-4)
+    record = Dataset(record.inputs, record.outputs, record.dt, input_noise=np.array([0.3, 0.0]))
+    G = toeplitz(filtered(np.eye(300)[0]), np.zeros(300))
+    S = columns(3.0 * filtered(record.inputs[:, 0]), record.inputs[:, 1])
+    back = np.linalg.inv(S.T @ S) @ S.T @ (3.0 * 0.3 * G)
+    expected = np.sqrt(np.diag(back @ back.T))
+    found = estimates(NOISY.tell([record]))
+    # 128 drawn errors: a standard deviation to 6 %.
+    assert found["k"].std / found["k"].value == pytest.approx(expected[0], rel=0.25)
+    assert found["c"].std / found["c"].value == pytest.approx(expected[1], rel=0.25)
+
+
+def test_noise_of_an_input_that_the_residuals_show_is_not_counted_twice():
+    record = noisy_record(np.random.default_rng(2), 0.0, 0.3)
+    silent = Dataset(record.inputs, record.outputs, record.dt)
+    little = Dataset(record.inputs, record.outputs, record.dt, input_noise=np.array([0.1, 0.1]))
+    one, other = estimates(NOISY.tell([silent])), estimates(NOISY.tell([little]))
+    for name in ("k", "c"):
+        assert other[name].std == pytest.approx(one[name].std, rel=1e-6)
+
+
+def test_intervals_cover_with_noise_on_an_input():
+    inside = []
+    for seed in range(150):
+        record = noisy_record(np.random.default_rng([5, seed]), 0.3, 0.01)
+        found = estimates(NOISY.tell([record]))
+        inside += [found["k"].low < 3.0 < found["k"].high, found["c"].low < 1.0 < found["c"].high]
+    assert 0.90 < np.mean(inside) <= 0.995
+
+
+# --- a dynamic model through the compiled simulator ----------------------------------------------
+
+
+def lag_record(rng, n=200, sigma=0.05):
+    u = prbs(rng, n, -1.0, 1.0)
+    y = linear_response(np.array([[-20.0]]), np.array([[40.0]]), u[:, None], 0.01, "zoh")
+    return Dataset(u, y + sigma * rng.standard_normal(y.shape), 0.01)
+
+
+def test_intervals_of_a_lag_cover():
+    simulator, space = BatchSimulator(lag(), accuracy=1e-6), SearchSpace.of(lag())
+    inside = []
+    for seed in range(100):
+        objective = Objective(simulator, space, [lag_record(np.random.default_rng([9, seed]))])
+        found = uncertainty(objective, refine(objective, np.array([2.0, 0.05])).chromosome)
+        inside += [e.low < v < e.high for e, v in zip(found.parameters, (2.0, 0.05), strict=True)]
+    assert 0.90 < np.mean(inside) < 0.99
+
+
+def test_a_fitted_estimator_tells_its_own_uncertainty():
+    record = lag_record(np.random.default_rng(4))
+    estimator = GASSI(lag(), population=20, generations=3).fit(record)
+    found = estimator.uncertainty(record)
+    direct = uncertainty(
+        Objective(BatchSimulator(lag()), estimator.space_, [record]), estimator.chromosome_
+    )
+    assert found.parameters == direct.parameters
+    assert found.parameters == estimator.uncertainty(record).parameters
+    assert estimates(found)["tau"].value == estimator.parameters_["tau"]
+    timed = GASSI(lag(), population=20, generations=3, dt=record.dt)
+    timed.fit(record.inputs, record.outputs)
+    arrays = timed.uncertainty(record.inputs, record.outputs)
+    assert arrays.parameters == found.parameters
+
+
+def test_without_a_refined_minimum_there_are_no_intervals():
+    record = lag_record(np.random.default_rng(4))
+    small = {"population": 10, "generations": 2}
+    thesis = GASSI(lag(), preset="thesis", **small).fit(record)
+    with pytest.raises(ModelError, match="preset thesis has no local refinement"):
+        thesis.uncertainty(record)
+
+    def stop(step):
+        if step.stage == "refine":
+            raise KeyboardInterrupt
+
+    interrupted = GASSI(lag(), **small).fit(record, on_progress=stop)
+    with pytest.raises(ModelError, match="interrupted"):
+        interrupted.uncertainty(record)
+
+
+# --- what only acts together ---------------------------------------------------------------------
+
+
+def same_interval(one, other):
+    assert one.value == pytest.approx(other.value, rel=1e-4)
+    assert (one.low, one.high) == pytest.approx((other.low, other.high), rel=1e-4)
+
+
+def resolved(problem, ambiguity):
+    """The parameters once those to measure are fixed at their true values."""
+    found = problem.tell(fixed={name: problem.truth[name] for name in ambiguity.measure})
+    assert not found.ambiguities
+    return estimates(found)
+
+
+@pytest.mark.parametrize("scale", ["log", "linear"])
+def test_a_product_has_an_interval_and_its_factors_none(scale):
+    problem = Problem(
+        lambda p, u: columns(p["a"] * p["b"] * u[:, 0] + p["c"] * u[:, 1]),
+        [unknown("a", 3.0, scale, "m/s"), unknown("b", 0.5, scale, "kg"), unknown("c", 1.0)],
+    )
+    found = problem.tell()
+    told = estimates(found)
+    assert [told[name].why for name in "abc"] == ["tied", "tied", ""]
+    assert all(told[name].std is told[name].low is told[name].high is None for name in "ab")
+    (ambiguity,) = found.ambiguities
+    # A scale weighs what has kg; nothing measures m/s as easily.
+    assert (ambiguity.kind, ambiguity.parameters) == ("product", ("b", "a"))
+    assert ambiguity.measure == ("b",)
+    (combined,) = ambiguity.determined
+    assert combined.name == "a b" and combined.terms == (("a", 1.0), ("b", 1.0))
+    assert combined.at({"a": 2.0, "b": 5.0}) == 10.0
+    assert found.rank == 2 and len(found.singular_values) == 3
+
+    one = Problem(
+        lambda p, u: columns(p["g"] * u[:, 0] + p["c"] * u[:, 1]),
+        [unknown("g", 1.5), unknown("c", 1.0)],
+    )
+    instead = estimates(one.tell())
+    same_interval(combined, instead["g"])
+    same_interval(told["c"], instead["c"])
+    after = resolved(problem, ambiguity)
+    assert not any(e.why for e in after.values())
+    assert after["a"].std / after["a"].value == pytest.approx(
+        combined.std / combined.value, rel=1e-3 if scale == "log" else 2e-2
+    )
+
+
+@pytest.mark.parametrize("scale", ["log", "linear"])
+@pytest.mark.parametrize(
+    "factor, text", [(1.0, "a + b"), (2.0, "a + 2 b"), (-1.0, "a - b"), (-2.5, "a - 2.5 b")]
+)
+def test_a_sum_has_an_interval_and_its_terms_none(scale, factor, text):
+    problem = Problem(
+        lambda p, u: columns((p["a"] + factor * p["b"]) * u[:, 0] + p["c"] * u[:, 1]),
+        [unknown("a", 2.0, scale), unknown("b", 0.5, scale), unknown("c", 1.0)],
+    )
+    found = problem.tell()
+    told = estimates(found)
+    assert [told[name].why for name in "abc"] == ["tied", "tied", ""]
+    (ambiguity,) = found.ambiguities
+    assert ambiguity.kind == "sum" and set(ambiguity.parameters) == {"a", "b"}
+    (combined,) = ambiguity.determined
+    assert combined.name == text and combined.form == "sum"
+    assert combined.at({"a": 1.0, "b": 10.0}) == pytest.approx(1.0 + 10.0 * factor)
+    one = Problem(
+        lambda p, u: columns(p["g"] * u[:, 0] + p["c"] * u[:, 1]),
+        [unknown("g", 2.0 + 0.5 * factor, "linear"), unknown("c", 1.0)],
+    )
+    same_interval(combined, estimates(one.tell())["g"])
+    assert not any(e.why for e in resolved(problem, ambiguity).values())
+
+
+def test_a_sum_of_three_is_one_combination():
+    problem = Problem(
+        lambda p, u: columns((p["a"] + p["b"] + 3.0 * p["c"]) * u[:, 0]),
+        [unknown("a", 2.0), unknown("b", 0.5), unknown("c", 0.1)],
+    )
+    found = problem.tell()
+    (ambiguity,) = found.ambiguities
+    assert ambiguity.kind == "sum" and len(ambiguity.measure) == 2
+    (combined,) = ambiguity.determined
+    assert combined.name == "a + b + 3 c"
+    one = Problem(lambda p, u: columns(p["g"] * u[:, 0]), [unknown("g", 2.8, "linear")])
+    same_interval(combined, estimates(one.tell())["g"])
+    assert not any(e.why for e in resolved(problem, ambiguity).values())
+
+
+def test_groups_that_share_nothing_are_told_apart():
+    problem = Problem(
+        lambda p, u: columns(p["a"] * p["b"] * u[:, 0], (p["c"] + p["d"]) * u[:, 1]),
+        [unknown(name, value) for name, value in zip("abcd", (2.0, 3.0, 0.4, 0.7), strict=True)],
+    )
+    found = problem.tell()
+    groups = {frozenset(a.parameters): a for a in found.ambiguities}
+    assert set(groups) == {frozenset("ab"), frozenset("cd")}
+    assert set(combinations(found)) == {"a b", "c + d"}
+    fixed = {a.measure[0]: problem.truth[a.measure[0]] for a in found.ambiguities}
+    assert len(fixed) == 2
+    assert not any(e.why for e in problem.tell(fixed=fixed).parameters)
+
+
+def test_three_factors_of_one_product_want_two_measurements():
+    problem = Problem(
+        lambda p, u: columns(p["a"] * p["b"] / p["c"] * u[:, 0]),
+        [unknown("a", 2.0), unknown("b", 3.0), unknown("c", 4.0)],
+    )
+    found = problem.tell()
+    (ambiguity,) = found.ambiguities
+    assert set(ambiguity.parameters) == set("abc") and len(ambiguity.measure) == 2
+    assert [e.name for e in ambiguity.determined] == ["a b / c"]
+    one = Problem(lambda p, u: columns(p["g"] * u[:, 0]), [unknown("g", 1.5)])
+    same_interval(ambiguity.determined[0], estimates(one.tell())["g"])
+    assert not any(e.why for e in resolved(problem, ambiguity).values())
+
+
+def test_a_chain_of_products_is_one_group():
+    problem = Problem(
+        lambda p, u: columns(p["a"] * p["b"] * u[:, 0], p["b"] * p["c"] * u[:, 1]),
+        [unknown("a", 2.0), unknown("b", 3.0), unknown("c", 0.4)],
+    )
+    found = problem.tell()
+    (ambiguity,) = found.ambiguities
+    assert set(ambiguity.parameters) == set("abc") and len(ambiguity.measure) == 1
+    assert len(ambiguity.determined) == 2
+    two = Problem(
+        lambda p, u: columns(p["g"] * u[:, 0], p["h"] * u[:, 1]),
+        [unknown("g", 6.0), unknown("h", 1.2)],
+    )
+    instead = estimates(two.tell())
+    products = {frozenset(e.terms): e for e in ambiguity.determined}
+    same_interval(products[frozenset({("a", 1.0), ("b", 1.0)})], instead["g"])
+    # Which two of the three simple products are named is a matter of taste: here a / c comes first.
+    ratio = products[frozenset({("a", 1.0), ("c", -1.0)})]
+    assert ratio.name == "a / c" and ratio.value == pytest.approx(5.0, rel=0.02)
+    assert not any(e.why for e in resolved(problem, ambiguity).values())
+
+
+@pytest.mark.parametrize("exponent, text", [(2.0, "a b^2"), (-2.0, "a / b^2"), (0.5, "a^2 b")])
+def test_a_power_in_a_product_is_named(exponent, text):
+    problem = Problem(
+        lambda p, u: columns(p["a"] * p["b"] ** exponent * u[:, 0]),
+        [unknown("a", 2.0), unknown("b", 3.0)],
+    )
+    (ambiguity,) = problem.tell().ambiguities
+    (combined,) = ambiguity.determined
+    assert combined.name == text
+    one = Problem(lambda p, u: columns(p["g"] * u[:, 0]), [unknown("g", 2.0 * 3.0**exponent)])
+    instead = estimates(one.tell())["g"]
+    power = 2.0 if exponent == 0.5 else 1.0
+    assert combined.low == pytest.approx(instead.low**power, rel=1e-4)
+    assert combined.high == pytest.approx(instead.high**power, rel=1e-4)
+
+
+def test_a_factor_on_a_bound_is_tied_all_the_same():
+    problem = Problem(
+        lambda p, u: columns(p["a"] * p["b"] * u[:, 0] + p["c"] * u[:, 1]),
+        [unknown("a", 3.0, lower=3.0), unknown("b", 0.5), unknown("c", 1.0)],
+    )
+    objective = problem.objective()
+    found = uncertainty(objective, refine(objective, np.array([3.0, 0.5, 1.0])).chromosome)
+    on_bound = uncertainty(objective, np.array([3.0, 0.5, 1.0]))
+    for one in (found, on_bound):
+        assert [e.why for e in one.parameters] == ["tied", "tied", ""]
+        assert set(combinations(one)) == {"a b"}
+
+
+def test_a_parameter_held_by_its_bound_counts_as_fixed():
+    def formula(p, u):
+        return columns(p["a"] * u[:, 0] + p["b"] * u[:, 1])
+
+    problem = Problem(formula, [unknown("a", 3.0), unknown("b", 0.5)])
+    ranges = {"b": (1.0, 2.0)}
+    found = problem.tell(ranges=ranges)
+    told = estimates(found)
+    assert told["b"].why == "bound" and told["b"].value == 1.0 and told["b"].std is None
+    assert not found.ambiguities and found.rank == 1
+    same_interval(told["a"], estimates(problem.tell(fixed={"b": 1.0}))["a"])
+    assert np.isnan(found.correlation()[0, 1]) and found.covariance[1, 1] == 0.0
+
+
+def test_what_does_nothing_is_said_to_be_hardly_felt():
+    problem = Problem(
+        lambda p, u: columns(p["a"] * u[:, 0]), [unknown("a", 2.0), unknown("idle", 1.0)]
+    )
+    found = problem.tell()
+    told = estimates(found)
+    assert told["idle"].why == "vague" and told["idle"].std is None
+    (ambiguity,) = found.ambiguities
+    assert (ambiguity.kind, ambiguity.parameters) == ("vague", ("idle",))
+    assert ambiguity.measure == ("idle",) and ambiguity.determined == ()
+    same_interval(told["a"], estimates(problem.tell(fixed={"idle": 1.0}))["a"])
+
+
+def test_what_the_noise_hides_is_vague_until_the_noise_goes():
+    def formula(p, u):
+        return columns(p["a"] * u[:, 0] + 1e-3 * p["b"] * u[:, 1])
+
+    # A standard deviation of 0.05 / sqrt(400) against 1e-3.
+    parameters = [unknown("a", 2.0), unknown("b", 1.0)]
+    loud = Problem(formula, parameters)
+    found = uncertainty(loud.objective(), np.array([2.0, 1.0]))
+    told = estimates(found)
+    assert (told["a"].why, told["b"].why) == ("", "vague")
+    (ambiguity,) = found.ambiguities
+    assert (ambiguity.kind, ambiguity.parameters) == ("vague", ("b",))
+    assert found.rank == 1
+    quiet = estimates(Problem(formula, parameters, sigma=0.002).tell())
+    assert quiet["b"].why == "" and quiet["b"].std / quiet["b"].value == pytest.approx(0.1, rel=0.2)
+
+
+def test_a_parameter_that_is_zero_spoils_no_other():
+    problem = Problem(
+        lambda p, u: columns(p["a"] * p["b"] * u[:, 0] + p["c"] * u[:, 1]),
+        [unknown("a", 3.0), unknown("b", 0.5), unknown("c", 0.0, "linear", lower=0.0, upper=2.0)],
+    )
+    objective = problem.objective()
+    held = uncertainty(objective, np.array([3.0, 0.5, 0.0]))
+    assert [e.why for e in held.parameters] == ["tied", "tied", "bound"]
+    assert combinations(held)["a b"].std > 0.0
+    free = problem.objective(ranges={"c": (-1.0, 1.0)})
+    zero = uncertainty(free, np.array([3.0, 0.5, 0.0])).parameters[2]
+    assert zero.why == "" and zero.low < 0.0 < zero.high
+
+
+def test_what_is_tied_is_told_apart_from_what_is_hardly_felt():
+    """The data hardly tell a^2 b^2 from nothing, and the outputs depend on a b alone."""
+
+    def formula(p, u):
+        return columns(p["c"] * u[:, 0] + 1e-4 * p["a"] * p["b"] * p["d"] * u[:, 1]
+                       + p["d"] * u[:, 2])  # fmt: skip
+
+    parameters = [unknown("a", 3.0), unknown("b", 0.5), unknown("c", 1.0), unknown("d", 2.0)]
+    problem = Problem(formula, parameters)
+    found = uncertainty(problem.objective(), np.array([3.0, 0.5, 1.0, 2.0]))
+    assert [e.why for e in found.parameters] == ["tied", "tied", "", ""]
+    exact, vague = found.ambiguities
+    assert (exact.kind, set(exact.parameters), exact.determined) == ("product", {"a", "b"}, ())
+    # Of the direction that the noise hides one factor is enough to name.
+    assert vague.kind == "vague" and len(vague.parameters) == 1
+    assert set(vague.parameters) < {"a", "b"}
+
+
+# --- what must not matter, and how much what does -------------------------------------------------
+
+UNITS = [
+    unknown("a", 3.0),
+    unknown("b", 0.5, "linear", lower=0.1, upper=2.0),
+    unknown("c", 2.0),
+]
+
+
+def two_outputs(p, u, scale=1.0):
+    return columns(
+        p["a"] * u[:, 0] + p["b"] * u[:, 1], scale * p["c"] * (p["b"] * u[:, 1] + u[:, 2])
+    )
+
+
+def relative(found):
+    return {e.name: (e.std / abs(e.value), e.why) for e in found.parameters}
+
+
+@functools.cache
+def plain_two():
+    problem = Problem(two_outputs, UNITS, records=2)
+    return problem, problem.tell()
+
+
+@settings(max_examples=20)
+@given(power=st.floats(-6.0, 6.0))
+def test_the_unit_of_an_output_matters_to_nothing(power):
+    problem, before = plain_two()
+    scale = 10.0**power
+    records = [Dataset(r.inputs, r.outputs * np.array([1.0, scale]), r.dt) for r in problem.records]
+    objective = Objective(
+        Formula(problem.model, functools.partial(two_outputs, scale=scale)),
+        SearchSpace.of(problem.model), records,
+    )  # fmt: skip
+    at = np.array([e.value for e in before.parameters])
+    after = uncertainty(objective, at)
+    for one, other in zip(before.parameters, after.parameters, strict=True):
+        same_interval(one, other)
+    np.testing.assert_allclose(after.covariance, before.covariance, rtol=1e-4, atol=1e-12)
+
+
+@settings(max_examples=20)
+@given(order=st.permutations([0, 1, 2]), swap=st.booleans())
+def test_the_order_of_parameters_and_records_matters_to_nothing(order, swap):
+    problem, before = plain_two()
+    model = ProcessModel(**{
+        **{name: getattr(problem.model, name)
+           for name in ("name", "states", "inputs", "outputs", "derivative", "output")},
+        "parameters": [UNITS[i] for i in order],
+    })  # fmt: skip
+    records = problem.records[::-1] if swap else problem.records
+    at = np.array([before.parameters[i].value for i in order])
+    after = uncertainty(problem.objective(records, model), at)
+    for place, i in enumerate(order):
+        same_interval(after.parameters[place], before.parameters[i])
+    np.testing.assert_allclose(
+        after.correlation(), before.correlation()[np.ix_(order, order)], atol=1e-5
+    )
+
+
+def test_the_scale_of_the_search_hardly_matters_to_what_is_well_known():
+    problem = Problem(two_outputs, UNITS)
+    logarithmic = problem.tell(scale=dict.fromkeys("abc", "log"))
+    linear = problem.tell(scale=dict.fromkeys("abc", "linear"))
+    for one, other in zip(logarithmic.parameters, linear.parameters, strict=True):
+        assert one.std == pytest.approx(other.std, rel=1e-3)
+        assert one.low == pytest.approx(other.low, rel=1e-3)
+    np.testing.assert_allclose(logarithmic.correlation(), linear.correlation(), atol=1e-3)
+
+
+def test_twice_the_data_shrink_deviations_by_the_root_of_two():
+    problem = Problem(two_outputs, UNITS)
+    at = np.array([e.value for e in problem.tell().parameters])
+    once = uncertainty(problem.objective(), at)
+    twice = uncertainty(problem.objective(problem.records * 2), at)
+    for one, other in zip(once.parameters, twice.parameters, strict=True):
+        assert one.std / other.std == pytest.approx(np.sqrt(2.0), rel=1e-6)
+
+
+@pytest.mark.parametrize("lost", [0.1, 0.5])
+def test_lost_samples_cost_what_they_would_have_told(lost):
+    """Half of the samples at random: as good as a record of half the length."""
+    problem = Problem(two_outputs, UNITS, n=4000)
+    (record,) = problem.records
+    outputs = record.outputs.copy()
+    outputs[np.random.default_rng(1).random(len(outputs)) < lost] = np.nan
+    at = np.array([p.nominal for p in UNITS])
+    whole = uncertainty(problem.objective(), at)
+    part = uncertainty(problem.objective([Dataset(record.inputs, outputs, record.dt)]), at)
+    for one, other in zip(whole.parameters, part.parameters, strict=True):
+        assert other.std / one.std == pytest.approx(1.0 / np.sqrt(1.0 - lost), rel=0.05)
+
+
+def test_the_same_question_has_the_same_answer():
+    record = noisy_record(np.random.default_rng(2), 0.3, 0.01)
+    one, other = NOISY.tell([record]), NOISY.tell([record])
+    assert one.parameters == other.parameters
+    np.testing.assert_array_equal(one.covariance, other.covariance)
+
+
+# --- the actuator ---------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def rig_minimum():
+    """Record of the shipped experiment on the simulated rig, and the minimum next to its values."""
+    model, truth = actuator(), actuator(parameters="rig")
+    record, _ = simulated_logs(model)
+    values = dict(zip(truth.parameter_names, truth.nominal, strict=True))
+    objective, start = rig_objective(record, values)
+    found = dict(zip(objective.space.names, refine(objective, start).chromosome, strict=True))
+    return record, values, found
+
+
+def rig_objective(record, values, fixed=()):
+    """The objective with some parameters fixed, and a chromosome of the values given."""
+    model = actuator()
+    space = SearchSpace.of(model, fixed={n: values[n] for n in fixed}).with_starts([record])
+    at = np.array([values.get(name, 0.0) for name in space.names])
+    return Objective(BatchSimulator(model), space, [record]), at
+
+
+def exact_groups(found):
+    return {frozenset(a.parameters): a for a in found.ambiguities if a.kind != "vague"}
+
+
+def test_the_redundancies_of_the_actuator_are_found(rig_minimum):
+    record, values, found = rig_minimum
+    told = uncertainty(*rig_objective(record, found))
+    groups = exact_groups(told)
+    bristle = frozenset({"A", "alpha0", "alpha1", "z(0)"})
+    coil = frozenset({"R_b", "L_b", "K_db"})
+    inertia, damping = frozenset({"J_m", "J_b"}), frozenset({"B_m", "c0"})
+    assert set(groups) == {bristle, coil, inertia, damping}
+    assert [groups[g].kind for g in (bristle, coil, inertia, damping)] == [
+        "product", "product", "sum", "sum",
+    ]  # fmt: skip
+    assert all(len(group.measure) == 1 for group in groups.values())
+    assert {e.why for e in told.parameters if e.name in bristle | coil | inertia | damping} == {
+        "tied"
+    }
+    known = combinations(told)
+    for name in ("A alpha0", "A alpha1", "J_m + J_b", "R_b / L_b"):
+        assert known[name].low < known[name].at(values) < known[name].high
+    for name in ("K_m", "K_dm", "R_m", "L_m", "omega_dm", "gamma", "beta"):
+        estimate = estimates(told)[name]
+        assert estimate.why == "" and estimate.low < values[name] < estimate.high
+
+
+def test_what_to_measure_on_the_actuator_resolves_it(rig_minimum):
+    record, _, found = rig_minimum
+    told = uncertainty(*rig_objective(record, found))
+    measure = [name for a in exact_groups(told).values() for name in a.measure]
+    after = uncertainty(*rig_objective(record, found, fixed=measure))
+    assert not exact_groups(after)
+    assert {e.why for e in after.parameters} <= {"", "vague"}
+    assert {"J_b", "A", "alpha0", "z(0)", "L_b"} <= {e.name for e in after.determined()}
