@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from sysid.data import Dataset
-from sysid.metrics import Metrics, evaluate
+from sysid.metrics import Metrics, evaluate, mean_known
 from sysid.model import FloatArray, ProcessModel
 from sysid.residual_tests import ResidualTest, residual_test
 from sysid.uncertainty import Uncertainty
@@ -25,9 +25,10 @@ _FITTED = 50.0  # fit [%] below which a model explains little
 
 @dataclass(frozen=True)
 class RecordResult:
-    """How a model does on one record."""
+    """How a model does on one record; ``simulated``: whether its free run came to the end."""
 
     name: str
+    simulated: bool
     metrics: Metrics
     residuals: ResidualTest
 
@@ -53,6 +54,7 @@ def examine(
         results.append(
             RecordResult(
                 record.name,
+                bool(np.all(np.isfinite(simulated))),
                 evaluate(record.outputs, simulated),
                 residual_test(record.outputs - simulated, record.inputs, record.input_noise),
             )
@@ -70,6 +72,7 @@ def judge(
     """A verdict from all that is known of an identification."""
     grave = [] if feasible else ["No parameters were found that satisfy all the constraints."]
     light: list[str] = []
+    grave += _failed(model, (*training, *validation))
     for name, ratio, fit in _progress(model, training, validation):
         if fit < _FITTED:
             grave.append(f"{name} is explained poorly on the validation data (fit {fit:.0f} %).")
@@ -87,6 +90,17 @@ def judge(
     return Verdict("limited", tuple(light)) if light else Verdict("good", _praise(validation))
 
 
+def _failed(model: ProcessModel, results: Sequence[RecordResult]) -> list[str]:
+    """Records that the model cannot follow to the end."""
+    failed = [result.name for result in results if not result.simulated]
+    if not failed:
+        return []
+    return [
+        f"Model {model.name} cannot be simulated on {', '.join(failed)}: its response grows beyond "
+        "all bounds, or needs too small steps."
+    ]
+
+
 def _progress(
     model: ProcessModel, training: Sequence[RecordResult], validation: Sequence[RecordResult]
 ) -> list[tuple[str, float, float]]:
@@ -95,26 +109,26 @@ def _progress(
         return []
     errors = [
         # Absolute, because each record has its own largest output.
-        np.sqrt(np.nanmean([(r.metrics.rmse * r.metrics.scale) ** 2 for r in part], axis=0))
+        np.sqrt(mean_known(np.array([(r.metrics.rmse * r.metrics.scale) ** 2 for r in part]), 0))
         for part in (training, validation)
     ]
     with np.errstate(divide="ignore", invalid="ignore"):
         ratios = errors[1] / errors[0]
-        fits = np.nanmean([r.metrics.fit for r in validation], axis=0)
+        fits = mean_known(np.array([r.metrics.fit for r in validation]), 0)
     return list(zip(model.output_names, ratios.tolist(), fits.tolist(), strict=True))
 
 
 def _left_over(model: ProcessModel, results: Sequence[RecordResult]) -> list[str]:
     """Outputs whose residuals still follow an input."""
-    shares = np.array([result.residuals.independent for result in results])
+    # Over the records: of many, one is outside by chance.
+    shares = mean_known(np.array([result.residuals.independent for result in results]), 0)
     found = []
-    for j, output in enumerate(model.output_names):
-        least = [
-            (float(np.nanmin(shares[:, j, i])), signal)
-            for i, signal in enumerate(model.input_names)
-            if np.isfinite(shares[:, j, i]).any()
+    for output, own in zip(model.output_names, shares, strict=True):
+        follows = [
+            signal
+            for signal, share in zip(model.input_names, own, strict=True)
+            if share < _INDEPENDENT
         ]
-        follows = [signal for share, signal in least if share < _INDEPENDENT]
         if follows:
             found.append(
                 f"Residuals of {output} still follow {' and '.join(follows)}: the model lacks "
@@ -133,7 +147,7 @@ def _open(uncertainty: Uncertainty) -> list[str]:
 
 
 def _praise(validation: Sequence[RecordResult]) -> tuple[str, ...]:
-    fit = float(np.nanmean([result.metrics.fit for result in validation]))
+    fit = float(mean_known(np.array([result.metrics.fit for result in validation])))
     return (
         f"Data not used in the fit are explained as well as those that were (mean fit {fit:.1f} "
         "%), and nothing of the inputs is left in the residuals.",

@@ -38,6 +38,14 @@ def fit_percent(measured: FloatArray, simulated: FloatArray) -> FloatArray:
         return np.where(spread > 0.0, 100.0 * (1.0 - residual / spread), np.nan)
 
 
+def mean_known(values: FloatArray, axis: int | None = None) -> FloatArray:
+    """Mean of the values that are not NaN; NaN where there is none."""
+    known = ~np.isnan(values)
+    with np.errstate(invalid="ignore"):
+        mean: FloatArray = np.where(known, values, 0.0).sum(axis=axis) / known.sum(axis=axis)
+    return mean
+
+
 def _mean(values: FloatArray, measured: FloatArray) -> FloatArray:
     """Mean over the samples that were measured; NaN for an output without any.
 

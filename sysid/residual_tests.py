@@ -63,12 +63,12 @@ def residual_test(
     measured with. n_lags: at most a quarter of the record is used.
     """
     n_lags = max(2, min(n_lags, len(residual) // 4))
-    lags = range(n_lags)
     seen = np.isfinite(residual)
-    e, u = _standard(np.where(seen, residual, np.nan)), _standard(inputs)
-    own = np.stack([np.diagonal(_correlation(e, e, k)) for k in lags])
-    driving = np.stack([np.diagonal(_correlation(u, u, k)) for k in lags])
+    e, u = _standard(residual), _standard(inputs)
     counted = np.maximum(seen.sum(axis=0), 1)
+    own = np.stack([np.diagonal(_products(e, e, k)) for k in range(n_lags)]) / counted
+    driving = np.stack([np.diagonal(_products(u, u, k)) for k in range(n_lags)]) / len(u)
+    cross = np.stack([_products(e, u, k) for k in range(n_lags)]) / counted[:, None]
     # Both being coloured widens the band: sum over k of R_e(k) R_u(k) / n is the variance.
     both = 1.0 + 2.0 * np.einsum("ko,ki->oi", own[1:], driving[1:])
     variance = np.maximum(both, _LEAST_VARIANCE) / counted[:, None]
@@ -77,7 +77,7 @@ def residual_test(
         lags=np.arange(n_lags),
         auto=own,
         auto_band=_Z95 / np.sqrt(counted),
-        cross=np.stack([_correlation(e, u, k) for k in lags]),
+        cross=cross,
         cross_band=_Z95 * np.sqrt(variance),
         tested=(noisy == 0.0) & np.any(u != 0.0, axis=0),
     )
@@ -95,7 +95,7 @@ def _standard(values: FloatArray) -> FloatArray:
     return np.where(steady, 0.0, centred / np.where(steady, 1.0, deviation))
 
 
-def _correlation(a: FloatArray, b: FloatArray, lag: int) -> FloatArray:
-    """Mean of a(t) b(t - lag), (n_a, n_b)."""
-    product: FloatArray = a[lag:].T @ b[: len(b) - lag] / len(a)
+def _products(a: FloatArray, b: FloatArray, lag: int) -> FloatArray:
+    """Sum of a(t) b(t - lag), (n_a, n_b)."""
+    product: FloatArray = a[lag:].T @ b[: len(b) - lag]
     return product

@@ -15,7 +15,7 @@ from daq.cli import console
 from daq.config.identification import IdentificationConfig, Signals
 from sysid.assessment import RecordResult, judge
 from sysid.gassi import GASSI
-from sysid.metrics import Metrics
+from sysid.metrics import Metrics, mean_known
 from sysid.model import Parameter, ProcessModel
 from sysid.ranges import Range
 from sysid.uncertainty import Ambiguity, Estimate, Profile, Uncertainty
@@ -386,7 +386,7 @@ def _show_residuals(result: Identified) -> None:
     for j, name in enumerate(model.output_names):
         white = float(np.mean([r.residuals.white[j] for r in records]))
         shares = np.array([[r.residuals.independent[j, i] for i in tested] for r in records])
-        own = [float(np.nanmean(shares[:, k])) for k in range(len(tested))]
+        own = mean_known(shares, 0)
         rows.append([name, *(f"{100.0 * share:.0f} %" for share in (white, *own))])
     console.print_table(
         f"Residuals, {part}: share of correlations inside their 95 % band", head, rows
@@ -447,8 +447,8 @@ def _print_logs(title: str, model: ProcessModel, records: Sequence[RecordResult]
         ]
         for record in records
     ]
-    fits = np.nanmean([record.metrics.fit for record in records], axis=0)
-    errors = np.mean([record.metrics.rmse for record in records], axis=0)
+    fits = mean_known(np.array([record.metrics.fit for record in records]), 0)
+    errors = mean_known(np.array([record.metrics.rmse for record in records]), 0)
     rows.append(
         ["mean", *(f"{v:.1f}" for v in fits), *(console.number(float(v), 3) for v in errors)]
     )
