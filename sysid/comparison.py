@@ -9,7 +9,7 @@ run, each output in units of the best structure's mean squared error: outputs of
 alike, and a mean loss of 1.2 means squared errors a fifth larger. The best structure is the one
 with the lowest geometric mean of its outputs' errors; by the inequality of arithmetic and
 geometric mean no other has a lower mean loss. How surely the losses of two structures differ over
-the same samples says ``evidence.mean_difference``.
+the same samples says ``evidence.ratio_of_means``.
 
 *Information criteria.* Of the free run's residuals e_t on the training records, all outputs
 together:
@@ -32,7 +32,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from sysid.data import Dataset, output_scale
-from sysid.evidence import Difference, independent_samples, mean_difference
+from sysid.evidence import Ratio, independent_samples, ratio_of_means
 from sysid.metrics import fit_percent, msd, rmse
 from sysid.model import BoolArray, FloatArray, ModelError
 
@@ -95,9 +95,9 @@ class Row:
 
     training_error: mean over outputs of the RMSE in parts of max|y|. rmse, msd, fit: on the
     validation records, rmse and msd in parts of max|y|; NaN without any. daic, dbic: above the
-    lowest of all structures. excess: how much larger squared errors on validation are than the
-    best structure's, 0.2 being a fifth; None for the best itself, without validation, and for a
-    structure whose free run left the floating-point range.
+    lowest of all structures. ratio: squared errors on validation in parts of the best
+    structure's; None for the best itself, without validation, and for a structure whose free run
+    left the floating-point range.
     """
 
     name: str
@@ -109,7 +109,7 @@ class Row:
     fit: FloatArray
     daic: float
     dbic: float
-    excess: Difference | None
+    ratio: Ratio | None
     verdict: Verdict
 
 
@@ -137,7 +137,7 @@ class Comparison:
         best = self.rows[0]
         if self.validated:
             said = [f"{best.name} explains the validation data best."]
-            said += [_against_validation(row) for row in self.rows[1:]]
+            said += [_against_validation(row, best.name) for row in self.rows[1:]]
         else:
             said = [
                 "Without validation data this ranks by BIC on the training data, which favours "
@@ -193,15 +193,15 @@ def compare(
     criteria = _criteria(trained, [c.n_effective for c in candidates])
     if validation:
         score = np.array([tested.score(i, importance) for i in range(len(names))])
-        excesses = _excesses(tested, int(np.argmin(score)), importance)
+        ratios = _ratios(tested, int(np.argmin(score)), importance)
     else:
-        score, excesses = criteria.bic, [None] * len(names)
+        score, ratios = criteria.bic, [None] * len(names)
     order = [int(i) for i in np.argsort(score, kind="stable")]
     if np.isposinf(score[order[0]]):
         raise ModelError("no structure has a free run that stays finite")
     daic, dbic = _above_lowest(criteria.aic), _above_lowest(criteria.bic)
     verdicts = [
-        _verdict(i == order[0], float(score[i]), excesses[i], float(dbic[i]))
+        _verdict(i == order[0], float(score[i]), ratios[i], float(dbic[i]))
         for i in range(len(names))
     ]
     good = [i for i in order if verdicts[i] in ("best", "as good")]
@@ -219,7 +219,7 @@ def compare(
             tested.fit(i) if validation else np.full(q, np.nan),
             float(daic[i]),
             float(dbic[i]),
-            excesses[i],
+            ratios[i],
             verdicts[i],
         )
         for i in order
@@ -334,8 +334,8 @@ def _criteria(errors: _Errors, n_effective: Sequence[int]) -> _Criteria:
     return _Criteria(worth * log_det + 2.0 * k, worth * log_det + np.log(worth) * k, n, worth)
 
 
-def _excesses(errors: _Errors, best: int, importance: FloatArray) -> list[Difference | None]:
-    """Relative difference of each structure's squared errors from the best one's."""
+def _ratios(errors: _Errors, best: int, importance: FloatArray) -> list[Ratio | None]:
+    """Squared errors of each structure in parts of the best one's."""
     if not errors.finite[best]:
         return [None] * len(errors.finite)
     unit = np.maximum(errors.rmse(best) ** 2, np.finfo(float).tiny)
@@ -350,9 +350,7 @@ def _excesses(errors: _Errors, best: int, importance: FloatArray) -> list[Differ
 
     reference = losses(best)
     return [
-        mean_difference([a - b for a, b in zip(losses(i), reference, strict=True)])
-        if finite and i != best
-        else None
+        ratio_of_means(losses(i), reference) if finite and i != best else None
         for i, finite in enumerate(errors.finite)
     ]
 
@@ -364,12 +362,12 @@ def _above_lowest(values: FloatArray) -> FloatArray:
     return above
 
 
-def _verdict(best: bool, score: float, excess: Difference | None, dbic: float) -> Verdict:
+def _verdict(best: bool, score: float, ratio: Ratio | None, dbic: float) -> Verdict:
     if np.isposinf(score):
         return "failed"
     if best:
         return "best"
-    good = excess.low <= _MARGIN if excess is not None else dbic <= _BIC_MARGIN
+    good = ratio.low <= 1.0 + _MARGIN if ratio is not None else dbic <= _BIC_MARGIN
     return "as good" if good else "worse"
 
 
@@ -381,17 +379,16 @@ def _rank(estimator: GASSI, training: Sequence[Dataset]) -> int:
         return len(estimator.space_.names)
 
 
-def _against_validation(row: Row) -> str:
-    if row.excess is None:
+def _against_validation(row: Row, best: str) -> str:
+    if row.ratio is None:
         return f"{row.name} failed: its free run grows out of bounds."
-    excess = row.excess
-    size = (
-        f"{row.name} has squared errors {_percent(excess.mean)} % larger "
-        f"(95 %: {_percent(excess.low)} to {_percent(excess.high)} %)"
-    )
+    value, low, high = (_times(x) for x in (row.ratio.value, row.ratio.low, row.ratio.high))
+    size = f"{row.name} has squared errors {value} times those of {best} (95 %: {low} to {high})"
     if row.verdict == "worse":
-        chance = "p < 0.001" if excess.p_value < 1e-3 else f"p = {excess.p_value:.2g}"
-        return f"{size}: worse, by more than chance ({chance})."
+        p = row.ratio.p_value
+        return (
+            f"{size}: worse, by more than chance ({'p < 0.001' if p < 1e-3 else f'p = {p:.2g}'})."
+        )
     return f"{size}: as good, as far as these data tell."
 
 
@@ -402,5 +399,5 @@ def _against_training(row: Row) -> str:
     return f"{row.name} is {row.dbic:.3g} above it: {meaning}."
 
 
-def _percent(share: float) -> str:
-    return f"{100.0 * share:.2g}" if abs(share) < 0.995 else f"{100.0 * share:.0f}"
+def _times(ratio: float) -> str:
+    return f"{ratio:.3g}" if abs(ratio) >= 10.0 else f"{ratio:.3f}"

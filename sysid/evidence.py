@@ -1,4 +1,4 @@
-"""How much coloured residuals tell: differences of losses, and independent samples."""
+"""How much coloured residuals tell: ratios of losses, and independent samples."""
 
 from __future__ import annotations
 
@@ -13,42 +13,58 @@ _LEVEL = 0.95
 
 
 @dataclass(frozen=True)
-class Difference:
-    """A mean with its 95 % interval; p_value: of one this far from zero by chance."""
+class Ratio:
+    """A ratio of two means with its 95 % interval; p_value: of one this far from 1 by chance."""
 
-    mean: float
+    value: float
     low: float
     high: float
     p_value: float
 
 
-def mean_difference(series: Sequence[FloatArray]) -> Difference:
-    """Mean of a series that is correlated in time, such as a difference of two losses.
+def ratio_of_means(losses: Sequence[FloatArray], others: Sequence[FloatArray]) -> Ratio:
+    """Mean of losses in parts of the mean of others, over the same samples in time.
 
-    series: of each record by itself, (n_rows,). Long-run variance with Bartlett weights, their
-    bandwidth by the autoregressive rule of Andrews ("Heteroskedasticity and autocorrelation
-    consistent covariance matrix estimation", Econometrica 59, 1991); Student's t with as many
-    degrees of freedom as the records have stretches of the bandwidth's length. Diebold & Mariano,
-    "Comparing predictive accuracy", J. Business & Economic Statistics 13, 1995.
+    losses, others: not negative, of each record by itself, (n_rows,). Diebold & Mariano
+    ("Comparing predictive accuracy", J. Business & Economic Statistics 13, 1995), who look at the
+    mean difference of the losses, on a logarithmic scale: the interval of a ratio stays positive,
+    and a much larger loss is not hidden by its own spread. The standard error allows for
+    correlation in time by Bartlett weights, their bandwidth by the autoregressive rule of Andrews
+    ("Heteroskedasticity and autocorrelation consistent covariance matrix estimation",
+    Econometrica 59, 1991); Student's t has as many degrees of freedom as the records have
+    stretches of the bandwidth's length.
     """
     from scipy.stats import t as student
 
+    tops, bottoms = np.concatenate(losses), np.concatenate(others)
+    top, bottom = float(tops.mean()), float(bottoms.mean())
+    if top == bottom == 0.0 or np.array_equal(tops, bottoms):
+        return Ratio(1.0, 1.0, 1.0, 1.0)
+    if top == 0.0 or bottom == 0.0:
+        ratio = 0.0 if top == 0.0 else np.inf
+        return Ratio(ratio, ratio, ratio, 0.0)
+    error, freedom = _standard_error(
+        [a / top - b / bottom for a, b in zip(losses, others, strict=True)]
+    )
+    log = float(np.log(top / bottom))
+    half = float(student.ppf(0.5 + _LEVEL / 2.0, freedom)) * error
+    p_value = 2.0 * float(student.sf(abs(log) / error, freedom)) if error > 0.0 else 0.0
+    low, value, high = np.exp(np.array([log - half, log, log + half])).tolist()
+    return Ratio(value, low, high, p_value)
+
+
+def _standard_error(series: Sequence[FloatArray]) -> tuple[float, float]:
+    """Of the mean of series around zero, correlated in time; and its degrees of freedom."""
     n = sum(map(len, series))
-    mean = float(np.concatenate(series).mean())
-    centred = [part - mean for part in series]
-    variance = _covariance(centred, 0, n)
+    variance = _covariance(series, 0, n)
     if variance == 0.0:
-        return Difference(mean, mean, mean, 1.0 if mean == 0.0 else 0.0)
-    rho = float(np.clip(_covariance(centred, 1, n) / variance, -0.99, 0.99))
+        return 0.0, float(n)
+    rho = float(np.clip(_covariance(series, 1, n) / variance, -0.99, 0.99))
     width = 1.1447 * (4.0 * rho**2 / (1.0 - rho**2) ** 2 * n) ** (1.0 / 3.0)
     width = min(width, n / 4.0)
     for lag in range(1, int(width) + 1):
-        variance += 2.0 * (1.0 - lag / (width + 1.0)) * _covariance(centred, lag, n)
-    error = float(np.sqrt(max(variance, 0.0) / n))
-    freedom = max(n / (width + 1.0) - 1.0, 1.0)
-    half = float(student.ppf(0.5 + _LEVEL / 2.0, freedom)) * error
-    p_value = 2.0 * float(student.sf(abs(mean) / error, freedom)) if error > 0.0 else 0.0
-    return Difference(mean, mean - half, mean + half, p_value)
+        variance += 2.0 * (1.0 - lag / (width + 1.0)) * _covariance(series, lag, n)
+    return float(np.sqrt(max(variance, 0.0) / n)), max(n / (width + 1.0) - 1.0, 1.0)
 
 
 def independent_samples(residuals: Sequence[FloatArray]) -> float:

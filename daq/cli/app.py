@@ -109,7 +109,7 @@ def check(
 @app.command(epilog="Example:  rig identify runs/20260101T120000Z-prbs --validate other_log.csv")
 def identify(
     logs: Logs,
-    model: ModelName = None,
+    model: ModelNames = None,
     config: ConfigFile = None,
     validate: Validation = None,
     out: Annotated[
@@ -142,13 +142,19 @@ def identify(
             help="Any key of the configuration file, such as fixed.R_m=1.18; may be repeated.",
         ),
     ] = None,
+    arx: Annotated[bool, typer.Option("--arx", help="Compare with an ARX model.")] = False,
+    armax: Annotated[bool, typer.Option("--armax", help="Compare with an ARMAX model.")] = False,
+    seeds: Seeds = None,
+    jobs: Jobs = None,
+    dask: Dask = None,
     json: AsJson = False,
 ) -> None:
-    """Identify a model's parameters from logs: one parameter set for all of them."""
-    from daq.cli.identifying import identify_command
+    """Identify a model's parameters from logs: one parameter set for all of them.
 
+    Several models, or linear ones, are ranked: which explains the validation data best, by more
+    than chance, and with how many parameters.
+    """
     options = {
-        "model": model,
         "preset": preset,
         "population": population,
         "generations": generations,
@@ -156,6 +162,19 @@ def identify(
         "hold_back": hold_back,
         "profile": profile,
     }
+    baselines = [name for name, asked in (("ARX", arx), ("ARMAX", armax)) if asked]
+    if len(model or []) > 1 or baselines or seeds is not None:
+        from daq.cli.campaigning import Workers
+        from daq.cli.comparing import Ask, compare_command
+
+        compare_command(
+            logs, validate or [], Ask(model or [], baselines, seeds), config, out, options,
+            settings or [], Workers(jobs, dask), json,
+        )  # fmt: skip
+        return
+    from daq.cli.identifying import identify_command
+
+    options["model"] = model[0] if model else None
     identify_command(logs, validate or [], config, out, options, settings or [], json)
 
 

@@ -24,7 +24,7 @@ from daq.cli.identifying import (
     prepare_models,
     write_parameters,
 )
-from daq.cli.reporting import document
+from daq.cli.reporting import Identified, document
 from daq.errors import ConfigError
 from sysid import Campaign, Outcome, Run, Spread, campaign
 
@@ -83,10 +83,14 @@ class Group:
 
     def report(self, outcome: Outcome) -> dict[str, Any]:
         """What ``rig identify`` would have reported of it."""
+        return document(self.result(outcome))
+
+    def result(self, outcome: Outcome) -> Identified:
+        """The finished identification of a run that did not fail."""
         assert outcome.estimator is not None
         settings = self.prepared.settings.model_copy(update={"seed": outcome.run.seed})
         prepared = dataclasses.replace(self.prepared, settings=settings)
-        return document(assemble(prepared, outcome.estimator, self.training, self.validation, True))
+        return assemble(prepared, outcome.estimator, self.training, self.validation, True)
 
 
 def campaign_command(

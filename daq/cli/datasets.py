@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -97,10 +96,11 @@ def _halves(log: Loaded, part: float) -> tuple[Loaded, Loaded]:
     return halves[0], halves[1]
 
 
-def check_mapping(model: ProcessModel, mapping: Mapping, spare: Sequence[str] = ()) -> None:
+def check_mapping(model: ProcessModel, mapping: Mapping, spare: dict[str, tuple[str, ...]]) -> None:
     """Raise ConfigError unless every signal of the model, and no other, has its column.
 
-    spare: outputs that may have one as well though the model is used without them.
+    spare: ``inputs`` and ``outputs`` that may have one as well though this model is used without
+    them.
     """
     groups = (
         ("inputs", mapping.columns.inputs, model.input_names),
@@ -108,7 +108,7 @@ def check_mapping(model: ProcessModel, mapping: Mapping, spare: Sequence[str] = 
     )
     for group, given, needed in groups:
         for name in given:
-            if name not in needed and not (group == "outputs" and name in spare):
+            if name not in needed and name not in spare[group]:
                 raise mapping.file.error(
                     ("columns", group, name),
                     f"model {model.name} has no such signal; {suggestion(name, needed)}",

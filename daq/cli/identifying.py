@@ -100,12 +100,18 @@ def prepare_models(
     models = [_with_outputs(file, settings, model) for model, _ in found]
     _check_names(file, settings, models)
     mapping = Mapping(file, settings.columns) if settings.columns else None
+    spare = {
+        "inputs": _all_names(models, "input_names"),
+        "outputs": tuple(
+            n for model, _ in found for n in (*model.output_names, *model.state_names)
+        ),
+    }
     prepared = []
-    for (whole, name), model in zip(found, models, strict=True):
+    for (_, name), model in zip(found, models, strict=True):
         own = _own_settings(settings, model)
         _check_space(file, own, model)
         if mapping is not None:
-            datasets.check_mapping(model, mapping, (*whole.output_names, *whole.state_names))
+            datasets.check_mapping(model, mapping, spare)
         used = _with_starts(file, own, model)
         prepared.append(Prepared(used, name, own, mapping, _range_sources(file)))
     return prepared

@@ -130,5 +130,9 @@ def _mapping(config: Path | None, model: ProcessModel) -> Mapping | None:
             f"but the parameters are of {model.name}"
         )
     mapping = Mapping(file, settings.columns)
-    datasets.check_mapping(model, mapping, spare=list(settings.columns.outputs))
+    # The file may be of a comparison, in which other models have other signals.
+    columns = settings.columns
+    datasets.check_mapping(
+        model, mapping, {"inputs": tuple(columns.inputs), "outputs": tuple(columns.outputs)}
+    )
     return mapping

@@ -2,6 +2,6 @@
 
 from sysid.linear.armax import ARMAX
 from sysid.linear.arx import ARX
-from sysid.linear.selection import Candidate, Selection, select_orders
+from sysid.linear.selection import Candidate, Selection, select_orders, tuned
 
-__all__ = ["ARMAX", "ARX", "Candidate", "Selection", "select_orders"]
+__all__ = ["ARMAX", "ARX", "Candidate", "Selection", "select_orders", "tuned"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -21,6 +21,14 @@ from sysid.model import FloatArray, ModelError
 from sysid.recording import given_datasets
 
 Criterion = Literal["fit", "aic", "bic"]
+
+# Orders that ``tuned`` tries.
+TRIED: dict[str, Iterable[Order]] = {
+    "na": range(1, 7),
+    "nb": range(1, 5),
+    "nc": range(4),
+    "nk": (0, 1),
+}
 
 
 @dataclass(frozen=True)
@@ -100,6 +108,31 @@ def select_orders(
             raise ModelError(_nothing(found))
         model = judge.fitted(found[ranks[0]].orders)
     return Selection(criterion, tuple(found[i] for i in ranks), model)
+
+
+def tuned(
+    estimator: PolynomialModel,
+    records: Dataset | Sequence[Dataset],
+    *,
+    held_back: float = 0.3,
+    **orders: Iterable[Order],
+) -> Selection:
+    """Choose orders by free runs over the ends of the records, then fit them to the whole.
+
+    held_back: the part of each record that the candidates are judged by and not fitted to.
+    orders: as of ``select_orders``; default na to 6, nb to 4, nc to 3, nk 0 and 1. ``model`` of
+    the result is fitted to all of the records. Raises ModelError as ``select_orders``.
+    """
+    data = _datasets("records", records)
+    first, last = [], []
+    for record in data:
+        cut = round(record.n_samples * (1.0 - held_back))
+        first.append(record.part(0, cut, record.name))
+        last.append(record.part(cut, record.n_samples, record.name))
+    known = estimator.get_params()
+    grid: dict[str, Any] = {name: values for name, values in TRIED.items() if name in known}
+    found = select_orders(estimator, first, last, **grid | orders)
+    return replace(found, model=clone(estimator).set_params(**found.best.orders).fit(data))
 
 
 class _Judge:

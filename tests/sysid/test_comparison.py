@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 
 from sysid import ARX, GASSI, Dataset, ModelError, Parameter, fit_percent
 from sysid.comparison import Candidate, compare
-from sysid.evidence import independent_samples, mean_difference
+from sysid.evidence import independent_samples, ratio_of_means
 from tests.sysid.support import lag
 
 
@@ -26,29 +26,56 @@ def coloured(rng, n, rho):
 # --- evidence -------------------------------------------------------------------------------
 
 
-def test_white_differences_have_the_interval_of_students_t():
-    x = np.random.default_rng(0).normal(0.1, 1.0, 400)
-    found = mean_difference([x])
-    low, high = stats.t.interval(0.95, 399, x.mean(), x.std() / 20.0)
-    assert found.mean == pytest.approx(x.mean())
+def test_white_losses_have_the_interval_of_students_t():
+    """For losses that hardly differ the logarithm of the ratio is their relative difference."""
+    rng = np.random.default_rng(0)
+    b = rng.uniform(50.0, 150.0, 400)
+    a = b + rng.normal(0.1, 1.0, 400)
+    found = ratio_of_means([a], [b])
+    assert found.value == pytest.approx(a.mean() / b.mean())
+    d = (a - b) / b.mean()
+    low, high = stats.t.interval(0.95, 399, d.mean(), d.std() / 20.0)
     # The correlation of white noise is small, not zero.
-    assert found.low == pytest.approx(low, abs=0.03)
-    assert found.high == pytest.approx(high, abs=0.03)
-    assert found.p_value == pytest.approx(stats.ttest_1samp(x, 0.0).pvalue, abs=0.03)
+    assert found.low - 1.0 == pytest.approx(low, abs=0.1 * (high - low))
+    assert found.high - 1.0 == pytest.approx(high, abs=0.1 * (high - low))
+    assert found.p_value == pytest.approx(stats.ttest_1samp(d, 0.0).pvalue, abs=0.05)
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.8, 0.95])
-def test_intervals_of_coloured_differences_cover_the_mean(rho):
+def test_intervals_of_coloured_losses_cover_the_ratio(rho):
+    """Chi-square losses of equal size, of residuals as coloured as free runs leave them."""
     rng = np.random.default_rng(1)
-    found = [
-        mean_difference([coloured(rng, 1000, rho), coloured(rng, 500, rho)]) for _ in range(400)
-    ]
-    covered = np.mean([f.low <= 0.0 <= f.high for f in found])
+
+    def losses():
+        return [coloured(rng, n, rho) ** 2 for n in (2000, 1000)]
+
+    found = [ratio_of_means(losses(), losses()) for _ in range(400)]
+    covered = np.mean([f.low <= 1.0 <= f.high for f in found])
     assert 0.90 <= covered <= 0.99
-    assert covered == 1.0 - np.mean([f.p_value < 0.05 for f in found])
-    # White noise's interval would not have covered it.
-    naive = [1.96 / np.sqrt(1500) >= abs(f.mean) for f in found]
-    assert rho == 0.0 or np.mean(naive) < 0.7
+    assert covered == pytest.approx(np.mean([f.p_value >= 0.05 for f in found]))
+    assert all(f.low < f.value < f.high for f in found)
+    # An interval for white noise would not have covered it: chi-square losses have variance 2.
+    naive = [abs(np.log(f.value)) <= 1.96 * np.sqrt(4.0 / 3000) for f in found]
+    assert rho == 0.0 or np.mean(naive) < 0.8
+
+
+def test_a_much_larger_loss_is_not_hidden_by_its_own_spread():
+    rng = np.random.default_rng(4)
+    small, large = coloured(rng, 300, 0.95) ** 2, 1e4 * coloured(rng, 300, 0.95) ** 2
+    found = ratio_of_means([large], [small])
+    assert found.low > 100.0 and found.p_value < 0.01
+    swapped = ratio_of_means([small], [large])
+    assert swapped.value == pytest.approx(1.0 / found.value)
+    assert swapped.high == pytest.approx(1.0 / found.low)
+    assert swapped.p_value == pytest.approx(found.p_value)
+
+
+def test_losses_that_are_equal_or_none():
+    one = [np.ones(9)]
+    assert ratio_of_means(one, one).p_value == 1.0
+    assert ratio_of_means([np.zeros(9)], [np.zeros(9)]).value == 1.0
+    assert ratio_of_means(one, [np.zeros(9)]).low == np.inf
+    assert ratio_of_means([np.zeros(9)], one).high == 0.0
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.5, 0.9])
@@ -103,9 +130,10 @@ def test_the_better_structure_wins_by_more_than_chance():
     right, wrong = result.rows
     assert (right.verdict, wrong.verdict, result.preferred) == ("best", "worse", "right")
     # Noise of one and an offset of one: twice the squares.
-    assert wrong.excess.mean == pytest.approx(1.0, abs=0.15)
-    assert wrong.excess.low > 0.8 and wrong.excess.high < 1.2 and wrong.excess.p_value < 1e-6
+    assert wrong.ratio.value == pytest.approx(2.0, abs=0.15)
+    assert wrong.ratio.low > 1.8 and wrong.ratio.high < 2.2 and wrong.ratio.p_value < 1e-6
     assert "right explains the validation data best. wrong has squared errors" in result.verdict
+    assert f"{wrong.ratio.value:.3f} times those of right" in result.verdict
     assert "worse, by more than chance (p < 0.001)" in result.verdict
 
 
@@ -148,7 +176,7 @@ def test_a_difference_nobody_would_notice_makes_none():
     runs = [candidate("rich", 9), candidate("plain", 4, 0.07)]
     runs = [Candidate(c.name, c.n_free, c.n_effective, c.training, c.validation * 40) for c in runs]
     result = compare(runs, [TRAINING], many)
-    assert result.row("plain").excess.mean < 0.01
+    assert result.row("plain").ratio.value < 1.01
     assert result.preferred == "plain"
 
 
@@ -195,7 +223,7 @@ def test_units_of_the_outputs_do_not_matter():
     ]
     one = found(*runs)
     two = compare(other, [scaled(TRAINING)], [scaled(VALIDATION)])
-    assert two.row("wrong").excess.mean == pytest.approx(one.row("wrong").excess.mean)
+    assert two.row("wrong").ratio.value == pytest.approx(one.row("wrong").ratio.value)
     assert two.row("wrong").dbic == pytest.approx(one.row("wrong").dbic)
     assert_allclose(two.row("wrong").rmse, one.row("wrong").rmse)
 
@@ -222,9 +250,9 @@ def test_lost_samples_and_an_output_that_was_not_measured_do_not_count():
     kept = np.r_[0:100, 300:800]
     error = (TESTED - VALIDATION.outputs)[kept, 0]
     wrong = error + np.where(np.arange(800) // 20 % 2 == 0, 0.1, -0.1)[kept]
-    excess = result.row("wrong").excess
-    assert excess.mean == pytest.approx(np.mean(wrong**2) / np.mean(error**2) - 1.0)
-    assert 0.3 < excess.low < excess.mean < excess.high < 1.5
+    ratio = result.row("wrong").ratio
+    assert ratio.value == pytest.approx(np.mean(wrong**2) / np.mean(error**2))
+    assert 1.3 < ratio.low < ratio.value < ratio.high < 2.5
     peak = np.abs(VALIDATION.outputs[kept, 0]).max()
     assert result.row("right").rmse[0] == pytest.approx(np.sqrt(np.mean(error**2)) / peak)
 
@@ -242,8 +270,8 @@ def test_no_structure_has_a_lower_loss_than_the_best(wrongs):
     result = found(*(candidate(str(i), i + 1, w) for i, w in enumerate(wrongs)))
     assert result.rows[0].verdict == "best"
     for row in result.rows[1:]:
-        assert row.excess.mean >= -1e-9
-        assert row.excess.low <= row.excess.mean <= row.excess.high
+        assert row.ratio.value >= 1.0 - 1e-9
+        assert row.ratio.low <= row.ratio.value <= row.ratio.high
 
 
 def test_names_must_differ():

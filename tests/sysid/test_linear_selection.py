@@ -8,6 +8,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from sysid import ARMAX, ARX, Dataset, ModelError, evaluate, select_orders
+from sysid.linear import tuned
 from tests.sysid.linear_systems import record, telegraph
 
 TRAINING = [record(600, 0, 1.0), record(400, 1, 1.0)]
@@ -149,6 +150,23 @@ def test_orders_not_given_are_the_estimators():
     assert not hasattr(estimator, "A_")
     tables = select_orders(ARX(), TRAINING, VALIDATION, na=([[1, 0], [0, 1]], [[2, 2], [2, 2]]))
     assert tables.best.orders["na"] == [[2, 2], [2, 2]]
+
+
+def test_tuning_holds_the_ends_back_and_then_fits_the_whole():
+    grid = {"na": (1, 2, 3), "nb": (1, 2), "nc": (0, 2), "nk": (1,)}
+    found = tuned(ARMAX(stable=True), TRAINING, **grid)
+    cut = [round(0.7 * r.n_samples) for r in TRAINING]
+    by_hand = select_orders(
+        ARMAX(stable=True),
+        [r.part(0, k, "begin") for r, k in zip(TRAINING, cut, strict=True)],
+        [r.part(k, r.n_samples, "end") for r, k in zip(TRAINING, cut, strict=True)],
+        **grid,
+    )
+    assert orders(found) == orders(by_hand)
+    whole = ARMAX(stable=True, **found.best.orders).fit(TRAINING)
+    assert_array_equal(found.model.theta_, whole.theta_)
+    # By itself it tries a wide grid, without the orders that an ARX model lacks.
+    assert len(tuned(ARX(stable=True), TRAINING[0]).candidates) == 6 * 4 * 2
 
 
 def test_the_example_of_the_documentation_runs(capsys):
