@@ -302,8 +302,10 @@ def no_overlap(train: list[Loaded], check: list[Loaded]) -> None:
 
 def default_folder(logs: list[Path], model: str) -> Path:
     """Beside a single capture's log; otherwise a new folder under runs/."""
-    if len(logs) == 1 and capture.log_path(logs[0]).name == capture.LOG_NAME:
-        return capture.log_path(logs[0]).parent / "identification"
+    first = capture.log_path(logs[0])
+    # A folder without a log.csv stands for the CSVs in it, and is no place for results.
+    if len(logs) == 1 and first.name == capture.LOG_NAME and first.exists():
+        return first.parent / "identification"
     now = datetime.datetime.now(datetime.UTC)
     return Path("runs") / f"{now:%Y%m%dT%H%M%SZ}-identify-{model}" / "identification"
 

@@ -4,6 +4,7 @@ import json
 import os
 import pty
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -430,3 +431,13 @@ def test_ctrl_c_before_there_is_any_result_says_so_in_one_line(tmp_path):
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 1
     assert errors.splitlines()[-1] == "rig: stopped by Ctrl-C"
+
+
+def test_results_of_a_folder_of_logs_do_not_go_into_that_folder(tmp_path, captured):
+    folder = tmp_path / "logs"
+    folder.mkdir()
+    shutil.copy(captured[1] / "log.csv", folder / "one.csv")
+    result = rig("identify", "logs", "--population", "8", "--generations", "1", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert [path.name for path in folder.iterdir()] == ["one.csv"]
+    assert len(list(tmp_path.glob("runs/*-identify-*/identification/parameters.yaml"))) == 1
