@@ -63,7 +63,10 @@ def load(folder: Path) -> tuple[ProcessModel, list[Dataset]]:
 
 
 class Fitter:
-    """From logs to parameters: search on thinned logs, refinement on all samples."""
+    """From logs to parameters: search on thinned logs, refinement on all samples.
+
+    All logs count alike, whatever their length and largest force.
+    """
 
     def __init__(self, model: ProcessModel, population: int, generations: int) -> None:
         self.model = model
@@ -78,10 +81,11 @@ class Fitter:
             population=self.population,
             generations=self.generations,
             per_log=True,
+            balance="logs",
             random_state=seed,
         ).fit([thinned(log) for log in logs])
         space = SearchSpace.of(self.model)
-        objective = Objective(self._simulator, space, logs, per_log=True)
+        objective = Objective(self._simulator, space, logs, per_log=True, balance="logs")
         return space.full(refine(objective, search.chromosome_).chromosome)
 
     def fits(self, vector: FloatArray, logs: list[Dataset]) -> list[float]:

@@ -304,13 +304,14 @@ def _jacobian(s: Shape) -> list[str]:
     """J of the driven rows and columns of N beside X, by differences.
 
     Beside, because what switches most often does so where a model starts: dry friction at rest.
-    A difference across the switch would be taken for an endlessly fast rate.
+    A difference across the switch would be taken for an endlessly fast rate. And by more than
+    the differences: the flow through an orifice is endlessly steep at rest, but only there.
     """
     rows = s.structure.driven
     x = [f"X[{i}]" for i in range(s.n_states)]
     u = [f"u[k, {j}]" for j in range(s.n_inputs)]
     return [
-        *[f"X[{i}] += 1e-7 * max(abs(X[{i}]), 1e-2)" for i in rows],
+        *[f"X[{i}] += 1e-5 * max(abs(X[{i}]), 1e-2)" for i in rows],
         # Round -1 evaluates at the point itself; a single call site keeps compilation short.
         f"for j in range(-1, {len(rows)}):",
         "    d = 0.0",

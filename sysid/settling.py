@@ -61,7 +61,9 @@ def _settle(
 ) -> Settled:
     given = objective.weights
     rms = objective.rms(chromosome[None])[0]
-    for _ in range(_ROUNDS if given @ rms > _OWN * objective.simulator.accuracy else 0):
+    # A refinement may end where a simulation takes more steps than a chromosome is allowed.
+    noisy = np.isfinite(rms).all() and given @ rms > _OWN * objective.simulator.accuracy
+    for _ in range(_ROUNDS if noisy else 0):
         weights = given / np.maximum(rms, max(_LEAST_SHARE * rms.max(), 1e-300))
         weighed = objective.weighed(weights)
         steady = np.allclose(weighed.weights, objective.weights, rtol=_STEADY)
