@@ -64,6 +64,10 @@ class Objective:
         """Simulations of one chromosome on all records until now."""
         return self._counter[0]
 
+    def resume_count(self, simulations: int) -> None:
+        """Count on from a number of simulations done before."""
+        self._counter[0] = simulations
+
     def over(self, space: SearchSpace) -> Objective:
         """The same objective over another space of the same model; counts go on together."""
         other = copy.copy(self)
@@ -125,7 +129,7 @@ class Objective:
     def rms_of(self, residuals: FloatArray) -> FloatArray:
         """Root mean square of each output's residuals, (n, n_outputs)."""
         with np.errstate(over="ignore", invalid="ignore"):
-            squares = np.einsum("nkj,nkj->nj", residuals, residuals)
+            squares = np.sum(residuals * residuals, axis=1)
             rms: FloatArray = np.sqrt(squares / np.maximum(self.counts, 1))
         return rms
 

@@ -60,13 +60,13 @@ class Descent:
 
     at: search coordinates (n_free,). error: the objective there, infinite before the first
     iteration. gain: part of the error that the last iteration took away. steps: integration
-    steps per sample of each record, chosen at ``steps_at``; None where they are to be chosen.
+    steps per sample of each record, chosen at ``steps_at``, None where they are to be chosen.
     """
 
     at: FloatArray
     error: float = np.inf
     gain: float = 0.0
-    steps: tuple[int, ...] | None = None
+    steps: tuple[int, ...] = ()
     steps_at: FloatArray | None = None
     damping: float = _FIRST_DAMPING
     level: int = 0
@@ -152,7 +152,7 @@ class _Frame:
 
     def with_steps(self, descents: list[Descent]) -> list[Descent]:
         """The descents with integration steps chosen where they lack them."""
-        lacking = [i for i, descent in enumerate(descents) if descent.steps is None]
+        lacking = [i for i, descent in enumerate(descents) if descent.steps_at is None]
         if lacking:
             rows = np.stack([descents[i].at for i in lacking])
             chosen = self.objective.steps_needed(self.objective.space.decode(rows))
@@ -163,8 +163,8 @@ class _Frame:
 
     def finer_steps(self, descent: Descent) -> tuple[int, ...]:
         """The descent's steps, or more of them where it has come to need more."""
-        assert descent.steps is not None
-        if np.all(np.abs(descent.at - descent.steps_at) <= _NEAR * self.width):
+        at = descent.steps_at
+        if at is not None and np.all(np.abs(descent.at - at) <= _NEAR * self.width):
             return descent.steps
         needed = self.objective.steps_needed(self.objective.space.decode(descent.at[None]))[0]
         return tuple(max(int(n), have) for n, have in zip(needed, descent.steps, strict=True))
@@ -173,7 +173,6 @@ class _Frame:
         """Residuals of each descent's rows of coordinates, those of like steps in one batch."""
         groups: dict[tuple[int, ...], list[int]] = defaultdict(list)
         for i, descent in enumerate(descents):
-            assert descent.steps is not None
             groups[descent.steps].append(i)
         found: dict[int, FloatArray] = {}
         for steps, members in groups.items():
@@ -264,13 +263,14 @@ def _judged(
     moved, damping = descent, descent.damping
     if gain > 0.0:
         at = candidates.rows[best]
+        assert descent.steps_at is not None
         far = bool(np.any(np.abs(at - descent.steps_at) > _FAR * frame.width))
         moved = replace(
             descent,
             at=at,
             error=float(objective.error_of(tried[best : best + 1])[0]),
             gain=gain,
-            steps=None if far else descent.steps,
+            steps_at=None if far else descent.steps_at,
         )
         damping = candidates.damping[best] / np.sqrt(_FACTORS[-1])
     promising = candidates.promise > _NOTHING
@@ -297,6 +297,7 @@ def _next_round(frame: _Frame, descent: Descent, residual: FloatArray) -> Descen
     finer = frame.finer_steps(descent)
     if finer != descent.steps:
         return replace(descent, steps=finer, steps_at=descent.at, failures=0)
+    descent = replace(descent, steps_at=descent.at)
     if descent.level == 0 or descent.error > (1.0 - _NOTHING) * descent.error_of_round:
         return replace(descent, finished=True)
     return replace(descent, level=0, failures=0, error_of_round=descent.error)
@@ -404,4 +405,5 @@ def _across(frame: _Frame, descent: Descent, moves: FloatArray, size: float) -> 
     lengths = np.linalg.norm(normals, axis=0)
     good = np.isfinite(lengths) & (lengths > 0.0)
     unit = normals[:, good] / lengths[good]
-    return _SIDEWAYS * size * (unit @ unit.T)
+    stiffness: FloatArray = _SIDEWAYS * size * (unit @ unit.T)
+    return stiffness

@@ -8,7 +8,9 @@ whole range, and new descents start from the dips of the error along these lines
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +24,9 @@ AT_ONCE = 6  # descents under way together
 # below the best error known.
 _HORIZON = 10
 _ARRIVED = 3e-4  # part of the error that an iteration gains less than where a descent ends
-_POLISHING = 12  # iterations kept for the last descent, from the best
+# Iterations that simulations are kept for, of the last descent, from the best; and its most. It
+# runs to its end even where the budget was too small for it: only a minimum means anything.
+_POLISHING, _MOST_ITERATIONS = 15, 50
 _SAME = 1e-3  # part of an error by which minima differ, or they are one
 _BEFORE_GIVING_UP = 2  # iterations
 _MOST_POINTS, _FEWEST_POINTS = 16, 4  # along each parameter's range
@@ -48,12 +52,16 @@ class Dip:
     error: float
 
 
+_PLAIN = ("reserve", "polishing", "polished", "best", "error", "feasible")
+_ITEMS: dict[str, Callable[..., Any]] = {"descents": Descent, "dips": Dip, "minima": Minimum}
+
+
 class LocalSearch:
     """Descents and jumps, step by step, within a budget of simulations.
 
     starts: (n, n_free) chromosomes, the most promising first. most: simulations that the
-    objective may have counted in the end. points: of one round of variations, shared by all
-    parameters.
+    objective is to have counted in the end. points: of one round of variations, shared by all
+    parameters. rng: draws the variations.
 
     After each ``step``: ``best`` (n_free,) in search coordinates and ``error``, feasible before
     infeasible.
@@ -92,8 +100,8 @@ class LocalSearch:
 
     @property
     def done(self) -> bool:
-        """Whether the best has been polished, or the simulations do not suffice."""
-        return self.polished or self.left < self.each
+        """Whether the best has been polished."""
+        return self.polished
 
     def step(self) -> None:
         """One iteration of the descents under way, or else new starts for some."""
@@ -110,6 +118,18 @@ class LocalSearch:
         else:
             self._vary()
 
+    def state(self) -> dict[str, Any]:
+        """All that the next steps depend on beside what it was made with and ``rng``."""
+        plain = {name: getattr(self, name) for name in _PLAIN}
+        return plain | {name: [vars(item) for item in getattr(self, name)] for name in _ITEMS}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Go on from a ``state``."""
+        for name in _PLAIN:
+            setattr(self, name, state[name])
+        for name, kind in _ITEMS.items():
+            setattr(self, name, [kind(**values) for values in state[name]])
+
     def _next_cost(self) -> int:
         """Simulations that the next step takes at least."""
         if self.descents or self.dips:
@@ -119,7 +139,8 @@ class LocalSearch:
     def _polish(self) -> None:
         self.descents = refinement.advance(self.objective, self.descents)
         self._take(self.descents[0])
-        self.polished = self.descents[0].finished
+        descent = self.descents[0]
+        self.polished = descent.finished or descent.iterations >= _MOST_ITERATIONS
 
     def _descend(self) -> None:
         affordable = (self.left - self.reserve) // self.each
@@ -129,7 +150,8 @@ class LocalSearch:
         self.descents = []
         for descent in moved:
             # What remains to be smoothed matters to the last digits only.
-            if descent.finished or descent.smoothing > 0:
+            ended = descent.finished or descent.iterations >= _MOST_ITERATIONS
+            if ended or descent.smoothing > 0:
                 if np.isfinite(descent.error) and not self._known(descent):
                     self.minima.append(Minimum(descent.at, descent.error))
             elif not self._hopeless(descent):

@@ -6,8 +6,10 @@
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -41,6 +43,11 @@ class Preset:
     collapse: float = 0.0
     local_share: float = 0.0
 
+    @property
+    def refine(self) -> bool:
+        """Whether local refinement follows the search."""
+        return self.local_share > 0.0
+
 
 PRESETS: dict[PresetName, Preset] = {
     "classic": Preset(operators="classic", penalty=False),
@@ -61,6 +68,12 @@ PRESETS: dict[PresetName, Preset] = {
 # Chromosomes that local refinement may start from, and how far apart they are at least: root mean
 # square over the parameters, in parts of their ranges.
 _KEPT, _APART = 8, 0.1
+
+_STATE = (
+    "elite", "elite_error", "elite_feasible", "history", "converged", "_coded", "_initial_spread",
+    "_elite_rank", "_leader", "_leader_rank", "_kept", "_kept_behind", "_kept_errors",
+    "_first_error", "_first_change",
+)  # fmt: skip
 
 # Hyperparameters that Algorithm 1 leaves open and the adaptive algorithms do without.
 _CLASSIC_RATIO, _CLASSIC_CROSSOVER, _CLASSIC_MUTATION = 0.3, 0.8, 0.05
@@ -105,12 +118,13 @@ class GeneticSearch:
         draw = operators.stratified if self.preset.stratified else operators.uniform
         self._coded = draw(self.population, self._lower, self._upper, self.rng)
         self._initial_spread = self._coded.std(axis=0)
-        self._elite_rank = (True, np.inf)
+        self._elite_rank: tuple[bool, float] = (True, np.inf)
         # The best since the population last started anew, by which it breeds.
         self._leader: FloatArray | None = None
-        self._leader_rank = (True, np.inf)
-        n = len(self._lower)
-        self._kept, self._kept_behind, self._kept_errors = np.empty((0, n)), np.empty(0), np.empty(0)
+        self._leader_rank: tuple[bool, float] = (True, np.inf)
+        self._kept = np.empty((0, len(self._lower)))
+        self._kept_behind: BoolArray = np.empty(0, dtype=bool)
+        self._kept_errors = np.empty(0)
         self._first_error = np.inf
         self._first_change: int | None = None
 
@@ -147,6 +161,15 @@ class GeneticSearch:
     def promising(self, count: int) -> FloatArray:
         """The best chromosomes yet that lie apart, best first, (at most ``count``, n_free)."""
         return self.space.decode(self._kept[:count])
+
+    def state(self) -> dict[str, Any]:
+        """All that the next generations depend on beside the settings and ``rng``."""
+        return {name: copy.copy(getattr(self, name)) for name in _STATE}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Go on from a ``state``."""
+        for name in _STATE:
+            setattr(self, name, state[name])
 
     def _save_elite(
         self, errors: FloatArray, behind: BoolArray, feasible: BoolArray, chromosomes: FloatArray
