@@ -83,14 +83,8 @@ def kernels(model: ProcessModel, *, exact: bool = True) -> Kernels:
     Compilation itself happens at the first call. Without ``exact`` nothing is integrated
     exactly. Raises ModelError when the model's functions use something that cannot be compiled.
     """
-    # Numba is slow to import.
-    from sysid._intrinsics import many_registers
-
     shape = Shape.of(model, analyse(model, exact=exact))
-    program = shape.structure.program
-    batch = _kernel.source(shape, many_registers=many_registers())
-    text = "\n\n".join((program.text, batch, _trajectory_kernel.source(shape)))
-    called = {name: getattr(model, name) for name in sorted(program.calls)}
+    text, called = _text(model, shape)
     path = _source_file(f"{_safe(model.name)}_{_key(text, called)}.py", text)
     scope = _scope(called)
     exec(compile(text, str(path or "<kernel>"), "exec"), scope)
@@ -110,6 +104,29 @@ def kernels(model: ProcessModel, *, exact: bool = True) -> Kernels:
         fewest_steps=shape.fewest_steps,
         guarded=bool(shape.structure.guards),
     )
+
+
+def fingerprint(model: ProcessModel) -> str:
+    """What decides every digit of a model's simulations and constraints, as a hash.
+
+    The equations, the constraints, and how this computer's processor is made use of.
+    """
+    text, called = _text(model, Shape.of(model, analyse(model, exact=True)))
+    key = hashlib.sha256(_key(text, called).encode())
+    for constraint in model.constraints:
+        _fingerprint(constraint.function, key, set())
+    return key.hexdigest()
+
+
+def _text(model: ProcessModel, shape: Shape) -> tuple[str, dict[str, Any]]:
+    """Text of a model's kernels, and the model's functions that it calls."""
+    # Numba is slow to import.
+    from sysid._intrinsics import many_registers
+
+    program = shape.structure.program
+    batch = _kernel.source(shape, many_registers=many_registers())
+    text = "\n\n".join((program.text, batch, _trajectory_kernel.source(shape)))
+    return text, {name: getattr(model, name) for name in sorted(program.calls)}
 
 
 def _tables(shape: Shape, first: int) -> Tables:

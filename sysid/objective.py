@@ -46,12 +46,12 @@ class Objective:
         relative = np.ones(q) if weights is None else np.asarray(weights, dtype=np.float64)
         self.weights = relative / relative.sum()
         counts = np.array([np.isfinite(record.outputs).sum(axis=0) for record in self.records])
-        self._counts = counts.sum(axis=0)
+        self.counts = counts.sum(axis=0)
         self.scales = _balanced(output_scale(self.records, per_log), counts, balance)
         unseen = [
             output.name
             for output, count, weight in zip(
-                simulator.model.outputs, self._counts, self.weights, strict=True
+                simulator.model.outputs, self.counts, self.weights, strict=True
             )
             if weight > 0.0 and not count
         ]
@@ -63,6 +63,10 @@ class Objective:
     def simulations(self) -> int:
         """Simulations of one chromosome on all records until now."""
         return self._counter[0]
+
+    def resume_count(self, simulations: int) -> None:
+        """Count on from a number of simulations done before."""
+        self._counter[0] = simulations
 
     def over(self, space: SearchSpace) -> Objective:
         """The same objective over another space of the same model; counts go on together."""
@@ -87,7 +91,7 @@ class Objective:
     def rms(self, chromosomes: FloatArray) -> FloatArray:
         """RMSE of each output in parts of its scale, (n, n_outputs), infinite where it failed."""
         result = self.evaluate(chromosomes)[1]
-        roots: FloatArray = np.sqrt(result.sse.sum(axis=1) / np.maximum(self._counts, 1))
+        roots: FloatArray = np.sqrt(result.sse.sum(axis=1) / np.maximum(self.counts, 1))
         return roots
 
     def residuals(self, chromosomes: FloatArray, n_steps: Sequence[int]) -> FloatArray:
@@ -100,16 +104,51 @@ class Objective:
         for record, scale, steps, start in zip(
             self.records, self.scales, n_steps, starts, strict=True
         ):
-            simulated = self.simulator.trajectories(vectors, record, steps, start)
+            residuals = self.simulator.trajectories(vectors, record, steps, start)
+            residuals -= record.outputs
+            residuals /= scale
             missing = ~np.isfinite(record.outputs)
-            parts.append(np.where(missing, 0.0, (simulated - record.outputs) / scale))
+            if missing.any():
+                residuals[:, missing] = 0.0
+            parts.append(residuals)
         self._counter[0] += len(vectors)
-        return np.concatenate(parts, axis=1)
+        return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
+
+    def steps_needed(self, chromosomes: FloatArray) -> IntArray:
+        """Integration steps per sample that each chromosome needs, (n, n_records)."""
+        vectors = self.space.full(chromosomes)
+        self._counter[0] += len(vectors)
+        return np.stack(
+            [self.simulator.steps_of_each(vectors, record) for record in self.records], axis=1
+        )
 
     def error_of(self, residuals: FloatArray) -> FloatArray:
         """The error of residuals as returned by ``residuals``, (n,)."""
+        errors = self.rms_of(residuals) @ self.weights
+        return np.where(np.isfinite(errors), errors, np.inf)
+
+    def smoothed_error_of(self, residuals: FloatArray, floor: float) -> FloatArray:
+        """The same, but smooth where an output is explained exactly, (n,).
+
+        An RMSE below ``floor`` counts by the parabola that meets the root there with its slope.
+        """
+        rms = self.rms_of(residuals)
         with np.errstate(over="ignore", invalid="ignore"):
-            return self._mean_rmse(np.sum(residuals**2, axis=1))
+            smooth = np.where(rms > floor, rms, 0.5 * (rms**2 / floor + floor))
+            errors = smooth @ self.weights
+        return np.where(np.isfinite(errors), errors, np.inf)
+
+    def rms_of(self, residuals: FloatArray) -> FloatArray:
+        """Root mean square of each output's residuals, (n, n_outputs)."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            squares = np.sum(residuals * residuals, axis=1)
+            rms: FloatArray = np.sqrt(squares / np.maximum(self.counts, 1))
+        return rms
+
+    @property
+    def n_residuals(self) -> int:
+        """Residuals of one chromosome, those of all outputs and of lost samples included."""
+        return int(sum(record.outputs.size for record in self.records))
 
     def least_squares_weights(self, residual: FloatArray) -> FloatArray:
         """Weights of squared residuals whose sum is least where the error is, (n_outputs,).
@@ -117,7 +156,7 @@ class Objective:
         residual: (n_residuals, n_outputs), at that minimum. Half the second derivative of the
         error is that of the weighted mean square.
         """
-        counts = np.maximum(self._counts, 1)
+        counts = np.maximum(self.counts, 1)
         rms = np.sqrt(np.sum(residual**2, axis=0) / counts)
         weights: FloatArray = self.weights * len(residual) / counts / np.maximum(rms, 1e-12)
         return weights
@@ -132,7 +171,7 @@ class Objective:
 
     def _mean_rmse(self, sse: FloatArray) -> FloatArray:
         with np.errstate(invalid="ignore"):  # infinite times a weight of zero
-            errors = np.sqrt(sse / np.maximum(self._counts, 1)) @ self.weights
+            errors = np.sqrt(sse / np.maximum(self.counts, 1)) @ self.weights
         return np.where(np.isfinite(errors), errors, np.inf)
 
 

@@ -26,8 +26,6 @@ _STEADY = 1e-3  # part by which weights may still change
 _LEAST_SHARE = 1e-2
 # Errors below this part of the simulation's accuracy are its own: there is no noise to weigh by.
 _OWN = 0.1
-# Errors of the simulation are kept below this part of those of the fit, down to the finest.
-_ACCURATE, _FINEST = 0.03, 1e-6
 
 
 @dataclass(frozen=True)

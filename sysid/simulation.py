@@ -146,10 +146,14 @@ class BatchSimulator:
 
     def steps_needed(self, parameters: FloatArray, record: Dataset) -> int:
         """Integration steps per sample that serve all the given parameter vectors."""
+        return int(self.steps_of_each(parameters, record).max())
+
+    def steps_of_each(self, parameters: FloatArray, record: Dataset) -> IntArray:
+        """Integration steps per sample that each parameter vector needs, (n,)."""
         parameters = self._check(parameters, [record])
         with ThreadPoolExecutor(self.threads) as pool:
             runner = _Runner(self, record, pool)
-            return runner.common_steps(parameters)
+            return runner.steps_of_each(parameters)
 
     def _check(self, parameters: FloatArray, records: Sequence[Dataset]) -> FloatArray:
         if not records:
@@ -215,10 +219,14 @@ class _Runner:
 
     def common_steps(self, parameters: FloatArray) -> int:
         """One number of steps per sample that serves all, within the budget."""
+        return int(self.steps_of_each(parameters).max())
+
+    def steps_of_each(self, parameters: FloatArray) -> IntArray:
+        """Steps per sample that each needs, within the budget, (n,)."""
         sse = np.empty((len(parameters), 1, self.y.shape[1]))
         spent = np.zeros(len(parameters), dtype=np.int64)
         steps = self._choose(parameters, sse, spent)[0]
-        return int(min(steps.max(), self.simulator.max_steps))
+        return np.minimum(steps, self.simulator.max_steps)
 
     def record_block(
         self, parameters: FloatArray, lanes: IntArray, n_steps: int, outputs: FloatArray

@@ -234,6 +234,10 @@ class SearchSpace:
             vectors[..., tie.index] = tie.factor * vectors[..., tie.source]
         return vectors
 
+    def feasible(self, chromosome: FloatArray) -> bool:
+        """Whether all limits and constraints hold of a chromosome, (n_free,)."""
+        return bool(np.all(self.violations(chromosome[None]) <= 0.0))
+
     def violations(self, chromosomes: FloatArray) -> FloatArray:
         """Inequality violations max(0, g) of (4.15), (n_chromosomes, n_constraints).
 

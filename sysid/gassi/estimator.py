@@ -4,31 +4,40 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
 from sklearn.utils.validation import check_is_fitted
 
 from sysid.data import Dataset
-from sysid.gassi.search import PRESETS, GeneticSearch, PresetName
+from sysid.gassi.checkpoint import Checkpoint, load, origin
+from sysid.gassi.running import Best, Run
+from sysid.gassi.search import PRESETS, GeneticSearch, Preset, PresetName
 from sysid.metrics import fit_percent
 from sysid.model import FloatArray, ModelError, ProcessModel, Scale
 from sysid.objective import Balance, Objective
 from sysid.ranges import Range
 from sysid.recording import Data, RecordEstimator, split
-from sysid.refinement import Refinement, refine
+from sysid.refinement import Refinement
 from sysid.settling import settle
-from sysid.simulation import BatchSimulator, Status
+from sysid.simulation import BatchSimulator
 from sysid.space import SearchSpace
 from sysid.starting import free_run
 from sysid.uncertainty import Profile, Uncertainty, profile, uncertainty
 
 Criterion = Literal["likelihood", "error"]
 
+# Settings that the result does not depend on, or that a checkpoint knows otherwise.
+_NOT_DECIDING = ("model", "threads", "dt")
+
 
 @dataclass(frozen=True)
 class Progress:
-    """What a watcher of the search is told: step ``done`` of ``total`` and the best error."""
+    """What a watcher of the search is told: generation ``done`` of ``total``, the best error.
+
+    stage: ``search`` or, while the local refinement spends the rest of them, ``refine``.
+    """
 
     stage: str
     done: int
@@ -45,7 +54,8 @@ class GASSI(RecordEstimator):
         outputs count, where its states start, and how inputs run between samples.
     preset : ``default``, ``thesis`` (Algorithms 2 to 5 with the penalty (4.13)-(4.20), as
         written), ``cega`` (the same without penalty) or ``classic`` (Algorithm 1).
-    population, generations : chromosomes per generation, generations evaluated.
+    population, generations : chromosomes per generation, generations evaluated. Their product is
+        the number of simulations that search and local refinement share.
     ranges : {name: (lower, upper)}, search ranges in place of the model's. One of the ends may
         be None: then the other is a bound, and this one only where the search starts.
     fixed : {name: value}, parameters not searched.
@@ -74,9 +84,10 @@ class GASSI(RecordEstimator):
     space_ : SearchSpace that was searched; estimated initial states stand behind the parameters.
     output_weights_ : (n_outputs,), what the outputs counted in the end.
     error_ : mean over outputs of the RMSE normalised by max|y| (see ``Objective``).
-    search_error_ : the error before local refinement.
+    search_error_ : the lowest error before local refinement.
     feasible_ : whether all constraints hold.
-    history_ : (n_generations,), the best error after each generation.
+    history_ : (n_generations,), the best error after each generation; in the local refinement
+        one is ``population`` simulations.
     stopped_ : ``generations``, ``converged`` or ``interrupted``.
     flagged_ : {status name: count} of simulations that failed during the search.
     n_simulations_ : simulations of one chromosome on all records.
@@ -134,14 +145,22 @@ class GASSI(RecordEstimator):
         *,
         records: Any = None,
         on_progress: Callable[[Progress], None] | None = None,
+        checkpoint: Path | None = None,
+        resume: Path | None = None,
     ) -> GASSI:
         """Search the parameters that make the model follow the records.
 
         X: one Dataset, several of any lengths and rates, or an (n_samples, n_inputs) array
         with y (n_samples,) or (n_samples, n_outputs), NaN where a sample was lost. records:
         (n_samples,), which record each row of the arrays belongs to, default one record. Ctrl-C
-        stops the search and keeps the best so far. Raises ModelError when every simulation of
-        the first generation fails, or for settings that make no sense.
+        stops the search and keeps the best so far.
+
+        checkpoint: file that the search's whole state is written to as it goes, at most twice a
+        second. resume: such a file to go on from, with the same result as if the search had
+        never stopped; further checkpoints go to the same file unless another is named.
+
+        Raises ModelError when every simulation of the first generation fails, for settings that
+        make no sense, or for a checkpoint of other data, settings or model.
         """
         data = self._records(X, y, records, None, reset=True)
         model = self._model()
@@ -158,40 +177,58 @@ class GASSI(RecordEstimator):
         )
         objective = self._objective(data)
         self.output_weights_: FloatArray = objective.weights
-        search = GeneticSearch(
-            self.space_,
-            preset,
-            self.population,
-            self.generations,
-            np.random.default_rng(self.random_state),
-            self.elite_percent,
-            self.minimum_generations,
-            self.termination_ratio,
-        )
+        run = self._run(objective, preset)
+        keeper = self._keeper(data, run, checkpoint, resume)
         notify = on_progress or (lambda progress: None)
-        self.flagged_: dict[str, int] = {}
         self.stopped_ = "generations"
-        searched = False
         try:
-            self._search(search, objective, notify)
-            self._take(search.elite, search.elite_error, search.elite_feasible)
-            self.search_error_ = self.error_
-            searched = True
-            if preset.refine:
-                objective = self._with_starts(objective)
-                self._refine(objective, notify)
-                if self.criterion == "likelihood":
-                    self._settle(objective, notify)
+            while not run.done:
+                run.step()
+                if keeper is not None:
+                    keeper.save(run.state())
+                self._take(run)
+                generation = min(len(run.history), self.generations)
+                notify(Progress(run.stage, generation, self.generations, self.error_))
         except KeyboardInterrupt:
-            if search.elite is None:
+            if run.best is None:
                 raise
             self.stopped_ = "interrupted"
-            if not searched:
-                self._take(search.elite, search.elite_error, search.elite_feasible)
-                self.search_error_ = self.error_
-        self.history_ = np.array(search.history)
-        self.n_simulations_ = objective.simulations
+        finally:
+            if keeper is not None:
+                keeper.flush()
+        self._take(run)
+        if self.stopped_ != "interrupted":
+            self._end(run, notify)
         return self
+
+    def _end(self, run: Run, notify: Callable[[Progress], None]) -> None:
+        """Where a run that came to its own end goes on to."""
+        if run.search.converged:
+            self.stopped_ = "converged"
+        if not run.preset.refine or self.criterion != "likelihood":
+            return
+        done = 0
+
+        def watch(step: Refinement) -> None:
+            nonlocal done
+            done += 1
+            notify(Progress("weigh", done, done, self.error_))
+
+        try:
+            settled = settle(run.objective, run.minima, watch)
+        except KeyboardInterrupt:
+            self.stopped_ = "interrupted"
+            return
+        self._set(
+            Best(
+                run.objective.space,
+                settled.chromosome,
+                float(run.objective.evaluate(settled.chromosome[None])[0][0]),
+                run.objective.space.feasible(settled.chromosome),
+            )
+        )
+        self.output_weights_ = settled.objective.weights
+        self.n_simulations_ = run.objective.simulations
 
     def predict(self, X: Dataset | FloatArray, *, records: Any = None) -> FloatArray:
         """Free-run outputs of the identified model, (n_samples, n_outputs).
@@ -297,71 +334,57 @@ class GASSI(RecordEstimator):
             raise ModelError("every output has weight 0; at least one must count")
         return weights
 
-    def _search(
-        self, search: GeneticSearch, objective: Objective, notify: Callable[[Progress], None]
-    ) -> None:
-        while not search.done:
-            errors, result = objective.evaluate(search.ask())
-            for status in (Status.UNBOUNDED, Status.OVER_BUDGET):
-                count = int(np.sum(result.status == status))
-                if count:
-                    name = status.name.lower()
-                    self.flagged_[name] = self.flagged_.get(name, 0) + count
-            if not np.isfinite(errors).any() and search.elite is None:
-                raise ModelError(
-                    f"every simulation of the first generation failed ({self.flagged_}); "
-                    "narrow the ranges, or raise max_steps if the model is this stiff"
-                )
-            search.tell(errors)
-            notify(Progress("search", len(search.history), self.generations, search.elite_error))
-        if search.converged:
-            self.stopped_ = "converged"
+    def _run(self, objective: Objective, preset: Preset) -> Run:
+        rng = np.random.default_rng(self.random_state)
+        # Of the generations the genetic search has its share, the local refinement the rest.
+        own = self.generations
+        if preset.refine and own > 0:
+            own = max(1, round((1.0 - preset.local_share) * own))
+        search = GeneticSearch(
+            self.space_,
+            preset,
+            self.population,
+            own,
+            rng,
+            self.elite_percent,
+            self.minimum_generations,
+            self.termination_ratio,
+        )
+        return Run(objective, preset, search, self.generations, rng)
 
-    def _refine(self, objective: Objective, notify: Callable[[Progress], None]) -> None:
-        limit = 50
+    def _keeper(
+        self, data: Sequence[Dataset], run: Run, checkpoint: Path | None, resume: Path | None
+    ) -> Checkpoint | None:
+        """What writes the checkpoints, after the run has been set to where it goes on."""
+        path = checkpoint if checkpoint is not None else resume
+        if path is None:
+            return None
+        settings = {k: v for k, v in self.get_params(deep=False).items() if k not in _NOT_DECIDING}
+        begun_with = origin(self._model(), data, settings)
+        if resume is not None:
+            run.restore(load(Path(resume), begun_with))
+        keeper = Checkpoint(Path(path), begun_with)
+        keeper.save(run.state())
+        return keeper
 
-        def watch(step: Refinement) -> None:
-            # Taken as it goes, so that Ctrl-C keeps what has been gained.
-            if step.error < self.error_:
-                violations = self.space_.violations(step.chromosome[None])
-                self._take(step.chromosome, step.error, bool(np.all(violations <= 0.0)))
-            notify(Progress("refine", step.iterations, limit, self.error_))
+    def _take(self, run: Run) -> None:
+        """The run's best and what it took, as they are known from outside."""
+        assert run.best is not None
+        self._set(run.best)
+        self.search_error_: float = run.search.elite_error
+        self.history_: FloatArray = np.array(run.history)
+        self.flagged_ = dict(run.flagged)
+        self.n_simulations_ = run.objective.simulations
 
-        result = refine(objective, self.chromosome_, max_iterations=limit, on_iteration=watch)
-        # It rarely needs all the iterations it may take.
-        notify(Progress("refine", result.iterations, result.iterations, self.error_))
-
-    def _settle(self, objective: Objective, notify: Callable[[Progress], None]) -> None:
-        """Go on to the likeliest parameters, each output weighed by its own error."""
-
-        def watch(step: Refinement) -> None:
-            notify(Progress("weigh", step.iterations, max(step.iterations, 10), self.error_))
-
-        settled = settle(objective, [self.chromosome_], watch)
-        error = float(objective.evaluate(settled.chromosome[None])[0][0])
-        violations = self.space_.violations(settled.chromosome[None])
-        self._take(settled.chromosome, error, bool(np.all(violations <= 0.0)))
-        self.output_weights_ = settled.objective.weights
-
-    def _with_starts(self, objective: Objective) -> Objective:
-        """The objective over the parameters and the initial states left to be estimated."""
-        space = self.space_.with_starts(objective.records)
-        if not space.estimated:
-            return objective
-        self.space_ = space
-        chromosome = space.with_nominal_starts(self.chromosome_)
-        self._take(chromosome, self.error_, self.feasible_)
-        return objective.over(space)
-
-    def _take(self, chromosome: FloatArray | None, error: float, feasible: bool) -> None:
-        assert chromosome is not None
-        self.chromosome_: FloatArray = chromosome
-        self.vector_ = self.space_.full(chromosome)
+    def _set(self, best: Best) -> None:
+        self.space_ = best.space
+        self.chromosome_: FloatArray = best.chromosome
+        self.vector_ = best.space.full(best.chromosome)
         names = self._model().parameter_names
         self.parameters_ = {n: float(v) for n, v in zip(names, self.vector_, strict=True)}
-        self.initial_states_ = self.space_.named_starts(chromosome)
-        self.error_: float = error
-        self.feasible_ = feasible
+        self.initial_states_ = best.space.named_starts(best.chromosome)
+        self.error_: float = best.error
+        self.feasible_ = best.feasible
 
     def __sklearn_is_fitted__(self) -> bool:
         return hasattr(self, "vector_")

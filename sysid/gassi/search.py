@@ -6,14 +6,16 @@
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from sysid.gassi import operators
 from sysid.gassi.penalty import infeasibility, penalise
-from sysid.model import FloatArray, ModelError
+from sysid.model import BoolArray, FloatArray, ModelError
 from sysid.space import SearchSpace
 
 PresetName = Literal["default", "thesis", "cega", "classic"]
@@ -27,8 +29,9 @@ class Preset:
     infeasible chromosomes are penalised (4.13)-(4.20). log_scale: search parameters marked
     ``log`` by their logarithm. keep_in_range: clip to the ranges' bounds; else a range
     is only where the search starts. spread: mutation noise from the ``initial`` population, as
-    written, or from the ``current`` one. stratified: Latin-hypercube start. refine: finish with
-    local least squares.
+    written, or from the ``current`` one. stratified: Latin-hypercube start. collapse: share of
+    the initial spread below which the population starts anew, away from the elite. local_share:
+    share of the simulations left to local refinement.
     """
 
     operators: Literal["adaptive", "classic"]
@@ -37,7 +40,13 @@ class Preset:
     keep_in_range: bool = False
     spread: Literal["initial", "current"] = "initial"
     stratified: bool = False
-    refine: bool = False
+    collapse: float = 0.0
+    local_share: float = 0.0
+
+    @property
+    def refine(self) -> bool:
+        """Whether local refinement follows the search."""
+        return self.local_share > 0.0
 
 
 PRESETS: dict[PresetName, Preset] = {
@@ -51,9 +60,20 @@ PRESETS: dict[PresetName, Preset] = {
         keep_in_range=True,
         spread="current",
         stratified=True,
-        refine=True,
+        collapse=0.03,
+        local_share=0.85,
     ),
 }
+
+# Chromosomes that local refinement may start from, and how far apart they are at least: root mean
+# square over the parameters, in parts of their ranges.
+_KEPT, _APART = 8, 0.1
+
+_STATE = (
+    "elite", "elite_error", "elite_feasible", "history", "converged", "_coded", "_initial_spread",
+    "_elite_rank", "_leader", "_leader_rank", "_kept", "_kept_behind", "_kept_errors",
+    "_first_error", "_first_change",
+)  # fmt: skip
 
 # Hyperparameters that Algorithm 1 leaves open and the adaptive algorithms do without.
 _CLASSIC_RATIO, _CLASSIC_CROSSOVER, _CLASSIC_MUTATION = 0.3, 0.8, 0.05
@@ -98,7 +118,13 @@ class GeneticSearch:
         draw = operators.stratified if self.preset.stratified else operators.uniform
         self._coded = draw(self.population, self._lower, self._upper, self.rng)
         self._initial_spread = self._coded.std(axis=0)
-        self._elite_rank = (True, np.inf)
+        self._elite_rank: tuple[bool, float] = (True, np.inf)
+        # The best since the population last started anew, by which it breeds.
+        self._leader: FloatArray | None = None
+        self._leader_rank: tuple[bool, float] = (True, np.inf)
+        self._kept = np.empty((0, len(self._lower)))
+        self._kept_behind: BoolArray = np.empty(0, dtype=bool)
+        self._kept_errors = np.empty(0)
         self._first_error = np.inf
         self._first_change: int | None = None
 
@@ -117,7 +143,9 @@ class GeneticSearch:
         flagged = ~np.isfinite(errors)
         violations = self.space.violations(chromosomes)
         scores = infeasibility(violations)
-        self._save_elite(errors, scores, chromosomes)
+        behind = scores > 0.0 if self.preset.penalty else np.zeros(len(scores), dtype=bool)
+        self._save_elite(errors, behind, scores == 0.0, chromosomes)
+        self._keep(errors, behind)
         self._check_termination()
         if self.done:
             return
@@ -130,20 +158,52 @@ class GeneticSearch:
         if self.preset.keep_in_range:
             np.clip(self._coded, *self._bounds, out=self._coded)
 
-    def _save_elite(self, errors: FloatArray, scores: FloatArray, chromosomes: FloatArray) -> None:
+    def promising(self, count: int) -> FloatArray:
+        """The best chromosomes yet that lie apart, best first, (at most ``count``, n_free)."""
+        return self.space.decode(self._kept[:count])
+
+    def state(self) -> dict[str, Any]:
+        """All that the next generations depend on beside the settings and ``rng``."""
+        return {name: copy.copy(getattr(self, name)) for name in _STATE}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Go on from a ``state``."""
+        for name in _STATE:
+            setattr(self, name, state[name])
+
+    def _save_elite(
+        self, errors: FloatArray, behind: BoolArray, feasible: BoolArray, chromosomes: FloatArray
+    ) -> None:
         """Keep the best yet: feasible before infeasible, then the lower error (4.9)."""
         # An infeasibility score is relative to its own generation; between generations only
         # feasible or not, and the error, can be compared.
         usable = np.flatnonzero(np.isfinite(errors))
         if len(usable):
-            behind = scores > 0.0 if self.preset.penalty else np.zeros(len(scores), dtype=bool)
             best = min(usable, key=lambda j: (behind[j], errors[j]))
             rank = (bool(behind[best]), float(errors[best]))
+            if self._leader is None or rank < self._leader_rank:
+                self._leader, self._leader_rank = chromosomes[best].copy(), rank
             if self.elite is None or rank < self._elite_rank:
                 self.elite, self._elite_rank = chromosomes[best].copy(), rank
                 self.elite_error = float(errors[best])
-                self.elite_feasible = bool(scores[best] == 0.0)
+                self.elite_feasible = bool(feasible[best])
         self.history.append(self.elite_error)
+
+    def _keep(self, errors: FloatArray, behind: BoolArray) -> None:
+        """Merge the generation into the best chromosomes that lie apart."""
+        rows = np.concatenate([self._kept, self._coded])
+        all_behind = np.concatenate([self._kept_behind, behind])
+        all_errors = np.concatenate([self._kept_errors, errors])
+        width = self._upper - self._lower
+        chosen: list[int] = []
+        for j in np.lexsort((all_errors, all_behind)):
+            if len(chosen) == _KEPT or not np.isfinite(all_errors[j]):
+                break
+            away = (rows[chosen] - rows[j]) / width
+            if np.all(np.mean(away**2, axis=1) > _APART**2):
+                chosen.append(int(j))
+        self._kept = rows[chosen]
+        self._kept_behind, self._kept_errors = all_behind[chosen], all_errors[chosen]
 
     def _check_termination(self) -> None:
         """Running mean of the elite's error since it first changed, (4.10) and (4.11).
@@ -166,11 +226,21 @@ class GeneticSearch:
         sigma = self._initial_spread
         if self.preset.spread == "current":
             sigma = self._coded.std(axis=0)
+        spread = np.mean(self._coded.std(axis=0) / self._initial_spread)
+        if spread < self.preset.collapse:
+            self._restart()
+            return
         operators.adaptive_crossover(self._coded, fitness, self.rng)
         operators.adaptive_mutation(self._coded, fitness, sigma, self.rng)
-        if self.elite is not None:
-            elite = self.space.encode(self.elite)
-            operators.replace_by_elite(self._coded, elite, self.elite_percent, self.rng)
+        if self._leader is not None:
+            leader = self.space.encode(self._leader)
+            operators.replace_by_elite(self._coded, leader, self.elite_percent, self.rng)
+
+    def _restart(self) -> None:
+        """A new population that knows nothing of the elite, which is kept."""
+        draw = operators.stratified if self.preset.stratified else operators.uniform
+        self._coded = draw(self.population, self._lower, self._upper, self.rng)
+        self._leader, self._leader_rank = None, (True, np.inf)
 
     def _breed_classic(self, fitness: FloatArray) -> None:
         self._coded = operators.roulette(self._coded, fitness, self.rng)

@@ -1,0 +1,197 @@
+"""The state of a search in a file, from which it goes on to the bit.
+
+A checkpoint is a NumPy archive: the arrays of the state, and JSON for all else. Beside the state
+it holds what the search was begun with, in words and hashes, so that it is never continued with
+other data, settings or equations.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import time
+import warnings
+import zipfile
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sysid._compile import fingerprint
+from sysid.data import Dataset
+from sysid.model import ModelError, ProcessModel
+
+FORMAT = 1
+INTERVAL = 0.5  # s between two writings
+
+State = dict[str, Any]
+
+
+def origin(
+    model: ProcessModel, records: Sequence[Dataset], settings: Mapping[str, Any]
+) -> dict[str, Any]:
+    """What a search is begun with: the model, the records and the settings."""
+    signals = (model.states, model.inputs, model.outputs, model.parameters)
+    origin = {
+        "model": {
+            "name": model.name,
+            "signals and parameters": _hash(repr(signals).encode()),
+            "equations": fingerprint(model),
+        },
+        "records": [
+            {
+                "name": record.name,
+                "samples": record.n_samples,
+                "sample time": record.dt,
+                "values": _hash(record.inputs.tobytes(), record.outputs.tobytes()),
+            }
+            for record in records
+        ],
+        "settings": dict(settings),
+    }
+    plain: dict[str, Any] = json.loads(json.dumps(origin, default=_number))
+    return plain
+
+
+class Checkpoint:
+    """Writes states to a file, whole or not at all, and not more often than makes sense.
+
+    A first writing that fails raises ModelError; later on a full disk is no reason to lose what
+    the search may still find, and is a warning.
+    """
+
+    def __init__(self, path: Path, begun_with: Mapping[str, Any]) -> None:
+        self.path = path
+        self.begun_with = begun_with
+        self._written: float | None = None
+        self._pending: State | None = None
+
+    def save(self, state: State) -> None:
+        """Keep a state, in the file at once if the last writing was a while ago."""
+        self._pending = state
+        if self._written is None or time.monotonic() - self._written >= INTERVAL:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write the last state if it has not been written."""
+        if self._pending is None:
+            return
+        arrays: dict[str, Any] = {}
+        content = {
+            "format": FORMAT,
+            "begun with": self.begun_with,
+            "state": _packed(self._pending, arrays),
+        }
+        arrays["json"] = np.array(json.dumps(content))
+        temporary = self.path.with_name(f"{self.path.name}.{os.getpid()}.tmp")
+        try:
+            with temporary.open("wb") as file:
+                np.savez(file, **arrays)
+                file.flush()
+                os.fsync(file.fileno())
+            temporary.replace(self.path)
+        except OSError as error:
+            temporary.unlink(missing_ok=True)
+            problem = f"{self.path}: the checkpoint cannot be written: {error.strerror}"
+            if self._written is None:
+                raise ModelError(problem) from None
+            warnings.warn(problem, stacklevel=2)
+        self._pending = None
+        self._written = time.monotonic()
+
+
+def load(path: Path, begun_with: Mapping[str, Any]) -> State:
+    """The state in a checkpoint of a search begun with the same.
+
+    Raises ModelError when there is none, or when it belongs to other data, settings or model.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            content = json.loads(str(archive["json"]))
+            if content["format"] != FORMAT:
+                raise ModelError(
+                    f"{path}: a checkpoint of another version of this program; start anew"
+                )
+            found = differences(content["begun with"], begun_with)
+            if found:
+                raise ModelError(
+                    f"{path}: this checkpoint belongs to another identification:\n  "
+                    + "\n  ".join(found)
+                    + "\n  Continue it with what it was begun with, or start anew."
+                )
+            state: State = _unpacked(content["state"], archive)
+            return state
+    except FileNotFoundError:
+        raise ModelError(f"{path}: there is no checkpoint to continue from") from None
+    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
+        if isinstance(error, ModelError):
+            raise
+        raise ModelError(f"{path}: not a checkpoint of a search: {error}") from None
+
+
+def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[str]:
+    """What differs between two origins, in words."""
+    found = []
+    if there["model"]["name"] != here["model"]["name"]:
+        return [f"it searches model {there['model']['name']}, this is {here['model']['name']}"]
+    for what in ("equations", "signals and parameters"):
+        if there["model"].get(what) != here["model"].get(what):
+            found.append(f"the {what} of model {here['model']['name']} have changed")
+    if len(there["records"]) != len(here["records"]):
+        found.append(f"it has {len(there['records'])} record(s), here are {len(here['records'])}")
+    for k, (old, new) in enumerate(zip(there["records"], here["records"], strict=False), 1):
+        names = old["name"] if old["name"] == new["name"] else f"{old['name']}, {new['name']} here"
+        for what in ("samples", "sample time"):
+            if old[what] != new[what]:
+                found.append(f"record {k} ({names}): {what} {old[what]:g}, here {new[what]:g}")
+                break
+        else:
+            if old["values"] != new["values"]:
+                found.append(f"record {k} ({names}) has other values")
+    for key in sorted({*there["settings"], *here["settings"]}):
+        was, now = there["settings"].get(key), here["settings"].get(key)
+        if was != now:
+            found.append(f"{key} is {was}, here {now}")
+    return found
+
+
+def _hash(*parts: bytes) -> str:
+    key = hashlib.sha256()
+    for part in parts:
+        key.update(part)
+    return key.hexdigest()
+
+
+def _number(value: Any) -> float:
+    """Numbers of other libraries as JSON's."""
+    return float(value)
+
+
+def _packed(value: Any, arrays: dict[str, Any]) -> Any:
+    """A value as JSON knows it, its arrays put aside."""
+    if isinstance(value, np.ndarray):
+        name = f"array{len(arrays)}"
+        arrays[name] = value
+        return {"array": name}
+    if isinstance(value, dict):
+        return {"dict": {key: _packed(item, arrays) for key, item in value.items()}}
+    if isinstance(value, list | tuple):
+        kind = type(value).__name__
+        return {kind: [_packed(item, arrays) for item in value]}
+    return value.item() if isinstance(value, np.generic) else value
+
+
+_SEQUENCES: dict[str, Callable[[list[Any]], Any]] = {"list": list, "tuple": tuple}
+
+
+def _unpacked(value: Any, archive: Mapping[str, Any]) -> Any:
+    if not isinstance(value, dict):
+        return value
+    ((kind, content),) = value.items()
+    if kind == "array":
+        return np.array(archive[content])
+    if kind == "dict":
+        return {key: _unpacked(item, archive) for key, item in content.items()}
+    return _SEQUENCES[kind]([_unpacked(item, archive) for item in content])
