@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sysid._lanes import LANES
+from sysid.constrained import Constraints, shortened
 from sysid.model import BoolArray, FloatArray
 from sysid.objective import Objective
 
@@ -128,7 +129,7 @@ def _candidates(
     lower: FloatArray,
     upper: FloatArray,
 ) -> tuple[FloatArray, float]:
-    """Damped Gauss-Newton steps clipped to the ranges, one for each damping, (LANES, n_free).
+    """Damped Gauss-Newton steps within ranges and constraints, a row for each damping.
 
     And the part of the error that the longest of them would take away, were all linear.
     """
@@ -149,9 +150,16 @@ def _candidates(
         values = np.maximum(values, 0.0)
         projected = vectors.T @ gradient[free]
         damping = _DAMPING * max(values.max(), 1e-300)
-        moves[:, free] = -(projected / (values + damping[:, None])) @ vectors.T
-        promise = float(np.sum(projected**2 / (values + damping[-1])) / (2.0 * right @ right))
-    return np.clip(at + moves * width, lower, upper), promise
+        steps = -(projected / (values + damping[:, None])) @ vectors.T
+        limits = Constraints.at(objective.space, at, width).among(free)
+        for step, extra in zip(steps, damping, strict=True):
+            step[:] = limits.nearest(step, (vectors / (values + extra)) @ vectors.T)
+        moves[:, free] = steps
+        longest = steps[-1]
+        less = -2.0 * gradient[free] @ longest - longest @ normal @ longest
+        promise = float(less / (2.0 * right @ right))
+    reached = np.clip(at + moves * width, lower, upper)
+    return shortened(objective.space, at, reached), promise
 
 
 def _feasible(objective: Objective, candidates: FloatArray) -> BoolArray:
