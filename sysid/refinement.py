@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sysid.constrained import Constraints
 from sysid.model import BoolArray, FloatArray
 from sysid.objective import Objective
 
@@ -39,7 +40,6 @@ ROUNDING = 1e-12  # errors below it are those of the arithmetic
 # After moves of more than this part of a range the integration steps are chosen anew.
 _FAR = 0.05
 _NEAR = 1e-3  # for the last time
-_SIDEWAYS = 1e6  # how much stiffer a violated constraint makes the way across it
 _RETREAT, _RETREATS = 0.4, 6
 _HOLDING_ROUNDS = 4
 _BATCH_BYTES = 2**28  # residuals held at once, unless one descent needs more
@@ -189,13 +189,6 @@ class _Frame:
         distance = np.where(descent.at + h * self.width > self.upper, -h, h)
         return np.vstack([descent.at, descent.at + np.diag(distance * self.width)]), distance
 
-    def constraints(self, rows: FloatArray) -> FloatArray:
-        """Values g(p) of the model's constraints, (n, n_constraints); above 0 is violated."""
-        space = self.objective.space
-        columns = tuple(space.full(space.decode(rows)).T)
-        values = [np.broadcast_to(c.function(columns), len(rows)) for c in space.model.constraints]
-        return np.array(values).reshape(len(values), len(rows)).T
-
     def infeasible(self, rows: FloatArray) -> BoolArray:
         """Which rows violate a constraint or a physical limit."""
         space = self.objective.space
@@ -330,8 +323,9 @@ def _candidates(
     moves = _steps(hessian, gradient, damping[:, None] * scale, low, high)
     bad = frame.infeasible(descent.at + moves * frame.width)
     if bad.any() and frame.objective.space.model.constraints:
-        stiff = hessian + _across(frame, descent, moves[bad], scale.max())
-        moves[bad] = _steps(stiff, gradient, damping[bad, None] * scale, low, high)
+        limits = Constraints.at(frame.objective.space, descent.at, frame.width)
+        for i in np.flatnonzero(bad):
+            moves[i] = _within(limits, moves[i], hessian + np.diag(damping[i] * scale), low, high)
     for _ in range(_RETREATS):
         if not bad.any():
             break
@@ -395,15 +389,15 @@ def _steps(
     return np.where(np.isfinite(moves), moves, 0.0)
 
 
-def _across(frame: _Frame, descent: Descent, moves: FloatArray, size: float) -> FloatArray:
-    """What makes steps across the constraints that ``moves`` violate expensive, (n, n)."""
-    ends = frame.constraints(descent.at + moves * frame.width)
-    violated = np.any(ends > 0.0, axis=0)
-    around, distance = frame.perturbed(descent)
-    values = frame.constraints(around)[:, violated]
-    normals = (values[1:] - values[0]) / distance[:, None]
-    lengths = np.linalg.norm(normals, axis=0)
-    good = np.isfinite(lengths) & (lengths > 0.0)
-    unit = normals[:, good] / lengths[good]
-    stiffness: FloatArray = _SIDEWAYS * size * (unit @ unit.T)
-    return stiffness
+def _within(
+    limits: Constraints, move: FloatArray, curvature: FloatArray, low: FloatArray,
+    high: FloatArray,
+) -> FloatArray:  # fmt: skip
+    """A move that slides along the constraints it would cross, bounds kept."""
+    free = np.flatnonzero((move > low) & (move < high))
+    held = np.setdiff1d(np.arange(len(move)), free)
+    rest = Constraints(limits.value + limits.slope[:, held] @ move[held], limits.slope)
+    inverse: FloatArray = np.linalg.inv(curvature[np.ix_(free, free)]).astype(np.float64)
+    slid = move.copy()
+    slid[free] = rest.among(free).nearest(move[free], inverse)
+    return np.clip(slid, low, high)

@@ -253,12 +253,19 @@ class SearchSpace:
             parameter, values = self.model.parameters[tie.index], columns[tie.index]
             outside = np.maximum(parameter.minimum - values, values - parameter.maximum)
             rows.append(np.maximum(0.0, outside)[:, None])
-        for constraint in self.model.constraints:
-            values = np.broadcast_to(constraint.function(columns), (len(chromosomes),))
-            rows.append(np.maximum(0.0, values)[:, None])
+        rows.append(np.maximum(0.0, self.constraint_values(chromosomes)))
         violations = np.concatenate(rows, axis=1)
         # Not-a-number is no proof of feasibility.
         return np.where(np.isnan(violations), np.inf, violations)
+
+    def constraint_values(self, chromosomes: FloatArray) -> FloatArray:
+        """The model's constraints g, satisfied where not above 0, (n_chromosomes, n)."""
+        vectors = self.full(chromosomes)
+        columns = tuple(vectors[:, i] for i in range(vectors.shape[1]))
+        values = np.zeros((len(chromosomes), len(self.model.constraints)))
+        for i, constraint in enumerate(self.model.constraints):
+            values[:, i] = constraint.function(columns)
+        return values
 
 
 def _check_conflicts(*groups: Mapping[str, object]) -> None:

@@ -27,7 +27,8 @@ _ARRIVED = 3e-4  # part of the error that an iteration gains less than where a d
 # Iterations that simulations are kept for, of the last descent, from the best; and its most. It
 # runs to its end even where the budget was too small for it: only a minimum means anything.
 _POLISHING, _MOST_ITERATIONS = 15, 50
-_SAME = 1e-3  # part of an error by which minima differ, or they are one
+_SAME = 1e-3  # part by which an output's error differs between minima, or they are one
+_NEAR = 0.02  # descents that may come so close to the best, in parts of its error, go on
 _BEFORE_GIVING_UP = 2  # iterations
 _MOST_POINTS, _FEWEST_POINTS = 16, 4  # along each parameter's range
 _FAR = (0.15, 0.45)  # parts of a range by which parameters move along their valleys
@@ -37,10 +38,14 @@ _ITERATIONS_EACH = 12  # what a descent from a first start may be expected to ta
 
 @dataclass(frozen=True)
 class Minimum:
-    """Where a descent ended: search coordinates (n_free,), error, how often it has been varied."""
+    """Where a descent ended: search coordinates (n_free,), error, how often it has been varied.
+
+    rms: (n_outputs,), each output's error.
+    """
 
     at: FloatArray
     error: float
+    rms: FloatArray
     varied: int = 0
 
 
@@ -103,14 +108,11 @@ class LocalSearch:
         """Whether the best has been polished."""
         return self.polished
 
-    def rivals(self, share: float, most: int) -> list[FloatArray]:
-        """Minima in search coordinates (n_free,) whose error is within a share of the best's.
-
-        The best stands first; at most so many.
-        """
-        near = [m for m in self.minima if m.error <= (1.0 + share) * self.error]
+    def rivals(self, most: int) -> list[FloatArray]:
+        """The best in search coordinates (n_free,), then other minima hardly worse; so many."""
+        near = [m for m in self.minima if m.error <= (1.0 + _NEAR) * self.error]
         near.sort(key=lambda minimum: minimum.error)
-        others = [m.at for m in near if m.error > (1.0 + _SAME) * self.error]
+        others = [m.at for m in near if not np.array_equal(m.at, self.best)]
         return [self.best, *others][:most]
 
     def step(self) -> None:
@@ -162,12 +164,12 @@ class LocalSearch:
             # What remains to be smoothed matters to the last digits only.
             ended = descent.finished or descent.iterations >= _MOST_ITERATIONS
             if ended or descent.smoothing > 0:
-                if np.isfinite(descent.error) and not self._known(descent):
-                    self.minima.append(Minimum(descent.at, descent.error))
+                if np.isfinite(descent.error):
+                    self._add(descent.at, descent.error)
             elif not self._hopeless(descent):
                 self.descents.append(descent)
         if not (self.descents or self.minima):
-            self.minima = [Minimum(self.best, self.error)]
+            self._add(self.best, self.error)
 
     def _take(self, descent: Descent) -> None:
         feasible = self._feasible(descent.at)
@@ -178,16 +180,21 @@ class LocalSearch:
         space = self.objective.space
         return space.feasible(space.decode(at))
 
-    def _known(self, descent: Descent) -> bool:
-        """Whether a descent ended where another has; flat directions tell nothing."""
-        return any(abs(descent.error - m.error) <= _SAME * m.error for m in self.minima)
+    def _add(self, at: FloatArray, error: float) -> None:
+        """One minimum more, unless the outputs err as in another; flat directions tell nothing."""
+        rms = self.objective.rms(self.objective.space.decode(at[None]))[0]
+        for known in self.minima:
+            if np.allclose(rms, known.rms, rtol=_SAME, atol=_SAME * error):
+                return
+        self.minima.append(Minimum(at, error, rms))
 
     def _hopeless(self, descent: Descent) -> bool:
-        if descent.error <= (1.0 + _SAME) * self.error or descent.iterations < _BEFORE_GIVING_UP:
+        enough = (1.0 + _NEAR) * self.error
+        if descent.error <= enough or descent.iterations < _BEFORE_GIVING_UP:
             return False
         if descent.failures == 1:
             return False  # about to try again with more damping
-        return descent.error * (1.0 - descent.gain) ** _HORIZON > self.error
+        return descent.error * (1.0 - descent.gain) ** _HORIZON > enough
 
     def _vary(self) -> None:
         """New starts around the best of the minima that have been varied least."""

@@ -16,7 +16,7 @@ from sysid.simulation import Status
 from sysid.space import SearchSpace
 
 # Minima of the mean RMSE so close to the best are left for the likelihood to tell apart.
-_RIVAL, _MOST_RIVALS = 0.05, 4
+_MOST_RIVALS = 6
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class Run:
         if local is None:
             return [best.chromosome]
         space = self.objective.space
-        return [space.decode(at) for at in local.rivals(_RIVAL, _MOST_RIVALS)]
+        return [space.decode(at) for at in local.rivals(_MOST_RIVALS)]
 
     def step(self) -> None:
         """The next generation, or the next step of the local refinement."""

@@ -156,6 +156,9 @@ class Formula:
     def steps_needed(self, vectors, record):
         return 1
 
+    def steps_of_each(self, vectors, record):
+        return np.ones(len(vectors), dtype=int)
+
     def trajectories(self, vectors, record, n_steps=None, starts=None):
         names = self.model.parameter_names
         return np.stack(

@@ -230,3 +230,31 @@ def test_an_output_that_lost_most_of_its_samples_counts_as_the_error_counts_it()
     exact = minimize_scalar(error, bounds=(0.5, 2.0), method="bounded", options={"xatol": 1e-9})
     found = refine(target, np.array([2.0]), tolerance=1e-12).chromosome[0]
     assert found == pytest.approx(exact.x, abs=1e-5)
+
+
+# --- constraints ----------------------------------------------------------------------------
+
+
+def ordered(p):
+    """tau >= 0.03 gain: active where the lag that fits best has a smaller tau."""
+    return 0.03 * p[0] - p[1]
+
+
+@pytest.mark.parametrize("start", [(1.0, 0.0301), (4.0, 0.4), (0.5, 0.05)])
+def test_it_slides_along_a_constraint_to_the_best_point_on_it(start):
+    rng = np.random.default_rng(0)
+    inputs = np.repeat(rng.uniform(-1.0, 1.0, 20), 10)[:, None]
+    truth = np.array([[2.0, 0.04]])
+    model = lag(constraints=(Constraint("tau >= 0.03 gain", ordered),))
+    blank = Dataset(inputs, np.full((200, 1), np.nan), 0.01)
+    clean = BatchSimulator(model, accuracy=1e-6).trajectories(truth, blank)[0]
+    target = objective(model, [Dataset(inputs, clean, 0.01)])
+    # On the boundary the gain is all there is to choose.
+    best = minimize_scalar(
+        lambda gain: float(target.evaluate(np.array([[gain, 0.03 * gain]]))[0][0]),
+        bounds=(1.0, 3.0), method="bounded", options={"xatol": 1e-9},
+    )  # fmt: skip
+    found = refine(target, np.array(start))
+    assert found.error == pytest.approx(best.fun, rel=1e-4)
+    assert found.chromosome == pytest.approx([best.x, 0.03 * best.x], rel=1e-3)
+    assert not np.any(target.space.violations(found.chromosome[None]) > 0.0)
