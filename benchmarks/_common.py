@@ -57,18 +57,24 @@ def timed(function: Callable[[], Any]) -> tuple[float, Any]:
     return time.perf_counter() - start, result
 
 
-def simulated_logs(model: ProcessModel, seed: int | None = None) -> tuple[Dataset, Dataset]:
+def simulated_logs(
+    model: ProcessModel, seed: int | None = None, **plant: Any
+) -> tuple[Dataset, Dataset]:
     """Training and validation record of the shipped experiment on the simulated rig.
 
-    seed: of the rig's noise and offsets, default its own.
+    seed: of the rig's noise and offsets, default its own. plant: parts other than the rig's own,
+    such as friction="cyclic".
     """
     loaded = load_experiment("prbs.yaml")
     validation = loaded.validation()
     assert validation is not None
     rig, device = load_rig("simulated.yaml")
-    if seed is not None:
-        assert isinstance(device, SimulatedDevice)
-        device = SimulatedDevice(device.options.model_copy(update={"seed": seed}))
+    assert isinstance(device, SimulatedDevice)
+    own = device.options
+    changes = {"seed": own.seed if seed is None else seed}
+    device = SimulatedDevice(
+        own.model_copy(update=changes | {"plant": own.plant.model_copy(update=plant)})
+    )
     with tempfile.TemporaryDirectory() as folder:
         records = []
         for item in (loaded, validation):

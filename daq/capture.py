@@ -97,7 +97,7 @@ class Recording:
             samples = int(found.get("samples", 1))
             if not (math.isfinite(deviation) and deviation >= 0.0 and samples > 0):
                 raise ValueError
-        except (AttributeError, TypeError, ValueError):
+        except (AttributeError, OverflowError, TypeError, ValueError):
             raise ConfigError(
                 f"{self.log.path.parent / RUN_NAME}: 'calibration' must hold 'samples' and, for "
                 f"{channel}, a 'noise' of 0 or more; delete it to go without"

@@ -4,7 +4,10 @@ States: armature current and speed. Inputs: terminal voltage, held between sampl
 converter holds it, and load torque, interpolated because it changes smoothly.
 """
 
-from sysid import Input, Output, Parameter, ProcessModel, State
+import numpy as np
+
+from sysid import Guess, Input, Output, Parameter, ProcessModel, State
+from sysid.guessing import regression
 
 
 def derivative(x, u, p):
@@ -15,6 +18,32 @@ def derivative(x, u, p):
         (voltage - resistance * current - constant * omega) / inductance,
         (constant * current - damping * omega - load) / inertia,
     )
+
+
+def guesses(records, known):
+    """Resistance and motor constant from voltage = R current + K omega, the inductance settled.
+
+    An output stands before its row's voltage is applied, so it goes with the voltage of the row
+    before. Asked for with ``rig identify --guess``.
+    """
+    voltage, current, omega = (
+        np.concatenate([r[name][begin : r.record.n_samples - 1 + begin] for r in records])
+        for name, begin in (("voltage", 0), ("current", 1), ("omega", 1))
+    )
+    fitted = regression(voltage, [current, omega])
+    if fitted is None:
+        return {}
+    values, covariance = fitted
+    # The winding has not quite settled where the voltage has just changed: a tenth either way.
+    spread = 3.0 * np.sqrt(np.diag(covariance)) + 0.1 * np.abs(values)
+    names = ", ".join(r.name for r in records)
+    return {
+        name: Guess(
+            max(value - off, 0.0), value + off, f"voltage over current and speed in {names}"
+        )
+        for name, value, off in zip(("resistance", "constant"), values, spread, strict=True)
+        if value > 0.0
+    }
 
 
 def around(value, factor):
@@ -35,4 +64,5 @@ model = ProcessModel(
         Parameter("constant", "N*m/A", **around(2.38e-2, 10.0)),
     ),
     derivative=derivative,
+    guesses=guesses,
 )

@@ -14,6 +14,7 @@ from typing import Any
 from sim_rig import electrical, loads, values
 from sim_rig import friction as frictions
 from sim_rig import hysteresis as hystereses
+from sim_rig.guesses import guesses
 from sim_rig.options import (
     BrakeDriver,
     Exponent,
@@ -118,6 +119,7 @@ def actuator(
         derivative=_derivative(parts, layout, shaft),
         output=_output(outputs, shaft) if "torque" in outputs else None,
         constraints=_constraints(parts, layout),
+        guesses=guesses(driver_motor, driver_brake, load, friction),
     )
     known_here = values.named(parameters, driver_motor, driver_brake, hysteresis, exponent)
     changes = {k: {"nominal": v} for k, v in known_here.items() if k in model.parameter_names}

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 from sysid.campaigns import Campaign, Outcome, Run, Spread, campaign, combinations
 from sysid.comparison import Candidate, Comparison, compare
 from sysid.data import Dataset, output_scale
+from sysid.guessing import Guess, guess_ranges
 from sysid.linearization import LinearModel, equilibrium, jacobian, linearize
 from sysid.metrics import Metrics, evaluate, fit_percent, msd, rmse
 from sysid.model import (
@@ -38,6 +39,7 @@ __all__ = [
     "Comparison",
     "Constraint",
     "Dataset",
+    "Guess",
     "Input",
     "LinearModel",
     "Metrics",
@@ -59,6 +61,7 @@ __all__ = [
     "evaluate",
     "fit_percent",
     "free_run",
+    "guess_ranges",
     "jacobian",
     "linearize",
     "msd",

@@ -142,6 +142,7 @@ class ProcessModel:
     ``derivative(x, u, p)`` takes tuples of floats in the declared order and returns dx/dt as a
     tuple; it may use ``math`` and helper functions of its own. ``output(x, u, p)`` likewise
     returns the outputs; without it each output is the state of the same name.
+    ``guesses(records, known)`` reads starting ranges from data, see ``sysid.guessing``.
 
     Raises ModelError when names repeat, an output has no state, or a function returns the
     wrong number of values at the nominal parameters.
@@ -156,6 +157,7 @@ class ProcessModel:
     output: Function | None = None
     constraints: tuple[Constraint, ...] = ()
     description: str = ""
+    guesses: Callable[[Any, Any], Mapping[str, Any]] | None = None
     _output_states: tuple[int, ...] | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:

@@ -134,6 +134,15 @@ def identify(
             help="Trace how the fit worsens as this one moves; may be repeated.",
         ),
     ] = None,
+    guess: Annotated[
+        bool, typer.Option("--guess", help="Starting ranges from the logs, where none are given.")
+    ] = False,
+    datasheet: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--datasheet", metavar="FILE.yaml", help="Data-sheet values; may be repeated."
+        ),
+    ] = None,
     settings: Annotated[
         list[str] | None,
         typer.Option(
@@ -160,6 +169,8 @@ def identify(
         "generations": generations,
         "seed": seed,
         "hold_back": hold_back,
+        "guess": guess or None,
+        "datasheet": datasheet,
         "profile": profile,
     }
     baselines = [name for name, asked in (("ARX", arx), ("ARMAX", armax)) if asked]

@@ -128,7 +128,7 @@ def check_mapping(model: ProcessModel, mapping: Mapping, spare: dict[str, tuple[
         ("outputs", mapping.columns.outputs, [(s.name, s.unit) for s in model.outputs]),
     ):
         for name, unit in signals:
-            _factor(mapping, ("columns", group, name, "unit"), given[name].unit, unit)
+            unit_factor(mapping.file, ("columns", group, name, "unit"), given[name].unit, unit)
 
 
 def _from_log(log: Log, model: ProcessModel, title: str) -> Dataset:
@@ -167,7 +167,7 @@ def _load_foreign(path: Path, model: ProcessModel, mapping: Mapping) -> Loaded:
 
     def values(signal: Input | Output, group: str, source: Column) -> FloatArray:
         key = ("columns", group, signal.name, "unit")
-        factor = source.sign * _factor(mapping, key, source.unit, signal.unit)
+        factor = source.sign * unit_factor(mapping.file, key, source.unit, signal.unit)
         if source.column is None:
             assert source.constant is not None
             return np.full(len(frame), source.constant * factor)
@@ -193,7 +193,7 @@ def _foreign_time(table: Table, mapping: Mapping) -> tuple[IntArray, float]:
     if time.column is None:
         assert time.sample_rate is not None
         return np.arange(len(table.frame), dtype=np.int64), 1.0 / time.sample_rate
-    seconds = _factor(mapping, ("columns", "time", "unit"), time.unit, "s")
+    seconds = unit_factor(mapping.file, ("columns", "time", "unit"), time.unit, "s")
     values = table.frame[time.column].to_numpy() * seconds
     return time_base(table.path, values, first_line=table.first_line)
 
@@ -222,7 +222,7 @@ def _dataset(
     return Dataset(inputs[np.maximum.accumulate(latest)], whole, dt, name)
 
 
-def _factor(mapping: Mapping, key: tuple[str, ...], unit: str | None, wanted: str) -> float:
+def unit_factor(file: YamlFile, key: tuple[str, ...], unit: str | None, wanted: str) -> float:
     """Factor from a unit in the file to the model's unit."""
     if unit is None or unit == wanted:
         return 1.0
@@ -233,14 +233,14 @@ def _factor(mapping: Mapping, key: tuple[str, ...], unit: str | None, wanted: st
         given, model = (registry.Quantity(1.0, _spelt(u)) for u in (unit, wanted))
         factor = float(given.to(model.units).magnitude)
     except pint.DimensionalityError:
-        raise mapping.file.error(key, f"{unit!r} does not convert to {wanted!r}") from None
+        raise file.error(key, f"{unit!r} does not convert to {wanted!r}") from None
     except Exception:
-        raise mapping.file.error(
+        raise file.error(
             key, f"unit {unit!r} is not understood; write it as in 'mm/s' or 'N*m'"
         ) from None
     if _angles(given) != _angles(model):
         # A number per minute may count turns or radians, and so may hertz.
-        raise mapping.file.error(
+        raise file.error(
             key,
             f"{unit!r} does not say whether it counts turns or radians, as {wanted!r} of the model "
             "does, or the other way round; write 'rpm', 'turn/s', 'deg' or 'rad/s'",

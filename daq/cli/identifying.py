@@ -14,7 +14,7 @@ from typing import Any
 import yaml
 
 from daq import capture
-from daq.cli import console, datasets, reporting
+from daq.cli import console, datasets, datasheets, reporting
 from daq.cli.datasets import Loaded, Mapping
 from daq.cli.modelling import DEFAULT_MODEL, find_model, whole_name
 from daq.cli.reporting import Identified
@@ -106,14 +106,19 @@ def prepare_models(
             n for model, _ in found for n in (*model.output_names, *model.state_names)
         ),
     }
+    sheets = [datasheets.load(path) for path in _datasheets(config, file, settings)]
+    datasheets.check_names(sheets, models)
     prepared = []
     for (_, name), model in zip(found, models, strict=True):
-        own = _own_settings(settings, model)
+        own, sources = datasheets.under(_own_settings(settings, model), sheets, model)
         _check_space(file, own, model)
         if mapping is not None:
             datasets.check_mapping(model, mapping, spare)
         used = _with_starts(file, own, model)
-        prepared.append(Prepared(used, name, own, mapping, _range_sources(file)))
+        if own.guess and model.guesses is None:
+            raise file.error(("guess",), f"model {model.name} has no 'guesses' function that "
+                             "reads ranges from logs; leave this out")  # fmt: skip
+        prepared.append(Prepared(used, name, own, mapping, sources | _range_sources(file)))
     return prepared
 
 
@@ -132,6 +137,7 @@ def gassi_settings(settings: IdentificationConfig) -> dict[str, Any]:
         "fixed": settings.fixed,
         "tied": settings.tied,
         "scale": settings.scale,
+        "guess": settings.guess,
         "elite_percent": settings.elite_percent,
         "weights": settings.weights or None,
         "per_log": settings.per_log,
@@ -179,6 +185,14 @@ def _with_starts(file: YamlFile, signals: Signals, model: ProcessModel) -> Proce
         return model.with_holds(signals.hold)
     except ModelError as error:
         raise file.error(("hold",), str(error)) from None
+
+
+def _datasheets(
+    config: Path | None, file: CommandLine, settings: IdentificationConfig
+) -> list[Path]:
+    """Typed names are relative to where they are typed, those in a file to that file."""
+    beside = config.parent if config is not None and "datasheet" not in file.typed else Path()
+    return [beside / name for name in settings.datasheet]
 
 
 def _range_sources(file: CommandLine) -> dict[str, str]:
@@ -351,7 +365,7 @@ def assemble(
         model=prepared.model,
         model_name=prepared.model_name,
         settings=prepared.settings,
-        sources=prepared.sources,
+        sources={n: g.source for n, g in estimator.guesses_.items()} | dict(prepared.sources),
         columns_file=Path(prepared.mapping.file.path) if prepared.mapping is not None else None,
         estimator=estimator,
         uncertainty=estimator.uncertainty(records) if refined else None,

@@ -227,6 +227,8 @@ def show(result: Identified, path: Path) -> None:
     """Tables and sentences on standard output."""
     console.print_line()
     _show_parameters(result)
+    for name, guess in result.estimator.guesses_.items():
+        console.print_line(f"{name} searched as the data suggest: {guess.source}.")
     if result.uncertainty is not None:
         _show_open_questions(result.uncertainty)
     _show_profiles(result.profiles)
@@ -258,7 +260,7 @@ def _show_parameters(result: Identified) -> None:
 def _parameter_row(result: Identified, parameter: Parameter) -> list[str]:
     name, space = parameter.name, result.estimator.space_
     value, unit = result.estimator.parameters_[name], parameter.unit
-    source = result.source(name)
+    source = "data" if name in result.estimator.guesses_ else result.source(name)
     if name not in space.names:
         how = f"= {result.settings.tied[name]}" if name in result.settings.tied else "fixed"
         return [name, console.number(value), "", unit, how, source, ""]

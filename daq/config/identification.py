@@ -39,6 +39,10 @@ def _is_number(value: Any) -> bool:
 StartSetting = Annotated[Any, BeforeValidator(_start)]
 
 
+def _several(value: Any) -> Any:
+    return [value] if isinstance(value, str) else value
+
+
 class TimeColumn(Section):
     """The column that holds time, or the rate of the rows in a file without one."""
 
@@ -115,6 +119,12 @@ class IdentificationConfig(Signals):
     fixed: dict[str, float] = Field(default_factory=dict, description="parameters not searched")
     tied: dict[str, str] = Field(
         default_factory=dict, description="multiples of other parameters, as '0.5 * R_m'"
+    )
+    datasheet: Annotated[list[str], BeforeValidator(_several)] = Field(
+        default_factory=list, description="files with data-sheet values; see docs"
+    )
+    guess: bool = Field(
+        False, description="ranges from the logs themselves, where nothing else is said"
     )
     scale: dict[str, Literal["log", "linear"]] = Field(
         default_factory=dict, description="scales to search on in place of the model's"

@@ -14,6 +14,7 @@ from sysid.data import Dataset
 from sysid.gassi.checkpoint import Checkpoint, load, origin
 from sysid.gassi.running import Best, Run
 from sysid.gassi.search import PRESETS, GeneticSearch, Preset, PresetName
+from sysid.guessing import Guess, guess_ranges
 from sysid.metrics import fit_percent
 from sysid.model import FloatArray, ModelError, ProcessModel, Scale
 from sysid.objective import Balance, Objective
@@ -60,6 +61,8 @@ class GASSI(RecordEstimator):
         be None: then the other is a bound, and this one only where the search starts.
     fixed : {name: value}, parameters not searched.
     tied : {name: "0.5 * other"}, parameters that are multiples of others.
+    guess : narrow the ranges of parameters of which nothing is said by what the records tell,
+        with the model's ``guesses`` function.
     scale : {name: "log" or "linear"}, scales to search on in place of the model's.
     elite_percent : share of the population replaced by the elite, r_elite.
     minimum_generations, termination_ratio : i_min and r_termination of (4.11).
@@ -81,6 +84,7 @@ class GASSI(RecordEstimator):
     vector_ : (n_parameters,), the same in the model's order.
     chromosome_ : (n_free,), the free ones in ``space_.names`` order.
     initial_states_ : for each record a dict of the initial states that were estimated.
+    guesses_ : {name: Guess} of the ranges that were read from the records.
     space_ : SearchSpace that was searched; estimated initial states stand behind the parameters.
     output_weights_ : (n_outputs,), what the outputs counted in the end.
     error_ : mean over outputs of the RMSE normalised by max|y| (see ``Objective``).
@@ -104,6 +108,7 @@ class GASSI(RecordEstimator):
         fixed: Mapping[str, float] | None = None,
         tied: Mapping[str, str] | None = None,
         scale: Mapping[str, Scale] | None = None,
+        guess: bool = False,
         elite_percent: float = 0.5,
         minimum_generations: int = 0,
         termination_ratio: float = 0.0,
@@ -125,6 +130,7 @@ class GASSI(RecordEstimator):
         self.fixed = fixed
         self.tied = tied
         self.scale = scale
+        self.guess = guess
         self.elite_percent = elite_percent
         self.minimum_generations = minimum_generations
         self.termination_ratio = termination_ratio
@@ -172,8 +178,17 @@ class GASSI(RecordEstimator):
         preset = PRESETS.get(self.preset)
         if preset is None:
             raise ModelError(f"unknown preset {self.preset!r}; choose from {', '.join(PRESETS)}")
+        self.guesses_: dict[str, Guess] = {}
+        if self.guess:
+            self.guesses_ = guess_ranges(model, data, self.ranges, self.fixed, self.tied)
+        guessed = {name: (guess.low, guess.high) for name, guess in self.guesses_.items()}
         self.space_ = SearchSpace.of(
-            model, self.ranges, self.fixed, preset.log_scale, tied=self.tied, scale=self.scale
+            model,
+            {**guessed, **(self.ranges or {})},
+            self.fixed,
+            preset.log_scale,
+            tied=self.tied,
+            scale=self.scale,
         )
         objective = self._objective(data)
         self.output_weights_: FloatArray = objective.weights

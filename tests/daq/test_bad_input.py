@@ -91,6 +91,11 @@ def settings(name, text, *said, args=()):
     return Case(name, command, list(said), {"id.yaml": text})
 
 
+def datasheet(name, text, *said):
+    command = ["identify", "log.csv", "--datasheet", "sheet.yaml"]
+    return Case(name, command, list(said), {"sheet.yaml": text})
+
+
 def log(name, text, *said):
     return Case(name, ["identify", "log.csv"], list(said), {"log.csv": text})
 
@@ -210,6 +215,35 @@ CASES = [
              "id.yaml:4:3: ranges.K_n: model actuator has no such name; did you mean"),
     settings("an infinite range", IDENTIFICATION.replace("0.2]", ".inf]"),
              "id.yaml:4:14: ranges.K_m.1: expected a finite number, found .inf"),
+    settings("a guess from a model that cannot", COLUMNS + "guess: true\n",
+             "id.yaml:8:1: guess: model lag has no 'guesses' function"),
+    Case("a missing data sheet", ["identify", "log.csv", "--datasheet", "absent.yaml"],
+         ["absent.yaml: there is no such file"]),
+    datasheet("an unknown parameter in a data sheet", "R_n: {value: 1, tolerance: 5}\n",
+              "sheet.yaml:1:1: R_n: model actuator has no such parameter; did you mean 'R_m'?"),
+    datasheet("a value without tolerance", "R_m: {value: 1.18}\n",
+              "sheet.yaml:1:1: R_m: say how exact the value is: 'tolerance: 10 %', or 'fixed"),
+    datasheet("a value and a range", "R_m: {value: 1.18, range: [1, 2]}\n",
+              "sheet.yaml:1:1: R_m: give either 'value' or 'range'"),
+    datasheet("a fixed range", "R_m: {range: [1, 2], fixed: true}\n",
+              "sheet.yaml:1:1: R_m: a range has no tolerance and cannot be fixed"),
+    datasheet("a tolerance of nothing", "R_m: {value: 1.18, tolerance: 0 %}\n",
+              "sheet.yaml:1:20: R_m.tolerance: it must be above 0"),
+    datasheet("a tolerance in words", "R_m: {value: 1.18, tolerance: small}\n",
+              "sheet.yaml:1:20: R_m.tolerance: expected a number, found 'small'"),
+    datasheet("a misspelt key of a data sheet", "R_m: {valu: 1.18, tolerance: 5 %}\n",
+              "sheet.yaml:1:7: R_m.valu: unknown key; did you mean 'value'?"),
+    datasheet("a unit of another kind in a data sheet", "R_m: {value: 1, fixed: yes, unit: mH}\n",
+              "sheet.yaml:1:29: R_m.unit: 'mH' does not convert to 'ohm'"),
+    datasheet("a physically impossible data sheet", "R_m: {range: [-1, 2]}\n",
+              "sheet.yaml:1:1: R_m: parameter R_m: range [-1, 2] leaves what is physically"),
+    datasheet("a number for an entry", "R_m: 1.18\n",
+              "sheet.yaml:1:1: R_m: expected 'key: value' lines, found 1.18"),
+    Case("the same in two data sheets", ["identify", "log.csv", "--datasheet", "sheet.yaml",
+                                         "--datasheet", "other.yaml"],
+         ["other.yaml:1:1: R_m: also in sheet.yaml:1:1; keep one"],
+         {"sheet.yaml": "R_m: {value: 1, fixed: true}\n",
+          "other.yaml": "R_m: {value: 2, fixed: true}\n"}),
     settings("a balance that is none", "balance: runs\n",
              "id.yaml:1:1: balance: it must be 'samples' or 'logs', found 'runs'"),
     settings("all held back", "hold_back: 1\n",

@@ -342,6 +342,36 @@ def test_the_end_of_each_log_is_held_back(captured, tmp_path):
     assert values[0] == values[1]
 
 
+def test_ranges_from_a_data_sheet_and_from_the_log(captured, tmp_path):
+    root, folder = captured
+    (tmp_path / "motor.yaml").write_text(
+        "R_m: {value: 1.18, tolerance: 10 %, source: S23 data sheet}\n"
+        "L_m: {value: 1.18, unit: mH, fixed: true}\n"
+        "R_b: {range: [100, 150]}\n"
+    )
+    (tmp_path / "id.yaml").write_text(
+        "population: 20\ngenerations: 2\ndatasheet: motor.yaml\nfixed: {R_b: 126}\n"
+    )
+    out = tmp_path / "out"
+    result = rig("identify", folder, "--config", tmp_path / "id.yaml", "--guess", "--out", out,
+                 cwd=root)  # fmt: skip
+    assert result.returncode == 0, result.stderr
+    found = yaml.safe_load((out / "parameters.yaml").read_text())["parameters"]
+    sheet = tmp_path / "motor.yaml"
+    assert found["R_m"]["source"] == f"{sheet}:1 (S23 data sheet)"
+    assert found["R_m"]["range"] == pytest.approx([1.062, 1.298])
+    assert found["L_m"]["source"] == f"{sheet}:2" and found["L_m"]["fixed"] is True
+    assert found["L_m"]["value"] == pytest.approx(1.18e-3)
+    # The configuration goes before the data sheet.
+    assert found["R_b"]["value"] == 126 and found["R_b"]["source"] == f"{tmp_path}/id.yaml:4"
+    assert "current_motor over its command" in found["K_dm"]["source"]
+    assert folder.name in found["K_dm"]["source"]
+    low, high = found["K_dm"]["range"]
+    assert 10.0 < low < 120.0 < high < 500.0
+    assert "K_dm searched as the data suggest: current_motor over its command" in result.stdout
+    assert found["J_m"]["source"] == "model"
+
+
 def test_the_report_says_where_every_range_came_from(tmp_path):
     foreign_log(tmp_path / "bench.csv")
     two = OWN_MODEL.replace("1.0, \"log\"),)", "1.0, \"log\"), "

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sysid import GASSI, BatchSimulator, Dataset, SearchSpace
+from sysid import GASSI, BatchSimulator, Dataset, SearchSpace, guess_ranges
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -60,3 +60,22 @@ def test_simulate_identify_predict(dc_motor):
     assert found.error_ < 1e-4
     assert found.parameters_["resistance"] == pytest.approx(1.0, rel=0.02)
     assert found.score(inputs, outputs, dt=0.01) > 0.999
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_what_it_guesses_from_a_noisy_record_holds_the_truth(dc_motor, seed):
+    rng = np.random.default_rng(seed)
+    model = dc_motor.model
+    true = model.nominal * rng.uniform(0.5, 2.0, 5)
+    voltage = np.repeat(rng.choice([-1.0, 0.3, 1.0], 40), 10)
+    record = Dataset(
+        np.column_stack([voltage, 0.005 * np.sin(0.02 * np.arange(400))]),
+        np.full((400, 2), np.nan), 0.01, "bench",
+    )  # fmt: skip
+    outputs = BatchSimulator(model, accuracy=1e-6).trajectories(true, record)[0]
+    noisy = outputs + 0.01 * np.abs(outputs).max(axis=0) * rng.normal(size=(400, 2))
+    found = guess_ranges(model, [Dataset(record.inputs, noisy, 0.01, "bench")])
+    assert set(found) == {"resistance", "constant"}
+    for name, guess in found.items():
+        assert guess.low < true[model.parameter_names.index(name)] < guess.high
+        assert guess.high < 2.0 * guess.low and guess.source.endswith("in bench")

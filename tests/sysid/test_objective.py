@@ -70,7 +70,7 @@ def test_the_fit_of_uneven_logs_is_a_minimum_of_it(balance):
     """No parameter moved by half a per cent makes SciPy's figure better."""
     model, records = motor(2.0), logs()
     found = GASSI(
-        model, population=60, generations=8, balance=balance, accuracy=1e-6,
+        model, population=60, generations=8, balance=balance, criterion="error", accuracy=1e-6,
         weights={"current": 3.0},
     ).fit(records)  # fmt: skip
     at = expected(model, found.vector_, records, False, balance, WEIGHTS)

@@ -1,0 +1,314 @@
+"""What ``rig identify`` tells of how far its numbers can be trusted, and where it knows it from."""
+
+import json
+import math
+import re
+
+import numpy as np
+import pytest
+import yaml
+from scipy.signal import lfilter
+
+from daq import capture
+from daq.cli import datasets
+from daq.errors import ConfigError
+from sim_rig.actuator import actuator
+from tests.daq.support import forked_rig, only_capture, write_experiment
+
+# A gain of which only a product acts, another that wants to be lower than its range allows, and a
+# parameter that nothing depends on.
+MODEL = """
+from sysid import Input, Output, Parameter, ProcessModel, State
+
+
+def derivative(x, u, p):
+    tau, a, b, c, idle = p
+    return ((a * b * u[0] + c * u[1] + 1e-7 * idle - x[0]) / tau,)
+
+
+model = ProcessModel(
+    name="gains",
+    states=(State("y", "m"),),
+    inputs=(Input("u", "V"), Input("w", "V"), Input("still", "V")),
+    outputs=(Output("y", "m"),),
+    parameters=(
+        Parameter("tau", "s", 0.3, 0.05, 1.0, "log"),
+        Parameter("a", "m/kg", 2.0, 0.5, 10.0, "log"),
+        Parameter("b", "kg", 1.0, 0.2, 5.0, "log"),
+        Parameter("c", "m/V", 0.1, 0.05, 1.0, "log"),
+        Parameter("idle", "m", 0.1, 0.01, 1.0, "log"),
+    ),
+    derivative=derivative,
+)
+"""
+CONFIG = """
+model: gains.py:model
+population: 40
+generations: 8
+columns:
+  time: {column: t}
+  inputs: {u: {column: u}, w: {column: w}, still: {constant: 0}}
+  outputs: {y: {column: y}}
+"""
+TAU, GAIN, LOW, DT = 0.2, 1.5, 0.045, 0.01
+
+
+def write_log(path, seed, n=500):
+    rng = np.random.default_rng(seed)
+    u, w = (np.repeat(rng.choice([-1.0, 1.0], n // 20), 20) for _ in range(2))
+    pole = np.exp(-DT / TAU)
+    y = lfilter([0.0, 1.0 - pole], [1.0, -pole], GAIN * u + LOW * w)
+    y += 0.05 * rng.standard_normal(n)
+    rows = "".join(f"{DT * k:.2f},{u[k]},{w[k]},{y[k]:.6f}\n" for k in range(n))
+    path.write_text("t,u,w,y\n" + rows)
+
+
+@pytest.fixture(scope="module")
+def command():
+    with forked_rig() as run:
+        yield run
+
+
+@pytest.fixture(scope="module")
+def identify(command, folder):
+    """Standard output of an identification from the two logs."""
+
+    def run(*args):
+        logs = ("training.csv", "--validate", "validation.csv", "--config", "id.yaml")
+        result = command(("identify", *logs, *args), folder)
+        assert result.returncode == 0, result.stderr
+        return result.stdout
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    root = tmp_path_factory.mktemp("report")
+    write_log(root / "training.csv", 1)
+    write_log(root / "validation.csv", 2)
+    (root / "gains.py").write_text(MODEL)
+    (root / "id.yaml").write_text(CONFIG)
+    return root
+
+
+@pytest.fixture(scope="module")
+def told(identify, folder):
+    """The report for people, and what ``parameters.yaml`` says of the same."""
+    text = identify("--out", "found")
+    return text, yaml.safe_load((folder / "found" / "parameters.yaml").read_text())
+
+
+def row(text, first):
+    """Cells of the table row that begins with a name."""
+    (line,) = re.findall(rf"^ {re.escape(first)}  .*$", text, flags=re.MULTILINE)
+    return re.split(r"\s{2,}", line.strip())
+
+
+def ends(cell):
+    low, high = cell.split(" .. ")
+    return float(low), float(high)
+
+
+# --- the report -----------------------------------------------------------------------------------
+
+
+def test_what_the_data_determine_has_an_interval(told):
+    text, document = told
+    tau = document["parameters"]["tau"]
+    name, value, interval, unit, searched = row(text, "tau")
+    assert (name, unit, searched) == ("tau", "s", "0.05 .. 1")
+    assert float(value) == pytest.approx(tau["value"], abs=0.51 * tau["std"])
+    assert ends(interval) == pytest.approx(tau["interval"], abs=0.51 * tau["std"])
+    low, high = tau["interval"]
+    assert low < TAU < high and low < tau["value"] < high
+    assert "undetermined" not in tau and tau["on_bound"] is False
+
+
+def test_what_they_do_not_determine_has_none_and_says_why(told):
+    text, document = told
+    marks = {"a": "tied", "b": "tied", "c": "bound", "idle": "vague"}
+    words = {"tied": "only with others", "bound": "at its end", "vague": "hardly felt"}
+    for name, why in marks.items():
+        entry = document["parameters"][name]
+        assert entry["undetermined"] == why and not {"std", "interval"} & set(entry)
+        cells = row(text, name)
+        assert cells[2] == "-" and cells[-1] == words[why]
+    assert document["parameters"]["c"]["on_bound"] is True
+    assert document["parameters"]["a"]["on_bound"] is False
+
+
+def test_what_acts_only_together_is_told_with_what_would_help(told):
+    text, document = told
+    exact, vague = document["ambiguities"]
+    assert (exact["kind"], exact["parameters"], exact["measure"]) == ("product", ["b", "a"], ["b"])
+    (product,) = exact["determined"]
+    low, high = product["interval"]
+    assert product["name"] == "a b" and low < GAIN < high
+    assert (vague["kind"], vague["parameters"]) == ("vague", ["idle"])
+    assert "  b, a act only together." in text
+    (shown,) = re.findall(r"a b = (\S+), 95 % interval (\S+ \.\. \S+)", text)
+    assert float(shown[0]) == pytest.approx(product["value"], abs=0.51 * product["std"])
+    assert ends(shown[1]) == pytest.approx((low, high), abs=0.51 * product["std"])
+    assert "measure b by other means" in text and "under 'fixed'" in text
+    assert "Hardly felt by these data: idle." in text
+    # Of tau, a b, and neither idle nor what is at its end.
+    assert document["determined_directions"] == 2
+    assert "Determined: 1 of 5 by themselves, and 1 combinations." in text
+    assert [p["parameters"] for p in document["correlations"]] == []
+
+
+def test_the_digits_shown_are_those_that_are_known(told):
+    text, document = told
+    tau = document["parameters"]["tau"]
+    shown = row(text, "tau")[1]
+    last = 10.0 ** -len(shown.partition(".")[2])
+    # Rounding costs nothing, and no digit is noise alone.
+    assert tau["std"] / 100.0 < last <= tau["std"]
+
+
+def test_residual_tests_and_verdict_are_those_of_the_document(told):
+    text, document = told
+    (validated,) = document["metrics"]["validation"]
+    output = validated["outputs"]["y"]
+    assert validated["name"] == "validation" and output["rmse"] > 0.0
+    assert set(output["residual_independent_of"]) == {"u", "w"}, "the last never changes"
+    cells = row(text[text.index("Residuals, validation") :], "y")
+    independent = output["residual_independent_of"]
+    shares = (output["residual_autocorrelation_in_band"], independent["u"], independent["w"])
+    assert cells == ["y", *(f"{100.0 * share:.0f} %" for share in shares)]
+    assert document["verdict"]["trust"] == "limited"
+    reasons = document["verdict"]["reasons"]
+    assert reasons[-1].startswith("c stands on an end of the range")
+    assert f"Trust: limited. {' '.join(reasons)}" in text
+
+
+def test_without_validation_the_residuals_are_those_of_the_training(command, folder):
+    result = command(("identify", "training.csv", "--config", "id.yaml", "--out", "alone"), folder)
+    assert "Residuals, training: share of correlations" in result.stdout
+    assert "Trust: limited. No data were held back for validation" in result.stdout
+
+
+def test_json_is_what_the_file_holds(identify, folder, told):
+    document = json.loads(identify("--out", "json", "--json"))
+    kept = yaml.safe_load((folder / "json" / "parameters.yaml").read_text())
+    assert document.pop("files") == {"parameters": "json/parameters.yaml"}
+    assert document == json.loads(json.dumps(kept))
+    # And one seed gives one report.
+    before = json.loads(json.dumps(told[1]))
+    for part in ("parameters", "ambiguities", "verdict", "metrics", "singular_values"):
+        assert document[part] == before[part]
+
+
+def test_replay_reads_the_parameters_of_a_report(command, folder, told):
+    parameters = ("--parameters", "found/parameters.yaml", "--config", "id.yaml", "--json")
+    result = command(("replay", "validation.csv", *parameters), folder)
+    assert result.returncode == 0, result.stderr
+    again = json.loads(result.stdout)["outputs"]["y"]
+    (validated,) = told[1]["metrics"]["validation"]
+    assert again["rmse"] == pytest.approx(validated["outputs"]["y"]["rmse"], rel=1e-6)
+
+
+def test_fixing_what_should_be_measured_gives_all_the_rest(identify):
+    settings = ("--set", "fixed.b=1", "--set", "fixed.idle=0.1")
+    report = json.loads(identify("--out", "fixed", "--json", *settings))
+    assert report["ambiguities"] == []
+    a = report["parameters"]["a"]
+    assert a["interval"][0] < GAIN < a["interval"][1]
+
+
+def test_the_thesis_preset_has_no_intervals_and_says_nothing_of_them(identify, folder):
+    text = identify("--preset", "thesis", "--out", "thesis")
+    assert "95 % interval" not in text and "act only together" not in text
+    assert "Determined" not in text and "Trust: " in text
+    document = yaml.safe_load((folder / "thesis" / "parameters.yaml").read_text())
+    assert not {"ambiguities", "determined_directions", "correlations"} & set(document)
+    for entry in document["parameters"].values():
+        assert not {"std", "interval", "undetermined"} & set(entry)
+    assert document["verdict"]["trust"] in {"good", "limited", "poor"}
+
+
+# --- what the calibration of a run tells ----------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def captured(command, tmp_path_factory):
+    root = tmp_path_factory.mktemp("captured")
+    write_experiment(root / "e.yaml", calibration={"samples": 1600}, duration=0.2)
+    result = command(("run", "e.yaml"), root)
+    assert result.returncode == 0, result.stderr
+    return only_capture(root)
+
+
+def loaded(folder):
+    return datasets.load(folder, actuator(), None).dataset
+
+
+@pytest.fixture
+def record(captured):
+    """The run record, put back after the test has written another."""
+    path = captured / capture.RUN_NAME
+    text = path.read_text()
+    yield json.loads(text)
+    path.write_text(text)
+
+
+def test_noise_and_zeros_of_a_run_reach_the_data(captured, record):
+    model, data = actuator(), loaded(captured)
+    noise = record["calibration"]["noise"]
+    assert record["calibration"]["samples"] == 1600
+    # 10 mV rms at 0.5 A/V and 0.706 N*m/V, to the 2 % that 1600 samples give, and quantisation.
+    expected = {"current_motor": 5e-3, "current_brake": 5e-3, "torque": 7.06e-3}
+    assert noise == pytest.approx(expected, rel=0.08)
+    inputs, outputs = model.input_names, model.output_names
+    torque = inputs.index("torque")
+    assert data.input_noise[torque] == noise["torque"]
+    assert data.input_zero[torque] == pytest.approx(noise["torque"] / math.sqrt(1600))
+    known = {"current_motor", "current_brake"}
+    for name, zero in zip(outputs, data.output_zero, strict=True):
+        assert zero == pytest.approx(noise[name] / 40.0 if name in known else 0.0)
+    # What was commanded is known; what the encoder counts has no zero of its own.
+    others = [i for i in range(len(inputs)) if i != torque]
+    assert not data.input_noise[others].any() and not data.input_zero[others].any()
+
+
+def test_a_run_recorded_without_calibration_still_loads(captured, record):
+    del record["calibration"]
+    (captured / capture.RUN_NAME).write_text(json.dumps(record))
+    data = loaded(captured)
+    assert not any(v.any() for v in (data.input_noise, data.input_zero, data.output_zero))
+    (captured / capture.RUN_NAME).unlink()
+    assert not loaded(captured).input_noise.any()
+
+
+MALFORMED = {
+    "a number": 16,
+    "nothing": None,
+    "a list": [1, 2],
+    "noise a number": {"samples": 16, "noise": 0.1},
+    "noise negative": {"samples": 16, "noise": {"torque": -0.1}},
+    "noise not a number": {"samples": 16, "noise": {"torque": "low"}},
+    "noise nan": {"samples": 16, "noise": {"torque": math.nan}},
+    "noise null": {"samples": 16, "noise": {"torque": None}},
+    "no samples": {"samples": 0, "noise": {"torque": 0.1}},
+    "samples a word": {"samples": "many", "noise": {"torque": 0.1}},
+    "samples without end": {"samples": math.inf, "noise": {"torque": 0.1}},
+}
+
+
+@pytest.mark.parametrize("case", MALFORMED)
+def test_a_calibration_that_makes_no_sense_is_refused(captured, record, case):
+    path = captured / capture.RUN_NAME
+    path.write_text(json.dumps({**record, "calibration": MALFORMED[case]}))
+    with pytest.raises(ConfigError) as error:
+        loaded(captured)
+    said = str(error.value)
+    assert str(path) in said and "'calibration'" in said and "delete it to go without" in said
+
+
+def test_the_command_line_refuses_it_too(command, captured, record):
+    path = captured / capture.RUN_NAME
+    path.write_text(json.dumps({**record, "calibration": {"noise": {"torque": -1}}}))
+    result = command(("identify", captured), captured.parent)
+    assert result.returncode == 2 and result.stdout == ""
+    assert result.stderr.count("\n") == 1 and f"{path}: 'calibration' must hold" in result.stderr
