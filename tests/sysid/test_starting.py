@@ -75,14 +75,12 @@ def test_without_a_range_the_start_stays_as_declared():
 
 
 def test_a_prediction_finds_the_start_of_its_own_record():
-    found = GASSI(chain(), population=24, generations=6).fit(record(2.0, 0))
+    found = GASSI(chain(), population=24, generations=6, dt=record(0.0, 0).dt).fit(record(2.0, 0))
     other = record(-4.0, 7)
     np.testing.assert_allclose(found.predict(other), other.outputs, atol=1e-3)
     # An array has no outputs to tell the start from.
     from_rest = record(0.0, 7)
-    np.testing.assert_allclose(
-        found.predict(other.inputs, dt=other.dt), from_rest.outputs, atol=1e-3
-    )
+    np.testing.assert_allclose(found.predict(other.inputs), from_rest.outputs, atol=1e-3)
 
 
 def test_the_start_is_the_least_squares_one():
