@@ -56,6 +56,20 @@ Validation = Annotated[
 Preset = Annotated[str | None, typer.Option("--preset", help="default, thesis, cega or classic.")]
 Population = Annotated[int | None, typer.Option("--population", help="Chromosomes per generation.")]
 Generations = Annotated[int | None, typer.Option("--generations", help="Generations evaluated.")]
+HoldBack = Annotated[
+    float | None,
+    typer.Option(
+        "--hold-back", metavar="PART", help="Part of each log, its end, kept for validation."
+    ),
+]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Any key of the configuration file, such as fixed.R_m=1.18; may be repeated.",
+    ),
+]
 Seeds = Annotated[
     str | None,
     typer.Option("--seeds", metavar="FIRST:END|LIST", help="0:10 for 0 to 9, or 3,5,8."),
@@ -120,12 +134,7 @@ def identify(
     population: Population = None,
     generations: Generations = None,
     seed: Annotated[int | None, typer.Option("--seed", help="One seed gives one result.")] = None,
-    hold_back: Annotated[
-        float | None,
-        typer.Option(
-            "--hold-back", metavar="PART", help="Part of each log, its end, kept for validation."
-        ),
-    ] = None,
+    hold_back: HoldBack = None,
     profile: Annotated[
         list[str] | None,
         typer.Option(
@@ -143,14 +152,7 @@ def identify(
             "--datasheet", metavar="FILE.yaml", help="Data-sheet values; may be repeated."
         ),
     ] = None,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="KEY=VALUE",
-            help="Any key of the configuration file, such as fixed.R_m=1.18; may be repeated.",
-        ),
-    ] = None,
+    settings: Settings = None,
     arx: Annotated[bool, typer.Option("--arx", help="Compare with an ARX model.")] = False,
     armax: Annotated[bool, typer.Option("--armax", help="Compare with an ARMAX model.")] = False,
     seeds: Seeds = None,
@@ -209,6 +211,8 @@ def campaign(
     preset: Preset = None,
     population: Population = None,
     generations: Generations = None,
+    hold_back: HoldBack = None,
+    settings: Settings = None,
     jobs: Jobs = None,
     dask: Dask = None,
     json: AsJson = False,
@@ -216,9 +220,14 @@ def campaign(
     """Identify every log with every model and seed, over all cores or a dask cluster."""
     from daq.cli.campaigning import Workers, campaign_command
 
-    overrides = {"preset": preset, "population": population, "generations": generations}
+    options = {
+        "preset": preset,
+        "population": population,
+        "generations": generations,
+        "hold_back": hold_back,
+    }
     campaign_command(
-        logs, validate or [], model or [], config, out, overrides, seeds, together,
+        logs, validate or [], model or [], config, out, options, settings or [], seeds, together,
         Workers(jobs, dask), json,
     )  # fmt: skip
 

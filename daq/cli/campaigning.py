@@ -99,14 +99,15 @@ def campaign_command(
     models: list[str],
     config: Path | None,
     out: Path | None,
-    overrides: Mapping[str, Any],
+    options: Mapping[str, Any],
+    settings: Sequence[str],
     seeds: str | None,
     together: bool,
     workers: Workers,
     as_json: bool,
 ) -> None:
     """Identify every log with every model and seed; print the spread, keep every result."""
-    prepared = prepare_models(config, overrides, distinct(models))
+    prepared = prepare_models(config, options, distinct(models), settings)
     drawn = parse_seeds(seeds) or [prepared[0].settings.seed]
     folder = out or _default_folder()
     check_writable(folder)

@@ -100,9 +100,13 @@ def test_every_log_with_every_model_and_seed(folder):
 
 
 def test_one_parameter_set_for_all_logs_together(folder):
-    document = campaign(folder, "--together", "--jobs", 1)
+    document = campaign(folder, "--together", "--jobs", 1, "--hold-back", 0.3, "--set", "seed=9")
     assert [(r["data"], r["seed"]) for r in document["runs"]] == [("2 logs", 0), ("2 logs", 1)] * 2
     assert 0.1 < document["runs"][0]["tau"] < 0.2
+    path = folder / document["spread"][0]["parameters_file"]
+    kept = yaml.safe_load(path.read_text())
+    validated = [entry["name"] for entry in kept["metrics"]["validation"]]
+    assert validated == ["fast (last 30 %)", "slow (last 30 %)", "check"]
 
 
 def test_a_dask_cluster_by_one_setting_gives_the_same(folder):

@@ -56,10 +56,10 @@ def test_simulate_identify_predict(dc_motor):
     blank = Dataset(inputs, np.full((200, 2), np.nan), 0.01)
     model = dc_motor.model
     outputs = BatchSimulator(model, accuracy=1e-6).trajectories(model.nominal, blank)[0]
-    found = GASSI(model).fit(inputs, outputs, dt=0.01)
+    found = GASSI(model, dt=0.01).fit(inputs, outputs)
     assert found.error_ < 1e-4
     assert found.parameters_["resistance"] == pytest.approx(1.0, rel=0.02)
-    assert found.score(inputs, outputs, dt=0.01) > 0.999
+    assert found.score(inputs, outputs) > 0.999
 
 
 @pytest.mark.parametrize("seed", range(5))
