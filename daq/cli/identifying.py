@@ -30,7 +30,7 @@ from sysid.uncertainty import Profile
 
 _STAGES = {
     "search": ("Genetic search", "generation"),
-    "refine": ("Local refinement", "iteration"),
+    "refine": ("Local refinement", "generation"),
     "weigh": ("Weighing by noise", "iteration"),
 }
 

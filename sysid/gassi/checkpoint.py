@@ -108,7 +108,7 @@ def load(path: Path, begun_with: Mapping[str, Any]) -> State:
     Raises ModelError when there is none, or when it belongs to other data, settings or model.
     """
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             content = json.loads(str(archive["json"]))
             if content["format"] != FORMAT:
                 raise ModelError(

@@ -34,7 +34,8 @@ class Run:
     """A search and what follows it, with what they have found and spent.
 
     history: the best error after each generation, one being as many simulations as the
-    population has chromosomes. flagged: simulations that failed in the search, by status.
+    population has chromosomes; the last with what exceeded the budget. flagged: simulations
+    that failed in the search, by status.
     """
 
     objective: Objective
@@ -91,7 +92,7 @@ class Run:
         if self.local is None:
             self.local = self._begin_local()
         self.local.step()
-        generation = -(-self.objective.simulations // self.search.population)
+        generation = min(-(-self.objective.simulations // self.search.population), self.generations)
         best = self.best
         assert best is not None
         self.history += [best.error] * (generation - len(self.history))

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -198,3 +200,57 @@ def test_without_penalty_the_elite_is_the_best_and_says_that_it_is_infeasible():
 def test_settings_that_make_no_sense(settings, message):
     with pytest.raises(ModelError, match=message):
         search(**settings)
+
+
+# --- a population that has collapsed --------------------------------------------------------
+
+
+def two_basins(rows):
+    """A wide basin with a raised floor, and a narrow deeper one that is seldom hit at first."""
+    wide = 0.3 + np.sqrt(np.sum((rows - [6.0, 3.0, 0.5]) ** 2, axis=1))
+    narrow = 4.0 * np.sqrt(np.sum((rows - GOAL) ** 2, axis=1))
+    return np.minimum(wide, narrow)
+
+
+def test_a_collapsed_population_starts_anew_over_the_whole_box_and_keeps_the_elite():
+    found = search(population=60, generations=80)
+    spreads = []
+    while not found.done:
+        rows = found.ask()
+        spreads.append(np.mean(found.space.encode(rows).std(axis=0)))
+        elite = found.elite_error
+        found.tell(bowl(rows))
+        assert found.elite_error <= elite
+    spreads = np.array(spreads) / spreads[0]
+    again = np.flatnonzero((spreads[1:] > 0.8) & (spreads[:-1] < 0.1)) + 1
+    assert len(again) >= 2
+    assert spreads[:-1].min() < 0.1
+    # A start of its own: the elite is not in it, or it would fall back to where it was.
+    assert np.all(spreads[again] > 0.8)
+
+
+def test_starting_anew_finds_more_than_one_basin():
+    def best(preset):
+        runs = [
+            run(GeneticSearch(space(), preset, 60, 120, np.random.default_rng(seed)), two_basins)
+            for seed in range(10)
+        ]
+        return np.array([found.elite_error for found in runs])
+
+    default = PRESETS["default"]
+    once = best(replace(default, collapse=0.0))
+    assert np.sum(best(default) < 0.2) > np.sum(once < 0.2)
+
+
+def test_promising_chromosomes_lie_apart_and_begin_with_the_elite():
+    found = run(search(generations=12))
+    rows = found.promising(5)
+    np.testing.assert_allclose(rows[0], found.elite)
+    assert 2 <= len(rows) <= 5
+    where = space()
+    width = where.encode(where.upper) - where.encode(where.lower)
+    coded = where.encode(rows) / width
+    for i, row in enumerate(coded):
+        for other in coded[:i]:
+            assert np.sqrt(np.mean((row - other) ** 2)) > 0.1
+    assert np.all(np.diff(bowl(rows)) >= 0.0)

@@ -1,0 +1,191 @@
+"""Local refinement with jumps between minima."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from sysid import (
+    GASSI,
+    BatchSimulator,
+    Constraint,
+    Dataset,
+    Input,
+    Output,
+    Parameter,
+    ProcessModel,
+    State,
+)
+from sysid.gassi.local import LocalSearch
+from sysid.objective import Objective
+from sysid.refinement import advance, begin, refine
+from sysid.space import SearchSpace
+from tests.sysid.support import MOTOR, lag, motor, motor_record
+
+DT = 0.01
+
+
+def spring_derivative(x, u, p):
+    position, speed = x
+    stiffness, damping, gain = p
+    return (speed, gain * u[0] - stiffness * position - damping * speed)
+
+
+SPRING = (
+    Parameter("stiffness", "1/s^2", 2e5, 1e4, 3e6, "log"),
+    Parameter("damping", "1/s", 20.0, 2.0, 200.0, "log"),
+    Parameter("gain", "m/s^2", 5e4, 1e3, 1e6, "log"),
+)
+
+
+def spring():
+    """An oscillator that is faster than its samples: many frequencies look nearly alike."""
+    return ProcessModel(
+        "spring", (State("position", "m"), State("speed", "m/s")), (Input("force", "1", "zoh"),),
+        (Output("position", "m"),), SPRING, spring_derivative,
+    )  # fmt: skip
+
+
+def spring_record(n=250):
+    """Samples by the closed form of a damped oscillation between steps of the force."""
+    rng = np.random.default_rng(4)
+    force = np.repeat(rng.choice([-1.0, 1.0], n // 5), 5)
+    stiffness, damping, gain = (p.nominal for p in SPRING)
+    decay, omega = damping / 2.0, math.sqrt(stiffness - damping**2 / 4.0)
+    position = speed = 0.0
+    rows = []
+    for u in force:
+        rows.append(position)
+        rest = gain * u / stiffness
+        a, b = position - rest, (speed + decay * (position - rest)) / omega
+        c, s, e = math.cos(omega * DT), math.sin(omega * DT), math.exp(-decay * DT)
+        position = rest + e * (a * c + b * s)
+        speed = e * (-decay * (a * c + b * s) + omega * (b * c - a * s))
+    return Dataset(force, np.array(rows), DT)
+
+
+def objective(model, record, accuracy=1e-3):
+    return Objective(BatchSimulator(model, accuracy=accuracy), SearchSpace.of(model), [record])
+
+
+def alias(target):
+    """Where a descent from another frequency gets stuck."""
+    low = np.array([2.0e4, 20.0, 5e3])
+    stuck = refine(target, low)
+    assert stuck.error > 0.005
+    return stuck.chromosome
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_jumps_leave_a_minimum_that_a_descent_cannot(seed):
+    target = objective(spring(), spring_record())
+    start = alias(target)
+    before = target.simulations
+    local = LocalSearch(target, start[None], before + 6000, 300, np.random.default_rng(seed))
+    while not local.done:
+        local.step()
+    assert local.error < 1e-6
+    expected = [p.nominal for p in SPRING]
+    np.testing.assert_allclose(target.space.decode(local.best), expected, rtol=1e-4)
+    assert target.simulations <= before + 6000
+
+
+def test_the_budget_is_kept_and_the_end_is_a_minimum():
+    noise = np.random.default_rng(0).normal(0.0, 0.02, (200, 2))
+    clean = motor_record()
+    record = Dataset(
+        clean.inputs, clean.outputs + noise * np.abs(clean.outputs).max(axis=0), clean.dt
+    )
+    found = GASSI(motor(), population=100, generations=20).fit(record)
+    assert 0.9 * 2000 < found.n_simulations_ <= 2000
+    assert len(found.history_) in (19, 20)
+    assert np.all(np.diff(found.history_) <= 1e-12)
+    assert found.history_[-1] == found.error_
+    again = refine(objective(motor(), record), found.chromosome_)
+    assert found.error_ == pytest.approx(again.error, rel=1e-6)
+
+
+def test_a_budget_too_small_is_exceeded_by_one_descent_to_the_minimum():
+    found = GASSI(motor(), population=10, generations=2).fit(motor_record())
+    again = refine(objective(motor(), motor_record()), found.chromosome_)
+    assert found.error_ <= 1.001 * again.error
+    assert found.n_simulations_ <= 20 + 50 * 14
+    assert len(found.history_) == 2
+
+
+def test_rounding_ends_it_early():
+    found = GASSI(motor(), population=100, generations=100).fit(motor_record())
+    np.testing.assert_allclose(found.vector_, list(MOTOR.values()), rtol=1e-6)
+    assert found.n_simulations_ < 0.3 * 100 * 100
+
+
+# --- descents in one batch ------------------------------------------------------------------
+
+
+def test_a_descent_is_the_same_alone_and_among_others():
+    record = motor_record()
+    factors = np.random.default_rng(1).uniform(0.5, 2.0, (4, 5))
+    starts = factors * np.array(list(MOTOR.values()))
+    target = objective(motor(), record)
+    together = [begin(target, start) for start in starts]
+    for _ in range(6):
+        together = advance(target, together)
+    for start, one in zip(starts, together, strict=True):
+        alone = [begin(target, start)]
+        for _ in range(6):
+            alone = advance(target, alone)
+        np.testing.assert_array_equal(alone[0].at, one.at)
+        assert alone[0].error == one.error
+
+
+def test_flat_directions_cost_nothing():
+    """Two parameters of which only the product acts: the descent ends as with one."""
+
+    def derivative(x, u, p):
+        return ((p[0] * p[1] * u[0] - x[0]) / p[2],)
+
+    model = lag(
+        parameters=(
+            Parameter("a", "1", 2.0, 0.2, 20.0, "log"),
+            Parameter("b", "1", 1.0, 0.1, 10.0, "log"),
+            Parameter("tau", "s", 0.05, 0.005, 0.5, "log"),
+        ),
+        derivative=derivative,
+    )
+    inputs = np.sign(np.sin(np.arange(120) / 7.0))
+    one = lag()
+    blank = Dataset(inputs, np.full(120, np.nan), 0.01)
+    outputs = BatchSimulator(one).trajectories(one.nominal, blank)[0]
+    record = Dataset(inputs, outputs, 0.01)
+    both = refine(objective(model, record), np.array([1.0, 0.7, 0.1]))
+    single = refine(objective(one, record), np.array([0.7, 0.1]))
+    assert both.error < 1e-10
+    assert both.iterations <= single.iterations + 2
+    assert both.chromosome[0] * both.chromosome[1] == pytest.approx(2.0, rel=1e-8)
+
+
+def test_it_slides_along_a_constraint():
+    """The minimum on a slanted constraint, against a search along the line that it is."""
+    limit = Constraint("resistance >= 50 constant", lambda p: 50.0 * p[4] - p[0])  # truth: 42
+    record = motor_record()
+    target = objective(motor(3.0, (limit,)), record, 1e-6)
+    start = np.array([1.5, 9e-4, 1.1e-6, 2e-5, 2.2e-2])
+    found = refine(target, start, max_iterations=200)
+    assert found.chromosome[0] >= 50.0 * found.chromosome[4]
+    assert found.chromosome[0] == pytest.approx(50.0 * found.chromosome[4], rel=1e-4)
+
+    def tied(x, u, p):
+        current, omega = x
+        inductance, inertia, damping, constant = p
+        return (
+            (u[0] - 50.0 * constant * current - constant * omega) / inductance,
+            (constant * current - damping * omega - u[1]) / inertia,
+        )
+
+    line = ProcessModel(
+        "line", motor().states, motor().inputs, motor().outputs, motor(3.0).parameters[1:], tied
+    )
+    expected = refine(objective(line, record, 1e-6), start[1:], max_iterations=200)
+    assert found.error == pytest.approx(expected.error, rel=1e-3)
