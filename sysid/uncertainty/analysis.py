@@ -85,7 +85,7 @@ def uncertainty(objective: Objective, chromosome: FloatArray) -> Uncertainty:
     told = directions(objective, chromosome, steps, found, ends)
     units = coordinate_units(objective, chromosome)
     slope = np.where(objective.space.log, chromosome, units)
-    hidden = relations(objective, chromosome, steps, slope, told.lost, told.still)
+    hidden = relations(objective, chromosome, steps, found, slope, told)
     return _Teller(objective.space, chromosome, slope, told, hidden).result()
 
 

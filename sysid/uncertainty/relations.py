@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -10,6 +11,8 @@ import numpy as np
 
 from sysid.model import BoolArray, FloatArray, IntArray
 from sysid.objective import Objective
+from sysid.uncertainty.directions import Directions
+from sysid.uncertainty.sensitivity import Sensitivity
 
 Kind = Literal["product", "sum", "vague"]
 
@@ -18,6 +21,10 @@ Kind = Literal["product", "sum", "vague"]
 _FOLLOW = 0.2
 _UNMOVED = 1e-3
 _NOTHING = 3e-3  # entries of a direction below this are rounding
+# Shares of a direction's largest entry above which a parameter may be part of what is exact.
+_SHARES = (0.1, 0.03, 0.01, 0.003)
+_NEARLY = 0.02  # of a whole number
+_NEW = 0.1  # part of a direction that others must leave unexplained
 _SHARE = 0.1  # entries of a vague direction below this share of its largest are not worth naming
 
 
@@ -48,22 +55,27 @@ def relations(
     objective: Objective,
     chromosome: FloatArray,
     steps: list[int],
+    found: Sensitivity,
     slope: FloatArray,
-    lost: FloatArray,
-    still: BoolArray,
+    told: Directions,
 ) -> list[Relation]:
     """The undetermined directions as simple ones, each followed to see what it is.
 
-    slope: (n_free,), change of each parameter per unit of its coordinate. lost: (n_lost, n_free);
-    still: (n_lost,), which of them do not move the outputs at all. These are made simple by
-    themselves, the others up to them.
+    slope: (n_free,), change of each parameter per unit of its coordinate. Directions that do not
+    move the outputs at all are made simple by themselves, the others up to these.
     """
-    hidden = sparse(lost[still])
-    felt = [_simplest(vector, hidden) for vector in sparse(lost[~still])]
-    return [
-        Relation(vector, _kind(objective, chromosome, steps, vector * slope))
-        for vector in (*hidden, *felt)
-    ]
+    counted = found.slopes[:, objective.weights > 0.0]
+    follower = _Follower(objective, chromosome, steps, slope, counted.reshape(-1, len(chromosome)))
+    exact: list[Relation] = []
+    vague: list[FloatArray] = []
+    for basis in (told.lost[told.still], told.lost[~told.still]):
+        for vector in sparse(basis):
+            relation = follower.exact(_simplest(vector, exact), exact)
+            if relation is None:
+                vague.append(vector)
+            else:
+                exact.append(relation)
+    return exact + [Relation(_simplest(vector, exact), "vague") for vector in vague]
 
 
 def overlapping(supports: list[BoolArray]) -> list[list[int]]:
@@ -75,22 +87,88 @@ def overlapping(supports: list[BoolArray]) -> list[list[int]]:
     return groups
 
 
-def _kind(objective: Objective, chromosome: FloatArray, steps: list[int], step: FloatArray) -> Kind:
-    """Follow a direction as a product and as a sum; what leaves the outputs alone."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        relative = np.where(step != 0.0, step / chromosome, 0.0)
-    if not np.all(np.isfinite(relative)):
-        return "vague"
-    relative *= _FOLLOW / np.max(np.abs(relative))
-    alone = np.where(np.abs(relative) == np.max(np.abs(relative)), relative, 0.0)
-    moved = chromosome * np.stack(
-        [np.ones_like(relative), np.exp(relative), 1.0 + relative, 1.0 + alone]
-    )
-    residuals = objective.residuals(moved, steps)
-    change = np.sqrt(np.mean((residuals[1:] - residuals[0]) ** 2, axis=(1, 2)))
-    if change[0] < _UNMOVED * change[2]:
-        return "product"
-    return "sum" if change[1] < _UNMOVED * change[2] else "vague"
+@dataclass(frozen=True)
+class _Follower:
+    """Follows directions far enough to see what they are.
+
+    rows: (n_rows, n_free), slopes of the outputs that count.
+    """
+
+    objective: Objective
+    chromosome: FloatArray
+    steps: list[int]
+    slope: FloatArray
+    rows: FloatArray
+
+    def exact(self, vector: FloatArray, known: list[Relation]) -> Relation | None:
+        """The exact relation that a direction is but for errors, other than those known."""
+        tried = []
+        size = np.abs(vector)
+        for share in _SHARES:
+            members = np.flatnonzero(size > share * size.max()).tolist()
+            if members in tried:
+                continue
+            tried.append(members)
+            for candidate in self._candidates(vector, members):
+                kind = self._kind(candidate)
+                if kind != "vague" and _is_new(candidate, known):
+                    return Relation(candidate, kind)
+        return None
+
+    def _candidates(self, vector: FloatArray, members: list[int]) -> Iterator[FloatArray]:
+        """What of a direction could be exact among these members.
+
+        Slopes at kinks are taken with errors that mix what does nothing with what does little: so
+        the direction is sought anew without the others, and with whole numbers for what is near.
+        """
+        best = np.zeros_like(vector)
+        best[members] = np.linalg.svd(self.rows[:, members], full_matrices=False)[2][-1]
+        yield best
+        for unit in (self.chromosome, np.ones_like(vector)):
+            if np.all(unit[members] != 0.0):
+                whole = _whole(best[members] * self.slope[members] / unit[members])
+                if whole is not None:
+                    snapped = np.zeros_like(vector)
+                    snapped[members] = whole * unit[members] / self.slope[members]
+                    yield snapped / np.max(np.abs(snapped))
+
+    def _kind(self, vector: FloatArray) -> Kind:
+        """Follow a direction as a product and as a sum; what leaves the outputs alone."""
+        step = vector * self.slope
+        with np.errstate(divide="ignore", invalid="ignore"):
+            relative = np.where(step != 0.0, step / self.chromosome, 0.0)
+        if not np.all(np.isfinite(relative)):
+            return "vague"
+        relative *= _FOLLOW / np.max(np.abs(relative))
+        alone = np.where(np.abs(relative) == np.max(np.abs(relative)), relative, 0.0)
+        moved = self.chromosome * np.stack(
+            [np.ones_like(relative), np.exp(relative), 1.0 + relative, 1.0 + alone]
+        )
+        residuals = self.objective.residuals(moved, self.steps)
+        counted = residuals[..., self.objective.weights > 0.0]
+        change = np.sqrt(np.mean((counted[1:] - counted[0]) ** 2, axis=(1, 2)))
+        if change[0] < _UNMOVED * change[2]:
+            return "product"
+        return "sum" if change[1] < _UNMOVED * change[2] else "vague"
+
+
+def _is_new(vector: FloatArray, known: list[Relation]) -> bool:
+    """Whether a direction is no mixture of those known."""
+    if not known:
+        return True
+    basis = np.linalg.qr(np.stack([relation.vector for relation in known]).T)[0]
+    rest = vector - basis @ (basis.T @ vector)
+    return bool(np.linalg.norm(rest) > _NEW * np.linalg.norm(vector))
+
+
+def _whole(ratios: FloatArray) -> FloatArray | None:
+    """Small whole numbers that are nearly in these ratios, if there are."""
+    ratios = ratios / np.min(np.abs(ratios)) if np.all(ratios != 0.0) else np.full(1, np.nan)
+    for factor in (1.0, 2.0, 3.0):
+        whole = np.round(factor * ratios)
+        if np.all(np.abs(factor * ratios - whole) < _NEARLY * np.abs(whole)):
+            return whole
+    return None
 
 
 def named(vector: FloatArray) -> IntArray:
@@ -99,12 +177,12 @@ def named(vector: FloatArray) -> IntArray:
     return np.flatnonzero(size > _SHARE * size.max())
 
 
-def _simplest(vector: FloatArray, hidden: FloatArray) -> FloatArray:
-    """A direction about as few parameters as moves along hidden ones, which do nothing, allow."""
-    for relation in hidden:
+def _simplest(vector: FloatArray, exact: list[Relation]) -> FloatArray:
+    """A direction about as few parameters as moves along exact ones, which do nothing, allow."""
+    for relation in exact:
         ways = [vector]
-        for j in np.flatnonzero(relation):
-            way = vector - vector[j] / relation[j] * relation
+        for j in np.flatnonzero(relation.support):
+            way = vector - vector[j] / relation.vector[j] * relation.vector
             ways.append(np.where(np.abs(way) < _NOTHING * np.max(np.abs(way)), 0.0, way))
         vector = min(ways, key=lambda way: len(named(way)))
     return vector

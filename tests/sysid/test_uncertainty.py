@@ -677,6 +677,38 @@ def test_what_is_tied_is_told_apart_from_what_is_hardly_felt():
     assert set(vague.parameters) < {"a", "b"}
 
 
+def test_slopes_with_errors_mix_nothing_into_what_is_exact():
+    """Where a model switches, slopes err by more than what hardly acts does."""
+
+    def formula(p, u):
+        rough = 1e-7 * (np.sin(1e9 * p["a"]) + np.cos(1e9 * p["b"]) + np.sin(3e8 * p["c"]))
+        return columns((p["a"] * p["b"] + rough) * u[:, 0] + 2e-5 * p["c"] * u[:, 1]
+                       + p["d"] * u[:, 2])  # fmt: skip
+
+    parameters = [unknown("a", 3.0), unknown("b", 0.5), unknown("c", 1.0), unknown("d", 2.0)]
+    problem = Problem(formula, parameters)
+    found = uncertainty(problem.objective(), np.array([3.0, 0.5, 1.0, 2.0]))
+    assert [e.why for e in found.parameters] == ["tied", "tied", "vague", ""]
+    exact, vague = found.ambiguities
+    assert set(exact.parameters) == {"a", "b"} and vague.parameters == ("c",)
+    assert [e.name for e in exact.determined] == ["a b"]
+
+
+def test_an_output_that_does_not_count_resolves_nothing():
+    problem = Problem(
+        lambda p, u: columns(p["a"] * p["b"] * u[:, 0], p["a"] * u[:, 1]),
+        [unknown("a", 3.0), unknown("b", 0.5)],
+    )
+    objective = Objective(
+        Formula(problem.model, problem.formula), SearchSpace.of(problem.model), problem.records,
+        weights=np.array([1.0, 0.0]),
+    )  # fmt: skip
+    found = uncertainty(objective, np.array([3.0, 0.5]))
+    assert [e.why for e in found.parameters] == ["tied", "tied"]
+    assert set(combinations(found)) == {"a b"}
+    assert not any(e.why for e in problem.tell().parameters)
+
+
 # --- what must not matter, and how much what does -------------------------------------------------
 
 UNITS = [
