@@ -53,8 +53,13 @@ def noisy(shift=0.0):
 def whole():
     steps = []
     found = GASSI(motor(), **SETTINGS).fit(noisy(), on_progress=steps.append)
-    assert {step.stage for step in steps} == {"search", "refine"}
+    assert {step.stage for step in steps} == {"search", "refine", "weigh"}
     return found, steps
+
+
+def searching(steps):
+    """Those that a checkpoint is written after; what comes then is soon done again."""
+    return [step for step in steps if step.stage != "weigh"]
 
 
 def assert_same(found, expected):
@@ -71,6 +76,7 @@ def assert_same(found, expected):
 @pytest.mark.parametrize("share", [0.02, 0.3, 0.6, 0.97])
 def test_a_killed_search_goes_on_to_the_bit(tmp_path, whole, share):
     expected, steps = whole
+    steps = searching(steps)
     path = tmp_path / "search.ckpt"
     step = max(1, round(share * len(steps)))
     killed = subprocess.run(
@@ -81,7 +87,7 @@ def test_a_killed_search_goes_on_to_the_bit(tmp_path, whole, share):
     rest = []
     found = GASSI(motor(), **SETTINGS).fit(noisy(), resume=path, on_progress=rest.append)
     assert_same(found, expected)
-    assert rest == steps[step:]
+    assert searching(rest) == steps[step:]
 
 
 class Stop:
@@ -110,7 +116,7 @@ def test_a_finished_search_is_only_read_again(tmp_path, whole):
     assert_same(
         GASSI(motor(), **SETTINGS).fit(noisy(), resume=path, on_progress=steps.append), whole[0]
     )
-    assert steps == []
+    assert searching(steps) == []
 
 
 def test_estimated_starts_go_on_too(tmp_path):

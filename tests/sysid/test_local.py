@@ -98,7 +98,7 @@ def test_the_budget_is_kept_and_the_end_is_a_minimum():
     record = Dataset(
         clean.inputs, clean.outputs + noise * np.abs(clean.outputs).max(axis=0), clean.dt
     )
-    found = GASSI(motor(), population=100, generations=20).fit(record)
+    found = GASSI(motor(), population=100, generations=20, criterion="error").fit(record)
     assert 0.9 * 2000 < found.n_simulations_ <= 2000
     assert len(found.history_) in (19, 20)
     assert np.all(np.diff(found.history_) <= 1e-12)
