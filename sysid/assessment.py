@@ -21,6 +21,10 @@ Trust = Literal["good", "limited", "poor"]
 _HARDLY_WORSE, _FAR_WORSE = 1.3, 2.0
 _INDEPENDENT = 0.75  # share of lags inside a 95 % band below which something is left
 _FITTED = 50.0  # fit [%] below which a model explains little
+_EXACT = 99.0  # fit [%] above which an error several times as large is still a small one
+# Correlation with an input below which what is left is found in long records, but is nothing to
+# mend: one per cent of the residuals' variance.
+_NOTICEABLE = 0.1
 
 
 @dataclass(frozen=True)
@@ -76,7 +80,7 @@ def judge(
     for name, ratio, fit in _progress(model, training, validation):
         if fit < _FITTED:
             grave.append(f"{name} is explained poorly on the validation data (fit {fit:.0f} %).")
-        elif ratio > _FAR_WORSE:
+        elif ratio > _FAR_WORSE and fit < _EXACT:
             grave.append(f"{name} errs {ratio:.1f} times as much in validation as in training.")
         elif ratio > _HARDLY_WORSE:
             light.append(f"{name} errs {ratio:.1f} times as much in validation as in training.")
@@ -122,12 +126,13 @@ def _left_over(model: ProcessModel, results: Sequence[RecordResult]) -> list[str
     """Outputs whose residuals still follow an input."""
     # Over the records: of many, one is outside by chance.
     shares = mean_known(np.array([result.residuals.independent for result in results]), 0)
+    sizes = np.mean([np.abs(result.residuals.cross).max(axis=0) for result in results], axis=0)
     found = []
-    for output, own in zip(model.output_names, shares, strict=True):
+    for output, own, size in zip(model.output_names, shares, sizes, strict=True):
         follows = [
             signal
-            for signal, share in zip(model.input_names, own, strict=True)
-            if share < _INDEPENDENT
+            for signal, share, strength in zip(model.input_names, own, size, strict=True)
+            if share < _INDEPENDENT and strength > _NOTICEABLE
         ]
         if follows:
             found.append(

@@ -154,6 +154,26 @@ def test_what_follows_an_input_is_named():
     assert verdict([slow(1)], [slow(2), *(result(k) for k in range(3, 7))]).trust == "good"
 
 
+def test_a_trace_of_an_input_in_a_long_record_is_nothing_to_mend():
+    def long(part):
+        n = 20_000
+        slow = np.sin(np.arange(n) / 300.0)[:, None] * [1.0, 1.0]
+        data = Dataset(slow, slow + 0.5, 0.01, "long")
+        wrong = NOISE * (np.random.default_rng(6).standard_normal((n, 2)) + part * slow)
+        return examine([data], lambda r: r.outputs - wrong)[0]
+
+    trace, much = long(0.07), long(0.3)
+    assert np.all(trace.residuals.independent < 0.1)
+    assert verdict([trace], [trace]).trust == "good"
+    assert "follow" in verdict([much], [much]).reasons[0]
+
+
+def test_an_error_several_times_as_large_may_still_be_a_small_one():
+    found = verdict([result(1, (1e-4, 1e-4))], [result(2, (1e-4, 4e-4))])
+    assert found.trust == "limited"
+    assert found.reasons[0].startswith("current errs ")
+
+
 def test_what_follows_a_noisy_input_is_not_held_against_the_model():
     noise = {"input_noise": np.array([0.0, 0.3])}
     data = record(3, **noise)
