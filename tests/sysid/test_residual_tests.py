@@ -114,6 +114,13 @@ def test_a_constant_or_noisy_input_says_nothing():
     assert np.all(np.isfinite(test.cross)) and np.all(np.isfinite(test.cross_band))
 
 
+def test_a_band_has_a_width_whatever_the_colours():
+    t = np.arange(400.0)
+    # The estimated variance of the correlations is negative here.
+    test = residual_test(((-1.0) ** t)[:, None], t[:, None])
+    assert np.all(test.cross_band > 0.0)
+
+
 def test_a_model_without_inputs_or_errors_is_tested_for_what_there_is():
     without = residual_test(np.random.default_rng(0).standard_normal((50, 1)), np.zeros((50, 0)))
     assert without.independent.shape == (1, 0) and without.tested.shape == (0,)

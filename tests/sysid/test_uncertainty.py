@@ -677,6 +677,22 @@ def test_what_is_tied_is_told_apart_from_what_is_hardly_felt():
     assert set(vague.parameters) < {"a", "b"}
 
 
+def test_what_is_exact_is_named_once_beside_what_overlaps_it():
+    """a, b and c scale together exactly; a and w against each other up to the noise."""
+
+    def formula(p, u):
+        return columns(0.1 * p["b"] / p["c"] * u[:, 0] + p["a"] * p["w"] / p["b"] * u[:, 1]
+                       + 0.02 * p["w"] * u[:, 2])  # fmt: skip
+
+    parameters = [unknown(name, 1.0) for name in "abcw"]
+    problem = Problem(formula, parameters, sigma=0.5)
+    found = uncertainty(problem.objective(), np.ones(4))
+    exact, vague = found.ambiguities
+    assert set(exact.parameters) == set("abc") and len(exact.measure) == 1
+    assert vague.kind == "vague" and "w" in vague.parameters
+    assert found.rank == 2
+
+
 def test_slopes_with_errors_mix_nothing_into_what_is_exact():
     """Where a model switches, slopes err by more than what hardly acts does."""
 
@@ -778,6 +794,15 @@ def test_the_scale_of_the_search_hardly_matters_to_what_is_well_known():
         assert one.std == pytest.approx(other.std, rel=1e-3)
         assert one.low == pytest.approx(other.low, rel=1e-3)
     np.testing.assert_allclose(logarithmic.correlation(), linear.correlation(), atol=1e-3)
+
+
+def test_an_interval_on_a_logarithmic_scale_is_one_of_factors():
+    problem = Problem(two_outputs, UNITS, sigma=2.0)
+    for estimate in problem.tell(scale=dict.fromkeys("abc", "log")).parameters:
+        factor = np.exp(Z * estimate.std / estimate.value)
+        assert factor > 1.02
+        assert estimate.high / estimate.value == pytest.approx(factor, rel=1e-9)
+        assert estimate.value / estimate.low == pytest.approx(factor, rel=1e-9)
 
 
 def test_twice_the_data_shrink_deviations_by_the_root_of_two():
