@@ -5,7 +5,8 @@ it lets an output that is noisy, or whose errors wander slowly, decide what anot
 white errors could tell better. The likelihood of independent normal errors whose variances are
 unknown has its maximum where the product of the RMSEs is least (Ljung, "System Identification",
 section 7.4, with a diagonal covariance): every output then weighs by the inverse of its own error.
-Minima that the mean cannot tell apart, the likelihood often does.
+Among minima the likelihood chooses once more, each output counted by as many independent samples
+as the colour of its errors leaves; those that it cannot tell apart are rivals.
 """
 
 from __future__ import annotations
@@ -15,9 +16,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sysid.lookalikes import lookalikes
 from sysid.model import FloatArray
 from sysid.objective import Objective
 from sysid.refinement import Refinement, refine
+from sysid.uncertainty.colour import colour, longest_memory
+from sysid.uncertainty.sensitivity import common_steps, sensitivity
 
 _ROUNDS = 6  # of weights and parameters in turn
 _STEADY = 1e-3  # part by which weights may still change
@@ -26,37 +30,105 @@ _STEADY = 1e-3  # part by which weights may still change
 _LEAST_SHARE = 1e-2
 # Errors below this part of the simulation's accuracy are its own: there is no noise to weigh by.
 _OWN = 0.1
+# Twice the logarithm of a likelihood ratio above which one minimum is no rival to another: one
+# in a hundred for the four parameters in which such minima typically differ.
+_TOLD_APART = 13.3
+_EXPLORED = 2  # minima whose lookalikes are descended from
+# Minima are one that stand so near each other, in parts of the ranges, with errors so alike.
+_NEAR, _SAME = 0.02, 1e-3
+
+Watch = Callable[[Refinement], None]
 
 
 @dataclass(frozen=True)
 class Settled:
     """Where an identification ends.
 
-    objective: with the weights that were used in the end. chromosome: (n_free,).
-    loss: minus the mean log-likelihood of a sample up to a constant, the weighted mean of the
-    logarithms of the outputs' RMSEs.
+    objective: with the weights that were used in the end. chromosome: (n_free,). rivals: other
+    chromosomes, far from it, that the data do not tell from it.
     """
 
     objective: Objective
     chromosome: FloatArray
-    loss: float
+    rivals: tuple[FloatArray, ...] = ()
 
 
 def settle(
-    objective: Objective,
-    minima: Sequence[FloatArray],
-    on_iteration: Callable[[Refinement], None] | None = None,
+    objective: Objective, minima: Sequence[FloatArray], watch: Watch | None = None
 ) -> Settled:
-    """The likeliest of some minima (n_free,) of the mean RMSE, refined by the likelihood."""
-    settled = [_settle(objective, minimum, on_iteration) for minimum in minima]
-    return min(settled, key=lambda one: one.loss)
+    """The likeliest of some minima (n_free,) of the mean RMSE and of their lookalikes."""
+    known = _Known(objective)
+    for minimum in minima:
+        known.add(_weighed(objective, minimum, watch))
+    explored: list[_Settling] = []
+    while len(explored) < _EXPLORED:
+        best = known.ranked()[0]
+        if any(best is one for one in explored):
+            break  # nothing better was found around it
+        explored.append(best)
+        for start in lookalikes(best.objective, best.chromosome):
+            found = refine(best.objective, start, on_iteration=watch).chromosome
+            known.add(_weighed(objective, found, watch))
+    best, *others = known.ranked()
+    near = [one for one in others if known.evidence(one, best) < _TOLD_APART]
+    return Settled(best.objective, best.chromosome, tuple(one.chromosome for one in near))
 
 
-def _settle(
-    objective: Objective,
-    chromosome: FloatArray,
-    on_iteration: Callable[[Refinement], None] | None,
-) -> Settled:
+@dataclass(frozen=True)
+class _Settling:
+    """A minimum by the likelihood: chromosome (n_free,), the outputs' errors (n_outputs,)."""
+
+    objective: Objective
+    chromosome: FloatArray
+    rms: FloatArray
+    feasible: bool
+
+
+class _Known:
+    """The minima found so far."""
+
+    def __init__(self, objective: Objective) -> None:
+        self._objective = objective
+        self._minima: list[_Settling] = []
+        self._samples: FloatArray | None = None
+
+    def add(self, minimum: _Settling) -> None:
+        """One more, unless it stands where another does and its outputs err alike."""
+        space, floor = self._objective.space, _SAME * float(minimum.rms.max())
+        width = space.encode(space.upper) - space.encode(space.lower)
+        for known in self._minima:
+            moved = space.encode(known.chromosome) - space.encode(minimum.chromosome)
+            near = np.max(np.abs(moved / width)) < _NEAR
+            if near and np.allclose(known.rms, minimum.rms, rtol=_SAME, atol=floor):
+                return
+        self._minima.append(minimum)
+
+    def ranked(self) -> list[_Settling]:
+        """The likeliest first, feasible before infeasible."""
+        first = self._minima[0]
+        return sorted(self._minima, key=lambda one: (not one.feasible, self.evidence(one, first)))
+
+    def evidence(self, one: _Settling, other: _Settling) -> float:
+        """Twice the logarithm of the likelihood ratio by which the other is likelier."""
+        samples = self._independent_samples()
+        floor = _LEAST_SHARE * max(one.rms.max(), other.rms.max(), 1e-300)
+        ratio = np.log(np.maximum(one.rms, floor) / np.maximum(other.rms, floor))
+        return float(2.0 * np.sum(samples * ratio))
+
+    def _independent_samples(self) -> FloatArray:
+        """How many independent samples each output's errors amount to, (n_outputs,)."""
+        if self._samples is None:
+            first = self._minima[0]
+            steps = common_steps(first.objective, first.chromosome)
+            found = sensitivity(first.objective, first.chromosome, steps)
+            memory = longest_memory(colour(found.residual, found.seen, found.lengths))
+            weights = self._objective.weights * len(self._objective.weights)
+            self._samples = weights * self._objective.counts / memory
+        return self._samples
+
+
+def _weighed(objective: Objective, chromosome: FloatArray, watch: Watch | None) -> _Settling:
+    """Weights and parameters in turn, until the weights are those of the errors."""
     given = objective.weights
     rms = objective.rms(chromosome[None])[0]
     # A refinement may end where a simulation takes more steps than a chromosome is allowed.
@@ -66,9 +138,9 @@ def _settle(
         weighed = objective.weighed(weights)
         steady = np.allclose(weighed.weights, objective.weights, rtol=_STEADY)
         objective = weighed
-        chromosome = refine(objective, chromosome, on_iteration=on_iteration).chromosome
+        chromosome = refine(objective, chromosome, on_iteration=watch).chromosome
         rms = objective.rms(chromosome[None])[0]
         if steady:
             break
-    floor = max(_LEAST_SHARE * rms.max(), 1e-300)
-    return Settled(objective, chromosome, float(given @ np.log(np.maximum(rms, floor))))
+    finite = np.where(np.isfinite(rms), rms, np.finfo(np.float64).max)
+    return _Settling(objective, chromosome, finite, objective.space.feasible(chromosome))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -266,6 +266,26 @@ class SearchSpace:
         for i, constraint in enumerate(self.model.constraints):
             values[:, i] = constraint.function(columns)
         return values
+
+
+@dataclass(frozen=True)
+class HeldSpace(SearchSpace):
+    """A space in which one coordinate keeps its value."""
+
+    place: int = 0
+    value: float = 0.0
+
+    @classmethod
+    def holding(cls, space: SearchSpace, place: int, value: float) -> HeldSpace:
+        """The space with one search coordinate held."""
+        given = {f.name: getattr(space, f.name) for f in fields(SearchSpace)}
+        return cls(**given, place=place, value=value)
+
+    def coded_bounds(self) -> tuple[FloatArray, FloatArray]:
+        """As of the whole space, but both at the held value."""
+        lower, upper = super().coded_bounds()
+        lower[self.place] = upper[self.place] = self.value
+        return lower, upper
 
 
 def _check_conflicts(*groups: Mapping[str, object]) -> None:

@@ -25,6 +25,7 @@ _NOTES = {
     "tied": "only with others",
     "vague": "hardly felt",
     "bound": "at its end",
+    "rival": "two answers",
     "": "",
 }
 
@@ -183,6 +184,7 @@ def _uncertainty(found: Uncertainty | None) -> dict[str, Any]:
             }
             for ambiguity in found.ambiguities
         ],
+        **({"rivals": [dict(rival) for rival in found.rivals]} if found.rivals else {}),
         "correlations": pairs,
     }
 
@@ -303,7 +305,8 @@ def _interval_text(estimate: Estimate) -> str:
 
 def _show_open_questions(found: Uncertainty) -> None:
     """What the data do not tell, what they tell instead, and what measurement would."""
-    exact = [a for a in found.ambiguities if a.kind != "vague"]
+    _show_rivals(found)
+    exact = [a for a in found.ambiguities if a.kind in ("product", "sum")]
     if exact:
         console.print_line("What these data cannot tell apart:")
     for ambiguity in exact:
@@ -319,6 +322,26 @@ def _show_open_questions(found: Uncertainty) -> None:
                            f"{'; '.join(close)}.")  # fmt: skip
     if exact or vague or close:
         console.print_line()
+
+
+def _show_rivals(found: Uncertainty) -> None:
+    """Other minima that explain the data as well."""
+    for ambiguity in found.ambiguities:
+        if ambiguity.kind != "rival":
+            continue
+        here = {estimate.name: estimate.value for estimate in found.parameters}
+        sets = [here, *found.rivals]
+        console.print_table(
+            "Sets of parameters that explain these data alike",
+            ["parameter", "this one", *["another"] * len(found.rivals)],
+            [
+                [name, *(console.number(values[name], 3) for values in sets)]
+                for name in ambiguity.parameters
+            ],
+        )
+        console.print_line(
+            f"A measured {ambiguity.measure[0]}, given under 'fixed', would tell which it is.\n"
+        )
 
 
 def _exact_lines(ambiguity: Ambiguity) -> list[str]:

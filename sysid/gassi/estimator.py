@@ -192,6 +192,7 @@ class GASSI(RecordEstimator):
         )
         objective = self._objective(data)
         self.output_weights_: FloatArray = objective.weights
+        self._rivals: tuple[FloatArray, ...] = ()
         run = self._run(objective, preset)
         keeper = self._keeper(data, run, checkpoint, resume)
         notify = on_progress or (lambda progress: None)
@@ -243,6 +244,7 @@ class GASSI(RecordEstimator):
             )
         )
         self.output_weights_ = settled.objective.weights
+        self._rivals = settled.rivals
         self.n_simulations_ = run.objective.simulations
 
     def predict(self, X: Dataset | FloatArray, *, records: Any = None) -> FloatArray:
@@ -282,7 +284,7 @@ class GASSI(RecordEstimator):
         X, y, records: what ``fit`` was given. Raises ModelError where the local refinement did
         not run to its end: only at a minimum of the error do its sensitivities tell.
         """
-        return uncertainty(self._settled(X, y, records), self.chromosome_)
+        return uncertainty(self._settled(X, y, records), self.chromosome_, self._rivals)
 
     def profile(
         self, name: str, X: Data, y: FloatArray | None = None, *, records: Any = None
@@ -293,6 +295,13 @@ class GASSI(RecordEstimator):
         parameter that is not free.
         """
         return profile(self._settled(X, y, records), self.chromosome_, name)
+
+    @property
+    def rivals_(self) -> list[dict[str, float]]:
+        """All the model's parameters in other minima that the data do not tell from the result."""
+        names = self._model().parameter_names
+        vectors = [self.space_.full(rival) for rival in self._rivals]
+        return [dict(zip(names, vector.tolist(), strict=True)) for vector in vectors]
 
     def _settled(self, X: Data, y: FloatArray | None, records: Any) -> Objective:
         """The objective at whose minimum ``fit`` ended."""

@@ -9,7 +9,9 @@ data do determine (products, sums) do.
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from scipy.linalg import null_space
@@ -22,6 +24,7 @@ from sysid.uncertainty.estimate import Z95, Estimate, Why, product_text, sum_tex
 from sysid.uncertainty.relations import Kind, Relation, named, overlapping, relations, sparse
 from sysid.uncertainty.sensitivity import common_steps, coordinate_units, sensitivity
 
+_ALIKE = 0.05  # rivals closer than this are one
 _WHOLE = 1e-3  # a factor this close to a whole number is meant to be one
 
 # Units of what a lab measures with a meter, a scale or a data sheet, easiest first.
@@ -33,12 +36,13 @@ class Ambiguity:
     """Parameters of which only combinations act on the outputs.
 
     kind: ``product`` and ``sum`` are exact, tried by moving the parameters along them; ``vague``
-    is a direction that the noise hides. determined: the combinations that have an interval.
+    is a direction that the noise hides; ``rival`` are those that differ between minima that the
+    data do not tell apart. determined: the combinations that have an interval.
     measure: the parameters whose measurement by other means would resolve it, as many as there
     are directions to resolve, what is easiest to measure first.
     """
 
-    kind: Kind
+    kind: Kind | Literal["rival"]
     parameters: tuple[str, ...]
     determined: tuple[Estimate, ...]
     measure: tuple[str, ...]
@@ -51,7 +55,8 @@ class Uncertainty:
     parameters: one estimate for each free parameter (and estimated initial state). covariance:
     (n_free, n_free) of the coordinates (logarithms where searched so, else parts of the value),
     undetermined directions and parameters on a bound left out. singular_values: of the scaled
-    sensitivity, falling. rank: how many directions the data determine.
+    sensitivity, falling. rank: how many directions the data determine. rivals: free parameters
+    of other minima that the data do not tell from this one.
     """
 
     parameters: tuple[Estimate, ...]
@@ -59,6 +64,7 @@ class Uncertainty:
     covariance: FloatArray
     singular_values: FloatArray
     rank: int
+    rivals: tuple[Mapping[str, float], ...] = ()
 
     def correlation(self) -> FloatArray:
         """Correlation of the free parameters, NaN where there is no variance."""
@@ -73,11 +79,14 @@ class Uncertainty:
         return (*(p for p in self.parameters if not p.why), *combined)
 
 
-def uncertainty(objective: Objective, chromosome: FloatArray) -> Uncertainty:
+def uncertainty(
+    objective: Objective, chromosome: FloatArray, rivals: Sequence[FloatArray] = ()
+) -> Uncertainty:
     """Intervals, ambiguities and what is determined at an identified chromosome, (n_free,).
 
     The estimate is taken as the minimum of the objective; the colour of its residuals and the
-    records' zero errors enter the covariance.
+    records' zero errors enter the covariance. rivals: other minima that explain the data as well;
+    what is another there has no interval.
     """
     steps = common_steps(objective, chromosome)
     found = sensitivity(objective, chromosome, steps)
@@ -86,7 +95,55 @@ def uncertainty(objective: Objective, chromosome: FloatArray) -> Uncertainty:
     units = coordinate_units(objective, chromosome)
     slope = np.where(objective.space.log, chromosome, units)
     hidden = relations(objective, chromosome, steps, found, slope, told)
-    return _Teller(objective.space, chromosome, slope, told, hidden).result()
+    result = _Teller(objective.space, chromosome, slope, told, hidden).result()
+    names = objective.space.names
+    return _beside(result, [dict(zip(names, rival.tolist(), strict=True)) for rival in rivals])
+
+
+def _beside(result: Uncertainty, rivals: Sequence[Mapping[str, float]]) -> Uncertainty:
+    """Without the intervals of what is another in a rival minimum."""
+
+    def other(estimate: Estimate, rival: Mapping[str, float]) -> bool:
+        if estimate.low is None or estimate.high is None:
+            return False
+        return not estimate.low <= estimate.at(rival) <= estimate.high
+
+    def open_(estimate: Estimate) -> bool:
+        return any(other(estimate, rival) for rival in rivals)
+
+    several = [e for e in result.parameters if open_(e)]
+    names = tuple(e.name for e in sorted(several, key=lambda e: _effort(e.unit)))
+    parameters = tuple(
+        replace(e, std=None, low=None, high=None, why="rival") if open_(e) else e
+        for e in result.parameters
+    )
+    ambiguities = [
+        replace(a, determined=tuple(e for e in a.determined if not open_(e)))
+        for a in result.ambiguities
+    ]
+    if names:
+        ambiguities.insert(0, Ambiguity("rival", names, (), names[:1]))
+    apart = [rival for rival in rivals if any(other(e, rival) for e in several)]
+    return replace(
+        result,
+        parameters=parameters,
+        ambiguities=tuple(ambiguities),
+        rivals=tuple(_unlike(apart, names)),
+    )
+
+
+def _unlike(
+    rivals: Sequence[Mapping[str, float]], names: Sequence[str]
+) -> list[Mapping[str, float]]:
+    """Those that differ from each other in some of the named parameters."""
+    kept: list[Mapping[str, float]] = []
+    for rival in rivals:
+        values = [rival[name] for name in names]
+        if not any(
+            np.allclose(values, [known[name] for name in names], rtol=_ALIKE) for known in kept
+        ):
+            kept.append(rival)
+    return kept
 
 
 @dataclass(frozen=True)

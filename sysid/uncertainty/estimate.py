@@ -10,7 +10,7 @@ import numpy as np
 
 Z95 = 1.959963984540054  # of a normal distribution, two-sided 95 %
 
-Why = Literal["", "tied", "vague", "bound"]
+Why = Literal["", "tied", "vague", "bound", "rival"]
 
 
 @dataclass(frozen=True)
@@ -18,8 +18,8 @@ class Estimate:
     """A value with its standard deviation and 95 % interval, or without where there is none.
 
     terms: (parameter, exponent) of a product, (parameter, factor) of a sum. why: empty, ``tied``
-    (it acts only together with others), ``vague`` (the data hardly feel it), or ``bound`` (it
-    stands on an end of its range).
+    (it acts only together with others), ``vague`` (the data hardly feel it), ``bound`` (it
+    stands on an end of its range), or ``rival`` (it is another in a rival minimum).
     """
 
     name: str

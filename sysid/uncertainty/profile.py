@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
 from sysid.model import FloatArray, ModelError
 from sysid.objective import Objective
 from sysid.refinement import refine
-from sysid.space import SearchSpace
+from sysid.space import HeldSpace
 from sysid.uncertainty.directions import directions
 from sysid.uncertainty.estimate import Z95
 from sysid.uncertainty.sensitivity import common_steps, coordinate_units, sensitivity
@@ -38,19 +38,6 @@ class Profile:
     statistic: FloatArray
     low: float | None
     high: float | None
-
-
-@dataclass(frozen=True)
-class _Held(SearchSpace):
-    """A space in which one coordinate keeps its value."""
-
-    place: int = 0
-    value: float = 0.0
-
-    def coded_bounds(self) -> tuple[FloatArray, FloatArray]:
-        lower, upper = super().coded_bounds()
-        lower[self.place] = upper[self.place] = self.value
-        return lower, upper
 
 
 def profile(objective: Objective, chromosome: FloatArray, name: str) -> Profile:
@@ -137,8 +124,7 @@ class _Tracer:
         return (np.sqrt(variance) * size if own else blind), 2.0 * n / inflation
 
     def _fitted(self, at: FloatArray, coordinate: float) -> tuple[FloatArray, float]:
-        given = {f.name: getattr(self.space, f.name) for f in fields(SearchSpace)}
-        held = _Held(**given, place=self.place, value=coordinate)
+        held = HeldSpace.holding(self.space, self.place, coordinate)
         moved = at.copy()
         moved[self.place] = coordinate
         result = refine(self.objective.over(held), held.decode(moved), max_iterations=_ITERATIONS)
