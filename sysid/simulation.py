@@ -243,8 +243,11 @@ class _Runner:
             for task in queue:
                 function(task)
 
-        workers = [self.pool.submit(work) for _ in range(self.simulator.threads)]
+        # This thread is one of them: waking another takes as long as a short simulation.
+        others = min(self.simulator.threads, len(tasks)) - 1
+        workers = [self.pool.submit(work) for _ in range(others)]
         try:
+            work()
             for worker in workers:
                 worker.result()
         finally:

@@ -122,7 +122,12 @@ def check(
 
 @app.command(epilog="Example:  rig identify runs/20260101T120000Z-prbs --validate other_log.csv")
 def identify(
-    logs: Logs,
+    logs: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="RUN_OR_CSV...", help="Capture folders, CSV logs, or folders of them."
+        ),
+    ] = None,
     model: ModelNames = None,
     config: ConfigFile = None,
     validate: Validation = None,
@@ -158,6 +163,12 @@ def identify(
     seeds: Seeds = None,
     jobs: Jobs = None,
     dask: Dask = None,
+    resume: Annotated[
+        Path | None,
+        typer.Option(
+            "--resume", metavar="DIR", help="Go on with what was interrupted, as it was asked."
+        ),
+    ] = None,
     json: AsJson = False,
 ) -> None:
     """Identify a model's parameters from logs: one parameter set for all of them.
@@ -165,6 +176,19 @@ def identify(
     Several models, or linear ones, are ranked: which explains the validation data best, by more
     than chance, and with how many parameters.
     """
+    if resume is not None:
+        others = (
+            logs, model, config, validate, out, preset, population, generations, seed, hold_back,
+            profile, guess, datasheet, settings, arx, armax, seeds, jobs, dask,
+        )  # fmt: skip
+        if any(others):
+            raise typer.BadParameter("--resume goes on as it was asked; give nothing but --json")
+        from daq.cli.identifying import resume_command
+
+        resume_command(resume, json)
+        return
+    if not logs:
+        raise typer.BadParameter("name the logs to identify from, or a folder with --resume")
     options = {
         "preset": preset,
         "population": population,

@@ -14,10 +14,11 @@ from typing import Any
 import yaml
 
 from daq import capture
-from daq.cli import console, datasets, datasheets, reporting
+from daq.cli import console, datasets, datasheets, reporting, resuming
 from daq.cli.datasets import Loaded, Mapping
 from daq.cli.modelling import DEFAULT_MODEL, find_model, whole_name
 from daq.cli.reporting import Identified
+from daq.cli.resuming import Asked
 from daq.config import yaml_file
 from daq.config.identification import IdentificationConfig, Signals
 from daq.config.yaml_file import CommandLine, YamlFile, suggestion
@@ -39,7 +40,8 @@ _STAGES = {
 class Prepared:
     """Settings of an identification, checked before any log is read or rig moved.
 
-    sources: where each parameter's range or value stands that is not the model's own.
+    sources: where each parameter's range or value stands that is not the model's own. asked:
+    what all this was made from.
     """
 
     model: ProcessModel
@@ -47,6 +49,7 @@ class Prepared:
     settings: IdentificationConfig
     mapping: Mapping | None
     sources: MappingType[str, str]
+    asked: Asked
 
 
 def identify_command(
@@ -63,6 +66,19 @@ def identify_command(
     folder = out or default_folder(logs, prepared.model.name)
     check_writable(folder)
     report = identify_logs(prepared, logs, validate, folder, as_json)
+    if as_json:
+        console.print_json(report)
+
+
+def resume_command(folder: Path, as_json: bool) -> None:
+    """Go on with an identification that was interrupted, and print it."""
+    folder, request = resuming.recall(folder)
+    asked = request.asked
+    config = Path(asked.config) if asked.config is not None else None
+    prepared = prepare(config, asked.options, asked.settings)
+    report = identify_logs(
+        prepared, request.training, request.validation, folder, as_json, resume=True
+    )
     if as_json:
         console.print_json(report)
 
@@ -118,7 +134,9 @@ def prepare_models(
         if own.guess and model.guesses is None:
             raise file.error(("guess",), f"model {model.name} has no 'guesses' function that "
                              "reads ranges from logs; leave this out")  # fmt: skip
-        prepared.append(Prepared(used, name, own, mapping, sources | _range_sources(file)))
+        asked = Asked.of(config, options, more, name)
+        all_sources = sources | _range_sources(file)
+        prepared.append(Prepared(used, name, own, mapping, all_sources, asked))
     return prepared
 
 
@@ -211,8 +229,12 @@ def identify_logs(
     validation: list[Path],
     folder: Path,
     as_json: bool,
+    resume: bool = False,
 ) -> dict[str, Any]:
-    """Identify, print for people unless ``as_json``, write files; the report for machines."""
+    """Identify, print for people unless ``as_json``, write files; the report for machines.
+
+    resume: go on from the checkpoint in the folder.
+    """
     model = prepared.model
     train = [datasets.load(p, model, prepared.mapping) for p in datasets.expand(training)]
     check = [datasets.load(p, model, prepared.mapping) for p in datasets.expand(validation)]
@@ -222,13 +244,21 @@ def identify_logs(
             console.report_note(log.warning)
     train, ends = datasets.hold_back(train, prepared.settings.hold_back)
     check = [*ends, *check]
-    estimator = _fit(prepared, train, as_json)
+    if not resume:
+        resuming.remember(folder, prepared.asked, training, validation)
+    estimator = _fit(prepared, train, folder, as_json, resume)
     result = assemble(prepared, estimator, train, check, as_json)
     report = reporting.document(result)
     path = write_parameters(folder, report)
     report["files"] = {"parameters": str(path)}
     if not as_json:
         reporting.show(result, path)
+    if estimator.stopped_ != "interrupted":
+        resuming.forget(folder)
+    elif as_json:
+        report["search"]["resume"] = resuming.command(folder)
+    else:
+        console.print_line(f"Go on with the search: {resuming.command(folder)}")
     return report
 
 
@@ -336,7 +366,8 @@ def check_writable(folder: Path) -> None:
     raise ConfigError(f"{folder}: cannot be created: {reason}; choose a folder with --out")
 
 
-def _fit(prepared: Prepared, train: list[Loaded], quiet: bool) -> GASSI:
+def _fit(prepared: Prepared, train: list[Loaded], folder: Path, quiet: bool, resume: bool) -> GASSI:
+    checkpoint = resuming.checkpoint(folder)
     estimator = GASSI(prepared.model, **gassi_settings(prepared.settings))
     with console.progress(quiet) as bar:
 
@@ -346,8 +377,15 @@ def _fit(prepared: Prepared, train: list[Loaded], quiet: bool) -> GASSI:
             bar.update(title, step.done, step.total, note)
 
         try:
-            return estimator.fit([log.dataset for log in train], on_progress=watch)
+            return estimator.fit(
+                [log.dataset for log in train],
+                on_progress=watch,
+                checkpoint=checkpoint,
+                resume=checkpoint if resume else None,
+            )
         except ModelError as error:
+            if not resume:
+                resuming.forget(folder)
             raise ConfigError(str(error)) from None
 
 

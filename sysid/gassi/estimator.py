@@ -374,7 +374,8 @@ class GASSI(RecordEstimator):
             self.minimum_generations,
             self.termination_ratio,
         )
-        return Run(objective, preset, search, self.generations, rng)
+        likelihood = self.criterion == "likelihood"
+        return Run(objective, preset, search, self.generations, rng, likelihood)
 
     def _keeper(
         self, data: Sequence[Dataset], run: Run, checkpoint: Path | None, resume: Path | None

@@ -109,11 +109,18 @@ class LocalSearch:
         return self.polished
 
     def rivals(self, most: int) -> list[FloatArray]:
-        """The best in search coordinates (n_free,), then other minima hardly worse; so many."""
+        """The likeliest of the minima hardly worse than the best, so many, (n_free,) each.
+
+        By the likelihood where they are: the mean logarithm of the outputs' errors.
+        """
+        rms = self.objective.rms(self.objective.space.decode(self.best[None]))[0]
         near = [m for m in self.minima if m.error <= (1.0 + _NEAR) * self.error]
-        near.sort(key=lambda minimum: minimum.error)
-        others = [m.at for m in near if not np.array_equal(m.at, self.best)]
-        return [self.best, *others][:most]
+        near = [m for m in near if not np.allclose(m.rms, rms, rtol=_SAME, atol=_SAME * m.error)]
+        near = [Minimum(self.best, self.error, rms), *near]
+        weights = self.objective.weights
+        with np.errstate(divide="ignore"):  # of an output explained exactly
+            near.sort(key=lambda m: float(np.log(m.rms[weights > 0.0]) @ weights[weights > 0.0]))
+        return [minimum.at for minimum in near[:most]]
 
     def step(self) -> None:
         """One iteration of the descents under way, or else new starts for some."""

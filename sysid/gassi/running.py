@@ -12,11 +12,13 @@ from sysid.gassi.local import AT_ONCE, LocalSearch
 from sysid.gassi.search import GeneticSearch, Preset
 from sysid.model import FloatArray, ModelError
 from sysid.objective import Objective
+from sysid.refinement import simulations_per_iteration
 from sysid.simulation import Status
 from sysid.space import SearchSpace
 
-# Minima of the mean RMSE so close to the best are left for the likelihood to tell apart.
-_MOST_RIVALS = 6
+# Minima of the mean RMSE so close to the best are left for the likelihood to tell apart, and
+# iterations kept for each.
+_MOST_RIVALS, _ITERATIONS_EACH = 2, 20
 
 
 @dataclass(frozen=True)
@@ -33,6 +35,7 @@ class Best:
 class Run:
     """A search and what follows it, with what they have found and spent.
 
+    likelihood: whether simulations are kept for telling minima apart by their likelihood.
     history: the best error after each generation, one being as many simulations as the
     population has chromosomes; the last with what exceeded the budget. flagged: simulations
     that failed in the search, by status.
@@ -43,6 +46,7 @@ class Run:
     search: GeneticSearch
     generations: int
     rng: np.random.Generator
+    likelihood: bool
     local: LocalSearch | None = None
     history: list[float] = field(default_factory=list)
     flagged: dict[str, int] = field(default_factory=dict)
@@ -142,10 +146,14 @@ class Run:
         generations = self.generations
         if search.converged:
             generations = round(len(search.history) / (1.0 - self.preset.local_share))
+        most = search.population * generations
+        if self.likelihood:
+            kept = _MOST_RIVALS * _ITERATIONS_EACH * simulations_per_iteration(self.objective)
+            most -= min(kept, most // 4)
         return LocalSearch(
             self.objective,
             space.with_nominal_starts(search.promising(AT_ONCE)),
-            search.population * generations,
+            most,
             search.population,
             self.rng,
         )

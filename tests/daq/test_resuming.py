@@ -1,0 +1,114 @@
+"""``rig identify --resume``: an identification that was stopped goes on as it was asked."""
+
+import re
+import shutil
+import signal
+import subprocess
+
+import pytest
+import yaml
+
+from tests.daq.support import RIG, environment, rig, until, write_experiment
+
+SEARCH = ("--population", 80, "--generations", 120, "--seed", 3)
+
+
+@pytest.fixture(scope="module")
+def captured(tmp_path_factory):
+    root = tmp_path_factory.mktemp("resume")
+    write_experiment(root / "e.yaml", validation={"motor": {"seed": 77}})
+    result = rig("run", "e.yaml", cwd=root)
+    assert result.returncode == 0, result.stderr
+    (folder,) = (root / "runs").iterdir()
+    return root, folder
+
+
+def begin(root, *args):
+    return subprocess.Popen(
+        [*RIG, "identify", *map(str, args)], cwd=root, env=environment(),
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+
+
+def parameters(folder):
+    report = yaml.safe_load((folder / "parameters.yaml").read_text())
+    return {key: value for key, value in report.items() if key != "software"}
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no SIGKILL here")
+def test_a_killed_identification_goes_on_to_the_same_result(captured, tmp_path):
+    root, folder = captured
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    assert rig("identify", folder, *SEARCH, "--out", whole, cwd=root).returncode == 0
+    process = begin(root, folder.relative_to(root), *SEARCH, "--out", cut)
+    checkpoint = cut / "search.ckpt"
+    until(checkpoint.exists, "a checkpoint")
+    first = checkpoint.stat().st_mtime_ns
+    until(lambda: checkpoint.stat().st_mtime_ns > first, "a later checkpoint")
+    process.kill()
+    process.communicate()
+    assert not (cut / "parameters.yaml").exists()
+    # From another working folder: what was asked is known.
+    result = rig("identify", "--resume", cut, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert parameters(cut) == parameters(whole)
+    assert [path.name for path in cut.iterdir()] == [path.name for path in whole.iterdir()]
+
+
+def test_ctrl_c_says_how_to_go_on(captured, tmp_path):
+    root, folder = captured
+    out = tmp_path / "out"
+    process = begin(root, folder, *SEARCH[:3], 5000, "--out", out)
+    until((out / "search.ckpt").exists, "a checkpoint")
+    first = (out / "search.ckpt").stat().st_mtime_ns
+    until(lambda: (out / "search.ckpt").stat().st_mtime_ns > first, "a later checkpoint")
+    process.send_signal(signal.SIGINT)
+    text, errors = process.communicate(timeout=120)
+    assert process.returncode == 0, errors
+    hint = re.search(r"rig identify --resume (\S+)", text.replace("\n", ""))
+    assert hint is not None and hint[1] == str(out)
+    assert (out / "search.ckpt").exists() and (out / "parameters.yaml").exists()
+
+
+def test_nothing_is_left_of_an_identification_that_ended(captured, tmp_path):
+    root, folder = captured
+    result = rig(
+        "identify", folder, "--population", 20, "--generations", 2, "--out", tmp_path / "o",
+        cwd=root,
+    )  # fmt: skip
+    assert result.returncode == 0, result.stderr
+    assert [path.name for path in (tmp_path / "o").iterdir()] == ["parameters.yaml"]
+    result = rig("identify", "--resume", tmp_path / "o", cwd=root)
+    assert result.returncode == 2 and "no identification was interrupted there" in result.stderr
+
+
+def test_what_has_changed_meanwhile_is_named(captured, tmp_path):
+    root, folder = captured
+    log = tmp_path / "log.csv"
+    shutil.copy(folder / "log.csv", log)
+    process = begin(root, log, *SEARCH, "--out", tmp_path / "o")
+    until((tmp_path / "o" / "search.ckpt").exists, "a checkpoint")
+    process.kill()
+    process.communicate()
+    lines = log.read_text().splitlines(keepends=True)
+    log.write_text("".join(lines[:-20]))
+    result = rig("identify", "--resume", tmp_path / "o", cwd=root)
+    assert result.returncode == 2
+    assert "belongs to another identification" in result.stderr
+    assert re.search(r"samples 400, here 380", " ".join(result.stderr.split()))
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (["identify"], "name the logs"),
+        (["identify", "log.csv", "--resume", "."], "give nothing but --json"),
+        (["identify", "--resume", ".", "--population", "9"], "give nothing but --json"),
+        (["identify", "--resume", "nowhere"], "no identification was interrupted there"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(tmp_path, args, message):
+    result = rig(*args, cwd=tmp_path)
+    assert result.returncode == 2
+    assert message in " ".join(result.stderr.replace("│", " ").split())
+    assert "Traceback" not in result.stderr
