@@ -19,10 +19,11 @@ from sysid.objective import Objective
 _FASTEST_SEEN = 0.4  # of the sample rate: slower modes have no alias that could be mistaken
 _REACH = 2.0  # how many times faster or slower than the mode its aliases may be
 _MOST = 6
-_STAGES, _ITERATIONS = 4, 2  # on the way to the alias, Newton steps at each
+_STAGES, _ITERATIONS = 3, 2  # on the way to the alias, Newton steps at each
 _TURNED = 3  # parameters that are moved to find twins
 _TURNS = (-0.3, -0.15, 0.15, 0.3)  # by these parts of their ranges
 _DIFFERENCE = 1e-6
+_ACTING = 1e-4  # parameters that move the mode less than this part of what the strongest does
 _REACHED = 0.02  # part of the frequency by which the end may miss the alias
 
 
@@ -98,6 +99,10 @@ class _Modes:
         self.start = self.space.encode(chromosome)
         self.bounds = self.space.coded_bounds()
         self.width = self.space.encode(self.space.upper) - self.space.encode(self.space.lower)
+        self.acting = np.arange(len(self.start))
+        size = np.linalg.norm(self.slopes(self.start, self.fastest(self.start)), axis=0)
+        # The others need no differences of their own.
+        self.acting = np.flatnonzero(size > _ACTING * size.max())
 
     def fastest(self, at: FloatArray) -> complex:
         """The eigenvalue of largest imaginary part, or where nothing oscillates of largest size."""
@@ -120,14 +125,16 @@ class _Modes:
 
     def slopes(self, at: FloatArray, value: complex) -> FloatArray:
         """How real and imaginary part move per range of each coordinate, (2, n_free)."""
-        shifts = np.where(at + _DIFFERENCE * self.width > self.bounds[1], -1.0, 1.0)
-        columns = []
-        for i, shift in enumerate(shifts * _DIFFERENCE):
+        slopes = np.zeros((2, len(at)))
+        for i in self.acting:
+            shift = -_DIFFERENCE if at[i] + _DIFFERENCE * self.width[i] > self.bounds[1][i] else (
+                _DIFFERENCE
+            )  # fmt: skip
             beside = at.copy()
             beside[i] += shift * self.width[i]
             change = (self.nearest(beside, value) - value) / shift
-            columns.append([change.real, change.imag])
-        return np.array(columns, dtype=np.float64).T
+            slopes[:, i] = change.real, change.imag
+        return slopes
 
     def nearest(self, at: FloatArray, value: complex) -> complex:
         """The eigenvalue nearest to a value."""

@@ -101,6 +101,23 @@ def refine(
     return Refinement(space.decode(descent.at), descent.error, descent.iterations)
 
 
+def refine_each(
+    objective: Objective,
+    chromosomes: Sequence[FloatArray],
+    *,
+    max_iterations: int = 50,
+    tolerance: float = 1e-7,
+) -> list[Refinement]:
+    """The same from each of several chromosomes (n_free,), side by side in the same batches."""
+    descents = [begin(objective, chromosome) for chromosome in chromosomes]
+    for _ in range(max_iterations):
+        if all(descent.finished for descent in descents):
+            break
+        descents = advance(objective, descents, tolerance)
+    decode = objective.space.decode
+    return [Refinement(decode(d.at), d.error, d.iterations) for d in descents]
+
+
 def begin(objective: Objective, chromosome: FloatArray) -> Descent:
     """A descent from a chromosome (n_free,), moved to the nearest point within the ranges."""
     return Descent(np.clip(objective.space.encode(chromosome), *objective.space.coded_bounds()))

@@ -19,9 +19,14 @@ import numpy as np
 from sysid.lookalikes import lookalikes
 from sysid.model import FloatArray
 from sysid.objective import Objective
-from sysid.refinement import Refinement, refine
+from sysid.refinement import Refinement, refine, refine_each
 from sysid.uncertainty.colour import colour, longest_memory
-from sysid.uncertainty.sensitivity import common_steps, sensitivity
+from sysid.uncertainty.sensitivity import (
+    Sensitivity,
+    common_steps,
+    coordinate_units,
+    sensitivity,
+)
 
 _ROUNDS = 6  # of weights and parameters in turn
 _STEADY = 1e-3  # part by which weights may still change
@@ -33,9 +38,12 @@ _OWN = 0.1
 # Twice the logarithm of a likelihood ratio above which one minimum is no rival to another: one
 # in a hundred for the four parameters in which such minima typically differ.
 _TOLD_APART = 13.3
+_CONCEIVABLE = 40.0  # the same before a minimum has been refined to its end
+_QUICKLY, _ROUGHLY = 15, 1e-4  # iterations and tolerance until then
 _EXPLORED = 2  # minima whose lookalikes are descended from
-# Minima are one that stand so near each other, in parts of the ranges, with errors so alike.
-_NEAR, _SAME = 0.02, 1e-3
+# Minima are one when the way between them, were all linear, changed twice the log-likelihood by
+# less than this.
+_ONE = 16.0
 
 Watch = Callable[[Refinement], None]
 
@@ -66,9 +74,14 @@ def settle(
         if any(best is one for one in explored):
             break  # nothing better was found around it
         explored.append(best)
-        for start in lookalikes(best.objective, best.chromosome):
-            found = refine(best.objective, start, on_iteration=watch).chromosome
-            known.add(_weighed(objective, found, watch))
+        starts = lookalikes(best.objective, best.chromosome)
+        for found in refine_each(
+            best.objective, starts, max_iterations=_QUICKLY, tolerance=_ROUGHLY
+        ):
+            # By the best one's weights, until it turns out to matter.
+            rough = _as_found(best.objective, found.chromosome)
+            if known.new(rough) and known.evidence(rough, best) < _CONCEIVABLE:
+                known.add(_weighed(objective, found.chromosome, watch))
     best, *others = known.ranked()
     near = [one for one in others if known.evidence(one, best) < _TOLD_APART]
     return Settled(best.objective, best.chromosome, tuple(one.chromosome for one in near))
@@ -91,17 +104,23 @@ class _Known:
         self._objective = objective
         self._minima: list[_Settling] = []
         self._samples: FloatArray | None = None
+        self._sensitivity: Sensitivity | None = None
 
     def add(self, minimum: _Settling) -> None:
-        """One more, unless it stands where another does and its outputs err alike."""
-        space, floor = self._objective.space, _SAME * float(minimum.rms.max())
-        width = space.encode(space.upper) - space.encode(space.lower)
+        """One more, unless it is known."""
+        if self.new(minimum):
+            self._minima.append(minimum)
+
+    def new(self, minimum: _Settling) -> bool:
+        """Whether it is far from all others in directions that the data feel."""
+        space = self._objective.space
         for known in self._minima:
+            found = self._first_sensitivity()
             moved = space.encode(known.chromosome) - space.encode(minimum.chromosome)
-            near = np.max(np.abs(moved / width)) < _NEAR
-            if near and np.allclose(known.rms, minimum.rms, rtol=_SAME, atol=floor):
-                return
-        self._minima.append(minimum)
+            felt = found.slopes @ (moved / coordinate_units(self._objective, known.chromosome))
+            if np.sum(felt**2 / self._variance(found)) < _ONE:
+                return False
+        return True
 
     def ranked(self) -> list[_Settling]:
         """The likeliest first, feasible before infeasible."""
@@ -118,13 +137,25 @@ class _Known:
     def _independent_samples(self) -> FloatArray:
         """How many independent samples each output's errors amount to, (n_outputs,)."""
         if self._samples is None:
-            first = self._minima[0]
-            steps = common_steps(first.objective, first.chromosome)
-            found = sensitivity(first.objective, first.chromosome, steps)
+            found = self._first_sensitivity()
             memory = longest_memory(colour(found.residual, found.seen, found.lengths))
             weights = self._objective.weights * len(self._objective.weights)
             self._samples = weights * self._objective.counts / memory
         return self._samples
+
+    def _first_sensitivity(self) -> Sensitivity:
+        """At the minimum that was known first."""
+        if self._sensitivity is None:
+            first = self._minima[0]
+            steps = common_steps(first.objective, first.chromosome)
+            self._sensitivity = sensitivity(first.objective, first.chromosome, steps)
+        return self._sensitivity
+
+    @staticmethod
+    def _variance(found: Sensitivity) -> FloatArray:
+        """Of each output's residuals, (n_outputs,)."""
+        variance: FloatArray = np.mean(found.residual**2, axis=0)
+        return np.maximum(variance, max(_LEAST_SHARE**2 * variance.max(), 1e-300))
 
 
 def _weighed(objective: Objective, chromosome: FloatArray, watch: Watch | None) -> _Settling:
@@ -142,5 +173,10 @@ def _weighed(objective: Objective, chromosome: FloatArray, watch: Watch | None) 
         rms = objective.rms(chromosome[None])[0]
         if steady:
             break
+    return _as_found(objective, chromosome)
+
+
+def _as_found(objective: Objective, chromosome: FloatArray) -> _Settling:
+    rms = objective.rms(chromosome[None])[0]
     finite = np.where(np.isfinite(rms), rms, np.finfo(np.float64).max)
     return _Settling(objective, chromosome, finite, objective.space.feasible(chromosome))
