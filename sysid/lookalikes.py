@@ -10,6 +10,8 @@ the linearised model.
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 
 from sysid.linearization import jacobian
@@ -20,6 +22,7 @@ _FASTEST_SEEN = 0.4  # of the sample rate: slower modes have no alias that could
 _REACH = 2.0  # how many times faster or slower than the mode its aliases may be
 _MOST = 6
 _STAGES, _ITERATIONS = 3, 2  # on the way to the alias, Newton steps at each
+_HARM = 2.0  # times the error that a swap may cost before its descent
 _TURNED = 3  # parameters that are moved to find twins
 _TURNS = (-0.3, -0.15, 0.15, 0.3)  # by these parts of their ranges
 _DIFFERENCE = 1e-6
@@ -35,7 +38,27 @@ def lookalikes(objective: Objective, chromosome: FloatArray) -> list[FloatArray]
     """
     modes = _Modes(objective, chromosome)
     mode = modes.fastest(modes.start)
-    return [*_twins(modes, mode), *_aliases(modes, mode, objective.records[0].dt)]
+    dt = objective.records[0].dt
+    return [*_swaps(objective, chromosome), *_twins(modes, mode), *_aliases(modes, mode, dt)]
+
+
+def _swaps(objective: Objective, chromosome: FloatArray) -> list[FloatArray]:
+    """With two parameters of a unit changed for each other, where that does little harm."""
+    space = objective.space
+    units = [parameter.unit for parameter in space.parameters[: len(space.index)]]
+    pairs = [
+        (i, j) for i, j in itertools.combinations(range(len(units)), 2) if units[i] == units[j]
+    ]
+    swapped = np.repeat(chromosome[None], len(pairs) + 1, axis=0)
+    for row, (i, j) in zip(swapped, pairs, strict=False):
+        row[[i, j]] = row[[j, i]]
+    coded = space.encode(np.maximum(swapped, np.finfo(np.float64).tiny * space.log))
+    lower, upper = space.coded_bounds()
+    admitted = np.all((coded >= lower) & (coded <= upper), axis=1)
+    errors, _ = objective.evaluate(np.where(admitted[:, None], swapped, chromosome))
+    # The last one is the chromosome itself.
+    kept = admitted & (errors < _HARM * errors[-1])
+    return [swapped[k] for k in np.flatnonzero(kept[:-1])]
 
 
 def _aliases(modes: _Modes, mode: complex, dt: float) -> list[FloatArray]:
