@@ -11,7 +11,7 @@ charged for everything, the refinement included.
 
 Cases: the actuator's 19 parameters and the hysteresis's start, from a noisy simulated record;
 the DC motor of section 4.1.4, noise-free, a decade either side; the damper of
-examples/mr_damper, where its measured logs are at hand, thinned.
+examples/mr_damper, where its measured logs are at hand, one of each motion, thinned.
 """
 
 from __future__ import annotations
@@ -35,7 +35,6 @@ from sysid.model import FloatArray, ProcessModel
 from sysid.objective import Objective
 
 LOGS = damper.ROOT.parent / "shared" / "data" / "mr_damper"
-DAMPER_SAMPLES = 300  # of each log
 OURS = "ours"
 
 
@@ -61,14 +60,15 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=10, help="runs of each method")
     parser.add_argument("--budget", type=int, help="simulations of a run; default each case's own")
     parser.add_argument("--case", action="append", help="actuator, dc_motor or damper")
+    parser.add_argument("--data", type=Path, default=LOGS, help="the damper's logs; %(default)s")
     parser.add_argument("--ablation", action="store_true", help="variants of ours instead of peers")
     options = parser.parse_args()
     names = options.case or ["actuator", "dc_motor", "damper"]
     figures: dict[str, Any] = {"seeds": options.seeds, "cases": {}}
     for name in names:
-        case = CASES[name]()
+        case = CASES[name](options.data)
         if case is None:
-            figures["cases"][name] = {"skipped": f"the logs are not in {LOGS}"}
+            figures["cases"][name] = {"skipped": f"the logs are not in {options.data}"}
             continue
         if options.budget is not None:
             case = replace(case, generations=max(1, options.budget // case.population))
@@ -80,13 +80,13 @@ def main() -> None:
 # --- cases --------------------------------------------------------------------------------------
 
 
-def actuator_case() -> Case:
+def actuator_case(_: Path) -> Case:
     """The shipped experiment on the simulated rig, with its sensors' noise."""
     model = actuator()
     return Case("actuator", model, [simulated_logs(model)[0]], 300, 40)
 
 
-def dc_motor_case() -> Case:
+def dc_motor_case(_: Path) -> Case:
     """Section 4.1.4, the ranges a decade either side."""
     sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "examples"))
     import dc_motor
@@ -95,19 +95,16 @@ def dc_motor_case() -> Case:
     return Case("dc_motor", dc_motor.model, [dc_motor_data.training()], 400, 50)
 
 
-def damper_case() -> Case | None:
-    """All measured logs, thinned; None where they are not at hand."""
-    if not LOGS.is_dir():
+def damper_case(folder: Path) -> Case | None:
+    """A measured log of each motion, the currents in turn; None where they are not at hand."""
+    if not folder.is_dir():
         return None
-    model, logs = damper.load(LOGS)
-    thinned = []
-    for log in logs:
-        every = max(1, log.n_samples // DAMPER_SAMPLES)
-        thinned.append(Dataset(log.inputs[::every], log.outputs[::every], every * log.dt, log.name))
-    return Case("damper", model, thinned, 150, 30, per_log=True)
+    model, logs = damper.load(folder)
+    chosen = [damper.thinned(log) for i, log in enumerate(logs) if (i // 3 + i) % 3 == 0]
+    return Case("damper", model, chosen, 150, 30, per_log=True)
 
 
-CASES: dict[str, Callable[[], Case | None]] = {
+CASES: dict[str, Callable[[Path], Case | None]] = {
     "actuator": actuator_case,
     "dc_motor": dc_motor_case,
     "damper": damper_case,

@@ -60,7 +60,9 @@ class Descent:
 
     at: search coordinates (n_free,). error: the objective there, infinite before the first
     iteration. gain: part of the error that the last iteration took away. steps: integration
-    steps per sample of each record, chosen at ``steps_at``, None where they are to be chosen.
+    steps per sample of each record, chosen at ``steps_at``, None where they are to be chosen:
+    then the error is that of steps that may not do. origin, origin_error: from where the last
+    iteration went, and the error there, of steps that do.
     """
 
     at: FloatArray
@@ -75,6 +77,8 @@ class Descent:
     failures: int = 0
     iterations: int = 0
     finished: bool = False
+    origin: FloatArray | None = None
+    origin_error: float = np.inf
 
 
 def refine(
@@ -235,9 +239,16 @@ def _iterate(frame: _Frame, descents: list[Descent], tolerance: float) -> list[D
     ):
         error = float(frame.objective.error_of(residuals[:1])[0])
         if not np.isfinite(error):
-            result[i] = replace(descent, error=np.inf, finished=True)
+            result[i] = _back(descent)
             continue
-        at = replace(descent, error=error, gain=0.0, iterations=descent.iterations + 1)
+        at = replace(
+            descent,
+            error=error,
+            gain=0.0,
+            iterations=descent.iterations + 1,
+            origin=descent.at,
+            origin_error=error,
+        )
         if error <= ROUNDING:
             result[i] = replace(at, finished=True)
             continue
@@ -253,6 +264,23 @@ def _iterate(frame: _Frame, descents: list[Descent], tolerance: float) -> list[D
     for (i, residual, candidates), residuals in zip(open_, tried, strict=True):
         result[i] = _judged(frame, descents[i], residual, candidates, residuals, tolerance)
     return [descent for descent in result if descent is not None]
+
+
+def _back(descent: Descent) -> Descent:
+    """Back from where a simulation fails with the steps it needs, to try more damping."""
+    if descent.origin is None:
+        return replace(descent, error=np.inf, finished=True)
+    return replace(
+        descent,
+        at=descent.origin,
+        error=descent.origin_error,
+        gain=0.0,
+        steps_at=None,
+        damping=_limited(descent.damping * _FACTORS[-1] / _FACTORS[0]),
+        failures=descent.failures + 1,
+        iterations=descent.iterations + 1,
+        finished=descent.failures + 1 >= _PATIENCE,
+    )
 
 
 def _judged(

@@ -126,7 +126,7 @@ class LocalSearch:
         """One iteration of the descents under way, or else new starts for some."""
         if self.polishing:
             self._polish()
-        elif self.error <= ROUNDING or self.left < self.reserve + self._next_cost():
+        elif self._nothing_more():
             self.polishing = True
             self.descents = [Descent(self.best)]
         elif self.descents:
@@ -148,6 +148,12 @@ class LocalSearch:
             setattr(self, name, state[name])
         for name, kind in _ITEMS.items():
             setattr(self, name, [kind(**values) for values in state[name]])
+
+    def _nothing_more(self) -> bool:
+        """Whether only the last descent remains."""
+        if self.error <= ROUNDING or not (self.descents or self.minima):
+            return True
+        return self.left < self.reserve + self._next_cost()
 
     def _next_cost(self) -> int:
         """Simulations that the next step takes at least."""
@@ -179,9 +185,13 @@ class LocalSearch:
             self._add(self.best, self.error)
 
     def _take(self, descent: Descent) -> None:
-        feasible = self._feasible(descent.at)
-        if (not feasible, descent.error) < (not self.feasible, self.error):
-            self.best, self.error, self.feasible = descent.at, descent.error, feasible
+        at, error = descent.at, descent.error
+        if descent.steps_at is None and descent.origin is not None:
+            # An error found with steps that may not do is not to be trusted.
+            at, error = descent.origin, descent.origin_error
+        feasible = self._feasible(at)
+        if (not feasible, error) < (not self.feasible, self.error):
+            self.best, self.error, self.feasible = at, error, feasible
 
     def _feasible(self, at: FloatArray) -> bool:
         space = self.objective.space
@@ -190,6 +200,8 @@ class LocalSearch:
     def _add(self, at: FloatArray, error: float) -> None:
         """One minimum more, unless the outputs err as in another; flat directions tell nothing."""
         rms = self.objective.rms(self.objective.space.decode(at[None]))[0]
+        if not np.all(np.isfinite(rms)):
+            return
         for known in self.minima:
             if np.allclose(rms, known.rms, rtol=_SAME, atol=_SAME * error):
                 return

@@ -258,3 +258,28 @@ def test_it_slides_along_a_constraint_to_the_best_point_on_it(start):
     assert found.error == pytest.approx(best.fun, rel=1e-4)
     assert found.chromosome == pytest.approx([best.x, 0.03 * best.x], rel=1e-3)
     assert not np.any(target.space.violations(found.chromosome[None]) > 0.0)
+
+
+# --- simulations that fail ------------------------------------------------------------------
+
+
+def runaway_derivative(x, u, p):
+    """Beyond a rate of 2.5/s the state runs away before the record ends."""
+    return (p[0] * x[0] * x[0] * 0.4 + u[0],)
+
+
+def test_it_comes_back_from_where_simulations_fail():
+    """Steps towards the minimum lead across an edge: it ends where a simulation is possible."""
+    model = lag(
+        parameters=(Parameter("rate", "1/s", 1.0, 0.1, 9.0, "log"),),
+        states=(State("y", "1", 1.0),),
+        derivative=runaway_derivative,
+    )
+    truth, n = 2.4, 100
+    blank = Dataset(np.zeros(n), np.full(n, np.nan), 0.01)
+    exact = 1.0 / (1.0 - 0.4 * truth * blank.time)
+    target = objective(model, [Dataset(np.zeros(n), exact, 0.01)])
+    found = refine(target, np.array([0.2]))
+    assert np.isfinite(target.evaluate(found.chromosome[None])[0][0])
+    assert found.chromosome[0] == pytest.approx(truth, rel=1e-3)
+    assert found.error == pytest.approx(target.evaluate(found.chromosome[None])[0][0], rel=0.1)
