@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import minimize
 
 from sysid import Constraint, Parameter, SearchSpace
-from sysid.constrained import Constraints, shortened
+from sysid.constrained import Constraints
 from tests.sysid.support import lag
 
 
@@ -56,7 +56,3 @@ def test_slopes_are_those_of_the_constraints_by_moves():
     # A parameter that may not move, and a constraint that is then out of reach.
     assert near.among(np.array([1])).slope.shape == (1, 1)
     assert len(near.among(np.array([], dtype=np.int64)).value) == 0
-    outside = space.encode(np.array([[4.0, 0.1], [2.1, 0.1]]))
-    inside = shortened(space, at, outside)
-    assert not np.any(space.violations(space.decode(inside)) > 0.0)
-    assert np.allclose(inside[1], outside[1]) and inside[0][0] > at[0]
