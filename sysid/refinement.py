@@ -60,9 +60,9 @@ class Descent:
 
     at: search coordinates (n_free,). error: the objective there, infinite before the first
     iteration. gain: part of the error that the last iteration took away. steps: integration
-    steps per sample of each record, chosen at ``steps_at``, None where they are to be chosen:
-    then the error is that of steps that may not do. origin, origin_error: from where the last
-    iteration went, and the error there, of steps that do.
+    steps per sample of each record, chosen at ``steps_at``, None where they are to be chosen.
+    sure, sure_error: where they were last chosen and a simulation succeeded, and the error
+    there; further on they may not do, until the descent has finished.
     """
 
     at: FloatArray
@@ -77,8 +77,8 @@ class Descent:
     failures: int = 0
     iterations: int = 0
     finished: bool = False
-    origin: FloatArray | None = None
-    origin_error: float = np.inf
+    sure: FloatArray | None = None
+    sure_error: float = np.inf
 
 
 def refine(
@@ -239,16 +239,12 @@ def _iterate(frame: _Frame, descents: list[Descent], tolerance: float) -> list[D
     ):
         error = float(frame.objective.error_of(residuals[:1])[0])
         if not np.isfinite(error):
+            # With more steps the simulation fails.
             result[i] = _back(descent)
             continue
-        at = replace(
-            descent,
-            error=error,
-            gain=0.0,
-            iterations=descent.iterations + 1,
-            origin=descent.at,
-            origin_error=error,
-        )
+        at = replace(descent, error=error, gain=0.0, iterations=descent.iterations + 1)
+        if at.steps_at is not None and np.array_equal(at.at, at.steps_at):
+            at = replace(at, sure=at.at, sure_error=error)
         if error <= ROUNDING:
             result[i] = replace(at, finished=True)
             continue
@@ -268,12 +264,12 @@ def _iterate(frame: _Frame, descents: list[Descent], tolerance: float) -> list[D
 
 def _back(descent: Descent) -> Descent:
     """Back from where a simulation fails with the steps it needs, to try more damping."""
-    if descent.origin is None:
+    if descent.sure is None:
         return replace(descent, error=np.inf, finished=True)
     return replace(
         descent,
-        at=descent.origin,
-        error=descent.origin_error,
+        at=descent.sure,
+        error=descent.sure_error,
         gain=0.0,
         steps_at=None,
         damping=_limited(descent.damping * _FACTORS[-1] / _FACTORS[0]),

@@ -162,33 +162,35 @@ class LocalSearch:
         return self.n_varied * self.points + 2 * self.each
 
     def _polish(self) -> None:
-        self.descents = refinement.advance(self.objective, self.descents)
-        self._take(self.descents[0])
-        descent = self.descents[0]
+        (descent,) = self.descents = refinement.advance(self.objective, self.descents)
         self.polished = descent.finished or descent.iterations >= _MOST_ITERATIONS
+        self._take(descent)
 
     def _descend(self) -> None:
         affordable = (self.left - self.reserve) // self.each
         moved = refinement.advance(self.objective, self.descents[:affordable], _ARRIVED)
-        for descent in moved:
-            self._take(descent)
         self.descents = []
         for descent in moved:
+            self._take(descent)
             # What remains to be smoothed matters to the last digits only.
             ended = descent.finished or descent.iterations >= _MOST_ITERATIONS
             if ended or descent.smoothing > 0:
-                if np.isfinite(descent.error):
-                    self._add(descent.at, descent.error)
-            elif not self._hopeless(descent):
+                self._add(descent.at, descent.error)
+            else:
                 self.descents.append(descent)
+        least = min([self.error, *(descent.error for descent in self.descents)])
+        self.descents = [d for d in self.descents if not _hopeless(d, least)]
         if not (self.descents or self.minima):
             self._add(self.best, self.error)
 
     def _take(self, descent: Descent) -> None:
-        at, error = descent.at, descent.error
-        if descent.steps_at is None and descent.origin is not None:
-            # An error found with steps that may not do is not to be trusted.
-            at, error = descent.origin, descent.origin_error
+        """What a descent has surely reached, if it is the best yet."""
+        if descent.finished:
+            self._offer(descent.at, descent.error)
+        elif descent.sure is not None:
+            self._offer(descent.sure, descent.sure_error)
+
+    def _offer(self, at: FloatArray, error: float) -> None:
         feasible = self._feasible(at)
         if (not feasible, error) < (not self.feasible, self.error):
             self.best, self.error, self.feasible = at, error, feasible
@@ -200,20 +202,13 @@ class LocalSearch:
     def _add(self, at: FloatArray, error: float) -> None:
         """One minimum more, unless the outputs err as in another; flat directions tell nothing."""
         rms = self.objective.rms(self.objective.space.decode(at[None]))[0]
-        if not np.all(np.isfinite(rms)):
+        if not (np.isfinite(error) and np.all(np.isfinite(rms))):
             return
+        self._offer(at, error)
         for known in self.minima:
             if np.allclose(rms, known.rms, rtol=_SAME, atol=_SAME * error):
                 return
         self.minima.append(Minimum(at, error, rms))
-
-    def _hopeless(self, descent: Descent) -> bool:
-        enough = (1.0 + _NEAR) * self.error
-        if descent.error <= enough or descent.iterations < _BEFORE_GIVING_UP:
-            return False
-        if descent.failures == 1:
-            return False  # about to try again with more damping
-        return descent.error * (1.0 - descent.gain) ** _HORIZON > enough
 
     def _vary(self) -> None:
         """New starts around the best of the minima that have been varied least."""
@@ -271,6 +266,16 @@ class LocalSearch:
         chromosomes = space.decode(rows)
         errors, _ = self.objective.evaluate(chromosomes)
         return np.where(np.any(space.violations(chromosomes) > 0.0, axis=1), np.inf, errors)
+
+
+def _hopeless(descent: Descent, least: float) -> bool:
+    """Whether a descent will not come near the least error known."""
+    enough = (1.0 + _NEAR) * least
+    if descent.error <= enough or descent.iterations < _BEFORE_GIVING_UP:
+        return False
+    if descent.failures == 1:
+        return False  # about to try again with more damping
+    return descent.error * (1.0 - descent.gain) ** _HORIZON > enough
 
 
 def _dips(moves: FloatArray, errors: FloatArray, error: float) -> list[int]:

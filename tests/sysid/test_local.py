@@ -108,7 +108,7 @@ def test_the_budget_is_kept_and_the_end_is_a_minimum():
 
 
 def test_a_budget_too_small_is_exceeded_by_one_descent_to_the_minimum():
-    found = GASSI(motor(), population=10, generations=2).fit(motor_record())
+    found = GASSI(motor(), population=10, generations=2, criterion="error").fit(motor_record())
     again = refine(objective(motor(), motor_record()), found.chromosome_)
     assert found.error_ <= 1.001 * again.error
     assert found.n_simulations_ <= 20 + 50 * 14
@@ -116,7 +116,7 @@ def test_a_budget_too_small_is_exceeded_by_one_descent_to_the_minimum():
 
 
 def test_rounding_ends_it_early():
-    found = GASSI(motor(), population=100, generations=100).fit(motor_record())
+    found = GASSI(motor(), population=100, generations=100, criterion="error").fit(motor_record())
     np.testing.assert_allclose(found.vector_, list(MOTOR.values()), rtol=1e-6)
     assert found.n_simulations_ < 0.3 * 100 * 100
 
