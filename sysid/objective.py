@@ -17,6 +17,9 @@ from sysid.space import SearchSpace
 Balance = Literal["samples", "logs"]
 
 
+_MOST_STEPS = 4096  # a sample, where accuracy is asked for
+
+
 class Objective:
     """Mean over outputs of the RMSE on outputs normalised by max|y|.
 
@@ -78,6 +81,18 @@ class Objective:
         """The same objective with other weights of the outputs, (n_outputs,)."""
         other = copy.copy(self)
         other.weights = weights / weights.sum()
+        return other
+
+    def finer(self, accuracy: float) -> Objective:
+        """The same objective by simulations of another accuracy, stiff ones given the steps."""
+        other = copy.copy(self)
+        old = self.simulator
+        other.simulator = BatchSimulator(
+            old.model,
+            accuracy=accuracy,
+            threads=old.threads,
+            max_steps=max(old.max_steps, _MOST_STEPS),
+        )
         return other
 
     def evaluate(self, chromosomes: FloatArray) -> tuple[FloatArray, BatchResult]:

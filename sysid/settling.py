@@ -35,6 +35,9 @@ _STEADY = 1e-3  # part by which weights may still change
 _LEAST_SHARE = 1e-2
 # Errors below this part of the simulation's accuracy are its own: there is no noise to weigh by.
 _OWN = 0.1
+_FINER, _FINEST = 1e-3, 1e-9
+# Colour does not make an output's errors count as fewer independent samples than this.
+_FEWEST = 30.0
 # Twice the logarithm of a likelihood ratio above which one minimum is no rival to another: one
 # in a hundred for the four parameters in which such minima typically differ.
 _TOLD_APART = 13.3
@@ -83,6 +86,7 @@ def settle(
             if known.new(rough) and known.evidence(rough, best) < _CONCEIVABLE:
                 known.add(_weighed(objective, found.chromosome, watch))
     best, *others = known.ranked()
+    best = _exact(best)
     near = [one for one in others if known.evidence(one, best) < _TOLD_APART]
     return Settled(best.objective, best.chromosome, tuple(one.chromosome for one in near))
 
@@ -140,7 +144,7 @@ class _Known:
             found = self._first_sensitivity()
             memory = longest_memory(colour(found.residual, found.seen, found.lengths))
             weights = self._objective.weights * len(self._objective.weights)
-            self._samples = weights * self._objective.counts / memory
+            self._samples = weights * np.maximum(self._objective.counts / memory, _FEWEST)
         return self._samples
 
     def _first_sensitivity(self) -> Sensitivity:
@@ -156,6 +160,15 @@ class _Known:
         """Of each output's residuals, (n_outputs,)."""
         variance: FloatArray = np.mean(found.residual**2, axis=0)
         return np.maximum(variance, max(_LEAST_SHARE**2 * variance.max(), 1e-300))
+
+
+def _exact(minimum: _Settling) -> _Settling:
+    """One whose errors are the simulation's own goes on with finer simulations."""
+    accuracy = minimum.objective.simulator.accuracy
+    if minimum.rms.max() > _OWN * accuracy:
+        return minimum
+    objective = minimum.objective.finer(max(_FINER * accuracy, _FINEST))
+    return _as_found(objective, refine(objective, minimum.chromosome).chromosome)
 
 
 def _weighed(objective: Objective, chromosome: FloatArray, watch: Watch | None) -> _Settling:

@@ -193,6 +193,7 @@ class GASSI(RecordEstimator):
         objective = self._objective(data)
         self.output_weights_: FloatArray = objective.weights
         self._rivals: tuple[FloatArray, ...] = ()
+        self._final_accuracy = self.accuracy
         run = self._run(objective, preset)
         keeper = self._keeper(data, run, checkpoint, resume)
         notify = on_progress or (lambda progress: None)
@@ -245,6 +246,7 @@ class GASSI(RecordEstimator):
         )
         self.output_weights_ = settled.objective.weights
         self._rivals = settled.rivals
+        self._final_accuracy = settled.objective.simulator.accuracy
         self.n_simulations_ = run.objective.simulations
 
     def predict(self, X: Dataset | FloatArray, *, records: Any = None) -> FloatArray:
@@ -311,7 +313,10 @@ class GASSI(RecordEstimator):
         if self.stopped_ == "interrupted":
             raise ModelError("the identification was interrupted, so there are no intervals")
         data = self._records(X, y, records, None, reset=False)
-        return self._objective(data).weighed(self.output_weights_)
+        objective = self._objective(data).weighed(self.output_weights_)
+        if self._final_accuracy < self.accuracy:
+            return objective.finer(self._final_accuracy)
+        return objective
 
     def _step(self, dt: float | None) -> float:
         if self.dt is None:

@@ -182,8 +182,10 @@ class _Teller:
         why: Why = ""
         if self.told.held[j]:
             why = "bound"
+        elif any(relation.exact and relation.support[j] for relation in self.hidden):
+            why = "tied"
         elif np.sum(self.told.lost[:, j] ** 2) > PART:
-            why = "tied" if any(r.exact and r.support[j] for r in self.hidden) else "vague"
+            why = "vague"
         if why:
             parameter = self.space.parameters[j]
             value = float(self.chromosome[j])

@@ -13,7 +13,7 @@ from sysid.uncertainty.colour import colour, score_covariance
 from sysid.uncertainty.sensitivity import Sensitivity, input_noises, zero_errors
 
 # Singular values below this share of the largest are rounding: the direction does nothing.
-_EXACT = 2e-8
+_EXACT = 1e-6
 # Share of a coordinate in undetermined directions above which it is not determined itself.
 PART = 1e-3
 # A direction whose standard deviation (in logarithms, or in units of the value) exceeds this is
