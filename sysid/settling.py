@@ -142,7 +142,8 @@ class _Known:
         """How many independent samples each output's errors amount to, (n_outputs,)."""
         if self._samples is None:
             found = self._first_sensitivity()
-            memory = longest_memory(colour(found.residual, found.seen, found.lengths))
+            noise = colour(found.residual, found.seen, found.lengths)
+            memory = longest_memory(noise, np.mean(found.residual**2, axis=0))
             weights = self._objective.weights * len(self._objective.weights)
             self._samples = weights * np.maximum(self._objective.counts / memory, _FEWEST)
         return self._samples

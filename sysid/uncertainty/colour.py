@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import lapack, solve_discrete_lyapunov
+from scipy.linalg import lapack
 
 from sysid.model import BoolArray, FloatArray
 
@@ -132,25 +132,18 @@ def _covariance(e: FloatArray, order: int) -> FloatArray:
     return covariance
 
 
-def longest_memory(model: Autoregression) -> FloatArray:
+def longest_memory(model: Autoregression, variance: FloatArray) -> FloatArray:
     """By how much each residual's mean varies more than if it were white, at least 1, (q,).
 
-    The ratio of the spectrum at zero frequency to the variance: so many samples count as one.
+    variance: (q,), of the residuals. The ratio of the spectrum at zero frequency to the variance:
+    so many samples count as one.
     """
-    order, q = len(model.coefficients), len(model.noise)
-    if order == 0:
-        return np.ones(q)
-    companion = np.zeros((order * q, order * q))
-    companion[:q] = np.hstack(list(model.coefficients))
-    companion[q:, :-q] = np.eye((order - 1) * q)
-    noise = np.zeros_like(companion)
-    noise[:q, :q] = model.noise
-    radius = float(np.max(np.abs(np.linalg.eigvals(companion))))
-    # Residuals that look unstable are of a trend: they count as the slowest stable ones.
-    companion *= min(1.0, 0.9999 / radius) if radius > 0.0 else 1.0
-    variance = np.diag(solve_discrete_lyapunov(companion, noise))[:q]
-    gain = np.linalg.inv(np.eye(order * q) - companion)
-    slow = np.diag(gain @ noise @ gain.T)[:q]
+    q = len(model.noise)
+    try:
+        gain = np.linalg.inv(np.eye(q) - model.coefficients.sum(axis=0))
+    except np.linalg.LinAlgError:  # a pole at exactly one
+        return np.full(q, np.inf)
+    slow = np.diag(gain @ model.noise @ gain.T)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = slow / variance
     return np.where(np.isfinite(ratio), np.maximum(ratio, 1.0), 1.0)
