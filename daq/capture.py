@@ -186,19 +186,34 @@ def _git_commit() -> str | None:
         return None
 
 
+def make_folder(folder: Path, exist_ok: bool = True) -> None:
+    """Make a folder and what leads to it; ConfigError with the cure when that is impossible.
+
+    Raises FileExistsError where it must be new and is not.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=exist_ok)
+    except FileExistsError:
+        if not exist_ok:
+            raise
+        raise _no_folder(folder, "File exists") from None
+    except OSError as error:
+        raise _no_folder(folder, error.strerror) from None
+
+
+def _no_folder(folder: Path, reason: str | None) -> ConfigError:
+    return ConfigError(f"{folder}: cannot be created: {reason}; choose a folder with --out")
+
+
 def _new_folder(root: Path, stem: str) -> Path:
     for attempt in range(1, 1000):
         folder = root / (stem if attempt == 1 else f"{stem}-{attempt}")
         try:
-            folder.mkdir(parents=True)
+            make_folder(folder, exist_ok=False)
         except FileExistsError:
             if root.exists() and not root.is_dir():
                 break
             continue
-        except OSError as error:
-            raise ConfigError(
-                f"{folder}: cannot be created: {error.strerror}; choose a folder with --out"
-            ) from None
         return folder
     raise ConfigError(f"{root}: no capture folder can be made here; choose another with --out")
 

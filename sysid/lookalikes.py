@@ -37,9 +37,8 @@ def lookalikes(objective: Objective, chromosome: FloatArray) -> list[FloatArray]
     out.
     """
     modes = _Modes(objective, chromosome)
-    mode = modes.fastest(modes.start)
     dt = objective.records[0].dt
-    return [*_swaps(objective, chromosome), *_twins(modes, mode), *_aliases(modes, mode, dt)]
+    return [*_swaps(objective, chromosome), *_twins(modes), *_aliases(modes, dt)]
 
 
 def _swaps(objective: Objective, chromosome: FloatArray) -> list[FloatArray]:
@@ -61,8 +60,9 @@ def _swaps(objective: Objective, chromosome: FloatArray) -> list[FloatArray]:
     return [swapped[k] for k in np.flatnonzero(kept[:-1])]
 
 
-def _aliases(modes: _Modes, mode: complex, dt: float) -> list[FloatArray]:
+def _aliases(modes: _Modes, dt: float) -> list[FloatArray]:
     """With the mode at the frequencies that the sampling does not tell from its own."""
+    mode = modes.fastest
     if mode.imag * dt < 2.0 * np.pi * _FASTEST_SEEN:
         return []
     every = np.ones(len(modes.start), dtype=bool)
@@ -77,14 +77,11 @@ def _aliases(modes: _Modes, mode: complex, dt: float) -> list[FloatArray]:
     return found
 
 
-def _twins(modes: _Modes, mode: complex) -> list[FloatArray]:
+def _twins(modes: _Modes) -> list[FloatArray]:
     """With one of the parameters that the mode hangs on moved, the others keeping the mode."""
-    slopes = np.linalg.norm(modes.slopes(modes.start, mode), axis=0)
-    found = []
-    for place in np.argsort(slopes)[::-1][:_TURNED]:
-        if slopes[place] == 0.0:
-            break
-        others = np.arange(len(slopes)) != place
+    mode, found = modes.fastest, []
+    for place in modes.acting[:_TURNED]:
+        others = np.arange(len(modes.start)) != place
         for share in _TURNS:
             at = modes.start.copy()
             at[place] += share * modes.width[place]
@@ -111,7 +108,12 @@ def _folded(frequency: float, dt: float) -> list[float]:
 
 
 class _Modes:
-    """Eigenvalues of the linearised model over the search coordinates."""
+    """Eigenvalues of the linearised model over the search coordinates.
+
+    start: search coordinates (n_free,) of the minimum. fastest: the eigenvalue there of largest
+    imaginary part, or where nothing oscillates of largest size. acting: places of the parameters
+    that it hangs on, the strongest first; the others need no differences of their own.
+    """
 
     def __init__(self, objective: Objective, chromosome: FloatArray) -> None:
         self.space, self.model = objective.space, objective.simulator.model
@@ -122,16 +124,13 @@ class _Modes:
         self.start = self.space.encode(chromosome)
         self.bounds = self.space.coded_bounds()
         self.width = self.space.encode(self.space.upper) - self.space.encode(self.space.lower)
+        values = self._eigenvalues(self.start)
+        oscillates = bool(values.imag.max() > 0.0)
+        self.fastest = complex(values[np.argmax(values.imag if oscillates else np.abs(values))])
         self.acting = np.arange(len(self.start))
-        size = np.linalg.norm(self.slopes(self.start, self.fastest(self.start)), axis=0)
-        # The others need no differences of their own.
-        self.acting = np.flatnonzero(size > _ACTING * size.max())
-
-    def fastest(self, at: FloatArray) -> complex:
-        """The eigenvalue of largest imaginary part, or where nothing oscillates of largest size."""
-        values = self._eigenvalues(at)
-        best = complex(values[np.argmax(values.imag)])
-        return best if best.imag > 0.0 else complex(values[np.argmax(np.abs(values))])
+        size = np.linalg.norm(self.slopes(self.start, self.fastest), axis=0)
+        strongest = np.argsort(size)[::-1]
+        self.acting = strongest[size[strongest] > _ACTING * size.max()]
 
     def towards(
         self, at: FloatArray, value: complex, wanted: complex, moving: BoolArray,

@@ -101,13 +101,11 @@ class Objective:
             self.space.full(chromosomes), self.records, self.scales, self._starts(chromosomes)
         )
         self._counter[0] += len(chromosomes)
-        return self._mean_rmse(result.sse.sum(axis=1)), result
+        return self._mean(self._roots(result.sse.sum(axis=1))), result
 
     def rms(self, chromosomes: FloatArray) -> FloatArray:
         """RMSE of each output in parts of its scale, (n, n_outputs), infinite where it failed."""
-        result = self.evaluate(chromosomes)[1]
-        roots: FloatArray = np.sqrt(result.sse.sum(axis=1) / np.maximum(self.counts, 1))
-        return roots
+        return self._roots(self.evaluate(chromosomes)[1].sse.sum(axis=1))
 
     def residuals(self, chromosomes: FloatArray, n_steps: Sequence[int]) -> FloatArray:
         """Normalised residuals at common step counts, (n, n_residuals, n_outputs).
@@ -139,8 +137,7 @@ class Objective:
 
     def error_of(self, residuals: FloatArray) -> FloatArray:
         """The error of residuals as returned by ``residuals``, (n,)."""
-        errors = self.rms_of(residuals) @ self.weights
-        return np.where(np.isfinite(errors), errors, np.inf)
+        return self._mean(self.rms_of(residuals))
 
     def smoothed_error_of(self, residuals: FloatArray, floor: float) -> FloatArray:
         """The same, but smooth where an output is explained exactly, (n,).
@@ -150,15 +147,12 @@ class Objective:
         rms = self.rms_of(residuals)
         with np.errstate(over="ignore", invalid="ignore"):
             smooth = np.where(rms > floor, rms, 0.5 * (rms**2 / floor + floor))
-            errors = smooth @ self.weights
-        return np.where(np.isfinite(errors), errors, np.inf)
+        return self._mean(smooth)
 
     def rms_of(self, residuals: FloatArray) -> FloatArray:
         """Root mean square of each output's residuals, (n, n_outputs)."""
         with np.errstate(over="ignore", invalid="ignore"):
-            squares = np.sum(residuals * residuals, axis=1)
-            rms: FloatArray = np.sqrt(squares / np.maximum(self.counts, 1))
-        return rms
+            return self._roots(np.sum(residuals * residuals, axis=1))
 
     @property
     def n_residuals(self) -> int:
@@ -171,8 +165,7 @@ class Objective:
         residual: (n_residuals, n_outputs), at that minimum. Half the second derivative of the
         error is that of the weighted mean square.
         """
-        counts = np.maximum(self.counts, 1)
-        rms = np.sqrt(np.sum(residual**2, axis=0) / counts)
+        counts, rms = np.maximum(self.counts, 1), self.rms_of(residual[None])[0]
         weights: FloatArray = self.weights * len(residual) / counts / np.maximum(rms, 1e-12)
         return weights
 
@@ -184,9 +177,15 @@ class Objective:
             for k, record in enumerate(self.records)
         ]
 
-    def _mean_rmse(self, sse: FloatArray) -> FloatArray:
-        with np.errstate(invalid="ignore"):  # infinite times a weight of zero
-            errors = np.sqrt(sse / np.maximum(self.counts, 1)) @ self.weights
+    def _roots(self, sse: FloatArray) -> FloatArray:
+        """Root mean squares of sums of squares, (n, n_outputs)."""
+        roots: FloatArray = np.sqrt(sse / np.maximum(self.counts, 1))
+        return roots
+
+    def _mean(self, rms: FloatArray) -> FloatArray:
+        """The error of the outputs' errors, (n,), infinite where one is not finite."""
+        with np.errstate(over="ignore", invalid="ignore"):  # infinite times a weight of zero
+            errors = rms @ self.weights
         return np.where(np.isfinite(errors), errors, np.inf)
 
 

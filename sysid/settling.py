@@ -117,12 +117,15 @@ class _Known:
 
     def new(self, minimum: _Settling) -> bool:
         """Whether it is far from all others in directions that the data feel."""
-        space = self._objective.space
+        if not self._minima:
+            return True
+        space, found = self._objective.space, self._first_sensitivity()
+        variance: FloatArray = np.mean(found.residual**2, axis=0)
+        variance = np.maximum(variance, max(_LEAST_SHARE**2 * variance.max(), 1e-300))
         for known in self._minima:
-            found = self._first_sensitivity()
             moved = space.encode(known.chromosome) - space.encode(minimum.chromosome)
             felt = found.slopes @ (moved / coordinate_units(self._objective, known.chromosome))
-            if np.sum(felt**2 / self._variance(found)) < _ONE:
+            if np.sum(felt**2 / variance) < _ONE:
                 return False
         return True
 
@@ -155,12 +158,6 @@ class _Known:
             steps = common_steps(first.objective, first.chromosome)
             self._sensitivity = sensitivity(first.objective, first.chromosome, steps)
         return self._sensitivity
-
-    @staticmethod
-    def _variance(found: Sensitivity) -> FloatArray:
-        """Of each output's residuals, (n_outputs,)."""
-        variance: FloatArray = np.mean(found.residual**2, axis=0)
-        return np.maximum(variance, max(_LEAST_SHARE**2 * variance.max(), 1e-300))
 
 
 def _exact(minimum: _Settling) -> _Settling:

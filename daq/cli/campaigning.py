@@ -20,7 +20,7 @@ from daq.cli.identifying import (
     assemble,
     check_writable,
     gassi_settings,
-    no_overlap,
+    load_logs,
     prepare_models,
     write_parameters,
 )
@@ -172,13 +172,7 @@ def groups_of(
 ) -> list[Group]:
     """The logs for one model, each by itself or all together, less what is held back of them."""
 
-    def loaded(paths: list[Path]) -> list[Loaded]:
-        return [
-            datasets.load(path, prepared.model, prepared.mapping) for path in datasets.expand(paths)
-        ]
-
-    training, validation = loaded(logs), loaded(validate)
-    no_overlap(training, validation)
+    training, validation = load_logs(prepared, logs, validate)
     names = [_together(training)] if together else _log_names(training)
     groups = [training] if together else [[log] for log in training]
     part, made = prepared.settings.hold_back, []

@@ -235,10 +235,7 @@ def identify_logs(
 
     resume: go on from the checkpoint in the folder.
     """
-    model = prepared.model
-    train = [datasets.load(p, model, prepared.mapping) for p in datasets.expand(training)]
-    check = [datasets.load(p, model, prepared.mapping) for p in datasets.expand(validation)]
-    no_overlap(train, check)
+    train, check = load_logs(prepared, training, validation)
     for log in (*train, *check):
         if log.warning is not None:
             console.report_note(log.warning)
@@ -333,8 +330,22 @@ def _try_space(file: YamlFile, key: tuple[str, ...], *args: Any, **more: Any) ->
         raise file.error(key, str(error)) from None
 
 
-def no_overlap(train: list[Loaded], check: list[Loaded]) -> None:
-    """Raise ConfigError when a log is given for training and for validation."""
+def load_logs(
+    prepared: Prepared, training: list[Path], validation: list[Path]
+) -> tuple[list[Loaded], list[Loaded]]:
+    """Logs for training and for validation; ConfigError when one is given for both."""
+
+    def loaded(paths: list[Path]) -> list[Loaded]:
+        return [
+            datasets.load(path, prepared.model, prepared.mapping) for path in datasets.expand(paths)
+        ]
+
+    train, check = loaded(training), loaded(validation)
+    _no_overlap(train, check)
+    return train, check
+
+
+def _no_overlap(train: list[Loaded], check: list[Loaded]) -> None:
     known = {log.path.resolve() for log in train}
     for log in check:
         if log.path.resolve() in known:
@@ -430,12 +441,7 @@ def _profiles(
 
 def write_parameters(folder: Path, report: dict[str, Any]) -> Path:
     """Write a report as ``parameters.yaml``; ConfigError when the folder cannot be made."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(
-            f"{folder}: cannot be created: {error.strerror}; choose a folder with --out"
-        ) from None
+    capture.make_folder(folder)
     path = folder / "parameters.yaml"
     text = yaml.safe_dump(report, sort_keys=False, allow_unicode=True)
     capture.write_whole(path, text)

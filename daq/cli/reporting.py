@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import numpy as np
 from daq import capture
 from daq.cli import console
 from daq.config.identification import IdentificationConfig, Signals
-from sysid.assessment import RecordResult, judge
+from sysid.assessment import RecordResult, Verdict, judge
 from sysid.gassi import GASSI
 from sysid.metrics import Metrics, mean_known
 from sysid.model import Parameter, ProcessModel
@@ -52,6 +53,17 @@ class Identified:
     training_paths: Sequence[Path]
     validation_paths: Sequence[Path]
 
+    @cached_property
+    def verdict(self) -> Verdict:
+        """How far to trust it, and why."""
+        return judge(
+            self.model,
+            self.training,
+            self.validation,
+            self.uncertainty,
+            self.estimator.feasible_,
+        )
+
     def source(self, name: str) -> str:
         """Where a parameter's range or value comes from."""
         return self.sources.get(name, "model")
@@ -72,9 +84,7 @@ class Identified:
 def document(result: Identified) -> dict[str, Any]:
     """All of it for machines; what ``parameters.yaml`` holds."""
     estimator, settings = result.estimator, result.settings
-    verdict = judge(
-        result.model, result.training, result.validation, result.uncertainty, estimator.feasible_
-    )
+    verdict = result.verdict
     parts = (
         ("training", result.training, result.training_paths),
         ("validation", result.validation, result.validation_paths),
@@ -430,9 +440,7 @@ def _show_notes(result: Identified) -> None:
             "At the end of its range: the data want more room there. Set 'ranges' in a file "
             "given with --config."
         )
-    verdict = judge(
-        result.model, result.training, result.validation, result.uncertainty, estimator.feasible_
-    )
+    verdict = result.verdict
     console.print_line(f"Trust: {verdict.trust}. {' '.join(verdict.reasons)}")
     if (found := result.uncertainty) is not None:
         own = sum(not estimate.why for estimate in found.parameters)

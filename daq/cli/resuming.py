@@ -55,12 +55,7 @@ def remember(
     folder: Path, asked: Asked, training: Sequence[Path], validation: Sequence[Path]
 ) -> None:
     """Write down what is about to be done, in the folder that the results will go to."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(
-            f"{folder}: cannot be created: {error.strerror}; choose a folder with --out"
-        ) from None
+    capture.make_folder(folder)
     content = {
         "asked": asdict(asked),
         "training": _absolute(training),

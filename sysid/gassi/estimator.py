@@ -37,7 +37,8 @@ _NOT_DECIDING = ("model", "threads", "dt")
 class Progress:
     """What a watcher of the search is told: generation ``done`` of ``total``, the best error.
 
-    stage: ``search`` or, while the local refinement spends the rest of them, ``refine``.
+    stage: ``search``; ``refine`` while the local refinement spends the rest of them; ``weigh``
+    in the last step by the likelihood, which counts iterations and knows no total.
     """
 
     stage: str
@@ -87,6 +88,7 @@ class GASSI(RecordEstimator):
     guesses_ : {name: Guess} of the ranges that were read from the records.
     space_ : SearchSpace that was searched; estimated initial states stand behind the parameters.
     output_weights_ : (n_outputs,), what the outputs counted in the end.
+    rivals_ : parameters of other minima that the data do not tell from the result.
     error_ : mean over outputs of the RMSE normalised by max|y| (see ``Objective``).
     search_error_ : the lowest error before local refinement.
     feasible_ : whether all constraints hold.
