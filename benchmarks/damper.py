@@ -22,7 +22,7 @@ import numpy as np
 
 from benchmarks._common import arguments, report, timed
 from daq.cli import datasets
-from daq.cli.identifying import prepare
+from daq.cli.preparing import prepare
 from sysid import GASSI, BatchSimulator, Dataset, SearchSpace, evaluate, free_run
 from sysid.model import FloatArray, ProcessModel
 from sysid.objective import Objective

@@ -22,7 +22,8 @@ from daq.cli.campaigning import (
     parse_seeds,
     run_all,
 )
-from daq.cli.identifying import check_writable, default_folder, prepare_models, write_parameters
+from daq.cli.identifying import check_writable, default_folder, write_parameters
+from daq.cli.preparing import prepare_models
 from daq.errors import ConfigError
 from sysid import Campaign, Candidate, Comparison, ModelError, Outcome, Spread, compare
 from sysid.comparison import Row

@@ -9,8 +9,8 @@ from typing import Any
 from daq.cli import console, datasets
 from daq.cli.datasets import Mapping
 from daq.cli.files import load_rig
-from daq.cli.identifying import as_told
 from daq.cli.modelling import DEFAULT_MODEL, find_model
+from daq.cli.preparing import as_told
 from daq.cli.reporting import print_metrics
 from daq.config import yaml_file
 from daq.config.identification import IdentificationConfig, Signals

@@ -44,7 +44,7 @@ def run_command(
     overrides = {"model": model}
     prepared = None
     if identify:
-        from daq.cli.identifying import prepare
+        from daq.cli.preparing import prepare
 
         # A mistake in the model must show before the rig moves.
         prepared = prepare(config, overrides)

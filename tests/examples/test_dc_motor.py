@@ -1,22 +1,14 @@
 from __future__ import annotations
 
-import importlib
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from sysid import GASSI, BatchSimulator, Dataset, SearchSpace, guess_ranges
 
-EXAMPLES = Path(__file__).parents[2] / "examples"
-
 
 @pytest.fixture
-def dc_motor(monkeypatch):
-    monkeypatch.syspath_prepend(str(EXAMPLES))
-    yield importlib.import_module("dc_motor")
-    sys.modules.pop("dc_motor", None)
+def dc_motor(example):
+    return example("dc_motor")
 
 
 def test_it_is_the_motor_of_section_4_1_4(dc_motor):

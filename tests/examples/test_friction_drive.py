@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-EXAMPLES = Path(__file__).parents[2] / "examples"
+from tests.examples.conftest import EXAMPLES
 
 
 @pytest.fixture
-def data(monkeypatch):
-    monkeypatch.syspath_prepend(str(EXAMPLES))
-    yield importlib.import_module("friction_drive_data")
-    sys.modules.pop("friction_drive_data", None)
+def data(example):
+    return example("friction_drive_data")
 
 
 def test_its_motion_obeys_newton(data):
