@@ -8,6 +8,7 @@ perturbations: equations that switch, such as dry friction, are steps and platea
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -40,6 +41,9 @@ ROUNDING = 1e-12  # errors below it are those of the arithmetic
 # After moves of more than this part of a range the integration steps are chosen anew.
 _FAR = 0.05
 _NEAR = 1e-3  # for the last time
+# A neighbour whose outputs err by so many times their size more than the descent's has left a
+# simulation at the edge of stability: so many times the steps are taken.
+_BURST, _STEADIER, _BRACINGS = 10.0, 1.5, 3
 _RETREAT, _RETREATS = 0.4, 6
 _HOLDING_ROUNDS = 4
 _BATCH_BYTES = 2**28  # residuals held at once, unless one descent needs more
@@ -60,7 +64,8 @@ class Descent:
 
     at: search coordinates (n_free,). error: the objective there, infinite before the first
     iteration. gain: part of the error that the last iteration took away. steps: integration
-    steps per sample of each record, chosen at ``steps_at``, None where they are to be chosen.
+    steps per sample of each record, chosen at ``steps_at``, None where they are to be chosen;
+    braced: how often they have been raised since, for the sake of the sensitivities.
     sure, sure_error: where they were last chosen and a simulation succeeded, and the error
     there; further on they may not do, until the descent has finished.
     """
@@ -72,6 +77,7 @@ class Descent:
     steps_at: FloatArray | None = None
     damping: float = _FIRST_DAMPING
     level: int = 0
+    braced: int = 0
     error_of_round: float = np.inf
     smoothing: int = 0
     failures: int = 0
@@ -179,7 +185,7 @@ class _Frame:
             chosen = self.objective.steps_needed(self.objective.space.decode(rows))
             for i, steps in zip(lacking, chosen, strict=True):
                 own = tuple(int(n) for n in steps)
-                descents[i] = replace(descents[i], steps=own, steps_at=descents[i].at)
+                descents[i] = replace(descents[i], steps=own, steps_at=descents[i].at, braced=0)
         return descents
 
     def finer_steps(self, descent: Descent) -> tuple[int, ...]:
@@ -248,6 +254,12 @@ def _iterate(frame: _Frame, descents: list[Descent], tolerance: float) -> list[D
         if error <= ROUNDING:
             result[i] = replace(at, finished=True)
             continue
+        burst = ~(frame.objective.error_of(residuals[1:]) <= _BURST + error)
+        if burst.any() and at.braced < _BRACINGS:
+            result[i] = _steadier(at)
+            continue
+        # Where more steps do not help it is the model that is unbounded there: not that way.
+        residuals[1:][burst] = residuals[0]
         if not np.isfinite(at.error_of_round):
             at = replace(at, error_of_round=error)
         candidates = _candidates(frame, at, residuals, distance)
@@ -277,6 +289,12 @@ def _back(descent: Descent) -> Descent:
         iterations=descent.iterations + 1,
         finished=descent.failures + 1 >= _PATIENCE,
     )
+
+
+def _steadier(descent: Descent) -> Descent:
+    """With more integration steps: those it has serve its simulation, not its neighbours'."""
+    more = tuple(math.ceil(_STEADIER * steps) for steps in descent.steps)
+    return replace(descent, steps=more, braced=descent.braced + 1)
 
 
 def _judged(

@@ -137,16 +137,12 @@ class BatchSimulator:
         outputs = np.full((n, record.n_samples, q), np.nan)
         with ThreadPoolExecutor(self.threads) as pool:
             runner = _Runner(self, record, pool, starts=starts)
-            n_steps = n_steps or runner.common_steps(parameters)
+            n_steps = n_steps or int(runner.steps_of_each(parameters).max())
             runner.each(
                 lambda lanes: runner.record_block(parameters, lanes, n_steps, outputs),
                 _blocks(np.arange(n)),
             )
         return outputs
-
-    def steps_needed(self, parameters: FloatArray, record: Dataset) -> int:
-        """Integration steps per sample that serve all the given parameter vectors."""
-        return int(self.steps_of_each(parameters, record).max())
 
     def steps_of_each(self, parameters: FloatArray, record: Dataset) -> IntArray:
         """Integration steps per sample that each parameter vector needs, (n,)."""
@@ -216,10 +212,6 @@ class _Runner:
         status[~np.all(np.isfinite(sse), axis=(1, 2))] = Status.UNBOUNDED
         status[over] = Status.OVER_BUDGET
         return BatchResult(sse, status, spent)
-
-    def common_steps(self, parameters: FloatArray) -> int:
-        """One number of steps per sample that serves all, within the budget."""
-        return int(self.steps_of_each(parameters).max())
 
     def steps_of_each(self, parameters: FloatArray) -> IntArray:
         """Steps per sample that each needs, within the budget, (n,)."""

@@ -124,7 +124,27 @@ def _fit(y: FloatArray, past: FloatArray, q: int) -> Autoregression:
     order = past.shape[1] // q
     solution = np.asarray(np.linalg.lstsq(past, y, rcond=None)[0], dtype=np.float64)
     noise = _covariance(y - past @ solution, order)
-    return Autoregression(np.moveaxis(solution.reshape(order, q, q), 1, 2), noise)
+    coefficients = np.moveaxis(solution.reshape(order, q, q), 1, 2)
+    return Autoregression(_decaying(coefficients, len(y)), noise)
+
+
+def _decaying(coefficients: FloatArray, samples: int) -> FloatArray:
+    """An autoregression whose memory is no longer than the samples it was found from.
+
+    Least squares may find one that grows with time, where its response would have no end.
+    """
+    order, q, _ = coefficients.shape
+    if order == 0:
+        return coefficients
+    companion = np.eye(order * q, k=-q)
+    companion[:q] = np.moveaxis(coefficients, 0, 1).reshape(q, order * q)
+    radius = np.abs(np.linalg.eigvals(companion)).max()
+    slowest = np.exp(-1.0 / samples)
+    if radius <= slowest:
+        return coefficients
+    # All roots move towards zero in the same proportion.
+    shrunk: FloatArray = coefficients * (slowest / radius) ** np.arange(1, order + 1)[:, None, None]
+    return shrunk
 
 
 def _covariance(e: FloatArray, order: int) -> FloatArray:

@@ -35,9 +35,9 @@ class Sensitivity:
 
 
 def common_steps(objective: Objective, chromosome: FloatArray) -> list[int]:
-    """Integration steps per sample that serve a chromosome, for each record."""
-    vector = objective.space.full(chromosome[None])
-    return [objective.simulator.steps_needed(vector, record) for record in objective.records]
+    """Integration steps per sample that serve a chromosome and its neighbours, for each record."""
+    needed = objective.steps_needed(_with_neighbours(objective, chromosome))
+    return [int(steps) for steps in needed.max(axis=0)]
 
 
 def sensitivity(objective: Objective, chromosome: FloatArray, steps: list[int]) -> Sensitivity:
@@ -45,17 +45,21 @@ def sensitivity(objective: Objective, chromosome: FloatArray, steps: list[int]) 
 
     chromosome: (n_free,). A perturbed simulation that fails has slope zero.
     """
-    space = objective.space
-    at, units = space.encode(chromosome), coordinate_units(objective, chromosome)
-    moved = np.diag(_PERTURBATION * units)
-    batch = np.concatenate([at[None], at + moved, at - moved])
-    residuals = objective.residuals(space.decode(batch), steps)
-    n = len(at)
+    residuals = objective.residuals(_with_neighbours(objective, chromosome), steps)
+    n = len(chromosome)
     slopes = (residuals[1 : n + 1] - residuals[n + 1 :]) / (2.0 * _PERTURBATION)
     slopes = np.where(np.isfinite(slopes), slopes, 0.0)
     lengths = tuple(record.n_samples for record in objective.records)
     seen = np.concatenate([np.isfinite(record.outputs) for record in objective.records])
     return Sensitivity(residuals[0], seen, np.moveaxis(slopes, 0, 2), lengths)
+
+
+def _with_neighbours(objective: Objective, chromosome: FloatArray) -> FloatArray:
+    """A chromosome, then it with each coordinate moved up, then down, (1 + 2 n_free, n_free)."""
+    space = objective.space
+    at, units = space.encode(chromosome), coordinate_units(objective, chromosome)
+    moved = np.diag(_PERTURBATION * units)
+    return space.decode(np.concatenate([at[None], at + moved, at - moved]))
 
 
 def coordinate_units(objective: Objective, chromosome: FloatArray) -> FloatArray:

@@ -153,9 +153,6 @@ class Formula:
     def __init__(self, model, formula):
         self.model, self.formula = model, formula
 
-    def steps_needed(self, vectors, record):
-        return 1
-
     def steps_of_each(self, vectors, record):
         return np.ones(len(vectors), dtype=int)
 

@@ -122,7 +122,7 @@ def test_the_number_of_integration_steps_may_change_on_the_way():
     target = objective(model, [Dataset(inputs, exact, 0.01)], accuracy=1e-2)
     start = np.array([3.0, 0.3])
     steps = [
-        target.simulator.steps_needed(vector, target.records[0])
+        target.simulator.steps_of_each(vector, target.records[0])[0]
         for vector in (start, model.nominal)
     ]
     assert steps[1] > steps[0]
@@ -289,3 +289,50 @@ def test_it_comes_back_from_where_simulations_fail():
     # The error is that of the chromosome: half the record's peak is explained at a gain of 1.
     exact = (2.0 - found.chromosome[0]) / 2.0 * np.sqrt(np.mean(u**2)) / np.abs(u).max()
     assert found.error == pytest.approx(exact, rel=1e-6)
+
+
+class Brink(Formula):
+    """One step a sample serves the start and nothing beside it, three serve all.
+
+    With ``unbounded`` nothing serves another gain than the start's.
+    """
+
+    unbounded = False
+
+    def steps_of_each(self, vectors, record):
+        return np.where(np.all(vectors == START, axis=1), 1, 3)
+
+    def trajectories(self, vectors, record, n_steps=None, starts=None):
+        found = super().trajectories(vectors, record, n_steps, starts)
+        found[np.any(vectors != START, axis=1) & (n_steps < 3)] = np.inf
+        if self.unbounded:
+            found[vectors[:, 0] != START[0]] = np.inf
+        return found
+
+
+START = np.array([0.3, 2.0])
+
+
+def brink(unbounded=False):
+    model = lag(
+        parameters=(
+            Parameter("gain", "1", 1.0, 0.1, 10.0, "log"),
+            Parameter("offset", "1", 0.0, -10.0, 10.0, minimum=-math.inf),
+        ),
+        derivative=lambda x, u, p: (p[0] * u[0] + p[1],),
+    )
+    u = np.sin(np.arange(100) / 5.0)
+    simulator = Brink(model, lambda p, u: p["gain"] * u + p["offset"])
+    simulator.unbounded = unbounded
+    return Objective(simulator, SearchSpace.of(model), [Dataset(u, 2.0 * u, 0.01)])
+
+
+def test_more_steps_are_taken_where_those_of_the_descent_fail_beside_it():
+    found = refine(brink(), START)
+    np.testing.assert_allclose(found.chromosome, [2.0, 0.0], atol=1e-6)
+
+
+def test_other_parameters_go_on_where_one_cannot_be_moved():
+    found = refine(brink(unbounded=True), START)
+    assert found.chromosome[0] == START[0]
+    assert found.chromosome[1] == pytest.approx(np.mean(1.7 * np.sin(np.arange(100) / 5.0)))

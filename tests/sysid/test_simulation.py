@@ -206,7 +206,7 @@ def test_finer_accuracy_takes_more_steps():
     inputs = np.column_stack([prbs(rng, n, -1, 1), prbs(rng, n, 0, 0.14), np.zeros(n)])
     record = blank(actuator(), inputs, 1.0 / 800.0)
     needed = [
-        BatchSimulator(actuator(), accuracy=a).steps_needed(actuator().nominal, record)
+        BatchSimulator(actuator(), accuracy=a).steps_of_each(actuator().nominal, record)[0]
         for a in (1e-1, 1e-3, 1e-5, 1e-7)
     ]
     assert needed == sorted(needed)

@@ -127,6 +127,18 @@ def test_a_record_does_not_continue_the_one_before():
     assert found.noise[0, 0] < 1e-5
 
 
+def test_residuals_that_grow_are_given_no_endless_memory():
+    """Drift that ends with the record: least squares alone finds memory that grows without end."""
+    residual = np.exp(0.02 * np.arange(2000))[:, None]
+    found = colour(residual, seen(2000), (2000,))
+    covariance = score_covariance(np.ones((2000, 1, 1)), (2000,), found)
+    # No sum of these residuals exceeds as many of the largest.
+    assert 0.0 < covariance[0, 0] <= (2000 * residual.max()) ** 2
+    lone = colour(np.exp(0.5 * np.arange(500))[:, None], seen(500), (500,))
+    assert len(lone.coefficients) > 0
+    assert np.isfinite(score_covariance(np.ones((500, 1, 1)), (500,), lone)).all()
+
+
 def test_of_white_residuals_it_is_sigma_squared_s_s():
     rng = np.random.default_rng(3)
     residual = 0.2 * rng.standard_normal((500, 1))
