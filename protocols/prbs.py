@@ -9,6 +9,7 @@ from pydantic import Field
 
 from daq.config import Experiment
 from daq.config.base import Section
+from daq.config.units import Seconds, Volts
 from daq.hal import CHANNELS, FloatArray, IntArray
 
 REGISTER_BITS = 16
@@ -21,9 +22,9 @@ _TAP_SHIFTS = (0, 2, 3, 5)
 class PrbsChannel(Section):
     """One channel: offset plus or minus amplitude, switched by a shift register."""
 
-    amplitude: float = Field(ge=0.0, le=10.0, description="half the step between levels [V]")
-    offset: float = Field(0.0, ge=-10.0, le=10.0, description="mean of the two levels [V]")
-    minimum_period: float = Field(gt=0.0, le=3600.0, description="shortest time at a level [s]")
+    amplitude: Volts = Field(ge=0.0, le=10.0, description="half the step between levels")
+    offset: Volts = Field(0.0, ge=-10.0, le=10.0, description="mean of the two levels")
+    minimum_period: Seconds = Field(gt=0.0, le=3600.0, description="shortest time at a level")
     seed: int = Field(
         ge=1, le=SEQUENCE_LENGTH, description="first content of the register, not zero"
     )
@@ -32,8 +33,8 @@ class PrbsChannel(Section):
 class Prbs(Experiment):
     """PRBS from a 16-bit Fibonacci shift register, one for each channel."""
 
-    motor: PrbsChannel
-    brake: PrbsChannel
+    motor: PrbsChannel = Field(description="sequence of the motor's commands")
+    brake: PrbsChannel = Field(description="sequence of the brake's commands")
 
     def waveform(self) -> FloatArray:
         """Both channels' sequences, (n_samples, 2) [V]."""

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 import time
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field
 
 from daq.config.base import Section
+from daq.config.units import Unit, Volts
 from daq.errors import DeviceError
 from daq.hal import (
     ANALOG_INPUTS,
@@ -41,9 +42,9 @@ _INTERLOCK = int(Flag.INTERLOCK)
 class Imperfections(Section):
     """The sensing chain's errors; ``ideal`` in the simulation's options turns them all off."""
 
-    noise: float = Field(0.010, ge=0.0, le=1.0, description="rms on every analog input [V]")
-    offset: float = Field(
-        0.020, ge=0.0, le=1.0, description="largest offset of an analog input, drawn by seed [V]"
+    noise: Volts = Field(0.010, ge=0.0, le=1.0, description="rms on every analog input")
+    offset: Volts = Field(
+        0.020, ge=0.0, le=1.0, description="largest offset of an analog input, drawn by seed"
     )
     bits: int = Field(16, ge=8, le=24, description="resolution of the converters")
 
@@ -58,8 +59,12 @@ class Simulation(Section):
     )
     plant: Plant = Field(Plant(), description="parts of the actuator and what hangs on it")
     imperfections: Imperfections = Field(Imperfections(), description="of the sensing chain")
-    current_sense: float = Field(2.0, gt=0.0, description="of both channels [V/A]")
-    torque_sense: float = Field(5.0 / 3.53, gt=0.0, description="torque bridge [V per N*m]")
+    current_sense: Annotated[float, Unit("V/A")] = Field(
+        2.0, gt=0.0, description="gain of both channels' current sensors"
+    )
+    torque_sense: Annotated[float, Unit("V/(N*m)")] = Field(
+        5.0 / 3.53, gt=0.0, description="gain of the torque bridge"
+    )
     encoder_cycles: int = Field(2048, ge=1, description="cycles per revolution")
 
 

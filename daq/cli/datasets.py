@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from daq import capture
 from daq.config.identification import Column, Columns
+from daq.config.units import factor
 from daq.config.yaml_file import YamlFile, suggestion
 from daq.errors import ConfigError
 from daq.hal import FloatArray, IntArray
@@ -224,35 +224,7 @@ def _dataset(
 
 def unit_factor(file: YamlFile, key: tuple[str, ...], unit: str | None, wanted: str) -> float:
     """Factor from a unit in the file to the model's unit."""
-    if unit is None or unit == wanted:
-        return 1.0
-    import pint
-
-    registry: Any = pint.UnitRegistry()
     try:
-        given, model = (registry.Quantity(1.0, _spelt(u)) for u in (unit, wanted))
-        factor = float(given.to(model.units).magnitude)
-    except pint.DimensionalityError:
-        raise file.error(key, f"{unit!r} does not convert to {wanted!r}") from None
-    except Exception:
-        raise file.error(
-            key, f"unit {unit!r} is not understood; write it as in 'mm/s' or 'N*m'"
-        ) from None
-    if _angles(given) != _angles(model):
-        # A number per minute may count turns or radians, and so may hertz.
-        raise file.error(
-            key,
-            f"{unit!r} does not say whether it counts turns or radians, as {wanted!r} of the model "
-            "does, or the other way round; write 'rpm', 'turn/s', 'deg' or 'rad/s'",
-        )
-    return factor
-
-
-def _angles(quantity: Any) -> float:
-    """Power of the angle in a quantity's unit."""
-    powers = dict(quantity.to_root_units().unit_items())
-    return float(powers.get("radian", 0.0))
-
-
-def _spelt(unit: str) -> str:
-    return unit.replace("·", "*").replace("^", "**") if unit != "1" else "dimensionless"
+        return 1.0 if unit is None else factor(unit, wanted)
+    except ValueError as error:
+        raise file.error(key, str(error)) from None

@@ -2,27 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
-
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import Field, model_validator
 
 from daq.config.base import Section
 from daq.config.identification import Range
-
-
-def _per_cent(value: Any) -> Any:
-    if isinstance(value, str) and value.rstrip().endswith("%"):
-        return value.rstrip().removesuffix("%").strip()
-    return value
+from daq.config.units import Percent
 
 
 class DatasheetEntry(Section):
     """One parameter: a value and how exact it is, or a range, and who says so."""
 
     value: float | None = Field(None, description="nominal value")
-    tolerance: Annotated[float | None, BeforeValidator(_per_cent)] = Field(
-        None, gt=0.0, description="either side of the value [%]"
-    )
+    tolerance: Percent | None = Field(None, gt=0.0, description="either side of the value")
     range: Range | None = Field(None, description="in place of value and tolerance")
     fixed: bool = Field(False, description="the value is exact enough not to be searched")
     unit: str | None = Field(None, min_length=1, description="of the numbers; default the model's")

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from daq.config.base import Section
+from daq.config.units import Hertz, Part, Percent
 
 
 def _ordered(ends: tuple[float | None, float | None]) -> tuple[float | None, float | None]:
@@ -48,7 +49,7 @@ class TimeColumn(Section):
 
     column: str | None = Field(None, min_length=1, description="name in the CSV's header")
     unit: str = Field("s", min_length=1, description="unit of the numbers")
-    sample_rate: float | None = Field(None, gt=0.0, description="rows per second [Hz]")
+    sample_rate: Hertz | None = Field(None, gt=0.0, description="rows per second")
 
     @model_validator(mode="after")
     def _one_source(self) -> TimeColumn:
@@ -106,13 +107,15 @@ class IdentificationConfig(Signals):
     population: int = Field(300, ge=2, le=1_000_000, description="chromosomes per generation")
     generations: int = Field(40, ge=1, le=1_000_000, description="generations evaluated")
     seed: int = Field(0, ge=0, le=2**32 - 1, description="one seed, one result")
-    accuracy: float = Field(
+    accuracy: Part = Field(
         1e-3, ge=1e-12, le=0.1, description="normalised RMS error of a simulation"
     )
     max_steps: int = Field(
         512, ge=1, le=1_000_000, description="integration steps a sample may take"
     )
-    elite_percent: float = Field(0.5, ge=0.0, lt=100.0, description="r_elite [%]")
+    elite_percent: Percent = Field(
+        0.5, ge=0.0, lt=100.0, description="share of the population replaced by the best (r_elite)"
+    )
     ranges: dict[str, Range] = Field(
         default_factory=dict, description="search ranges in place of the model's"
     )
@@ -143,7 +146,7 @@ class IdentificationConfig(Signals):
     balance: Literal["samples", "logs"] = Field(
         "samples", description="logs count by their samples, or each alike"
     )
-    hold_back: float = Field(
+    hold_back: Part = Field(
         0.0, ge=0.0, lt=1.0, description="part of each log, its end, that validates"
     )
     profile: list[str] = Field(

@@ -7,6 +7,7 @@ from typing import Any, Literal
 from pydantic import Field, field_validator
 
 from daq.config.base import Section
+from daq.config.units import Amperes, Volts
 
 Sign = Literal[-1, 1]
 
@@ -43,9 +44,10 @@ class Sensors(Section):
 class CommandLimits(Section):
     """Range of each command [V at the amplifier input]; beyond it the range's end is applied."""
 
-    motor: tuple[float, float] = Field((-5.0, 5.0), description="motor command [V]")
-    brake: tuple[float, float] = Field(
-        (0.0, 0.38), description="brake command [V]; 0.38 V gives 0.19 A at 0.5 A/V"
+    motor: tuple[Volts, Volts] = Field((-5.0, 5.0), description="lowest and highest motor command")
+    brake: tuple[Volts, Volts] = Field(
+        (0.0, 0.38),
+        description="lowest and highest brake command; 0.38 V gives 0.19 A at 0.5 A/V",
     )
 
     @field_validator("motor", "brake")
@@ -62,8 +64,8 @@ class CommandLimits(Section):
 class CurrentLimits(Section):
     """Measured current at which the run is stopped and the outputs zeroed [A]."""
 
-    motor: float = Field(2.4, gt=0.0, le=10.0, description="motor current [A]")
-    brake: float = Field(0.19, gt=0.0, le=10.0, description="brake current [A]")
+    motor: Amperes = Field(2.4, gt=0.0, le=10.0, description="largest motor current")
+    brake: Amperes = Field(0.19, gt=0.0, le=10.0, description="largest brake current")
 
 
 class Limits(Section):

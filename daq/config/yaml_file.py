@@ -14,6 +14,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
+from daq.config.units import unit_of
 from daq.errors import ConfigError
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -323,12 +324,14 @@ def _fields(model: type[BaseModel], loc: Key) -> list[str]:
 
 
 def _description(model: type[BaseModel], loc: Key) -> str | None:
-    """What a key means, as its field says."""
+    """What a key means and its unit, as its field says."""
     while loc:
         fields = getattr(_section(model, loc[:-1]), "model_fields", {})
         if loc[-1] in fields:
-            text: str | None = fields[loc[-1]].description
-            return text
+            found = fields[loc[-1]]
+            unit = unit_of(found)
+            text: str | None = found.description
+            return f"{text} [{unit}]" if text and unit not in {None, "1"} else text
         loc = loc[:-1]
     return None
 

@@ -1,0 +1,128 @@
+"""Physical settings: each number in a file has a declared unit, and may be written with one.
+
+    amplitude: Volts = Field(0.5, ge=0.0, le=10.0, description="half the step between levels")
+    slope: Annotated[float, Unit("V/s")] = Field(gt=0.0, description="of the ramp")
+    levels: list[RadiansPerSecond] = Field(min_length=1, description="speeds to visit")
+
+In YAML ``0.5``, ``0.5 V`` and ``500 mV`` are then the same. The unit stands in the reference and
+in the JSON Schema, so a description does not repeat it.
+"""
+
+from __future__ import annotations
+
+import functools
+import re
+import typing
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
+from pydantic.fields import FieldInfo
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema, PydanticCustomError, core_schema
+
+_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+# Atomic: 1e3 is no 1 with the unit e3.
+_QUANTITY = re.compile(rf"\s*((?>{_NUMBER}))\s*([^\s\d.,].*?)\s*")
+
+
+@dataclass(frozen=True)
+class Unit:
+    """Marks a number of a configuration model as being in this unit, ``1`` for a plain part.
+
+    Text such as ``5 ms`` is converted to it; what does not convert is a mistake in the file.
+    """
+
+    symbol: str
+
+    def number(self, value: Any) -> Any:
+        """The number that a text with a unit stands for; anything else as it is."""
+        if not isinstance(value, str) or not (quantity := _QUANTITY.fullmatch(value)):
+            return value
+        try:
+            return float(quantity[1]) * factor(quantity[2], self.symbol)
+        except ValueError as error:
+            raise PydanticCustomError("unit", "{problem}", {"problem": str(error)}) from None
+
+    def __get_pydantic_core_schema__(self, kind: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return core_schema.no_info_before_validator_function(self.number, handler(kind))
+
+    def __get_pydantic_json_schema__(
+        self, schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> JsonSchemaValue:
+        # Bounds in a JSON Schema hold for numbers only, and patterns for text only.
+        quantity = {"type": ["number", "string"], "pattern": rf"^\s*{_NUMBER}\s*[^\s\d.,].*$"}
+        return {**handler(schema), **quantity, "unit": self.symbol}
+
+
+Volts = Annotated[float, Unit("V")]
+Amperes = Annotated[float, Unit("A")]
+Seconds = Annotated[float, Unit("s")]
+Hertz = Annotated[float, Unit("Hz")]
+Radians = Annotated[float, Unit("rad")]
+RadiansPerSecond = Annotated[float, Unit("rad/s")]
+NewtonMetres = Annotated[float, Unit("N*m")]
+Turns = Annotated[float, Unit("turn")]
+Percent = Annotated[float, Unit("%")]
+Part = Annotated[float, Unit("1")]
+
+
+def unit_of(field: FieldInfo) -> str | None:
+    """The unit of a field's numbers, wherever in its type it stands; None without one."""
+    return _unit_in(field.metadata) or _unit_of_type(field.annotation)
+
+
+def factor(given: str, wanted: str) -> float:
+    """Factor from one unit to another, as in ``mm/s`` or ``N*m``.
+
+    Raises ValueError that says why there is none.
+    """
+    if given == wanted:
+        return 1.0
+    import pint
+
+    registry = _registry()
+    try:
+        have, want = (registry.Quantity(1.0, _spelt(unit)) for unit in (given, wanted))
+        found = float(have.to(want.units).magnitude)
+    except pint.DimensionalityError:
+        raise ValueError(f"{given!r} does not convert to {wanted!r}") from None
+    except Exception:
+        raise ValueError(
+            f"unit {given!r} is not understood; write it as in 'mm/s' or 'N*m'"
+        ) from None
+    if _angles(have) != _angles(want):
+        # A number per minute may count turns or radians, and so may hertz.
+        raise ValueError(
+            f"{given!r} does not say whether it counts turns or radians, as {wanted!r} does, or "
+            "the other way round; write 'rpm', 'turn/s', 'deg' or 'rad/s'"
+        )
+    return found
+
+
+@functools.cache
+def _registry() -> Any:
+    import pint
+
+    return pint.UnitRegistry()
+
+
+def _angles(quantity: Any) -> float:
+    """Power of the angle in a quantity's unit."""
+    powers = dict(quantity.to_root_units().unit_items())
+    return float(powers.get("radian", 0.0))
+
+
+def _spelt(unit: str) -> str:
+    return unit.replace("·", "*").replace("^", "**") if unit != "1" else "dimensionless"
+
+
+def _unit_in(metadata: typing.Iterable[Any]) -> str | None:
+    return next((item.symbol for item in metadata if isinstance(item, Unit)), None)
+
+
+def _unit_of_type(kind: Any) -> str | None:
+    own = _unit_in(getattr(kind, "__metadata__", ()))
+    if own is not None:
+        return own
+    return next((unit for part in typing.get_args(kind) if (unit := _unit_of_type(part))), None)
