@@ -6,7 +6,7 @@ python -m benchmarks.simulation --memory
 Seven states, 1000 samples at 800 Hz, held commands. Peers that are not installed
 (`pip install -e ".[bench]"`), or a missing C compiler, are left out and named. Times are per
 simulation on one core; errors are normalised RMS of the worst output against a tight solution.
-The figure needs matplotlib (`pip install -e ".[plot]"`). ``--memory`` runs nothing but a large
+``--memory`` runs nothing but a large
 population on a long record, which takes minutes, and says how much memory that took.
 """
 

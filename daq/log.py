@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -44,6 +45,8 @@ UNITS = {
 }
 
 
+# Columns that ``Samples`` has under another name.
+FIELDS = {"t": "time"}
 _UNEVEN = 0.3  # of a sample that a row may stand off its place
 BoolArray = npt.NDArray[np.bool_]
 
@@ -51,11 +54,11 @@ BoolArray = npt.NDArray[np.bool_]
 class LogWriter:
     """Appends samples to a log.csv; every ``append`` is with the operating system at once.
 
-    Use as a context manager. Raises RunError when the disk refuses, naming how many samples
-    are safe.
+    extra: names of further columns. Use as a context manager. Raises RunError when the disk
+    refuses, naming how many samples are safe.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, extra: Sequence[str] = ()) -> None:
         self.path = path
         self.n_samples = 0
         try:
@@ -64,7 +67,7 @@ class LogWriter:
         except OSError as error:
             raise self._refused(error) from None
         try:
-            self._write(",".join(COLUMNS) + "\n")
+            self._write(",".join((*COLUMNS, *extra)) + "\n")
         except BaseException:
             self._file.close()
             raise
@@ -80,10 +83,10 @@ class LogWriter:
     ) -> None:
         self.close()
 
-    def append(self, samples: Samples) -> None:
-        """Write a block of samples."""
-        names = {"t": "time"}
-        columns = [getattr(samples, names.get(name, name)).tolist() for name in COLUMNS]
+    def append(self, samples: Samples, extra: Sequence[FloatArray] = ()) -> None:
+        """Write a block of samples; extra: of each further column, (n,)."""
+        columns = [getattr(samples, FIELDS.get(name, name)).tolist() for name in COLUMNS]
+        columns += [values.tolist() for values in extra]
         rows = [",".join(map(repr, row)) for row in zip(*columns, strict=True)]
         self._write("\n".join(rows) + "\n", counts=True)
 
@@ -130,14 +133,20 @@ class Log:
     dt: float
     torn: bool
 
+    def samples(self) -> Samples:
+        """Its rows as the run had them."""
+        return Samples(**{FIELDS.get(name, name): self.frame[name].to_numpy() for name in COLUMNS})
 
-def load_log(path: Path) -> Log:
+
+def load_log(path: Path, extra: Sequence[str] = ()) -> Log:
     """Read a log of this or of the original program.
 
-    Raises ConfigError naming the file, line and column of what is wrong with it.
+    extra: names of further columns wanted, where it has them. Raises ConfigError naming the file,
+    line and column of what is wrong with it.
     """
     present = column_names(path)
     columns = [name for name in COLUMNS if name in present or name in ORIGINAL_COLUMNS]
+    columns += [name for name in extra if name in present]
     table = read_table(path, columns)
     frame = table.frame
     require_rows(path, len(frame))

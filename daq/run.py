@@ -6,7 +6,7 @@ import contextlib
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from daq.capture import COMPLETED, Capture
-from daq.config.experiment import Experiment, peaks
 from daq.config.rig import RigConfig
 from daq.errors import ConfigError, DeviceError, InterlockError, RigError, RunError, Terminated
+from daq.experiment import Answer, ClosedLoop, Controller, Experiment, Plan, Sample
 from daq.hal import CHANNELS, Device, Flag, FloatArray, Mode, Phase, Samples
 from daq.log import LogWriter
 from daq.rig import Rig, interlock_reason, mark_interlock
@@ -25,6 +25,7 @@ from daq.rig import Rig, interlock_reason, mark_interlock
 _ZEROS_AHEAD = 0.05  # s of zero commands queued while waiting
 _REST_TIME = 1.0  # s that the shaft must stand still to end homing
 _REST_TURNS = 0.01  # turns it may creep meanwhile
+_SAMPLE = Sample._fields
 
 
 @dataclass(frozen=True)
@@ -79,28 +80,30 @@ class _Timing:
         }
 
 
-def plan(experiment: Experiment, rig: RigConfig) -> FloatArray:
-    """The commands of a run, (n_samples, 2) [V], checked against the rig's limits.
+def plan(experiment: Experiment, rig: RigConfig) -> Plan:
+    """What a run will do, checked against the rig's limits.
 
-    Raises ConfigError, before anything is energised, for settings that make no waveform or
-    commands that the rig would clamp.
+    Raises ConfigError, before anything is energised, for settings that make no run or commands
+    that the rig would clamp.
     """
     try:
-        waveform = experiment.waveform()
+        planned = experiment.plan()
     except ValueError as error:
         raise ConfigError(str(error)) from None
-    for name, low, high in zip(CHANNELS, *peaks(waveform), strict=True):
+    for channel, name in enumerate(CHANNELS):
         least, most = getattr(rig.limits.command, name)
+        low, high = planned.lowest[channel], planned.highest[channel]
         if low < least or high > most:
-            beyond, row = (low, int(np.argmin(waveform[:, CHANNELS.index(name)])))
-            if high > most:
-                beyond, row = high, int(np.argmax(waveform[:, CHANNELS.index(name)]))
+            beyond, where = (high, np.argmax) if high > most else (low, np.argmin)
+            asked = f"up to {beyond:.6g} V"
+            if planned.commands is not None:
+                asked = f"for {beyond:.6g} V in sample {where(planned.commands[:, channel])}"
             raise ConfigError(
-                f"{name}: the plan asks for {beyond:.6g} V in sample {row}, outside the rig's "
-                f"limits [{least:g}, {most:g}] V; change amplitude or offset, or "
+                f"{name}: the plan asks {asked}, outside the rig's limits "
+                f"[{least:g}, {most:g}] V; change amplitude or offset, or "
                 f"limits.command.{name} in the rig's file if the hardware allows it"
             )
-    return waveform
+    return planned
 
 
 def run_experiment(
@@ -117,13 +120,13 @@ def run_experiment(
     ConfigError before energising; DeviceError, InterlockError, RunError, KeyboardInterrupt or
     Terminated afterwards.
     """
-    waveform = plan(experiment, rig_config)
+    planned = plan(experiment, rig_config)
     capture = Capture.create(
         root,
         name,
         {"experiment": experiment.describe(), "rig": rig_config.model_dump(mode="json")},
     )
-    run = _Run(experiment, waveform, Rig(device, rig_config), capture, watch)
+    run = _Run(experiment, planned, Rig(device, rig_config), capture, watch)
     with _signals_raise():
         return run.execute()
 
@@ -154,13 +157,13 @@ class _Run:
     def __init__(
         self,
         experiment: Experiment,
-        waveform: FloatArray,
+        planned: Plan,
         rig: Rig,
         capture: Capture,
         watch: Watcher,
     ) -> None:
         self.experiment = experiment
-        self.waveform = waveform
+        self.plan = planned
         self.rig = rig
         self.capture = capture
         self.watch = watch
@@ -170,7 +173,7 @@ class _Run:
     def execute(self) -> RunResult:
         """All phases; the record in the capture folder names how they ended."""
         try:
-            with LogWriter(self.capture.log_path) as log:
+            with LogWriter(self.capture.log_path, self._columns) as log:
                 self._phases(log)
         except (RigError, KeyboardInterrupt, Terminated) as error:
             self._finish(*_outcome(error, self.phase))
@@ -196,7 +199,10 @@ class _Run:
                 self._enter(Phase.HOMING, self.experiment.homing.turns)
                 self._home()
             self._enter(Phase.RUN)
-            self._excite(log)
+            if isinstance(self.experiment, ClosedLoop):
+                self._control(self.experiment, log)
+            else:
+                self._play(log)
             self._enter(Phase.SAFE)
         except BaseException:
             self.rig.safe()
@@ -207,6 +213,11 @@ class _Run:
         self.rig.safe()
         self.phase = Phase.CLOSE
         self.rig.close()
+
+    @property
+    def _columns(self) -> tuple[str, ...]:
+        """What the log holds beside the samples."""
+        return tuple(self.experiment.columns) if isinstance(self.experiment, ClosedLoop) else ()
 
     def _enter(self, phase: Phase, turns: float = 0.0) -> None:
         self.phase = phase
@@ -296,37 +307,76 @@ class _Run:
                 asked += missing
         self.rig.stop()
 
-    def _excite(self, log: LogWriter) -> None:
-        """Preload and play the waveform; every sample is in the log before the next wait."""
-        total = len(self.waveform)
-        self.rig.start(self.experiment.sample_rate, Mode.OPEN_LOOP)
-        self.timing = _Timing()
+    def _play(self, log: LogWriter) -> None:
+        """Preload and play the waveform."""
+        waveform = self.plan.commands
+        assert waveform is not None
+        total = len(waveform)
+        self._begin(Mode.OPEN_LOOP)
         sent = done = 0
         while done < total:
             room = self.rig.room()
             if sent < total and room > 0:
-                chunk = self.waveform[sent : sent + room]
+                chunk = waveform[sent : sent + room]
                 self.rig.send(sent, chunk)
                 sent += len(chunk)
             samples = _first(self.rig.receive(), total)
             if len(samples) == 0:
                 break  # the last samples of the run were lost
-            trip = interlock_reason(samples, self.rig.config)
-            if trip is not None:
-                self.rig.safe()
-                samples = mark_interlock(_first(samples, int(samples.tick[trip[0]]) + 1), trip[0])
-            log.append(samples)
-            self.timing.block(samples)
-            done = int(samples.tick[-1]) + 1
-            self.watch(PhaseProgress(Phase.RUN, done, total, "samples"))
-            if trip is not None:
-                raise InterlockError(f"interlock in sample {done - 1}: {trip[1]}; outputs are zero")
+            samples, trip = self._guarded(samples)
+            done = self._keep(log, samples, (), trip)
             if np.any(samples.flags & int(Flag.UNDERFLOW)):
                 raise DeviceError(
                     f"the device ran out of commands by sample {done - 1} and made itself safe; "
                     "the host was too slow to refill it"
                 )
         self.rig.stop()
+
+    def _control(self, experiment: ClosedLoop, log: LogWriter) -> None:
+        """Answer every sample with a command until the controller, or the plan, is at its end."""
+        answering = _Answering(experiment)
+        self._begin(Mode.CLOSED_LOOP)
+        self.rig.send(0, np.zeros((experiment.ahead, len(CHANNELS))))
+        asked, done = experiment.ahead, 0
+        while done < self.plan.n_samples and not answering.ended:
+            samples = _first(self.rig.receive(), self.plan.n_samples)
+            if len(samples) == 0:
+                break
+            samples, trip = self._guarded(samples)
+            answers = answering.to(samples)
+            if trip is None and not answering.ended:
+                # A lost sample has no answer: the one after it serves its tick too.
+                ticks = np.arange(asked, int(samples.tick[-1]) + 1 + experiment.ahead)
+                places = np.searchsorted(samples.tick + experiment.ahead, ticks)
+                self.rig.send(asked, answers.commands[places])
+                asked += len(ticks)
+            done = self._keep(log, _first(samples, answers.end), answers.logged, trip)
+        self.rig.stop()
+
+    def _begin(self, mode: Mode) -> None:
+        self.rig.start(self.experiment.sample_rate, mode)
+        self.timing = _Timing()
+
+    def _guarded(self, samples: Samples) -> tuple[Samples, str | None]:
+        """The samples up to one beyond a limit, and why; the outputs are zero by then."""
+        trip = interlock_reason(samples, self.rig.config)
+        if trip is None:
+            return samples, None
+        self.rig.safe()
+        row, reason = trip
+        return mark_interlock(_first(samples, int(samples.tick[row]) + 1), row), reason
+
+    def _keep(
+        self, log: LogWriter, samples: Samples, extra: Sequence[FloatArray], trip: str | None
+    ) -> int:
+        """Log samples, before the next wait; how far the run is. Raises InterlockError."""
+        log.append(samples, extra)
+        self.timing.block(samples)
+        done = int(samples.tick[-1]) + 1
+        self.watch(PhaseProgress(Phase.RUN, done, self.plan.n_samples, "samples"))
+        if trip is not None:
+            raise InterlockError(f"interlock in sample {done - 1}: {trip}; outputs are zero")
+        return done
 
     def _check(self, samples: Samples) -> None:
         trip = interlock_reason(samples, self.rig.config)
@@ -335,6 +385,52 @@ class _Run:
             raise InterlockError(
                 f"interlock during {self.phase.value}: {trip[1]}; outputs are zero"
             )
+
+
+@dataclass(frozen=True)
+class _Answers:
+    """Answers to n samples: commands (n, 2) [V], logged values (n,) each; end: tick after them."""
+
+    commands: FloatArray
+    logged: list[FloatArray]
+    end: int
+
+
+class _Answering:
+    """A controller asked for one sample after the other."""
+
+    def __init__(self, experiment: ClosedLoop) -> None:
+        self._experiment = experiment
+        self._controller: Controller = experiment.controller()
+        self._last = Answer(0.0, 0.0, (0.0,) * len(experiment.columns))
+        self.ended = False
+
+    def to(self, samples: Samples) -> _Answers:
+        """Answers to some samples; ``ended`` once the controller has none."""
+        rows: list[Answer] = []
+        for values in zip(*(getattr(samples, name).tolist() for name in _SAMPLE), strict=True):
+            answer = self._ask(Sample(*values))
+            if answer is None:
+                self.ended = True
+                rows.append(Answer(0.0, 0.0, self._last.logged))
+                break
+            self._last = answer
+            rows.append(answer)
+        commands = np.array([(row.motor, row.brake) for row in rows], dtype=np.float64)
+        logged = np.array([row.logged for row in rows], dtype=np.float64)
+        logged = logged.reshape(len(rows), len(self._experiment.columns))
+        return _Answers(commands, list(logged.T), int(samples.tick[len(rows) - 1]) + 1)
+
+    def _ask(self, sample: Sample) -> Answer | None:
+        try:
+            return self._controller.answer(sample)
+        except RigError:
+            raise
+        except Exception as error:
+            raise RunError(
+                f"the protocol {self._experiment.protocol!r} failed at sample {sample.tick}: "
+                f"{type(error).__name__}: {error}; outputs were set to zero"
+            ) from error
 
 
 def _first(samples: Samples, end_tick: int) -> Samples:

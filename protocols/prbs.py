@@ -7,9 +7,9 @@ import math
 import numpy as np
 from pydantic import Field
 
-from daq.config import Experiment
 from daq.config.base import Section
 from daq.config.units import Seconds, Volts
+from daq.experiment import Timed
 from daq.hal import CHANNELS, FloatArray, IntArray
 
 REGISTER_BITS = 16
@@ -30,7 +30,7 @@ class PrbsChannel(Section):
     )
 
 
-class Prbs(Experiment):
+class Prbs(Timed):
     """PRBS from a 16-bit Fibonacci shift register, one for each channel."""
 
     motor: PrbsChannel = Field(description="sequence of the motor's commands")
@@ -38,14 +38,14 @@ class Prbs(Experiment):
 
     def waveform(self) -> FloatArray:
         """Both channels' sequences, (n_samples, 2) [V]."""
-        self.check_length()
+        n_samples = self.n_samples
         columns = []
         for name in CHANNELS:
             channel: PrbsChannel = getattr(self, name)
             hold = self._samples_per_bit(name, channel.minimum_period)
-            bits = lfsr_bits(channel.seed, math.ceil(self.n_samples / hold))
+            bits = lfsr_bits(channel.seed, math.ceil(n_samples / hold))
             levels = channel.offset + channel.amplitude * (2.0 * bits - 1.0)
-            columns.append(np.repeat(levels, hold)[: self.n_samples])
+            columns.append(np.repeat(levels, hold)[:n_samples])
         return np.stack(columns, axis=1)
 
     def _samples_per_bit(self, name: str, period: float) -> int:

@@ -120,6 +120,17 @@ def check(
     check_command(experiment, rig, json)
 
 
+@app.command(epilog="Example:  rig analyse runs/20260101T120000Z-constant_velocity")
+def analyse(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Capture folder.")],
+    json: AsJson = False,
+) -> None:
+    """Conclude from a run's log what its protocol concludes: tables, figures, numbers."""
+    from daq.cli.analysing import analyse_command
+
+    analyse_command(run, json)
+
+
 @app.command(epilog="Example:  rig identify runs/20260101T120000Z-prbs --validate other_log.csv")
 def identify(
     logs: Annotated[

@@ -30,7 +30,7 @@ def report_note(message: str) -> None:
 
 def print_json(document: Any) -> None:
     """One JSON document; numbers JSON cannot hold become null."""
-    sys.stdout.write(json.dumps(_plain(document), indent=2) + "\n")
+    sys.stdout.write(json.dumps(plain(document), indent=2) + "\n")
 
 
 def print_line(text: str = "") -> None:
@@ -146,13 +146,14 @@ def _terminal_bar() -> Iterator[Bar]:
         yield Bars()
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
+    """A document as JSON can hold it: numbers that are not finite become null."""
     if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     if hasattr(value, "tolist"):
-        return _plain(value.tolist())
+        return plain(value.tolist())
     if isinstance(value, float) and not math.isfinite(value):
         return None
     if isinstance(value, str | int | float | bool) or value is None:

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import importlib.resources
+import inspect
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from daq.cli.user_code import from_file, locate
 from daq.config import yaml_file
-from daq.config.experiment import Experiment
 from daq.config.rig import RigConfig
 from daq.config.yaml_file import YamlFile
 from daq.errors import ConfigError
-from daq.hal import Device, FloatArray
+from daq.experiment import Experiment, Plan
+from daq.hal import Device
 from daq.plugins import load_plugin
 from daq.run import plan
 
@@ -25,8 +28,8 @@ class LoadedExperiment:
     experiment: Experiment
     name: str
 
-    def plan(self, rig: RigConfig) -> FloatArray:
-        """The commands of the run; ConfigError that names this file when they cannot be."""
+    def plan(self, rig: RigConfig) -> Plan:
+        """What the run will do; ConfigError that names this file when it cannot be."""
         try:
             return plan(self.experiment, rig)
         except ConfigError as error:
@@ -44,7 +47,7 @@ class LoadedExperiment:
             **{k[1:]: v for k, v in self.file.places.items() if k[:1] == ("validation",) and k[1:]},
         }
         file = YamlFile(self.file.path, content, places)
-        experiment = yaml_file.validate(file, type(self.experiment), content)
+        experiment = make_experiment(file, type(self.experiment))
         return LoadedExperiment(file, experiment, f"{self.name}-validation")
 
 
@@ -77,11 +80,55 @@ def load_experiment(name: str) -> LoadedExperiment:
             ("protocol",), "this key is missing or not a name; for example 'protocol: prbs'"
         )
     try:
-        kind: type[Experiment] = load_plugin("rig.protocols", protocol)
+        kind = find_protocol(protocol, file.path.parent)
     except ConfigError as error:
         raise file.error(("protocol",), str(error)) from None
-    experiment = yaml_file.validate(file, kind)
+    experiment = make_experiment(file, kind)
     return LoadedExperiment(file, experiment, experiment.name or file.path.stem)
+
+
+def find_protocol(name: str, folder: Path) -> type[Experiment]:
+    """An installed protocol, or a class in a file given as ``FILE.py:CLASS``.
+
+    File names are looked up from the working folder, then from ``folder``. Raises ConfigError.
+    """
+    file = _own_protocol(name)
+    if file is None:
+        found = load_plugin("rig.protocols", name)
+    else:
+        path = locate(Path(file[1]), "protocol", folder)
+        found = from_file(path, file[2], "protocol", _is_protocol)
+    if not _is_protocol(found):
+        raise ConfigError(
+            f"{name} is no protocol; make it a class derived from daq.experiment.Timed, OpenLoop "
+            "or ClosedLoop, with all of its methods"
+        )
+    kind: type[Experiment] = found
+    return kind
+
+
+def make_experiment(file: YamlFile, kind: type[Experiment]) -> Experiment:
+    """The checked content of an experiment's file."""
+    content = dict(file.content)
+    own = _own_protocol(content["protocol"])
+    if own is not None:
+        # The capture must find it from any folder.
+        path = locate(Path(own[1]), "protocol", file.path.parent).resolve()
+        content["protocol"] = f"{path}:{own[2]}"
+    experiment = yaml_file.validate(file, kind, content)
+    experiment._folder = file.path.parent
+    return experiment
+
+
+def _own_protocol(name: str) -> re.Match[str] | None:
+    """File and class of ``FILE.py:CLASS``."""
+    # Not at the first colon: a Windows path has one behind its drive.
+    return re.match(r"^(.*\.py):(\w+)$", name)
+
+
+def _is_protocol(found: Any) -> bool:
+    is_class = inspect.isclass(found) and issubclass(found, Experiment)
+    return is_class and not inspect.isabstract(found)
 
 
 def load_rig(name: str) -> tuple[RigConfig, Any]:

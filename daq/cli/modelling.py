@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import importlib.util
 import inspect
 import re
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 from daq.cli import console
+from daq.cli.user_code import from_file, locate
 from daq.config.yaml_file import suggestion
 from daq.errors import ConfigError
 from daq.plugins import installed, load_plugin
@@ -49,7 +47,7 @@ def find_model(name: str, relative_to: Path | None = None) -> ProcessModel:
     parsed = _Name.parse(name)
     where = f"model {parsed.source!r}"
     if parsed.attribute is not None:
-        where = f"{_locate(Path(parsed.source), relative_to)}:{parsed.attribute}"
+        where = f"{locate(Path(parsed.source), 'model', relative_to)}:{parsed.attribute}"
     return _as_model(_find(parsed, relative_to), where, parsed.options)
 
 
@@ -57,7 +55,8 @@ def _find(name: _Name, relative_to: Path | None = None) -> Any:
     """The model, or the function that makes it."""
     if name.attribute is None:
         return load_plugin("rig.models", name.source)
-    return _from_file(_locate(Path(name.source), relative_to), name.attribute)
+    path = locate(Path(name.source), "model", relative_to)
+    return from_file(path, name.attribute, "model", lambda found: isinstance(found, ProcessModel))
 
 
 def whole_name(name: str, relative_to: Path | None = None) -> str:
@@ -65,7 +64,7 @@ def whole_name(name: str, relative_to: Path | None = None) -> str:
     parsed = _Name.parse(name)
     if parsed.attribute is None:
         return name
-    path = _locate(Path(parsed.source), relative_to).resolve()
+    path = locate(Path(parsed.source), "model", relative_to).resolve()
     return f"{path}{name.removeprefix(parsed.source)}"
 
 
@@ -202,57 +201,6 @@ def _as_text(value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     return console.number(value) if isinstance(value, float) else str(value)
-
-
-def _locate(path: Path, relative_to: Path | None) -> Path:
-    for candidate in (path, *([relative_to / path] if relative_to else [])):
-        if candidate.is_file():
-            return candidate
-    raise ConfigError(f"{path}: there is no such model file")
-
-
-def _from_file(path: Path, attribute: str) -> Any:
-    module = _import_file(path)
-    if not hasattr(module, attribute):
-        models = [key for key, value in vars(module).items() if isinstance(value, ProcessModel)]
-        raise ConfigError(
-            f"{path}: it defines no {attribute!r}; {suggestion(attribute, models)} "
-            "(--model file.py:object names a ProcessModel in it)"
-        )
-    return getattr(module, attribute)
-
-
-def _import_file(path: Path) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(f"_rig_model_{path.stem}", path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    # A model file may import its neighbours, as a script in that folder could.
-    folder = str(path.resolve().parent)
-    sys.path.insert(0, folder)
-    try:
-        spec.loader.exec_module(module)
-    except (Exception, SystemExit) as error:
-        raise ConfigError(f"{_place(path, error)}: the model file does not import: "
-                          f"{type(error).__name__}: {error}") from None  # fmt: skip
-    finally:
-        sys.path.remove(folder)
-    return module
-
-
-def _place(path: Path, error: BaseException) -> str:
-    """``file:line`` of the last line of the user's file that the error passed through."""
-    if isinstance(error, SyntaxError) and _same(error.filename, path):
-        return f"{path}:{error.lineno}"
-    line, trace = None, error.__traceback__
-    while trace is not None:
-        if _same(trace.tb_frame.f_code.co_filename, path):
-            line = trace.tb_lineno
-        trace = trace.tb_next
-    return f"{path}:{line}" if line is not None else str(path)
-
-
-def _same(file: str | None, path: Path) -> bool:
-    return file is not None and Path(file).resolve() == path.resolve()
 
 
 def _as_model(found: Any, where: str, options: str) -> ProcessModel:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from daq.cli import console
+from daq.cli.analysing import analyse, as_document, show_findings
 from daq.cli.files import LoadedExperiment, load_experiment, load_rig
 from daq.config.rig import RigConfig
+from daq.experiment import Plan
 from daq.hal import CHANNELS, Device, Phase
 from daq.run import PhaseProgress, RunResult, run_experiment
 
@@ -49,8 +52,13 @@ def run_command(
         # A mistake in the model must show before the rig moves.
         prepared = prepare(config, overrides)
     result = _run(loaded, rig_config, device, out, as_json)
+    found = analyse(loaded.experiment, result.folder)
     check = _run(validation, rig_config, device, out, as_json) if validation else None
     report = {"run": _summary(result), "validation": _summary(check) if check else None}
+    if found is not None:
+        report["findings"] = as_document(found, result.folder)
+        if not as_json:
+            show_findings(found, result.folder)
     if prepared is not None:
         from daq.cli.identifying import identify_logs
 
@@ -72,52 +80,48 @@ def check_command(experiment: str, rig: str, as_json: bool) -> None:
     """Validate an experiment and say what it would do."""
     loaded = load_experiment(experiment)
     rig_config, _device = load_rig(rig)
-    waveform = loaded.plan(rig_config)
+    planned = loaded.plan(rig_config)
     validation = loaded.validation()
     if validation is not None:
         validation.plan(rig_config)
     settings = loaded.experiment
-    channels: dict[str, dict[str, Any]] = {}
-    for index, name in enumerate(CHANNELS):
-        column = waveform[:, index]
-        channels[name] = {
-            "lowest_volts": float(column.min()),
-            "highest_volts": float(column.max()),
-            "mean_volts": float(column.mean()),
-            "changes": int(np.count_nonzero(np.diff(column))),
-            "limits_volts": list(getattr(rig_config.limits.command, name)),
-        }
+    seconds = planned.n_samples / settings.sample_rate
+    channels = _channels(planned, rig_config)
     if as_json:
         console.print_json(
             {
                 "experiment": str(loaded.file.path),
                 "protocol": settings.protocol,
+                "mode": settings.mode.value,
                 "sample_rate_hz": settings.sample_rate,
-                "samples": len(waveform),
-                "duration_seconds": len(waveform) / settings.sample_rate,
+                "samples": planned.n_samples,
+                "duration_seconds": seconds,
                 "channels": channels,
+                "remarks": list(planned.remarks),
                 "validation_run": validation is not None,
                 "rig": rig_config.name,
             }
         )
         return
+    most = "up to " if planned.commands is None else ""
     console.print_table(
         f"{loaded.file.path} on {rig_config.name}: "
-        f"{len(waveform)} samples at {settings.sample_rate:g} Hz, "
-        f"{len(waveform) / settings.sample_rate:g} s",
+        f"{most}{planned.n_samples} samples at {settings.sample_rate:g} Hz, {most}{seconds:g} s",
         ["channel", "lowest [V]", "highest [V]", "mean [V]", "changes", "limits [V]"],
         [
             [
                 name,
                 console.number(facts["lowest_volts"], 3),
                 console.number(facts["highest_volts"], 3),
-                console.number(facts["mean_volts"], 3),
-                str(facts["changes"]),
+                console.number(facts.get("mean_volts", math.nan), 3),
+                str(facts.get("changes", "-")),
                 "{:g} to {:g}".format(*facts["limits_volts"]),
             ]
             for name, facts in channels.items()
         ],
     )
+    for remark in planned.remarks:
+        console.print_line(remark)
     turns = settings.homing.turns
     before = [f"{settings.calibration.samples} samples of offset calibration"]
     if turns > 0:
@@ -129,6 +133,22 @@ def check_command(experiment: str, rig: str, as_json: bool) -> None:
     )  # fmt: skip
     on = f" --rig {rig}" if rig != DEFAULT_RIG else ""
     console.print_line(f"Next: rig run {experiment}{on} --identify")
+
+
+def _channels(planned: Plan, rig: RigConfig) -> dict[str, dict[str, Any]]:
+    """What a plan does to each channel; mean and changes only of commands known beforehand."""
+    channels: dict[str, dict[str, Any]] = {}
+    for index, name in enumerate(CHANNELS):
+        channels[name] = {
+            "lowest_volts": float(planned.lowest[index]),
+            "highest_volts": float(planned.highest[index]),
+            "limits_volts": list(getattr(rig.limits.command, name)),
+        }
+        if planned.commands is not None:
+            column = planned.commands[:, index]
+            channels[name]["mean_volts"] = float(column.mean())
+            channels[name]["changes"] = int(np.count_nonzero(np.diff(column)))
+    return channels
 
 
 def _run(

@@ -1,0 +1,146 @@
+"""``rig analyse``: what a protocol concludes from its run, in tables and figures."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from daq import capture
+from daq.cli import console
+from daq.cli.files import find_protocol
+from daq.errors import ConfigError, RigError
+from daq.experiment import ClosedLoop, Experiment
+from daq.findings import Findings, Table
+from daq.log import load_log
+
+RESULTS = "results"
+
+
+def analyse_command(folder: Path, as_json: bool) -> None:
+    """Conclude from a capture again, and show it."""
+    warning = capture.describe_end(capture.log_path(folder), torn=False)
+    if warning is not None:
+        console.report_note(warning)
+    experiment = recorded_experiment(folder)
+    found = analyse(experiment, folder)
+    if found is None:
+        raise ConfigError(
+            f"{folder}: the protocol {experiment.protocol!r} only excites, and concludes nothing "
+            f"by itself; rig identify {folder} finds parameters"
+        )
+    if as_json:
+        console.print_json(as_document(found, folder))
+        return
+    show_findings(found, folder)
+
+
+def recorded_experiment(folder: Path) -> Experiment:
+    """The experiment that a capture folder says was run; ConfigError when it does not."""
+    path = folder / capture.RUN_NAME
+    record = capture.read_record(capture.log_path(folder))
+    if record is None:
+        raise ConfigError(f"{path}: there is no such file; give a capture folder that rig run made")
+    settings = record.get("experiment")
+    if not isinstance(settings, dict) or not isinstance(settings.get("protocol"), str):
+        raise ConfigError(f"{path}: experiment.protocol: the name of a protocol is missing")
+    kind = find_protocol(settings["protocol"], folder)
+    try:
+        experiment = kind.model_validate(settings)
+    except ValueError as error:
+        raise ConfigError(f"{path}: experiment: {error}") from None
+    return experiment
+
+
+def analyse(experiment: Experiment, folder: Path) -> Findings | None:
+    """What an experiment's protocol concludes from a capture, written to its ``results``."""
+    if type(experiment).findings is Experiment.findings:
+        return None
+    extra = tuple(experiment.columns) if isinstance(experiment, ClosedLoop) else ()
+    log = load_log(folder / capture.LOG_NAME, extra)
+    columns = {name: log.frame[name].to_numpy() for name in extra if name in log.frame}
+    try:
+        found = experiment.findings(log.samples(), columns)
+    except ValueError as error:
+        console.report_note(f"{folder}: no result: {error}")
+        return None
+    if found is not None:
+        _write(found, folder / RESULTS)
+    return found
+
+
+def as_document(found: Findings, folder: Path) -> dict[str, Any]:
+    """Findings for machines, and the files they were written to."""
+    written = [str(path) for path in sorted((folder / RESULTS).iterdir())]
+    return {**_contents(found), "files": written}
+
+
+def _contents(found: Findings) -> dict[str, Any]:
+    return {
+        "numbers": {
+            n.name: {"value": n.value, "unit": n.unit, "low": n.low, "high": n.high}
+            for n in found.numbers
+        },
+        "tables": {t.name: {k: v.tolist() for k, v in t.columns.items()} for t in found.tables},
+        "ranges": {name: list(ends) for name, ends in found.ranges.items()},
+        "remarks": list(found.remarks),
+    }
+
+
+def show_findings(found: Findings, folder: Path) -> None:
+    """Findings for people."""
+    if found.numbers:
+        console.print_table(
+            "Results",
+            ["quantity", "value", "95 % interval", "unit", "meaning"],
+            [
+                [
+                    n.name,
+                    console.number(n.value),
+                    "-" if n.low is None or n.high is None
+                    else f"{console.number(n.low)} .. {console.number(n.high)}",
+                    n.unit,
+                    n.meaning,
+                ]
+                for n in found.numbers
+            ],
+            text=["unit", "meaning"],
+        )  # fmt: skip
+    for table in found.tables:
+        heads = [_with_unit(name, table) for name in table.columns]
+        rows = zip(*(values.tolist() for values in table.columns.values()), strict=True)
+        console.print_table(table.title, heads, [[console.number(v) for v in row] for row in rows])
+    for remark in found.remarks:
+        console.print_line(remark)
+    console.print_line(f"Results: {folder / RESULTS}")
+
+
+def _with_unit(name: str, table: Table) -> str:
+    return f"{name} [{table.units[name]}]" if name in table.units else name
+
+
+def _write(found: Findings, folder: Path) -> None:
+    """Tables as CSV, figures, and all in findings.json."""
+    from daq.figures.findings import draw
+
+    capture.make_folder(folder)
+    for table in found.tables:
+        rows = np.column_stack(list(table.columns.values()))
+        lines = [",".join(table.columns), *(",".join(map(repr, row)) for row in rows.tolist())]
+        capture.write_whole(folder / f"{table.name}.csv", "\n".join(lines) + "\n")
+    for figure in found.figures:
+        drawn = draw(figure)
+        for kind in ("png", "pdf"):
+            path = folder / f"{figure.name}.{kind}"
+            try:
+                drawn.savefig(path)
+            except OSError as error:
+                raise RigError(f"{path}: cannot be written: {error.strerror}") from None
+    text = json.dumps(console.plain(_contents(found)), indent=2)
+    capture.write_whole(folder / "findings.json", text + "\n")
+    if found.ranges:
+        lines = ["# Starting ranges for rig identify --config", "ranges:"]
+        lines += [f"  {k}: [{low:.6g}, {high:.6g}]" for k, (low, high) in found.ranges.items()]
+        capture.write_whole(folder / "ranges.yaml", "\n".join(lines) + "\n")

@@ -1,0 +1,198 @@
+"""Experiments: what every experiment's YAML has in common, and how a protocol decides commands.
+
+A protocol is a subclass of one of three: ``Timed``, commands known beforehand for a duration;
+``OpenLoop``, commands known beforehand; ``ClosedLoop``, a controller answers every sample.
+"""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple, Protocol
+
+import numpy as np
+from pydantic import Field, PrivateAttr
+
+from daq.config.base import Section
+from daq.findings import Findings
+from daq.hal import FloatArray, Mode, Samples
+
+MOST_SAMPLES = 20_000_000
+
+
+class OffsetCalibration(Section):
+    """Mean of the analog inputs at zero command, taken off all later samples."""
+
+    samples: int = Field(3200, ge=1, le=1_000_000, description="samples averaged")
+
+
+class Homing(Section):
+    """Winding of the load's cable before the run."""
+
+    turns: float = Field(0.0, ge=0.0, le=1000.0, description="turns to wind; 0 skips homing")
+    timeout: float = Field(60.0, gt=0.0, le=3600.0, description="time allowed for it [s]")
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a run will do, known before anything is energised.
+
+    n_samples: of the run; of a closed loop the most. lowest, highest: (2,), commands [V] of motor
+    and brake; of a closed loop what its controller confines itself to. commands: (n_samples, 2)
+    [V], None in closed loop. references: what a controller will ask for, by column name,
+    (n_samples,) each. remarks: what else a user should know beforehand, a line each.
+    """
+
+    n_samples: int
+    lowest: FloatArray
+    highest: FloatArray
+    commands: FloatArray | None = None
+    references: Mapping[str, FloatArray] = field(default_factory=dict)
+    remarks: tuple[str, ...] = ()
+
+
+class Experiment(Section, abc.ABC):
+    """An experiment: common settings here, a protocol's own in its subclass.
+
+    A protocol is registered under the entry-point group ``rig.protocols``, or named in the YAML
+    as ``FILE.py:CLASS``.
+    """
+
+    mode: ClassVar[Mode]
+
+    name: str = Field("", max_length=80, description="of the capture folder; default the file's")
+    protocol: str = Field(min_length=1, description="name of a protocol, or FILE.py:CLASS")
+    sample_rate: float = Field(800.0, gt=0.0, le=1e6, description="samples per second [Hz]")
+    calibration: OffsetCalibration = Field(OffsetCalibration(), description="offset calibration")
+    homing: Homing = Field(Homing(), description="winding of the load")
+    validation: dict[str, Any] = Field(
+        default_factory=dict,
+        description="keys that differ in the validation run of rig run --identify",
+    )
+    # Where its file lies, for the names of other files in it.
+    _folder: Path = PrivateAttr(default=Path())
+
+    @abc.abstractmethod
+    def plan(self) -> Plan:
+        """What the run will do.
+
+        Raises ValueError, its text beginning with the key, for settings that make no run.
+        """
+
+    def findings(self, samples: Samples, extra: Mapping[str, FloatArray]) -> Findings | None:
+        """What the protocol itself concludes from its run, None for those that only excite.
+
+        extra: the columns that its controller adds, (n,) each. Called with what was logged,
+        after a run that ended early too. Raises ValueError, saying why, where nothing follows.
+        """
+        return None
+
+    def describe(self) -> dict[str, Any]:
+        """The experiment as resolved, for run.json."""
+        return self.model_dump(mode="json")
+
+    def samples_in(self, seconds: float, key: str = "duration") -> int:
+        """Samples in a run of so many seconds, the nearest whole number.
+
+        Raises ValueError, naming the key that decides it, for a senseless number.
+        """
+        n_samples = round(seconds * self.sample_rate)
+        if not 2 <= n_samples <= MOST_SAMPLES:
+            raise ValueError(
+                f"{key}: {seconds:g} s at {self.sample_rate:g} Hz makes "
+                f"{n_samples} samples; 2 to {MOST_SAMPLES} are possible: "
+                f"change {key} or sample_rate"
+            )
+        return n_samples
+
+
+class OpenLoop(Experiment):
+    """A protocol whose commands are known beforehand; the device's clock plays them."""
+
+    mode = Mode.OPEN_LOOP
+
+    @abc.abstractmethod
+    def waveform(self) -> FloatArray:
+        """Commands of the whole run, (n_samples, 2): motor and brake [V].
+
+        Raises ValueError, its text beginning with the key, for settings that make no waveform.
+        """
+
+    def remarks(self) -> tuple[str, ...]:
+        """What else a user should know beforehand, a line each."""
+        return ()
+
+    def plan(self) -> Plan:
+        """The commands and their peaks."""
+        commands = self.waveform()
+        lowest, highest = np.min(commands, axis=0), np.max(commands, axis=0)
+        return Plan(len(commands), lowest, highest, commands, remarks=self.remarks())
+
+
+class Timed(OpenLoop):
+    """Commands known beforehand, for as long as the file says."""
+
+    duration: float = Field(gt=0.0, le=86400.0, description="length of the excitation [s]")
+
+    @property
+    def n_samples(self) -> int:
+        """Number of samples. Raises ValueError for a senseless one."""
+        return self.samples_in(self.duration)
+
+    @property
+    def times(self) -> FloatArray:
+        """Time of every sample, (n_samples,) [s]. Raises ValueError for a senseless number."""
+        return np.arange(self.n_samples) / self.sample_rate
+
+
+class Sample(NamedTuple):
+    """One sample in SI units, as ``Samples`` has them."""
+
+    tick: int
+    time: float
+    current_motor: float
+    current_brake: float
+    torque: float
+    theta: float
+    omega: float
+    flags: int
+
+
+class Answer(NamedTuple):
+    """A controller's answer to a sample: commands [V], and what it logs beside the sample.
+
+    logged: values of its ``columns``, such as the reference that the sample was compared with.
+    """
+
+    motor: float
+    brake: float
+    logged: tuple[float, ...] = ()
+
+
+class Controller(Protocol):
+    """Decides the commands of a closed-loop run; a new one is made for each run."""
+
+    def answer(self, sample: Sample) -> Answer | None:
+        """The commands that answer a sample; None ends the run, with zero commands.
+
+        Every sample that arrives is answered, in order; lost ones are missing. The commands are
+        applied ``ahead`` ticks after the sample, and held until the next.
+        """
+
+
+class ClosedLoop(Experiment):
+    """A protocol whose controller answers every sample with a command."""
+
+    mode = Mode.CLOSED_LOOP
+    columns: ClassVar[Mapping[str, str]] = {}
+    """What its controller logs beside every sample: column names and their units."""
+
+    ahead: int = Field(
+        1, ge=1, le=20, description="ticks from a sample to the command that answers it"
+    )
+
+    @abc.abstractmethod
+    def controller(self) -> Controller:
+        """A new controller for one run, before its first sample."""
