@@ -17,8 +17,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
+from sysid._threads import one_thread
 from sysid.data import Dataset
 from sysid.model import FloatArray, ModelError, Parameter, ProcessModel
 from sysid.ranges import Range, searched
@@ -100,7 +100,7 @@ def guess_ranges(
     }
     for record in records:
         record.check(model)
-    with threadpool_limits(1, user_api="blas"):  # fits too small for threads to pay
+    with one_thread():
         told = _called(model, [Measured(record, model) for record in records], known)
     found = {}
     for parameter in space.parameters:

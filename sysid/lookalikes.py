@@ -52,7 +52,7 @@ def _swaps(objective: Objective, chromosome: FloatArray) -> list[FloatArray]:
     for row, (i, j) in zip(swapped, pairs, strict=False):
         row[[i, j]] = row[[j, i]]
     coded = space.encode(np.maximum(swapped, np.finfo(np.float64).tiny * space.log))
-    lower, upper = space.coded_bounds()
+    lower, upper = space.coded_bounds
     admitted = np.all((coded >= lower) & (coded <= upper), axis=1)
     errors, _ = objective.evaluate(np.where(admitted[:, None], swapped, chromosome))
     # The last one is the chromosome itself.
@@ -122,8 +122,8 @@ class _Modes:
         self.x = self.space.starts(chromosome[None], 0, own)[0]
         self.u = record.inputs[0]
         self.start = self.space.encode(chromosome)
-        self.bounds = self.space.coded_bounds()
-        self.width = self.space.encode(self.space.upper) - self.space.encode(self.space.lower)
+        self.bounds = self.space.coded_bounds
+        self.width = self.space.width
         values = self._eigenvalues(self.start)
         oscillates = bool(values.imag.max() > 0.0)
         self.fastest = complex(values[np.argmax(values.imag if oscillates else np.abs(values))])

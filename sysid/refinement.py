@@ -130,7 +130,7 @@ def refine_each(
 
 def begin(objective: Objective, chromosome: FloatArray) -> Descent:
     """A descent from a chromosome (n_free,), moved to the nearest point within the ranges."""
-    return Descent(np.clip(objective.space.encode(chromosome), *objective.space.coded_bounds()))
+    return Descent(np.clip(objective.space.encode(chromosome), *objective.space.coded_bounds))
 
 
 def simulations_per_iteration(objective: Objective) -> int:
@@ -174,8 +174,8 @@ class _Frame:
     def __init__(self, objective: Objective) -> None:
         space = objective.space
         self.objective = objective
-        self.lower, self.upper = space.coded_bounds()
-        self.width = space.encode(space.upper) - space.encode(space.lower)
+        self.lower, self.upper = space.coded_bounds
+        self.width = space.width
 
     def with_steps(self, descents: list[Descent]) -> list[Descent]:
         """The descents with integration steps chosen where they lack them."""

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 
 import numpy as np
 
 from sysid.data import Dataset
-from sysid.model import BoolArray, FloatArray, ModelError, Parameter, ProcessModel, Scale
+from sysid.model import BoolArray, FloatArray, IntArray, ModelError, Parameter, ProcessModel, Scale
 from sysid.ranges import Range, Tie, one_sided, searched, ties
 
 # A search value this close to an end of its range, in parts of the range, stands on it.
@@ -144,15 +145,25 @@ class SearchSpace:
         """Names of the free parameters, in order."""
         return tuple(parameter.name for parameter in self.parameters)
 
-    @property
+    @cached_property
     def lower(self) -> FloatArray:
         """Low ends of the ranges, (n_free,)."""
-        return np.array([parameter.lower for parameter in self.parameters])
+        return _constant([parameter.lower for parameter in self.parameters])
 
-    @property
+    @cached_property
     def upper(self) -> FloatArray:
         """High ends of the ranges, (n_free,)."""
-        return np.array([parameter.upper for parameter in self.parameters])
+        return _constant([parameter.upper for parameter in self.parameters])
+
+    @cached_property
+    def coded_lower(self) -> FloatArray:
+        """Low ends of the ranges in search coordinates, (n_free,)."""
+        return _constant(self.encode(self.lower))
+
+    @cached_property
+    def width(self) -> FloatArray:
+        """Widths of the ranges in search coordinates, (n_free,)."""
+        return _constant(self.encode(self.upper) - self.encode(self.lower))
 
     @property
     def hard_lower(self) -> FloatArray:
@@ -166,33 +177,42 @@ class SearchSpace:
         """High ends that the search keeps to, (n_free,); inf where there is none."""
         return np.where(self._open_ended, self.maximum, self.upper)
 
+    @cached_property
     def coded_bounds(self) -> tuple[FloatArray, FloatArray]:
         """``hard_lower`` and ``hard_upper`` in search coordinates, (n_free,) each."""
         with np.errstate(divide="ignore"):  # the logarithm of zero is the bound -inf
-            return self.encode(self.hard_lower), self.encode(self.hard_upper)
+            ends = self.encode(self.hard_lower), self.encode(self.hard_upper)
+        return _constant(ends[0]), _constant(ends[1])
 
     def on_bound(self, chromosome: FloatArray) -> BoolArray:
         """Which values of a chromosome (n_free,) stand on a bound of their range."""
-        lower, upper = self.coded_bounds()
-        near = _ON_BOUND * (self.encode(self.upper) - self.encode(self.lower))
+        lower, upper = self.coded_bounds
+        near = _ON_BOUND * self.width
         at = self.encode(chromosome)
         mask: BoolArray = (at < lower + near) | (at > upper - near)
         return mask
 
-    @property
+    @cached_property
     def minimum(self) -> FloatArray:
         """Physical minima, (n_free,)."""
-        return np.array([parameter.minimum for parameter in self.parameters])
+        return _constant([parameter.minimum for parameter in self.parameters])
 
-    @property
+    @cached_property
     def maximum(self) -> FloatArray:
         """Physical maxima, (n_free,)."""
-        return np.array([parameter.maximum for parameter in self.parameters])
+        return _constant([parameter.maximum for parameter in self.parameters])
 
-    @property
+    @cached_property
     def log(self) -> BoolArray:
         """Mask of the parameters searched by logarithm, (n_free,)."""
-        return np.array([parameter.scale == "log" for parameter in self.parameters], dtype=bool)
+        mask = np.array([parameter.scale == "log" for parameter in self.parameters], dtype=bool)
+        mask.setflags(write=False)
+        return mask
+
+    @cached_property
+    def _places(self) -> IntArray:
+        """Where the free parameters stand in a complete vector."""
+        return np.array(self.index, dtype=np.int64)
 
     @property
     def _open_ended(self) -> BoolArray:
@@ -228,8 +248,9 @@ class SearchSpace:
     def full(self, chromosomes: FloatArray) -> FloatArray:
         """Complete parameter vectors of chromosomes, (..., n_parameters)."""
         chromosomes = np.asarray(chromosomes)
-        vectors = np.broadcast_to(self.base, (*chromosomes.shape[:-1], len(self.base))).copy()
-        vectors[..., list(self.index)] = chromosomes[..., : len(self.index)]
+        vectors = np.empty((*chromosomes.shape[:-1], len(self.base)))
+        vectors[:] = self.base
+        vectors[..., self._places] = chromosomes[..., : len(self.index)]
         for tie in self.ties:
             vectors[..., tie.index] = tie.factor * vectors[..., tie.source]
         return vectors
@@ -245,24 +266,22 @@ class SearchSpace:
         model's constraints.
         """
         vectors = self.full(chromosomes)
-        columns = tuple(vectors[:, i] for i in range(vectors.shape[1]))
-        below = np.maximum(0.0, self.minimum - chromosomes)
-        above = np.maximum(0.0, chromosomes - self.maximum)
-        rows = [below, above]
+        rows = [self.minimum - chromosomes, chromosomes - self.maximum]
         for tie in self.ties:
-            parameter, values = self.model.parameters[tie.index], columns[tie.index]
-            outside = np.maximum(parameter.minimum - values, values - parameter.maximum)
-            rows.append(np.maximum(0.0, outside)[:, None])
-        rows.append(np.maximum(0.0, self.constraint_values(chromosomes)))
-        violations = np.concatenate(rows, axis=1)
+            parameter, values = self.model.parameters[tie.index], vectors[:, tie.index]
+            rows.append(np.maximum(parameter.minimum - values, values - parameter.maximum)[:, None])
+        rows.append(self._constraints_of(vectors))
+        violations = np.maximum(0.0, np.concatenate(rows, axis=1))
         # Not-a-number is no proof of feasibility.
         return np.where(np.isnan(violations), np.inf, violations)
 
     def constraint_values(self, chromosomes: FloatArray) -> FloatArray:
         """The model's constraints g, satisfied where not above 0, (n_chromosomes, n)."""
-        vectors = self.full(chromosomes)
-        columns = tuple(vectors[:, i] for i in range(vectors.shape[1]))
-        values = np.zeros((len(chromosomes), len(self.model.constraints)))
+        return self._constraints_of(self.full(chromosomes))
+
+    def _constraints_of(self, vectors: FloatArray) -> FloatArray:
+        columns = tuple(vectors.T)
+        values = np.zeros((len(vectors), len(self.model.constraints)))
         for i, constraint in enumerate(self.model.constraints):
             values[:, i] = constraint.function(columns)
         return values
@@ -281,11 +300,19 @@ class HeldSpace(SearchSpace):
         given = {f.name: getattr(space, f.name) for f in fields(SearchSpace)}
         return cls(**given, place=place, value=value)
 
+    @cached_property
     def coded_bounds(self) -> tuple[FloatArray, FloatArray]:
         """As of the whole space, but both at the held value."""
-        lower, upper = super().coded_bounds()
+        lower, upper = (ends.copy() for ends in super().coded_bounds)
         lower[self.place] = upper[self.place] = self.value
         return lower, upper
+
+
+def _constant(values: Sequence[float] | FloatArray) -> FloatArray:
+    """An array that several may hold because nobody can change it."""
+    array = np.array(values, dtype=np.float64)
+    array.setflags(write=False)
+    return array
 
 
 def _check_conflicts(*groups: Mapping[str, object]) -> None:

@@ -10,6 +10,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from sklearn.utils.validation import check_is_fitted
 
+from sysid._threads import one_thread
 from sysid.data import Dataset
 from sysid.gassi.checkpoint import Checkpoint, load, origin
 from sysid.gassi.running import Best, Run
@@ -146,6 +147,7 @@ class GASSI(RecordEstimator):
         self.random_state = random_state
         self.dt = dt
 
+    @one_thread()
     def fit(
         self,
         X: Data,
@@ -280,6 +282,7 @@ class GASSI(RecordEstimator):
         fits = [fit_percent(record.outputs, self.predict(record)) for record in data]
         return float(np.nanmean(fits)) / 100.0
 
+    @one_thread()
     def uncertainty(
         self, X: Data, y: FloatArray | None = None, *, records: Any = None
     ) -> Uncertainty:
@@ -290,6 +293,7 @@ class GASSI(RecordEstimator):
         """
         return uncertainty(self._settled(X, y, records), self.chromosome_, self._rivals)
 
+    @one_thread()
     def profile(
         self, name: str, X: Data, y: FloatArray | None = None, *, records: Any = None
     ) -> Profile:

@@ -225,7 +225,7 @@ class LocalSearch:
 
     def _lines(self, centre: Minimum) -> list[Dip]:
         """Dips of the error along each parameter's whole range."""
-        lower, width = self._box()
+        lower, width = self.objective.space.coded_lower, self.objective.space.width
         n, k = self.n_varied, self.points
         shares = (np.arange(k) + self.rng.random((n, k))) / k
         moves = shares - ((centre.at - lower) / width)[:n, None]
@@ -243,7 +243,7 @@ class LocalSearch:
         A valley is the way on which the outputs change least as one parameter is changed, the
         others following, by the sensitivities at the minimum.
         """
-        lower, width = self._box()
+        lower, width = self.objective.space.coded_lower, self.objective.space.width
         hessian = refinement.curvature(self.objective, centre.at)
         loaded = hessian + _SLACK * np.diag(np.maximum(np.diag(hessian), 1e-300))
         covariance = np.linalg.inv(loaded)
@@ -253,12 +253,6 @@ class LocalSearch:
         rows = np.clip(centre.at + moves * width, lower, lower + width)
         errors = self._errors(rows)
         return [Dip(row, float(error)) for row, error in zip(rows, errors, strict=True)]
-
-    def _box(self) -> tuple[FloatArray, FloatArray]:
-        """Low ends and widths of the ranges in search coordinates."""
-        space = self.objective.space
-        lower = space.encode(space.lower)
-        return lower, space.encode(space.upper) - lower
 
     def _errors(self, rows: FloatArray) -> FloatArray:
         """Error at each row of coordinates, infinite where it is infeasible."""

@@ -112,9 +112,9 @@ class GeneticSearch:
             raise ModelError(f"generations is {self.generations}; it must be at least 1")
         if not 0.0 <= self.elite_percent < 100.0:
             raise ModelError(f"elite_percent is {self.elite_percent}; it must be in [0, 100)")
-        self._lower = self.space.encode(self.space.lower)
+        self._lower = self.space.coded_lower
         self._upper = self.space.encode(self.space.upper)
-        self._bounds = self.space.coded_bounds()
+        self._bounds = self.space.coded_bounds
         draw = operators.stratified if self.preset.stratified else operators.uniform
         self._coded = draw(self.population, self._lower, self._upper, self.rng)
         self._initial_spread = self._coded.std(axis=0)

@@ -9,13 +9,13 @@ from typing import Any, Self
 import numpy as np
 from sklearn.utils.validation import check_is_fitted
 
+from sysid._threads import one_thread
 from sysid.data import Dataset
 from sysid.linear.identification import Coefficients, Estimate, identify
 from sysid.linear.orders import Orders
 from sysid.linear.polynomials import poles
 from sysid.linear.predictor import Predictor
 from sysid.linear.records import check_alike, check_columns, check_sample_time
-from sysid.linear.regression import one_thread
 from sysid.metrics import fit_percent
 from sysid.model import FloatArray, ModelError
 from sysid.recording import Data, RecordEstimator, given_datasets, split

@@ -4,23 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import scipy.linalg
-from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
 from sysid.data import Dataset
 from sysid.linear.orders import Orders, Term
 from sysid.model import BoolArray, FloatArray, IntArray
-
-
-def one_thread() -> Any:
-    """Context in which linear algebra keeps to one thread, and releases the others.
-
-    Matrices this narrow gain nothing from several, and lose much on a busy machine.
-    """
-    return threadpool_limits(1, user_api="blas")
 
 
 @dataclass(frozen=True)

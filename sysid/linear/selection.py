@@ -11,11 +11,11 @@ from typing import Any, Literal
 import numpy as np
 from sklearn.base import clone
 
+from sysid._threads import one_thread
 from sysid.data import Dataset
 from sysid.linear.base import PolynomialModel
 from sysid.linear.orders import Order
 from sysid.linear.records import check_alike
-from sysid.linear.regression import one_thread
 from sysid.metrics import evaluate
 from sysid.model import FloatArray, ModelError
 from sysid.recording import given_datasets

@@ -85,7 +85,7 @@ class _Tracer:
 
     def side(self, sign: float) -> list[tuple[float, float]]:
         """Coordinates and statistics on one side, until well beyond the 95 % level."""
-        lower, upper = self.space.coded_bounds()
+        lower, upper = self.space.coded_bounds
         end = float((lower if sign < 0.0 else upper)[self.place])
         at, points = self.start, []
         for step in _STEPS:
@@ -115,8 +115,7 @@ class _Tracer:
         found = sensitivity(objective, chromosome, steps)
         told = directions(objective, chromosome, steps, found, self.space.on_bound(chromosome))
         n = sum(found.lengths)
-        lower, upper = self.space.encode(np.stack([self.space.lower, self.space.upper]))
-        blind = _BLIND_SHARE * float((upper - lower)[self.place])
+        blind = _BLIND_SHARE * float(self.space.width[self.place])
         variance = float(told.covariance[self.place, self.place])
         own = variance > 0.0 and np.sum(told.lost[:, self.place] ** 2) < 1e-3
         inflation = told.inflation(self.place if own else None)

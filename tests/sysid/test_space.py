@@ -154,7 +154,7 @@ def test_the_given_end_is_a_limit_and_the_other_none():
     space = SearchSpace.of(mixed(), {"gain": (1.0, None), "tau": (None, 0.1)})
     rows = np.array([[0.5, 0.05], [1e9, 0.05], [2.0, 0.2], [2.0, 1e-9]])
     assert (space.violations(rows) > 0.0).any(axis=1).tolist() == [True, False, True, False]
-    lower, upper = space.coded_bounds()
+    lower, upper = space.coded_bounds
     np.testing.assert_array_equal(lower, [0.0, 0.0])
     np.testing.assert_array_equal(upper, [np.inf, 0.1])
 
@@ -172,7 +172,7 @@ def test_only_a_bound_is_something_to_stand_on():
 def test_a_log_scale_with_an_open_low_end_stops_at_zero():
     space = SearchSpace.of(mixed(), {"gain": (None, 2.0)})
     assert space.log.tolist() == [True, False]
-    assert space.coded_bounds()[0][0] == -np.inf
+    assert space.coded_bounds[0][0] == -np.inf
     signed = one(Parameter("a", "1", 1.0, 0.5, 2.0, "log", minimum=-1.0))
     assert SearchSpace.of(signed, {"a": (None, 3.0)}).hard_lower.tolist() == [0.0]
 
