@@ -16,6 +16,7 @@ import numpy as np
 from pydantic import Field, PrivateAttr
 
 from daq.config.base import Section
+from daq.config.units import Hertz, Seconds, Turns
 from daq.findings import Findings
 from daq.hal import FloatArray, Mode, Samples
 
@@ -31,8 +32,8 @@ class OffsetCalibration(Section):
 class Homing(Section):
     """Winding of the load's cable before the run."""
 
-    turns: float = Field(0.0, ge=0.0, le=1000.0, description="turns to wind; 0 skips homing")
-    timeout: float = Field(60.0, gt=0.0, le=3600.0, description="time allowed for it [s]")
+    turns: Turns = Field(0.0, ge=0.0, le=1000.0, description="turns to wind; 0 skips homing")
+    timeout: Seconds = Field(60.0, gt=0.0, le=3600.0, description="time allowed for it")
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,7 @@ class Experiment(Section, abc.ABC):
 
     name: str = Field("", max_length=80, description="of the capture folder; default the file's")
     protocol: str = Field(min_length=1, description="name of a protocol, or FILE.py:CLASS")
-    sample_rate: float = Field(800.0, gt=0.0, le=1e6, description="samples per second [Hz]")
+    sample_rate: Hertz = Field(800.0, gt=0.0, le=1e6, description="samples per second")
     calibration: OffsetCalibration = Field(OffsetCalibration(), description="offset calibration")
     homing: Homing = Field(Homing(), description="winding of the load")
     validation: dict[str, Any] = Field(
@@ -134,7 +135,7 @@ class OpenLoop(Experiment):
 class Timed(OpenLoop):
     """Commands known beforehand, for as long as the file says."""
 
-    duration: float = Field(gt=0.0, le=86400.0, description="length of the excitation [s]")
+    duration: Seconds = Field(gt=0.0, le=86400.0, description="length of the excitation")
 
     @property
     def n_samples(self) -> int:

@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 import numpy as np
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
 from daq.config.base import Section
 from sim_rig.actuator import actuator
@@ -54,14 +54,6 @@ class Plant(Section):
     parameters: dict[str, float] = Field(
         default_factory=dict, description="values that differ from the set, by name"
     )
-
-    @field_validator("parameters", mode="before")
-    @classmethod
-    def _truth_is_no_value(cls, values: Any) -> Any:
-        for name, value in values.items() if isinstance(values, dict) else ():
-            if isinstance(value, bool):
-                raise ValueError(f"parameter {name}: yes, no, on, off, true and false are no value")
-        return values
 
     @model_validator(mode="after")
     def _can_be_built(self) -> Plant:

@@ -19,8 +19,9 @@ class Bar(Protocol):
 
 
 def report_error(message: str) -> None:
-    """One error message on standard error, the cure included."""
-    sys.stderr.write(f"rig: {message}\n")
+    """An error message on standard error, the cure included; one line for each mistake."""
+    for line in message.splitlines():
+        sys.stderr.write(f"rig: {line}\n")
 
 
 def report_note(message: str) -> None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from daq.cli.datasets import unit_factor
-from daq.config import yaml_file
+from daq.config import checking, yaml_file
 from daq.config.datasheet import DatasheetEntry
 from daq.config.identification import IdentificationConfig
 from daq.config.yaml_file import YamlFile, suggestion
@@ -25,9 +25,14 @@ class Datasheet:
 def load(path: Path) -> Datasheet:
     """Read a data sheet; ConfigError names line, key and cure."""
     file = yaml_file.load(path)
-    entries = {
-        str(name): yaml_file.validate(file, DatasheetEntry, content, (str(name),))
+    found = [
+        mistake
         for name, content in file.content.items()
+        for mistake in checking.mistakes(file, DatasheetEntry, content, (str(name),))
+    ]
+    checking.refuse([*file.repeated, *found])
+    entries = {
+        str(name): DatasheetEntry.model_validate(content) for name, content in file.content.items()
     }
     return Datasheet(file, entries)
 

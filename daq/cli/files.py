@@ -9,9 +9,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pydantic import ConfigDict, create_model
+
 from daq.cli.user_code import from_file, locate
-from daq.config import yaml_file
-from daq.config.rig import RigConfig
+from daq.config import checking, yaml_file
+from daq.config.base import Section
+from daq.config.rig import RigConfig, with_options
 from daq.config.yaml_file import YamlFile
 from daq.errors import ConfigError
 from daq.experiment import Experiment, Plan
@@ -38,17 +41,19 @@ class LoadedExperiment:
 
     def validation(self) -> LoadedExperiment | None:
         """The validation run: the same with the keys under ``validation`` changed, if any."""
-        changes = self.experiment.validation
-        if not changes:
+        if not self.experiment.validation:
             return None
-        content = yaml_file.merge(self.file.content, {**changes, "validation": {}})
-        places = {
-            **self.file.places,
-            **{k[1:]: v for k, v in self.file.places.items() if k[:1] == ("validation",) and k[1:]},
-        }
-        file = YamlFile(self.file.path, content, places)
+        file = _validation_file(self.file)
         experiment = make_experiment(file, type(self.experiment))
         return LoadedExperiment(file, experiment, f"{self.name}-validation")
+
+
+def _validation_file(file: YamlFile) -> YamlFile:
+    """An experiment's file as if its ``validation`` section stood over the rest."""
+    changes = file.content["validation"]
+    content = yaml_file.merge(file.content, {**changes, "validation": {}})
+    moved = {key[1:]: place for key, place in file.places.items() if key[:1] == ("validation",)}
+    return YamlFile(file.path, content, {**file.places, **moved, (): file.place(())})
 
 
 def find(name: str, package: str) -> Path:
@@ -74,17 +79,40 @@ def find(name: str, package: str) -> Path:
 def load_experiment(name: str) -> LoadedExperiment:
     """Read and check an experiment; ConfigError names file, line, key and cure."""
     file = yaml_file.load(find(name, "protocols"))
-    protocol = file.content.get("protocol")
-    if not isinstance(protocol, str):
-        raise file.error(
-            ("protocol",), "this key is missing or not a name; for example 'protocol: prbs'"
-        )
     try:
-        kind = find_protocol(protocol, file.path.parent)
+        kind = find_protocol(_protocol_name(file), file.path.parent)
     except ConfigError as error:
-        raise file.error(("protocol",), str(error)) from None
+        unknown = file.mistake(("protocol",), str(error))
+        checking.validate(file, _common_settings(), others=[unknown])
+        raise
+    own = checking.mistakes(file, kind, file.content)
+    if file.content.get("validation") and isinstance(file.content["validation"], dict):
+        validation = _validation_file(file)
+        own += checking.mistakes(validation, kind, validation.content)
+    checking.refuse([*file.repeated, *own])
     experiment = make_experiment(file, kind)
     return LoadedExperiment(file, experiment, experiment.name or file.path.stem)
+
+
+def _protocol_name(file: YamlFile) -> str:
+    name = file.content.get("protocol")
+    if not isinstance(name, str):
+        raise ConfigError("this key is missing or not a name; for example 'protocol: prbs'")
+    return name
+
+
+def _common_settings() -> type[Section]:
+    """What can be checked of an experiment whose protocol is not known."""
+
+    class Common(Section):
+        model_config = ConfigDict(extra="ignore")
+
+    fields: dict[str, Any] = {
+        name: (field.annotation, field)
+        for name, field in Experiment.model_fields.items()
+        if name != "protocol"
+    }
+    return create_model("Common", __base__=Common, **fields)
 
 
 def find_protocol(name: str, folder: Path) -> type[Experiment]:
@@ -115,7 +143,7 @@ def make_experiment(file: YamlFile, kind: type[Experiment]) -> Experiment:
         # The capture must find it from any folder.
         path = locate(Path(own[1]), "protocol", file.path.parent).resolve()
         content["protocol"] = f"{path}:{own[2]}"
-    experiment = yaml_file.validate(file, kind, content)
+    experiment = checking.validate(file, kind, content)
     experiment._folder = file.path.parent
     return experiment
 
@@ -134,15 +162,15 @@ def _is_protocol(found: Any) -> bool:
 def load_rig(name: str) -> tuple[RigConfig, Any]:
     """Read and check a rig file; its configuration and the backend's device, not yet open."""
     file = yaml_file.load(find(name, "sim_rig"))
-    config = yaml_file.validate(file, RigConfig)
-    return config, _make_device(file, config)
-
-
-def _make_device(file: YamlFile, config: RigConfig) -> Device:
+    backend_name = file.content.get("backend", RigConfig.model_fields["backend"].default)
+    if not isinstance(backend_name, str):
+        checking.validate(file, RigConfig)
     try:
-        backend = load_plugin("rig.backends", config.backend)
+        backend = load_plugin("rig.backends", backend_name)
     except ConfigError as error:
-        raise file.error(("backend",), str(error)) from None
-    options = yaml_file.validate(file, backend.Options, config.options, ("options",))
-    device: Device = backend(options)
-    return device
+        unknown = file.mistake(("backend",), str(error))
+        checking.validate(file, RigConfig, others=[unknown])
+        raise
+    config = checking.validate(file, with_options(backend.Options))
+    device: Device = backend(config.options)
+    return config, device

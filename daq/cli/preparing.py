@@ -13,7 +13,7 @@ from daq.cli import datasets, datasheets
 from daq.cli.datasets import Mapping
 from daq.cli.modelling import DEFAULT_MODEL, find_model, whole_name
 from daq.cli.resuming import Asked
-from daq.config import yaml_file
+from daq.config import checking, yaml_file
 from daq.config.identification import IdentificationConfig, Signals
 from daq.config.yaml_file import CommandLine, YamlFile, suggestion
 from daq.errors import ConfigError
@@ -61,7 +61,7 @@ def prepare_models(
     """
     given = {key: value for key, value in options.items() if value is not None}
     file = CommandLine.of(given, more, yaml_file.load(config) if config is not None else None)
-    settings = yaml_file.validate(file, IdentificationConfig)
+    settings = checking.validate(file, IdentificationConfig)
     if settings.preset not in PRESETS:
         raise file.error(
             ("preset",), f"unknown preset {settings.preset!r}; "

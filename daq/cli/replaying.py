@@ -12,7 +12,7 @@ from daq.cli.files import load_rig
 from daq.cli.modelling import DEFAULT_MODEL, find_model
 from daq.cli.preparing import as_told
 from daq.cli.reporting import print_metrics
-from daq.config import yaml_file
+from daq.config import checking, yaml_file
 from daq.config.identification import IdentificationConfig, Signals
 from daq.config.yaml_file import suggestion
 from daq.errors import ConfigError
@@ -74,7 +74,7 @@ def read_parameters(path: Path) -> tuple[ProcessModel, dict[str, float]]:
     except ConfigError as error:
         raise file.error(("model",), str(error)) from None
     chosen = {key: file.content[key] for key in Signals.model_fields if key in file.content}
-    model = as_told(file, yaml_file.validate(file, Signals, chosen), model)
+    model = as_told(file, checking.validate(file, Signals, chosen), model)
     entries = file.content.get("parameters")
     if not isinstance(entries, dict):
         raise file.error(("parameters",), "this key is missing; it holds 'name: value' lines")
@@ -120,7 +120,7 @@ def _mapping(config: Path | None, model: ProcessModel) -> Mapping | None:
     if config is None:
         return None
     file = yaml_file.load(config)
-    settings = yaml_file.validate(file, IdentificationConfig)
+    settings = checking.validate(file, IdentificationConfig)
     if settings.columns is None:
         return None
     name = find_model(settings.model or DEFAULT_MODEL, config.parent).name

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterable
+from typing import Any, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, ValidationInfo, field_validator
 
@@ -16,8 +17,20 @@ class Section(BaseModel):
     @classmethod
     def _truth_is_no_number(cls, value: Any, info: ValidationInfo) -> Any:
         # YAML reads yes, no, on and off as truth values, and pydantic those as 1 and 0.
-        if isinstance(value, bool):
-            field = cls.model_fields[info.field_name or ""]
-            if field.annotation is not bool:
-                raise ValueError("yes, no, on, off, true and false are no value for this key")
+        kind = cls.model_fields[info.field_name or ""].annotation
+        if not _takes_truth(kind) and any(isinstance(v, bool) for v in _values(value, kind)):
+            raise ValueError("yes, no, on, off, true and false are no value for this key")
         return value
+
+
+def _takes_truth(kind: Any) -> bool:
+    return kind in {bool, Any} or any(_takes_truth(part) for part in get_args(kind))
+
+
+def _values(value: Any, kind: Any) -> Iterable[Any]:
+    """The value, or those in a list or under keys of its own."""
+    if isinstance(value, list):
+        return value
+    if isinstance(value, dict) and get_origin(kind) is dict:
+        return value.values()
+    return (value,)

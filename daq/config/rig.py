@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field, create_model, field_validator
 
 from daq.config.base import Section
 from daq.config.units import Amperes, Volts
@@ -47,7 +47,7 @@ class CommandLimits(Section):
     motor: tuple[Volts, Volts] = Field((-5.0, 5.0), description="lowest and highest motor command")
     brake: tuple[Volts, Volts] = Field(
         (0.0, 0.38),
-        description="lowest and highest brake command; 0.38 V gives 0.19 A at 0.5 A/V",
+        description="lowest and highest brake command (at 0.5 A/V, 0.38 V give 0.19 A)",
     )
 
     @field_validator("motor", "brake")
@@ -80,6 +80,12 @@ class RigConfig(Section):
 
     name: str = Field("rig", min_length=1, max_length=80, description="shown in captures")
     backend: str = Field("simulated", min_length=1, description="name of an installed backend")
-    options: dict[str, Any] = Field(default_factory=dict, description="the backend's own settings")
+    options: Any = Field(default_factory=dict, description="the backend's own settings")
     sensors: Sensors = Field(Sensors(), description="calibration of the measured channels")
     limits: Limits = Field(Limits(), description="clamps and interlocks")
+
+
+def with_options(options: type[Section]) -> type[RigConfig]:
+    """The configuration of a rig whose backend has these options."""
+    field = Field(default_factory=options, description="the backend's own settings")
+    return create_model("RigConfig", __base__=RigConfig, options=(options, field))

@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 import difflib
-import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar, get_args, get_origin
+from typing import Any
 
 import yaml
-from pydantic import BaseModel, ValidationError
-from pydantic_core import ErrorDetails
 
-from daq.config.units import unit_of
 from daq.errors import ConfigError
 
-Model = TypeVar("Model", bound=BaseModel)
 Key = tuple[str | int, ...]
 _DEEPEST = 20  # levels of nesting
-_SHOWN = 60  # characters of a value in a message
+_LISTED = 8  # line numbers in a message
+_LOOK = "{problem}; check the indentation, colons and quotes here and in the line before"
 
 
 class _Loader(yaml.SafeLoader):
@@ -37,28 +33,48 @@ _Loader.add_implicit_resolver(
 )
 
 
+@dataclass(frozen=True, order=True)
+class Mistake:
+    """Something wrong at a line and column, both (0, 0) outside of a file; text: all of it."""
+
+    place: tuple[int, int]
+    text: str
+
+
 @dataclass(frozen=True)
 class YamlFile:
-    """Parsed content of a file and the place of each key in it."""
+    """Parsed content of a file and the place of each key in it.
+
+    repeated: keys that stand twice, of which ``content`` has the last.
+    """
 
     path: Path
     content: dict[str, Any]
     places: dict[Key, tuple[int, int]]
+    repeated: tuple[Mistake, ...] = ()
 
     def where(self, key: Key) -> str:
         """``file:line:column`` of a key, or of its nearest parent that stands in the file."""
+        line, column = self.place(key)
+        return f"{self.path}:{line}:{column}"
+
+    def place(self, key: Key) -> tuple[int, int]:
+        """Line and column of a key, or of its nearest parent that stands in the file."""
         while key and key not in self.places:
             key = key[:-1]
-        line, column = self.places.get(key, (1, 1))
-        return f"{self.path}:{line}:{column}"
+        return self.places.get(key, (1, 1))
 
     def error(self, key: Key, message: str) -> ConfigError:
         """A ConfigError that points at a key."""
-        return ConfigError(f"{self.named(key)}: {message}")
+        return ConfigError(self.mistake(key, message).text)
+
+    def mistake(self, key: Key, message: str) -> Mistake:
+        """The same, to be told with others."""
+        return Mistake(self.place(key), f"{self.named(key)}: {message}")
 
     def named(self, key: Key) -> str:
         """Place and name of a key, as error messages begin."""
-        return f"{self.where(key)}: {dotted(key)}"
+        return f"{self.where(key)}: {dotted(key)}" if key else self.where(key)
 
 
 @dataclass(frozen=True)
@@ -85,12 +101,16 @@ class CommandLine(YamlFile):
             typed = merge(typed, _setting(text))
         path = file.path if file else Path("command line")
         content = merge(file.content if file else {}, typed)
-        places = file.places if file else {}
-        return cls(path, content, places, typed, frozenset(options))
+        places, repeated = (file.places, file.repeated) if file else ({}, ())
+        return cls(path, content, places, repeated, typed, frozenset(options))
 
     def where(self, key: Key) -> str:
         """``command line``, or the place in the file."""
         return "command line" if self._is_typed(key) else super().where(key)
+
+    def place(self, key: Key) -> tuple[int, int]:
+        """Before all lines of the file, or the place in it."""
+        return (0, 0) if self._is_typed(key) else super().place(key)
 
     def named(self, key: Key) -> str:
         """The option as it is typed, or the key in the file."""
@@ -130,7 +150,7 @@ def _setting(text: str) -> dict[str, Any]:
 
 def dotted(key: Key) -> str:
     """A key as people write it: motor.amplitude."""
-    return ".".join(str(part) for part in key) or "(file)"
+    return ".".join(str(part) for part in key)
 
 
 def load(path: Path) -> YamlFile:
@@ -149,29 +169,14 @@ def load(path: Path) -> YamlFile:
         node = yaml.compose(text, Loader=_Loader)
         content = yaml.load(text, Loader=_Loader)
     except yaml.YAMLError as error:
-        raise ConfigError(_syntax_error(path, error)) from None
+        raise ConfigError(_syntax_error(path, text, error)) from None
     if content is None:
         raise ConfigError(f"{path}: the file is empty; it must hold 'key: value' lines")
     if not isinstance(node, yaml.MappingNode) or not isinstance(content, dict):
         raise ConfigError(f"{path}:1:1: expected 'key: value' lines, found {_kind(content)}")
-    places: dict[Key, tuple[int, int]] = {}
-    _collect(path, node, (), places)
-    return YamlFile(path, content, places)
-
-
-def validate(
-    file: YamlFile, model: type[Model], content: Mapping[str, Any] | None = None, at: Key = ()
-) -> Model:
-    """Check a file's content, or the part of it at a key, against a model.
-
-    Raises one ConfigError that lists every mistake, each with line, key, value and cure.
-    """
-    data = file.content if content is None else content
-    try:
-        return model.model_validate(data)
-    except ValidationError as error:
-        lines = [_explain(file, model, at, item) for item in error.errors()]
-        raise ConfigError("\n".join(dict.fromkeys(lines))) from None
+    found = _Places(path)
+    found.collect(node, ())
+    return YamlFile(path, content, found.places, tuple(found.repeated))
 
 
 def merge(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
@@ -192,149 +197,98 @@ def suggestion(name: str, known: Sequence[str]) -> str:
     return f"known are {', '.join(sorted(known))}" if known else "none are known"
 
 
-def _collect(path: Path, node: yaml.Node, key: Key, places: dict[Key, tuple[int, int]]) -> None:
-    if len(key) > _DEEPEST:
-        raise ConfigError(
-            f"{path}:{node.start_mark.line + 1}: nested too deeply; does an alias (*name) "
-            "stand inside its own anchor (&name)?"
-        )
-    places[key] = (node.start_mark.line + 1, node.start_mark.column + 1)
-    if isinstance(node, yaml.MappingNode):
+class _Places:
+    """Where each key of a file stands."""
+
+    def __init__(self, path: Path) -> None:
+        self.places: dict[Key, tuple[int, int]] = {}
+        self.repeated: list[Mistake] = []
+        self._path = path
+
+    def collect(self, node: yaml.Node, key: Key) -> None:
+        """Note the places of all keys below a node; ConfigError where there is no end to them."""
+        if len(key) > _DEEPEST:
+            raise ConfigError(
+                f"{self._path}:{node.start_mark.line + 1}: nested too deeply; does an alias "
+                "(*name) stand inside its own anchor (&name)?"
+            )
+        self.places.setdefault(key, _place(node))
+        if isinstance(node, yaml.MappingNode):
+            self._mapping(node, key)
+        elif isinstance(node, yaml.SequenceNode):
+            for index, value in enumerate(node.value):
+                self.collect(value, (*key, index))
+
+    def _mapping(self, node: yaml.MappingNode, key: Key) -> None:
+        seen: dict[str, int] = {}
         for name, value in node.value:
-            child = (*key, str(name.value))
-            place = (name.start_mark.line + 1, name.start_mark.column + 1)
-            if child in places:
-                first = places[child][0]
-                raise ConfigError(
-                    f"{path}:{place[0]}:{place[1]}: {dotted(child)}: this key stands twice, "
-                    f"first in line {first}; keep one"
+            child, place = (*key, str(name.value)), _place(name)
+            if name.value in seen:
+                self.repeated.append(
+                    Mistake(
+                        place,
+                        f"{self._path}:{place[0]}:{place[1]}: {dotted(child)}: this key stands "
+                        f"twice, first in line {seen[name.value]}; keep one",
+                    )
                 )
-            _collect(path, value, child, places)
-            places[child] = place
-    elif isinstance(node, yaml.SequenceNode):
-        for index, value in enumerate(node.value):
-            _collect(path, value, (*key, index), places)
+            seen.setdefault(str(name.value), place[0])
+            self.places[child] = place
+            self.collect(value, child)
 
 
-def _syntax_error(path: Path, error: yaml.YAMLError) -> str:
+def _place(node: yaml.Node) -> tuple[int, int]:
+    return node.start_mark.line + 1, node.start_mark.column + 1
+
+
+# How PyYAML's messages about frequent mistakes begin, and what people make of them; context: the
+# line where what is amiss begins.
+_CURES = {
+    "mapping values are not allowed": (
+        "a second ':' where one value should stand, or a line indented too far; check the "
+        "indentation of this line and the one before, and put text with ': ' in quotes"
+    ),
+    "could not find expected ':'": (
+        "a line without ':' here or before; write 'key: value', with a space behind the colon"
+    ),
+    "expected <block end>, but found '<block mapping start>'": (
+        "a line indented differently from its neighbours; keys of one section begin in the same "
+        "column"
+    ),
+    "expected <block end>, but found '?'": (
+        "a key among the lines of a list; put it where its neighbours begin"
+    ),
+    "expected <block end>, but found '-'": (
+        "a '-' among 'key: value' lines; leave out the '-', or indent the list below its key"
+    ),
+    "expected ',' or": "a bracket opened in line {context} is not closed; close it",
+    "found unexpected end of stream": "a quote opened in line {context} is not closed; close it",
+    "found undefined alias": "*name stands for what &name marks, and there is no such mark; put "
+    "text that begins with * in quotes",
+    "found character": "{problem}; put text that begins so in quotes",
+}
+
+
+def _syntax_error(path: Path, text: str, error: yaml.YAMLError) -> str:
     mark = getattr(error, "problem_mark", None)
     problem = getattr(error, "problem", None) or str(error)
     if mark is None:
         return f"{path}: not valid YAML: {problem}"
-    return (
-        f"{path}:{mark.line + 1}:{mark.column + 1}: not valid YAML: {problem}; "
-        "check the indentation, colons and quotes here and in the line before"
-    )
+    where = f"{path}:{mark.line + 1}:{mark.column + 1}: not valid YAML"
+    tabs = [i for i, line in enumerate(text.splitlines(), 1) if re.match(r" *\t", line)]
+    if mark.line + 1 in tabs:
+        lines = "this line begins" if len(tabs) == 1 else f"lines {_listed(tabs)} begin"
+        return f"{where}: {lines} with a tab; indent with spaces"
+    opened = getattr(error, "context_mark", None) or mark
+    cure = next((cure for said, cure in _CURES.items() if problem.startswith(said)), _LOOK)
+    return f"{where}: {cure.format(problem=problem, context=opened.line + 1)}"
 
 
-def _explain(file: YamlFile, model: type[BaseModel], at: Key, item: ErrorDetails) -> str:
-    # pydantic adds the names of union branches and of the key/value side to the location.
-    loc = tuple(part for part in item["loc"] if part != "[key]")
-    kind, value = item["type"], item.get("input")
-    if kind == "missing" and isinstance(loc[-1], int):
-        kind, loc = "too_short", loc[:-1]
-    key: Key = (*at, *(str(p) if kind == "invalid_key" else p for p in loc))
-    if kind in {"extra_forbidden", "invalid_key"}:
-        hint = suggestion(str(loc[-1]), _fields(model, loc[:-1]))
-        return f"{file.named(key)}: unknown key; {hint}"
-    description = _description(model, loc)
-    # A message of the project's own says what it needs to.
-    about = f" ({description})" if description and kind != "value_error" else ""
-    if kind == "missing":
-        return f"{file.named(key)}: this key is missing; add it{about}"
-    return f"{file.named(key)}: {_complaint(kind, item, value)}{about}"
-
-
-_NUMBER, _WHOLE, _LINES = (
-    "expected a number",
-    "expected a whole number",
-    "expected 'key: value' lines",
-)
-_EXPECTED = {
-    "float_parsing": _NUMBER,
-    "float_type": _NUMBER,
-    "finite_number": "expected a finite number",
-    "int_parsing": _WHOLE,
-    "int_parsing_size": _WHOLE,
-    "int_type": _WHOLE,
-    "int_from_float": _WHOLE,
-    "bool_parsing": "expected true or false",
-    "bool_type": "expected true or false",
-    "string_type": "expected text",
-    "dict_type": _LINES,
-    "model_type": _LINES,
-    "list_type": "expected a list [a, b]",
-    "tuple_type": "expected two values [low, high]",
-    "too_long": "expected two values [low, high]",
-    "too_short": "expected two values [low, high]",
-    "greater_than": "it must be above {gt:g}",
-    "greater_than_equal": "it must be at least {ge:g}",
-    "less_than": "it must be below {lt:g}",
-    "less_than_equal": "it must be at most {le:g}",
-    "literal_error": "it must be {expected}",
-    "string_too_short": "it must not be empty",
-    "string_too_long": "it must have at most {max_length} characters",
-}
-
-
-def _complaint(kind: str, item: ErrorDetails, value: object) -> str:
-    """What is wrong with a value, in plain English, with the value."""
-    expected = _EXPECTED.get(kind)
-    if expected is not None:
-        return f"{expected.format(**item.get('ctx', {}))}, found {_shown(value)}"
-    message = item["msg"].removeprefix("Value error, ")
-    found = "" if isinstance(value, Mapping) else f"; found {_shown(value)}"
-    return message[0].lower() + message[1:] + found
-
-
-def _shown(value: object) -> str:
-    """A value as it stood in the YAML, shortened."""
-    if value is None:
-        return "nothing"
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, float) and not math.isfinite(value):
-        return f"{'-' * (value < 0)}.{'nan' if math.isnan(value) else 'inf'}"
-    text = repr(value)
-    return text if len(text) <= _SHOWN else f"{text[: _SHOWN - 3]}..."
-
-
-def _section(model: type[BaseModel], loc: Key) -> Any:
-    """The configuration model at a location; None where there is none."""
-    current: Any = model
-    for part in loc:
-        fields = getattr(current, "model_fields", None)
-        if fields:
-            if part not in fields:
-                return None
-            current = fields[part].annotation
-            options = [a for a in get_args(current) if hasattr(a, "model_fields")]
-            # A dict of sections stands for itself until its key has been passed.
-            current = current if get_origin(current) is dict else (options or [current])[0]
-        elif get_origin(current) is dict:
-            current = get_args(current)[1]
-        else:
-            return None
-    return current
-
-
-def _fields(model: type[BaseModel], loc: Key) -> list[str]:
-    """Names of the keys allowed at a location."""
-    return list(getattr(_section(model, loc), "model_fields", {}))
-
-
-def _description(model: type[BaseModel], loc: Key) -> str | None:
-    """What a key means and its unit, as its field says."""
-    while loc:
-        fields = getattr(_section(model, loc[:-1]), "model_fields", {})
-        if loc[-1] in fields:
-            found = fields[loc[-1]]
-            unit = unit_of(found)
-            text: str | None = found.description
-            return f"{text} [{unit}]" if text and unit not in {None, "1"} else text
-        loc = loc[:-1]
-    return None
+def _listed(numbers: Sequence[int]) -> str:
+    shown = ", ".join(map(str, numbers[:_LISTED]))
+    return f"{shown}, ..." if len(numbers) > _LISTED else shown
 
 
 def _kind(content: object) -> str:
-    return {"list": "a list", "str": "plain text"}.get(type(content).__name__, repr(content))
+    if isinstance(content, str):
+        return "plain text; write a space behind each colon"
+    return "a list" if isinstance(content, list) else repr(content)

@@ -4,6 +4,7 @@ Each case is one wrong file or argument. All of them must end with status 2, nam
 line and the key, say what to do, show no traceback, and leave no folder behind.
 """
 
+import json
 from dataclasses import dataclass, field
 
 import pytest
@@ -121,7 +122,7 @@ CASES = [
     experiment("no protocol", "protocol: prbs", "name: x", "e.yaml:1:1: protocol:",
                "for example 'protocol: prbs'"),
     experiment("misspelt key", "duration", "duratoin", "e.yaml:3:1: duratoin: unknown key",
-               "did you mean 'duration'?", "duration: this key is missing"),
+               "did you mean 'duration'?"),
     experiment("misspelt nested key", "  offset: 0.1", "  ofset: 0.1",
                "e.yaml:7:3: motor.ofset: unknown key; did you mean 'offset'?"),
     experiment("out of range", "seed: 4", "seed: 70000",
@@ -157,8 +158,36 @@ CASES = [
     experiment("a validation run with a misspelt key", "  seed: 5",
                "  seed: 5\nvalidation:\n  motor: {sead: 3}",
                "e.yaml:16:11: motor.sead: unknown key; did you mean 'seed'?", command="check"),
-    experiment("no YAML", "motor:", "motor: [", "e.yaml:", "not valid YAML", "indentation"),
-    experiment("a tab", "  amplitude: 0.75", "\tamplitude: 0.75", "e.yaml:6:1: not valid YAML"),
+    experiment("no YAML", "motor:", "motor: [", "e.yaml:7:9: not valid YAML",
+               "a bracket opened in line 5 is not closed"),
+    experiment("a quote without end", "motor:", 'motor: "', "not valid YAML",
+               "a quote opened in line 5 is not closed"),
+    experiment("a tab", "  amplitude: 0.75", "\tamplitude: 0.75",
+               "e.yaml:6:1: not valid YAML: this line begins with a tab; indent with spaces"),
+    experiment("tabs", "  amplitude: 0.75\n  offset", "\tamplitude: 0.75\n\toffset",
+               "e.yaml:6:1: not valid YAML: lines 6, 7 begin with a tab; indent with spaces"),
+    experiment("a line indented too far", "  offset: 0.1", "    offset: 0.1",
+               "e.yaml:7:11: not valid YAML", "or a line indented too far; check the indentation"),
+    experiment("a key without a colon", "duration: 0.5", "duration", "not valid YAML",
+               "write 'key: value', with a space behind the colon"),
+    experiment("a value of another unit", "duration: 0.5", "duration: 0.5 V",
+               "e.yaml:3:1: duration: 'V' does not convert to 's'; found '0.5 V' (length"),
+    experiment("a value of a unit that is none", "duration: 0.5", "duration: 0.5 parrots",
+               "e.yaml:3:1: duration: unit 'parrots' is not understood; write it as in 'mm/s'"),
+    experiment("a quantity beyond a bound", "duration: 0.5", "duration: 9000 min",
+               "e.yaml:3:1: duration: it must be at most 86400, found '9000 min' (length", "[s])"),
+    experiment("a unit for a count", "seed: 4", "seed: 4 V",
+               "e.yaml:9:3: motor.seed: expected a whole number, found '4 V'; this one takes no"),
+    experiment("a decimal comma", "0.75", "0,75",
+               "e.yaml:6:3: motor.amplitude: expected a number, found '0,75'; write a decimal"),
+    experiment("a key of a section at the top", "sample_rate: 800", "amplitude: 800",
+               "e.yaml:2:1: amplitude: unknown key; it belongs under motor or brake"),
+    experiment("a key of the top in a section", "  offset: 0.1", "  duration: 0.1",
+               "e.yaml:7:3: motor.duration: unknown key; it belongs at the left margin"),
+    experiment("a missing key in a section", "  seed: 4\n", "",
+               "e.yaml:5:1: motor.seed: this key is missing; add it (first content of the"),
+    experiment("a list for a section", "{samples: 16}", "[16]",
+               "e.yaml:4:1: calibration: expected 'key: value' lines, found [16]; write its keys"),
     experiment("duplicate key", "  offset: 0.1", "  amplitude: 0.1",
                "e.yaml:7:3: motor.amplitude: this key stands twice, first in line 6; keep one"),
     experiment("a number for a key", "sample_rate: 800", "1: 800", "e.yaml:2:1: 1: unknown key"),
@@ -468,8 +497,55 @@ def test_the_good_files_are_good(tmp_path):
         assert result.returncode == 0, result.stderr
 
 
-def test_several_mistakes_in_one_file_are_told_at_once(tmp_path):
-    text = EXPERIMENT.replace("duration: 0.5", "duration: x").replace("seed: 5", "seed: -5")
+def test_several_mistakes_in_one_file_are_told_at_once_in_its_order(tmp_path):
+    text = (
+        EXPERIMENT.replace("duration: 0.5", "duration: x")
+        .replace("seed: 5", "seed: -5")
+        .replace("  offset: 0.1", "  amplitude: 0.1")
+        .replace("calibration", "calibrtion")
+    )
     lay_out(tmp_path, Case("", [], [], {"e.yaml": text}))
     result = rig("check", "e.yaml", cwd=tmp_path)
-    assert "e.yaml:3:1: duration" in result.stderr and "e.yaml:14:3: brake.seed" in result.stderr
+    told = [line.split(": ")[1:3] for line in result.stderr.splitlines()]
+    assert told == [
+        ["e.yaml:3:1", "duration"],
+        ["e.yaml:4:1", "calibrtion"],
+        ["e.yaml:7:3", "motor.amplitude"],
+        ["e.yaml:14:3", "brake.seed"],
+    ]
+
+
+def test_mistakes_are_told_together_wherever_they_stand_in_a_file(tmp_path):
+    wrong = EXPERIMENT.replace("protocol: prbs", "protocol: prbx").replace(
+        "duration", "sample_rate"
+    )
+    checked = EXPERIMENT.replace("seed: 4", "seed: 0") + "validation: {brake: {sead: 5}}\n"
+    bench = RIG.replace("simulated", "serail").replace("0.706", "-1")
+    options = RIG.replace("seed: 3", "plan: 3").replace("0.706", "-1") + "plant: {}\n"
+    files = {"a.yaml": wrong, "b.yaml": checked, "c.yaml": bench, "d.yaml": options}
+    lay_out(tmp_path, Case("", [], [], files))
+    expected = {
+        ("a.yaml",): ["1:1: protocol", "3:1: sample_rate"],
+        ("b.yaml",): ["9:3: motor.seed", "15:22: brake.sead"],
+        ("e.yaml", "--rig", "c.yaml"): ["2:1: backend", "6:12: sensors.torque.scale"],
+        ("e.yaml", "--rig", "d.yaml"): [
+            "4:3: options.plan", "6:12: sensors.torque.scale", "10:1: plant",
+        ],
+    }  # fmt: skip
+    for args, places in expected.items():
+        result = rig("check", *args, cwd=tmp_path)
+        lines = result.stderr.splitlines()
+        assert len(lines) == len(places), result.stderr
+        for line, place in zip(lines, places, strict=True):
+            assert line.startswith(f"rig: {args[-1]}:{place}: ")
+    assert "it belongs under options" in result.stderr
+
+
+def test_quantities_with_units_are_what_they_stand_for(tmp_path):
+    text = EXPERIMENT.replace("0.75", "750 mV").replace("0.005", "5 ms").replace("800", "0.8 kHz")
+    lay_out(tmp_path, Case("", [], [], {"e.yaml": text, "plain.yaml": EXPERIMENT}))
+    told = [
+        {**json.loads(rig("check", name, "--json", cwd=tmp_path).stdout), "experiment": ""}
+        for name in ("e.yaml", "plain.yaml")
+    ]
+    assert told[0] == told[1]

@@ -1,0 +1,325 @@
+"""Configuration files against their models: every mistake at once, each with place and cure."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from types import UnionType
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
+
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
+
+from daq.config.units import unit_of
+from daq.config.yaml_file import Key, Mistake, YamlFile, dotted, suggestion
+from daq.errors import ConfigError
+
+Model = TypeVar("Model", bound=BaseModel)
+_SHOWN = 60  # characters of a value in a message
+_DEEPEST = 6  # levels of sections in which a misplaced key is looked for
+
+
+def validate(
+    file: YamlFile,
+    model: type[Model],
+    content: Mapping[str, Any] | None = None,
+    at: Key = (),
+    others: Sequence[Mistake] = (),
+) -> Model:
+    """Check a file's content, or the part of it at a key, against a model.
+
+    Raises one ConfigError that lists every mistake in the order of the file, ``others`` and keys
+    that stand twice among them, each with line, column, key, value and cure.
+    """
+    data = file.content if content is None else content
+    refuse([*file.repeated, *others, *mistakes(file, model, data, at)])
+    return model.model_validate(data)
+
+
+def mistakes(
+    file: YamlFile, model: type[BaseModel], content: Mapping[str, Any], at: Key = ()
+) -> list[Mistake]:
+    """What is wrong with the part of a file at a key by a model; one for each key."""
+    try:
+        model.model_validate(content)
+    except ValidationError as error:
+        return _Explainer(file, model, content, at).mistakes(error.errors())
+    return []
+
+
+def refuse(mistakes: Sequence[Mistake]) -> None:
+    """Raise a ConfigError of all mistakes, if any, in the order of the file."""
+    if mistakes:
+        raise ConfigError("\n".join(mistake.text for mistake in sorted(set(mistakes))))
+
+
+class _Explainer:
+    """What pydantic found wrong with data, told by file, key, value and cure."""
+
+    def __init__(
+        self, file: YamlFile, model: type[BaseModel], data: Mapping[str, Any], at: Key
+    ) -> None:
+        self._file = file
+        self._model = model
+        self._data = data
+        self._at = at
+
+    def mistakes(self, errors: Sequence[ErrorDetails]) -> list[Mistake]:
+        """One mistake for each key that is wrong."""
+        complaints: dict[Key, list[str]] = {}
+        meant = set()
+        for item, key in _of_best_branch([(item, self._key(item)) for item in errors]):
+            if item["type"] in {"extra_forbidden", "invalid_key"}:
+                near = self._near(key)
+                meant.add((*key[:-1], near))
+                complaints[key] = [f"unknown key; {self._cure(key, near)}"]
+            else:
+                complaints.setdefault(key, []).append(self._complaint(item, key))
+        return [
+            self._file.mistake((*self._at, *key), " or ".join(dict.fromkeys(said)))
+            for key, said in complaints.items()
+            # What is missing because it is misspelt is said once.
+            if key not in meant or self._is_there(key)
+        ]
+
+    def _key(self, item: ErrorDetails) -> Key:
+        """The key an error is about, without what pydantic adds for branches of a union."""
+        value: Any = self._data
+        key: list[str | int] = []
+        for part in item["loc"]:
+            if isinstance(value, Mapping) and (part in value or str(part) in map(str, value)):
+                value = value.get(part)
+                key.append(str(part))
+            elif isinstance(value, list) and isinstance(part, int) and part < len(value):
+                value = value[part]
+                key.append(part)
+        if item["type"] == "missing" and isinstance(item["loc"][-1], str):
+            key.append(item["loc"][-1])
+        if item["type"] == "union_tag_invalid":
+            key.append(item["ctx"]["discriminator"].strip("'"))
+        return tuple(key)
+
+    def _is_there(self, key: Key) -> bool:
+        return (*self._at, *key) in self._file.places
+
+    def _value(self, key: Key) -> Any:
+        value: Any = self._data
+        for part in key:
+            try:
+                value = value[part]
+            except (KeyError, IndexError, TypeError):
+                return None
+        return value
+
+    def _near(self, key: Key) -> str | None:
+        known = self._fields(key[:-1])
+        return next(iter(difflib.get_close_matches(str(key[-1]), known, n=1, cutoff=0.6)), None)
+
+    def _cure(self, key: Key, near: str | None) -> str:
+        """Where an unknown key belongs, or what it may have meant."""
+        parents = [
+            parent for parent in _sections_with(self._model, str(key[-1])) if parent != key[:-1]
+        ]
+        if parents:
+            under = " or ".join(dotted(parent) for parent in parents if parent)
+            top = "at the left margin, under no other key" if () in parents else ""
+            return "it belongs " + " or ".join(
+                filter(None, [top, f"under {under}" if under else ""])
+            )
+        if near is not None:
+            return f"did you mean {near!r}?"
+        return suggestion(str(key[-1]), self._fields(key[:-1]))
+
+    def _complaint(self, item: ErrorDetails, key: Key) -> str:
+        kind = item["type"]
+        about = self._about(key)
+        if kind == "missing" and isinstance(item["loc"][-1], str):
+            return f"this key is missing; add it{about}"
+        value = self._value(key)
+        # A message of the project's own says what it needs to.
+        return _complaint(kind, item, value, self._types(key)) + about * (kind != "value_error")
+
+    def _about(self, key: Key) -> str:
+        """What a key means and its unit, as its field or that of the section it is in says."""
+        while key:
+            for kind in self._types(key[:-1]):
+                field = getattr(kind, "model_fields", {}).get(key[-1])
+                if field is not None and field.description:
+                    unit = unit_of(field)
+                    shown = f" [{unit}]" if unit not in {None, "1"} else ""
+                    return f" ({field.description}{shown})"
+            key = key[:-1]
+        return ""
+
+    def _fields(self, key: Key) -> list[str]:
+        """Names of the keys allowed in a section."""
+        names = [name for kind in self._types(key) for name in getattr(kind, "model_fields", {})]
+        return list(dict.fromkeys(names))
+
+    def _types(self, key: Key) -> list[Any]:
+        """What may stand at a key: the alternatives that agree with what stands there."""
+        kinds: list[Any] = [self._model]
+        for depth, part in enumerate(key):
+            section = self._value(key[:depth])
+            kinds = [inner for kind in _agreeing(kinds, section) for inner in _inside(kind, part)]
+        return _agreeing(kinds, self._value(key))
+
+
+def _of_best_branch(
+    errors: Sequence[tuple[ErrorDetails, Key]],
+) -> Iterator[tuple[ErrorDetails, Key]]:
+    """Errors without those of a union's branches that others fit better, as they go deeper."""
+    for item, key in errors:
+        branched = len(item["loc"]) > len(key)
+        deeper = any(
+            other[: len(key)] == key and len(other) > len(key) and len(its["loc"]) > len(other)
+            for its, other in errors
+        )
+        if not (branched and deeper):
+            yield item, key
+
+
+def alternatives(kind: Any) -> list[Any]:
+    """The branches of a type, each without its marks."""
+    if get_origin(kind) is Annotated:
+        return alternatives(get_args(kind)[0])
+    if get_origin(kind) in {Union, UnionType}:
+        return [branch for part in get_args(kind) for branch in alternatives(part)]
+    return [kind]
+
+
+def _inside(kind: Any, part: str | int) -> list[Any]:
+    """What may stand at a key or index of a value of a type."""
+    if hasattr(kind, "model_fields"):
+        field = kind.model_fields.get(part)
+        return alternatives(field.annotation) if field is not None else []
+    inner = get_args(kind)
+    if get_origin(kind) is dict:
+        return alternatives(inner[1])
+    if get_origin(kind) is list:
+        return alternatives(inner[0])
+    if get_origin(kind) is tuple and isinstance(part, int):
+        return alternatives(inner[min(part, len(inner) - 1)])
+    return []
+
+
+def _agreeing(kinds: list[Any], value: Any) -> list[Any]:
+    """Of several models those whose fixed words stand in the value, all where none agrees."""
+
+    def agrees(kind: Any) -> bool:
+        return not isinstance(value, Mapping) or all(
+            name not in value or value[name] in get_args(field.annotation)
+            for name, field in getattr(kind, "model_fields", {}).items()
+            if get_origin(field.annotation) is Literal
+        )
+
+    return [kind for kind in kinds if agrees(kind)] or kinds
+
+
+def _sections_with(model: Any, name: str, at: Key = ()) -> list[Key]:
+    """Sections below a model that have a key of that name."""
+    if len(at) > _DEEPEST or not hasattr(model, "model_fields"):
+        return []
+    found = [at] if name in model.model_fields else []
+    for own, field in model.model_fields.items():
+        for kind in alternatives(field.annotation):
+            found += _sections_with(kind, name, (*at, own))
+    return list(dict.fromkeys(found))
+
+
+_NUMBER, _WHOLE, _TRUTH = "expected a number", "expected a whole number", "expected true or false"
+_EXPECTED = {
+    "float_parsing": _NUMBER,
+    "float_type": _NUMBER,
+    "finite_number": "expected a finite number",
+    "int_parsing": _WHOLE,
+    "int_parsing_size": _WHOLE,
+    "int_type": _WHOLE,
+    "int_from_float": _WHOLE,
+    "bool_parsing": _TRUTH,
+    "bool_type": _TRUTH,
+    "string_type": "expected text",
+    "dict_type": "expected 'key: value' lines",
+    "model_type": "expected 'key: value' lines",
+    "model_attributes_type": "expected 'key: value' lines",
+    "list_type": "expected a list [a, b]",
+    "greater_than": "it must be above {gt:g}",
+    "greater_than_equal": "it must be at least {ge:g}",
+    "less_than": "it must be below {lt:g}",
+    "less_than_equal": "it must be at most {le:g}",
+    "literal_error": "it must be {expected}",
+    "union_tag_invalid": "it must be {expected_tags}",
+    "union_tag_not_found": "its key {discriminator} is missing",
+    "string_too_short": "it must not be empty",
+    "string_too_long": "it must have at most {max_length} characters",
+}
+
+
+_SECTIONS = {"dict_type", "model_type", "model_attributes_type"}
+_NO_SECTION = {
+    "list": "write its keys without '-' and brackets",
+    "NoneType": "indent its keys below it",
+}
+
+
+def _complaint(kind: str, item: ErrorDetails, value: object, types: Sequence[Any]) -> str:
+    """What is wrong with a value, in plain English, with the value and a cure if it is plain."""
+    context = item.get("ctx", {})
+    expected = _EXPECTED.get(kind) or _expected_values(kind, context, types)
+    if expected is not None:
+        said = f"{expected.format(**context)}, found {_shown(value)}"
+        cure = _cure_of_value(kind, value, context)
+        return f"{said}; {cure}" if cure else said
+    message = item["msg"].removeprefix("Value error, ")
+    found = "" if isinstance(value, Mapping) else f"; found {_shown(value)}"
+    return message[0].lower() + message[1:] + found
+
+
+def _expected_values(kind: str, context: Mapping[str, Any], types: Sequence[Any]) -> str | None:
+    """How many values are expected."""
+    if kind == "too_short" and context.get("field_type") != "Tuple":
+        least = context["min_length"]
+        return f"it needs at least {least} {'value' if least == 1 else 'values'}"
+    if kind == "too_long" and context.get("field_type") != "Tuple":
+        return f"it may have at most {context['max_length']} values"
+    if kind in {"tuple_type", "too_short", "too_long", "missing"}:
+        lengths = {len(get_args(each)) for each in types if get_origin(each) is tuple}
+        if lengths == {2}:
+            return "expected two values [low, high]"
+        return f"expected {' or '.join(map(str, sorted(lengths)))} values [a, b, ...]"
+    return None
+
+
+def _cure_of_value(kind: str, value: object, context: Mapping[str, Any]) -> str:
+    """What to write instead, where that is plain from the value."""
+    if _EXPECTED.get(kind) in {_NUMBER, _WHOLE}:
+        return _cure_of_number(str(value))
+    if kind in _SECTIONS:
+        return _NO_SECTION.get(type(value).__name__, "")
+    if kind == "list_type" and isinstance(value, str | int | float):
+        return f"write [{value}]"
+    if kind == "string_type" and isinstance(value, int | float):
+        return "put it in quotes"
+    known = re.findall(r"'([^']+)'", context.get("expected", context.get("expected_tags", "")))
+    near = difflib.get_close_matches(str(value), known, n=1, cutoff=0.5)
+    return f"did you mean {near[0]!r}?" if near else ""
+
+
+def _cure_of_number(text: str) -> str:
+    if re.match(r"[-+]?\d+,\d", text):
+        return "write a decimal point"
+    return "this one takes no unit" if re.match(r"[-+]?[\d.]+\s*[^\W\d]", text) else ""
+
+
+def _shown(value: object) -> str:
+    """A value as it stood in the YAML, shortened."""
+    if value is None:
+        return "nothing"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, float) and not math.isfinite(value):
+        return f"{'-' * (value < 0)}.{'nan' if math.isnan(value) else 'inf'}"
+    text = repr(value)
+    return text if len(text) <= _SHOWN else f"{text[: _SHOWN - 3]}..."
