@@ -11,7 +11,7 @@ import numpy as np
 from daq import capture
 from daq.cli import console
 from daq.cli.files import find_protocol
-from daq.errors import ConfigError, RigError
+from daq.errors import ConfigError
 from daq.experiment import ClosedLoop, Experiment
 from daq.findings import Findings, Table
 from daq.log import load_log
@@ -123,6 +123,7 @@ def _with_unit(name: str, table: Table) -> str:
 
 def _write(found: Findings, folder: Path) -> None:
     """Tables as CSV, figures, and all in findings.json."""
+    from daq.figures import style
     from daq.figures.findings import draw
 
     capture.make_folder(folder)
@@ -132,12 +133,8 @@ def _write(found: Findings, folder: Path) -> None:
         capture.write_whole(folder / f"{table.name}.csv", "\n".join(lines) + "\n")
     for figure in found.figures:
         drawn = draw(figure)
-        for kind in ("png", "pdf"):
-            path = folder / f"{figure.name}.{kind}"
-            try:
-                drawn.savefig(path)
-            except OSError as error:
-                raise RigError(f"{path}: cannot be written: {error.strerror}") from None
+        for kind in style.PRINTED:
+            capture.write_whole(folder / f"{figure.name}.{kind}", style.render(drawn, kind))
     text = json.dumps(console.plain(_contents(found)), indent=2)
     capture.write_whole(folder / "findings.json", text + "\n")
     if found.ranges:

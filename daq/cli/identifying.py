@@ -187,8 +187,8 @@ def assemble(
         profiles=_profiles(prepared, estimator, records, quiet) if refined else [],
         training=examine(records, estimator.predict),
         validation=examine([log.dataset for log in check], estimator.predict),
-        training_paths=[log.path for log in train],
-        validation_paths=[log.path for log in check],
+        training_logs=train,
+        validation_logs=check,
     )
 
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from daq import capture
 from daq.cli import console
+from daq.cli.datasets import Loaded
 from daq.config.identification import IdentificationConfig, Signals
 from sysid.assessment import RecordResult, Verdict, judge
 from sysid.gassi import GASSI
@@ -22,7 +23,8 @@ from sysid.ranges import Range
 from sysid.uncertainty import Ambiguity, Estimate, Profile, Uncertainty
 
 _STRONG = 0.95  # correlation above which two parameters are named together
-_NOTES = {
+# What is said of a parameter without an interval, by why it has none.
+NOTES = {
     "tied": "only with others",
     "vague": "hardly felt",
     "bound": "at its end",
@@ -37,7 +39,7 @@ class Identified:
 
     sources: where each parameter's range or value stands that is not the model's own.
     uncertainty: None where the search was not refined to a minimum. training, validation: one
-    result for each log, in the order of the paths.
+    result for each log, in their order.
     """
 
     model: ProcessModel
@@ -50,8 +52,8 @@ class Identified:
     profiles: Sequence[Profile]
     training: Sequence[RecordResult]
     validation: Sequence[RecordResult]
-    training_paths: Sequence[Path]
-    validation_paths: Sequence[Path]
+    training_logs: Sequence[Loaded]
+    validation_logs: Sequence[Loaded]
 
     @cached_property
     def verdict(self) -> Verdict:
@@ -86,8 +88,8 @@ def document(result: Identified) -> dict[str, Any]:
     estimator, settings = result.estimator, result.settings
     verdict = result.verdict
     parts = (
-        ("training", result.training, result.training_paths),
-        ("validation", result.validation, result.validation_paths),
+        ("training", result.training, result.training_logs),
+        ("validation", result.validation, result.validation_logs),
     )
     return {
         "model": result.model_name,
@@ -104,10 +106,10 @@ def document(result: Identified) -> dict[str, Any]:
         },
         "metrics": {
             part: [
-                {"log": str(path), "name": record.name, **_record(result.model, record)}
-                for record, path in zip(records, paths, strict=True)
+                {"log": str(log.path), "name": record.name, **_record(result.model, record)}
+                for record, log in zip(records, logs, strict=True)
             ]
-            for part, records, paths in parts
+            for part, records, logs in parts
         },
         "search": {
             "preset": settings.preset,
@@ -249,7 +251,7 @@ def show(result: Identified, path: Path) -> None:
     _show_notes(result)
     console.print_line(f"Parameters: {path}")
     columns = f" --config {result.columns_file}" if result.columns_file is not None else ""
-    log = (*result.validation_paths, *result.training_paths)[0]
+    log = (*result.validation_logs, *result.training_logs)[0].path
     console.print_line(f"Next: rig replay {log} --parameters {path}{columns}")
 
 
@@ -279,12 +281,12 @@ def _parameter_row(result: Identified, parameter: Parameter) -> list[str]:
     span = _span(space.parameters[space.names.index(name)], result.settings.ranges.get(name))
     estimate = result.estimate(name)
     if estimate is None:
-        note = _NOTES["bound" if result.on_bound(name) else ""]
+        note = NOTES["bound" if result.on_bound(name) else ""]
         return [name, console.number(value), "", unit, span, source, note]
     digits = _digits(estimate)
     return [
         name, console.number(value, digits), _interval_text(estimate), unit, span, source,
-        _NOTES[estimate.why],
+        NOTES[estimate.why],
     ]  # fmt: skip
 
 

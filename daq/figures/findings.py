@@ -2,42 +2,82 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from daq import notation
+from daq.figures import style
 from daq.findings import Axis, Chart, Heatmap, Series
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+_LETTERS_A_LINE = 62  # of a title across a column of print
+_LETTERS_A_LEGEND = 58
+_HANDLE = 7  # what the sample of a line takes of a legend's row, in letters
 
+
+@style.styled
 def draw(figure: Chart | Heatmap) -> Figure:
     """A figure of a chart or of a value over a plane."""
-    from matplotlib.figure import Figure
-
-    drawn = Figure(figsize=(5.0, 3.6), dpi=150, layout="constrained")
-    axes = drawn.add_subplot()
+    title = style.wrapped(figure.title, _LETTERS_A_LINE)
+    named = [series.label for series in figure.series if series.label]
+    columns = _columns(named) if len(named) > 1 or isinstance(figure, Heatmap) else 0
+    rows = -(-len(named) // columns) if columns else 0
+    top = 0.08 + 0.13 * (title.count("\n") + 1) + 0.14 * rows
+    right = 0.72 if isinstance(figure, Heatmap) else 0.1
+    drawn, (panel,) = style.stack([2.1], top=top, right=right)
     if isinstance(figure, Heatmap):
-        mesh = axes.pcolormesh(figure.across, figure.up, figure.values, shading="nearest")
-        drawn.colorbar(mesh, label=_label(figure.value))
-    for series in figure.series:
-        _add(axes, series)
-    axes.set(title=figure.title, xlabel=_label(figure.x), ylabel=_label(figure.y))
-    if figure.series:
-        axes.legend(fontsize="small")
+        _plane(drawn, panel, figure)
+    for k, series in enumerate(figure.series):
+        _add(panel, series, k, over=isinstance(figure, Heatmap))
+    panel.set_xlabel(_label(figure.x))
+    style.name_y(panel, notation.words(figure.y.label), notation.bracketed(figure.y.unit))
+    panel.set_title(title, loc="left", x=(0.08 - style.LEFT) / (style.WIDTH - style.LEFT - right),
+                    pad=4.0 + 10.0 * rows)  # fmt: skip
+    if rows:
+        panel.legend(loc="lower left", bbox_to_anchor=(-0.12, 1.0), ncols=columns,
+                     borderaxespad=0.2, borderpad=0.0)  # fmt: skip
     return drawn
 
 
-def _add(axes: Axes, series: Series) -> None:
+def _columns(labels: list[str]) -> int:
+    """As many as stand beside each other above the panel."""
+    widest = max((len(label) for label in labels), default=0) + _HANDLE
+    return max(1, min(len(labels), _LETTERS_A_LEGEND // widest))
+
+
+def _plane(drawn: Figure, panel: Axes, figure: Heatmap) -> None:
+    # Violet to yellow by lightness alone, the same for all readers and in grey.
+    mesh = panel.pcolormesh(
+        figure.across, figure.up, figure.values, shading="nearest", cmap="cividis",
+        rasterized=True,
+    )  # fmt: skip
+    box = panel.get_position()
+    bar = drawn.colorbar(mesh, cax=drawn.add_axes((box.x1 + 0.02, box.y0, 0.03, box.height)))
+    bar.set_label(_label(figure.value))
+    panel.grid(visible=False)
+
+
+def _add(panel: Axes, series: Series, k: int, over: bool) -> None:
+    """One series; over: a plane, on which black with a white edge is seen everywhere."""
+    from matplotlib.patheffects import withStroke
+
+    look: dict[str, Any] = {
+        "color": "black" if over else style.CYCLE[k % len(style.CYCLE)],
+        "label": notation.words(series.label) or None,
+        "path_effects": [withStroke(linewidth=2.2, foreground="white")] if over else None,
+    }
+    marker: dict[str, Any] = {"marker": "os^Dv"[k % 5], "ms": 3.0, "ls": ""}
     if series.spread is not None:
-        axes.errorbar(
-            series.x, series.y, series.spread, fmt="o", markersize=3, capsize=2, label=series.label
-        )
+        panel.errorbar(series.x, series.y, series.spread, capsize=1.5, elinewidth=0.7,
+                       **marker, **look)  # fmt: skip
     elif series.style == "points":
-        axes.plot(series.x, series.y, "o", markersize=3, label=series.label)
+        panel.plot(series.x, series.y, **marker, **look)
     else:
-        axes.plot(series.x, series.y, linewidth=1, label=series.label)
+        dash = style.DASHES[k % len(style.DASHES)]
+        panel.plot(*style.thinned(series.x, series.y), ls=dash, **look)
 
 
 def _label(axis: Axis) -> str:
-    return f"{axis.label} [{axis.unit}]" if axis.unit else axis.label
+    return f"{notation.words(axis.label)} {notation.bracketed(axis.unit)}"

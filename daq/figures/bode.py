@@ -1,0 +1,104 @@
+"""Frequency responses: measured, of a model treated likewise, and of linear models."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from daq import notation
+from daq.figures import style
+from daq.figures.style import FloatArray
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+ComplexArray = npt.NDArray[np.complex128]
+_Z95 = 1.959963984540054
+_SEEN = 0.3  # coherence below which a measured point is drawn faintly
+
+
+@dataclass(frozen=True)
+class Measured:
+    """An estimated response, (n,) complex, its coherence and standard deviation of a magnitude."""
+
+    response: ComplexArray
+    coherence: FloatArray
+    deviation: FloatArray
+
+
+@style.styled
+def bode(
+    frequency: FloatArray,
+    measured: Measured,
+    curves: Mapping[str, ComplexArray],
+    units: tuple[str, str],
+) -> Figure:
+    """Magnitude, phase and coherence over frequencies [Hz], (n,).
+
+    curves: responses at the same frequencies by name. units: of output and input. Measured
+    magnitudes carry 95 % bars; points of low coherence are faint.
+    """
+    figure, (size, angle, seen) = style.stack(
+        [1.1, 0.8, 0.45], 0.1, top=0.36 if len(curves) > 1 else 0.24
+    )
+    magnitude = np.abs(measured.response)
+    good = measured.coherence >= _SEEN
+    for chosen, colour in ((~good, style.FAINT), (good, style.MEASURED)):
+        if not chosen.any():
+            continue
+        bars = _Z95 * measured.deviation[chosen]
+        lower = np.minimum(bars, 0.98 * magnitude[chosen])
+        size.errorbar(
+            frequency[chosen], magnitude[chosen], yerr=[lower, bars], fmt="none",
+            ecolor=colour, elinewidth=0.4,
+        )  # fmt: skip
+        size.plot(frequency[chosen], magnitude[chosen], ".", ms=2.5, color=colour,
+                  label="measured, 95 %" if colour == style.MEASURED else None)  # fmt: skip
+        angle.plot(frequency[chosen], _degrees(measured.response[chosen]), ".", ms=2.5,
+                   color=colour)  # fmt: skip
+    for k, (name, response) in enumerate(curves.items()):
+        look = {"color": style.CYCLE[(1, 0, 2, 3)[k % 4]], "ls": style.DASHES[k % 4]}
+        size.plot(frequency, np.abs(response), label=name, **look)  # type: ignore[arg-type]
+        angle.plot(frequency, _degrees(response), **look)  # type: ignore[arg-type]
+    style.logarithmic(size.xaxis, frequency)
+    limits = _limits(magnitude, good, curves)
+    style.logarithmic(size.yaxis, np.array(limits))
+    size.set_ylim(*limits)
+    angle.set_ylim(-190, 190)
+    angle.set_yticks([-180, -90, 0, 90, 180])
+    seen.plot(frequency, measured.coherence, color=style.MEASURED, lw=0.8)
+    seen.set_ylim(-0.05, 1.05)
+    seen.set_xlabel("frequency [Hz]")
+    style.name_y(size, "magnitude", f"[{_ratio(*units)}]")
+    style.name_y(angle, "phase", "[°]")
+    style.name_y(seen, "coherence", "[1]")
+    style.legend(figure, size, columns=2)
+    return figure
+
+
+def _limits(
+    magnitude: FloatArray, good: npt.NDArray[np.bool_], curves: Mapping[str, ComplexArray]
+) -> tuple[float, float]:
+    """Limits by what is known: neither bars that reach to zero nor a curve's notch."""
+    known = magnitude[good] if good.any() else magnitude
+    middles = [float(np.median(np.abs(values))) for values in curves.values()]
+    every = np.concatenate([known[known > 0.0], [m for m in middles if m > 0.0]])
+    if not len(every):
+        return 0.1, 1.0
+    return 0.4 * float(every.min()), 2.5 * float(every.max())
+
+
+def _degrees(response: ComplexArray) -> FloatArray:
+    degrees: FloatArray = np.degrees(np.angle(response))
+    return degrees
+
+
+def _ratio(output: str, given: str) -> str:
+    above, below = notation.unit_text(output) or "1", notation.unit_text(given)
+    if not below:
+        return above
+    return f"({above})/{below}" if "/" in above else f"{above}/{below}"

@@ -1,0 +1,146 @@
+"""What a search tells of parameters: intervals in their ranges, and correlations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daq import notation
+from daq.figures import style
+from daq.figures.style import FloatArray
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_NUMBERED = 9  # parameters up to which a correlation is written into its cell
+
+
+@dataclass(frozen=True)
+class Searched:
+    """A parameter in the range that it was searched in; without interval where there is none."""
+
+    name: str
+    unit: str
+    value: float
+    lower: float
+    upper: float
+    log: bool
+    interval: tuple[float, float] | None
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Determined:
+    """A quantity that has an interval."""
+
+    name: str
+    value: float
+    low: float
+    high: float
+
+
+@style.styled
+def ranges(parameters: Sequence[Searched]) -> Figure:
+    """Each parameter's value and interval inside its range, from one end to the other."""
+    left = 0.72
+    figure, (panel,) = style.stack([0.155 * len(parameters) + 0.1], left=left, top=0.24,
+                                   right=0.95)  # fmt: skip
+    for row, one in enumerate(parameters):
+        panel.plot([0.0, 1.0], [row, row], color=style.FAINT, lw=3.0, solid_capstyle="butt",
+                   zorder=1)  # fmt: skip
+        known = one.interval is not None
+        if one.interval is not None:
+            ends = [_place(one, end) for end in one.interval]
+            panel.plot(ends, [row, row], color=style.BASELINE, lw=3.0, solid_capstyle="butt",
+                       zorder=2)  # fmt: skip
+        panel.plot(
+            _place(one, one.value), row, "o", ms=3.2, zorder=3,
+            mfc=style.IDENTIFIED if known else "white", mec=style.IDENTIFIED, mew=0.8,
+        )  # fmt: skip
+        if one.note:
+            panel.text(1.05, row, one.note, va="center", fontsize=6.0)
+    _legend_of_ranges(figure, panel, left)
+    panel.set_yticks(range(len(parameters)), [notation.label(p.name) for p in parameters])
+    panel.set_ylim(len(parameters) - 0.4, -0.6)
+    panel.set_xlim(-0.04, 1.04)
+    panel.set_xticks([0.0, 0.5, 1.0], ["low end", "middle", "high end"])
+    panel.set_xlabel("place in the range searched [1]")
+    panel.grid(visible=False, axis="y")
+    panel.tick_params(axis="y", length=0)
+    return figure
+
+
+def _legend_of_ranges(figure: Figure, panel: Axes, left: float) -> None:
+    panel.plot([], [], color=style.FAINT, lw=3.0, label="range")
+    panel.plot([], [], color=style.BASELINE, lw=3.0, label="95 % interval")
+    panel.plot([], [], "o", ms=3.2, mfc=style.IDENTIFIED, mec=style.IDENTIFIED, label="value")
+    panel.plot([], [], "o", ms=3.2, mfc="white", mec=style.IDENTIFIED, label="open")
+    style.legend(figure, panel, left=left)
+
+
+def _place(one: Searched, value: float) -> float:
+    """From 0 at the low end to 1 at the high end, on the scale of the search."""
+    values = np.array([value, one.lower, one.upper])
+    if one.log:
+        values = np.log(np.maximum(values, np.finfo(float).tiny))
+    place = float((values[0] - values[1]) / (values[2] - values[1]))
+    # An interval may be wider than the range.
+    return min(max(place, -0.04), 1.04)
+
+
+@style.styled
+def intervals(quantities: Sequence[Determined]) -> Figure:
+    """The 95 % interval of every determined quantity, in per cent of its value."""
+    left = 0.95
+    figure, (panel,) = style.stack([0.17 * len(quantities) + 0.1], left=left, top=0.1)
+    widest = 0.0
+    for row, one in enumerate(quantities):
+        size = abs(one.value) or 1.0
+        below, above = (100.0 * (end - one.value) / size for end in (one.low, one.high))
+        widest = max(widest, abs(below), abs(above))
+        panel.errorbar(
+            0.0, row, xerr=[[abs(below)], [abs(above)]], fmt="o", ms=3.0, capsize=2.0,
+            color=style.IDENTIFIED, ecolor=style.BASELINE, elinewidth=1.2, capthick=0.8,
+        )  # fmt: skip
+    panel.axvline(0.0, color="black", lw=0.4, zorder=1)
+    panel.set_yticks(range(len(quantities)), [notation.label(q.name) for q in quantities])
+    panel.set_ylim(len(quantities) - 0.4, -0.6)
+    panel.set_xlim(-1.1 * widest, 1.1 * widest) if widest > 0.0 else None
+    panel.set_xlabel("95 % interval, distance from the value [%]")
+    panel.grid(visible=False, axis="y")
+    panel.tick_params(axis="y", length=0)
+    return figure
+
+
+@style.styled
+def correlation(names: Sequence[str], matrix: FloatArray) -> Figure:
+    """Correlation coefficients of parameters, (n, n), NaN where there is none."""
+    n = len(names)
+    left, right = 0.62, 0.62
+    side = style.WIDTH - left - right
+    figure, (panel,) = style.stack([side], left=left, right=right, top=0.12, bottom=0.5)
+    # Orange to violet keeps its order for readers who confuse red and green.
+    image = panel.imshow(matrix, cmap="PuOr", vmin=-1.0, vmax=1.0)
+    labels = [notation.label(name) for name in names]
+    panel.set_xticks(range(n), labels, rotation=90 if n > 6 else 0)
+    panel.set_yticks(range(n), labels)
+    panel.grid(visible=False)
+    panel.tick_params(length=0)
+    for spine in panel.spines.values():
+        spine.set_visible(False)
+    if n <= _NUMBERED:
+        for i, j in np.argwhere(np.isfinite(matrix)).tolist():
+            dark = abs(matrix[i, j]) > 0.6
+            panel.text(j, i, f"{matrix[i, j]:.2f}".replace("-", "−"), ha="center", va="center",
+                       fontsize=5.5 if n > 7 else 6.5,
+                       color="white" if dark else "black")  # fmt: skip
+    box = panel.get_position()
+    beside = figure.add_axes((box.x1 + 0.02, box.y0, 0.025, box.height))
+    bar = figure.colorbar(image, cax=beside)
+    bar.set_label("correlation coefficient [1]", labelpad=1.0)
+    bar.outline.set_linewidth(0.4)
+    return figure

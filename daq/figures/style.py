@@ -1,0 +1,235 @@
+"""One look for all figures: a column of print (3.5 in), 7 pt, colours told apart by everyone.
+
+Colours are those of Okabe and Ito (jfly.uni-koeln.de/color, 2008), and lines differ in
+dash or weight as well, so that figures survive a black-and-white printer.
+"""
+
+from __future__ import annotations
+
+import functools
+import io
+import textwrap
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, Literal, ParamSpec
+
+import numpy as np
+import numpy.typing as npt
+
+from daq import notation
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
+    from matplotlib.figure import Figure
+
+FloatArray = npt.NDArray[np.float64]
+Format = Literal["svg", "pdf", "png"]
+PRINTED: tuple[Format, ...] = ("pdf", "png")  # of figures that stand by themselves
+
+WIDTH = 3.5  # in, one column
+LEFT = 0.72  # in, left of the panels
+DPI = 300
+
+MEASURED = "#4d4d4d"
+IDENTIFIED = "#d55e00"
+BASELINE = "#0072b2"
+ASKED = "#56b4e9"
+FAINT = "#bdbdbd"
+# For whatever else comes in several: Okabe and Ito's, the darker first.
+CYCLE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
+DASHES = ("-", "--", "-.", ":")
+
+_LETTER = 0.058  # in, mean width of a letter of a label
+_SPARE = 0.1  # in, by which a label may stand over its panel
+_PLAIN = 30.0  # span of a logarithmic axis below which it needs more marks than the decades
+
+# More points than a column of print can show are drawn as their envelope.
+_COLUMNS = 1400
+
+_SETTINGS = {
+    "font.family": "DejaVu Sans",
+    "font.size": 7.0,
+    "axes.labelsize": 7.0,
+    "axes.titlesize": 7.0,
+    "xtick.labelsize": 6.5,
+    "ytick.labelsize": 6.5,
+    "legend.fontsize": 6.5,
+    "legend.frameon": False,
+    "legend.handlelength": 1.6,
+    "legend.columnspacing": 1.2,
+    "axes.linewidth": 0.6,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#e4e4e4",
+    "grid.linewidth": 0.4,
+    "lines.linewidth": 0.9,
+    "lines.solid_joinstyle": "round",
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "xtick.major.size": 2.5,
+    "ytick.major.size": 2.5,
+    "xtick.minor.size": 1.5,
+    "ytick.minor.size": 1.5,
+    "xtick.minor.width": 0.4,
+    "ytick.minor.width": 0.4,
+    # Mathematical text is parsed, at ten times the price of plain text.
+    "axes.formatter.use_mathtext": False,
+    "axes.formatter.limits": (-3, 4),
+    "axes.unicode_minus": True,
+    "mathtext.fontset": "dejavusans",
+    # Outlines look alike everywhere; what they spell is in the caption.
+    "svg.fonttype": "path",
+    "svg.hashsalt": "rig",
+    # Fonts that journals' checkers take.
+    "pdf.fonttype": 42,
+}
+
+P = ParamSpec("P")
+
+
+def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
+    """A drawing function under the shared settings, which are put back behind it."""
+
+    @functools.wraps(draw)
+    def drawn(*args: P.args, **kwargs: P.kwargs) -> Figure:
+        import matplotlib as mpl
+
+        with mpl.rc_context(_SETTINGS):  # type: ignore[arg-type]
+            return draw(*args, **kwargs)
+
+    return drawn
+
+
+def stack(
+    heights: Sequence[float],
+    gaps: Sequence[float] | float = 0.12,
+    *,
+    left: float = LEFT,
+    right: float = 0.1,
+    top: float = 0.28,
+    bottom: float = 0.4,
+    width: float = WIDTH,
+    share_x: bool = True,
+) -> tuple[Figure, list[Axes]]:
+    """A figure of panels under one another; all lengths in inches.
+
+    gaps: below each panel but the last, or one for all. Places are given rather than found by a
+    layout engine, which would draw everything twice.
+    """
+    from matplotlib.figure import Figure
+
+    between = [gaps] * (len(heights) - 1) if isinstance(gaps, float | int) else list(gaps)
+    tall = top + bottom + sum(heights) + sum(between)
+    figure = Figure(figsize=(width, tall))
+    panels: list[Any] = []
+    above = top
+    for height, gap in zip(heights, [*between, 0.0], strict=True):
+        box = (left / width, 1 - (above + height) / tall, (width - left - right) / width,
+               height / tall)  # fmt: skip
+        first = panels[0] if panels and share_x else None
+        panels.append(figure.add_axes(box, sharex=first))
+        above += height + gap
+    if share_x:
+        for panel in panels[:-1]:
+            panel.tick_params(labelbottom=False)
+    return figure, panels
+
+
+def name_y(panel: Axes, name: str, unit: str) -> None:
+    """Label of a vertical axis, ``name [unit]``, wrapped to the panel's height.
+
+    It stands at the figure's edge, so that those of all panels align.
+    """
+    figure = panel.get_figure(root=True)
+    assert figure is not None
+    width, tall = figure.get_size_inches()
+    box = panel.get_position()
+    longest = max(int((box.height * tall + _SPARE) / _LETTER), 6)
+    lines = textwrap.wrap(name, longest, break_long_words=False) or [""]
+    if len(lines[-1]) + len(unit) < longest and len(lines) == 1:
+        lines[-1] += f" {unit}"
+    else:
+        lines.append(unit)
+    panel.set_ylabel("\n".join(lines), va="top", linespacing=1.05)
+    panel.yaxis.set_label_coords((0.03 - box.x0 * width) / (box.width * width), 0.5)
+
+
+def logarithmic(axis: Axis, values: FloatArray) -> None:
+    """A logarithmic axis, with plain numbers where powers of ten would leave it unmarked."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axis._set_axes_scale("log")  # type: ignore[attr-defined]
+    known = values[np.isfinite(values) & (values > 0.0)]
+    low, high = (float(known.min()), float(known.max())) if len(known) else (1.0, 10.0)
+    axis.set_minor_formatter(NullFormatter())
+    if high < _PLAIN * low:
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter(FuncFormatter(_plain if low >= 1e-3 and high < 1e5 else _power))
+
+
+def _plain(value: float, _place: int | None = None) -> str:
+    return f"{value:g}"
+
+
+def _power(value: float, _place: int | None = None) -> str:
+    """A power of ten, or a multiple of one."""
+    mantissa, power = f"{value:.0e}".split("e")
+    times = "" if mantissa == "1" else f"{mantissa}·"
+    return f"{times}10{str(int(power)).translate(notation.RAISED)}"
+
+
+def wrapped(text: str, letters: int) -> str:
+    """Text on several lines of at most so many letters; a dollar sign is no mathematics."""
+    return "\n".join(textwrap.wrap(text, letters)).replace("$", r"\$")
+
+
+def note(panel: Axes, text: str) -> None:
+    """A remark above a panel's right end."""
+    panel.set_title(text, loc="right", fontsize=6.5, pad=2.0)
+
+
+def legend(figure: Figure, panel: Axes, columns: int = 4, left: float = LEFT) -> None:
+    """What the lines of a panel mean, at the top of the figure."""
+    handles, labels = panel.get_legend_handles_labels()
+    tall = float(figure.get_size_inches()[1])
+    figure.legend(
+        handles, labels, loc="upper left", ncols=min(columns, max(len(labels), 1)),
+        bbox_to_anchor=((left - 0.08) / float(figure.get_size_inches()[0]), 1 - 0.02 / tall),
+        borderaxespad=0.0, borderpad=0.0,
+    )  # fmt: skip
+
+
+def thinned(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """A line that looks the same in print with no more points than can be told apart.
+
+    Of long records the lowest and highest point of each column are kept, in their order.
+    """
+    n = len(x)
+    if n <= 4 * _COLUMNS:
+        return x, y
+    size = int(np.ceil(n / _COLUMNS))
+    whole = n // size
+    blocks = y[: whole * size].reshape(whole, size)
+    lows = np.where(np.isnan(blocks), np.inf, blocks).argmin(axis=1)
+    highs = np.where(np.isnan(blocks), -np.inf, blocks).argmax(axis=1)
+    starts = np.arange(whole) * size
+    kept = np.unique(np.concatenate([starts + lows, starts + highs, [0, n - 1]]))
+    return x[kept], y[kept]
+
+
+def render(figure: Figure, kind: Format) -> bytes:
+    """A figure as a file of a format; the same figure gives the same bytes."""
+    import matplotlib as mpl
+
+    # Dates and versions would make every file another.
+    nameless: dict[str, dict[str, Any]] = {
+        "svg": {"Date": None, "Creator": None, "Format": None, "Type": None},
+        "pdf": {"CreationDate": None, "Creator": None, "Producer": None},
+        "png": {"Software": None},
+    }
+    target = io.BytesIO()
+    with mpl.rc_context(_SETTINGS):  # type: ignore[arg-type]
+        figure.savefig(target, format=kind, dpi=DPI, metadata=nameless[kind])
+    return target.getvalue()

@@ -1,0 +1,180 @@
+"""Names, units and numbers as mathematics writes them: for HTML, LaTeX and figures.
+
+``omega_dm`` is an omega with index dm, ``alpha1`` an alpha with index 1; a name that is a word
+(``current_motor``) stays one. Whatever comes from users is escaped.
+"""
+
+from __future__ import annotations
+
+import html as _html
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+
+_GREEK = {
+    "alpha": "α", "beta": "β", "gamma": "γ", "delta": "δ", "epsilon": "ε", "zeta": "ζ",
+    "eta": "η", "theta": "θ", "kappa": "κ", "lambda": "λ", "mu": "μ", "nu": "ν", "xi": "ξ",
+    "rho": "ρ", "sigma": "σ", "tau": "τ", "phi": "φ", "chi": "χ", "psi": "ψ", "omega": "ω",
+}  # fmt: skip
+_SYMBOL = re.compile(rf"({'|'.join(_GREEK)}|[A-Za-z])(\d*)(?:_([A-Za-z0-9]+))?(\(0\))?")
+_ATOM = re.compile(r"[^\W\d]\w*(?:\(0\))?")
+_TEX = {
+    "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_",
+    "{": r"\{", "}": r"\}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
+    "<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}",
+}  # fmt: skip
+_TEX_GREEK = {
+    "Ω": r"\ensuremath{\Omega}", "μ": r"\ensuremath{\mu}", "µ": r"\ensuremath{\mu}",
+    "°": r"\ensuremath{^\circ}", "·": r"\ensuremath{\cdot}", "²": r"\ensuremath{^2}",
+    "³": r"\ensuremath{^3}", "ω": r"\ensuremath{\omega}",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Symbol:
+    """A letter with its index; ``start`` where its value at time 0 is meant."""
+
+    letter: str
+    index: str
+    start: bool
+
+
+def html(expression: str) -> str:
+    """A name or an expression of names (``A alpha0``, ``J_m + J_b``) as HTML."""
+    return _translated(expression, _html_atom, _html_rest)
+
+
+def tex(expression: str) -> str:
+    """The same as LaTeX, to stand in text."""
+    return _translated(expression, _tex_atom, _tex_rest)
+
+
+def label(expression: str) -> str:
+    """The same as a label of a figure, in matplotlib's mathematical text."""
+    return _translated(expression, _label_atom, _label_rest)
+
+
+def words(name: str) -> str:
+    """A signal's name as words; a dollar sign is no mathematics."""
+    return name.replace("_", " ").replace("$", r"\$")
+
+
+def unit_text(unit: str) -> str:
+    """A unit with its signs: ``N·m·s/(rad·A)``, ``Ω``; nothing for a pure number."""
+    if unit in ("", "1"):
+        return ""
+    text = re.sub(r"\bohm\b", "Ω", unit).replace("*", "·")
+    return re.sub(r"\^(-?\d+)", lambda m: m[1].translate(RAISED), text)
+
+
+def unit_tex(unit: str) -> str:
+    """The same as LaTeX."""
+    if unit in ("", "1"):
+        return ""
+    pieces = re.split(r"(\^-?\d+|\*|\bohm\b)", unit)
+    return "".join(_tex_unit_piece(piece) for piece in pieces)
+
+
+def bracketed(unit: str) -> str:
+    """``[A]`` behind a label; ``[1]`` of a pure number."""
+    text = unit_text(unit).replace("$", r"\$")
+    return f"[{text or 1}]"
+
+
+def number_html(text: str) -> str:
+    """A printed number (``5.4e-4``) with a proper minus and power of ten, as HTML."""
+    mantissa, _, power = text.partition("e")
+    shown = _html.escape(mantissa.replace("-", "−"))
+    return f"{shown}×10<sup>{power.replace('-', '−')}</sup>" if power else shown
+
+
+def number_tex(text: str) -> str:
+    """The same as LaTeX."""
+    mantissa, _, power = text.partition("e")
+    return rf"${mantissa}\times10^{{{power}}}$" if power else f"${mantissa}$"
+
+
+def escape_tex(text: str) -> str:
+    """Any text, as LaTeX prints it."""
+    signs = _TEX | _TEX_GREEK
+    return "".join(signs.get(sign, sign) for sign in text)
+
+
+# Digits and minus as superscripts.
+RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def _translated(expression: str, atom: Callable[[str], str], rest: Callable[[str], str]) -> str:
+    parts, end = [], 0
+    for found in _ATOM.finditer(expression):
+        parts += [rest(expression[end : found.start()]), atom(found[0])]
+        end = found.end()
+    return "".join([*parts, rest(expression[end:])])
+
+
+def _symbol(name: str) -> _Symbol | None:
+    found = _SYMBOL.fullmatch(name)
+    if found is None:
+        return None
+    letter, digits, index, start = found.groups()
+    both = ",".join(part for part in (digits, index) if part)
+    return _Symbol(letter, both, start is not None)
+
+
+def _html_atom(name: str) -> str:
+    symbol = _symbol(name)
+    if symbol is None:
+        return _html.escape(name)
+    index = f"<sub>{symbol.index}</sub>" if symbol.index else ""
+    start = "(0)" if symbol.start else ""
+    return f"<i>{_GREEK.get(symbol.letter, symbol.letter)}</i>{index}{start}"
+
+
+def _html_rest(text: str) -> str:
+    raised = re.sub(r"\^(-?[\d.]+)", r"<sup>\1</sup>", _html.escape(text))
+    return raised.replace(" - ", " − ")
+
+
+def _tex_atom(name: str) -> str:
+    return f"${body}$" if (body := _math_body(name)) is not None else escape_tex(name)
+
+
+def _math_body(name: str) -> str | None:
+    symbol = _symbol(name)
+    if symbol is None:
+        return None
+    letter = f"\\{symbol.letter}" if symbol.letter in _GREEK else symbol.letter
+    index = f"_{{\\mathrm{{{symbol.index}}}}}" if symbol.index else ""
+    return f"{letter}{index}{'(0)' if symbol.start else ''}"
+
+
+def _tex_rest(text: str) -> str:
+    pieces = re.split(r"(\^-?[\d.]+| - | \+ )", text)
+    return "".join(_tex_rest_piece(piece) for piece in pieces)
+
+
+def _tex_rest_piece(piece: str) -> str:
+    if piece.startswith("^") and len(piece) > 1:
+        return f"$^{{{piece[1:]}}}$"
+    if piece in (" - ", " + "):
+        return f" ${piece.strip()}$ "
+    return escape_tex(piece)
+
+
+def _label_atom(name: str) -> str:
+    return f"${body}$" if (body := _math_body(name)) is not None else words(name)
+
+
+def _label_rest(text: str) -> str:
+    raised = re.sub(r"\^(-?[\d.]+)", r"$^{\1}$", text.replace("$", r"\$"))
+    return raised.replace(" - ", " − ")
+
+
+def _tex_unit_piece(piece: str) -> str:
+    if piece == "*":
+        return r"\,"
+    if piece == "ohm":
+        return r"\ensuremath{\Omega}"
+    if piece.startswith("^") and len(piece) > 1:
+        return f"$^{{{piece[1:]}}}$"
+    return escape_tex(piece)

@@ -1,0 +1,1 @@
+"""Reports of identifications: a page for people, a table for papers."""
