@@ -27,7 +27,7 @@ def convergence(
                label="best error")  # fmt: skip
     if before_refinement is not None and np.isfinite(before_refinement):
         panel.axhline(before_refinement, color=style.MEASURED, lw=0.7, ls="--",
-                      label="genetic search, before local refinement")  # fmt: skip
+                      label="genetic search alone")  # fmt: skip
     style.logarithmic(panel.yaxis, errors)
     panel.ticklabel_format(axis="x", style="plain")
     panel.set_xlabel("simulations of one parameter set [1]")

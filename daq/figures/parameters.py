@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq import notation
 from daq.figures import style
 from daq.figures.style import FloatArray
 
@@ -17,6 +16,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _NUMBERED = 9  # parameters up to which a correlation is written into its cell
+
+_SHORT = 9  # letters up to which names stand beside each other
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ class Determined:
 @style.styled
 def ranges(parameters: Sequence[Searched]) -> Figure:
     """Each parameter's value and interval inside its range, from one end to the other."""
-    left = 0.72
+    names, left = style.row_names([parameter.name for parameter in parameters])
     figure, (panel,) = style.stack([0.155 * len(parameters) + 0.1], left=left, top=0.24,
                                    right=0.95)  # fmt: skip
     for row, one in enumerate(parameters):
@@ -63,8 +64,8 @@ def ranges(parameters: Sequence[Searched]) -> Figure:
         )  # fmt: skip
         if one.note:
             panel.text(1.05, row, one.note, va="center", fontsize=6.0)
-    _legend_of_ranges(figure, panel, left)
-    panel.set_yticks(range(len(parameters)), [notation.label(p.name) for p in parameters])
+    _legend_of_ranges(figure, panel)
+    panel.set_yticks(range(len(parameters)), names)
     panel.set_ylim(len(parameters) - 0.4, -0.6)
     panel.set_xlim(-0.04, 1.04)
     panel.set_xticks([0.0, 0.5, 1.0], ["low end", "middle", "high end"])
@@ -74,12 +75,12 @@ def ranges(parameters: Sequence[Searched]) -> Figure:
     return figure
 
 
-def _legend_of_ranges(figure: Figure, panel: Axes, left: float) -> None:
+def _legend_of_ranges(figure: Figure, panel: Axes) -> None:
     panel.plot([], [], color=style.FAINT, lw=3.0, label="range")
     panel.plot([], [], color=style.BASELINE, lw=3.0, label="95 % interval")
     panel.plot([], [], "o", ms=3.2, mfc=style.IDENTIFIED, mec=style.IDENTIFIED, label="value")
     panel.plot([], [], "o", ms=3.2, mfc="white", mec=style.IDENTIFIED, label="open")
-    style.legend(figure, panel, left=left)
+    style.legend(figure, panel, left=0.3)
 
 
 def _place(one: Searched, value: float) -> float:
@@ -95,7 +96,7 @@ def _place(one: Searched, value: float) -> float:
 @style.styled
 def intervals(quantities: Sequence[Determined]) -> Figure:
     """The 95 % interval of every determined quantity, in per cent of its value."""
-    left = 0.95
+    names, left = style.row_names([quantity.name for quantity in quantities])
     figure, (panel,) = style.stack([0.17 * len(quantities) + 0.1], left=left, top=0.1)
     widest = 0.0
     for row, one in enumerate(quantities):
@@ -107,7 +108,7 @@ def intervals(quantities: Sequence[Determined]) -> Figure:
             color=style.IDENTIFIED, ecolor=style.BASELINE, elinewidth=1.2, capthick=0.8,
         )  # fmt: skip
     panel.axvline(0.0, color="black", lw=0.4, zorder=1)
-    panel.set_yticks(range(len(quantities)), [notation.label(q.name) for q in quantities])
+    panel.set_yticks(range(len(quantities)), names)
     panel.set_ylim(len(quantities) - 0.4, -0.6)
     panel.set_xlim(-1.1 * widest, 1.1 * widest) if widest > 0.0 else None
     panel.set_xlabel("95 % interval, distance from the value [%]")
@@ -120,13 +121,16 @@ def intervals(quantities: Sequence[Determined]) -> Figure:
 def correlation(names: Sequence[str], matrix: FloatArray) -> Figure:
     """Correlation coefficients of parameters, (n, n), NaN where there is none."""
     n = len(names)
-    left, right = 0.62, 0.62
+    labels, left = style.row_names(names)
+    right = 0.72
+    upright = max(len(name) for name in names) > _SHORT
     side = style.WIDTH - left - right
-    figure, (panel,) = style.stack([side], left=left, right=right, top=0.12, bottom=0.5)
+    figure, (panel,) = style.stack(
+        [side], left=left, right=right, top=0.12, bottom=left if upright else 0.3
+    )
     # Orange to violet keeps its order for readers who confuse red and green.
     image = panel.imshow(matrix, cmap="PuOr", vmin=-1.0, vmax=1.0)
-    labels = [notation.label(name) for name in names]
-    panel.set_xticks(range(n), labels, rotation=90 if n > 6 else 0)
+    panel.set_xticks(range(n), labels, rotation=90 if upright else 0)
     panel.set_yticks(range(n), labels)
     panel.grid(visible=False)
     panel.tick_params(length=0)
@@ -140,7 +144,7 @@ def correlation(names: Sequence[str], matrix: FloatArray) -> Figure:
                        color="white" if dark else "black")  # fmt: skip
     box = panel.get_position()
     beside = figure.add_axes((box.x1 + 0.02, box.y0, 0.025, box.height))
-    bar = figure.colorbar(image, cax=beside)
-    bar.set_label("correlation coefficient [1]", labelpad=1.0)
+    bar = figure.colorbar(image, cax=beside, ticks=[-1.0, -0.5, 0.0, 0.5, 1.0])
+    bar.set_label("correlation coefficient [1]", labelpad=2.0)
     bar.outline.set_linewidth(0.4)
     return figure

@@ -40,6 +40,7 @@ CYCLE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000
 DASHES = ("-", "--", "-.", ":")
 
 _LETTER = 0.058  # in, mean width of a letter of a label
+_LONGEST = 18  # letters of a row's name
 _SPARE = 0.1  # in, by which a label may stand over its panel
 _PLAIN = 30.0  # span of a logarithmic axis below which it needs more marks than the decades
 
@@ -183,6 +184,13 @@ def _power(value: float, _place: int | None = None) -> str:
 def wrapped(text: str, letters: int) -> str:
     """Text on several lines of at most so many letters; a dollar sign is no mathematics."""
     return "\n".join(textwrap.wrap(text, letters)).replace("$", r"\$")
+
+
+def row_names(names: Sequence[str]) -> tuple[list[str], float]:
+    """Parameters' names as labels of rows, and the room in inches that they take."""
+    shown = [name if len(name) <= _LONGEST else f"{name[: _LONGEST - 1]}…" for name in names]
+    longest = max((len(name) for name in shown), default=0)
+    return [notation.label(name) for name in shown], max(_LETTER * longest + 0.16, 0.5)
 
 
 def note(panel: Axes, text: str) -> None:

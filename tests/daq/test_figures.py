@@ -1,0 +1,146 @@
+"""Figures: every axis says what it shows and in which unit, nothing is cut, files are of a kind."""
+
+import re
+import xml.etree.ElementTree as ET
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+
+from daq.figures import style
+from daq.figures.bode import Measured, bode
+from daq.figures.convergence import convergence
+from daq.figures.findings import draw
+from daq.figures.loops import Loop, hysteresis_loops
+from daq.figures.parameters import Determined, Searched, correlation, intervals, ranges
+from daq.figures.responses import Response, responses
+from daq.figures.signals import Panel, signals
+from daq.figures.spectra import Spectrum, spectra
+from daq.findings import Axis, Chart, Heatmap, Series
+
+TIME = np.linspace(0.0, 1.0, 400)
+WAVE = np.sin(20.0 * TIME)
+FREQUENCY = np.linspace(1.0, 100.0, 80)
+LAG = 1.0 / (1.0 + 0.1j * FREQUENCY)
+# Names as users give them.
+NASTY = "gain_$x<&%_of_the_outer_loop"
+
+
+def charts():
+    series = tuple(Series(f"brake {b} V", TIME, b * WAVE, 0.1 + 0.0 * TIME) for b in (1, 2, 3))
+    chart = Chart("c", "Torque over speed " * 6, Axis("speed", "rad/s"), Axis("torque", "N*m"),
+                  (*series, Series("fitted", TIME, WAVE)))  # fmt: skip
+    plane = Heatmap("h", "Z-width", Axis("damping", "N*m*s/rad"), Axis("stiffness", "N*m/rad"),
+                    Axis("energy", "J"), np.arange(4.0), np.arange(3.0), np.ones((3, 4)),
+                    (Series("bound", np.arange(4.0), np.arange(4.0)),))  # fmt: skip
+    return chart, plane
+
+
+def drawn():
+    lost = np.where(TIME > 0.9, np.nan, WAVE)
+    loop = Loop("brake 0.1 A", TIME, WAVE, np.cos(20.0 * TIME))
+    searched = [
+        Searched("K_m", "N*m/A", 0.1, 0.01, 1.0, True, (0.09, 0.12)),
+        Searched(NASTY, "1", 2.0, 1.0, 5.0, False, None, "only with others"),
+    ]
+    chart, plane = charts()
+    return {
+        "signals": signals(TIME, [
+            Panel("voltage_motor", "V", {"asked": WAVE, "applied": WAVE}, steps=True),
+            Panel(NASTY, "rad/s", {"": lost}),
+        ]),
+        "responses": responses(TIME, [
+            Response("omega", "rad/s", lost, {"identified": WAVE, "ARMAX": 1e9 * WAVE}, "fit 9 %"),
+            Response(NASTY, "1", WAVE, {"identified": WAVE}),
+        ]),
+        "convergence": convergence(np.array([0.5, 0.2, 0.11]), 300, 0.2),
+        "ranges": ranges(searched),
+        "intervals": intervals([Determined("A alpha0", 2.0, 1.5, 2.9), Determined("k", -1, -2, 0)]),
+        "correlation": correlation(["K_m", NASTY], np.array([[1.0, -0.9], [-0.9, 1.0]])),
+        "spectra": spectra(FREQUENCY, [Spectrum("torque", "N*m", np.abs(LAG) ** 2)]),
+        "bode": bode(FREQUENCY, Measured(LAG, np.abs(LAG), 0.1 * np.abs(LAG)),
+                     {"identified": LAG, "linear": 1.1 * LAG}, ("rad/s", "V")),
+        "loops": hysteresis_loops([loop, loop]),
+        "points": hysteresis_loops([loop], points=True),
+        "chart": draw(chart),
+        "plane": draw(plane),
+    }  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def figures():
+    before = dict(mpl.rcParams)
+    made = drawn()
+    assert dict(mpl.rcParams) == before
+    return made
+
+
+NAMES = [
+    "signals", "responses", "convergence", "ranges", "intervals", "correlation", "spectra",
+    "bode", "loops", "points", "chart", "plane",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_axis_has_a_name_and_a_unit(figures, name):
+    for axes in figures[name].axes:
+        ticks = [text.get_text() for text in axes.get_yticklabels()]
+        words = any(re.search("[A-Za-z]{2}|\\$", text) for text in ticks)  # rows with names
+        if not words:
+            assert re.search(r"\[.+\]", axes.get_ylabel()), axes.get_ylabel()
+        below = axes.xaxis.get_tick_params().get("labelbottom", True)
+        shown = any(text.get_text() for text in axes.get_xticklabels())
+        if below and shown and name != "correlation" and axes.get_label() != "<colorbar>":
+            assert re.search(r"\[.+\]", axes.get_xlabel()), axes.get_xlabel()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_column_wide_and_nothing_is_cut(figures, name):
+    figure = figures[name]
+    assert figure.get_size_inches()[0] == pytest.approx(3.5)
+    figure.draw_without_rendering()
+    needed = figure.get_tightbbox()
+    width, height = figure.get_size_inches()
+    assert needed.x0 > -0.01 and needed.y0 > -0.01
+    assert needed.x1 < width + 0.01 and needed.y1 < height + 0.01
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_labels_of_axes_do_not_overlap(figures, name):
+    figure = figures[name]
+    figure.draw_without_rendering()
+    boxes = [
+        label.get_window_extent()
+        for axes in figure.axes
+        for label in (axes.xaxis.label, axes.yaxis.label)
+        if label.get_text()
+    ]
+    for k, box in enumerate(boxes):
+        assert not any(box.overlaps(other) for other in boxes[k + 1 :])
+
+
+def test_files_are_of_their_kind_and_the_same_every_time(figures):
+    figure = figures["bode"]
+    assert style.render(figure, "png").startswith(b"\x89PNG")
+    assert style.render(figure, "pdf").startswith(b"%PDF")
+    vector = style.render(figure, "svg")
+    assert ET.fromstring(vector).tag.endswith("svg")
+    assert vector == style.render(figure, "svg")
+
+
+def test_a_long_record_is_thinned_without_losing_its_extremes():
+    rng = np.random.default_rng(0)
+    values = rng.normal(size=200_000)
+    values[[777, 123_456]] = 50.0, -60.0
+    values[1000:1400] = np.nan
+    x, y = style.thinned(np.arange(200_000.0), values)
+    assert len(x) < 10_000
+    assert np.all(np.diff(x) > 0)
+    assert (np.nanmax(y), np.nanmin(y)) == (50.0, -60.0)
+    assert (x[0], x[-1]) == (0.0, 199_999.0)
+
+
+def test_a_model_that_runs_away_does_not_flatten_what_was_measured(figures):
+    response, residual = figures["responses"].axes[:2]
+    assert response.get_ylim()[1] < 2.0
+    assert residual.get_ylim()[1] < 2.0
