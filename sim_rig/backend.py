@@ -7,10 +7,11 @@ import time
 from typing import Annotated, Literal
 
 import numpy as np
+import numpy.typing as npt
 from pydantic import Field
 
 from daq.config.base import Section
-from daq.config.units import Unit, Volts
+from daq.config.units import Part, Unit, Volts
 from daq.errors import DeviceError
 from daq.hal import (
     ANALOG_INPUTS,
@@ -49,6 +50,17 @@ class Imperfections(Section):
     bits: int = Field(16, ge=8, le=24, description="resolution of the converters")
 
 
+class Faults(Section):
+    """What goes wrong between host and device; the same seed, the same faults."""
+
+    late: Part = Field(
+        0.0, ge=0.0, le=1.0,
+        description="share of closed-loop commands that take a tick more to arrive: too late "
+        "where the experiment answers one tick ahead",
+    )  # fmt: skip
+    lost: Part = Field(0.0, ge=0.0, lt=1.0, description="share of samples that do not arrive")
+
+
 class Simulation(Section):
     """Options of the simulated rig."""
 
@@ -59,6 +71,7 @@ class Simulation(Section):
     )
     plant: Plant = Field(Plant(), description="parts of the actuator and what hangs on it")
     imperfections: Imperfections = Field(Imperfections(), description="of the sensing chain")
+    faults: Faults = Field(Faults(), description="of the connection")
     current_sense: Annotated[float, Unit("V/A")] = Field(
         2.0, gt=0.0, description="gain of both channels' current sensors"
     )
@@ -87,6 +100,9 @@ class SimulatedDevice:
         self._n_inputs = len(self._plant.inputs)
         self._single = np.zeros((2, self._n_inputs))
         self._steppers: dict[float, Stepper] = {}
+        # Draws of their own, so that the noise stays what it is without faults.
+        self._chance = np.random.default_rng([options.seed, 1])
+        self._late: list[tuple[int, FloatArray]] = []
         self._queue = CommandQueue()
         self._clock = 0.0  # device time since it was switched on [s], at the next tick
         self._origin = 0.0  # and at tick 0
@@ -129,6 +145,7 @@ class SimulatedDevice:
         self._waits_for_commands = mode is Mode.OPEN_LOOP
         self._origin = self._clock
         self._queue.restart(mode)
+        self._late = []
         self._running = True
         self._wall_start: float | None = None
 
@@ -136,7 +153,11 @@ class SimulatedDevice:
         """Queue commands; those for ticks already past are too late and dropped."""
         self._require_running()
         volts = np.ascontiguousarray(commands, dtype=np.float64)
-        self._queue.put(tick, self._converters.commands(volts, self._guard))
+        limited = self._converters.commands(volts, self._guard)
+        if self._delayed(tick):
+            self._late.append((tick, limited))
+        else:
+            self._queue.put(tick, limited)
         if self._wall_start is None:
             self._wall_start = time.perf_counter()
 
@@ -147,9 +168,18 @@ class SimulatedDevice:
     def receive(self) -> RawSamples:
         """Simulate what is queued, or one tick when nothing is."""
         self._require_running()
-        guarded = not self._queue.latched
-        applied, flags = self._queue.take(self._due())
-        return self._play(applied, flags, guarded)
+        while True:
+            guarded = not self._queue.latched
+            applied, flags = self._queue.take(self._due())
+            raw = self._play(applied, flags, guarded)
+            for tick, commands in self._late:
+                self._queue.put(tick, commands)
+            self._late = []
+            if self.options.faults.lost == 0.0:
+                return raw
+            kept = self._chance.random(len(raw.tick)) >= self.options.faults.lost
+            if kept.any():
+                return _rows(raw, kept)
 
     def stop(self) -> None:
         """End sampling."""
@@ -168,6 +198,13 @@ class SimulatedDevice:
     def _require_running(self) -> None:
         if not self._running:
             raise DeviceError("the simulated rig is not sampling; start it first")
+
+    def _delayed(self, tick: int) -> bool:
+        """Whether commands come too late; the first, before the clock runs, never do."""
+        share = self.options.faults.late
+        if share == 0.0 or self._waits_for_commands or tick == 0:
+            return False
+        return bool(self._chance.random() < share)
 
     def _make_converters(self) -> Converters:
         options, flaws = self.options, self.options.imperfections
@@ -260,3 +297,8 @@ class SimulatedDevice:
         first = self._noise_used
         self._noise_used += n
         return self._noise[first : self._noise_used]
+
+
+def _rows(raw: RawSamples, kept: npt.NDArray[np.bool_]) -> RawSamples:
+    """Some rows of a block of samples."""
+    return RawSamples(**{name: values[kept] for name, values in vars(raw).items()})

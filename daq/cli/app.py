@@ -100,12 +100,16 @@ def run(
     ] = False,
     model: ModelName = None,
     config: ConfigFile = None,
+    realtime: Annotated[
+        bool,
+        typer.Option("--realtime", help="Keep a simulated rig at the pace of the clock."),
+    ] = False,
     json: AsJson = False,
 ) -> None:
     """Run an experiment on a rig and log every sample."""
     from daq.cli.running import run_command
 
-    run_command(experiment, rig, out, identify, model, config, json)
+    run_command(experiment, rig, out, identify, model, config, realtime, json)
 
 
 @app.command(epilog="Example:  rig check prbs.yaml --rig my_rig.yaml")
@@ -283,12 +287,24 @@ def replay(
         ),
     ] = None,
     config: ConfigFile = None,
+    figure: Annotated[
+        Path | None,
+        typer.Option("--figure", metavar="FILE.png|pdf|svg", help="Default beside the log."),
+    ] = None,
+    fail_under: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--fail-under",
+            metavar="OUTPUT=PERCENT",
+            help="Exit status 1 when its fit is below; may be repeated.",
+        ),
+    ] = None,
     json: AsJson = False,
 ) -> None:
     """Simulate a log's applied commands and measured load, and say how close the outputs are."""
     from daq.cli.replaying import replay_command
 
-    replay_command(log, rig, parameters, config, json)
+    replay_command(log, rig, parameters, config, figure, fail_under or [], json)
 
 
 @app.command(epilog="Example:  rig models actuator --json")

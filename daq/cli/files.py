@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.resources
 import inspect
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +23,8 @@ from daq.experiment import Experiment, Plan
 from daq.hal import Device
 from daq.plugins import load_plugin
 from daq.run import plan
+
+DEFAULT_RIG = "simulated.yaml"
 
 
 @dataclass(frozen=True)
@@ -159,9 +163,16 @@ def _is_protocol(found: Any) -> bool:
     return is_class and not inspect.isabstract(found)
 
 
-def load_rig(name: str) -> tuple[RigConfig, Any]:
-    """Read and check a rig file; its configuration and the backend's device, not yet open."""
+def load_rig(name: str, options: Mapping[str, Any] | None = None) -> tuple[RigConfig, Any]:
+    """Read and check a rig file; its configuration and the backend's device, not yet open.
+
+    options: the backend's own settings that take precedence over the file's.
+    """
     file = yaml_file.load(find(name, "sim_rig"))
+    if options:
+        file = dataclasses.replace(
+            file, content=yaml_file.merge(file.content, {"options": options})
+        )
     backend_name = file.content.get("backend", RigConfig.model_fields["backend"].default)
     if not isinstance(backend_name, str):
         checking.validate(file, RigConfig)

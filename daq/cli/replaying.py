@@ -3,61 +3,187 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from daq import capture
 from daq.cli import console, datasets
 from daq.cli.datasets import Mapping
-from daq.cli.files import load_rig
+from daq.cli.files import DEFAULT_RIG, load_rig
 from daq.cli.modelling import DEFAULT_MODEL, find_model
 from daq.cli.preparing import as_told
 from daq.cli.reporting import print_metrics
 from daq.config import checking, yaml_file
 from daq.config.identification import IdentificationConfig, Signals
 from daq.config.yaml_file import suggestion
-from daq.errors import ConfigError
-from sysid import BatchSimulator, ModelError, evaluate, free_run
+from daq.errors import ConfigError, RunError
+from daq.hal import FloatArray
+from sysid import BatchSimulator, Metrics, ModelError, evaluate, free_run
 from sysid.model import ProcessModel
 
 
-def replay_command(
-    log: Path, rig: str, parameters: Path | None, config: Path | None, as_json: bool
-) -> None:
-    """Simulate what the log's inputs do to a model, and compare with what was measured."""
-    if parameters is not None:
-        model, values = read_parameters(parameters)
-        source = str(parameters)
-    else:
-        model, values = _rig_truth(rig)
-        source = rig
-    mapping = _mapping(config, model)
-    loaded = datasets.load(log, model, mapping)
-    if loaded.warning is not None:
-        console.report_note(loaded.warning)
+@dataclass(frozen=True)
+class Replay:
+    """A log's inputs through a model, beside what was measured.
+
+    time: (n,) [s]. measured, simulated: (n, n_outputs) in the outputs' units. source: whose
+    parameters. warning: how a run that did not complete ended.
+    """
+
+    path: Path
+    model: ProcessModel
+    source: str
+    time: FloatArray
+    measured: FloatArray
+    simulated: FloatArray
+    metrics: Metrics
+    warning: str | None
+
+    @property
+    def fit(self) -> dict[str, float]:
+        """Fit of each output [%]: 100 is perfect, 0 no better than its mean."""
+        return self._named(self.metrics.fit)
+
+    @property
+    def rmse(self) -> dict[str, float]:
+        """Root mean squared error of each output in parts of its largest measured value."""
+        return self._named(self.metrics.rmse)
+
+    @property
+    def msd(self) -> dict[str, float]:
+        """Mean signed deviation of each output in parts of its largest measured value."""
+        return self._named(self.metrics.msd)
+
+    def _named(self, values: FloatArray) -> dict[str, float]:
+        return dict(zip(self.model.output_names, values.tolist(), strict=True))
+
+
+def replay(
+    log: Path, rig: str = DEFAULT_RIG, parameters: Path | None = None, config: Path | None = None
+) -> Replay:
+    """Simulate what a log's applied commands and measured load do to a model.
+
+    parameters: of an identification; default those of the simulated rig. config: names the
+    columns of a foreign log. Raises ConfigError.
+    """
+    model, values = read_parameters(parameters) if parameters is not None else _rig_truth(rig)
+    loaded = datasets.load(log, model, _mapping(config, model))
+    record = loaded.dataset
     try:
-        simulated = free_run(BatchSimulator(model), model.vector(values), loaded.dataset)
+        simulated = free_run(BatchSimulator(model), model.vector(values), record)
     except ModelError as error:
         raise ConfigError(str(error)) from None
-    metrics = evaluate(loaded.dataset.outputs, simulated)
-    if as_json:
-        console.print_json(
-            {
-                "log": str(loaded.path),
-                "model": model.name,
-                "parameters": source,
-                "outputs": {
-                    name: {
-                        "rmse": metrics.rmse[j],
-                        "msd": metrics.msd[j],
-                        "fit_percent": metrics.fit[j],
-                    }
-                    for j, name in enumerate(model.output_names)
-                },
-            }
+    return Replay(
+        loaded.path,
+        model,
+        rig if parameters is None else str(parameters),
+        np.arange(record.n_samples, dtype=np.float64) * record.dt,
+        record.outputs,
+        simulated,
+        evaluate(record.outputs, simulated),
+        loaded.warning,
+    )
+
+
+def replay_command(
+    log: Path,
+    rig: str,
+    parameters: Path | None,
+    config: Path | None,
+    figure: Path | None,
+    fail_under: list[str],
+    as_json: bool,
+) -> None:
+    """Replay a log, print metrics, draw both, and fail where a fit is below its bound."""
+    bounds = _bounds(fail_under)
+    found = replay(log, rig, parameters, config)
+    unknown = [name for name in bounds if name not in found.fit]
+    if unknown:
+        raise ConfigError(
+            f"--fail-under {unknown[0]}: model {found.model.name} has no such output; "
+            f"{suggestion(unknown[0], found.model.output_names)}"
         )
-        return
-    console.print_line(f"{loaded.path} through {model.name} with the parameters of {source}")
-    print_metrics(model, metrics, [], "replay")
+    if found.warning is not None:
+        console.report_note(found.warning)
+    drawn = _draw(found, figure)
+    # A fit that is not a number (the simulation failed) is under any bound.
+    missed = {name: least for name, least in bounds.items() if not found.fit[name] >= least}
+    if as_json:
+        console.print_json(_document(found, drawn, bounds, missed))
+    else:
+        console.print_line(
+            f"{found.path} through {found.model.name} with the parameters of {found.source}"
+        )
+        print_metrics(found.model, found.metrics, [], "replay")
+        if drawn is not None:
+            console.print_line(f"Figure: {drawn}")
+    if missed:
+        raise RunError(
+            f"{found.path}: "
+            + "; ".join(
+                f"fit of {n} is {found.fit[n]:.1f} %, below {b:g} %" for n, b in missed.items()
+            )
+        )
+
+
+def _document(
+    found: Replay, drawn: Path | None, bounds: dict[str, float], missed: dict[str, float]
+) -> dict[str, Any]:
+    return {
+        "log": str(found.path),
+        "model": found.model.name,
+        "parameters": found.source,
+        "outputs": {
+            name: {
+                "rmse": found.rmse[name],
+                "msd": found.msd[name],
+                "fit_percent": found.fit[name],
+            }
+            for name in found.model.output_names
+        },
+        "figure": None if drawn is None else str(drawn),
+        "fail_under": bounds,
+        "passed": not missed,
+    }
+
+
+def _bounds(texts: list[str]) -> dict[str, float]:
+    """``omega=80`` as the least fit [%] of an output."""
+    bounds = {}
+    for text in texts:
+        name, _, value = text.partition("=")
+        try:
+            bounds[name.strip()] = float(value)
+        except ValueError:
+            raise ConfigError(
+                f"--fail-under {text}: write OUTPUT=PERCENT, for example omega=80"
+            ) from None
+    return bounds
+
+
+def _draw(found: Replay, path: Path | None) -> Path | None:
+    """Measured and simulated outputs in a figure; without a path beside the log, if that can be."""
+    from daq.figures.comparison import measured_and_simulated
+
+    chosen = path or found.path.with_name(
+        "replay.png" if found.path.name == capture.LOG_NAME else f"{found.path.stem}-replay.png"
+    )
+    drawn = measured_and_simulated(
+        found.time, found.measured, found.simulated,
+        [(output.name, output.unit) for output in found.model.outputs], found.metrics.fit,
+    )  # fmt: skip
+    try:
+        drawn.savefig(chosen)
+    except (OSError, ValueError) as error:
+        reason = f"{chosen}: cannot be drawn: {error}; choose another with --figure FILE.png"
+        if path is not None:
+            raise ConfigError(reason) from None
+        console.report_note(reason)
+        return None
+    return chosen
 
 
 def read_parameters(path: Path) -> tuple[ProcessModel, dict[str, float]]:

@@ -10,13 +10,11 @@ import numpy as np
 
 from daq.cli import console
 from daq.cli.analysing import analyse, as_document, show_findings
-from daq.cli.files import LoadedExperiment, load_experiment, load_rig
+from daq.cli.files import DEFAULT_RIG, LoadedExperiment, load_experiment, load_rig
 from daq.config.rig import RigConfig
 from daq.experiment import Plan
 from daq.hal import CHANNELS, Device, Phase
 from daq.run import PhaseProgress, RunResult, run_experiment
-
-DEFAULT_RIG = "simulated.yaml"
 
 _TITLES = {
     Phase.CALIBRATION: "Offset calibration",
@@ -32,11 +30,12 @@ def run_command(
     identify: bool,
     model: str | None,
     config: Path | None,
+    realtime: bool,
     as_json: bool,
 ) -> None:
     """Run an experiment; with ``identify`` record a validation run and identify the model."""
     loaded = load_experiment(experiment)
-    rig_config, device = load_rig(rig)
+    rig_config, device = _at_pace(rig) if realtime else load_rig(rig)
     loaded.plan(rig_config)
     validation = loaded.validation()
     if validation is not None:
@@ -74,6 +73,15 @@ def run_command(
         console.print_json(report)
         return
     _print_end(result, check, identify)
+
+
+def _at_pace(rig: str) -> tuple[RigConfig, Device]:
+    """A simulated rig that keeps pace with the clock; any other does so anyway."""
+    config, device = load_rig(rig)
+    if "time" in device.Options.model_fields:
+        return load_rig(rig, {"time": "real"})
+    console.report_note(f"{rig}: its own clock paces it; --realtime changes nothing")
+    return config, device
 
 
 def check_command(experiment: str, rig: str, as_json: bool) -> None:

@@ -1,0 +1,175 @@
+"""``rig replay`` as a gate, its figure, and the pytest plugin that labs use."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+
+from sim_rig.plant import Plant
+from tests.daq.support import environment, forked_rig, only_capture, write_experiment, write_rig
+
+DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "testing.md"
+
+
+@pytest.fixture(scope="module")
+def rig():
+    with forked_rig() as run:
+        yield lambda *args, cwd: run(args, cwd)
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory, rig):
+    root = tmp_path_factory.mktemp("captured")
+    write_experiment(
+        root / "my_prbs.yaml", duration=1.25, homing={"turns": 5}, calibration={"samples": 3200}
+    )
+    assert rig("run", "my_prbs.yaml", cwd=root).returncode == 0
+    return only_capture(root)
+
+
+def test_a_fit_below_its_bound_ends_with_status_1(rig, capture, tmp_path):
+    asked = ["--fail-under", "omega=20", "--fail-under", "current_brake=99.9"]
+    result = rig("replay", capture, *asked, cwd=tmp_path)
+    assert result.returncode == 1
+    assert re.search(r"fit of current_brake is \d\d\.\d %, below 99.9 %", result.stderr)
+    assert "omega" not in result.stderr
+    assert "current_motor" in result.stdout, "the metrics are shown all the same"
+
+
+def test_a_gate_that_is_met_passes_and_says_so(rig, capture, tmp_path):
+    figure = tmp_path / "both.pdf"
+    result = rig("replay", capture, "--fail-under", "omega=20", "--figure", figure, "--json",
+                 cwd=tmp_path)  # fmt: skip
+    assert result.returncode == 0, result.stderr
+    document = json.loads(result.stdout)
+    assert document["passed"] is True
+    assert document["fail_under"] == {"omega": 20.0}
+    assert document["outputs"]["omega"]["fit_percent"] > 20.0
+    assert document["figure"] == str(figure)
+    assert figure.read_bytes().startswith(b"%PDF")
+
+
+def test_the_figure_is_written_beside_the_log(rig, capture, tmp_path):
+    assert rig("replay", capture, cwd=tmp_path).returncode == 0
+    assert (capture / "replay.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--fail-under", "omga=80"], "did you mean 'omega'"),
+        (["--fail-under", "omega"], "write OUTPUT=PERCENT"),
+        (["--fail-under", "omega=high"], "write OUTPUT=PERCENT"),
+        (["--figure", "absent/figure.png"], "choose another with --figure"),
+        (["--figure", "figure.docx"], "choose another with --figure"),
+    ],
+)
+def test_a_mistake_is_answered_with_the_cure(rig, capture, tmp_path, options, message):
+    result = rig("replay", capture, *options, cwd=tmp_path)
+    assert result.returncode == 2
+    assert message in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+# --- faults of the connection -----------------------------------------------------------------
+
+
+HOLD = '''
+import numpy as np
+from daq.experiment import Answer, ClosedLoop, Plan
+
+
+class Count(ClosedLoop):
+    """A command that tells which sample it answers."""
+
+    def plan(self):
+        return Plan(800, np.zeros(2), np.array([1.0, 0.0]))
+
+    def controller(self):
+        return self
+
+    def answer(self, sample):
+        return Answer(1e-3 * sample.tick, 0.0)
+'''
+
+
+def played(rig, tmp_path, **faults):
+    (tmp_path / "count.py").write_text(HOLD)
+    content = {"protocol": "count.py:Count", "calibration": {"samples": 16}}
+    (tmp_path / "count.yaml").write_text(yaml.safe_dump(content))
+    write_rig(tmp_path / "rig.yaml", options={"faults": faults})
+    assert rig("run", "count.yaml", "--rig", "rig.yaml", cwd=tmp_path).returncode == 0
+    return pd.read_csv(only_capture(tmp_path) / "log.csv")
+
+
+def test_late_commands_are_held_and_flagged_and_no_other_is_moved(rig, tmp_path):
+    log = played(rig, tmp_path, late=0.05)
+    held = (log["flags"] & 2) != 0
+    assert 20 < held.sum() < 65  # of 800, a share of 5 % give or take four deviations
+    asked, applied = log["cmd_voltage_motor"], log["applied_voltage_motor"]
+    np.testing.assert_allclose(asked[1:], 1e-3 * np.arange(799))
+    np.testing.assert_allclose(applied[~held], asked[~held], atol=1e-3)  # the converter's step
+    before = applied.shift(1)
+    np.testing.assert_array_equal(applied[held], before[held])
+
+
+def test_lost_samples_leave_a_gap_that_is_flagged(rig, tmp_path):
+    log = played(rig, tmp_path, lost=0.05)
+    gaps = np.diff(log["tick"], prepend=-1) > 1
+    assert 20 < 800 - len(log) < 65
+    np.testing.assert_array_equal((log["flags"] & 4) != 0, gaps)
+
+
+# --- the plugin -------------------------------------------------------------------------------
+
+
+def run_pytest(folder, *options):
+    return subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *options],
+        cwd=folder, env=environment(), capture_output=True, text=True, timeout=300, check=False,
+    )  # fmt: skip
+
+
+@pytest.fixture
+def lab(tmp_path, capture):
+    """A lab's folder with the example of the documentation."""
+    (example,) = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(), re.DOTALL)
+    (tmp_path / "test_my_rig.py").write_text(example)
+    write_experiment(tmp_path / "my_prbs.yaml")
+    (tmp_path / "log.csv").write_bytes((capture / "log.csv").read_bytes())
+    truth = Plant().process_model()
+    values = dict(zip(truth.parameter_names, truth.nominal.tolist(), strict=True))
+    (tmp_path / "parameters.yaml").write_text(
+        yaml.safe_dump({"model": "actuator", "parameters": values})
+    )
+    return tmp_path
+
+
+def test_the_documented_example_passes(lab):
+    result = run_pytest(lab)
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert "2 passed" in result.stdout
+
+
+def test_a_rig_that_is_another_fails_and_the_seed_is_told(lab):
+    values = yaml.safe_load((lab / "parameters.yaml").read_text())
+    values["parameters"]["K_m"] *= 2.0
+    (lab / "parameters.yaml").write_text(yaml.safe_dump(values))
+    (lab / "test_my_rig.py").write_text(
+        (lab / "test_my_rig.py").read_text()
+        + "\n\ndef test_that_fails(simulated_rig):\n"
+        + "    run = simulated_rig.run('my_prbs.yaml')\n"
+        + "    assert run.findings is not None\n"
+    )
+    result = run_pytest(lab, "--rig-seed", "5")
+    assert result.returncode == 1
+    assert "2 failed, 1 passed" in result.stdout
+    assert "--rig-seed 5" in result.stdout
