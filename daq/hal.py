@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import enum
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -131,6 +131,14 @@ class DeviceInfo:
     queue: int
     volts_in: tuple[float, float]
     virtual_time: bool = False
+
+
+@runtime_checkable
+class Reporting(Protocol):
+    """A device that has more to say for the record of a run than its name."""
+
+    def report(self) -> dict[str, Any]:
+        """Facts about device and connection that JSON can hold; at any time, also when closed."""
 
 
 class Device(Protocol):

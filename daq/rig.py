@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import TracebackType
+from typing import Any
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from daq.hal import (
     Mode,
     Phase,
     RawSamples,
+    Reporting,
     Samples,
 )
 
@@ -147,6 +149,10 @@ class Rig:
     def safe(self) -> None:
         """Zero both outputs now; never raises."""
         self._device.safe()
+
+    def report(self) -> dict[str, Any]:
+        """What the device has to say for the record of a run; nothing for most."""
+        return self._device.report() if isinstance(self._device, Reporting) else {}
 
     def close(self) -> None:
         """Zero the outputs and disconnect."""

@@ -31,6 +31,14 @@ RigName = Annotated[
     str,
     typer.Option("--rig", metavar="RIG.yaml", help="Rig file; default the simulated rig."),
 ]
+PortName = Annotated[
+    str | None,
+    typer.Option(
+        "--port",
+        metavar="PORT",
+        help="Port of a serial rig in place of its file's; see rig ports.",
+    ),
+]
 Logs = Annotated[
     list[Path],
     typer.Argument(metavar="RUN_OR_CSV...", help="Capture folders, CSV logs, or folders of them."),
@@ -89,6 +97,7 @@ AsJson = Annotated[bool, typer.Option("--json", help="One JSON document on stand
 def run(
     experiment: ExperimentName,
     rig: RigName = "simulated.yaml",
+    port: PortName = None,
     out: Annotated[
         Path, typer.Option("--out", metavar="DIR", help="Where capture folders go.")
     ] = Path("runs"),
@@ -109,19 +118,20 @@ def run(
     """Run an experiment on a rig and log every sample."""
     from daq.cli.running import run_command
 
-    run_command(experiment, rig, out, identify, model, config, realtime, json)
+    run_command(experiment, rig, port, out, identify, model, config, realtime, json)
 
 
 @app.command(epilog="Example:  rig check prbs.yaml --rig my_rig.yaml")
 def check(
     experiment: ExperimentName,
     rig: RigName = "simulated.yaml",
+    port: PortName = None,
     json: AsJson = False,
 ) -> None:
     """Validate an experiment against a rig's limits, without energising anything."""
     from daq.cli.running import check_command
 
-    check_command(experiment, rig, json)
+    check_command(experiment, rig, port, json)
 
 
 @app.command(epilog="Example:  rig analyse runs/20260101T120000Z-constant_velocity")
@@ -319,3 +329,41 @@ def models(
     from daq.cli.modelling import models_command
 
     models_command(name, json)
+
+
+@app.command(epilog="Example:  rig emulate --fault drop=0.01 --fault disconnect@run+0.5")
+def emulate(
+    rig: RigName = "simulated.yaml",
+    link: Annotated[
+        Path | None,
+        typer.Option("--link", metavar="PATH", help="A name for the pty that stays the same."),
+    ] = None,
+    tcp: Annotated[
+        int | None,
+        typer.Option(
+            "--tcp",
+            metavar="NUMBER",
+            help="Serve a loopback TCP port in place of a pty; 0 for any. Default on Windows.",
+        ),
+    ] = None,
+    fault: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--fault",
+            metavar="NAME[=VALUE][@PHASE[+SECONDS]]",
+            help="What goes wrong; may be repeated. 'help' lists the faults.",
+        ),
+    ] = None,
+    drift: Annotated[
+        float, typer.Option("--drift", metavar="PPM", help="Of the device's clock.")
+    ] = 0.0,
+    seed: Annotated[int, typer.Option("--seed", help="Of the faults' chances.")] = 0,
+    json: AsJson = False,
+) -> None:
+    """Put the simulated rig behind the serial protocol, in real time, until Ctrl-C.
+
+    Prints the port that rig run --rig serial.yaml --port takes.
+    """
+    from daq.cli.emulating import emulate_command
+
+    emulate_command(rig, link, tcp, fault or [], drift, seed, json)

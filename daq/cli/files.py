@@ -25,6 +25,7 @@ from daq.plugins import load_plugin
 from daq.run import plan
 
 DEFAULT_RIG = "simulated.yaml"
+_RIG_FILES = ("sim_rig", "daq.serial")  # packages that ship some
 
 
 @dataclass(frozen=True)
@@ -60,21 +61,23 @@ def _validation_file(file: YamlFile) -> YamlFile:
     return YamlFile(file.path, content, {**file.places, **moved, (): file.place(())})
 
 
-def find(name: str, package: str) -> Path:
-    """A file in the working folder, or the one shipped with a package under a bare name."""
+def find(name: str, *packages: str) -> Path:
+    """A file in the working folder, or the one shipped with the packages under a bare name."""
     path = Path(name)
     if path.exists():
         return path
     candidates = [name] if path.suffix else [name, f"{name}.yaml"]
-    shipped = importlib.resources.files(package)
+    shipped = [importlib.resources.files(package) for package in packages]
     if path.name == name:
         for candidate in candidates:
             if Path(candidate).exists():
                 return Path(candidate)
-            resource = shipped / candidate
-            if resource.is_file():
-                return Path(str(resource))
-    known = sorted(item.name for item in shipped.iterdir() if item.name.endswith(".yaml"))
+            for folder in shipped:
+                if (folder / candidate).is_file():
+                    return Path(str(folder / candidate))
+    known = sorted(
+        item.name for folder in shipped for item in folder.iterdir() if item.name.endswith(".yaml")
+    )
     raise ConfigError(
         f"{name}: there is no such file; check its name, or use a shipped one: {', '.join(known)}"
     )
@@ -168,7 +171,7 @@ def load_rig(name: str, options: Mapping[str, Any] | None = None) -> tuple[RigCo
 
     options: the backend's own settings that take precedence over the file's.
     """
-    file = yaml_file.load(find(name, "sim_rig"))
+    file = yaml_file.load(find(name, *_RIG_FILES))
     if options:
         file = dataclasses.replace(
             file, content=yaml_file.merge(file.content, {"options": options})

@@ -12,8 +12,9 @@ from daq.cli import console
 from daq.cli.analysing import analyse, as_document, show_findings
 from daq.cli.files import DEFAULT_RIG, LoadedExperiment, load_experiment, load_rig
 from daq.config.rig import RigConfig
+from daq.errors import ConfigError
 from daq.experiment import Plan
-from daq.hal import CHANNELS, Device, Phase
+from daq.hal import CHANNELS, Device, Phase, Reporting
 from daq.run import PhaseProgress, RunResult, run_experiment
 
 _TITLES = {
@@ -26,6 +27,7 @@ _TITLES = {
 def run_command(
     experiment: str,
     rig: str,
+    port: str | None,
     out: Path,
     identify: bool,
     model: str | None,
@@ -35,7 +37,7 @@ def run_command(
 ) -> None:
     """Run an experiment; with ``identify`` record a validation run and identify the model."""
     loaded = load_experiment(experiment)
-    rig_config, device = _at_pace(rig) if realtime else load_rig(rig)
+    rig_config, device = _load(rig, port, realtime)
     loaded.plan(rig_config)
     validation = loaded.validation()
     if validation is not None:
@@ -75,19 +77,27 @@ def run_command(
     _print_end(result, check, identify)
 
 
-def _at_pace(rig: str) -> tuple[RigConfig, Device]:
-    """A simulated rig that keeps pace with the clock; any other does so anyway."""
+def _load(rig: str, port: str | None, realtime: bool = False) -> tuple[RigConfig, Device]:
+    """A rig on a port in place of its file's, or simulated at the pace of the clock."""
     config, device = load_rig(rig)
-    if "time" in device.Options.model_fields:
-        return load_rig(rig, {"time": "real"})
-    console.report_note(f"{rig}: its own clock paces it; --realtime changes nothing")
-    return config, device
+    options = type(config.options).model_fields
+    if port is not None and "port" not in options:
+        raise ConfigError(
+            f"--port {port}: the backend {config.backend!r} of {rig} has no port; name the rig "
+            "file of one that has, such as --rig serial.yaml"
+        )
+    if realtime and "time" not in options:
+        console.report_note(f"{rig}: its own clock paces it; --realtime changes nothing")
+        realtime = False
+    asked = {"port": port, "time": "real" if realtime else None}
+    changes = {key: value for key, value in asked.items() if value is not None}
+    return load_rig(rig, changes) if changes else (config, device)
 
 
-def check_command(experiment: str, rig: str, as_json: bool) -> None:
+def check_command(experiment: str, rig: str, port: str | None, as_json: bool) -> None:
     """Validate an experiment and say what it would do."""
     loaded = load_experiment(experiment)
-    rig_config, _device = load_rig(rig)
+    rig_config, _device = _load(rig, port)
     planned = loaded.plan(rig_config)
     validation = loaded.validation()
     if validation is not None:
@@ -140,6 +150,7 @@ def check_command(experiment: str, rig: str, as_json: bool) -> None:
         "It has no 'validation' section: rig run --identify will identify without validation."
     )  # fmt: skip
     on = f" --rig {rig}" if rig != DEFAULT_RIG else ""
+    on += f" --port {port}" if port is not None else ""
     console.print_line(f"Next: rig run {experiment}{on} --identify")
 
 
@@ -172,7 +183,11 @@ def _run(
                 _TITLES[step.phase], step.done, step.total, f"{done}/{step.total:g} {step.unit}"
             )
 
-        return run_experiment(loaded.experiment, loaded.name, rig, device, out, watch)
+        result = run_experiment(loaded.experiment, loaded.name, rig, device, out, watch)
+    if isinstance(device, Reporting) and not as_json:
+        for warning in device.report().get("warnings", []):
+            console.report_note(warning)
+    return result
 
 
 def _summary(result: RunResult) -> dict[str, Any]:

@@ -1,0 +1,497 @@
+"""A rig on a serial port, as a ``daq.hal.Device``."""
+
+from __future__ import annotations
+
+import contextlib
+import getpass
+import os
+import platform
+import threading
+import time
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+
+from daq.config.base import Section
+from daq.errors import DeviceError
+from daq.hal import (
+    ANALOG_INPUTS,
+    CHANNELS,
+    DeviceInfo,
+    FloatArray,
+    Guard,
+    IntArray,
+    Mode,
+    Phase,
+    RawSamples,
+)
+from daq.serial import messages
+from daq.serial.host import HostMachine, refusal
+from daq.serial.link import Link, open_link
+from daq.serial.messages import Block, Codes, LoopMode, Reply, Result, Start, Type, Welcome
+from daq.serial.priority import lower_thread, raise_thread
+
+HANDSHAKE = 2.0
+"""Longest time that a device may take to say who it is [s]: a board resets in less."""
+
+_PINGS = 6  # round trips measured before a run
+_PING_PATIENCE = 0.5  # s for all of them
+_SAFE_PATIENCE = 0.25  # s to hear that the outputs are zero
+_PATIENCE = 1.0  # s without a call from the run until the watchdog is no longer fed
+_RATE_TOLERANCE = 5e-5  # as good as a quartz
+_N_IN, _N_OUT = len(ANALOG_INPUTS), len(CHANNELS)
+
+
+class SerialOptions(Section):
+    """Options of the serial backend."""
+
+    port: str = Field(
+        "", description="device name (/dev/serial/by-id/..., COM3), or a URL such as socket://"
+    )
+    baud: int = Field(
+        2_000_000, ge=1200, le=20_000_000, description="of a UART; USB does not care [bit/s]"
+    )
+    watchdog: float = Field(
+        0.1,
+        ge=0.01,
+        le=10.0,
+        description="the device zeroes its outputs when it hears nothing for so long [s]",
+    )
+
+
+class SerialDevice:
+    """A device on a port (see ``daq.hal.Device`` for the methods).
+
+    A thread reads the port and feeds the device's watchdog, but only while the program calls:
+    one that hangs is no better than one that is dead.
+    """
+
+    Options = SerialOptions
+
+    def __init__(self, options: SerialOptions) -> None:
+        self.options = options
+        self._link: Link | None = None
+        self._machine: HostMachine | None = None
+        self._welcome: Welcome | None = None
+        self._thread: threading.Thread | None = None
+        self._changed = threading.Condition()
+        self._run = 0
+        self._mode = Mode.CLOSED_LOOP
+        self._started = self._gone = self._closing = False
+        self._called = 0.0
+        self._tripped_before = self._realtime = False
+        self._warnings: list[str] = []
+        self._record: dict[str, Any] = {}
+
+    # --- daq.hal.Device -----------------------------------------------------------------------
+
+    def open(self) -> DeviceInfo:
+        """Connect, agree on the protocol, and clear what an earlier run left behind."""
+        if self._link is not None:
+            self.close()
+        if not self.options.port:
+            raise DeviceError(
+                "no port is named; write options.port in the rig file or give --port. 'rig ports' "
+                "lists the ports that there are"
+            )
+        self._link = open_link(self.options.port, self.options.baud)
+        session = int.from_bytes(os.urandom(2), "little") or 1
+        self._machine = HostMachine(session, f"{_user()}@{platform.node()}")
+        self._closing = self._started = False
+        self._thread = threading.Thread(target=self._serve, name="serial rig", daemon=True)
+        self._thread.start()
+        try:
+            self._welcome = self._shake_hands()
+            self._measure_delay()
+            self._tripped_before = self._welcome.latch is messages.Latch.WATCHDOG
+            self._ask(Type.CLEAR)
+        except BaseException:
+            self._disconnect()
+            raise
+        # This thread as well: the other cannot run while a waiting one holds the interpreter.
+        self._realtime = raise_thread()
+        low, high = self._input_range()
+        return DeviceInfo(
+            name=self._name(),
+            max_rate=self._welcome.max_rate,
+            queue=self._welcome.queue,
+            volts_in=(low, high),
+        )
+
+    def announce(self, phase: Phase, turns: float = 0.0) -> None:
+        """Tell the device which phase begins; an emulator's user winds the handle then."""
+        self._ask(Type.ANNOUNCE, messages.pack_announce(list(Phase).index(phase), turns))
+
+    def start(self, sample_rate: float, mode: Mode, guard: Guard) -> None:
+        """Arm the device. Its clock starts with the first ``receive``, what was sent preloaded."""
+        machine, welcome = self._opened()
+        self._run = (self._run + 1) & 0xFFFF
+        self._mode, self._gone = mode, False
+        start = self._start_message(sample_rate, mode, guard, welcome)
+        self._limits = np.array([start.command_low, start.command_high])
+        self._guard = guard
+        with self._changed:
+            self._called = time.monotonic()
+            machine.start(start, self._called)
+            self._started = True
+            self._write(machine)
+        self._await_reply(machine)
+
+    def send(self, tick: int, commands: FloatArray) -> None:
+        """Queue commands (n, 2) [V]; what the device has no room for yet waits here."""
+        machine = self._sampling()
+        codes = self._codes(np.asarray(commands, dtype=np.float64))
+        with self._changed:
+            self._called = time.monotonic()
+            machine.send(tick, codes, self._called)
+            self._write(machine)
+
+    def room(self) -> int:
+        """Commands that may be sent now."""
+        machine = self._sampling()
+        with self._changed:
+            self._called = time.monotonic()
+            return machine.room
+
+    def receive(self) -> RawSamples:
+        """Wait for samples; all that have come."""
+        machine = self._sampling()
+        if not self._gone:
+            self._go(machine)
+        with self._changed:
+            while not machine.blocks:
+                if machine.failure is not None:
+                    raise machine.failure
+                self._called = time.monotonic()
+                self._changed.wait(0.1)
+            self._called = time.monotonic()
+            blocks = list(machine.blocks)
+            machine.blocks.clear()
+        return self._raw(blocks)
+
+    def stop(self) -> None:
+        """End sampling; outputs are zero."""
+        machine, _ = self._opened()
+        with self._changed:
+            self._started = False
+            self._record = machine.describe()
+            machine.stop(time.monotonic())
+            self._write(machine)
+        self._await_reply(machine)
+
+    def safe(self) -> None:
+        """Zero both outputs now. Where the device cannot be reached, its watchdog does it."""
+        machine = self._machine
+        if machine is None or self._link is None:
+            return
+        with contextlib.suppress(DeviceError):
+            with self._changed:
+                # Said even to a device that seems lost: it may still hear.
+                machine.ask(Type.SAFE, b"", time.monotonic(), _SAFE_PATIENCE)
+                self._write(machine)
+            self._await_reply(machine)
+
+    def close(self) -> None:
+        """Zero the outputs and disconnect."""
+        if self._machine is None or self._link is None:
+            return
+        self.safe()
+        if self._started:
+            with contextlib.suppress(DeviceError):
+                self.stop()
+        self._disconnect()
+
+    def report(self) -> dict[str, Any]:
+        """What a run's record should say of device and connection."""
+        if self._welcome is None:
+            return {}
+        if self._machine is not None and self._started:
+            with self._changed:
+                self._record = self._machine.describe()
+        return {
+            "port": self.options.port,
+            "device": self._welcome.device,
+            "firmware": self._welcome.firmware,
+            "serial_number": self._welcome.serial,
+            "protocol_version": self._welcome.version,
+            "watchdog_tripped_before": self._tripped_before,
+            "real_time_scheduling": self._realtime,
+            "warnings": list(self._warnings),
+            **self._record,
+        }
+
+    # --- opening ------------------------------------------------------------------------------
+
+    def _shake_hands(self) -> Welcome:
+        machine, port = self._connected(), self.options.port
+        with self._changed:
+            machine.hello(time.monotonic(), HANDSHAKE)
+            self._write(machine)
+            while machine.waiting and machine.failure is None:
+                self._changed.wait(0.1)
+        if machine.failure is not None:
+            raise machine.failure
+        if machine.other_version is not None:
+            raise DeviceError(_version_mismatch(port, machine.other_version))
+        if machine.welcome is None:
+            raise DeviceError(_no_answer(port, machine))
+        names = tuple(channel.name for channel in machine.welcome.channels)
+        if names != messages.CHANNEL_NAMES:
+            raise DeviceError(
+                f"{port}: {machine.welcome.device} has the channels {', '.join(names) or 'none'}, "
+                f"not {', '.join(messages.CHANNEL_NAMES)}; its firmware is for another rig"
+            )
+        self._warnings = list(self._link.warnings) if self._link else []
+        return machine.welcome
+
+    def _measure_delay(self) -> None:
+        """Round trips before anything moves; a line too slow for the watchdog is refused."""
+        machine = self._connected()
+        deadline = time.monotonic() + _PING_PATIENCE
+        limit = 0.5 * self.options.watchdog
+        for _ in range(_PINGS):
+            with self._changed:
+                before = machine.clock.round_trips
+                machine.ping(time.monotonic())
+                self._write(machine)
+                while machine.clock.round_trips == before and time.monotonic() < deadline:
+                    self._changed.wait(0.02)
+        if machine.clock.quickest > limit:
+            took = (
+                f"took {1e3 * machine.clock.quickest:.0f} ms to answer"
+                if machine.clock.round_trips
+                else f"does not answer within {1e3 * _PING_PATIENCE:.0f} ms"
+            )
+            raise DeviceError(
+                f"{self.options.port}: the device {took}, too slow for its watchdog of "
+                f"{1e3 * self.options.watchdog:.0f} ms. Look at the adapter's latency timer ('rig "
+                "doctor'), at a hub in between, or raise options.watchdog in the rig file"
+            )
+
+    def _start_message(
+        self, sample_rate: float, mode: Mode, guard: Guard, welcome: Welcome
+    ) -> Start:
+        if sample_rate > welcome.max_rate:
+            raise DeviceError(
+                f"{self._name()} samples at up to {welcome.max_rate:g} Hz; "
+                f"sample_rate {sample_rate:g} Hz is too fast for it"
+            )
+        period = max(1, round(welcome.clock / sample_rate))
+        if abs(welcome.clock / period / sample_rate - 1.0) > _RATE_TOLERANCE:
+            near = [welcome.clock / p for p in (period + 1, period, period - 1) if p > 0]
+            raise DeviceError(
+                f"the device's clock of {welcome.clock:g} Hz cannot be divided down to "
+                f"{sample_rate:g} Hz; near it are {', '.join(f'{rate:.9g}' for rate in near)} Hz"
+            )
+        watchdog = round(1e3 * self.options.watchdog)
+        if watchdog > welcome.watchdog_longest:
+            raise DeviceError(
+                f"options.watchdog: {self._name()} waits {welcome.watchdog_longest} ms at most, "
+                f"not {watchdog} ms"
+            )
+        scale, offset = self._out_scale()
+        in_scale, in_offset = self._in_scale()
+        # Half a code beyond a limit would be beyond the limit.
+        low = np.ceil(_ratio(guard.command_low - offset, scale) - 1e-9)
+        high = np.floor(_ratio(guard.command_high - offset, scale) + 1e-9)
+        inside = np.iinfo(np.int32)
+        return Start(
+            self._run,
+            LoopMode.OPEN if mode is Mode.OPEN_LOOP else LoopMode.CLOSED,
+            period,
+            watchdog,
+            _whole(low, np.iinfo(np.int16)),
+            _whole(high, np.iinfo(np.int16)),
+            _whole(np.ceil(_ratio(guard.analog_low - in_offset, in_scale) - 1e-9), inside),
+            _whole(np.floor(_ratio(guard.analog_high - in_offset, in_scale) + 1e-9), inside),
+        )
+
+    # --- volts and codes ----------------------------------------------------------------------
+
+    def _out_scale(self) -> tuple[FloatArray, FloatArray]:
+        return self._table(slice(_N_IN, _N_IN + _N_OUT))
+
+    def _in_scale(self) -> tuple[FloatArray, FloatArray]:
+        return self._table(slice(_N_IN))
+
+    def _table(self, rows: slice) -> tuple[FloatArray, FloatArray]:
+        assert self._welcome is not None
+        channels = self._welcome.channels[rows]
+        return np.array([c.scale for c in channels]), np.array([c.offset for c in channels])
+
+    def _input_range(self) -> tuple[float, float]:
+        assert self._welcome is not None
+        inputs = self._welcome.channels[:_N_IN]
+        return max(c.low for c in inputs), min(c.high for c in inputs)
+
+    def _codes(self, volts: FloatArray) -> Codes:
+        """Converter codes (n, 2) of the commands, the nearest to each.
+
+        A command within the clamps is not rounded to beyond them, where the device would flag it.
+        """
+        scale, offset = self._out_scale()
+        codes = np.rint((volts - offset) / scale)
+        low, high = self._limits
+        codes = np.where(volts <= self._guard.command_high, np.minimum(codes, high), codes)
+        codes = np.where(volts >= self._guard.command_low, np.maximum(codes, low), codes)
+        info = np.iinfo(np.int16)
+        return np.clip(codes, info.min, info.max).astype(messages.COMMAND_DTYPE)
+
+    def _raw(self, blocks: list[Block]) -> RawSamples:
+        records = np.concatenate([block.records for block in blocks])
+        ticks: IntArray = np.concatenate(
+            [np.arange(b.first, b.first + len(b.records), dtype=np.int64) for b in blocks]
+        )
+        in_scale, in_offset = self._in_scale()
+        out_scale, out_offset = self._out_scale()
+        return RawSamples(
+            tick=ticks,
+            analog=records["analog"] * in_scale + in_offset,
+            counts=records["counts"].astype(np.float64),
+            count_rate=records["count_rate"].astype(np.float64),
+            applied=records["applied"] * out_scale + out_offset,
+            flags=records["flags"].astype(np.int64),
+        )
+
+    # --- requests -----------------------------------------------------------------------------
+
+    def _go(self, machine: HostMachine) -> None:
+        """Start the clock once the device has what was sent ahead."""
+        deadline = time.monotonic() + 2.0
+        with self._changed:
+            while not machine.preloaded and machine.failure is None:
+                self._called = time.monotonic()
+                if self._called > deadline:
+                    raise DeviceError(
+                        "the device does not take the commands sent ahead; the line loses more "
+                        "than it carries. Look at cable and baud rate"
+                    )
+                self._changed.wait(0.05)
+            self._called = time.monotonic()
+            machine.go(self._called)
+            self._write(machine)
+        self._await_reply(machine)
+        self._gone = True
+
+    def _ask(self, type_: Type, payload: bytes = b"") -> None:
+        machine, _ = self._opened()
+        with self._changed:
+            self._called = time.monotonic()
+            machine.ask(type_, payload, self._called)
+            self._write(machine)
+        self._await_reply(machine)
+
+    def _await_reply(self, machine: HostMachine) -> None:
+        reply: Reply | None = None
+        with self._changed:
+            while machine.waiting and machine.failure is None:
+                self._called = time.monotonic()
+                self._changed.wait(0.05)
+            reply = machine.reply
+            # Samples that came before a failure are still to be had from receive().
+            if reply is None and machine.failure is not None:
+                raise machine.failure
+        if reply is not None and reply.result is not Result.OK:
+            raise DeviceError(refusal(reply))
+
+    def _connected(self) -> HostMachine:
+        assert self._machine is not None
+        return self._machine
+
+    def _opened(self) -> tuple[HostMachine, Welcome]:
+        if self._machine is None or self._welcome is None or self._link is None:
+            raise DeviceError("the serial rig is not open; open it before starting")
+        return self._machine, self._welcome
+
+    def _sampling(self) -> HostMachine:
+        machine, _ = self._opened()
+        if not self._started:
+            raise DeviceError("the serial rig is not sampling; start it first")
+        return machine
+
+    def _name(self) -> str:
+        assert self._welcome is not None
+        return f"{self._welcome.device} (firmware {self._welcome.firmware})"
+
+    # --- the thread ---------------------------------------------------------------------------
+
+    def _serve(self) -> None:
+        machine, link = self._connected(), self._link
+        assert link is not None
+        raise_thread()
+        while not self._closing and machine.failure is None:
+            try:
+                data = link.read()
+                with self._changed:
+                    now = time.monotonic()
+                    if data:
+                        machine.feed(data, now)
+                    machine.poll(now, keep_alive=now - self._called < _PATIENCE)
+                    self._write(machine)
+                    self._changed.notify_all()
+            except DeviceError as error:
+                with self._changed:
+                    machine.failure = machine.failure or error
+        with self._changed:
+            self._changed.notify_all()
+
+    def _write(self, machine: HostMachine) -> None:
+        """Write what the machine has to say; the lock is held, so frames stay whole."""
+        data = machine.take()
+        if data and self._link is not None:
+            self._link.write(data)
+
+    def _disconnect(self) -> None:
+        if self._machine is not None and self._started:
+            self._record = self._machine.describe()
+        self._closing, self._started = True, False
+        lower_thread()
+        if self._thread is not None:
+            self._thread.join(timeout=2.0)
+        if self._link is not None:
+            self._link.close()
+        self._link = self._machine = None
+
+
+def _ratio(volts: FloatArray, scale: FloatArray) -> FloatArray:
+    return np.asarray(volts / scale, dtype=np.float64)
+
+
+def _whole(values: FloatArray, bounds: np.iinfo[Any]) -> tuple[int, ...]:
+    """Whole numbers within a type's range; limits that are infinite become its ends."""
+    return tuple(int(value) for value in np.clip(values, bounds.min, bounds.max))
+
+
+def _user() -> str:
+    try:
+        return getpass.getuser()
+    except (OSError, KeyError):
+        return "unknown"
+
+
+def _version_mismatch(port: str, version: int) -> str:
+    own = messages.VERSION
+    said = f"{port}: the device speaks version {version} of the protocol, this program {own}"
+    if version > own:
+        return f"{said}. This program is the old one: update hybrid-rig"
+    return f"{said}. The device's firmware is the old one: update that"
+
+
+def _no_answer(port: str, machine: HostMachine) -> str:
+    decoder = machine.decoder
+    if decoder.accepted:
+        return (
+            f"{port}: what answers speaks the protocol but does not say who it is; its firmware is "
+            "incomplete"
+        )
+    if decoder.received:
+        return (
+            f"{port}: {decoder.received} bytes came in {HANDSHAKE:g} s but no frame of the "
+            "protocol; the baud rate is wrong, or it is another device ('rig ports' shows who "
+            "answers)"
+        )
+    return (
+        f"{port}: no answer in {HANDSHAKE:g} s; check that the device has power and runs the "
+        "firmware of the protocol, and that this is its port ('rig ports' shows who answers)"
+    )

@@ -1,0 +1,229 @@
+"""Bytes in and out: a serial port, any pyserial URL, or a TCP socket.
+
+The only file of the package that touches an operating system.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import select
+import socket
+import sys
+from pathlib import Path
+from typing import Protocol
+
+from daq.errors import DeviceError
+
+PATIENCE = 0.01
+"""Longest time that ``read`` waits [s]."""
+
+_WRITE_PATIENCE = 0.5  # s that a port may take to accept a frame
+_SLOW_TIMER = 2  # ms; an adapter's latency timer above it delays every sample
+
+
+class Link(Protocol):
+    """An open connection. Methods raise DeviceError when it is gone."""
+
+    warnings: list[str]
+
+    def read(self) -> bytes:
+        """What has come, or nothing after ``PATIENCE``."""
+
+    def write(self, data: bytes) -> None:
+        """Send all of it."""
+
+    def close(self) -> None:
+        """Disconnect; never raises."""
+
+
+def open_link(port: str, baud: int) -> Link:
+    """Open a port by name or URL, for this program alone. DeviceError names the cure."""
+    if port.startswith("socket://"):
+        return SocketLink(port)
+    return SerialLink(port, baud)
+
+
+def _gone(port: str, error: Exception) -> DeviceError:
+    return DeviceError(
+        f"{port}: the port has gone ({error}); check the cable and the device's supply. The device "
+        "makes itself safe when it hears nothing"
+    )
+
+
+class SerialLink:
+    """A port by pyserial: a device name of any system, or a URL such as rfc2217://."""
+
+    def __init__(self, port: str, baud: int) -> None:
+        import serial
+
+        self.warnings: list[str] = []
+        self._port = port
+        try:
+            self._serial = serial.serial_for_url(
+                port,
+                baudrate=baud,
+                timeout=PATIENCE,
+                write_timeout=_WRITE_PATIENCE,
+                exclusive=True if os.name == "posix" else None,
+            )
+        except (OSError, ValueError) as error:
+            raise _not_opened(port, error) from None
+        self._failures = (serial.SerialException, OSError, TypeError)
+        self._prepare()
+
+    def read(self) -> bytes:
+        """What has come, or nothing after ``PATIENCE``."""
+        try:
+            first: bytes = self._serial.read(1)
+            waiting = self._serial.in_waiting if first else 0
+            return first + self._serial.read(waiting) if waiting else first
+        except self._failures as error:
+            raise _gone(self._port, error) from None
+
+    def write(self, data: bytes) -> None:
+        """Send all of it."""
+        try:
+            self._serial.write(data)
+        except self._failures as error:
+            raise _gone(self._port, error) from None
+
+    def close(self) -> None:
+        """Disconnect; never raises."""
+        with contextlib.suppress(*self._failures):
+            self._serial.close()
+
+    def _prepare(self) -> None:
+        """What was said before is not for us; no delay in the adapter; no reset on closing."""
+        with contextlib.suppress(*self._failures):
+            self._serial.reset_input_buffer()
+        if not sys.platform.startswith("linux") or "://" in self._port:
+            return
+        # Ports without such a mode, CDC-ACM among them, do not delay.
+        with contextlib.suppress(*self._failures, ValueError, AttributeError):
+            self._serial.set_low_latency_mode(True)
+        self._keep_line_up()
+        timer = latency_timer(self._port)
+        if timer is not None and timer[1] > _SLOW_TIMER:
+            self.warnings.append(
+                f"{self._port}: its adapter waits up to {timer[1]} ms before it hands on samples; "
+                f"as root: echo 1 > {timer[0]}"
+            )
+
+    def _keep_line_up(self) -> None:
+        """Do not lower DTR on closing: boards that reset on its edge stay as they are."""
+        import termios
+
+        with contextlib.suppress(termios.error, *self._failures):
+            attributes = termios.tcgetattr(self._serial.fileno())
+            attributes[2] &= ~termios.HUPCL
+            termios.tcsetattr(self._serial.fileno(), termios.TCSANOW, attributes)
+
+
+class SocketLink:
+    """A TCP connection, ``socket://HOST:PORT``: an emulator, or a device server."""
+
+    def __init__(self, port: str) -> None:
+        self.warnings: list[str] = []
+        self._port = port
+        host, _, number = port.removeprefix("socket://").strip("/").rpartition(":")
+        if not host or not number.isdigit():
+            raise DeviceError(f"{port}: not an address; write socket://HOST:PORT")
+        try:
+            self._socket = socket.create_connection((host.strip("[]"), int(number)), timeout=2.0)
+        except OSError as error:
+            raise DeviceError(
+                f"{port}: nobody answers there ({error}); check address and port number, and that "
+                "the emulator or device server is running"
+            ) from None
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._socket.settimeout(_WRITE_PATIENCE)
+
+    def read(self) -> bytes:
+        """What has come, or nothing after ``PATIENCE``."""
+        try:
+            if not select.select([self._socket], [], [], PATIENCE)[0]:
+                return b""
+            data = self._socket.recv(65_536)
+        except ConnectionError:
+            data = b""
+        except (OSError, ValueError) as error:
+            raise _gone(self._port, error) from None
+        if not data:
+            raise self._closed()
+        return data
+
+    def write(self, data: bytes) -> None:
+        """Send all of it."""
+        try:
+            self._socket.sendall(data)
+        except ConnectionError:
+            raise self._closed() from None
+        except OSError as error:
+            raise _gone(self._port, error) from None
+
+    def close(self) -> None:
+        """Disconnect; never raises."""
+        self._socket.close()
+
+    def _closed(self) -> DeviceError:
+        return DeviceError(
+            f"{self._port}: the other side has closed the connection. It serves one program "
+            "at a time: another may have it, or the emulator or device server has ended"
+        )
+
+
+def latency_timer(port: str) -> tuple[Path, int] | None:
+    """File and value [ms] of a USB adapter's latency timer; None for ports that have none."""
+    file = Path("/sys/class/tty") / Path(port).resolve().name / "device" / "latency_timer"
+    try:
+        return file, int(file.read_text())
+    except (OSError, ValueError):
+        return None
+
+
+def _not_opened(port: str, error: Exception) -> DeviceError:
+    number = getattr(error, "errno", None)
+    text = str(error)
+    if number == errno.ENOENT or "FileNotFoundError" in text:
+        cure = "there is no such port; 'rig ports' lists those that there are"
+    elif number == errno.EACCES or "Permission" in text or "PermissionError" in text:
+        if os.name == "nt":
+            cure = "another program has it open; close that first"
+        else:
+            cure = f"no permission; {permission_cure(port)}"
+    elif number in {errno.EAGAIN, errno.EBUSY} or "exclusively lock" in text:
+        cure = f"another program has it open{_holder(port)}; close that first"
+    else:
+        cure = f"it cannot be opened ({text}); 'rig ports' lists the ports that there are"
+    return DeviceError(f"{port}: {cure}")
+
+
+def permission_cure(port: str) -> str:
+    """What gives a user access to a port on this system."""
+    group = "dialout"
+    with contextlib.suppress(ImportError, OSError, KeyError):
+        import grp
+
+        group = grp.getgrgid(Path(port).stat().st_gid).gr_name
+    return f"sudo usermod -a -G {group} $USER, then log out and in again"
+
+
+def _holder(port: str) -> str:
+    """Who has the port open, where the system tells."""
+    try:
+        device = Path(port).resolve()
+        for process in Path("/proc").iterdir():
+            if not process.name.isdigit() or int(process.name) == os.getpid():
+                continue
+            with contextlib.suppress(OSError):
+                words = (process / "cmdline").read_bytes().replace(b"\0", b" ").decode().strip()
+                if " emulate" in words:
+                    continue  # the other end of a pty holds it as well
+                for entry in (process / "fd").iterdir():
+                    if entry.readlink() == device:
+                        return f" (process {process.name}: {words[:80]})"
+    except OSError:
+        pass
+    return ""

@@ -1,0 +1,417 @@
+"""What the frames say: message types, their layouts, and their numbers.
+
+All layouts are fixed, little-endian and without gaps that are not named; docs/serial-protocol.md
+has them as byte tables. ``unpack`` returns None for a payload of the wrong length, which the
+receiver counts like a frame with a wrong CRC.
+"""
+
+from __future__ import annotations
+
+import enum
+import struct
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+import numpy.typing as npt
+
+from daq.hal import ANALOG_INPUTS, CHANNELS
+
+VERSION = 1
+MAGIC = b"HRIG"
+
+COMMAND_DTYPE = np.dtype("<i2")
+"""Commands on the wire: converter codes, one per channel and tick."""
+
+SAMPLE_DTYPE = np.dtype(
+    [
+        ("analog", "<i4", (len(ANALOG_INPUTS),)),
+        ("counts", "<i4"),
+        ("count_rate", "<f4"),
+        ("applied", "<i2", (len(CHANNELS),)),
+        ("flags", "<u4"),
+    ]
+)
+"""One sample on the wire, 28 bytes: converter codes, quadrature counts and their rate [1/s]."""
+
+Records = npt.NDArray[np.void]
+Codes = npt.NDArray[np.int16]
+
+CHANNEL_NAMES = (*ANALOG_INPUTS, *CHANNELS, "encoder")
+"""Order of the channel table."""
+
+
+class Type(enum.IntEnum):
+    """First byte of a frame. Below 0x80 from the host, from 0x80 on from the device."""
+
+    HELLO = 0x01
+    START = 0x02
+    GO = 0x03
+    STOP = 0x04
+    SAFE = 0x05
+    CLEAR = 0x06
+    ANNOUNCE = 0x07
+    COMMANDS = 0x10
+    PING = 0x11
+    WELCOME = 0x81
+    REPLY = 0x82
+    SAMPLES = 0x90
+    PONG = 0x91
+    STATUS = 0x92
+
+
+class State(enum.IntEnum):
+    """What a device is doing."""
+
+    IDLE = 0
+    ARMED = 1
+    RUNNING = 2
+
+
+class Latch(enum.IntEnum):
+    """Why a device's outputs are held at zero."""
+
+    NONE = 0
+    SAFE = 1
+    UNDERFLOW = 2
+    INTERLOCK = 3
+    WATCHDOG = 4
+
+
+class Result(enum.IntEnum):
+    """Answer to a request."""
+
+    OK = 0
+    NO_SESSION = 1
+    WRONG_STATE = 2
+    BAD_VALUE = 3
+    LATCHED = 4
+    UNKNOWN = 5
+
+
+class LoopMode(enum.IntEnum):
+    """Mode byte of START."""
+
+    OPEN = 0
+    CLOSED = 1
+
+
+_VERSIONED = struct.Struct("<4sH")
+_HELLO = struct.Struct("<4sHH32s")
+_WELCOME = struct.Struct("<4sHBBIfIHHHH32s32s32s")
+_CHANNEL = struct.Struct("<16s8sdddd")
+_STATUS = struct.Struct("<HBBIIIII")
+_REPLY = struct.Struct("<BBH")
+_START = struct.Struct("<HBBIHH2h2h3i3i")
+_RUN = struct.Struct("<H")
+_ANNOUNCE = struct.Struct("<B3xf")
+_COMMANDS = struct.Struct("<HHI")
+_PING = struct.Struct("<Q")
+_PONG = struct.Struct("<QQQ")
+_SAMPLES = struct.Struct("<IHHQ")
+
+COMMANDS_OVERHEAD = _COMMANDS.size
+SAMPLES_OVERHEAD = _STATUS.size + _SAMPLES.size
+
+
+def version_of(payload: bytes) -> int | None:
+    """Protocol version that a HELLO or WELCOME of any version names; None when it is neither."""
+    if len(payload) < _VERSIONED.size:
+        return None
+    magic, version = _VERSIONED.unpack_from(payload)
+    return int(version) if magic == MAGIC else None
+
+
+def _text(field: bytes) -> str:
+    return field.split(b"\0", 1)[0].decode("utf-8", "replace")
+
+
+@dataclass(frozen=True)
+class Hello:
+    """A host opens a session. ``host`` says who it is, for a device's own log."""
+
+    host: str
+    version: int = VERSION
+
+    def pack(self) -> bytes:
+        """Payload of the frame."""
+        return _HELLO.pack(MAGIC, self.version, 0, self.host.encode()[:31])
+
+
+@dataclass(frozen=True)
+class Channel:
+    """A row of the channel table: value = scale * code + offset, in ``unit``.
+
+    low, high: what the input can measure, or the most that the output will ever give.
+    """
+
+    name: str
+    unit: str
+    scale: float
+    offset: float
+    low: float
+    high: float
+
+    def pack(self) -> bytes:
+        """The row's 56 bytes."""
+        return _CHANNEL.pack(
+            self.name.encode()[:15], self.unit.encode()[:7],
+            self.scale, self.offset, self.low, self.high,
+        )  # fmt: skip
+
+    @classmethod
+    def unpack(cls, row: bytes) -> Self:
+        """The row of 56 bytes."""
+        name, unit, *numbers = _CHANNEL.unpack(row)
+        return cls(_text(name), _text(unit), *numbers)
+
+
+@dataclass(frozen=True)
+class Welcome:
+    """A device says who it is and what it can do.
+
+    clock: ticks of its clock per second [Hz]. max_rate [Hz]. queue: commands it holds ahead.
+    max_payload: longest it takes. watchdog_default, watchdog_longest [ms]. channels: in
+    ``CHANNEL_NAMES`` order.
+    """
+
+    device: str
+    firmware: str
+    serial: str
+    clock: int
+    max_rate: float
+    queue: int
+    max_payload: int
+    watchdog_default: int
+    watchdog_longest: int
+    channels: tuple[Channel, ...]
+    latch: Latch = Latch.NONE
+    version: int = VERSION
+
+    def pack(self) -> bytes:
+        """Payload of the frame."""
+        head = _WELCOME.pack(
+            MAGIC, self.version, len(self.channels), self.latch, self.clock, self.max_rate,
+            self.queue, self.max_payload, self.watchdog_default, self.watchdog_longest, 0,
+            self.device.encode()[:31], self.firmware.encode()[:31], self.serial.encode()[:31],
+        )  # fmt: skip
+        return head + b"".join(channel.pack() for channel in self.channels)
+
+    @classmethod
+    def unpack(cls, payload: bytes) -> Self | None:
+        """The message, or None when it is none of this version."""
+        if version_of(payload) != VERSION or len(payload) < _WELCOME.size:
+            return None
+        (
+            _, version, n, latch, clock, max_rate, queue, max_payload, default, longest, _,
+            device, firmware, serial,
+        ) = _WELCOME.unpack_from(payload)  # fmt: skip
+        if len(payload) != _WELCOME.size + n * _CHANNEL.size or latch not in list(Latch):
+            return None
+        rows = range(_WELCOME.size, len(payload), _CHANNEL.size)
+        channels = tuple(Channel.unpack(payload[at : at + _CHANNEL.size]) for at in rows)
+        return cls(
+            _text(device), _text(firmware), _text(serial), clock, max_rate, queue, max_payload,
+            default, longest, channels, Latch(latch), version,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Reply:
+    """A device's answer to a request, which carries the request's seq in its header."""
+
+    request: int
+    result: Result
+
+    def pack(self) -> bytes:
+        """Payload, without the status that follows it."""
+        return _REPLY.pack(self.request, self.result, 0)
+
+
+@dataclass(frozen=True)
+class Status:
+    """What a device says of itself in every REPLY, SAMPLES, PONG and STATUS.
+
+    tick: the next to be latched. queued_until: tick after the last command received in order.
+    credit_until: first tick for which there is no room yet. late: commands that came after
+    their tick. overflow: samples dropped because the line took no more.
+    """
+
+    run: int
+    state: State
+    latch: Latch
+    tick: int
+    queued_until: int
+    credit_until: int
+    late: int
+    overflow: int
+
+    def pack(self) -> bytes:
+        """The 24 bytes."""
+        return _STATUS.pack(
+            self.run, self.state, self.latch, self.tick, self.queued_until, self.credit_until,
+            self.late, self.overflow,
+        )  # fmt: skip
+
+
+def _status(payload: bytes, at: int = 0) -> Status | None:
+    run, state, latch, *numbers = _STATUS.unpack_from(payload, at)
+    try:
+        return Status(run, State(state), Latch(latch), *numbers)
+    except ValueError:
+        return None
+
+
+def unpack_status(payload: bytes) -> Status | None:
+    """A STATUS payload."""
+    return _status(payload) if len(payload) == _STATUS.size else None
+
+
+def unpack_reply(payload: bytes) -> tuple[Reply, Status] | None:
+    """A REPLY payload."""
+    if len(payload) != _REPLY.size + _STATUS.size:
+        return None
+    request, result, _ = _REPLY.unpack_from(payload)
+    status = _status(payload, _REPLY.size)
+    if status is None or result not in list(Result):
+        return None
+    return Reply(request, Result(result)), status
+
+
+@dataclass(frozen=True)
+class Start:
+    """Arm a run. period: clock ticks per sample. watchdog [ms]. The rest are converter codes.
+
+    Clamps and guard as ``daq.hal.Guard``; a device narrows the clamps to its own limits.
+    """
+
+    run: int
+    mode: LoopMode
+    period: int
+    watchdog: int
+    command_low: tuple[int, ...]
+    command_high: tuple[int, ...]
+    analog_low: tuple[int, ...]
+    analog_high: tuple[int, ...]
+
+    def pack(self) -> bytes:
+        """Payload of the frame."""
+        return _START.pack(
+            self.run, self.mode, 0, self.period, self.watchdog, 0,
+            *self.command_low, *self.command_high, *self.analog_low, *self.analog_high,
+        )  # fmt: skip
+
+    @classmethod
+    def unpack(cls, payload: bytes) -> Self | None:
+        """The message, or None."""
+        if len(payload) != _START.size:
+            return None
+        run, mode, _, period, watchdog, _, *codes = _START.unpack(payload)
+        if mode not in list(LoopMode):
+            return None
+        low, high, under, over = codes[0:2], codes[2:4], codes[4:7], codes[7:10]
+        return cls(
+            run, LoopMode(mode), period, watchdog,
+            tuple(low), tuple(high), tuple(under), tuple(over),
+        )  # fmt: skip
+
+
+def pack_run(run: int) -> bytes:
+    """Payload of GO and STOP."""
+    return _RUN.pack(run)
+
+
+def unpack_run(payload: bytes) -> int | None:
+    """The run that a GO or STOP names."""
+    return int(_RUN.unpack(payload)[0]) if len(payload) == _RUN.size else None
+
+
+def pack_announce(phase: int, turns: float) -> bytes:
+    """Payload of ANNOUNCE: the phase's number in the order of ``daq.hal.Phase``."""
+    return _ANNOUNCE.pack(phase, turns)
+
+
+def unpack_announce(payload: bytes) -> tuple[int, float] | None:
+    """Phase and turns."""
+    if len(payload) != _ANNOUNCE.size:
+        return None
+    phase, turns = _ANNOUNCE.unpack(payload)
+    return phase, turns
+
+
+def pack_commands(run: int, first: int, codes: Codes) -> bytes:
+    """Payload of COMMANDS for consecutive ticks from ``first``; codes: (n, 2)."""
+    return _COMMANDS.pack(run, len(codes), first) + codes.astype(COMMAND_DTYPE).tobytes()
+
+
+def unpack_commands(payload: bytes) -> tuple[int, int, Codes] | None:
+    """Run, first tick and codes, (n, 2)."""
+    if len(payload) < _COMMANDS.size:
+        return None
+    run, count, first = _COMMANDS.unpack_from(payload)
+    if len(payload) != _COMMANDS.size + count * len(CHANNELS) * COMMAND_DTYPE.itemsize:
+        return None
+    codes = np.frombuffer(payload, COMMAND_DTYPE, offset=_COMMANDS.size)
+    return run, first, codes.reshape(count, len(CHANNELS))
+
+
+def pack_ping(stamp: int) -> bytes:
+    """Payload of PING: the host's own time, which the device only returns."""
+    return _PING.pack(stamp)
+
+
+def unpack_ping(payload: bytes) -> int | None:
+    """The host's stamp."""
+    return int(_PING.unpack(payload)[0]) if len(payload) == _PING.size else None
+
+
+@dataclass(frozen=True)
+class Pong:
+    """Answer to PING: its stamp, and the device's clock at its arrival and at the answer."""
+
+    stamp: int
+    received: int
+    answered: int
+
+    def pack(self, status: Status) -> bytes:
+        """Payload of the frame."""
+        return _PONG.pack(self.stamp, self.received, self.answered) + status.pack()
+
+
+def unpack_pong(payload: bytes) -> tuple[Pong, Status] | None:
+    """A PONG payload."""
+    if len(payload) != _PONG.size + _STATUS.size:
+        return None
+    status = _status(payload, _PONG.size)
+    return (Pong(*_PONG.unpack_from(payload)), status) if status is not None else None
+
+
+@dataclass(frozen=True)
+class Block:
+    """Consecutive samples from tick ``first`` on, latched from device time ``time`` on.
+
+    records: (n,) of ``SAMPLE_DTYPE``.
+    """
+
+    status: Status
+    first: int
+    time: int
+    records: Records
+
+    def pack(self) -> bytes:
+        """Payload of SAMPLES."""
+        head = _SAMPLES.pack(self.first, len(self.records), 0, self.time)
+        return self.status.pack() + head + self.records.tobytes()
+
+
+def unpack_samples(payload: bytes) -> Block | None:
+    """A SAMPLES payload; the records are a view of it."""
+    if len(payload) < SAMPLES_OVERHEAD:
+        return None
+    status = _status(payload)
+    first, count, _, time = _SAMPLES.unpack_from(payload, _STATUS.size)
+    right = len(payload) == SAMPLES_OVERHEAD + count * SAMPLE_DTYPE.itemsize and count > 0
+    if status is None or not right:
+        return None
+    records = np.frombuffer(payload, SAMPLE_DTYPE, offset=SAMPLES_OVERHEAD)
+    return Block(status, first, time, records)
