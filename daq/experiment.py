@@ -63,7 +63,9 @@ class Experiment(Section, abc.ABC):
 
     mode: ClassVar[Mode]
 
-    name: str = Field("", max_length=80, description="of the capture folder; default the file's")
+    name: str = Field(
+        "", max_length=80, description="name of the capture folder; default the file's"
+    )
     protocol: str = Field(min_length=1, description="name of a protocol, or FILE.py:CLASS")
     sample_rate: Hertz = Field(800.0, gt=0.0, le=1e6, description="samples per second")
     calibration: OffsetCalibration = Field(OffsetCalibration(), description="offset calibration")

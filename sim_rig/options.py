@@ -9,6 +9,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from daq.config.units import Part
+
 DriverKind = Literal["closed", "open"]
 HysteresisKind = Literal["bouc-wen", "dahl", "lugre"]
 FrictionKind = Literal["none", "stribeck", "cyclic"]
@@ -22,7 +24,7 @@ MotorDriver = Annotated[
 ]
 BrakeDriver = Annotated[DriverKind, Field(description="brake amplifier: likewise")]
 Hysteresis = Annotated[HysteresisKind, Field(description="hysteresis model of the brake")]
-Exponent = Annotated[float, Field(ge=1.0, le=50.0, description="n of the Bouc-Wen hysteresis")]
+Exponent = Annotated[Part, Field(ge=1.0, le=50.0, description="n of the Bouc-Wen hysteresis")]
 Smooth = Annotated[
     bool, Field(description="tanh(rho x) in place of the hysteresis's signs: differentiable")
 ]

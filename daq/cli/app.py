@@ -317,6 +317,47 @@ def replay(
     replay_command(log, rig, parameters, config, figure, fail_under or [], json)
 
 
+@app.command(epilog="Example:  rig init my_rig")
+def init(
+    folder: Annotated[
+        Path, typer.Argument(metavar="[FOLDER]", help="Where the files go; default this folder.")
+    ] = Path(),
+    protocol: Annotated[
+        str, typer.Option("--protocol", metavar="NAME", help="Shipped experiment to begin with.")
+    ] = "prbs",
+    json: AsJson = False,
+) -> None:
+    """Write a commented experiment, rig and identification file to begin with.
+
+    What is there already stays as it is. Editors complete and check the files by the JSON Schemas
+    written beside them.
+    """
+    from daq.cli.starting import init_command
+
+    init_command(folder, protocol, json)
+
+
+@app.command(epilog="Example:  rig schema schemas")
+def schema(
+    folder: Annotated[
+        Path, typer.Argument(metavar="[FOLDER]", help="Where the schemas go; default schemas.")
+    ] = Path("schemas"),
+    reference: Annotated[
+        Path | None,
+        typer.Option(
+            "--reference", metavar="DIR", help="Write reference pages (Markdown) there as well."
+        ),
+    ] = None,
+    json: AsJson = False,
+) -> None:
+    """Write JSON Schemas of all kinds of YAML, for the installed protocols and backends."""
+    from daq.cli.reference import write_reference
+    from daq.cli.schemas import schema_command
+
+    pages = None if reference is None else lambda: write_reference(reference, app)
+    schema_command(folder, pages, json)
+
+
 @app.command(epilog="Example:  rig models actuator --json")
 def models(
     name: Annotated[

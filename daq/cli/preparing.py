@@ -18,7 +18,6 @@ from daq.config.identification import IdentificationConfig, Signals
 from daq.config.yaml_file import CommandLine, YamlFile, suggestion
 from daq.errors import ConfigError
 from sysid import ModelError, SearchSpace
-from sysid.gassi import PRESETS
 from sysid.model import ProcessModel
 
 
@@ -62,11 +61,6 @@ def prepare_models(
     given = {key: value for key, value in options.items() if value is not None}
     file = CommandLine.of(given, more, yaml_file.load(config) if config is not None else None)
     settings = checking.validate(file, IdentificationConfig)
-    if settings.preset not in PRESETS:
-        raise file.error(
-            ("preset",), f"unknown preset {settings.preset!r}; "
-            f"{suggestion(settings.preset, list(PRESETS))}"
-        )  # fmt: skip
     found = [_find(config, file, settings, name) for name in names]
     models = [_with_outputs(file, settings, model) for model, _ in found]
     _check_names(file, settings, models)

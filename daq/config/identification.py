@@ -5,7 +5,14 @@ from __future__ import annotations
 import math
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    WithJsonSchema,
+    model_validator,
+)
 
 from daq.config.base import Section
 from daq.config.units import Hertz, Part, Percent
@@ -37,7 +44,21 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
-StartSetting = Annotated[Any, BeforeValidator(_start)]
+_START_SCHEMA = {
+    "anyOf": [
+        {"enum": ["first", "estimate"]},
+        {"type": "number"},
+        {"type": "array", "items": {"type": ["number", "null"]}, "minItems": 2, "maxItems": 2},
+    ]
+}
+StartSetting = Annotated[Any, BeforeValidator(_start), WithJsonSchema(_START_SCHEMA)]
+_NAMES_SCHEMA = {"anyOf": [{"type": "string"}, {"type": "array", "items": {"type": "string"}}]}
+Preset = Literal["default", "thesis", "cega", "classic"]
+
+
+def _one_of(*keys: str) -> dict[str, Any]:
+    """For the schema: exactly one of several keys is there."""
+    return {"oneOf": [{"required": [key]} for key in keys]}
 
 
 def _several(value: Any) -> Any:
@@ -46,6 +67,8 @@ def _several(value: Any) -> Any:
 
 class TimeColumn(Section):
     """The column that holds time, or the rate of the rows in a file without one."""
+
+    model_config = ConfigDict(json_schema_extra=_one_of("column", "sample_rate"))
 
     column: str | None = Field(None, min_length=1, description="name in the CSV's header")
     unit: str = Field("s", min_length=1, description="unit of the numbers")
@@ -63,6 +86,8 @@ class TimeColumn(Section):
 class Column(Section):
     """Where one signal of the model comes from: a column of the CSV, or a constant."""
 
+    model_config = ConfigDict(json_schema_extra=_one_of("column", "constant"))
+
     column: str | None = Field(None, min_length=1, description="name in the CSV's header")
     constant: float | None = Field(None, description="value in place of a column")
     unit: str | None = Field(None, description="unit of the numbers; default the model's")
@@ -78,7 +103,7 @@ class Column(Section):
 class Columns(Section):
     """Names, units and signs of a foreign CSV's columns, by the model's signal names."""
 
-    time: TimeColumn
+    time: TimeColumn = Field(description="the column of time, or the rate of the rows")
     inputs: dict[str, Column] = Field(description="for each input of the model")
     outputs: dict[str, Column] = Field(description="for each output that counts")
 
@@ -87,23 +112,31 @@ class Signals(Section):
     """How a model is used where not as it declares."""
 
     outputs: list[str] = Field(
-        default_factory=list, description="outputs or states of the model that count; default its"
+        default_factory=list,
+        description="outputs or states of the model that count; default its own outputs",
+        examples=[["current_motor", "omega"]],
     )
     initial: dict[str, StartSetting] = Field(
         default_factory=dict,
         description="where states start: first, estimate, a number, or [low, high]",
+        examples=[{"omega": "first"}],
     )
     hold: dict[str, Literal["zoh", "foh", "spline"]] = Field(
         default_factory=dict,
         description="how inputs run between samples: held (zoh), linear (foh), spline",
+        examples=[{"torque": "foh"}],
     )
 
 
 class IdentificationConfig(Signals):
     """Settings of ``rig identify``; each may be left out."""
 
-    model: str | None = Field(None, description="built-in model, or file.py:object")
-    preset: str = Field("default", description="default, thesis, cega or classic")
+    model: str | None = Field(
+        None, description="installed model, or FILE.py:OBJECT", examples=["actuator"]
+    )
+    preset: Preset = Field(
+        "default", description="how the search goes; thesis: the algorithm as the thesis has it"
+    )
     population: int = Field(300, ge=2, le=1_000_000, description="chromosomes per generation")
     generations: int = Field(40, ge=1, le=1_000_000, description="generations evaluated")
     seed: int = Field(0, ge=0, le=2**32 - 1, description="one seed, one result")
@@ -117,23 +150,39 @@ class IdentificationConfig(Signals):
         0.5, ge=0.0, lt=100.0, description="share of the population replaced by the best (r_elite)"
     )
     ranges: dict[str, Range] = Field(
-        default_factory=dict, description="search ranges in place of the model's"
+        default_factory=dict,
+        description="search ranges in place of the model's, in its units",
+        examples=[{"K_m": [0.1, 0.2]}],
     )
-    fixed: dict[str, float] = Field(default_factory=dict, description="parameters not searched")
+    fixed: dict[str, float] = Field(
+        default_factory=dict,
+        description="parameters not searched, in the model's units",
+        examples=[{"R_m": 1.18}],
+    )
     tied: dict[str, str] = Field(
-        default_factory=dict, description="multiples of other parameters, as '0.5 * R_m'"
+        default_factory=dict,
+        description="multiples of other parameters",
+        examples=[{"R_b": "0.5 * R_m"}],
     )
-    datasheet: Annotated[list[str], BeforeValidator(_several)] = Field(
-        default_factory=list, description="files with data-sheet values; see docs"
+    datasheet: Annotated[list[str], BeforeValidator(_several), WithJsonSchema(_NAMES_SCHEMA)] = (
+        Field(
+            default_factory=list,
+            description="files with data-sheet values",
+            examples=["motor.yaml"],
+        )
     )
     guess: bool = Field(
         False, description="ranges from the logs themselves, where nothing else is said"
     )
     scale: dict[str, Literal["log", "linear"]] = Field(
-        default_factory=dict, description="scales to search on in place of the model's"
+        default_factory=dict,
+        description="scales to search on in place of the model's",
+        examples=[{"K_m": "log"}],
     )
-    weights: dict[str, float] = Field(
-        default_factory=dict, description="relative importance of the outputs"
+    weights: dict[str, Part] = Field(
+        default_factory=dict,
+        description="relative importance of the outputs",
+        examples=[{"omega": 2.0}],
     )
     per_log: bool = Field(
         False, description="normalise each log by its own largest output, not by the overall one"
@@ -150,6 +199,18 @@ class IdentificationConfig(Signals):
         0.0, ge=0.0, lt=1.0, description="part of each log, its end, that validates"
     )
     profile: list[str] = Field(
-        default_factory=list, description="free parameters whose profile likelihood is wanted"
+        default_factory=list,
+        description="free parameters whose profile likelihood is wanted",
+        examples=[["K_m"]],
     )
-    columns: Columns | None = Field(None, description="how a foreign CSV's columns are meant")
+    columns: Columns | None = Field(
+        None,
+        description="how a foreign CSV's columns are meant",
+        examples=[
+            {
+                "time": {"column": "t", "unit": "ms"},
+                "inputs": {"voltage": {"column": "u", "unit": "V"}},
+                "outputs": {"omega": {"column": "n", "unit": "rpm"}},
+            }
+        ],
+    )

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, create_model, field_validator
 
 from daq.config.base import Section
-from daq.config.units import Amperes, Volts
+from daq.config.units import Amperes, Unit, Volts
 
 Sign = Literal[-1, 1]
 
@@ -15,8 +15,19 @@ Sign = Literal[-1, 1]
 class AnalogInput(Section):
     """Volts at an input to SI units: value = sign * scale * (volts - offset)."""
 
-    scale: float = Field(gt=0.0, description="SI units per volt")
     sign: Sign = Field(1, description="-1 turns the direction round")
+
+
+class CurrentInput(AnalogInput):
+    """A current sensor's volts."""
+
+    scale: Annotated[float, Unit("A/V")] = Field(gt=0.0, description="amperes per volt")
+
+
+class TorqueInput(AnalogInput):
+    """A torque bridge's volts."""
+
+    scale: Annotated[float, Unit("N*m/V")] = Field(gt=0.0, description="torque per volt")
 
 
 class Encoder(Section):
@@ -29,14 +40,14 @@ class Encoder(Section):
 class Sensors(Section):
     """Calibration of every measured channel; the only place where volts become SI units."""
 
-    current_motor: AnalogInput = Field(
-        AnalogInput(scale=0.5), description="motor current sense, A per volt (0.5 is 2 V/A)"
+    current_motor: CurrentInput = Field(
+        CurrentInput(scale=0.5), description="motor current sense (0.5 A/V is 2 V/A)"
     )
-    current_brake: AnalogInput = Field(
-        AnalogInput(scale=0.5), description="brake current sense, A per volt (0.5 is 2 V/A)"
+    current_brake: CurrentInput = Field(
+        CurrentInput(scale=0.5), description="brake current sense (0.5 A/V is 2 V/A)"
     )
-    torque: AnalogInput = Field(
-        AnalogInput(scale=0.706), description="torque bridge, N*m per volt (3.53 N*m at 5 V)"
+    torque: TorqueInput = Field(
+        TorqueInput(scale=0.706), description="torque bridge (3.53 N*m at 5 V is 0.706 N*m/V)"
     )
     encoder: Encoder = Field(Encoder(), description="shaft encoder")
 

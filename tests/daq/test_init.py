@@ -1,0 +1,62 @@
+"""``rig init``: files to begin with that work as they are, and never over somebody's own."""
+
+import json
+
+import jsonschema
+import pytest
+import yaml
+
+from daq.cli.starting import settings_text
+from tests.daq.support import rig
+
+
+def test_the_files_work_as_they_are_and_the_next_commands_are_told(tmp_path):
+    result = rig("init", "lab", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    told = result.stdout.splitlines()
+    assert told[-3:] == [
+        "Next: cd lab",
+        "Next: rig check prbs.yaml --rig rig.yaml",
+        "Then: rig run prbs.yaml --rig rig.yaml --identify --config identification.yaml",
+    ]
+    lab = tmp_path / "lab"
+    checked = rig(*told[-2].split()[2:], cwd=lab)
+    assert checked.returncode == 0, checked.stderr
+    for name in ("prbs.yaml", "rig.yaml", "identification.yaml"):
+        first, content = (lab / name).read_text().split("\n", 1)
+        schema = lab / first.removeprefix("# yaml-language-server: $schema=")
+        jsonschema.validate(yaml.safe_load(content), json.loads(schema.read_text()))
+
+
+def test_what_is_there_stays(tmp_path):
+    (tmp_path / "rig.yaml").write_text("name: mine\n")
+    result = rig("init", "--json", cwd=tmp_path)
+    assert json.loads(result.stdout)["kept"] == ["rig.yaml"]
+    assert json.loads(result.stdout)["written"] == ["prbs.yaml", "identification.yaml"]
+    assert (tmp_path / "rig.yaml").read_text() == "name: mine\n"
+    again = rig("init", cwd=tmp_path)
+    assert again.stdout.count("Kept as it was") == 3
+
+
+@pytest.mark.parametrize(
+    ("args", "said"),
+    [
+        (["--protocol", "prbx"], "--protocol: no 'prbx' to begin with; did you mean 'prbs'?"),
+        (["file"], "file: cannot be created: File exists"),
+    ],
+)
+def test_what_cannot_be_written_is_refused(tmp_path, args, said):
+    (tmp_path / "file").write_text("")
+    result = rig("init", *args, cwd=tmp_path)
+    assert result.returncode == 2 and said in result.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_every_setting_that_stands_as_a_comment_is_one():
+    from daq.config.identification import IdentificationConfig
+
+    lines = settings_text().splitlines()
+    shown = [line.lstrip("#") for line in lines if line[:1] not in {"", "#"} or line[1:2].strip()]
+    content = yaml.safe_load("\n".join(shown))
+    assert set(content) == set(IdentificationConfig.model_fields)
+    IdentificationConfig.model_validate(content)
