@@ -166,22 +166,24 @@ def _bounds(texts: list[str]) -> dict[str, float]:
 
 def _draw(found: Replay, path: Path | None) -> Path | None:
     """Measured and simulated outputs in a figure; without a path beside the log, if that can be."""
-    from daq.figures.comparison import measured_and_simulated
+    from daq.figures import style
+    from daq.figures.responses import Response, responses
 
     chosen = path or found.path.with_name(
         "replay.png" if found.path.name == capture.LOG_NAME else f"{found.path.stem}-replay.png"
     )
-    drawn = measured_and_simulated(
-        found.time, found.measured, found.simulated,
-        [(output.name, output.unit) for output in found.model.outputs], found.metrics.fit,
-    )  # fmt: skip
+    kind = style.format_of(chosen)
+    outputs = [
+        Response(output.name, output.unit, found.measured[:, j],
+                 {"simulated": found.simulated[:, j]}, f"fit {found.metrics.fit[j]:.1f} %")
+        for j, output in enumerate(found.model.outputs)
+    ]  # fmt: skip
     try:
-        drawn.savefig(chosen)
-    except (OSError, ValueError) as error:
-        reason = f"{chosen}: cannot be drawn: {error}; choose another with --figure FILE.png"
+        capture.write_whole(chosen, style.render(responses(found.time, outputs), kind))
+    except RunError as error:
         if path is not None:
-            raise ConfigError(reason) from None
-        console.report_note(reason)
+            raise ConfigError(f"{error}; choose another with --figure FILE.png") from None
+        console.report_note(str(error))
         return None
     return chosen
 

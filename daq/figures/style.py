@@ -10,12 +10,14 @@ import functools
 import io
 import textwrap
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, Literal, ParamSpec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, ParamSpec, get_args
 
 import numpy as np
 import numpy.typing as npt
 
 from daq import notation
+from daq.errors import ConfigError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -225,6 +227,18 @@ def thinned(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     starts = np.arange(whole) * size
     kept = np.unique(np.concatenate([starts + lows, starts + highs, [0, n - 1]]))
     return x[kept], y[kept]
+
+
+def format_of(path: Path) -> Format:
+    """The format that a file's name asks for; ConfigError for one that there is not."""
+    kind = path.suffix.removeprefix(".").lower()
+    for known in get_args(Format):
+        if kind == known:
+            return known  # type: ignore[no-any-return]
+    raise ConfigError(
+        f"{path}: figures are written as {', '.join(get_args(Format))}; "
+        f"for example {path.with_suffix('.png')}"
+    )
 
 
 def render(figure: Figure, kind: Format) -> bytes:

@@ -69,7 +69,7 @@ def test_the_figure_is_written_beside_the_log(rig, capture, tmp_path):
         (["--fail-under", "omega"], "write OUTPUT=PERCENT"),
         (["--fail-under", "omega=high"], "write OUTPUT=PERCENT"),
         (["--figure", "absent/figure.png"], "choose another with --figure"),
-        (["--figure", "figure.docx"], "choose another with --figure"),
+        (["--figure", "figure.docx"], "figures are written as"),
     ],
 )
 def test_a_mistake_is_answered_with_the_cure(rig, capture, tmp_path, options, message):
