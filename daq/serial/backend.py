@@ -8,12 +8,13 @@ import os
 import platform
 import threading
 import time
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field
 
 from daq.config.base import Section
+from daq.config.units import Seconds, Unit
 from daq.errors import DeviceError
 from daq.hal import (
     ANALOG_INPUTS,
@@ -49,14 +50,14 @@ class SerialOptions(Section):
     port: str = Field(
         "", description="device name (/dev/serial/by-id/..., COM3), or a URL such as socket://"
     )
-    baud: int = Field(
-        2_000_000, ge=1200, le=20_000_000, description="of a UART; USB does not care [bit/s]"
+    baud: Annotated[int, Unit("bit/s")] = Field(
+        2_000_000, ge=1200, le=20_000_000, description="speed of a UART; USB does not care"
     )
-    watchdog: float = Field(
+    watchdog: Seconds = Field(
         0.1,
         ge=0.01,
         le=10.0,
-        description="the device zeroes its outputs when it hears nothing for so long [s]",
+        description="the device zeroes its outputs when it hears nothing for so long",
     )
 
 

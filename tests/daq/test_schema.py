@@ -28,7 +28,7 @@ BACKENDS = {
 DOCUMENTS = schemas.documents(PROTOCOLS, BACKENDS)
 SHIPPED = sorted(
     path
-    for folder in ("protocols", "sim_rig", "examples")
+    for folder in ("protocols", "sim_rig", "daq", "examples")
     for path in (ROOT / folder).rglob("*.yaml")
 )
 # Numbers in a unit that stands elsewhere: in a model, or beside them.
