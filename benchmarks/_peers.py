@@ -8,7 +8,6 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,6 @@ from sysid._compile import kernels
 from sysid._lanes import LANES
 from sysid.model import FloatArray, ProcessModel
 from sysid.reference import simulate
-from sysid.simulation import _Runner
 
 RK4_STEPS = 32  # per sample, of the C code and of ours beside it
 PEER_SAMPLES = 100  # slow peers run the record's start; their time per sample is constant
@@ -96,10 +94,9 @@ def fixed_steps(simulator: BatchSimulator, record: Dataset, n_steps: int) -> flo
     """Seconds to the error sums of one chromosome, as one of a block, at so many steps."""
     parameters = np.repeat(simulator.model.nominal[None], LANES, axis=0)
     lanes, nothing = np.arange(LANES), np.empty((0, 0, 0))
-    with ThreadPoolExecutor(1) as pool:
-        runner = _Runner(simulator, record, pool, np.ones(len(simulator.model.outputs)))
-        runner._run(parameters, lanes, n_steps, nothing)
-        return best(lambda: runner._run(parameters, lanes, n_steps, nothing)) / LANES
+    runner = simulator._runner(record, np.ones(len(simulator.model.outputs)))
+    runner._run(parameters, lanes, n_steps, nothing)
+    return best(lambda: runner._run(parameters, lanes, n_steps, nothing)) / LANES
 
 
 def _c_vectors(record: Dataset, model: ProcessModel) -> tuple[float, None]:

@@ -92,7 +92,7 @@ def _simulate(s: Shape, paired: bool) -> str:
         "        if record.shape[0] > 0:",
         f"            for l in range({LANES}):",
         *[f"                {line}" for line in _outputs(s)],
-        *[f"                record[k, {j}, l] = o{j}" for j in range(q)],
+        *[f"                record[k, {j}, l] = (o{j} - y{j}) * w{j}" for j in range(q)],
         "        if k == n_samples - 1:",
         "            break",
         # A block in which every chromosome has blown up has nothing more to say.

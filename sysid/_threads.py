@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import os
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from typing import Any
 
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
@@ -17,3 +21,37 @@ def one_thread() -> Iterator[None]:
     """
     with threadpool_limits(1, user_api="blas"):
         yield
+
+
+class Workers:
+    """So many threads, the calling one included, that wait for tasks from call to call."""
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+        self._pool: ThreadPoolExecutor | None = None
+        self._process = 0
+
+    def each(self, function: Callable[[Any], None], tasks: Sequence[Any]) -> None:
+        """Run a function on every task, each thread taking the next one when it is free."""
+        queue = iter(tasks)  # hands each task out once, to whichever thread
+
+        def work() -> None:
+            for task in queue:
+                function(task)
+
+        # This thread is one of them: waking another takes as long as a short simulation.
+        others = min(self.count, len(tasks)) - 1
+        workers = [self._ready().submit(work) for _ in range(others)]
+        try:
+            work()
+            for worker in workers:
+                worker.result()
+        finally:
+            deque(queue, maxlen=0)  # after an interrupt nothing more is begun
+
+    def _ready(self) -> ThreadPoolExecutor:
+        # A forked process inherits the pool without its threads.
+        if self._pool is None or self._process != os.getpid():
+            self._pool = ThreadPoolExecutor(max(self.count - 1, 1))
+            self._process = os.getpid()
+        return self._pool

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -18,6 +19,18 @@ Balance = Literal["samples", "logs"]
 
 
 _MOST_STEPS = 4096  # a sample, where accuracy is asked for
+
+
+@dataclass(frozen=True)
+class Responses:
+    """Residuals of chromosomes, (n_residuals, n_outputs, n), and their RMS, (n, n_outputs).
+
+    In parts of the outputs' scales, 0 where a sample was lost, not finite where a simulation
+    failed.
+    """
+
+    values: FloatArray
+    rms: FloatArray
 
 
 class Objective:
@@ -107,25 +120,16 @@ class Objective:
         """RMSE of each output in parts of its scale, (n, n_outputs), infinite where it failed."""
         return self._roots(self.evaluate(chromosomes)[1].sse.sum(axis=1))
 
-    def residuals(self, chromosomes: FloatArray, n_steps: Sequence[int]) -> FloatArray:
-        """Normalised residuals at common step counts, (n, n_residuals, n_outputs).
+    def residuals(self, chromosomes: FloatArray, n_steps: Sequence[int] | IntArray) -> Responses:
+        """Residuals at given integration steps per sample, records one after another.
 
-        The records follow one another; lost samples leave 0.
+        n_steps: (n_records,), or of each chromosome (n, n_records).
         """
-        vectors, starts = self.space.full(chromosomes), self._starts(chromosomes)
-        parts = []
-        for record, scale, steps, start in zip(
-            self.records, self.scales, n_steps, starts, strict=True
-        ):
-            residuals = self.simulator.trajectories(vectors, record, steps, start)
-            residuals -= record.outputs
-            residuals /= scale
-            missing = ~np.isfinite(record.outputs)
-            if missing.any():
-                residuals[:, missing] = 0.0
-            parts.append(residuals)
-        self._counter[0] += len(vectors)
-        return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
+        return self._responses(chromosomes, n_steps, keep=True)
+
+    def rms_at(self, chromosomes: FloatArray, n_steps: Sequence[int] | IntArray) -> FloatArray:
+        """The same residuals' root mean squares alone, (n, n_outputs)."""
+        return self._responses(chromosomes, n_steps, keep=False).rms
 
     def steps_needed(self, chromosomes: FloatArray) -> IntArray:
         """Integration steps per sample that each chromosome needs, (n, n_records)."""
@@ -135,24 +139,18 @@ class Objective:
             [self.simulator.steps_of_each(vectors, record) for record in self.records], axis=1
         )
 
-    def error_of(self, residuals: FloatArray) -> FloatArray:
-        """The error of residuals as returned by ``residuals``, (n,)."""
-        return self._mean(self.rms_of(residuals))
+    def error_of(self, rms: FloatArray) -> FloatArray:
+        """The error that outputs' root mean squares (n, n_outputs) come to, (n,)."""
+        return self._mean(rms)
 
-    def smoothed_error_of(self, residuals: FloatArray, floor: float) -> FloatArray:
+    def smoothed_error_of(self, rms: FloatArray, floor: float) -> FloatArray:
         """The same, but smooth where an output is explained exactly, (n,).
 
         An RMSE below ``floor`` counts by the parabola that meets the root there with its slope.
         """
-        rms = self.rms_of(residuals)
         with np.errstate(over="ignore", invalid="ignore"):
             smooth = np.where(rms > floor, rms, 0.5 * (rms**2 / floor + floor))
         return self._mean(smooth)
-
-    def rms_of(self, residuals: FloatArray) -> FloatArray:
-        """Root mean square of each output's residuals, (n, n_outputs)."""
-        with np.errstate(over="ignore", invalid="ignore"):
-            return self._roots(np.sum(residuals * residuals, axis=1))
 
     @property
     def n_residuals(self) -> int:
@@ -165,7 +163,7 @@ class Objective:
         residual: (n_residuals, n_outputs), at that minimum. Half the second derivative of the
         error is that of the weighted mean square.
         """
-        counts, rms = np.maximum(self.counts, 1), self.rms_of(residual[None])[0]
+        counts, rms = np.maximum(self.counts, 1), self._roots(np.sum(residual**2, axis=0))
         weights: FloatArray = self.weights * len(residual) / counts / np.maximum(rms, 1e-12)
         return weights
 
@@ -176,6 +174,17 @@ class Objective:
             self.space.starts(chromosomes, k, record.initial_state(model))
             for k, record in enumerate(self.records)
         ]
+
+    def _responses(
+        self, chromosomes: FloatArray, n_steps: Sequence[int] | IntArray, *, keep: bool
+    ) -> Responses:
+        steps = np.broadcast_to(n_steps, (len(chromosomes), len(self.records)))
+        found = self.simulator.residuals(
+            self.space.full(chromosomes), self.records, self.scales, steps,
+            self._starts(chromosomes), keep=keep,
+        )  # fmt: skip
+        self._counter[0] += len(chromosomes)
+        return Responses(found.values, self._roots(found.sse.sum(axis=1)))
 
     def _roots(self, sse: FloatArray) -> FloatArray:
         """Root mean squares of sums of squares, (n, n_outputs)."""

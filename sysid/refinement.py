@@ -9,15 +9,14 @@ perturbations: equations that switch, such as dry friction, are steps and platea
 from __future__ import annotations
 
 import math
-from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sysid.constrained import Constraints
-from sysid.model import BoolArray, FloatArray
-from sysid.objective import Objective
+from sysid.model import BoolArray, FloatArray, IntArray
+from sysid.objective import Objective, Responses
 
 # Candidates of an iteration: damping values around the last one that served.
 _FACTORS = 5.0 ** np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
@@ -146,9 +145,9 @@ def curvature(objective: Objective, at: FloatArray) -> FloatArray:
     frame = _Frame(objective)
     descents = frame.with_steps([Descent(at)])
     rows, distance = frame.perturbed(descents[0])
-    (residuals,) = frame.residuals(descents, [rows])
-    error = float(objective.error_of(residuals[:1])[0])
-    return _normal_equations(objective, residuals, distance, _SMOOTHING[0] * error)[0]
+    (around,) = frame.residuals(descents, [rows])
+    error = float(objective.error_of(around.rms[:1])[0])
+    return _normal_equations(objective, around, distance, _SMOOTHING[0] * error).hessian
 
 
 def advance(
@@ -196,18 +195,35 @@ class _Frame:
         needed = self.objective.steps_needed(self.objective.space.decode(descent.at[None]))[0]
         return tuple(max(int(n), have) for n, have in zip(needed, descent.steps, strict=True))
 
-    def residuals(self, descents: list[Descent], rows: list[FloatArray]) -> list[FloatArray]:
-        """Residuals of each descent's rows of coordinates, those of like steps in one batch."""
-        groups: dict[tuple[int, ...], list[int]] = defaultdict(list)
-        for i, descent in enumerate(descents):
-            groups[descent.steps].append(i)
-        found: dict[int, FloatArray] = {}
-        for steps, members in groups.items():
-            together = np.concatenate([rows[i] for i in members])
-            batch = self.objective.residuals(self.objective.space.decode(together), steps)
-            ends = np.cumsum([len(rows[i]) for i in members])[:-1]
-            found |= dict(zip(members, np.split(batch, ends), strict=True))
-        return [found[i] for i in range(len(descents))]
+    def residuals(self, descents: list[Descent], rows: list[FloatArray]) -> list[Responses]:
+        """Responses of each descent's rows of coordinates, all in one batch."""
+        order, chromosomes, steps = self._together(descents, rows)
+        found = self.objective.residuals(chromosomes, steps)
+        ends = np.cumsum([len(rows[i]) for i in order])[:-1]
+        values = np.split(found.values, ends, axis=2)
+        parts = dict(zip(order, zip(values, np.split(found.rms, ends), strict=True), strict=True))
+        return [Responses(*parts[i]) for i in range(len(rows))]
+
+    def rms(self, descents: list[Descent], rows: list[FloatArray]) -> list[FloatArray]:
+        """The responses' root mean squares alone, (n_rows, n_outputs) each."""
+        if not rows:
+            return []
+        order, chromosomes, steps = self._together(descents, rows)
+        found = self.objective.rms_at(chromosomes, steps)
+        ends = np.cumsum([len(rows[i]) for i in order])[:-1]
+        parts = dict(zip(order, np.split(found, ends), strict=True))
+        return [parts[i] for i in range(len(rows))]
+
+    def _together(
+        self, descents: list[Descent], rows: list[FloatArray]
+    ) -> tuple[list[int], FloatArray, IntArray]:
+        """An order in which descents of like steps are neighbours, their chromosomes and steps."""
+        order = sorted(range(len(rows)), key=lambda i: descents[i].steps)
+        steps = np.repeat(
+            np.array([descents[i].steps for i in order]), [len(rows[i]) for i in order], axis=0
+        )
+        together = np.concatenate([rows[i] for i in order])
+        return order, self.objective.space.decode(together), steps
 
     def perturbed(self, descent: Descent) -> tuple[FloatArray, FloatArray]:
         """The descent's point and its neighbours, (1 + n_free, n_free), and their distances."""
@@ -217,10 +233,23 @@ class _Frame:
         return np.vstack([descent.at, descent.at + np.diag(distance * self.width)]), distance
 
     def infeasible(self, rows: FloatArray) -> BoolArray:
-        """Which rows violate a constraint or a physical limit."""
+        """Which rows (..., n_free) violate a constraint or a physical limit, (...)."""
         space = self.objective.space
-        mask: BoolArray = np.any(space.violations(space.decode(rows)) > 0.0, axis=1)
+        violations = space.violations(space.decode(rows.reshape(-1, rows.shape[-1])))
+        mask: BoolArray = np.any(violations > 0.0, axis=1).reshape(rows.shape[:-1])
         return mask
+
+
+@dataclass(frozen=True)
+class _Equations:
+    """The quadratic around a point: Hessian (n_free, n_free), gradient (n_free,), value.
+
+    Coordinates in units of the ranges.
+    """
+
+    hessian: FloatArray
+    gradient: FloatArray
+    value: float
 
 
 @dataclass(frozen=True)
@@ -235,43 +264,66 @@ class _Candidates:
     promise: float
 
 
+@dataclass(frozen=True)
+class _Sensed:
+    """A descent, the outputs' errors where it is, (n_outputs,), and the quadratic around it.
+
+    place: among those that are moved together.
+    """
+
+    place: int
+    descent: Descent
+    rms: FloatArray
+    equations: _Equations
+
+
 def _iterate(frame: _Frame, descents: list[Descent], tolerance: float) -> list[Descent]:
-    around = [frame.perturbed(descent) for descent in descents]
-    sensed = frame.residuals(descents, [rows for rows, _ in around])
     result: list[Descent | None] = [None] * len(descents)
-    open_: list[tuple[int, FloatArray, _Candidates]] = []
-    for i, (descent, residuals, (_, distance)) in enumerate(
-        zip(descents, sensed, around, strict=True)
-    ):
-        error = float(frame.objective.error_of(residuals[:1])[0])
-        if not np.isfinite(error):
-            # With more steps the simulation fails.
-            result[i] = _back(descent)
-            continue
-        at = replace(descent, error=error, gain=0.0, iterations=descent.iterations + 1)
-        if at.steps_at is not None and np.array_equal(at.at, at.steps_at):
-            at = replace(at, sure=at.at, sure_error=error)
-        if error <= ROUNDING:
-            result[i] = replace(at, finished=True)
-            continue
-        burst = ~(frame.objective.error_of(residuals[1:]) <= _BURST + error)
-        if burst.any() and at.braced < _BRACINGS:
-            result[i] = _steadier(at)
-            continue
-        # Where more steps do not help it is the model that is unbounded there: not that way.
-        residuals[1:][burst] = residuals[0]
-        if not np.isfinite(at.error_of_round):
-            at = replace(at, error_of_round=error)
-        candidates = _candidates(frame, at, residuals, distance)
-        descents[i] = at
-        if len(candidates.rows) == 0 or candidates.promise <= tolerance:
-            result[i] = _next_round(frame, at, residuals[0])
+    around = [frame.perturbed(descent) for descent in descents]
+    responses = frame.residuals(descents, [rows for rows, _ in around])
+    sensed: list[_Sensed] = []
+    for i, descent in enumerate(descents):
+        moved = _sensed(frame, i, descent, responses[i], around[i][1])
+        if isinstance(moved, Descent):
+            result[i] = moved
         else:
-            open_.append((i, residuals[0], candidates))
-    tried = frame.residuals([descents[i] for i, _, _ in open_], [c.rows for _, _, c in open_])
-    for (i, residual, candidates), residuals in zip(open_, tried, strict=True):
-        result[i] = _judged(frame, descents[i], residual, candidates, residuals, tolerance)
+            sensed.append(moved)
+    tried: list[tuple[_Sensed, _Candidates]] = []
+    for one, candidates in zip(sensed, _candidates(frame, sensed), strict=True):
+        if len(candidates.rows) == 0 or candidates.promise <= tolerance:
+            result[one.place] = _next_round(frame, one.descent, one.rms)
+        else:
+            tried.append((one, candidates))
+    errors = frame.rms([one.descent for one, _ in tried], [found.rows for _, found in tried])
+    for (one, candidates), rms in zip(tried, errors, strict=True):
+        result[one.place] = _judged(frame, one, candidates, rms, tolerance)
     return [descent for descent in result if descent is not None]
+
+
+def _sensed(
+    frame: _Frame, place: int, descent: Descent, around: Responses, distance: FloatArray
+) -> _Sensed | Descent:
+    """What the neighbours of a descent tell; or the descent where they do not help it on."""
+    errors = frame.objective.error_of(around.rms)
+    error = float(errors[0])
+    if not np.isfinite(error):
+        # With more steps the simulation fails.
+        return _back(descent)
+    at = replace(descent, error=error, gain=0.0, iterations=descent.iterations + 1)
+    if at.steps_at is not None and np.array_equal(at.at, at.steps_at):
+        at = replace(at, sure=at.at, sure_error=error)
+    if error <= ROUNDING:
+        return replace(at, finished=True)
+    burst = ~(errors[1:] <= _BURST + error)
+    if burst.any() and at.braced < _BRACINGS:
+        return _steadier(at)
+    # Where more steps do not help it is the model that is unbounded there: not that way.
+    around.values[..., 1:][..., burst] = around.values[..., :1]
+    if not np.isfinite(at.error_of_round):
+        at = replace(at, error_of_round=error)
+    floor = _SMOOTHING[at.smoothing] * error
+    equations = _normal_equations(frame.objective, around, distance, floor)
+    return _Sensed(place, at, around.rms[0], equations)
 
 
 def _back(descent: Descent) -> Descent:
@@ -298,19 +350,14 @@ def _steadier(descent: Descent) -> Descent:
 
 
 def _judged(
-    frame: _Frame,
-    descent: Descent,
-    residual: FloatArray,
-    candidates: _Candidates,
-    tried: FloatArray,
-    tolerance: float,
+    frame: _Frame, sensed: _Sensed, candidates: _Candidates, rms: FloatArray, tolerance: float
 ) -> Descent:
-    """The descent after its candidates have been simulated."""
-    objective = frame.objective
+    """The descent after its candidates have been simulated; rms: (n, n_outputs), theirs."""
+    objective, descent = frame.objective, sensed.descent
     floor = _SMOOTHING[descent.smoothing] * descent.error
-    errors = objective.smoothed_error_of(tried, floor)
+    errors = objective.smoothed_error_of(rms, floor)
     best = int(np.argmin(errors))
-    before = float(objective.smoothed_error_of(residual[None], floor)[0])
+    before = float(objective.smoothed_error_of(sensed.rms[None], floor)[0])
     gain = (before - float(errors[best])) / before
     moved, damping = descent, descent.damping
     if gain > 0.0:
@@ -320,7 +367,7 @@ def _judged(
         moved = replace(
             descent,
             at=at,
-            error=float(objective.error_of(tried[best : best + 1])[0]),
+            error=float(objective.error_of(rms[best : best + 1])[0]),
             gain=gain,
             steps_at=None if far else descent.steps_at,
         )
@@ -335,14 +382,14 @@ def _judged(
         # More damping did not help: it is the sensitivities that are wrong.
         return replace(moved, level=descent.level + 1, failures=0, damping=_FIRST_DAMPING)
     if failures >= _PATIENCE or 0.0 < gain <= tolerance:
-        return _next_round(frame, moved, tried[best] if gain > 0.0 else residual)
+        return _next_round(frame, moved, rms[best] if gain > 0.0 else sensed.rms)
     return moved
 
 
-def _next_round(frame: _Frame, descent: Descent, residual: FloatArray) -> Descent:
+def _next_round(frame: _Frame, descent: Descent, rms: FloatArray) -> Descent:
     """Finished; unless what was smoothed is not yet the error, or coarse sensitivities have
-    gained, from where fine ones may go on."""
-    rms = frame.objective.rms_of(residual[None])[0][frame.objective.weights > 0.0]
+    gained, from where fine ones may go on. rms: (n_outputs,), there."""
+    rms = rms[frame.objective.weights > 0.0]
     smoothing = descent.smoothing
     if np.any(rms < _SMOOTHING[smoothing] * descent.error) and smoothing + 1 < len(_SMOOTHING):
         return replace(descent, smoothing=smoothing + 1, failures=0)
@@ -359,63 +406,83 @@ def _limited(damping: float) -> float:
     return float(min(max(damping, _LEAST_DAMPING), _MOST_DAMPING))
 
 
-def _candidates(
-    frame: _Frame, descent: Descent, residuals: FloatArray, distance: FloatArray
-) -> _Candidates:
-    """Damped Gauss-Newton steps that keep to the ranges and constraints."""
-    hessian, gradient, size = _normal_equations(
-        frame.objective, residuals, distance, _SMOOTHING[descent.smoothing] * descent.error
-    )
-    n = len(gradient)
-    nowhere = _Candidates(np.empty((0, n)), np.empty(0), 0.0)
+def _candidates(frame: _Frame, sensed: list[_Sensed]) -> list[_Candidates]:
+    """Damped Gauss-Newton steps of each that keep to the ranges and constraints."""
+    n = len(frame.width)
+    found = [_Candidates(np.empty((0, n)), np.empty(0), 0.0)] * len(sensed)
     # Sensitivities may be too large to square at the edge of instability: then stay.
-    if not (np.all(np.isfinite(hessian)) and np.all(np.isfinite(gradient))):
-        return nowhere
-    diagonal = np.diag(hessian)
-    scale = np.maximum(diagonal, 1e-12 * diagonal.max())
-    if scale.max() <= 0.0:
-        return nowhere
-    low = (frame.lower - descent.at) / frame.width
-    high = (frame.upper - descent.at) / frame.width
-    damping = np.clip(descent.damping * _FACTORS, _LEAST_DAMPING, _MOST_DAMPING)
-    damping = np.append(damping, _LEAST_DAMPING)
-    moves = _steps(hessian, gradient, damping[:, None] * scale, low, high)
-    bad = frame.infeasible(descent.at + moves * frame.width)
+    usable = [k for k, one in enumerate(sensed) if _leads_somewhere(one.equations)]
+    if not usable:
+        return found
+    equations = [sensed[k].equations for k in usable]
+    hessian = np.stack([one.hessian for one in equations])
+    gradient = np.stack([one.gradient for one in equations])[:, :, None]
+    at = np.stack([sensed[k].descent.at for k in usable])[:, None]
+    low, high = (frame.lower - at) / frame.width, (frame.upper - at) / frame.width
+    last = np.array([[sensed[k].descent.damping] for k in usable])
+    damping = np.clip(last * np.append(_FACTORS, 0.0), _LEAST_DAMPING, _MOST_DAMPING)
+    diagonal = np.diagonal(hessian, axis1=1, axis2=2)
+    scale = np.maximum(diagonal, 1e-12 * diagonal.max(axis=1, keepdims=True))
+    added = damping[:, :, None] * scale[:, None]
+    moves = _steps(hessian, gradient, added, low, high)
+    bad = frame.infeasible(at + moves * frame.width)
     if bad.any() and frame.objective.space.model.constraints:
-        limits = Constraints.at(frame.objective.space, descent.at, frame.width)
-        for i in np.flatnonzero(bad):
-            moves[i] = _within(limits, moves[i], hessian + np.diag(damping[i] * scale), low, high)
+        for k in np.flatnonzero(bad.any(axis=1)).tolist():
+            limits = Constraints.at(frame.objective.space, at[k, 0], frame.width)
+            for j in np.flatnonzero(bad[k]).tolist():
+                curvature = hessian[k] + np.diag(added[k, j])
+                moves[k, j] = _within(limits, moves[k, j], curvature, low[k, 0], high[k, 0])
     for _ in range(_RETREATS):
         if not bad.any():
             break
-        bad[bad] = frame.infeasible(descent.at + moves[bad] * frame.width)
+        bad[bad] = frame.infeasible((at + moves * frame.width)[bad])
         moves[bad] *= _RETREAT
-    promise = -(moves @ gradient + 0.5 * np.sum((moves @ hessian) * moves, axis=1)) / size
-    kept = np.flatnonzero(~bad[:-1] & (promise[:-1] > 0.0))
-    rows = np.clip(descent.at + moves[kept] * frame.width, frame.lower, frame.upper)
-    return _Candidates(rows, damping[kept], float(promise.max()))
+    rows = np.clip(at + moves * frame.width, frame.lower, frame.upper)
+    gained = -(moves @ gradient)[..., 0] - 0.5 * np.sum((moves @ hessian) * moves, axis=2)
+    for place, k in enumerate(usable):
+        promise = gained[place] / equations[place].value
+        kept = np.flatnonzero(~bad[place, :-1] & (promise[:-1] > 0.0))
+        found[k] = _Candidates(rows[place, kept], damping[place, kept], float(promise.max()))
+    return found
+
+
+def _leads_somewhere(equations: _Equations) -> bool:
+    """Whether the quadratic is one, and not flat."""
+    finite = np.isfinite(equations.hessian).all() and np.isfinite(equations.gradient).all()
+    return bool(finite and np.diag(equations.hessian).max() > 0.0)
 
 
 def _normal_equations(
-    objective: Objective, residuals: FloatArray, distance: FloatArray, floor: float
-) -> tuple[FloatArray, FloatArray, float]:
-    """Hessian, gradient and value of the quadratic that bounds the smoothed error from above.
+    objective: Objective, around: Responses, distance: FloatArray, floor: float
+) -> _Equations:
+    """The quadratic that bounds the smoothed error from above.
 
-    Coordinates in units of the ranges. residuals: of the point and its neighbours.
+    around: responses of the point and its neighbours, at distances (n_free,) from it.
     """
-    rms = objective.rms_of(residuals[:1])[0]
-    large = np.maximum(rms, floor)
-    share = np.sqrt(objective.weights / (large * np.maximum(objective.counts, 1)))
+    rms, weights = around.rms[0], objective.weights
+    share = weights / (np.maximum(rms, floor) * np.maximum(objective.counts, 1))
+    counted = np.flatnonzero(weights > 0.0)
     with np.errstate(over="ignore", invalid="ignore"):
-        slopes = residuals[1:] - residuals[0]
-        slopes *= share / distance[:, None, None]
-        rows = slopes.reshape(len(distance), -1)
-        hessian, gradient = rows @ rows.T, rows @ (residuals[0] * share).ravel()
+        slopes = (around.values[..., 1:] - around.values[..., :1]) / distance
+        hessian, gradient = _summed(slopes, around.values[..., 0], share, counted)
         if not np.all(np.isfinite(gradient)):
-            rows = np.where(np.isfinite(rows), rows, 0.0)
-            hessian, gradient = rows @ rows.T, rows @ (residuals[0] * share).ravel()
-    value = float(np.where(rms > floor, rms, 0.5 * (rms**2 / floor + floor)) @ objective.weights)
-    return hessian, gradient, value
+            slopes = np.where(np.isfinite(slopes), slopes, 0.0)
+            hessian, gradient = _summed(slopes, around.values[..., 0], share, counted)
+    value = float(np.where(rms > floor, rms, 0.5 * (rms**2 / floor + floor)) @ weights)
+    return _Equations(hessian, gradient, value)
+
+
+def _summed(
+    slopes: FloatArray, residual: FloatArray, share: FloatArray, counted: IntArray
+) -> tuple[FloatArray, FloatArray]:
+    """Hessian and gradient of the outputs that count, each by its share."""
+    n = slopes.shape[2]
+    hessian, gradient = np.zeros((n, n)), np.zeros(n)
+    for j in counted:
+        rows = slopes[:, j]
+        hessian += share[j] * (rows.T @ rows)
+        gradient += share[j] * (residual[:, j] @ rows)
+    return hessian, gradient
 
 
 def _steps(
@@ -424,28 +491,41 @@ def _steps(
 ) -> FloatArray:  # fmt: skip
     """Minima of damped quadratics between bounds on the step, by holding what hits them.
 
-    damping: (n, n_free), one row for each step.
+    hessian: (m, n_free, n_free), gradient: (m, n_free, 1); damping: (m, n, n_free), so many steps
+    of each; low, high: (m, 1, n_free).
     """
+    down = -gradient[:, None, :, 0]
     # A direction held by a bound and pushed against it would only shorten the step.
-    pushed = ((low >= 0.0) & (gradient > 0.0)) | ((high <= 0.0) & (gradient < 0.0))
-    held = np.repeat(pushed[None], len(damping), axis=0)
+    pushed = ((low >= 0.0) & (down < 0.0)) | ((high <= 0.0) & (down > 0.0))
+    held = np.repeat(pushed, damping.shape[1], axis=1)
     moves = np.zeros(damping.shape)
-    n = len(gradient)
+    diagonal = np.arange(damping.shape[2])
+    live = np.arange(len(hessian))
     for _ in range(_HOLDING_ROUNDS):
-        # A held coordinate's row says that it moves as far as it does.
-        systems = np.where(held[:, :, None], 0.0, hessian)
-        systems[:, np.arange(n), np.arange(n)] += np.where(held, 1.0, damping)
-        right = np.where(held, moves, -gradient)
-        try:
-            moves = np.linalg.solve(systems, right[:, :, None])[:, :, 0]
-        except np.linalg.LinAlgError:
-            return np.zeros(damping.shape)
-        out = ~held & ((moves < low) | (moves > high))
-        moves = np.clip(moves, low, high)
-        if not out.any():
+        if len(live) == 0:
             break
-        held |= out
+        stay = held[live]
+        # A held coordinate's row says that it moves as far as it does.
+        systems = np.where(stay[..., None], 0.0, hessian[live, None])
+        systems[..., diagonal, diagonal] += np.where(stay, 1.0, damping[live])
+        found = _solved(systems, np.where(stay, moves[live], down[live]))
+        out = ~stay & ((found < low[live]) | (found > high[live]))
+        moves[live] = np.clip(found, low[live], high[live])
+        held[live] |= out
+        live = live[out.any(axis=(1, 2))]
     return np.where(np.isfinite(moves), moves, 0.0)
+
+
+def _solved(systems: FloatArray, right: FloatArray) -> FloatArray:
+    """Solutions (m, n, n_free) of linear systems, NaN for all of one of the m with a singular."""
+    try:
+        found: FloatArray = np.linalg.solve(systems, right[..., None])[..., 0].astype(np.float64)
+        return found
+    except np.linalg.LinAlgError:
+        if len(systems) == 1:
+            return np.full(right.shape, np.nan)
+    pairs = zip(systems[:, None], right[:, None], strict=True)
+    return np.concatenate([_solved(system, side) for system, side in pairs])
 
 
 def _within(

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import enum
 import os
-from collections import deque
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from sysid._compile import kernels
 from sysid._lanes import LANES, work_area
+from sysid._setup import Setup
+from sysid._threads import Workers
 from sysid.data import Dataset
 from sysid.model import BoolArray, FloatArray, IntArray, ModelError, ProcessModel
 
@@ -35,6 +34,7 @@ _MAX_STEPS = 512
 # Steps per sample come from a ladder so that chromosomes of like need share a block, while
 # each one's result depends on nothing but itself.
 _LADDER = np.unique(np.round(2.0 ** np.arange(0, 20.01, 0.5)).astype(np.int64))
+_MOST_SETUPS = 64  # records that a simulator keeps ready
 
 
 class Status(enum.IntEnum):
@@ -59,6 +59,19 @@ class BatchResult:
     sse: FloatArray
     status: IntArray
     steps: IntArray
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Weighted residuals at given steps.
+
+    values: (n_residuals, n_outputs, n_chromosomes), records one after another, 0 where a sample
+    was lost; not finite where a simulation failed. sse: (n_chromosomes, n_records, n_outputs),
+    their sums of squares.
+    """
+
+    values: FloatArray
+    sse: FloatArray
 
 
 class BatchSimulator:
@@ -87,6 +100,8 @@ class BatchSimulator:
         self.threads = threads or available_cores()
         self.max_steps = max_steps
         self._kernels = kernels(model)
+        self._workers = Workers(self.threads)
+        self._setups: dict[tuple[int, bytes], Setup] = {}
 
     def errors(
         self,
@@ -107,15 +122,13 @@ class BatchSimulator:
         sse = np.full((n, len(records), len(self.model.outputs)), np.inf)
         status = np.full(n, Status.OK, dtype=np.int64)
         steps = np.zeros(n, dtype=np.int64)
-        with ThreadPoolExecutor(self.threads) as pool:
-            for r, record in enumerate(records):
-                todo = np.flatnonzero(status == Status.OK)
-                start = None if starts is None else starts[r][todo]
-                runner = _Runner(self, record, pool, scales[r], start)
-                result = runner.population(parameters[todo])
-                sse[todo, r] = result.sse[:, 0]
-                status[todo] = result.status
-                steps[todo] += result.steps
+        for r, record in enumerate(records):
+            todo = np.flatnonzero(status == Status.OK)
+            start = None if starts is None else starts[r][todo]
+            result = self._runner(record, scales[r], start).population(parameters[todo])
+            sse[todo, r] = result.sse[:, 0]
+            status[todo] = result.status
+            steps[todo] += result.steps
         sse[status != Status.OK] = np.inf
         return BatchResult(sse, status, steps)
 
@@ -133,23 +146,73 @@ class BatchSimulator:
         (n, n_states), initial states; default the record's own.
         """
         parameters = self._check(parameters, [record])
+        runner = self._runner(record, None, starts)
+        n_steps = n_steps or int(runner.steps_of_each(parameters).max())
+        outputs = np.empty((record.n_samples, len(self.model.outputs), len(parameters)))
+        each = np.full(len(parameters), n_steps)
+
+        def run(task: tuple[slice, int]) -> None:
+            rows, steps = task
+            runner.residuals(parameters, rows, steps, outputs[..., rows])
+
+        self._workers.each(run, _runs(each))
+        return np.ascontiguousarray(np.moveaxis(outputs, 2, 0))
+
+    def residuals(
+        self,
+        parameters: FloatArray,
+        records: Sequence[Dataset],
+        scales: Sequence[FloatArray],
+        n_steps: IntArray,
+        starts: Sequence[FloatArray],
+        *,
+        keep: bool = True,
+    ) -> Residuals:
+        """Residuals of every parameter vector on every record at given steps.
+
+        n_steps: (n, n_records), integration steps per sample; rows of like steps had better be
+        neighbours, to share a block. scales, starts: as those of ``errors``. Without ``keep``
+        there are no values, only their sums of squares.
+        """
+        parameters = self._check(parameters, records)
         n, q = len(parameters), len(self.model.outputs)
-        outputs = np.full((n, record.n_samples, q), np.nan)
-        with ThreadPoolExecutor(self.threads) as pool:
-            runner = _Runner(self, record, pool, starts=starts)
-            n_steps = n_steps or int(runner.steps_of_each(parameters).max())
-            runner.each(
-                lambda lanes: runner.record_block(parameters, lanes, n_steps, outputs),
-                _blocks(np.arange(n)),
-            )
-        return outputs
+        sse = np.empty((n, len(records), q))
+        ends = np.cumsum([record.n_samples for record in records])
+        values = np.empty((ends[-1] if keep else 0, q, n))
+        tasks = []
+        for r, (record, end) in enumerate(zip(records, ends, strict=True)):
+            runner = self._runner(record, scales[r], starts[r])
+            part = values[end - record.n_samples : end]
+            tasks += [(runner, part, sse[:, r], *run) for run in _runs(n_steps[:, r])]
+        # What takes longest is begun first.
+        tasks.sort(key=lambda task: -task[4] * task[0].setup.record.n_samples)
+
+        def run(task: tuple[_Runner, FloatArray, FloatArray, slice, int]) -> None:
+            runner, part, sums, rows, steps = task
+            sums[rows] = runner.residuals(parameters, rows, steps, part[..., rows])
+
+        self._workers.each(run, tasks)
+        return Residuals(values, sse)
 
     def steps_of_each(self, parameters: FloatArray, record: Dataset) -> IntArray:
         """Integration steps per sample that each parameter vector needs, (n,)."""
         parameters = self._check(parameters, [record])
-        with ThreadPoolExecutor(self.threads) as pool:
-            runner = _Runner(self, record, pool)
-            return runner.steps_of_each(parameters)
+        return self._runner(record).steps_of_each(parameters)
+
+    def _runner(
+        self,
+        record: Dataset,
+        scale: FloatArray | None = None,
+        starts: FloatArray | None = None,
+    ) -> _Runner:
+        key = id(record), b"" if scale is None else scale.tobytes()
+        setup = self._setups.get(key)
+        if setup is None:
+            if len(self._setups) >= _MOST_SETUPS:
+                self._setups.clear()
+            # It holds the record, whose address stays its own as long.
+            setup = self._setups[key] = Setup.of(self.model, record, scale)
+        return _Runner(self, setup, starts)
 
     def _check(self, parameters: FloatArray, records: Sequence[Dataset]) -> FloatArray:
         if not records:
@@ -166,46 +229,21 @@ class BatchSimulator:
 
 
 class _Runner:
-    """One record's simulations: choice of steps, blocks of lanes, threads."""
+    """One record's simulations: choice of steps, blocks of lanes."""
 
-    def __init__(
-        self,
-        simulator: BatchSimulator,
-        record: Dataset,
-        pool: ThreadPoolExecutor,
-        scale: FloatArray | None = None,
-        starts: FloatArray | None = None,
-    ) -> None:
-        """With a scale residuals count; without, the simulated outputs are all that is wanted.
-
-        starts: (n, n_states), rows as those of the parameters; default the record's own.
-        """
+    def __init__(self, simulator: BatchSimulator, setup: Setup, starts: FloatArray | None) -> None:
+        """starts: (n, n_states), rows as those of the parameters; default the record's own."""
         self.simulator = simulator
-        self.record = record
-        self.pool = pool
+        self.setup = setup
         self.kernels = simulator._kernels
-        own = record.initial_state(simulator.model)
         # One row stands for all.
-        self.starts = own[None] if starts is None else np.asarray(starts, dtype=np.float64)
-        self.inputs = _with_bends(simulator.model, record.inputs)
-        missing = ~np.isfinite(record.outputs)
-        self.y = np.where(missing, 0.0, record.outputs)
-        if scale is None:
-            self.w = np.ones_like(self.y)
-            self.y = np.zeros_like(self.y)
-        else:
-            self.w = np.where(missing, 0.0, 1.0 / scale)
-        self.weight = np.max(self.w, axis=0)
-        # What an error is small against: the largest measured value, or the output's own size.
-        self.peak = np.where(missing, 0.0, np.abs(record.outputs)).max(axis=0)
-        # Where an input is largest is where a model driven through it is fastest.
-        peaks = np.argmax(np.abs(record.inputs), axis=0) if record.inputs.shape[1] else []
-        self.extremes: IntArray = np.unique(np.array([0, *peaks], dtype=np.int64))
+        given = setup.start[None] if starts is None else starts
+        self.starts: FloatArray = np.asarray(given, dtype=np.float64)
 
     def population(self, parameters: FloatArray) -> BatchResult:
         """Simulate each with the steps it needs, and again with more where it needed more."""
         n = len(parameters)
-        sse = np.full((n, 1, self.y.shape[1]), np.inf)
+        sse = np.full((n, 1, self.setup.measured.shape[1]), np.inf)
         spent = np.zeros(n, dtype=np.int64)
         over = self._choose(parameters, sse, spent)[1]
         status = np.full(n, Status.OK, dtype=np.int64)
@@ -215,35 +253,23 @@ class _Runner:
 
     def steps_of_each(self, parameters: FloatArray) -> IntArray:
         """Steps per sample that each needs, within the budget, (n,)."""
-        sse = np.empty((len(parameters), 1, self.y.shape[1]))
+        sse = np.empty((len(parameters), 1, self.setup.measured.shape[1]))
         spent = np.zeros(len(parameters), dtype=np.int64)
         steps = self._choose(parameters, sse, spent)[0]
         return np.minimum(steps, self.simulator.max_steps)
 
-    def record_block(
-        self, parameters: FloatArray, lanes: IntArray, n_steps: int, outputs: FloatArray
-    ) -> None:
-        record = np.full((self.record.n_samples, self.y.shape[1], LANES), np.nan)
-        self._run(parameters, lanes, n_steps, record)
-        outputs[lanes] = np.moveaxis(record, 2, 0)[: len(lanes)]
+    def residuals(
+        self, parameters: FloatArray, rows: slice, n_steps: int, values: FloatArray
+    ) -> FloatArray:
+        """Error sums (n, n_outputs) of up to LANES rows; values gets their residuals.
 
-    def each(self, function: Callable[[Any], None], tasks: Sequence[Any]) -> None:
-        """Run a function on every task, each thread taking the next one when it is free."""
-        queue = iter(tasks)  # hands each task out once, to whichever thread
-
-        def work() -> None:
-            for task in queue:
-                function(task)
-
-        # This thread is one of them: waking another takes as long as a short simulation.
-        others = min(self.simulator.threads, len(tasks)) - 1
-        workers = [self.pool.submit(work) for _ in range(others)]
-        try:
-            work()
-            for worker in workers:
-                worker.result()
-        finally:
-            deque(queue, maxlen=0)  # after an interrupt nothing more is begun
+        values: (n_samples, n_outputs, n), or without samples to keep none.
+        """
+        record = np.full((len(values), values.shape[1], LANES), np.nan)
+        lanes = np.arange(rows.start, rows.stop)
+        sums = self._run(parameters, lanes, n_steps, record)[0]
+        values[:] = record[..., : len(lanes)]
+        return sums
 
     def _choose(
         self, parameters: FloatArray, sse: FloatArray, spent: IntArray
@@ -254,14 +280,14 @@ class _Runner:
         those fail too it is the model, not the scheme, that is unbounded.
         """
         limit = self.simulator.max_steps
-        steps = _rungs(self._rates(parameters) * self.record.dt / _RATE_LIMIT)
+        steps = _rungs(self._rates(parameters) * self.setup.record.dt / _RATE_LIMIT)
         steps = np.maximum(steps, self.kernels.fewest_steps)
         over = steps > limit
         blown = np.zeros(len(parameters), dtype=bool)
         todo = np.flatnonzero(~over)
         # The record's start tells cheaply what most of them need; whether it is enough the whole
         # record says.
-        pilot = self.record.n_samples // _PILOT_PART
+        pilot = self.setup.record.n_samples // _PILOT_PART
         if pilot >= _PILOT_LEAST:
             excess = self._round(parameters, steps, todo, sse, spent, pilot)
             more = _finer(steps[todo], excess)
@@ -300,15 +326,15 @@ class _Runner:
             for rung in np.unique(steps[todo])[::-1]
             for lanes in _blocks(todo[steps[todo] == rung])
         ]
-        estimates = np.zeros((len(parameters), self.y.shape[1]))
+        estimates = np.zeros((len(parameters), self.setup.measured.shape[1]))
 
         def run(task: tuple[IntArray, int]) -> None:
             lanes, rung = task
             sums = self._run(parameters, lanes, rung, np.empty((0, 0, 0)), n_samples)
             sse[lanes, 0], estimates[lanes] = sums
 
-        self.each(run, tasks)
-        taken = steps[todo] * ((n_samples or self.record.n_samples) - 1)
+        self.simulator._workers.each(run, tasks)
+        taken = steps[todo] * ((n_samples or self.setup.record.n_samples) - 1)
         spent[todo] += taken
         errors = sse[todo, 0]
         with np.errstate(all="ignore"):
@@ -322,8 +348,9 @@ class _Runner:
         Where nothing but zeros was measured it is the RMS of the simulated output, and where
         nothing was measured at all no error matters.
         """
-        own = np.sqrt(errors / self.record.n_samples) / self.weight
-        size = np.where(self.peak > 0.0, self.peak, np.where(self.weight > 0.0, own, np.inf))
+        weight, peak = self.setup.weights.max(axis=0), self.setup.peak
+        own = np.sqrt(errors / len(self.setup.weights)) / weight
+        size = np.where(peak > 0.0, peak, np.where(weight > 0.0, own, np.inf))
         filled: FloatArray = np.where(size > 0.0, size, 1.0)
         return filled
 
@@ -336,22 +363,23 @@ class _Runner:
         n_samples: int | None = None,
     ) -> tuple[FloatArray, FloatArray]:
         """Error sums and estimate sums of up to LANES chromosomes, (n, n_outputs) each."""
+        setup = self.setup
         padded = lanes if len(lanes) == LANES else np.resize(lanes, LANES)
         p = np.ascontiguousarray(parameters[padded].T)
         start = self._start(padded)
-        q = self.y.shape[1]
+        q = setup.measured.shape[1]
         sums = np.empty((2 * q, LANES))
         work = work_area(self.kernels.work_rows * LANES)
         self.kernels.simulate(
             work,
             work.reshape(-1, LANES),
             self.kernels.tables,
-            self.inputs[:n_samples],
-            self.y[:n_samples],
-            self.w[:n_samples],
+            setup.inputs[:n_samples],
+            setup.measured[:n_samples],
+            setup.weights[:n_samples],
             start,
             p,
-            self.record.dt,
+            setup.record.dt,
             n_steps,
             sums,
             record,
@@ -366,34 +394,19 @@ class _Runner:
     def _rates(self, parameters: FloatArray) -> FloatArray:
         """Fastest rate at the start of the record, under its largest inputs [1/s]."""
         rates = np.zeros(len(parameters))
-        inputs = self.record.inputs[self.extremes]
+        setup = self.setup
+        inputs = setup.record.inputs[setup.extremes]
 
         def run(lanes: IntArray) -> None:
             rate = np.zeros(len(lanes))
             start = self._start(lanes)
-            states = np.broadcast_to(start, (len(self.extremes), *start.shape)).copy()
+            states = np.broadcast_to(start, (len(inputs), *start.shape)).copy()
             p = np.ascontiguousarray(parameters[lanes].T)
             self.kernels.spectrum(inputs, states, p, rate)
             rates[lanes] = rate
 
-        self.each(run, _blocks(np.arange(len(parameters))))
+        self.simulator._workers.each(run, _blocks(np.arange(len(parameters))))
         return rates
-
-
-def _with_bends(model: ProcessModel, inputs: FloatArray) -> FloatArray:
-    """Inputs, and behind them the squares' and cubes' coefficients of those that are splines.
-
-    From sample k a spline is u_k + (u_k+1 - u_k) r + a (r^2 - r) + b (r^3 - r), 0 <= r <= 1.
-    """
-    splines = [j for j, signal in enumerate(model.inputs) if signal.hold == "spline"]
-    if not splines:
-        return inputs
-    from scipy.interpolate import CubicSpline
-
-    pieces = CubicSpline(np.arange(len(inputs)), inputs[:, splines]).c
-    bends = np.zeros((len(inputs), 2 * len(splines)))
-    bends[:-1, 0::2], bends[:-1, 1::2] = pieces[1], pieces[0]
-    return np.ascontiguousarray(np.hstack([inputs, bends]))
 
 
 def _finer(steps: IntArray, excess: FloatArray) -> IntArray:
@@ -412,6 +425,17 @@ def _rungs(steps: FloatArray) -> IntArray:
 
 def _blocks(lanes: IntArray) -> list[IntArray]:
     return [lanes[i : i + LANES] for i in range(0, len(lanes), LANES)]
+
+
+def _runs(steps: IntArray) -> list[tuple[slice, int]]:
+    """Up to LANES neighbours each that take the same steps, and these."""
+    ends = [*(np.flatnonzero(np.diff(steps)) + 1).tolist(), len(steps)]
+    begins = [0, *ends[:-1]]
+    return [
+        (slice(i, min(i + LANES, end)), int(steps[begin]))
+        for begin, end in zip(begins, ends, strict=True)
+        for i in range(begin, end, LANES)
+    ]
 
 
 def available_cores() -> int:

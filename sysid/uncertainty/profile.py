@@ -132,8 +132,7 @@ class _Tracer:
 
     def _error(self, chromosome: FloatArray) -> float:
         steps = common_steps(self.objective, chromosome)
-        residual = self.objective.residuals(chromosome[None], steps)
-        return float(self.objective.error_of(residual)[0])
+        return float(self.objective.error_of(self.objective.rms_at(chromosome[None], steps))[0])
 
 
 def _crossing(points: list[tuple[float, float]]) -> float | None:

@@ -144,9 +144,9 @@ class _Follower:
         moved = self.chromosome * np.stack(
             [np.ones_like(relative), np.exp(relative), 1.0 + relative, 1.0 + alone]
         )
-        residuals = self.objective.residuals(moved, self.steps)
-        counted = residuals[..., self.objective.weights > 0.0]
-        change = np.sqrt(np.mean((counted[1:] - counted[0]) ** 2, axis=(1, 2)))
+        residuals = self.objective.residuals(moved, self.steps).values
+        counted = residuals[:, self.objective.weights > 0.0]
+        change = np.sqrt(np.mean((counted[..., 1:] - counted[..., :1]) ** 2, axis=(0, 1)))
         if change[0] < _UNMOVED * change[2]:
             return "product"
         return "sum" if change[1] < _UNMOVED * change[2] else "vague"

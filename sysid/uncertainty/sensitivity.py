@@ -45,13 +45,13 @@ def sensitivity(objective: Objective, chromosome: FloatArray, steps: list[int]) 
 
     chromosome: (n_free,). A perturbed simulation that fails has slope zero.
     """
-    residuals = objective.residuals(_with_neighbours(objective, chromosome), steps)
+    residuals = objective.residuals(_with_neighbours(objective, chromosome), steps).values
     n = len(chromosome)
-    slopes = (residuals[1 : n + 1] - residuals[n + 1 :]) / (2.0 * _PERTURBATION)
+    slopes = (residuals[..., 1 : n + 1] - residuals[..., n + 1 :]) / (2.0 * _PERTURBATION)
     slopes = np.where(np.isfinite(slopes), slopes, 0.0)
     lengths = tuple(record.n_samples for record in objective.records)
     seen = np.concatenate([np.isfinite(record.outputs) for record in objective.records])
-    return Sensitivity(residuals[0], seen, np.moveaxis(slopes, 0, 2), lengths)
+    return Sensitivity(residuals[..., 0].copy(), seen, slopes, lengths)
 
 
 def _with_neighbours(objective: Objective, chromosome: FloatArray) -> FloatArray:

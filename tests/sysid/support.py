@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from sysid import Constraint, Dataset, Input, Output, Parameter, ProcessModel, State
+from sysid.simulation import Residuals
 
 
 def lag_derivative(x, u, p):
@@ -161,3 +162,12 @@ class Formula:
         return np.stack(
             [self.formula(dict(zip(names, v, strict=True)), record.inputs) for v in vectors]
         )
+
+    def residuals(self, vectors, records, scales, n_steps, starts, *, keep=True):
+        parts = []
+        for record, scale, steps in zip(records, scales, n_steps.T, strict=True):
+            found = (self.trajectories(vectors, record, steps) - record.outputs) / scale
+            found[:, ~np.isfinite(record.outputs)] = 0.0
+            parts.append(found)
+        sse = np.stack([np.sum(part**2, axis=1) for part in parts], axis=1)
+        return Residuals(np.moveaxis(np.concatenate(parts, axis=1), 0, 2).copy(), sse)
