@@ -19,7 +19,7 @@ from daq.hal import FloatArray
 if TYPE_CHECKING:
     import pandas as pd
 
-_COMMENTS = ("#", "%", "//")
+COMMENTS = ("#", "%", "//")
 _TEXT_CONTROLS = b"\t\n\r\f"
 
 
@@ -37,8 +37,11 @@ class Table:
 
 
 @dataclass(frozen=True)
-class _Layout:
-    """How a table is written: the line of its header, the names in it, what is between them."""
+class Layout:
+    """How a table is written.
+
+    line: of its header, counted from 1. names: in the header. separator: between cells.
+    """
 
     line: int
     names: list[str]
@@ -47,7 +50,7 @@ class _Layout:
 
 def column_names(path: Path) -> list[str]:
     """Names in a table's header; raises ConfigError for a file that is no text."""
-    return _layout(_complete_lines(path)[0]).names
+    return layout_of(_complete_lines(path)[0]).names
 
 
 def read_table(path: Path, columns: Sequence[str] = ()) -> Table:
@@ -62,7 +65,7 @@ def read_table(path: Path, columns: Sequence[str] = ()) -> Table:
     import pandas as pd
 
     text, torn = _complete_lines(path)
-    layout = _layout(text)
+    layout = layout_of(text)
     header, separator = layout.names, layout.separator
     _check_header(path, layout, columns)
     try:
@@ -91,14 +94,15 @@ def read_table(path: Path, columns: Sequence[str] = ()) -> Table:
     return Table(path, pd.DataFrame(numbers), first, torn)
 
 
-def _layout(text: str) -> _Layout:
+def layout_of(text: str) -> Layout:
+    """Where the header of a table's text stands, the names in it and what is between them."""
     lines = text.split("\n")
     leading = list(
-        itertools.takewhile(lambda s: not s.strip() or s.lstrip().startswith(_COMMENTS), lines)
+        itertools.takewhile(lambda s: not s.strip() or s.lstrip().startswith(COMMENTS), lines)
     )
     at = len(leading)
     if at == len(lines):
-        return _Layout(1, [lines[0]], ",")
+        return Layout(1, [lines[0]], ",")
     header = lines[at]
     numbers = _cells(header, _separator(header))
     if leading and all(map(_is_number, numbers)):
@@ -106,7 +110,7 @@ def _layout(text: str) -> _Layout:
         if len(_cells(named, _separator(header))) == len(numbers):
             at, header = at - 1, named
     separator = _separator(header)
-    return _Layout(at + 1, _cells(header, separator), separator)
+    return Layout(at + 1, _cells(header, separator), separator)
 
 
 def _separator(line: str) -> str:
@@ -159,7 +163,7 @@ def _decoded(path: Path, data: bytes) -> str:
         return data.decode("cp1252", errors="replace")
 
 
-def _check_header(path: Path, layout: _Layout, columns: Sequence[str]) -> None:
+def _check_header(path: Path, layout: Layout, columns: Sequence[str]) -> None:
     line, header = layout.line, layout.names
     if all(_is_number(name) for name in header):
         raise ConfigError(

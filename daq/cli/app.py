@@ -408,3 +408,29 @@ def emulate(
     from daq.cli.emulating import emulate_command
 
     emulate_command(rig, link, tcp, fault or [], drift, seed, json)
+
+
+@app.command(epilog="Example:  rig scope")
+def scope(
+    run: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[RUN_OR_CSV]", help="Capture folder or log; default the newest run."
+        ),
+    ] = None,
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", help="Where the runs are that it follows.")
+    ] = Path("runs"),
+    port: Annotated[
+        int | None,
+        typer.Option("--port", min=0, max=65535, help="Of the page; default 5006, 0 for any."),
+    ] = None,
+    browser: Annotated[
+        bool, typer.Option("--browser/--no-browser", help="Open a browser on the page.")
+    ] = True,
+    json: AsJson = False,
+) -> None:
+    """Show a run while it is recorded, or afterwards, on a page of this machine."""
+    from daq.cli.scoping import scope_command
+
+    scope_command(run, out, port, browser, json)

@@ -1,0 +1,206 @@
+"""The figures of a page: one for each quantity, over one axis of time."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from bokeh.layouts import gridplot
+from bokeh.models import (
+    BasicTicker,
+    ColumnDataSource,
+    CrosshairTool,
+    DataRange1d,
+    FactorRange,
+    Range1d,
+)
+from bokeh.models.annotations import Span
+from bokeh.plotting import figure
+
+from daq.hal import Flag
+from daq.log import UNITS
+from daq.scope.history import View
+
+# Okabe & Ito's palette: told apart with any colour vision.
+BLUE, ORANGE, GREEN, RED = "#0072B2", "#E69F00", "#009E73", "#D55E00"
+PURPLE, GREY = "#CC79A7", "#666666"
+_FLAG_COLORS = {
+    Flag.CLAMPED: ORANGE,
+    Flag.HELD: BLUE,
+    Flag.LOST: RED,
+    Flag.INTERLOCK: RED,
+    Flag.UNDERFLOW: RED,
+    Flag.SATURATED: PURPLE,
+}
+_GRAVE = Flag.LOST | Flag.INTERLOCK | Flag.UNDERFLOW  # marked across all figures
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A column and how it is drawn; held: it keeps its value between samples."""
+
+    name: str
+    color: str
+    width: float
+    held: bool
+
+
+@dataclass(frozen=True)
+class Sources:
+    """What the figures draw: samples, where flags stand, and the grave ones of these."""
+
+    samples: ColumnDataSource
+    flags: ColumnDataSource
+    grave: ColumnDataSource
+
+    @classmethod
+    def empty(cls) -> Sources:
+        """Nothing to draw yet."""
+        return cls(
+            ColumnDataSource({"t": []}, name="samples"),
+            ColumnDataSource({"time": [], "flag": [], "color": []}, name="flags"),
+            ColumnDataSource({"time": []}, name="grave"),
+        )
+
+
+def curves_of(columns: Sequence[str]) -> list[list[Curve]]:
+    """Curves that share a figure: a command asked and applied, a quantity and its reference."""
+    groups: dict[str, list[Curve]] = {}
+    for name in columns:
+        if name in ("t", "tick", "flags"):
+            continue
+        held = name.startswith(("cmd_", "applied_"))
+        # What was asked or wanted lies, broad and pale, behind what came of it.
+        wanted = name.startswith("cmd_") or name.endswith("_ref")
+        curve = Curve(name, ORANGE if wanted else BLUE, 3.0 if wanted else 1.2, held)
+        group = groups.setdefault(_quantity(name), [])
+        group.insert(0 if wanted else len(group), curve)
+    return list(groups.values())
+
+
+def make_figures(
+    columns: Sequence[str], sources: Sources, time: Range1d
+) -> tuple[Any, list[figure], list[Span]]:
+    """The figures in a grid with one toolbar, each by itself, and their lines for a mark."""
+    cursor = Span(dimension="height", line_color=GREY, line_dash="dotted")
+    plots = [_curve_figure(curves, sources, time, cursor) for curves in curves_of(columns)]
+    if "flags" in columns:
+        plots.append(_flag_strip(sources, time, cursor))
+    last = plots[-1]
+    last.xaxis.visible = True
+    last.xaxis.axis_label = "t [s]"
+    last.height = (last.height or 0) + 45
+    marks = []
+    for plot in plots:
+        mark = Span(dimension="height", line_color="black", line_dash="dashed", visible=False)
+        plot.add_layout(mark)
+        marks.append(mark)
+    grid = gridplot(
+        [[plot] for plot in plots], merge_tools=True, toolbar_location="above",
+        sizing_mode="stretch_width", toolbar_options={"logo": None},
+    )  # fmt: skip
+    return grid, plots, marks
+
+
+def make_value_table(values: ColumnDataSource, n_rows: int) -> figure:
+    """The values at one time, drawn: new cells in a page's text would have it laid out anew."""
+    table = figure(
+        width=390, height=24 * n_rows, x_range=Range1d(start=0, end=390),
+        y_range=Range1d(start=n_rows - 0.5, end=-0.5), tools="",
+        toolbar_location=None, outline_line_color=None, min_border=0, name="table",
+    )  # fmt: skip
+    table.axis.visible = False
+    table.grid.visible = False
+    look: dict[str, Any] = {
+        "y": "row", "source": values, "text_font_size": "13px", "text_baseline": "middle",
+        "text_font_style": "style",
+    }  # fmt: skip
+    table.scatter(x=10, y="row", source=values, marker="square", size=10, color="color")
+    table.text(x=22, text="channel", **look)
+    table.text(x=270, text="value", text_align="right", **look)
+    table.text(x=276, text="unit", **look)
+    table.text(x=388, text="difference", text_align="right", **look)
+    return table
+
+
+def names_of(column: str) -> tuple[str, str]:
+    """What a column's lowest and highest values are called in the source of samples."""
+    return f"{column} low", f"{column} high"
+
+
+def as_data(columns: Sequence[str], view: View) -> dict[str, Any]:
+    """What the source of samples holds of a view."""
+    data: dict[str, Any] = {"t": view.time}
+    for curve in itertools.chain.from_iterable(curves_of(columns)):
+        place = columns.index(curve.name)
+        low, high = names_of(curve.name)
+        data[low], data[high] = view.low[:, place], view.high[:, place]
+    return data
+
+
+def flag_name(flag: Flag) -> str:
+    """A flag as people read it."""
+    return str(flag.name).lower()
+
+
+def flag_marks(view: View) -> tuple[dict[str, list[Any]], dict[str, list[Any]]]:
+    """Where which flag stands, and where one of the grave ones does."""
+    marks: dict[str, list[Any]] = {"time": [], "flag": [], "color": []}
+    time, flags = view.time, view.flags
+    if not flags.any():
+        return marks, {"time": []}
+    for flag, color in _FLAG_COLORS.items():
+        at = time[(flags & int(flag)) != 0].tolist()
+        marks["time"] += at
+        marks["flag"] += [flag_name(flag)] * len(at)
+        marks["color"] += [color] * len(at)
+    return marks, {"time": time[(flags & int(_GRAVE)) != 0].tolist()}
+
+
+def _quantity(name: str) -> str:
+    return name.removeprefix("cmd_").removeprefix("applied_").removesuffix("_ref")
+
+
+def _curve_figure(curves: Sequence[Curve], sources: Sources, time: Range1d, cursor: Span) -> figure:
+    plot = _empty(time, cursor, 108, DataRange1d(range_padding=0.08))
+    unit = UNITS.get(curves[-1].name)
+    label = _quantity(curves[-1].name).replace("_", " ")
+    plot.yaxis.axis_label = label + (f"\n[{unit}]" if unit else "")
+    plot.yaxis.ticker = BasicTicker(desired_num_ticks=3)
+    for curve in curves:
+        low, high = names_of(curve.name)
+        look: dict[str, Any] = {"source": sources.samples}
+        line = {**look, "line_color": curve.color, "line_width": curve.width}
+        area = {**look, "fill_color": curve.color}
+        # Areas between low and high cost a browser a tenth of lines that go up and down.
+        if curve.held:
+            plot.varea_step("t", low, high, step_mode="after", **area)
+            plot.step("t", low, mode="after", **line)
+        else:
+            plot.varea("t", low, high, **area)
+            plot.line("t", low, **line)
+    plot.vspan(x="time", source=sources.grave, line_color=RED, line_alpha=0.6)
+    return plot
+
+
+def _flag_strip(sources: Sources, time: Range1d, cursor: Span) -> figure:
+    names = [flag_name(flag) for flag in _FLAG_COLORS]
+    plot = _empty(time, cursor, 110, FactorRange(factors=names[::-1]))
+    plot.yaxis.axis_label = "flags"
+    plot.scatter("time", "flag", source=sources.flags, marker="square", size=7, color="color")
+    return plot
+
+
+def _empty(time: Range1d, cursor: Span, height: int, y_range: Any) -> figure:
+    plot = figure(
+        height=height, x_range=time, y_range=y_range, min_border_left=95, min_border_bottom=6,
+        tools="xbox_zoom,xpan,xwheel_zoom,reset,save", active_scroll="xwheel_zoom",
+        active_drag="xbox_zoom",
+    )  # fmt: skip
+    plot.add_tools(CrosshairTool(overlay=cursor))
+    plot.xaxis.visible = False
+    plot.yaxis.axis_label_text_font_style = "normal"
+    plot.outline_line_color = "#cccccc"
+    return plot

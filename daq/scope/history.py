@@ -1,0 +1,260 @@
+"""A run's samples in bounded memory: the newest as they are, all of them as lows and highs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from daq.hal import FloatArray, IntArray
+
+_RECENT = 65_536  # rows kept as they are
+_BUCKETS = 65_536  # stretches of the whole run of which low and high are kept
+_READ = 200_000  # rows read back from the file for one view
+
+Reader = Callable[[int, int], FloatArray]
+
+
+@dataclass(frozen=True)
+class View:
+    """What is drawn of a stretch of a run: the lowest and the highest of every ``step`` rows.
+
+    time: (m,), of the first of them [s]. low, high: (m, n_columns), one and the same where
+    ``step`` is 1; no spike is lost. flags: (m,), those of all of them. end: row after the last.
+    """
+
+    time: FloatArray
+    low: FloatArray
+    high: FloatArray
+    flags: IntArray
+    step: int
+    end: int
+
+
+class History:
+    """Rows of a log, to be looked at at any magnification.
+
+    A stretch is drawn from the newest rows, kept whole; from lows and highs over ``bucket`` rows,
+    which double when there are too many; or, magnified further, from the file itself. What is
+    kept does not depend on how long the run is.
+
+    columns: names, with ``t`` among them. read: rows of the file between two bytes.
+    """
+
+    def __init__(self, columns: tuple[str, ...], read: Reader) -> None:
+        n = len(columns)
+        self.n_rows = 0
+        self.bucket = 1
+        self._read = read
+        self._time = columns.index("t")
+        self._flags = columns.index("flags") if "flags" in columns else None
+        self._recent = np.empty((2 * _RECENT, n))
+        self._recent_end = 0
+        self._n_buckets = 0
+        self._low, self._high = np.empty((_BUCKETS, n)), np.empty((_BUCKETS, n))
+        self._marks = np.zeros(_BUCKETS, dtype=np.int64)
+        self._starts = np.zeros(_BUCKETS, dtype=np.int64)
+        self._pending = np.empty((0, n))  # rows of the bucket that is not full yet
+        self._pending_starts = np.empty(0, dtype=np.int64)
+        self._end_byte = 0
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """Time of the first and of the last row [s]; zeros without any."""
+        if not self.n_rows:
+            return 0.0, 0.0
+        first = self._low[0] if self._n_buckets else self._pending[0]
+        return float(first[self._time]), float(self._recent_rows()[-1, self._time])
+
+    @property
+    def dt(self) -> float:
+        """Time between neighbouring rows, on average over the newest [s]."""
+        time = self._recent_rows()[:, self._time]
+        return float((time[-1] - time[0]) / (len(time) - 1)) if len(time) > 1 else 0.0
+
+    def add(self, values: FloatArray, starts: IntArray) -> None:
+        """Take rows (n, n_columns) whose lines begin at ``starts`` (n + 1,)."""
+        if not len(values):
+            return
+        self._add_recent(values)
+        self._add_buckets(values, starts[:-1])
+        self._end_byte = int(starts[-1])
+        self.n_rows += len(values)
+
+    def at(self, time: float) -> FloatArray | None:
+        """The row nearest to a time [s], (n_columns,); None without any."""
+        if not self.n_rows:
+            return None
+        rows = self._recent_rows()
+        if time < rows[0, self._time]:
+            first, last = self._bucket_range(time, time)
+            rows = self._from_file(first, last)
+            if not len(rows):
+                return None
+        times = rows[:, self._time]
+        right = min(int(np.searchsorted(times, time)), len(times) - 1)
+        left = max(right - 1, 0)
+        nearest: FloatArray = rows[left if time - times[left] < times[right] - time else right]
+        return nearest
+
+    def view(self, start: float, end: float, points: int, to_the_end: bool = True) -> View:
+        """What there is between two times [s], in ``points`` to twice as many stretches.
+
+        to_the_end: draw the last rows too, where they fill no stretch; without it ``since`` can
+        go on from where the view ends.
+        """
+        recent = self._recent_rows()
+        first_kept = self.n_rows - len(recent)
+        if not self.n_rows or first_kept == 0 or start >= recent[0, self._time]:
+            times = recent[:, self._time]
+            low = max(int(np.searchsorted(times, start)) - 1, 0)
+            high = min(int(np.searchsorted(times, end, side="right")) + 1, len(times))
+            return self._reduced(recent[low:high], first_kept + low, points, to_the_end)
+        first, last = self._bucket_range(start, end)
+        rows = (last - first) * self.bucket
+        if step_for(rows, points) < self.bucket and rows <= _READ:
+            read = self._from_file(first, last)
+            return self._reduced(read, first * self.bucket, points, to_the_end)
+        return self._from_buckets(first, last, points, to_the_end)
+
+    def since(self, row: int, step: int) -> View:
+        """The full stretches of ``step`` rows from ``row`` on, or from the oldest row kept."""
+        recent = self._recent_rows()
+        kept = self.n_rows - len(recent)
+        first = max(row, kept)
+        n = (self.n_rows - first) // step * step
+        return self._drawn(recent[first - kept : first - kept + n], step, first + n)
+
+    def _recent_rows(self) -> FloatArray:
+        first = max(self._recent_end - _RECENT, 0)
+        return self._recent[first : self._recent_end]
+
+    def _add_recent(self, values: FloatArray) -> None:
+        values = values[-_RECENT:]
+        if self._recent_end + len(values) > len(self._recent):
+            kept = self._recent_rows()
+            self._recent[: len(kept)] = kept.copy()
+            self._recent_end = len(kept)
+        self._recent[self._recent_end : self._recent_end + len(values)] = values
+        self._recent_end += len(values)
+
+    def _add_buckets(self, values: FloatArray, starts: IntArray) -> None:
+        values = np.concatenate([self._pending, values])
+        starts = np.concatenate([self._pending_starts, starts])
+        done = 0
+        while (full := (len(values) - done) // self.bucket) > 0:
+            if self._n_buckets == _BUCKETS:
+                self._merge()
+                continue
+            n = min(full, _BUCKETS - self._n_buckets)
+            rows = slice(done, done + n * self.bucket)
+            into = slice(self._n_buckets, self._n_buckets + n)
+            self._low[into] = _lows(values[rows], self.bucket)
+            self._high[into] = _highs(values[rows], self.bucket)
+            self._marks[into] = _united(self._flags_of(values[rows]), self.bucket)
+            self._starts[into] = starts[rows][:: self.bucket]
+            self._n_buckets += n
+            done = rows.stop
+        self._pending, self._pending_starts = values[done:].copy(), starts[done:].copy()
+
+    def _merge(self) -> None:
+        """Buckets of twice the rows."""
+        half = _BUCKETS // 2
+        self._low[:half] = np.fmin(self._low[0::2], self._low[1::2])
+        self._high[:half] = np.fmax(self._high[0::2], self._high[1::2])
+        self._marks[:half] = self._marks[0::2] | self._marks[1::2]
+        self._starts[:half] = self._starts[0::2]
+        self._n_buckets, self.bucket = half, 2 * self.bucket
+
+    def _flags_of(self, rows: FloatArray) -> IntArray:
+        if self._flags is None:
+            return np.zeros(len(rows), dtype=np.int64)
+        return np.nan_to_num(rows[:, self._flags]).astype(np.int64)
+
+    def _bucket_range(self, start: float, end: float) -> tuple[int, int]:
+        """Buckets that hold the times, one more on each side; the last may be the pending rows."""
+        times = self._low[: self._n_buckets, self._time]
+        first = max(int(np.searchsorted(times, start, side="right")) - 2, 0)
+        last = int(np.searchsorted(times, end, side="right")) + 1
+        return first, min(last, self._n_buckets + 1)
+
+    def _from_file(self, first: int, last: int) -> FloatArray:
+        end = int(self._starts[last]) if last < self._n_buckets else self._end_byte
+        if first >= self._n_buckets:
+            return self._pending
+        return self._read(int(self._starts[first]), end)
+
+    def _from_buckets(self, first: int, last: int, points: int, to_the_end: bool) -> View:
+        whole = min(last, self._n_buckets)
+        together = max(1, step_for((last - first) * self.bucket, points) // self.bucket)
+        n = (whole - first) // together * together
+        part, rest = slice(first, first + n), slice(first + n, whole)
+        low = _lows(self._low[part], together)
+        high = _highs(self._high[part], together)
+        marks = _united(self._marks[part], together)
+        view = View(
+            low[:, self._time], low, high, marks, together * self.bucket, (first + n) * self.bucket
+        )
+        pending = self._pending if last > self._n_buckets else self._pending[:0]
+        left = np.concatenate([self._low[rest], self._high[rest], pending])
+        if not to_the_end or not len(left):
+            return view
+        mark = np.bitwise_or.reduce([*self._marks[rest], *self._flags_of(pending)])
+        low, high = _lows(left, len(left)), _highs(left, len(left))
+        end = whole * self.bucket + len(pending)
+        return _joined(view, View(low[:, self._time], low, high, np.array([mark]), 0, end))
+
+    def _reduced(self, rows: FloatArray, first: int, points: int, to_the_end: bool) -> View:
+        """Rows from number ``first`` on, in stretches of one length."""
+        step = step_for(len(rows), points)
+        n = len(rows) // step * step
+        view = self._drawn(rows[:n], step, first + n)
+        if n == len(rows) or not to_the_end:
+            return view
+        return _joined(view, self._drawn(rows[n:], len(rows) - n, first + len(rows)))
+
+    def _drawn(self, rows: FloatArray, step: int, end: int) -> View:
+        low, high = _lows(rows, step), _highs(rows, step)
+        flags = _united(self._flags_of(rows), step)
+        return View(low[:, self._time], low, high, flags, step, end)
+
+
+def _joined(view: View, last: View) -> View:
+    """A view and the rest that filled no stretch of it."""
+    return View(
+        np.concatenate([view.time, last.time]),
+        np.concatenate([view.low, last.low]),
+        np.concatenate([view.high, last.high]),
+        np.concatenate([view.flags, last.flags]),
+        view.step,
+        last.end,
+    )
+
+
+def nothing(n_columns: int) -> View:
+    """A view without samples."""
+    none = np.empty((0, n_columns))
+    return View(np.empty(0), none, none, np.empty(0, dtype=np.int64), 1, 0)
+
+
+def step_for(rows: int, points: int) -> int:
+    """Rows drawn together, a power of two; 1 where single samples fit."""
+    if rows <= 2 * points:
+        return 1
+    return 1 << max(1, (rows // (2 * points)).bit_length())
+
+
+def _lows(rows: FloatArray, step: int) -> FloatArray:
+    low: FloatArray = np.fmin.reduce(rows.reshape(-1, step, rows.shape[1]), axis=1)
+    return low
+
+
+def _highs(rows: FloatArray, step: int) -> FloatArray:
+    high: FloatArray = np.fmax.reduce(rows.reshape(-1, step, rows.shape[1]), axis=1)
+    return high
+
+
+def _united(flags: IntArray, step: int) -> IntArray:
+    united: IntArray = np.bitwise_or.reduce(flags.reshape(-1, step), axis=1)
+    return united

@@ -1,0 +1,253 @@
+"""One browser tab: what is drawn 30 times a second, and what the controls do."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from bokeh.document import Document
+from bokeh.events import DoubleTap, MouseLeave, MouseMove, RangesUpdate, Reset, Tap
+from bokeh.layouts import column, row
+from bokeh.models import ColumnDataSource, Range1d
+from bokeh.models.annotations import Span
+from bokeh.models.widgets import Button, Div, RadioButtonGroup
+
+from daq.scope.figures import (
+    GREY,
+    Sources,
+    as_data,
+    flag_marks,
+    make_figures,
+    make_value_table,
+)
+from daq.scope.history import History, View, nothing, step_for
+from daq.scope.recordings import Recording, Watch
+from daq.scope.wording import HELP, VALUE_FIELDS, heading, readout
+
+PERIOD = 33  # ms between updates: 30 a second
+_POINTS = 500  # stretches drawn at least over the width of the page
+_WINDOWS: tuple[tuple[str, float | None], ...] = (
+    ("2 s", 2.0), ("10 s", 10.0), ("60 s", 60.0), ("whole run", None),
+)  # fmt: skip
+_USUAL, _WHOLE = 1, len(_WINDOWS) - 1
+_VALUES_EVERY = 3  # updates between two of the table: ten a second can be read
+_HEAD_EVERY = 15  # and of the heading, after which a browser lays the whole page out anew
+_AHEAD = 2  # updates that may be on their way
+_LOST = 1.0  # s after which an update that the browser has not echoed counts as never received
+_MARGIN = 0.5  # of a held view's width that is drawn beyond its edges, to be there when it moves
+
+
+def page_maker(watch: Watch) -> Callable[[Document], None]:
+    """A function that fills a new tab's document."""
+
+    def make(document: Document) -> None:
+        Page(document, watch)
+
+    return make
+
+
+class Page:
+    """A tab that follows the watch, or holds a part of the run for a closer look."""
+
+    def __init__(self, document: Document, watch: Watch) -> None:
+        self._watch = watch
+        self._recording: Recording | None = None
+        self._columns: tuple[str, ...] = ()
+        self._live = True
+        self._ended = False
+        self._zoomed_to: tuple[float, float] | None = None
+        self._cursor: float | None = None
+        self._mark: float | None = None
+        self._drawn_step = self._drawn_end = 0
+        self._tick = 0
+        self._sources = Sources.empty()
+        self._time = Range1d(start=0.0, end=1.0, name="time")
+        self._mark_lines: list[Span] = []
+        self._head = Div(name="head", sizing_mode="stretch_width")
+        self._values = ColumnDataSource({name: [] for name in VALUE_FIELDS}, name="values")
+        # The browser copies the number of an update when it has come to it.
+        self._sent, self._seen = Range1d(start=0, name="sent"), Range1d(start=0, name="seen")
+        self._sent.js_link("start", self._seen, "start")
+        self._seen.on_change("start", self._came)
+        self._sent_at = 0.0
+        self._last_seen = 0
+        self._button = Button(label="Pause", width=90, name="pause", button_type="primary")
+        labels = [label for label, _ in _WINDOWS]
+        self._window = RadioButtonGroup(labels=labels, active=_USUAL, name="window")
+        self._button.on_click(self._toggle)
+        self._window.on_change("active", lambda attr, old, new: self._follow())
+        self._figures = column(sizing_mode="stretch_width", name="figures")
+        controls = row(self._button, self._window)
+        self._side = column(name="side")
+        body = row(self._figures, self._side, sizing_mode="stretch_width")
+        page = column(self._head, controls, body, sizing_mode="stretch_width")
+        page.tags = [self._sent, self._seen]
+        document.add_root(page)
+        document.title = "rig scope"
+        document.add_periodic_callback(self._update, PERIOD)
+        self._update()
+
+    # --- 30 times a second --------------------------------------------------------------------
+
+    def _update(self) -> None:
+        self._watch.poll()
+        newest = self._watch.recording
+        if self._live and newest is not self._recording:
+            self._show(newest)
+        recording = self._recording
+        if recording is not None and recording is not newest:
+            recording.look()
+            recording.read()
+        if self._browser_is_behind():
+            return
+        if recording is not None:
+            self._draw(recording)
+        if self._tick % _VALUES_EVERY == 0:
+            self._show_values()
+        if self._tick % _HEAD_EVERY == 0:
+            self._show_head()
+        self._tick += 1
+        self._sent.start, self._sent_at = self._tick, time.monotonic()
+
+    def _browser_is_behind(self) -> bool:
+        """Whether it has not come to the last updates yet: more of them would only queue up."""
+        waiting = time.monotonic() - self._sent_at < _LOST
+        return waiting and self._tick - self._last_seen > _AHEAD
+
+    def _came(self, attribute: str, old: int, new: int) -> None:
+        self._last_seen = new
+
+    def _show(self, recording: Recording | None) -> None:
+        self._recording = recording
+        self._ended = False
+        self._set_mark(None)
+        self._clear()
+        if recording is not None:
+            self._window.active = _USUAL if recording.state.running else _WHOLE
+
+    def _draw(self, recording: Recording) -> None:
+        history = recording.history
+        if history is None:
+            return
+        if recording.tail.columns != self._columns:
+            self._make_figures(recording.tail.columns)
+        if not history.n_rows:
+            return
+        if self._live:
+            self._draw_live(recording, history)
+        elif self._zoomed_to is not None:
+            start, end = self._zoomed_to
+            self._zoomed_to = None
+            margin = _MARGIN * (end - start)
+            points = round(_POINTS * (1.0 + 2.0 * _MARGIN))
+            self._replace(history.view(start - margin, end + margin, points))
+
+    def _draw_live(self, recording: Recording, history: History) -> None:
+        """Add what has come since; draw all anew where stretches change their length."""
+        ended = not recording.state.running and recording.loading is None
+        if ended and not self._ended:
+            self._window.active = _WHOLE
+        width = _WINDOWS[self._window.active or 0][1]
+        first, last = history.span
+        start = first if width is None else max(first, last - width)
+        rows = history.n_rows if width is None else round(width / (history.dt or 1.0))
+        step = step_for(min(rows, history.n_rows), _POINTS)
+        behind = history.n_rows - self._drawn_end
+        if self._drawn_step != step or ended != self._ended or behind < 0:
+            self._drawn_step, self._ended = step, ended
+            self._replace(history.view(start, last, _POINTS, to_the_end=ended))
+        elif behind >= step:
+            self._append(history.since(self._drawn_end, step), rows if width else None, start)
+        self._time.update(start=start, end=last if width is None else max(last, first + width))
+
+    def _replace(self, view: View) -> None:
+        self._drawn_end = view.end
+        self._sources.samples.data = as_data(self._columns, view)
+        marks, grave = flag_marks(view)
+        self._sources.flags.data, self._sources.grave.data = {**marks}, {**grave}
+
+    def _append(self, view: View, rows: int | None, start: float) -> None:
+        """Add to what is drawn; of the samples keep ``rows``, of the flags those from ``start``."""
+        self._drawn_end = view.end
+        keep = None if rows is None else rows // view.step + 2
+        self._sources.samples.stream(as_data(self._columns, view), rollover=keep)
+        drawn = (self._sources.flags, self._sources.grave)
+        for source, new in zip(drawn, flag_marks(view), strict=True):
+            kept = np.asarray(source.data["time"]) >= start
+            if new["time"] or not kept.all():
+                source.data = {
+                    name: [*np.asarray(source.data[name])[kept].tolist(), *values]
+                    for name, values in new.items()
+                }
+
+    def _clear(self) -> None:
+        self._drawn_step = 0
+        self._replace(nothing(len(self._columns)))
+
+    def _make_figures(self, columns: tuple[str, ...]) -> None:
+        self._columns = columns
+        self._clear()
+        grid, plots, self._mark_lines = make_figures(columns, self._sources, self._time)
+        for plot in plots:
+            plot.on_event(RangesUpdate, self._zoom)
+            plot.on_event(Reset, lambda event: self._follow())
+            plot.on_event(MouseMove, self._move)
+            plot.on_event(MouseLeave, self._leave)
+            plot.on_event(Tap, lambda event: self._set_mark(event.x))
+            plot.on_event(DoubleTap, lambda event: self._set_mark(None))
+        self._figures.children = [grid]
+        words = Div(text=HELP, width=380, styles={"color": GREY})
+        self._side.children = [make_value_table(self._values, len(columns) + 1), words]
+
+    def _show_head(self) -> None:
+        newer = self._recording is not self._watch.recording
+        head = heading(self._recording, self._watch.root, newer)
+        if head != self._head.text:
+            self._head.text = head
+
+    def _show_values(self) -> None:
+        history = self._recording.history if self._recording else None
+        if history is None or not history.n_rows:
+            return
+        values = history.at(history.span[1] if self._cursor is None else self._cursor)
+        marked = None if self._mark is None else history.at(self._mark)
+        if values is None:
+            return
+        self._values.data = {**readout(self._columns, values, marked, self._cursor is not None)}
+
+    # --- what the user does -------------------------------------------------------------------
+
+    def _toggle(self) -> None:
+        if self._live:
+            self._hold(self._time.start, self._time.end)
+        else:
+            self._follow()
+
+    def _follow(self) -> None:
+        """Show the end of the run as it grows, or all of it."""
+        self._live = True
+        self._drawn_step = 0
+        self._button.update(label="Pause", button_type="primary")
+
+    def _hold(self, start: Any, end: Any) -> None:
+        """Stay with this stretch of time, in as much detail as the page has room for."""
+        self._live = False
+        self._zoomed_to = float(start), float(end)
+        self._button.update(label="Live", button_type="warning")
+
+    def _zoom(self, event: Any) -> None:
+        self._time.update(start=event.x0, end=event.x1)
+        self._hold(event.x0, event.x1)
+
+    def _move(self, event: Any) -> None:
+        self._cursor = event.x
+
+    def _leave(self, event: Any) -> None:
+        self._cursor = None
+
+    def _set_mark(self, at: float | None) -> None:
+        self._mark = at
+        for line in self._mark_lines:
+            line.update(location=at, visible=at is not None)

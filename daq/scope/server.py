@@ -1,0 +1,68 @@
+"""Serving the page to this machine, and to no other."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import socket
+from collections.abc import Callable
+from types import FrameType
+
+from bokeh.application import Application
+from bokeh.application.handlers.function import FunctionHandler
+from bokeh.server.server import Server
+
+from daq.errors import ConfigError
+from daq.scope.page import page_maker
+from daq.scope.recordings import Watch
+
+HOST = "127.0.0.1"
+USUAL_PORT = 5006
+
+
+def serve(watch: Watch, port: int | None, ready: Callable[[str], None]) -> None:
+    """Serve until Ctrl-C or SIGTERM; ``ready`` is told the address.
+
+    port: None for the usual one or, where that is taken, any. Raises ConfigError when the port
+    that was asked for is taken.
+    """
+    port = _free(USUAL_PORT, or_any=True) if port is None else _free(port, or_any=False)
+    # Lines for the server's maintainers are no help to who looks at a run.
+    for name in ("bokeh", "tornado"):
+        logging.getLogger(name).setLevel(logging.ERROR)
+    server = Server(
+        {"/": Application(FunctionHandler(page_maker(watch)))},
+        port=port,
+        address=HOST,
+        allow_websocket_origin=[f"{HOST}:{port}", f"localhost:{port}"],
+    )
+    server.start()
+    loop = server.io_loop
+
+    def end(number: int, frame: FrameType | None) -> None:
+        loop.add_callback_from_signal(loop.stop)
+
+    before = [(number, signal.signal(number, end)) for number in (signal.SIGINT, signal.SIGTERM)]
+    try:
+        ready(f"http://{HOST}:{port}/")
+        loop.start()
+    finally:
+        server.stop()
+        for number, handler in before:
+            signal.signal(number, handler)
+
+
+def _free(port: int, or_any: bool) -> int:
+    """The port, if nobody listens on it; else another, or ConfigError."""
+    with socket.socket() as tried:
+        try:
+            tried.bind((HOST, port))
+        except OSError as error:
+            if not or_any:
+                raise ConfigError(
+                    f"--port {port}: cannot be used: {error.strerror}; another rig scope may be "
+                    "using it. Choose another, or 0 for any that is free"
+                ) from None
+        else:
+            return int(tried.getsockname()[1])
+    return _free(0, or_any=False)

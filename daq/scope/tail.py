@@ -1,0 +1,249 @@
+"""Reading a log that is still being written: whole lines only, and whatever of them is readable."""
+
+from __future__ import annotations
+
+import io
+import math
+import warnings
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from daq.hal import FloatArray, IntArray
+from daq.log import ORIGINAL_COLUMNS
+from daq.table import COMMENTS, Layout, layout_of
+
+CHUNK = 2_000_000  # bytes read at a time: some 20 ms of parsing, so that the page stays alive
+_HEAD = 65_536  # bytes in which a header must have ended
+_BULK = 50_000  # bytes from which pandas is quicker than going by line
+_KEPT = 5  # problems described; further ones are counted
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Samples in the order of the file.
+
+    values: (n, n_columns), NaN where a cell holds no finite number. starts: (n + 1,), byte at
+    which each row's line begins, and the one after the last line.
+    """
+
+    values: FloatArray
+    starts: IntArray
+
+
+@dataclass
+class Problems:
+    """What is wrong with a log: the first few described, all counted."""
+
+    first: list[str] = field(default_factory=list)
+    count: int = 0
+
+    def note(self, text: str) -> None:
+        """One problem more."""
+        self.count += 1
+        if len(self.first) < _KEPT:
+            self.first.append(text)
+
+
+class LogTail:
+    """The rows of a log as they come.
+
+    columns: names, known once the header has been read. fault: why nothing can be read, or None.
+    problems: what was left out. offset: bytes read. Nothing here raises for what a file holds.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.columns: tuple[str, ...] = ()
+        self.fault: str | None = None
+        self.problems = Problems()
+        self.offset = 0
+        self._layout: Layout | None = None
+        self._places: list[int] = []
+        self._line = 0  # lines before offset
+        self._last_time = -math.inf
+
+    def size(self) -> int:
+        """Bytes in the file now; 0 when there is none yet."""
+        try:
+            return self.path.stat().st_size
+        except OSError:
+            return 0
+
+    def poll(self) -> Rows:
+        """What has been written since the last time, up to ``CHUNK`` bytes of it."""
+        data = self._whole_lines()
+        if data and self._layout is None:
+            data = self._take_header(data)
+        if not data or not self.columns:
+            return _no_rows(len(self.columns), self.offset)
+        rows = self._parse(data, self.problems)
+        self._line += data.count(b"\n")
+        self.offset += len(data)
+        return self._advancing(rows)
+
+    def read_between(self, start: int, end: int) -> FloatArray:
+        """The rows whose lines stand in these bytes, once more, (n, n_columns)."""
+        try:
+            with self.path.open("rb") as file:
+                file.seek(start)
+                data = file.read(end - start)
+        except OSError:
+            data = b""
+        rows = self._parse(data[: data.rfind(b"\n") + 1], Problems()).values
+        # What was left out the first time is left out again.
+        time = rows[:, self.columns.index("t")]
+        return rows[_forward(time, -math.inf)]
+
+    def torn(self) -> bool:
+        """Whether the file ends in a line without its end."""
+        return self._layout is not None and self.size() > self.offset and not self._whole_lines()
+
+    def _whole_lines(self) -> bytes:
+        try:
+            with self.path.open("rb") as file:
+                file.seek(self.offset)
+                data = file.read(CHUNK)
+        except FileNotFoundError:
+            return b""
+        except OSError as error:
+            self.fault = f"cannot be read: {error.strerror}"
+            return b""
+        whole = data[: data.rfind(b"\n") + 1]
+        # A chunk without any end of line is no line of a log; it is passed over as one.
+        return whole if whole or len(data) < CHUNK else data
+
+    def _take_header(self, data: bytes) -> bytes:
+        """Read the header where it is whole; the data after it."""
+        head = data[:_HEAD]
+        text = head[: head.rfind(b"\n") + 1].decode("utf-8-sig", errors="replace")
+        lines = text.replace("\r\n", "\n").split("\n")
+        if all(not line.strip() or line.lstrip().startswith(COMMENTS) for line in lines):
+            if len(data) > _HEAD:
+                self.fault = "it has no line of column names"
+            return b""
+        layout = layout_of("\n".join(lines))
+        self.fault = _header_fault(layout)
+        if self.fault:
+            return b""
+        named = [(name, place) for place, name in enumerate(layout.names) if name]
+        first = dict(reversed(named))
+        self._layout = layout
+        self._places = sorted(first.values())
+        self.columns = tuple(layout.names[place] for place in self._places)
+        for name in sorted({name for name, _ in named if layout.names.count(name) > 1}):
+            self.problems.note(
+                f"line {layout.line}: column {name!r} stands twice; the first counts"
+            )
+        missing = [name for name in ORIGINAL_COLUMNS if name not in first]
+        if missing:
+            self.problems.note(f"line {layout.line}: without column {', '.join(missing)}")
+        self._line = layout.line
+        self.offset = _line_starts(data)[layout.line]
+        return data[self.offset :]
+
+    def _parse(self, data: bytes, problems: Problems) -> Rows:
+        assert self._layout is not None
+        starts = self.offset + np.array(_line_starts(data), dtype=np.int64)
+        if len(data) > _BULK:
+            values = _parse_bulk(data, self._layout, self._places)
+            if values is not None and len(values) == len(starts) - 1:
+                return Rows(values, starts)
+        return self._parse_lines(data, starts, problems)
+
+    def _parse_lines(self, data: bytes, starts: IntArray, problems: Problems) -> Rows:
+        """By line: what is not a row is left out, what is not a number becomes NaN."""
+        assert self._layout is not None
+        names, separator = self._layout.names, self._layout.separator
+        kept: list[int] = []
+        values: list[list[float]] = []
+        lines = data.decode("utf-8", errors="replace").split("\n")
+        for index, line in enumerate(lines[: len(starts) - 1]):
+            at = f"line {self._line + index + 1}"
+            cells = line.split(separator)
+            if len(cells) != len(names):
+                if line.strip():
+                    problems.note(f"{at}: {len(cells)} cells instead of {len(names)}; left out")
+                continue
+            row = []
+            for place in self._places:
+                row.append(_number(cells[place], separator))
+                if math.isnan(row[-1]):
+                    problems.note(
+                        f"{at}: {names[place]}: {cells[place].strip()[:20]!r} is no number"
+                    )
+            kept.append(index)
+            values.append(row)
+        table = np.array(values, dtype=np.float64).reshape(len(values), len(self.columns))
+        return Rows(table, np.append(starts[kept], starts[-1]))
+
+    def _advancing(self, rows: Rows) -> Rows:
+        """The rows in which time advances."""
+        time = rows.values[:, self.columns.index("t")]
+        good = _forward(time, self._last_time)
+        if not good.all():
+            wrong = int(np.count_nonzero(~good))
+            self.problems.note(
+                f"before line {self._line + 1}: time does not advance in {wrong} "
+                f"row{'s' * (wrong != 1)}; left out"
+            )
+        if good.any():
+            self._last_time = float(time[good][-1])
+        return Rows(rows.values[good], np.append(rows.starts[:-1][good], rows.starts[-1]))
+
+
+def _forward(time: FloatArray, last: float) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    """Which times are beyond all before them."""
+    known = np.where(np.isfinite(time), time, -np.inf)
+    before = np.maximum.accumulate(np.concatenate([[last], known]))[:-1]
+    return known > before
+
+
+def _no_rows(n_columns: int, offset: int) -> Rows:
+    return Rows(np.empty((0, n_columns)), np.array([offset], dtype=np.int64))
+
+
+def _line_starts(data: bytes) -> list[int]:
+    """Byte at which each line begins, and the length of the data."""
+    ends = np.flatnonzero(np.frombuffer(data, dtype=np.uint8) == ord("\n")) + 1
+    starts = [0, *ends.tolist()]
+    return starts if starts[-1] == len(data) else [*starts, len(data)]
+
+
+def _header_fault(layout: Layout) -> str | None:
+    names = [name for name in layout.names if name]
+    if "t" in names:
+        return None
+    if names and all(not math.isnan(_number(name, layout.separator)) for name in names):
+        return f"line {layout.line}: numbers where the column names should be"
+    return (
+        f"line {layout.line}: column 't' (time in s) is missing; there are {', '.join(names)[:200]}"
+    )
+
+
+def _number(cell: str, separator: str) -> float:
+    try:
+        value = float(cell if separator == "," else cell.replace(",", "."))
+    except ValueError:
+        return math.nan
+    return value if math.isfinite(value) else math.nan
+
+
+def _parse_bulk(data: bytes, layout: Layout, places: list[int]) -> FloatArray | None:
+    """All rows at once; None where a row is not what the header says."""
+    import pandas as pd
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", pd.errors.ParserWarning)
+            frame = pd.read_csv(
+                io.BytesIO(data), sep=layout.separator, header=None, index_col=False,
+                names=list(range(len(layout.names))), usecols=places, dtype=np.float64,
+                skipinitialspace=True, skip_blank_lines=False,
+                decimal="." if layout.separator == "," else ",",
+            )  # fmt: skip
+    except (ValueError, pd.errors.ParserWarning, pd.errors.ParserError):
+        return None
+    values: FloatArray = frame.to_numpy(dtype=np.float64)
+    return values if np.isfinite(values).all() else None

@@ -1,0 +1,96 @@
+"""The texts of a page, as HTML: the run's state above, the values beside the figures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from daq.hal import Flag, FloatArray
+from daq.log import UNITS
+from daq.scope.figures import BLUE, GREEN, GREY, ORANGE, RED, curves_of, flag_name
+from daq.scope.recordings import Recording
+
+_STATES = {
+    "running": (GREEN, "recording"),
+    "completed": (BLUE, "completed"),
+    "stopped": (ORANGE, "stopped"),
+    "log": (GREY, "log without a run record"),
+}
+VALUE_FIELDS = ("row", "color", "channel", "value", "unit", "difference", "style")
+HELP = (
+    "Drag: zoom in time. Wheel: zoom. Click: set a mark; double click: remove it. "
+    "Live, or the toolbar's reset: follow again."
+)
+
+
+def heading(recording: Recording | None, root: Path, newer: bool) -> str:
+    """Which run, in which state, and what is wrong with it; newer: another one has begun."""
+    if recording is None:
+        return (
+            f"<b>No run under {escape(str(root))} yet.</b> "
+            "It is shown as soon as one begins: <code>rig run prbs.yaml</code>"
+        )
+    lines = [_title(recording)]
+    if recording.state.reason:
+        lines.append(f"<b>{escape(recording.state.reason)}</b>")
+    if newer:
+        lines.append("<b>A new run has begun: press Live to see it.</b>")
+    if recording.loading is not None:
+        lines.append(f"reading the log: {recording.loading:.0%}")
+    elif recording.state.running and not _rows(recording):
+        lines.append("waiting for the first sample: offset calibration, winding of the load")
+    lines += [
+        f'<span style="color:#a33c00">&#9888; {escape(text)}</span>'
+        for text in recording.complaints()
+    ]
+    return "<br>".join(lines)
+
+
+def readout(
+    columns: Sequence[str], values: FloatArray, marked: FloatArray | None, at_cursor: bool
+) -> dict[str, list[Any]]:
+    """A table of every column's value, its unit, and its difference from the mark."""
+    where = "at the cursor" if at_cursor else "newest sample"
+    from_mark = "" if marked is None else "from the mark"
+    rows: list[tuple[Any, ...]] = [(0, "transparent", "", where, "", from_mark, "bold")]
+    colors = {curve.name: curve.color for group in curves_of(columns) for curve in group}
+    for place, name in enumerate(columns):
+        value, unit, difference = f"{values[place]:.6g}", UNITS.get(name, ""), ""
+        if name == "flags":
+            value = _flags(values[place])
+        elif marked is not None:
+            difference = f"{values[place] - marked[place]:+.5g}"
+        color = colors.get(name, "transparent")
+        rows.append((place + 1, color, name, value, unit, difference, "normal"))
+    return {
+        field: list(cells)
+        for field, cells in zip(VALUE_FIELDS, zip(*rows, strict=True), strict=True)
+    }
+
+
+def _title(recording: Recording) -> str:
+    state, rows = recording.state, _rows(recording)
+    color, word = _STATES.get(state.status, (RED, state.status))
+    facts = [f"{name} {value}" for name, value in state.details.items()]
+    if state.running and state.expected_rows:
+        facts.append(f"{100 * rows // state.expected_rows} % of {state.expected_rows} samples")
+    elif recording.history is not None and rows:
+        facts.append(f"{rows} samples, {recording.history.span[1]:.5g} s")
+    return (
+        f'<b style="font-size:1.25em">{escape(recording.name)}</b> '
+        f'<span style="background:{color};color:white;border-radius:3px;padding:1px 8px">'
+        f"{escape(word)}</span> {escape(' · '.join(facts))}"
+    )
+
+
+def _rows(recording: Recording) -> int:
+    return recording.history.n_rows if recording.history else 0
+
+
+def _flags(value: float) -> str:
+    if not math.isfinite(value):
+        return "?"
+    return ", ".join(flag_name(flag) for flag in Flag if int(value) & int(flag)) or "none"

@@ -1,0 +1,372 @@
+"""What the scope reads and keeps of a log, and its command; the page itself needs a browser."""
+
+import json
+import signal
+import socket
+import sys
+
+import numpy as np
+import psutil
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from daq.hal import Samples
+from daq.log import COLUMNS, LogWriter, load_log
+from daq.scope.history import History
+from daq.scope.recordings import Recording, Watch
+from daq.scope.tail import LogTail
+from tests.daq.support import environment, rig, start_rig, until
+
+RATE = 800.0
+
+
+def samples(n, first=0, **columns):
+    """n samples of something like noise, with what ``columns`` say instead."""
+    rng = np.random.default_rng(first)
+    tick = np.arange(first, first + n)
+    fields = {name: rng.normal(size=n) for name in Samples.__dataclass_fields__}
+    fields |= {"tick": tick, "time": tick / RATE, "flags": np.zeros(n, dtype=int), **columns}
+    return Samples(**fields)
+
+
+def write_log(folder, n, **columns):
+    folder.mkdir(parents=True, exist_ok=True)
+    with LogWriter(folder / "log.csv") as log:
+        log.append(samples(n, **columns))
+    return folder / "log.csv"
+
+
+def all_rows(tail):
+    """Everything that can be read now."""
+    blocks = [tail.poll().values]
+    while len(blocks[-1]):
+        blocks.append(tail.poll().values)
+    return np.concatenate(blocks)
+
+
+# --- reading ------------------------------------------------------------------------------
+
+
+@settings(max_examples=25, deadline=None)
+@given(cuts=st.lists(st.integers(0, 20_000), max_size=12), n=st.integers(2, 120))
+def test_a_log_read_as_it_grows_is_the_log_read_at_its_end(tmp_path_factory, cuts, n):
+    folder = tmp_path_factory.mktemp("log")
+    data = write_log(folder / "whole", n).read_bytes()
+    growing = folder / "log.csv"
+    tail = LogTail(growing)
+    assert len(tail.poll().values) == 0  # before there is a file
+    rows = []
+    for cut in [*sorted(cut % len(data) for cut in cuts), len(data)]:
+        growing.write_bytes(data[:cut])
+        rows += tail.poll().values.tolist()
+        assert not tail.problems.count and tail.fault is None
+    expected = load_log(folder / "whole" / "log.csv").frame[list(COLUMNS)].to_numpy()
+    assert tail.columns == COLUMNS
+    np.testing.assert_array_equal(rows, expected)
+    assert not tail.torn()
+
+
+def test_large_and_small_reads_give_the_same_numbers(tmp_path):
+    path = write_log(tmp_path, 3000)
+    expected = load_log(path).frame[list(COLUMNS)].to_numpy()
+    np.testing.assert_allclose(all_rows(LogTail(path)), expected, rtol=1e-14)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "t, cmd_voltage_motor, torque\n0.0, 1.0, 0.5\n0.1, 2.0, 0.25\n",
+        "t;cmd_voltage_motor;torque\r\n0,0;1,0;0,5\r\n0,1;2,0;0,25\r\n",
+        "\ufeff# made elsewhere\n\nt\tcmd_voltage_motor\ttorque\n0.0\t1.0\t0.5\n0.1\t2.0\t0.25\n",
+        "# t,cmd_voltage_motor,torque\n0.0,1.0,0.5\n0.1,2.0,0.25\n",
+    ],
+    ids=["original program", "semicolons", "comments and tabs", "numpy"],
+)
+def test_other_programs_logs_are_read(tmp_path, text):
+    path = tmp_path / "other.csv"
+    path.write_bytes(text.encode())
+    tail = LogTail(path)
+    assert all_rows(tail).tolist() == [[0.0, 1.0, 0.5], [0.1, 2.0, 0.25]]
+    assert tail.columns == ("t", "cmd_voltage_motor", "torque")
+    assert "without column cmd_voltage_brake, current_motor" in tail.problems.first[0]
+
+
+@pytest.mark.parametrize("bulk", [False, True], ids=["few rows", "many rows"])
+def test_what_is_broken_is_left_out_and_told(tmp_path, bulk):
+    path = write_log(tmp_path, 2000 if bulk else 20)
+    lines = path.read_bytes().splitlines(keepends=True)
+    good = np.genfromtxt(lines, delimiter=",", skip_header=1)
+    lines[5] = b"\x00\xff\xfe garbage\n"  # line 6 of the file
+    lines[8] = lines[8].replace(lines[8].split(b",")[3], b"oops")  # current_motor of row 7
+    lines[11] = lines[3]  # time goes back
+    path.write_bytes(b"".join(lines) + b"3.5,0.1")
+    tail = LogTail(path)
+    rows = all_rows(tail)
+    kept = np.delete(np.arange(len(good)), [4, 10])
+    expected = good[kept]
+    expected[expected[:, 0] == good[7, 0], 3] = np.nan
+    np.testing.assert_allclose(rows, expected, rtol=1e-14)
+    told = "\n".join(tail.problems.first)
+    assert "line 6: 1 cells instead of 12; left out" in told
+    assert "line 9: current_motor: 'oops' is no number" in told
+    assert "time does not advance in 1 row; left out" in told and tail.problems.count == 3
+    assert tail.torn()
+
+
+@pytest.mark.parametrize(
+    ("data", "fault"),
+    [
+        (b"1,2,3\n4,5,6\n", "line 1: numbers where the column names should be"),
+        (
+            b"time,torque\n1,2\n",
+            "line 1: column 't' (time in s) is missing; there are time, torque",
+        ),
+        (b"#\n" * 50_000, "it has no line of column names"),
+        (bytes(range(256)) * 20, "column 't' (time in s) is missing"),
+    ],
+    ids=["no header", "no time", "comments only", "binary"],
+)
+def test_a_file_that_is_no_log_says_so(tmp_path, data, fault):
+    path = tmp_path / "log.csv"
+    path.write_bytes(data)
+    recording = Recording(path)
+    recording.read()
+    (told, *_) = recording.complaints()
+    assert told.startswith(f"{path}: ") and fault in told
+    assert recording.history is None
+
+
+def test_a_line_without_end_does_not_stop_the_reading(tmp_path):
+    path = write_log(tmp_path, 5)
+    with path.open("ab") as log:
+        log.write(b"x" * 4_500_000 + b"\n9.0" + b",1.0" * 11 + b"\n")
+    tail = LogTail(path)
+    assert all_rows(tail)[:, 0].tolist() == [*(np.arange(5) / RATE), 9.0]
+    assert tail.problems.count
+
+
+def test_another_log_under_the_same_name_is_begun_anew(tmp_path):
+    path = write_log(tmp_path, 100)
+    recording = Recording(path)
+    recording.read()
+    path.unlink()
+    write_log(tmp_path, 3)
+    recording.read()
+    recording.read()
+    assert recording.history.n_rows == 3
+
+
+# --- what is kept -------------------------------------------------------------------------
+
+
+N_LONG = 400_000  # more than six times what is kept as it is
+
+
+@pytest.fixture(scope="module")
+def long():
+    """A long history with one spike, its rows, and what it read back from the file."""
+    rng = np.random.default_rng(1)
+    rows = np.column_stack([np.arange(N_LONG) / RATE, rng.normal(size=N_LONG), np.zeros(N_LONG)])
+    rows[123_456, 1], rows[123_456, 2] = 100.0, 4.0
+    reads = []
+
+    def read(start, end):
+        reads.append(end - start)
+        return rows[start:end]  # a byte for each row
+
+    history = History(("t", "torque", "flags"), read)
+    for first in range(0, N_LONG, 7001):
+        block = rows[first : first + 7001]
+        history.add(block, np.arange(first, first + len(block) + 1))
+    return history, rows, reads
+
+
+def test_memory_does_not_grow_with_the_log(long):
+    history, rows, _ = long
+    arrays = [value for value in vars(history).values() if isinstance(value, np.ndarray)]
+    small = History(("t", "torque", "flags"), lambda start, end: rows[start:end])
+    before = [value for value in vars(small).values() if isinstance(value, np.ndarray)]
+    grown = sum(a.nbytes for a in arrays) - sum(a.nbytes for a in before)
+    assert history.n_rows == N_LONG and grown <= 64 * history.bucket
+    assert history.span == (0.0, rows[-1, 0])
+
+
+@settings(max_examples=60, deadline=None)
+@given(start=st.floats(-10.0, 500.0), width=st.floats(0.01, 600.0), points=st.integers(50, 900))
+def test_a_view_shows_every_extreme_between_its_times(long, start, width, points):
+    history, rows, reads = long
+    reads.clear()
+    view = history.view(start, start + width, points)
+    inside = rows[(rows[:, 0] >= start) & (rows[:, 0] <= start + width)]
+    assert np.all(np.diff(view.time) > 0.0) and len(view.time) <= 2 * points + 4
+    if len(inside):
+        assert view.low[:, 1].min() <= inside[:, 1].min()
+        assert view.high[:, 1].max() >= inside[:, 1].max()
+        assert np.bitwise_or.reduce(view.flags) >= inside[:, 2].max()
+        around = rows[(rows[:, 0] >= view.time[0]) & (rows[:, 0] <= view.high[-1, 0])]
+        assert view.high[:, 1].max() == around[:, 1].max()
+        assert view.low[:, 1].min() == around[:, 1].min()
+    if view.step == 1:
+        index = np.round(view.time * RATE).astype(int)
+        np.testing.assert_array_equal(view.low, rows[index])
+    assert sum(reads) <= 200_000
+
+
+def test_magnified_old_rows_come_from_the_file(long):
+    history, rows, reads = long
+    reads.clear()
+    view = history.view(154.0, 155.0, 500)
+    assert view.step == 1 and reads and view.high[:, 1].max() == 100.0
+    assert history.at(123_456.4 / RATE).tolist() == rows[123_456].tolist()
+    assert history.at(1e9).tolist() == rows[-1].tolist()
+
+
+def test_what_is_added_to_a_view_is_what_a_later_view_shows():
+    rng = np.random.default_rng(2)
+    rows = np.column_stack([np.arange(6000) / RATE, rng.normal(size=6000)])
+    history = History(("t", "torque"), lambda start, end: rows[start:end])
+    history.add(rows[:3000], np.arange(3001))
+    view = history.view(0.0, 10.0, 500, to_the_end=False)
+    low, high, end = [view.low], [view.high], view.end
+    for first in range(3000, 6000, 37):
+        history.add(rows[first : first + 37], np.arange(first, min(first + 38, 6001)))
+        more = history.since(end, view.step)
+        low.append(more.low)
+        high.append(more.high)
+        end = more.end
+    low, high = np.concatenate(low), np.concatenate(high)
+    n = 6000 // view.step
+    np.testing.assert_array_equal(low[:, 1], rows[: n * view.step, 1].reshape(n, -1).min(axis=1))
+    np.testing.assert_array_equal(high[:, 1], rows[: n * view.step, 1].reshape(n, -1).max(axis=1))
+
+
+# --- which run ----------------------------------------------------------------------------
+
+
+def record(folder, started, status="completed", **more):
+    folder.mkdir(parents=True, exist_ok=True)
+    facts = {"status": status, "reason": None, "started": f"2026-01-0{started}T10:00:00.000+00:00"}
+    (folder / "run.json").write_text(json.dumps({**facts, **more}))
+
+
+def watch_until(watch, condition, what):
+    def found():
+        watch.poll()
+        return watch.recording is not None and condition(watch.recording)
+
+    until(found, what, seconds=10)
+    return watch.recording
+
+
+def test_the_newest_run_is_followed(tmp_path):
+    watch = Watch(tmp_path / "runs", None)
+    assert watch.recording is None
+    (tmp_path / "runs" / "notes").mkdir(parents=True)
+    write_log(tmp_path / "runs" / "b", 10)
+    record(tmp_path / "runs" / "b", 2)
+    write_log(tmp_path / "runs" / "z", 20)
+    record(tmp_path / "runs" / "z", 1)
+    first = watch_until(watch, lambda r: r.history is not None, "the newer of two runs")
+    assert first.name == "b" and first.history.n_rows == 10 and not first.state.running
+    record(tmp_path / "runs" / "a", 3, "running")
+    newest = watch_until(watch, lambda r: r.name == "a", "a run that begins")
+    assert newest.state.running and newest.history is None and newest.complaints() == []
+    write_log(tmp_path / "runs" / "a", 5)
+    watch_until(watch, lambda r: r.history is not None and r.history.n_rows == 5, "its samples")
+    record(tmp_path / "runs" / "a", 3, "interlock")
+    watch_until(watch, lambda r: r.state.status == "interlock", "its end")
+
+
+def test_a_malformed_record_hides_no_samples(tmp_path):
+    path = write_log(tmp_path, 10)
+    (tmp_path / "run.json").write_text("{")
+    recording = Recording(path)
+    recording.read()
+    assert recording.history.n_rows == 10
+    (told,) = recording.complaints()
+    assert "run.json: not a readable run record" in told
+
+
+# --- the command --------------------------------------------------------------------------
+
+
+def start_scope(*args, cwd):
+    """A running ``rig scope`` and the address that it says."""
+    process = start_rig("scope", "--no-browser", "--port", 0, *args, cwd=cwd)
+    line = process.stdout.readline()
+    assert line.startswith("http://127.0.0.1:"), process.communicate()[1]
+    return process, line.split()[0]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="ended by signals")
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
+def test_it_serves_this_machine_only_until_told_to_end(tmp_path, how):
+    process, address = start_scope(cwd=tmp_path)
+    port = int(address.rstrip("/").rsplit(":", 1)[1])
+    listens = [
+        c.laddr for c in psutil.Process(process.pid).net_connections("inet") if c.status == "LISTEN"
+    ]
+    assert [(a.ip, a.port) for a in listens] == [("127.0.0.1", port)]
+    taken = rig("scope", "--no-browser", "--port", port, cwd=tmp_path)
+    assert taken.returncode == 2 and f"--port {port}: cannot be used" in taken.stderr
+    process.send_signal(how)
+    _, err = process.communicate(timeout=30)
+    assert process.returncode == 0 and err == ""
+    with socket.socket() as again:
+        again.bind(("127.0.0.1", port))
+
+
+def test_a_page_of_another_site_is_refused(tmp_path):
+    from tornado import httpclient, ioloop, websocket
+
+    process, address = start_scope(cwd=tmp_path)
+    try:
+        request = httpclient.HTTPRequest(
+            address.replace("http", "ws") + "ws", headers={"Origin": "http://example.com"}
+        )
+
+        async def connect():
+            await websocket.websocket_connect(request)
+
+        with pytest.raises(httpclient.HTTPClientError, match="403"):
+            ioloop.IOLoop(make_current=False).run_sync(connect)
+    finally:
+        process.terminate()
+        process.communicate(timeout=30)
+
+
+@pytest.mark.parametrize(
+    ("args", "words"),
+    [
+        (("missing.csv",), ["missing.csv", "there is no such run"]),
+        ((".",), ["holds no run", "--out"]),
+    ],
+    ids=["missing", "a folder without a run"],
+)
+def test_a_run_that_is_not_there_is_refused(tmp_path, args, words):
+    result = rig("scope", "--no-browser", *args, cwd=tmp_path)
+    assert result.returncode == 2 and result.stdout == ""
+    assert all(word in result.stderr for word in words) and "Traceback" not in result.stderr
+
+
+def test_json_is_one_document_with_the_address(tmp_path):
+    process = start_rig("scope", "--port", 0, "--json", cwd=tmp_path)
+    text = ""
+    while not text.endswith("}\n"):
+        text += process.stdout.readline()
+    process.terminate()
+    process.communicate(timeout=30)
+    document = json.loads(text)
+    assert document["address"].startswith("http://127.0.0.1:") and document["out"] == "runs"
+
+
+def test_without_bokeh_it_says_how_to_install_it(tmp_path):
+    import subprocess
+
+    code = "import sys; sys.modules['bokeh'] = None; from daq.cli import main; main()"
+    result = subprocess.run(
+        [sys.executable, "-c", code, "scope"],
+        cwd=tmp_path, env=environment(), capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert result.returncode == 2 and "pip install 'hybrid-rig[scope]'" in result.stderr
