@@ -21,9 +21,9 @@ def scope_command(
             "pip install 'hybrid-rig[scope]' (in a clone: pip install -e '.[scope]')"
         )
     from daq.scope.recordings import Watch
-    from daq.scope.server import serve
 
-    watch = Watch(out, run)
+    watch = Watch(out, run)  # a mistake is told before the server is imported, which takes longer
+    from daq.scope.server import serve
 
     def ready(address: str) -> None:
         if as_json:

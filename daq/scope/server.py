@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import signal
 import socket
@@ -30,22 +31,26 @@ def serve(watch: Watch, port: int | None, ready: Callable[[str], None]) -> None:
     # Lines for the server's maintainers are no help to who looks at a run.
     for name in ("bokeh", "tornado"):
         logging.getLogger(name).setLevel(logging.ERROR)
+    asyncio.run(_serve(watch, port, ready))
+
+
+async def _serve(watch: Watch, port: int, ready: Callable[[str], None]) -> None:
+    loop, ended = asyncio.get_running_loop(), asyncio.Event()
+
+    def end(number: int, frame: FrameType | None) -> None:
+        loop.call_soon_threadsafe(ended.set)
+
     server = Server(
         {"/": Application(FunctionHandler(page_maker(watch)))},
         port=port,
         address=HOST,
         allow_websocket_origin=[f"{HOST}:{port}", f"localhost:{port}"],
     )
-    server.start()
-    loop = server.io_loop
-
-    def end(number: int, frame: FrameType | None) -> None:
-        loop.add_callback_from_signal(loop.stop)
-
     before = [(number, signal.signal(number, end)) for number in (signal.SIGINT, signal.SIGTERM)]
     try:
+        server.start()
         ready(f"http://{HOST}:{port}/")
-        loop.start()
+        await ended.wait()
     finally:
         server.stop()
         for number, handler in before:
