@@ -93,7 +93,11 @@ class Experiment(Section, abc.ABC):
         return None
 
     def describe(self) -> dict[str, Any]:
-        """The experiment as resolved, for run.json."""
+        """The experiment as resolved, for run.json.
+
+        A protocol adds under ``excitation`` what its settings alone do not tell: what it drew at
+        random, which file it played.
+        """
         return self.model_dump(mode="json")
 
     def samples_in(self, seconds: float, key: str = "duration") -> int:

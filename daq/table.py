@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 COMMENTS = ("#", "%", "//")
+_CURE = "mend or remove these lines (removed lines count as lost samples)"
 _TEXT_CONTROLS = b"\t\n\r\f"
 
 
@@ -53,8 +54,10 @@ def column_names(path: Path) -> list[str]:
     return layout_of(_complete_lines(path)[0]).names
 
 
-def read_table(path: Path, columns: Sequence[str] = ()) -> Table:
+def read_table(path: Path, columns: Sequence[str] = (), cure: str = _CURE) -> Table:
     """Read a CSV of numbers with a header line.
+
+    cure: what to do about cells that hold no number, for the error's end.
 
     Cells are separated by commas, semicolons or tabs (then decimals may have a comma), and
     separators may be followed by blanks. Lines of comments may stand before the header, or the
@@ -90,7 +93,7 @@ def read_table(path: Path, columns: Sequence[str] = ()) -> Table:
         raise ConfigError(f"{path}: not a table: {reason}") from None
     wanted = list(columns) or [name for name in header if name]
     first = layout.line + 1
-    numbers = {name: _numbers(path, name, frame[name], first, separator) for name in wanted}
+    numbers = {name: _numbers(path, name, frame[name], first, separator, cure) for name in wanted}
     return Table(path, pd.DataFrame(numbers), first, torn)
 
 
@@ -183,7 +186,7 @@ def _check_header(path: Path, layout: Layout, columns: Sequence[str]) -> None:
 
 
 def _numbers(
-    path: Path, name: str, column: pd.Series, first_line: int, separator: str
+    path: Path, name: str, column: pd.Series, first_line: int, separator: str, cure: str
 ) -> FloatArray:
     import pandas as pd
 
@@ -197,7 +200,7 @@ def _numbers(
         more = f", and in {len(bad) - 1} more lines" if len(bad) > 1 else ""
         raise ConfigError(
             f"{path}:{row + first_line}: {name}: {column.iloc[row]!r} is not a finite "
-            f"number{more}; mend or remove these lines (removed lines count as lost samples)"
+            f"number{more}; {cure}"
         )
     return values
 

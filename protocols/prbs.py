@@ -11,6 +11,7 @@ from daq.config.base import Section
 from daq.config.units import Seconds, Volts
 from daq.experiment import Timed
 from daq.hal import CHANNELS, FloatArray, IntArray
+from protocols.excitation import whole_samples
 
 REGISTER_BITS = 16
 SEQUENCE_LENGTH = 2**REGISTER_BITS - 1
@@ -42,23 +43,12 @@ class Prbs(Timed):
         columns = []
         for name in CHANNELS:
             channel: PrbsChannel = getattr(self, name)
-            hold = self._samples_per_bit(name, channel.minimum_period)
+            period = channel.minimum_period
+            hold = whole_samples(f"{name}.minimum_period", period, self.sample_rate)
             bits = lfsr_bits(channel.seed, math.ceil(n_samples / hold))
             levels = channel.offset + channel.amplitude * (2.0 * bits - 1.0)
             columns.append(np.repeat(levels, hold)[:n_samples])
         return np.stack(columns, axis=1)
-
-    def _samples_per_bit(self, name: str, period: float) -> int:
-        samples = period * self.sample_rate
-        nearest = max(1, round(samples))
-        if math.isclose(samples, nearest, rel_tol=1e-9):
-            return nearest
-        below, above = max(1, math.floor(samples)), max(1, math.ceil(samples))
-        near = " or ".join(f"{n / self.sample_rate:.10g}" for n in sorted({below, above}))
-        raise ValueError(
-            f"{name}.minimum_period: {period:g} s is {samples:.6g} samples at "
-            f"{self.sample_rate:g} Hz, not a whole number; the nearest that are: {near} s"
-        )
 
 
 def lfsr_bits(seed: int, n: int) -> IntArray:

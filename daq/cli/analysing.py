@@ -47,8 +47,10 @@ def recorded_experiment(folder: Path) -> Experiment:
     if not isinstance(settings, dict) or not isinstance(settings.get("protocol"), str):
         raise ConfigError(f"{path}: experiment.protocol: the name of a protocol is missing")
     kind = find_protocol(settings["protocol"], folder)
+    # Beside the settings stands what the protocol made of them.
+    written = {name: value for name, value in settings.items() if name != "excitation"}
     try:
-        experiment = kind.model_validate(settings)
+        experiment = kind.model_validate(written)
     except ValueError as error:
         raise ConfigError(f"{path}: experiment: {error}") from None
     return experiment

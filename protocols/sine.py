@@ -1,0 +1,42 @@
+"""A sine on each channel."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydantic import Field
+
+from daq.config.units import Hertz, Radians, Seconds
+from daq.hal import FloatArray
+from protocols.excitation import Excitation, ExcitedChannel
+
+
+class SineChannel(ExcitedChannel):
+    """One channel: offset + amplitude sin(2 pi frequency t + phase)."""
+
+    frequency: Hertz | None = Field(None, gt=0.0, description="of the sine")
+    phase: Radians = Field(0.0, ge=-100.0, le=100.0, description="of the sine at the start")
+
+
+class Sine(Excitation[SineChannel]):
+    """Sines, one on each channel, for as long as the file says."""
+
+    duration: Seconds = Field(gt=0.0, le=86400.0, description="of the sines, without the ramps")
+
+    def excited_samples(self) -> int:
+        """Samples between the ramps."""
+        return self.samples_in(self.duration)
+
+    def deviation(self, name: str, channel: SineChannel, time: FloatArray) -> FloatArray:
+        """The sine, (n,) [V]."""
+        frequency = self.frequency_of(f"{name}.frequency", channel.frequency)
+        sine: FloatArray = np.sin(2.0 * np.pi * frequency * time + channel.phase)
+        return channel.amplitude * sine
+
+    def remarks(self) -> tuple[str, ...]:
+        """How many periods each channel makes."""
+        lines = []
+        for name, channel in (("motor", self.motor), ("brake", self.brake)):
+            if channel.amplitude > 0.0 and channel.frequency is not None:
+                periods = channel.frequency * self.duration
+                lines.append(f"{name}: {periods:.4g} periods of {channel.frequency:g} Hz")
+        return tuple(lines)
