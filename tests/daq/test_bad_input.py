@@ -195,7 +195,7 @@ CASES = [
                "e.yaml:5: nested too deeply", "alias"),
     experiment("a control character", "0.75", "0.75\x01", "e.yaml: not valid YAML"),
     Case("missing experiment", ["run", "absent.yaml"],
-         ["absent.yaml: there is no such file; check its name, or use a shipped one: prbs.yaml"]),
+         ["absent.yaml: there is no such file; check its name, or use a shipped one: ", "prbs.yaml"]),
     Case("an empty experiment", ["run", "e.yaml"],
          ["e.yaml: the file is empty; it must hold 'key: value' lines"], {"e.yaml": ""}),
     Case("a list for an experiment", ["run", "e.yaml"],
