@@ -307,7 +307,7 @@ def length(settings):
 
 
 @settings(max_examples=150, deadline=None, derandomize=True,
-          suppress_health_check=[HealthCheck.function_scoped_fixture])  # fmt: skip
+          suppress_health_check=[HealthCheck.too_slow])  # fmt: skip
 @given(experiments())
 def test_any_settings_give_a_clear_error_or_commands_within_what_they_declare(content):
     kind = load_plugin("rig.protocols", content["protocol"])
