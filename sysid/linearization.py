@@ -62,6 +62,27 @@ def jacobian(
     return _gradient(model, model.derivative, x, u, p)[:, : len(x)]
 
 
+def jacobians(model: ProcessModel, x: FloatArray, u: FloatArray, p: FloatArray) -> FloatArray:
+    """df/dx at one point under each of several parameter vectors, (m, n_states, n_states).
+
+    p: (m, n_parameters). All at once, unless the equations branch on what differs between them.
+    """
+    states, n = len(x), len(p)
+    seeds = np.eye(states)[:, :, None]
+    columns = tuple(float(c[0]) if np.all(c == c[0]) else c for c in p.T)
+    try:
+        with np.errstate(all="ignore"):
+            values = _on_duals(model.derivative)(
+                tuple(Dual(float(v), seeds[i]) for i, v in enumerate(x)),
+                tuple(float(v) for v in u),
+                columns,
+            )
+    except (TypeError, ValueError):
+        return np.stack([jacobian(model, x, u, row) for row in p])
+    slopes = [np.broadcast_to(getattr(v, "slope", np.zeros((1, 1))), (states, n)) for v in values]
+    return np.ascontiguousarray(np.moveaxis(np.array(slopes), 2, 0))
+
+
 def equilibrium(
     model: ProcessModel,
     u: FloatArray,

@@ -11,12 +11,15 @@ the linearised model.
 from __future__ import annotations
 
 import itertools
+from typing import Any
 
 import numpy as np
 
-from sysid.linearization import jacobian
+from sysid.linearization import jacobians
 from sysid.model import BoolArray, FloatArray
 from sysid.objective import Objective
+
+ComplexArray = np.ndarray[Any, np.dtype[np.complex128]]
 
 _FASTEST_SEEN = 0.4  # of the sample rate: slower modes have no alias that could be mistaken
 _REACH = 2.0  # how many times faster or slower than the mode its aliases may be
@@ -63,38 +66,37 @@ def _swaps(objective: Objective, chromosome: FloatArray) -> list[FloatArray]:
 def _aliases(modes: _Modes, dt: float) -> list[FloatArray]:
     """With the mode at the frequencies that the sampling does not tell from its own."""
     mode = modes.fastest
-    if mode.imag * dt < 2.0 * np.pi * _FASTEST_SEEN:
+    frequencies = _folded(mode.imag, dt)
+    if mode.imag * dt < 2.0 * np.pi * _FASTEST_SEEN or not len(frequencies):
         return []
-    every = np.ones(len(modes.start), dtype=bool)
-    found = []
-    for frequency in _folded(mode.imag, dt):
-        at, value = modes.start, mode
-        for stage in np.linspace(0.0, 1.0, _STAGES + 1)[1:]:
-            wanted = complex(mode.real, mode.imag * (frequency / mode.imag) ** stage)
-            at, value = modes.towards(at, value, wanted, every)
-        if abs(value.imag - frequency) < _REACHED * frequency:
-            found.append(modes.space.decode(at))
-    return found
+    at, values = modes.here(len(frequencies))
+    for stage in np.linspace(0.0, 1.0, _STAGES + 1)[1:]:
+        wanted = mode.real + 1j * mode.imag * (frequencies / mode.imag) ** stage
+        at, values = modes.towards(at, values, wanted, np.ones(at.shape, dtype=bool))
+    reached = np.abs(values.imag - frequencies) < _REACHED * frequencies
+    return list(modes.space.decode(at[reached]))
 
 
 def _twins(modes: _Modes) -> list[FloatArray]:
     """With one of the parameters that the mode hangs on moved, the others keeping the mode."""
-    mode, found = modes.fastest, []
-    for place in modes.acting[:_TURNED]:
-        others = np.arange(len(modes.start)) != place
-        for share in _TURNS:
-            at = modes.start.copy()
-            at[place] += share * modes.width[place]
-            if not modes.bounds[0][place] <= at[place] <= modes.bounds[1][place]:
-                continue
-            value = modes.nearest(at, mode)
-            at, value = modes.towards(at, value, mode, others, _STAGES * _ITERATIONS)
-            if abs(value - mode) < _REACHED * abs(mode):
-                found.append(modes.space.decode(at))
-    return found
+    mode = modes.fastest
+    places = np.repeat(modes.acting[:_TURNED], len(_TURNS))
+    at, _ = modes.here(len(places))
+    rows = np.arange(len(places))
+    at[rows, places] += np.tile(_TURNS, len(places) // len(_TURNS)) * modes.width[places]
+    moved, (lower, upper) = at[rows, places], modes.bounds
+    inside = (moved >= lower[places]) & (moved <= upper[places])
+    at, places = at[inside], places[inside]
+    if not len(at):
+        return []
+    others = np.arange(at.shape[1]) != places[:, None]
+    wanted = np.full(len(at), mode)
+    values = modes.nearest(at, wanted)
+    at, values = modes.towards(at, values, wanted, others, _STAGES * _ITERATIONS)
+    return list(modes.space.decode(at[np.abs(values - mode) < _REACHED * abs(mode)]))
 
 
-def _folded(frequency: float, dt: float) -> list[float]:
+def _folded(frequency: float, dt: float) -> FloatArray:
     """Frequencies [rad/s] that look like this one at a sample time, nearest first."""
     rate = 2.0 * np.pi / dt
     count = int(_REACH * frequency / rate) + 2
@@ -104,7 +106,8 @@ def _folded(frequency: float, dt: float) -> list[float]:
     near = (all_of_them < _REACH * frequency) & (all_of_them > frequency / _REACH)
     chosen = np.unique(all_of_them[apart & near])
     order = np.argsort(np.abs(np.log(chosen / frequency)))
-    return [float(value) for value in chosen[order][:_MOST]]
+    nearest: FloatArray = chosen[order][:_MOST]
+    return nearest
 
 
 class _Modes:
@@ -124,46 +127,58 @@ class _Modes:
         self.start = self.space.encode(chromosome)
         self.bounds = self.space.coded_bounds
         self.width = self.space.width
-        values = self._eigenvalues(self.start)
+        (values,) = self._eigenvalues(self.start[None])
         oscillates = bool(values.imag.max() > 0.0)
         self.fastest = complex(values[np.argmax(values.imag if oscillates else np.abs(values))])
         self.acting = np.arange(len(self.start))
-        size = np.linalg.norm(self.slopes(self.start, self.fastest), axis=0)
+        (slopes,) = self.slopes(*self.here(1))
+        size = np.linalg.norm(slopes, axis=0)
         strongest = np.argsort(size)[::-1]
         self.acting = strongest[size[strongest] > _ACTING * size.max()]
 
-    def towards(
-        self, at: FloatArray, value: complex, wanted: complex, moving: BoolArray,
-        iterations: int = _ITERATIONS,
-    ) -> tuple[FloatArray, complex]:  # fmt: skip
-        """The least move, in parts of the ranges, that brings a mode where it is wanted."""
-        for _ in range(iterations):
-            slopes = np.where(moving, self.slopes(at, value), 0.0)
-            miss = np.array([wanted.real - value.real, wanted.imag - value.imag])
-            move = np.linalg.lstsq(slopes, miss, rcond=1e-9)[0]
-            at = np.clip(at + move * self.width, *self.bounds)
-            value = self.nearest(at, value + complex(*(slopes @ move)))
-        return at, value
+    def here(self, count: int) -> tuple[FloatArray, ComplexArray]:
+        """The minimum and its fastest mode, so many times."""
+        return np.repeat(self.start[None], count, axis=0), np.full(count, self.fastest)
 
-    def slopes(self, at: FloatArray, value: complex) -> FloatArray:
-        """How real and imaginary part move per range of each coordinate, (2, n_free)."""
-        slopes = np.zeros((2, len(at)))
-        for i in self.acting:
-            shift = -_DIFFERENCE if at[i] + _DIFFERENCE * self.width[i] > self.bounds[1][i] else (
-                _DIFFERENCE
-            )  # fmt: skip
-            beside = at.copy()
-            beside[i] += shift * self.width[i]
-            change = (self.nearest(beside, value) - value) / shift
-            slopes[:, i] = change.real, change.imag
+    def towards(
+        self, at: FloatArray, values: ComplexArray, wanted: ComplexArray, moving: BoolArray,
+        iterations: int = _ITERATIONS,
+    ) -> tuple[FloatArray, ComplexArray]:  # fmt: skip
+        """The least moves, in parts of the ranges, that bring modes where they are wanted.
+
+        at, moving: (n, n_free); values, wanted: (n,).
+        """
+        for _ in range(iterations):
+            slopes = np.where(moving[:, None], self.slopes(at, values), 0.0)
+            miss = np.stack([(wanted - values).real, (wanted - values).imag], axis=1)
+            move = np.linalg.pinv(slopes, rcond=1e-9) @ miss[:, :, None]
+            along = (slopes @ move)[:, :, 0]
+            at = np.clip(at + move[:, :, 0] * self.width, *self.bounds)
+            values = self.nearest(at, values + along[:, 0] + 1j * along[:, 1])
+        return at, values
+
+    def slopes(self, at: FloatArray, values: ComplexArray) -> FloatArray:
+        """How real and imaginary parts move per range of each coordinate, (n, 2, n_free)."""
+        n, count = len(at), len(self.acting)
+        back = at + _DIFFERENCE * self.width > self.bounds[1]
+        shift = np.where(back, -_DIFFERENCE, _DIFFERENCE)
+        beside = np.repeat(at[:, None], count, axis=1)
+        beside[:, np.arange(count), self.acting] += (shift * self.width)[:, self.acting]
+        found = self.nearest(beside.reshape(n * count, -1), np.repeat(values, count))
+        change = (found.reshape(n, count) - values[:, None]) / shift[:, self.acting]
+        slopes = np.zeros((n, 2, at.shape[1]))
+        slopes[:, 0, self.acting], slopes[:, 1, self.acting] = change.real, change.imag
         return slopes
 
-    def nearest(self, at: FloatArray, value: complex) -> complex:
-        """The eigenvalue nearest to a value."""
-        values = self._eigenvalues(at)
-        return complex(values[np.argmin(np.abs(values - value))])
+    def nearest(self, at: FloatArray, values: ComplexArray) -> ComplexArray:
+        """At each row of coordinates the eigenvalue nearest to a value, (n,)."""
+        found = self._eigenvalues(at)
+        chosen = np.argmin(np.abs(found - values[:, None]), axis=1)
+        nearest: ComplexArray = found[np.arange(len(at)), chosen]
+        return nearest
 
-    def _eigenvalues(self, at: FloatArray) -> np.ndarray[tuple[int], np.dtype[np.complex128]]:
-        vector = self.space.full(self.space.decode(at))
-        matrix = jacobian(self.model, self.x, self.u, vector)
-        return np.linalg.eigvals(np.where(np.isfinite(matrix), matrix, 0.0)).astype(np.complex128)
+    def _eigenvalues(self, at: FloatArray) -> ComplexArray:
+        vectors = self.space.full(self.space.decode(at))
+        matrices = jacobians(self.model, self.x, self.u, vectors)
+        found = np.linalg.eigvals(np.where(np.isfinite(matrices), matrices, 0.0))
+        return found.astype(np.complex128)

@@ -20,6 +20,7 @@ from sysid import (
     jacobian,
     linearize,
 )
+from sysid.linearization import jacobians
 from tests.sysid.support import motor, motor_matrices
 
 MODELS = {
@@ -96,6 +97,56 @@ def test_elementary_functions_are_differentiated():
         )
         found = jacobian(model, np.array([value]), np.array([0.4]))
         np.testing.assert_allclose(found, expected, rtol=1e-8)
+
+
+# --- several parameter vectors at once ------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", MODELS)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_jacobians_of_many_are_those_of_each(name, seed):
+    model, rng = MODELS[name], np.random.default_rng(seed)
+    x, u = rng.normal(size=len(model.states)), rng.normal(size=len(model.inputs))
+    x[rng.random(len(x)) < 0.2] = 0.0
+    p = model.nominal * rng.uniform(0.5, 2.0, (5, len(model.parameters)))
+    p[:, rng.random(p.shape[1]) < 0.5] = model.nominal[rng.integers(p.shape[1])]
+    expected = [jacobian(model, x, u, row) for row in p]
+    np.testing.assert_allclose(jacobians(model, x, u, p), expected, rtol=1e-9, atol=1e-300)
+
+
+def elementary(x, u, p):
+    a, b = x
+    k, n = p
+    return (
+        math.exp(k * a) + math.sin(a) * math.cos(k * a) - math.tanh(k * a) + math.sqrt(k * a)
+        + math.log(k + a) + math.atan2(a, k) + (k * a) ** n + k**a + k / (1.0 + n * a * a),
+        max(k * a, b, 0.1) + min(a, n * b) + abs(k - a) * b + math.hypot(a, k * b) + math.pow(a, n)
+        + math.exp(k) * b + math.fabs(-k * b) + (k - b) + math.copysign(b, k) + math.floor(a),
+    )  # fmt: skip
+
+
+def branching(x, u, p):
+    a, b = x
+    return (p[0] * a if p[0] * a > b else p[1] * b, a)
+
+
+@pytest.mark.parametrize("derivative", [elementary, branching])
+def test_jacobians_of_many_differentiate_and_branch_as_one(derivative):
+    model = ProcessModel(
+        name="functions",
+        states=(State("a", "1"), State("b", "1")),
+        inputs=(),
+        outputs=(Output("a", "1"),),
+        parameters=(Parameter("k", "1", 1.0, 0.5, 2.0), Parameter("n", "1", 1.7, 1.0, 2.0)),
+        derivative=derivative,
+    )
+    p = np.random.default_rng(3).uniform(0.6, 1.9, (20, 2))
+    for x in np.array([[0.7, 0.9], [1.4, 0.3]]):
+        expected = [jacobian(model, x, np.zeros(0), row) for row in p]
+        np.testing.assert_allclose(jacobians(model, x, np.zeros(0), p), expected, rtol=1e-9)
+
+
+# --- operating points -----------------------------------------------------------------------
 
 
 def test_an_equilibrium_is_one():
