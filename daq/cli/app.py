@@ -399,6 +399,10 @@ def emulate(
         float, typer.Option("--drift", metavar="PPM", help="Of the device's clock.")
     ] = 0.0,
     seed: Annotated[int, typer.Option("--seed", help="Of the faults' chances.")] = 0,
+    journal: Annotated[
+        Path | None,
+        typer.Option("--journal", metavar="FILE", help="Log of what became of the outputs, JSON."),
+    ] = None,
     json: AsJson = False,
 ) -> None:
     """Put the simulated rig behind the serial protocol, in real time, until Ctrl-C.
@@ -407,7 +411,7 @@ def emulate(
     """
     from daq.cli.emulating import emulate_command
 
-    emulate_command(rig, link, tcp, fault or [], drift, seed, json)
+    emulate_command(rig, link, tcp, fault or [], drift, seed, journal, json)
 
 
 @app.command(epilog="Example:  rig scope")

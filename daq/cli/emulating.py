@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import sys
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 import numpy as np
 
@@ -87,9 +89,13 @@ def emulate_command(
     fault: list[str],
     drift: float,
     seed: int,
+    journal: Path | None,
     as_json: bool,
 ) -> None:
     """Serve a simulated rig on a port until Ctrl-C."""
+    if "help" in fault:
+        _list_faults(as_json)
+        return
     chosen = [faults.parse(text) for text in fault]
     config, device = load_rig(rig)
     if not isinstance(device, SimulatedDevice):
@@ -97,7 +103,9 @@ def emulate_command(
             f"{rig}: its backend is {config.backend!r}; only the simulated one can be emulated. "
             "Name a rig file with 'backend: simulated'"
         )
-    options = device.options.model_copy(update={"time": "virtual"})
+    # Time is the machine's, and so is what goes wrong on the line.
+    own = {"time": "virtual", "faults": type(device.options.faults)()}
+    options = device.options.model_copy(update=own)
     identity = _identity(config.name, options.ideal, options.imperfections.bits)
     device = SimulatedDevice(options)
     _warm_up(device)
@@ -106,7 +114,8 @@ def emulate_command(
     stop = _StopRequest()
     port.connect()
     raise_thread()
-    emulator = Emulator(board, identity, port, chosen, 1e-6 * drift, seed)
+    note = _Journal(journal)
+    emulator = Emulator(board, identity, port, chosen, 1e-6 * drift, seed, note)
     if as_json:
         console.print_json({"port": port.name, "pid": os.getpid()})
     else:
@@ -117,6 +126,43 @@ def emulate_command(
         )
     sys.stdout.flush()
     emulator.run(stop)
+
+
+def _list_faults(as_json: bool) -> None:
+    if as_json:
+        console.print_json(
+            {name: {"default": value, "does": text} for name, (value, text) in faults.KINDS.items()}
+        )
+        return
+    console.print_table(
+        "Faults for --fault NAME[=VALUE][@PHASE[+SECONDS]]",
+        ["name", "default", "what it does"],
+        [
+            [name, "-" if value is None else f"{value:g}", text]
+            for name, (value, text) in faults.KINDS.items()
+        ],
+        text=["what it does"],
+    )
+    console.print_line(
+        "Phases: open, calibration, homing, run, safe. Without one a fault is there from the start."
+    )
+
+
+class _Journal:
+    """Lines of JSON in a file, each on disk before the device goes on."""
+
+    def __init__(self, path: Path | None) -> None:
+        self._file = None
+        if path is not None:
+            try:
+                self._file = path.open("w", encoding="utf-8")
+            except OSError as error:
+                raise ConfigError(f"--journal {path}: {error.strerror}") from None
+
+    def __call__(self, entry: dict[str, Any]) -> None:
+        if self._file is not None:
+            self._file.write(json.dumps(entry) + "\n")
+            self._file.flush()
 
 
 class _StopRequest:

@@ -218,7 +218,7 @@ class SerialDevice:
             "protocol_version": self._welcome.version,
             "watchdog_tripped_before": self._tripped_before,
             "real_time_scheduling": self._realtime,
-            "warnings": list(self._warnings),
+            "warnings": [*self._warnings, *_losses(self._record.get("line", {}))],
             **self._record,
         }
 
@@ -469,6 +469,17 @@ def _user() -> str:
         return getpass.getuser()
     except (OSError, KeyError):
         return "unknown"
+
+
+def _losses(line: dict[str, Any]) -> list[str]:
+    """What was lost of a run, for who looks at its summary."""
+    lost, dropped = line.get("lost_samples", 0), line.get("device_overflow_samples", 0)
+    if not lost:
+        return []
+    return [
+        f"{lost} samples were lost ({dropped} of them by the device, for which the line was too "
+        f"slow) and {line['rejected_frames']} damaged frames refused; the log shows the gaps"
+    ]
 
 
 def _version_mismatch(port: str, version: int) -> str:

@@ -145,7 +145,10 @@ class CommandRing:
 
 
 class DeviceMachine:
-    """A device: sessions, requests, the run, and everything that makes its outputs zero."""
+    """A device: sessions, requests, the run, and everything that makes its outputs zero.
+
+    heard: when the last frame of the session came.
+    """
 
     def __init__(self, board: Board, identity: Welcome) -> None:
         self.identity = identity
@@ -160,7 +163,7 @@ class DeviceMachine:
         self._run = 0
         self._start: Start | None = None
         self._origin = 0
-        self._heard = 0
+        self.heard = 0
         self._overflow = 0
         self._samples: list[Records] = []
         self._first = 0
@@ -179,12 +182,12 @@ class DeviceMachine:
         """Play the ticks that are due, watch the host, and send what is ready."""
         if self.state is not State.RUNNING or self._start is None:
             return
-        deadline = self._heard + self._watchdog
+        deadline = self.heard + self._watchdog
         self._play_until(min(now, deadline))
         if now > deadline and self.latch is not Latch.WATCHDOG:
             self._hold_at_zero(Latch.WATCHDOG)
         self._play_until(now)
-        if now > self._heard + round(LINGER_SECONDS * self.identity.clock):
+        if now > self.heard + round(LINGER_SECONDS * self.identity.clock):
             self._end()
 
     def next_event(self) -> int | None:
@@ -195,7 +198,7 @@ class DeviceMachine:
         due = self._origin + (self._ring.tick + ticks - 1) * self._start.period
         if self.latch is Latch.WATCHDOG:
             return due
-        return min(due, self._heard + self._watchdog + 1)
+        return min(due, self.heard + self._watchdog + 1)
 
     def take(self) -> bytes | None:
         """The next frame to write, or None."""
@@ -218,7 +221,7 @@ class DeviceMachine:
             # After a restart of the device: the host must hear that its run is gone.
             self._reply(frame, Result.NO_SESSION)
         else:
-            self._heard = now
+            self.heard = now
             self._dispatch(frame, now)
 
     def _dispatch(self, frame: Frame, now: int) -> None:
@@ -238,7 +241,7 @@ class DeviceMachine:
         # A repeated HELLO of the session that is open changes nothing.
         if version == self.identity.version and frame.session != self._session:
             self._end()
-            self._session, self._answered, self._heard = frame.session, None, now
+            self._session, self._answered, self.heard = frame.session, None, now
             self._outbox.clear()
             self._backlog = 0
             if self.latch is not Latch.WATCHDOG:
@@ -330,7 +333,7 @@ class DeviceMachine:
         if run != self._run or self.state is State.IDLE:
             return Result.WRONG_STATE
         if self.state is State.ARMED:
-            self._origin = self._heard = now
+            self._origin = self.heard = now
             self.state = State.RUNNING
         return Result.OK
 

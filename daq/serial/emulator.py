@@ -12,18 +12,19 @@ import socket
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
 from daq.errors import ConfigError
-from daq.hal import Phase
+from daq.hal import CHANNELS, Phase
 from daq.serial.device import Board, DeviceMachine
 from daq.serial.faults import Fault, Line
 from daq.serial.messages import Codes, Records, Start, Welcome
 
 _LONGEST_WAIT = 0.1  # s between two looks at faults and stop requests
 _GARBAGE_BYTES = 64
+_FORGIVEN = 0.005  # s that this process may wake late before it counts as a pause
 _COURTESY = 0.3  # s that a host has to go before the next one is refused
 
 
@@ -186,11 +187,12 @@ class TcpPort:
 
 
 class WatchedBoard:
-    """A board with a counter that can be stuck, which tells the phase of the run."""
+    """A board with a counter that can be stuck; it tells the phase and what its outputs are."""
 
     def __init__(self, board: Board) -> None:
         self.phase = Phase.OPEN
         self.stuck = False
+        self.outputs = [0] * len(CHANNELS)
         self._board = board
         self._count = 0
 
@@ -215,17 +217,20 @@ class WatchedBoard:
         if self.stuck:
             records["counts"], records["count_rate"] = self._count, 0.0
         self._count = int(records["counts"][-1])
+        self.outputs = records["applied"][-1].tolist()
         return records
 
     def zero(self) -> None:
         """Outputs to zero."""
+        self.outputs = [0] * len(CHANNELS)
         self._board.zero()
 
 
 class Emulator:
     """Runs a device machine in real time on a port, with its faults.
 
-    drift: of its clock against the computer's, as a quartz has it.
+    drift: of its clock against the computer's, as a quartz has it. journal: told of every change
+    of state, with the outputs and how long the host had been silent.
     """
 
     def __init__(
@@ -236,12 +241,15 @@ class Emulator:
         faults: Sequence[Fault] = (),
         drift: float = 0.0,
         seed: int = 0,
+        journal: Callable[[dict[str, Any]], None] = lambda entry: None,
     ) -> None:
         self._board = WatchedBoard(board)
         self._identity = identity
         self._port = port
         self._rate = identity.clock * (1.0 + drift)
         self._machine = DeviceMachine(self._board, identity)
+        self._journal = journal
+        self._noted: tuple[Any, ...] = ()
         self._waiting = list(faults)  # for their instant
         self._active: dict[str, float] = {}
         self._inward, self._outward = Line(seed), Line(seed + 1)
@@ -255,15 +263,44 @@ class Emulator:
 
     def run(self, stopped: Callable[[], bool]) -> None:
         """Serve until ``stopped`` says so."""
+        self._awake_by = self._now()
         while not stopped():
+            # The machine lives at this instant, before the port is read: a pause of this
+            # process after it must not look like silence of the host.
             now = self._now()
+            self._forgive(now - self._awake_by)
             self._trigger(now)
             self._come_back(now)
             self._receive(now)
-            self._machine.poll(self._ticks(self._now()))
+            self._note()
+            self._machine.poll(self._ticks(now))
+            self._note()
             self._transmit(self._now())
             self._wait()
         self._port.disconnect()
+
+    def _forgive(self, overslept: float) -> None:
+        """A pause of this process is no silence of a host that shares its computer."""
+        if overslept > _FORGIVEN:
+            self._machine.heard += self._ticks(overslept)
+
+    def _note(self) -> None:
+        """A line in the journal when something about the device has changed."""
+        machine = self._machine
+        state = (self._board.phase, machine.state, machine.latch, any(self._board.outputs))
+        if state != self._noted:
+            self._noted = state
+            now = self._now()
+            self._journal(
+                {
+                    "seconds": now,
+                    "phase": self._board.phase.value,
+                    "state": machine.state.name,
+                    "latch": machine.latch.name,
+                    "outputs": self._board.outputs,
+                    "silence_seconds": now - machine.heard / self._rate,
+                }
+            )
 
     def _now(self) -> float:
         return time.perf_counter()
@@ -313,11 +350,15 @@ class Emulator:
         event = self._machine.next_event()
         if event is not None:
             until.append((event + 1) / self._rate)
-        until += [at for line in (self._inward, self._outward) if (at := line.next_arrival())]
+        quiet = now < self._quiet_until
+        # What the port does not take, or must not get yet, is not waited for here.
+        lines = [self._inward] if quiet or self._unsent else [self._inward, self._outward]
+        until += [at for line in lines if (at := line.next_arrival()) is not None]
         until += [at for at in (self._quiet_until, self._back_at) if at is not None and at > now]
         timeout = max(0.0, min(until) - now)
+        self._awake_by = now + timeout
         files = self._port.files()
-        writing = files[-1:] if self._unsent and now >= self._quiet_until else []
+        writing = files[-1:] if self._unsent and not quiet else []
         if files:
             select.select(files, writing, [], timeout)
         else:

@@ -68,6 +68,8 @@ class Counters:
     malformed: int = 0
     retries: int = 0
     resent_commands: int = 0
+    longest_pause: float = 0.0
+    """Longest time in which the device's watchdog was not fed [s]."""
 
 
 class HostMachine:
@@ -158,6 +160,9 @@ class HostMachine:
 
     def ping(self, now: float) -> None:
         """Feed the watchdog, and learn about the clocks."""
+        if self._going:
+            pause = now - self._pinged
+            self.counters.longest_pause = max(self.counters.longest_pause, pause)
         self._pinged = now
         self._seq = (self._seq + 1) & 0xFFFF
         payload = messages.pack_ping(round(now * 1e9))
@@ -181,7 +186,7 @@ class HostMachine:
     def go(self, now: float) -> None:
         """Start the clock."""
         self._going = True
-        self._sample_at = now
+        self._sample_at = self._pinged = now
         self.ask(Type.GO, messages.pack_run(self._run), now)
 
     def stop(self, now: float) -> None:
@@ -324,13 +329,8 @@ class HostMachine:
         self._sent = max(self._sent, min(self._taken, self._asked))
         self._credit = max(self._credit, status.credit_until)
         self._pump(now)
-        if status.latch is Latch.WATCHDOG:
-            self._fail(
-                "the device's watchdog has zeroed the outputs: it had heard nothing from this "
-                f"program for {self._start.watchdog} ms. The computer was too busy, or the cable "
-                "fails towards the device; 'rig doctor' says what can be done, and 'watchdog' in "
-                "the rig file's options allows more"
-            )
+        if self._going and status.latch is Latch.WATCHDOG:
+            self._fail(self._why_tripped(now, self._start.watchdog))
         elif self._going and status.state is State.IDLE and self._request is None:
             self._fail("the device has ended the run by itself; its outputs are zero")
 
@@ -391,6 +391,22 @@ class HostMachine:
             request.sent = now
             self.counters.retries += 1
             self._outbox.append(request.frame)
+
+    def _why_tripped(self, now: float, watchdog: int) -> str:
+        tripped = (
+            "the device's watchdog has zeroed the outputs: it had heard nothing from this program "
+            f"for {watchdog} ms"
+        )
+        pause = max(self.counters.longest_pause, now - self._pinged)
+        if pause < 0.9e-3 * watchdog:
+            return (
+                f"{tripped}, which has spoken every {1e3 * pause:.0f} ms at least: the line fails "
+                "towards the device. Check cable, connectors and baud rate"
+            )
+        return (
+            f"{tripped}, which the computer had held up for {1e3 * pause:.0f} ms. 'rig doctor' "
+            "says what keeps it from doing so; options.watchdog in the rig file allows more"
+        )
 
     def _silence(self, now: float) -> str:
         if now - self._frame_at > 0.5 * SILENCE:

@@ -1,0 +1,217 @@
+"""``rig run`` over a line and a device that fail: what is logged, what is said, what is applied."""
+
+import os
+import signal
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from daq import capture
+from daq.errors import ConfigError, DeviceError
+from daq.hal import Flag
+from daq.serial import faults
+from daq.serial.backend import SerialDevice, SerialOptions
+from tests.daq.serial.support import forked_emulators, write_serial_rig
+from tests.daq.support import (
+    forked_rig,
+    only_capture,
+    record_of,
+    running_capture,
+    start_rig,
+    until,
+    write_experiment,
+)
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="ptys and signals of POSIX")
+
+# As long as a busy machine may hold this process up; the default is tested on its own.
+WATCHDOG = 0.5
+ANSWERS_WITHIN = 3.0  # s
+LOOP = """
+from daq.experiment import Answer, ClosedLoop
+import numpy as np
+from daq.experiment import Plan
+
+
+class Steady(ClosedLoop):
+    duration: float = 0.5
+
+    def plan(self):
+        n = self.samples_in(self.duration)
+        return Plan(n, np.zeros(2), np.array([0.3, 0.05]))
+
+    def controller(self):
+        return self
+
+    def answer(self, sample):
+        return Answer(0.2 + 1e-4 * (sample.tick % 500), 0.02)
+"""
+
+
+@pytest.fixture(scope="module")
+def emulate():
+    with forked_emulators() as start:
+        yield start
+
+
+@pytest.fixture(scope="module")
+def rig():
+    with forked_rig() as run:
+        yield run
+
+
+def write_run(folder, port, mode="open", seconds=0.5, watchdog=WATCHDOG):
+    if mode == "open":
+        write_experiment(folder / "e.yaml", duration=seconds)
+    else:
+        (folder / "loop.py").write_text(LOOP)
+        (folder / "e.yaml").write_text(
+            f"protocol: loop.py:Steady\nduration: {seconds}\ncalibration: {{samples: 16}}\n"
+        )
+    write_serial_rig(folder / "rig.yaml", port, watchdog=watchdog)
+
+
+def assert_consistent(folder, total=400):
+    """What was logged stands at its tick, and gaps are flagged."""
+    recording = capture.load(folder)
+    frame = recording.log.frame
+    ticks, flags = frame["tick"].to_numpy(), frame["flags"].to_numpy()
+    assert (np.diff(ticks) > 0).all() and ticks[-1] < total
+    np.testing.assert_allclose(frame["t"], ticks / 800)
+    gaps = np.flatnonzero(np.diff(ticks, prepend=-1) != 1)
+    assert np.array_equal(gaps, np.flatnonzero(flags & int(Flag.LOST)))
+    return frame, record_of(folder)
+
+
+@pytest.mark.parametrize("mode", ["open", "closed"])
+@pytest.mark.parametrize(
+    "fault",
+    ["bit-errors=2e-4@run", "drop=0.03", "duplicate=0.2", "split=9", "merge=0.016@run",
+     "jitter=0.01", "stall=0.3@run+0.1", "overflow=40@run+0.1", "stuck-encoder@run"],
+)  # fmt: skip
+def test_a_run_goes_on_over_what_can_be_borne(tmp_path, emulate, rig, fault, mode):
+    with emulate(tmp_path, "--fault", fault) as running:
+        write_run(tmp_path, running.port, mode)
+        result = rig(["run", "e.yaml", "--rig", "rig.yaml"], tmp_path)
+    assert result.returncode == 0, result.stderr
+    frame, record = assert_consistent(only_capture(tmp_path))
+    line, flagged = record["connection"]["line"], record["timing"]["flagged_samples"]
+    assert record["status"] == "completed"
+    name = fault.split("=")[0].split("@")[0]
+    if name == "overflow":
+        assert line["device_overflow_samples"] == 40 and flagged["lost"] == 1
+        assert "40 samples were lost" in result.stderr and "1 lost" in result.stdout
+    elif name not in {"bit-errors", "drop"}:
+        assert len(frame) == 400 and line["lost_samples"] == 0
+    if name in {"merge", "stall"} and mode == "closed":
+        assert flagged["held"] > 0 and "held" in result.stdout
+    if mode == "open":
+        assert set(flagged) <= {"lost"}, "what the line does is nothing to a preloaded waveform"
+    if name == "stuck-encoder":
+        assert frame["theta"].nunique() == 1
+    assert running.journal[-1]["outputs"] == [0, 0]
+
+
+@pytest.mark.parametrize("mode", ["open", "closed"])
+@pytest.mark.parametrize(
+    ("fault", "reason"),
+    [("disconnect=0.2@{}", "the port has gone"), ("reboot@{}", "has restarted")],
+)
+@pytest.mark.parametrize("phase", ["calibration", "run+0.15"])
+def test_a_run_that_cannot_go_on_says_why_and_the_next_one_just_works(
+    tmp_path, emulate, rig, fault, reason, phase, mode
+):
+    with emulate(tmp_path, "--fault", fault.format(phase)) as running:
+        write_run(tmp_path, running.port, mode)
+        result = rig(["run", "e.yaml", "--rig", "rig.yaml"], tmp_path)
+        assert result.returncode == 1
+        assert reason in result.stderr and "Traceback" not in result.stderr
+        folder = only_capture(tmp_path)
+        record = record_of(folder)
+        assert record["status"] == "failed" and reason in record["reason"]
+        assert record["phase"] == phase.split("+")[0]
+        if record["phase"] == "run":
+            frame, _ = assert_consistent(folder)
+            assert 40 < len(frame) < 400, "what came before is in the log"
+        until(lambda: running.journal[-1]["outputs"] == [0, 0], "zero outputs")
+        until((tmp_path / "port").exists, "the port to be back")
+        again = rig(["run", "e.yaml", "--rig", "rig.yaml", "--out", "again"], tmp_path)
+        assert again.returncode == 0, again.stderr
+
+
+@pytest.mark.parametrize(
+    ("fault", "reason"),
+    [
+        ("mute", "no answer"),
+        ("garbage", "no frame of the protocol"),
+        ("version=2", "This program is the old one"),
+        ("version=0", "The device's firmware is the old one"),
+        ("delay=0.4", "too slow for its watchdog"),
+        ("delay=9", "no answer"),
+    ],
+)
+def test_a_device_that_cannot_be_worked_with_is_refused_within_three_seconds(
+    tmp_path, emulate, fault, reason
+):
+    with emulate(tmp_path, "--fault", fault) as running:
+        device = SerialDevice(SerialOptions(port=running.port))
+        begun = time.monotonic()
+        with pytest.raises(DeviceError, match=reason):
+            device.open()
+        assert time.monotonic() - begun < ANSWERS_WITHIN
+        device.close()
+
+
+def test_a_second_host_is_refused_clearly(tmp_path, emulate):
+    with emulate(tmp_path) as running:
+        first, second = (SerialDevice(SerialOptions(port=running.port)) for _ in range(2))
+        first.open()
+        with pytest.raises(DeviceError, match="another program has it open"):
+            second.open()
+        first.close()
+        assert second.open().name
+        second.close()
+
+
+def test_a_port_that_is_not_there_is_named_with_the_cure(tmp_path):
+    for port, cure in ((str(tmp_path / "none"), "rig ports"), ("", "--port")):
+        with pytest.raises(DeviceError, match=cure):
+            SerialDevice(SerialOptions(port=port)).open()
+
+
+@pytest.mark.parametrize("mode", ["open", "closed"])
+def test_a_killed_host_means_zero_outputs_within_the_watchdogs_time(tmp_path, emulate, rig, mode):
+    with emulate(tmp_path) as running:
+        write_run(tmp_path, running.port, mode, seconds=60, watchdog=0.2)
+        process = start_rig("run", "e.yaml", "--rig", "rig.yaml", cwd=tmp_path)
+        running_capture(tmp_path, rows=80)
+        until(lambda: any(running.journal[-1]["outputs"]), "outputs that are not zero")
+        os.kill(process.pid, signal.SIGKILL)
+        process.communicate()
+        tripped = until(
+            lambda: next((e for e in running.journal if e["latch"] == "WATCHDOG"), None),
+            "the watchdog",
+        )
+        assert tripped["outputs"] == [0, 0] and tripped["silence_seconds"] < 0.3
+        assert not any(any(e["outputs"]) for e in running.journal[running.journal.index(tripped) :])
+        assert "interrupted" in capture.load(only_capture(tmp_path)).warning
+        write_run(tmp_path, running.port, mode)
+        again = rig(["run", "e.yaml", "--rig", "rig.yaml", "--out", "again"], tmp_path)
+        assert again.returncode == 0, again.stderr
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("drp=0.1", "did you mean 'drop'"),
+        ("drop", "give a value"),
+        ("drop=often", "'often' is not a number"),
+        ("stall@nowhere", "unknown phase"),
+        ("stall@run+x", "'x' is not a number"),
+    ],
+)
+def test_a_fault_that_is_none_is_refused_with_what_was_meant(text, said):
+    with pytest.raises(ConfigError, match=said):
+        faults.parse(text)
