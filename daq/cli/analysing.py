@@ -23,7 +23,7 @@ def analyse_command(folder: Path, as_json: bool) -> None:
     """Conclude from a capture again, and show it."""
     warning = capture.describe_end(capture.log_path(folder), torn=False)
     if warning is not None:
-        console.report_note(warning)
+        console.report_warning(warning)
     experiment = recorded_experiment(folder)
     found = analyse(experiment, folder)
     if found is None:
@@ -35,6 +35,13 @@ def analyse_command(folder: Path, as_json: bool) -> None:
         console.print_json(as_document(found, folder))
         return
     show_findings(found, folder)
+    console.print_next(next_command(folder))
+
+
+def next_command(folder: Path) -> str:
+    """The identification from a capture, in the ranges that its protocol found if it did."""
+    ranges = folder / RESULTS / "ranges.yaml"
+    return f"rig identify {folder}" + (f" --config {ranges}" if ranges.exists() else "")
 
 
 def recorded_experiment(folder: Path) -> Experiment:
@@ -66,7 +73,7 @@ def analyse(experiment: Experiment, folder: Path) -> Findings | None:
     try:
         found = experiment.findings(log.samples(), columns)
     except ValueError as error:
-        console.report_note(f"{folder}: no result: {error}")
+        console.report_warning(f"{folder}: no result: {error}")
         return None
     if found is not None:
         _write(found, folder / RESULTS)

@@ -7,7 +7,10 @@ from typing import Annotated
 
 import typer
 
-app = typer.Typer(
+from daq.cli import completing
+from daq.cli.commands import CommandLine
+
+app = CommandLine(
     name="rig",
     help=(
         "Excite a hybrid haptic actuator (DC motor and magnetorheological brake), log every "
@@ -25,11 +28,17 @@ ExperimentName = Annotated[
     typer.Argument(
         metavar="EXPERIMENT.yaml",
         help="Experiment file; a bare name not in this folder means the shipped one.",
+        autocompletion=completing.experiments,
     ),
 ]
 RigName = Annotated[
     str,
-    typer.Option("--rig", metavar="RIG.yaml", help="Rig file; default the simulated rig."),
+    typer.Option(
+        "--rig",
+        metavar="RIG.yaml",
+        help="Rig file; default the simulated rig.",
+        autocompletion=completing.rigs,
+    ),
 ]
 PortName = Annotated[
     str | None,
@@ -45,7 +54,12 @@ Logs = Annotated[
 ]
 ModelName = Annotated[
     str | None,
-    typer.Option("--model", metavar="NAME|FILE.py:OBJECT", help="Process model; see rig models."),
+    typer.Option(
+        "--model",
+        metavar="NAME|FILE.py:OBJECT",
+        help="Process model; see rig models.",
+        autocompletion=completing.models,
+    ),
 ]
 ConfigFile = Annotated[
     Path | None,
@@ -53,7 +67,12 @@ ConfigFile = Annotated[
 ]
 ModelNames = Annotated[
     list[str] | None,
-    typer.Option("--model", metavar="NAME|FILE.py:OBJECT", help="Process model; may be repeated."),
+    typer.Option(
+        "--model",
+        metavar="NAME|FILE.py:OBJECT",
+        help="Process model; may be repeated.",
+        autocompletion=completing.models,
+    ),
 ]
 Validation = Annotated[
     list[Path] | None,
@@ -61,9 +80,21 @@ Validation = Annotated[
         "--validate", metavar="RUN_OR_CSV", help="Log kept for validation; may be repeated."
     ),
 ]
-Preset = Annotated[str | None, typer.Option("--preset", help="default, thesis, cega or classic.")]
-Population = Annotated[int | None, typer.Option("--population", help="Chromosomes per generation.")]
-Generations = Annotated[int | None, typer.Option("--generations", help="Generations evaluated.")]
+Preset = Annotated[
+    str | None,
+    typer.Option(
+        "--preset",
+        metavar="NAME",
+        help="default, thesis, cega or classic.",
+        autocompletion=completing.presets,
+    ),
+]
+Population = Annotated[
+    int | None, typer.Option("--population", metavar="N", help="Chromosomes per generation.")
+]
+Generations = Annotated[
+    int | None, typer.Option("--generations", metavar="N", help="Generations evaluated.")
+]
 HoldBack = Annotated[
     float | None,
     typer.Option(
@@ -163,7 +194,9 @@ def identify(
     preset: Preset = None,
     population: Population = None,
     generations: Generations = None,
-    seed: Annotated[int | None, typer.Option("--seed", help="One seed gives one result.")] = None,
+    seed: Annotated[
+        int | None, typer.Option("--seed", metavar="N", help="One seed gives one result.")
+    ] = None,
     hold_back: HoldBack = None,
     profile: Annotated[
         list[str] | None,
@@ -323,8 +356,23 @@ def init(
         Path, typer.Argument(metavar="[FOLDER]", help="Where the files go; default this folder.")
     ] = Path(),
     protocol: Annotated[
-        str, typer.Option("--protocol", metavar="NAME", help="Shipped experiment to begin with.")
+        str,
+        typer.Option(
+            "--protocol",
+            metavar="NAME",
+            help="Shipped experiment to begin with.",
+            autocompletion=completing.protocols,
+        ),
     ] = "prbs",
+    rig: Annotated[
+        str,
+        typer.Option(
+            "--rig",
+            metavar="NAME",
+            help="Shipped rig to begin with.",
+            autocompletion=completing.rig_names,
+        ),
+    ] = "simulated",
     json: AsJson = False,
 ) -> None:
     """Write a commented experiment, rig and identification file to begin with.
@@ -334,7 +382,7 @@ def init(
     """
     from daq.cli.starting import init_command
 
-    init_command(folder, protocol, json)
+    init_command(folder, protocol, rig, json)
 
 
 @app.command(epilog="Example:  rig schema schemas")
@@ -362,7 +410,11 @@ def schema(
 def models(
     name: Annotated[
         str | None,
-        typer.Argument(metavar="[NAME|FILE.py:OBJECT]", help="Show this model in full."),
+        typer.Argument(
+            metavar="[NAME|FILE.py:OBJECT]",
+            help="Show this model in full.",
+            autocompletion=completing.models,
+        ),
     ] = None,
     json: AsJson = False,
 ) -> None:
@@ -398,7 +450,7 @@ def emulate(
     drift: Annotated[
         float, typer.Option("--drift", metavar="PPM", help="Of the device's clock.")
     ] = 0.0,
-    seed: Annotated[int, typer.Option("--seed", help="Of the faults' chances.")] = 0,
+    seed: Annotated[int, typer.Option("--seed", metavar="N", help="Of the faults' chances.")] = 0,
     journal: Annotated[
         Path | None,
         typer.Option("--journal", metavar="FILE", help="Log of what became of the outputs, JSON."),

@@ -180,7 +180,7 @@ def note_warnings(groups: Sequence[Group]) -> None:
     notes = [log.warning for group in groups for log in (*group.training, *group.validation)]
     for note in dict.fromkeys(notes):
         if note is not None:
-            console.report_note(note)
+            console.report_warning(note)
 
 
 def parse_seeds(text: str | None) -> list[int]:
@@ -296,6 +296,8 @@ def _print(found: Campaign, table: Path, files: Mapping[tuple[str, str], Path]) 
     for (model, data), path in files.items():
         console.print_line(f"Best of {model} on {data}: {path}")
     console.print_line(f"All runs with their parameters: {table}")
+    if files:
+        console.print_next(f"rig replay LOG --parameters {next(iter(files.values()))}")
 
 
 def _spread_row(spread: Spread, found: Campaign) -> list[str]:

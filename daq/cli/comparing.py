@@ -120,7 +120,7 @@ def _compare(
         try:
             selection = tuned({"ARX": ARX, "ARMAX": ARMAX}[kind](stable=True), training)
         except ModelError as error:
-            console.report_note(f"{kind} is left out: {error}")
+            console.report_warning(f"{kind} is left out: {error}")
             continue
         orders = ",".join(f"{name}={order}" for name, order in selection.best.orders.items())
         candidates.append(Candidate.of(f"{kind}:{orders}", selection.model, training, validation))
@@ -255,6 +255,8 @@ def _show(
     for name, path in files.items():
         console.print_line(f"Parameters of {name}: {path}")
     console.print_line(f"Comparison: {folder / 'comparison.yaml'}")
+    if result.preferred in files:
+        console.print_next(f"rig replay LOG --parameters {files[result.preferred]}")
 
 
 def _show_runs(found: Campaign) -> None:

@@ -8,7 +8,34 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
+from enum import IntEnum
 from typing import Any, Protocol
+
+
+class Volume(IntEnum):
+    """How much a command says."""
+
+    QUIET = 0
+    """Results, warnings and errors."""
+    NORMAL = 1
+    """Progress and what to do next as well."""
+    VERBOSE = 2
+    """Which files and plugins are used as well, and progress as it goes."""
+
+
+_volume: ContextVar[Volume] = ContextVar("volume", default=Volume.NORMAL)
+_VERBOSE_PERIOD = 1.0  # s between lines of progress
+
+
+@contextmanager
+def volume(level: Volume) -> Iterator[None]:
+    """Within it, commands say as much as this."""
+    token = _volume.set(level)
+    try:
+        yield
+    finally:
+        _volume.reset(token)
 
 
 class Bar(Protocol):
@@ -24,9 +51,28 @@ def report_error(message: str) -> None:
         sys.stderr.write(f"rig: {line}\n")
 
 
+def report_warning(message: str) -> None:
+    """One line on standard error of what a user must know, however quiet."""
+    sys.stderr.write(f"rig: warning: {message}\n")
+
+
 def report_note(message: str) -> None:
     """One line of notice on standard error."""
-    sys.stderr.write(f"rig: note: {message}\n")
+    if _volume.get() >= Volume.NORMAL:
+        sys.stderr.write(f"rig: note: {message}\n")
+
+
+def report_detail(message: str) -> None:
+    """One line on standard error for those who want to know more."""
+    if _volume.get() >= Volume.VERBOSE:
+        sys.stderr.write(f"rig: {message}\n")
+
+
+def print_next(*commands: str) -> None:
+    """Which commands a user may want now."""
+    if _volume.get() >= Volume.NORMAL:
+        for word, command in zip(["Next", *["Then"] * len(commands)], commands, strict=False):
+            print_line(f"{word}: {command}")
 
 
 def print_json(document: Any) -> None:
@@ -71,13 +117,13 @@ def print_table(
 @contextmanager
 def progress(quiet: bool = False) -> Iterator[Bar]:
     """A progress bar on a terminal; one plain line per finished step otherwise."""
-    if quiet:
+    if quiet or _volume.get() == Volume.QUIET:
         yield _Silent()
     elif sys.stderr.isatty():
         with _terminal_bar() as bar:
             yield bar
     else:
-        plain = _Plain()
+        plain = _Plain(_volume.get() == Volume.VERBOSE)
         yield plain
         plain.finish()
 
@@ -103,16 +149,21 @@ class _Silent:
 class _Plain:
     """One line per step, when it is finished."""
 
-    def __init__(self) -> None:
+    def __init__(self, verbose: bool) -> None:
         self._title = ""
         self._text = ""
-        self._started = time.perf_counter()
+        self._started = self._told = time.perf_counter()
+        self._verbose = verbose
 
     def update(self, title: str, done: float, total: float, note: str) -> None:
         if title != self._title:
             self.finish()
             self._title, self._started = title, time.perf_counter()
         self._text = f"{title}: {note}"
+        now = time.perf_counter()
+        if self._verbose and now - self._told > _VERBOSE_PERIOD:
+            self._told = now
+            sys.stderr.write(f"{self._text} ...\n")
 
     def finish(self) -> None:
         if self._title:

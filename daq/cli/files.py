@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.resources
 import inspect
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from pydantic import ConfigDict, create_model
 
+from daq.cli import console
+from daq.cli.shipped import EXPERIMENTS, RIGS, shipped_files
 from daq.cli.user_code import from_file, locate
 from daq.config import checking, yaml_file
 from daq.config.base import Section
@@ -25,7 +26,6 @@ from daq.plugins import load_plugin
 from daq.run import plan
 
 DEFAULT_RIG = "simulated.yaml"
-_RIG_FILES = ("sim_rig", "daq.serial")  # packages that ship some
 
 
 @dataclass(frozen=True)
@@ -61,31 +61,27 @@ def _validation_file(file: YamlFile) -> YamlFile:
     return YamlFile(file.path, content, {**file.places, **moved, (): file.place(())})
 
 
-def find(name: str, *packages: str) -> Path:
+def find(name: str, packages: Iterable[str]) -> Path:
     """A file in the working folder, or the one shipped with the packages under a bare name."""
     path = Path(name)
     if path.exists():
         return path
-    candidates = [name] if path.suffix else [name, f"{name}.yaml"]
-    shipped = [importlib.resources.files(package) for package in packages]
+    shipped = {file.name: file for file in shipped_files(packages)}
     if path.name == name:
-        for candidate in candidates:
+        for candidate in [name] if path.suffix else [name, f"{name}.yaml"]:
             if Path(candidate).exists():
                 return Path(candidate)
-            for folder in shipped:
-                if (folder / candidate).is_file():
-                    return Path(str(folder / candidate))
-    known = sorted(
-        item.name for folder in shipped for item in folder.iterdir() if item.name.endswith(".yaml")
-    )
+            if candidate in shipped:
+                console.report_detail(f"{name}: the shipped {shipped[candidate]}")
+                return shipped[candidate]
     raise ConfigError(
-        f"{name}: there is no such file; check its name, or use a shipped one: {', '.join(known)}"
+        f"{name}: there is no such file; check its name, or use a shipped one: {', '.join(shipped)}"
     )
 
 
 def load_experiment(name: str) -> LoadedExperiment:
     """Read and check an experiment; ConfigError names file, line, key and cure."""
-    file = yaml_file.load(find(name, "protocols"))
+    file = yaml_file.load(find(name, EXPERIMENTS))
     try:
         kind = find_protocol(_protocol_name(file), file.path.parent)
     except ConfigError as error:
@@ -98,7 +94,12 @@ def load_experiment(name: str) -> LoadedExperiment:
         own += checking.mistakes(validation, kind, validation.content)
     checking.refuse([*file.repeated, *own])
     experiment = make_experiment(file, kind)
+    _tell(file, f"protocol {experiment.protocol}", kind)
     return LoadedExperiment(file, experiment, experiment.name or file.path.stem)
+
+
+def _tell(file: YamlFile, what: str, kind: type[Any]) -> None:
+    console.report_detail(f"{file.path}: {what} is {kind.__module__}.{kind.__qualname__}")
 
 
 def _protocol_name(file: YamlFile) -> str:
@@ -171,7 +172,7 @@ def load_rig(name: str, options: Mapping[str, Any] | None = None) -> tuple[RigCo
 
     options: the backend's own settings that take precedence over the file's.
     """
-    file = yaml_file.load(find(name, *_RIG_FILES))
+    file = yaml_file.load(find(name, RIGS))
     if options:
         file = dataclasses.replace(
             file, content=yaml_file.merge(file.content, {"options": options})
@@ -186,5 +187,6 @@ def load_rig(name: str, options: Mapping[str, Any] | None = None) -> tuple[RigCo
         checking.validate(file, RigConfig, others=[unknown])
         raise
     config = checking.validate(file, with_options(backend.Options))
+    _tell(file, f"backend {backend_name}", backend)
     device: Device = backend(config.options)
     return config, device

@@ -75,7 +75,7 @@ def identify_logs(
     train, check = load_logs(prepared, training, validation)
     for log in (*train, *check):
         if log.warning is not None:
-            console.report_note(log.warning)
+            console.report_warning(log.warning)
     train, ends = datasets.hold_back(train, prepared.settings.hold_back)
     check = [*ends, *check]
     if not resume:

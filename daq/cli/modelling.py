@@ -98,7 +98,7 @@ def models_command(name: str | None, as_json: bool) -> None:
         ],
         text=["what it is"],
     )
-    console.print_line("Next: rig models NAME, or rig models my_model.py:model for one of your own")
+    console.print_next("rig models NAME, or rig models my_model.py:model for one of your own")
 
 
 def describe(model: ProcessModel) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from daq.cli import datasets, datasheets
+from daq.cli import console, datasets, datasheets
 from daq.cli.datasets import Mapping
 from daq.cli.modelling import DEFAULT_MODEL, find_model, whole_name
 from daq.cli.resuming import Asked
@@ -62,6 +62,8 @@ def prepare_models(
     file = CommandLine.of(given, more, yaml_file.load(config) if config is not None else None)
     settings = checking.validate(file, IdentificationConfig)
     found = [_find(config, file, settings, name) for name in names]
+    for model, name in found:
+        console.report_detail(f"model {name}: {model.description}")
     models = [_with_outputs(file, settings, model) for model, _ in found]
     _check_names(file, settings, models)
     mapping = Mapping(file, settings.columns) if settings.columns else None

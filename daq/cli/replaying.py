@@ -107,7 +107,7 @@ def replay_command(
             f"{suggestion(unknown[0], found.model.output_names)}"
         )
     if found.warning is not None:
-        console.report_note(found.warning)
+        console.report_warning(found.warning)
     drawn = _draw(found, figure)
     # A fit that is not a number (the simulation failed) is under any bound.
     missed = {name: least for name, least in bounds.items() if not found.fit[name] >= least}
@@ -120,6 +120,9 @@ def replay_command(
         print_metrics(found.model, found.metrics, [], "replay")
         if drawn is not None:
             console.print_line(f"Figure: {drawn}")
+        if not missed:
+            given = f"rig replay ANOTHER_LOG --parameters {parameters}"
+            console.print_next(given if parameters else f"rig identify {log}")
     if missed:
         raise RunError(
             f"{found.path}: "
@@ -183,7 +186,7 @@ def _draw(found: Replay, path: Path | None) -> Path | None:
     except RunError as error:
         if path is not None:
             raise ConfigError(f"{error}; choose another with --figure FILE.png") from None
-        console.report_note(str(error))
+        console.report_warning(str(error))
         return None
     return chosen
 

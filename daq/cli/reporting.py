@@ -252,7 +252,7 @@ def show(result: Identified, path: Path) -> None:
     console.print_line(f"Parameters: {path}")
     columns = f" --config {result.columns_file}" if result.columns_file is not None else ""
     log = (*result.validation_logs, *result.training_logs)[0].path
-    console.print_line(f"Next: rig replay {log} --parameters {path}{columns}")
+    console.print_next(f"rig replay {log} --parameters {path}{columns}")
 
 
 def _show_parameters(result: Identified) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from daq.cli import console
-from daq.cli.analysing import analyse, as_document, show_findings
+from daq.cli.analysing import analyse, as_document, next_command, show_findings
 from daq.cli.files import DEFAULT_RIG, LoadedExperiment, load_experiment, load_rig
 from daq.config.rig import RigConfig
 from daq.errors import ConfigError
@@ -151,7 +151,7 @@ def check_command(experiment: str, rig: str, port: str | None, as_json: bool) ->
     )  # fmt: skip
     on = f" --rig {rig}" if rig != DEFAULT_RIG else ""
     on += f" --port {port}" if port is not None else ""
-    console.print_line(f"Next: rig run {experiment}{on} --identify")
+    console.print_next(f"rig run {experiment}{on} --identify")
 
 
 def _channels(planned: Plan, rig: RigConfig) -> dict[str, dict[str, Any]]:
@@ -186,7 +186,7 @@ def _run(
         result = run_experiment(loaded.experiment, loaded.name, rig, device, out, watch)
     if isinstance(device, Reporting) and not as_json:
         for warning in device.report().get("warnings", []):
-            console.report_note(warning)
+            console.report_warning(warning)
     return result
 
 
@@ -209,4 +209,4 @@ def _print_end(result: RunResult, check: RunResult | None, identified: bool) -> 
             + (f"; flagged: {notes})" if notes else ")")
         )
     if not identified:
-        console.print_line(f"Next: rig identify {result.folder}")
+        console.print_next(next_command(result.folder))

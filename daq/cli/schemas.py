@@ -38,10 +38,7 @@ def schema_command(
     for paths in written.values():
         for path in paths:
             console.print_line(f"Written: {path}")
-    console.print_line(
-        "Editors complete and check a YAML file whose first line names its schema, such as\n"
-        f"{comment('experiment', folder)}"
-    )
+    console.print_next(f"begin an experiment's YAML with the line {comment('experiment', folder)}")
 
 
 def comment(kind: str, folder: Path | str = FOLDER) -> str:
@@ -173,5 +170,5 @@ def _loaded(group: Group) -> dict[str, Any]:
         try:
             found[name] = load_plugin(group, name)
         except ConfigError as error:
-            console.report_note(f"left out: {error}")
+            console.report_warning(f"left out: {error}")
     return found

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import importlib.resources
+from collections.abc import Sequence
 from pathlib import Path
 
 from daq import capture
 from daq.cli import console, schemas
+from daq.cli.shipped import EXPERIMENTS, RIGS, shipped_files
 from daq.config.schema import Schema
 from daq.config.yaml_file import suggestion
 from daq.errors import ConfigError, RunError
@@ -20,12 +21,12 @@ _SETTINGS_HEAD = """\
 _ACTIVE = {"model": "actuator", "preset": "default"}
 
 
-def init_command(folder: Path, protocol: str, as_json: bool) -> None:
+def init_command(folder: Path, protocol: str, rig: str, as_json: bool) -> None:
     """Write the files that are not there yet, and say what to do next."""
     experiment = f"{protocol}.yaml"
     texts = {
-        experiment: _copy("protocols", experiment, "experiment"),
-        _RIG: _copy("sim_rig", "simulated.yaml", "rig"),
+        experiment: _copy(EXPERIMENTS, protocol, "protocol", "experiment"),
+        _RIG: _copy(RIGS, rig, "rig", "rig"),
         _SETTINGS: settings_text(),
     }
     capture.make_folder(folder)
@@ -41,10 +42,12 @@ def init_command(folder: Path, protocol: str, as_json: bool) -> None:
     console.print_line(f"Written: {folder / schemas.FOLDER}, by which editors check these files")
     for path in kept:
         console.print_line(f"Kept as it was: {path}")
-    if folder.resolve() != Path.cwd():
-        console.print_line(f"Next: cd {folder}")
-    console.print_line(f"Next: rig check {experiment} --rig {_RIG}")
-    console.print_line(f"Then: rig run {experiment} --rig {_RIG} --identify --config {_SETTINGS}")
+    there = [] if folder.resolve() == Path.cwd() else [f"cd {folder}"]
+    console.print_next(
+        *there,
+        f"rig check {experiment} --rig {_RIG}",
+        f"rig run {experiment} --rig {_RIG} --identify --config {_SETTINGS}",
+    )
 
 
 def settings_text() -> str:
@@ -63,15 +66,14 @@ def _setting(name: str, item: Schema) -> str:
     return f"# {item['description']}\n{mark}{name}: {schemas.as_yaml(value)}\n"
 
 
-def _copy(package: str, name: str, kind: str) -> str:
+def _copy(packages: Sequence[str], name: str, option: str, kind: str) -> str:
     """A shipped file's text, for a folder that has its schema in it."""
-    shipped = importlib.resources.files(package)
-    if not (shipped / name).is_file():
-        known = [item.name.removesuffix(".yaml") for item in shipped.iterdir()
-                 if item.name.endswith(".yaml")]  # fmt: skip
-        wanted = name.removesuffix(".yaml")
-        raise ConfigError(f"--protocol: no {wanted!r} to begin with; {suggestion(wanted, known)}")
-    text = (shipped / name).read_text(encoding="utf-8")
+    shipped = {path.stem: path for path in shipped_files(packages)}
+    if name not in shipped:
+        raise ConfigError(
+            f"--{option}: no {name!r} to begin with; {suggestion(name, list(shipped))}"
+        )
+    text = shipped[name].read_text(encoding="utf-8")
     return f"{schemas.comment(kind)}\n{schemas.without_comment(text)}"
 
 

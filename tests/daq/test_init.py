@@ -16,7 +16,7 @@ def test_the_files_work_as_they_are_and_the_next_commands_are_told(tmp_path):
     told = result.stdout.splitlines()
     assert told[-3:] == [
         "Next: cd lab",
-        "Next: rig check prbs.yaml --rig rig.yaml",
+        "Then: rig check prbs.yaml --rig rig.yaml",
         "Then: rig run prbs.yaml --rig rig.yaml --identify --config identification.yaml",
     ]
     lab = tmp_path / "lab"
@@ -42,6 +42,7 @@ def test_what_is_there_stays(tmp_path):
     ("args", "said"),
     [
         (["--protocol", "prbx"], "--protocol: no 'prbx' to begin with; did you mean 'prbs'?"),
+        (["--rig", "serail"], "--rig: no 'serail' to begin with; did you mean 'serial'?"),
         (["file"], "file: cannot be created: File exists"),
     ],
 )

@@ -1,0 +1,90 @@
+"""What every command has in common at a terminal: how much it says, and what Tab offers."""
+
+import subprocess
+import sysconfig
+from pathlib import Path
+
+import pytest
+import typer
+
+from daq.cli.app import app
+from tests.daq.support import environment, forked_rig, rig, write_experiment, write_rig
+
+COMMANDS = typer.main.get_command(app).commands
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_has_the_common_options_and_an_example(name):
+    options = {option for parameter in COMMANDS[name].params for option in parameter.opts}
+    assert {"--json", "--quiet", "-q", "--verbose", "-v"} <= options
+    assert COMMANDS[name].help and COMMANDS[name].epilog.startswith("Example:")
+
+
+@pytest.fixture(scope="module")
+def said(tmp_path_factory):
+    """What a run says quietly, usually and verbosely, by option."""
+    folder = tmp_path_factory.mktemp("volume")
+    write_experiment(folder / "e.yaml")
+    with forked_rig() as run:
+        return {
+            option: run(["run", "e.yaml", *filter(None, [option])], folder)
+            for option in ("--quiet", "", "--verbose")
+        }
+
+
+def test_a_quiet_run_says_where_its_results_are_and_no_more(said):
+    assert said["--quiet"].stderr == ""
+    lines = said["--quiet"].stdout.splitlines()
+    assert len(lines) == 1 and lines[0].startswith("Log: runs")
+
+
+def test_usually_progress_and_the_next_command_are_told(said):
+    assert "Exciting and logging: 400/400 samples" in said[""].stderr
+    assert "\nNext: rig identify runs" in said[""].stdout
+
+
+def test_a_verbose_run_says_which_files_and_plugins_it_uses(said):
+    assert "e.yaml: protocol prbs is protocols.prbs.Prbs" in said["--verbose"].stderr
+    assert "simulated.yaml: the shipped " in said["--verbose"].stderr
+    assert said["--verbose"].stdout.splitlines()[1:] != []
+
+
+def test_quiet_and_verbose_are_not_given_together(tmp_path):
+    result = rig("check", "prbs.yaml", "-q", "-v", cwd=tmp_path)
+    assert result.returncode == 2 and "not both" in result.stderr
+
+
+TAB = [
+    ("rig run ", {"prbs.yaml", "mine.yaml", "folder/"}, {"bench.yaml", "notes.yaml"}),
+    ("rig run m", {"mine.yaml"}, {"prbs.yaml"}),
+    ("rig run folder/", {"folder/inner.yaml"}, {"prbs.yaml"}),
+    ("rig check mine.yaml --rig ", {"simulated.yaml", "bench.yaml", "folder/"}, {"mine.yaml"}),
+    ("rig identify log.csv --preset ", {"default", "thesis", "cega", "classic"}, set()),
+    ("rig identify log.csv --model ", {"actuator", "lag.py", "folder/"}, {"mine.yaml"}),
+    ("rig models a", {"actuator"}, {"lag.py"}),
+    ("rig init --protocol ", {"prbs"}, {"simulated"}),
+    ("rig init --rig ", {"simulated", "serial"}, {"prbs"}),
+    ("rig sch", {"schema"}, {"init"}),
+    ("rig run nowhere/", set(), {"prbs.yaml"}),
+]
+
+
+@pytest.mark.parametrize(("typed", "offered", "not_offered"), TAB, ids=[t[0] for t in TAB])
+def test_tab_offers_what_can_stand_there(tmp_path, typed, offered, not_offered):
+    (tmp_path / "folder").mkdir()
+    write_experiment(tmp_path / "mine.yaml")
+    write_experiment(tmp_path / "folder" / "inner.yaml")
+    write_rig(tmp_path / "bench.yaml")
+    (tmp_path / "notes.yaml").write_text("a: 1\n")
+    (tmp_path / "lag.py").write_text("")
+    (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe")
+    words = typed.split(" ")
+    env = {"_RIG_COMPLETE": "complete_bash", "COMP_WORDS": typed, "COMP_CWORD": f"{len(words) - 1}"}
+    # The shell completes the installed command, not ``python -m``.
+    script = Path(sysconfig.get_path("scripts")) / "rig"
+    result = subprocess.run(
+        [script], cwd=tmp_path, env=environment(**env), capture_output=True, text=True, check=False
+    )
+    found = set(result.stdout.split())
+    assert offered <= found and not found & not_offered
+    assert result.stderr == ""
