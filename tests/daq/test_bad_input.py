@@ -213,7 +213,7 @@ CASES = [
          ["/proc/none", "cannot be created", "--out"]),
     # --- rigs
     rig_file("unknown backend", "simulated", "serail",
-             "rig.yaml:2:1: backend: unknown backend 'serail'; known are", "simulated"),
+             "rig.yaml:2:1: backend: unknown backend 'serail'; did you mean 'serial'?"),
     rig_file("misspelt option", "  seed: 3", "  sed: 3",
              "rig.yaml:4:3: options.sed: unknown key; did you mean 'seed'?"),
     rig_file("misspelt sensor", "torque", "troque",
@@ -235,7 +235,7 @@ CASES = [
     rig_file("a sign of two", "{scale: 0.706}", "{scale: 0.706, sign: 2}",
              "rig.yaml:6:26: sensors.torque.sign: it must be -1 or 1, found 2"),
     Case("missing rig", ["run", "e.yaml", "--rig", "absent.yaml"],
-         ["absent.yaml: there is no such file; check its name, or use a shipped one: simulated"]),
+         ["absent.yaml: there is no such file; check its name, or use a shipped one: serial.yaml, simulated.yaml"]),
     # --- identification
     settings("misspelt setting", "populaton: 20\n",
              "id.yaml:1:1: populaton: unknown key; did you mean 'population'?"),
