@@ -13,10 +13,11 @@ from daq.cli import console
 from daq.cli.files import find_protocol
 from daq.errors import ConfigError
 from daq.experiment import ClosedLoop, Experiment
-from daq.findings import Findings, Table
+from daq.findings import Findings, Number, Table
 from daq.log import load_log
 
 RESULTS = "results"
+_WIDTH = 2 * 1.96  # standard deviations in a 95 % interval
 
 
 def analyse_command(folder: Path, as_json: bool) -> None:
@@ -104,19 +105,9 @@ def show_findings(found: Findings, folder: Path) -> None:
         console.print_table(
             "Results",
             ["quantity", "value", "95 % interval", "unit", "meaning"],
-            [
-                [
-                    n.name,
-                    console.number(n.value),
-                    "-" if n.low is None or n.high is None
-                    else f"{console.number(n.low)} .. {console.number(n.high)}",
-                    n.unit,
-                    n.meaning,
-                ]
-                for n in found.numbers
-            ],
+            [_number_row(number) for number in found.numbers],
             text=["unit", "meaning"],
-        )  # fmt: skip
+        )
     for table in found.tables:
         heads = [_with_unit(name, table) for name in table.columns]
         rows = zip(*(values.tolist() for values in table.columns.values()), strict=True)
@@ -124,6 +115,16 @@ def show_findings(found: Findings, folder: Path) -> None:
     for remark in found.remarks:
         console.print_line(remark)
     console.print_line(f"Results: {folder / RESULTS}")
+
+
+def _number_row(number: Number) -> list[str]:
+    scale, unit = console.engineering(number.value, number.unit)
+    value, interval, digits = scale * number.value, "-", 4
+    if number.low is not None and number.high is not None:
+        digits = console.digits(number.value, (number.high - number.low) / _WIDTH)
+        ends = (console.number(scale * end, digits) for end in (number.low, number.high))
+        interval = " .. ".join(ends)
+    return [number.name, console.number(value, digits), interval, unit, number.meaning]
 
 
 def _with_unit(name: str, table: Table) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -26,6 +27,10 @@ class Volume(IntEnum):
 
 _volume: ContextVar[Volume] = ContextVar("volume", default=Volume.NORMAL)
 _VERBOSE_PERIOD = 1.0  # s between lines of progress
+_PREFIXES = {-9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M"}
+# A power would be of the prefix as well: mm^2 is no thousandth of m^2.
+_PREFIXABLE = re.compile(r"(V|A|ohm|H|F|N|W|J|s|Hz|Pa|T|Wb|m|rad)(?![\w^])")
+_PLAIN = (0.1, 1000.0)
 
 
 @contextmanager
@@ -139,6 +144,27 @@ def number(value: float, digits: int = 4) -> str:
         return f"{value:.{max(digits - 1 - exponent, 0)}f}"
     mantissa, power = f"{value:.{digits - 1}e}".split("e")
     return f"{mantissa}e{int(power)}"
+
+
+def digits(value: float, std: float) -> int:
+    """Significant digits of a value that its standard deviation supports: to the second of it."""
+    if not std > 0.0 or value == 0.0:
+        return 4
+    ratio = max(abs(value) / std, 1e-3)
+    return min(max(math.floor(math.log10(ratio)) + 2, 2), 7)
+
+
+def engineering(value: float, unit: str) -> tuple[float, str]:
+    """Factor and unit in which a value has one to three digits before the point, as 0.54 mH.
+
+    The factor is 1 from a tenth to a thousand, and for units that take no prefix (kg, 1/s, m^2).
+    """
+    size = abs(value)
+    if not _PREFIXABLE.match(unit) or not math.isfinite(value) or _PLAIN[0] <= size < _PLAIN[1]:
+        return 1.0, unit
+    power = 3 * math.floor(math.log10(size) / 3) if size else 0
+    prefix = _PREFIXES.get(power)
+    return (1.0, unit) if prefix is None else (10.0**-power, f"{prefix}{unit}")
 
 
 class _Silent:

@@ -273,46 +273,47 @@ def _show_parameters(result: Identified) -> None:
 
 def _parameter_row(result: Identified, parameter: Parameter) -> list[str]:
     name, space = parameter.name, result.estimator.space_
-    value, unit = result.estimator.parameters_[name], parameter.unit
+    # All of a row in the same unit, which is that of its value.
+    scale, unit = console.engineering(result.estimator.parameters_[name], parameter.unit)
+    value = scale * result.estimator.parameters_[name]
     source = "data" if name in result.estimator.guesses_ else result.source(name)
     if name not in space.names:
         how = f"= {result.settings.tied[name]}" if name in result.settings.tied else "fixed"
         return [name, console.number(value), "", unit, how, source, ""]
-    span = _span(space.parameters[space.names.index(name)], result.settings.ranges.get(name))
+    searched = space.parameters[space.names.index(name)]
+    span = _span(searched, result.settings.ranges.get(name), scale)
     estimate = result.estimate(name)
     if estimate is None:
         note = NOTES["bound" if result.on_bound(name) else ""]
         return [name, console.number(value), "", unit, span, source, note]
     digits = _digits(estimate)
     return [
-        name, console.number(value, digits), _interval_text(estimate), unit, span, source,
+        name, console.number(value, digits), _interval_text(estimate, scale), unit, span, source,
         NOTES[estimate.why],
     ]  # fmt: skip
 
 
-def _span(parameter: Parameter, given: Range | None) -> str:
+def _span(parameter: Parameter, given: Range | None, scale: float) -> str:
     """A range; in brackets an end that is only where the search starts."""
     ends = (parameter.lower, parameter.upper)
     bounds = zip(ends, given or ends, strict=True)
-    return " .. ".join(f"({end:g})" if bound is None else f"{end:g}" for end, bound in bounds)
+    return " .. ".join(
+        f"({scale * end:g})" if bound is None else f"{scale * end:g}" for end, bound in bounds
+    )
 
 
 def _digits(estimate: Estimate) -> int:
-    """As many significant digits as the uncertainty supports; few where there is no telling."""
-    if estimate.std is None:
-        return 2
-    if estimate.std <= 0.0 or estimate.value == 0.0:
-        return 4
-    ratio = abs(estimate.value) / estimate.std
-    return int(np.clip(np.floor(np.log10(max(ratio, 1e-3))) + 2, 2, 7))
+    """As many as the uncertainty supports; few where there is no telling."""
+    return 2 if estimate.std is None else console.digits(estimate.value, estimate.std)
 
 
-def _interval_text(estimate: Estimate) -> str:
+def _interval_text(estimate: Estimate, scale: float) -> str:
     if estimate.why:
         return "-"
     assert estimate.low is not None and estimate.high is not None
     digits = _digits(estimate)
-    return f"{console.number(estimate.low, digits)} .. {console.number(estimate.high, digits)}"
+    ends = (console.number(scale * end, digits) for end in (estimate.low, estimate.high))
+    return " .. ".join(ends)
 
 
 def _show_open_questions(found: Uncertainty) -> None:
@@ -359,10 +360,11 @@ def _show_rivals(found: Uncertainty) -> None:
 def _exact_lines(ambiguity: Ambiguity) -> list[str]:
     lines = [f"  {', '.join(ambiguity.parameters)} act only together."]
     for estimate in ambiguity.determined:
-        value = console.number(estimate.value, _digits(estimate))
-        unit = f" {estimate.unit}" if estimate.unit else ""
+        scale, unit = console.engineering(estimate.value, estimate.unit)
+        value = console.number(scale * estimate.value, _digits(estimate))
+        interval = _interval_text(estimate, scale)
         lines.append(
-            f"    {estimate.name} = {value}{unit}, 95 % interval {_interval_text(estimate)}"
+            f"    {estimate.name} = {f'{value} {unit}'.rstrip()}, 95 % interval {interval}"
         )
     lines.append(
         f"    To tell them apart, measure {' and '.join(ambiguity.measure)} by other means (or "
