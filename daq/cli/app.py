@@ -490,3 +490,38 @@ def scope(
     from daq.cli.scoping import scope_command
 
     scope_command(run, out, port, browser, json)
+
+
+@app.command(epilog="Example:  rig ports")
+def ports(
+    names: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[PORT...]", help="Device names or URLs; default all that exist."),
+    ] = None,
+    quiet: Annotated[
+        bool, typer.Option("--quiet", help="Send nothing: list the ports without asking.")
+    ] = False,
+    baud: Annotated[int, typer.Option("--baud", help="Of UARTs; USB does not care.")] = 2_000_000,
+    json: AsJson = False,
+) -> None:
+    """List serial ports, and who answers there."""
+    from daq.cli.ports import ports_command
+
+    ports_command(names or [], quiet, baud, json)
+
+
+@app.command(epilog="Example:  rig doctor /dev/ttyACM0")
+def doctor(
+    names: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[PORT...]", help="Device names; default all that exist."),
+    ] = None,
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", help="Where capture folders go.")
+    ] = Path("runs"),
+    json: AsJson = False,
+) -> None:
+    """Check whether this computer suits a rig in real time, with a cure for what does not."""
+    from daq.cli.doctor import doctor_command
+
+    doctor_command(names or [], out, json)

@@ -31,7 +31,7 @@ from daq.serial import messages
 from daq.serial.host import HostMachine, refusal
 from daq.serial.link import Link, open_link
 from daq.serial.messages import Block, Codes, LoopMode, Reply, Result, Start, Type, Welcome
-from daq.serial.priority import lower_thread, raise_thread
+from daq.serial.priority import lock_memory, lower_thread, raise_thread, unlock_memory
 
 HANDSHAKE = 2.0
 """Longest time that a device may take to say who it is [s]: a board resets in less."""
@@ -81,7 +81,7 @@ class SerialDevice:
         self._mode = Mode.CLOSED_LOOP
         self._started = self._gone = self._closing = False
         self._called = 0.0
-        self._tripped_before = self._realtime = False
+        self._tripped_before = self._realtime = self._locked = False
         self._warnings: list[str] = []
         self._record: dict[str, Any] = {}
 
@@ -96,29 +96,19 @@ class SerialDevice:
                 "no port is named; write options.port in the rig file or give --port. 'rig ports' "
                 "lists the ports that there are"
             )
-        self._link = open_link(self.options.port, self.options.baud)
-        session = int.from_bytes(os.urandom(2), "little") or 1
-        self._machine = HostMachine(session, f"{_user()}@{platform.node()}")
-        self._closing = self._started = False
-        self._thread = threading.Thread(target=self._serve, name="serial rig", daemon=True)
-        self._thread.start()
+        welcome = self._connect()
         try:
-            self._welcome = self._shake_hands()
             self._measure_delay()
-            self._tripped_before = self._welcome.latch is messages.Latch.WATCHDOG
+            self._tripped_before = welcome.latch is messages.Latch.WATCHDOG
             self._ask(Type.CLEAR)
         except BaseException:
             self._disconnect()
             raise
         # This thread as well: the other cannot run while a waiting one holds the interpreter.
         self._realtime = raise_thread()
+        self._locked = lock_memory()
         low, high = self._input_range()
-        return DeviceInfo(
-            name=self._name(),
-            max_rate=self._welcome.max_rate,
-            queue=self._welcome.queue,
-            volts_in=(low, high),
-        )
+        return DeviceInfo(self._name(), welcome.max_rate, welcome.queue, (low, high))
 
     def announce(self, phase: Phase, turns: float = 0.0) -> None:
         """Tell the device which phase begins; an emulator's user winds the handle then."""
@@ -218,11 +208,32 @@ class SerialDevice:
             "protocol_version": self._welcome.version,
             "watchdog_tripped_before": self._tripped_before,
             "real_time_scheduling": self._realtime,
+            "memory_locked": self._locked,
             "warnings": [*self._warnings, *_losses(self._record.get("line", {}))],
             **self._record,
         }
 
+    def who(self) -> Welcome:
+        """Ask who answers on the port, and leave the device as it is. Raises DeviceError."""
+        welcome = self._connect()
+        self._disconnect()
+        return welcome
+
     # --- opening ------------------------------------------------------------------------------
+
+    def _connect(self) -> Welcome:
+        self._link = open_link(self.options.port, self.options.baud)
+        session = int.from_bytes(os.urandom(2), "little") or 1
+        self._machine = HostMachine(session, f"{_user()}@{platform.node()}")
+        self._closing = self._started = False
+        self._thread = threading.Thread(target=self._serve, name="serial rig", daemon=True)
+        self._thread.start()
+        try:
+            self._welcome = self._shake_hands()
+        except BaseException:
+            self._disconnect()
+            raise
+        return self._welcome
 
     def _shake_hands(self) -> Welcome:
         machine, port = self._connected(), self.options.port
@@ -448,6 +459,7 @@ class SerialDevice:
             self._record = self._machine.describe()
         self._closing, self._started = True, False
         lower_thread()
+        unlock_memory()
         if self._thread is not None:
             self._thread.join(timeout=2.0)
         if self._link is not None:

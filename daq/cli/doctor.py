@@ -1,0 +1,180 @@
+"""``rig doctor``: does this computer suit a rig in real time, and what to do where it does not."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Literal
+
+from daq.capture import make_folder
+from daq.cli import console
+from daq.errors import RunError
+from daq.serial import priority
+from daq.serial.link import latency_timer, permission_cure
+from daq.serial.ports import PortFacts, list_ports, named
+
+Verdict = Literal["good", "could be better", "bad"]
+
+_NAPS, _NAP = 400, 0.002  # wake-ups timed, and how long each sleeps [s]
+_LATE, _TOO_LATE = 0.005, 0.05  # s; the watchdog's default is 0.1 s
+_FLUSHES, _FLUSH_BYTES = 20, 512 * 1024
+# A log at 4 kHz is half a megabyte a second; a flush that takes longer than the samples that the
+# computer keeps meanwhile loses some.
+_SLOW_DISK, _SLOWEST_DISK = 10e6, 1e6  # bytes/s
+_LONG_FLUSH, _LONGEST_FLUSH = 0.2, 1.0  # s
+_TIMER = 2  # ms
+
+
+@dataclass(frozen=True)
+class Check:
+    """One thing looked at; cure: what to do, empty where all is well."""
+
+    what: str
+    verdict: Verdict
+    found: str
+    cure: str = ""
+
+
+def doctor_command(names: list[str], out: Path, as_json: bool) -> None:
+    """Look at ports, scheduling, memory and disk; exit status 1 when something is bad."""
+    ports = named(names) if names else list_ports()
+    checks = [
+        *(check for port in ports for check in _port(port)),
+        _scheduling(),
+        _wake_ups(),
+        _memory(),
+        _disk(out),
+    ]
+    if not ports:
+        checks.insert(0, Check("ports", "could be better", "there are none", "plug the device in"))
+    bad = [check.what for check in checks if check.verdict == "bad"]
+    if as_json:
+        console.print_json({"checks": [asdict(check) for check in checks], "good": not bad})
+    else:
+        _show(checks)
+    if bad:
+        raise RunError(f"not fit for a rig in real time: {', '.join(bad)}; the cures stand above")
+
+
+def _show(checks: list[Check]) -> None:
+    console.print_table(
+        "This computer",
+        ["what", "verdict", "found"],
+        [[check.what, check.verdict, check.found] for check in checks],
+        text=["verdict", "found"],
+    )
+    for check in checks:
+        if check.cure:
+            console.print_line(f"{check.what}: {check.cure}")
+
+
+def _port(port: PortFacts) -> list[Check]:
+    if "://" in port.name or os.name == "nt":
+        return []
+    what = f"access to {port.name}"
+    if not Path(port.name).exists():
+        return [Check(what, "bad", "there is no such port", "'rig ports' lists those there are")]
+    if not os.access(port.name, os.R_OK | os.W_OK):
+        return [Check(what, "bad", "no permission", permission_cure(port.name))]
+    checks = [Check(what, "good", "may be read and written")]
+    timer = latency_timer(port.name)
+    if timer is not None:
+        found = f"{timer[1]} ms"
+        slow = timer[1] > _TIMER
+        cure = (
+            f"as root: echo 1 > {timer[0]}; for good, a udev rule: "
+            'ACTION=="add", SUBSYSTEM=="usb-serial", ATTR{latency_timer}="1"'
+        )
+        verdict: Verdict = "could be better" if slow else "good"
+        checks.append(Check(f"latency timer of {port.name}", verdict, found, cure if slow else ""))
+    return checks
+
+
+def _scheduling() -> Check:
+    what = "real-time scheduling"
+    if not sys.platform.startswith("linux"):
+        return Check(what, "good", "left to the system")
+    allowed = priority.raise_thread()
+    priority.lower_thread()
+    if allowed:
+        return Check(what, "good", "allowed")
+    return Check(
+        what,
+        "could be better",
+        "not allowed: other programs can hold a run up until the watchdog trips",
+        "as root, write the line '@dialout - rtprio 10' to /etc/security/limits.d/rig.conf (the "
+        "group of your user), then log in again",
+    )
+
+
+def _wake_ups() -> Check:
+    """How late a program wakes up that wants to sleep shortly, scheduled as a run is."""
+    priority.raise_thread()
+    worst = 0.0
+    for _ in range(_NAPS):
+        begun = time.perf_counter()
+        time.sleep(_NAP)
+        worst = max(worst, time.perf_counter() - begun - _NAP)
+    priority.lower_thread()
+    found = f"{1e3 * worst:.1f} ms late at worst, of {_NAPS}"
+    if worst <= _LATE:
+        return Check("wake-ups", "good", found)
+    return Check(
+        "wake-ups",
+        "bad" if worst > _TOO_LATE else "could be better",
+        found,
+        "end other programs; on a laptop, plug in the supply and switch energy saving off",
+    )
+
+
+def _memory() -> Check:
+    what = "memory lock"
+    if not sys.platform.startswith("linux"):
+        return Check(what, "good", "left to the system")
+    if priority.may_lock_memory():
+        return Check(what, "good", "allowed")
+    return Check(
+        what,
+        "could be better",
+        "limited: the system may swap a run out",
+        "as root, write the line '@dialout - memlock unlimited' to /etc/security/limits.d/rig.conf "
+        "(the group of your user), then log in again",
+    )
+
+
+def _disk(out: Path) -> Check:
+    """Flushes of the size that a fast log makes, where logs go."""
+    made = not out.exists()
+    make_folder(out)
+    file, longest = out / f".doctor.{os.getpid()}", 0.0
+    block = bytes(_FLUSH_BYTES)
+    begun = time.perf_counter()
+    try:
+        with file.open("wb") as stream:
+            for _ in range(_FLUSHES):
+                before = time.perf_counter()
+                stream.write(block)
+                stream.flush()
+                os.fsync(stream.fileno())
+                longest = max(longest, time.perf_counter() - before)
+    except OSError as error:
+        return Check(
+            f"disk of {out}", "bad", f"cannot be written: {error.strerror}", "choose another: --out"
+        )
+    finally:
+        file.unlink(missing_ok=True)
+        if made:
+            out.rmdir()
+    speed = _FLUSHES * _FLUSH_BYTES / (time.perf_counter() - begun)
+    found = f"{speed / 1e6:.0f} MB/s, {1e3 * longest:.0f} ms for the slowest flush"
+    if speed >= _SLOW_DISK and longest <= _LONG_FLUSH:
+        return Check(f"disk of {out}", "good", found)
+    return Check(
+        f"disk of {out}",
+        "bad" if speed < _SLOWEST_DISK or longest > _LONGEST_FLUSH else "could be better",
+        found,
+        "write logs to a disk of this computer, not to a stick or the network: rig run --out DIR",
+    )
