@@ -498,8 +498,8 @@ def ports(
         list[str] | None,
         typer.Argument(metavar="[PORT...]", help="Device names or URLs; default all that exist."),
     ] = None,
-    quiet: Annotated[
-        bool, typer.Option("--quiet", help="Send nothing: list the ports without asking.")
+    unasked: Annotated[
+        bool, typer.Option("--list", help="Send nothing: list the ports without asking.")
     ] = False,
     baud: Annotated[int, typer.Option("--baud", help="Of UARTs; USB does not care.")] = 2_000_000,
     json: AsJson = False,
@@ -507,7 +507,7 @@ def ports(
     """List serial ports, and who answers there."""
     from daq.cli.ports import ports_command
 
-    ports_command(names or [], quiet, baud, json)
+    ports_command(names or [], unasked, baud, json)
 
 
 @app.command(epilog="Example:  rig doctor /dev/ttyACM0")

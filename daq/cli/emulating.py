@@ -16,10 +16,9 @@ from daq.cli import console
 from daq.cli.files import load_rig
 from daq.errors import ConfigError
 from daq.hal import ANALOG_INPUTS, CHANNELS, Device, Guard, IntArray, Mode, Phase
-from daq.serial import faults, messages
+from daq.serial import faults, messages, priority
 from daq.serial.emulator import Emulator, PtyPort, TcpPort
 from daq.serial.messages import Channel, Codes, Records, Start, Welcome
-from daq.serial.priority import raise_thread
 from sim_rig import converters
 from sim_rig.backend import SimulatedDevice
 
@@ -113,7 +112,8 @@ def emulate_command(
     port = _port(link, tcp)
     stop = _StopRequest()
     port.connect()
-    raise_thread()
+    priority.spare_collector()
+    priority.raise_thread()
     note = _Journal(journal)
     emulator = Emulator(board, identity, port, chosen, 1e-6 * drift, seed, note)
     if as_json:

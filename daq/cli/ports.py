@@ -9,12 +9,12 @@ from daq.cli import console
 from daq.serial.ports import Answer, ask, list_ports, named
 
 
-def ports_command(names: list[str], quiet: bool, baud: int, as_json: bool) -> None:
-    """List ports, those named or all, and ask who is there unless ``quiet``."""
+def ports_command(names: list[str], unasked: bool, baud: int, as_json: bool) -> None:
+    """List ports, those named or all, and ask who is there unless ``unasked``."""
     ports = named(names) if names else list_ports()
-    answers = [Answer(port, None, None) for port in ports] if quiet else ask(ports, baud)
+    answers = [Answer(port, None, None) for port in ports] if unasked else ask(ports, baud)
     if as_json:
-        console.print_json({"ports": [_document(answer, not quiet) for answer in answers]})
+        console.print_json({"ports": [_document(answer, not unasked) for answer in answers]})
         return
     if not answers:
         console.print_line(
@@ -26,7 +26,7 @@ def ports_command(names: list[str], quiet: bool, baud: int, as_json: bool) -> No
         "Serial ports",
         ["port", "what it is", "who answers"],
         [
-            [answer.port.lasting_name or answer.port.name, _kind(answer), _says(answer, quiet)]
+            [answer.port.lasting_name or answer.port.name, _kind(answer), _says(answer, unasked)]
             for answer in answers
         ],
         text=["what it is", "who answers"],
@@ -69,8 +69,8 @@ def _kind(answer: Answer) -> str:
     return ", ".join(fact for fact in facts if fact)
 
 
-def _says(answer: Answer, quiet: bool) -> str:
+def _says(answer: Answer, unasked: bool) -> str:
     if answer.welcome is not None:
         welcome = answer.welcome
         return f"{welcome.device}, firmware {welcome.firmware}, up to {welcome.max_rate:g} Hz"
-    return "not asked" if quiet else answer.problem or ""
+    return "not asked" if unasked else answer.problem or ""

@@ -27,11 +27,10 @@ from daq.hal import (
     Phase,
     RawSamples,
 )
-from daq.serial import messages
+from daq.serial import messages, priority
 from daq.serial.host import HostMachine, refusal
 from daq.serial.link import Link, open_link
 from daq.serial.messages import Block, Codes, LoopMode, Reply, Result, Start, Type, Welcome
-from daq.serial.priority import lock_memory, lower_thread, raise_thread, unlock_memory
 
 HANDSHAKE = 2.0
 """Longest time that a device may take to say who it is [s]: a board resets in less."""
@@ -105,8 +104,8 @@ class SerialDevice:
             self._disconnect()
             raise
         # This thread as well: the other cannot run while a waiting one holds the interpreter.
-        self._realtime = raise_thread()
-        self._locked = lock_memory()
+        self._realtime = priority.raise_thread()
+        self._locked = priority.lock_memory()
         low, high = self._input_range()
         return DeviceInfo(self._name(), welcome.max_rate, welcome.queue, (low, high))
 
@@ -223,6 +222,7 @@ class SerialDevice:
 
     def _connect(self) -> Welcome:
         self._link = open_link(self.options.port, self.options.baud)
+        priority.spare_collector()
         session = int.from_bytes(os.urandom(2), "little") or 1
         self._machine = HostMachine(session, f"{_user()}@{platform.node()}")
         self._closing = self._started = False
@@ -431,7 +431,7 @@ class SerialDevice:
     def _serve(self) -> None:
         machine, link = self._connected(), self._link
         assert link is not None
-        raise_thread()
+        priority.raise_thread()
         while not self._closing and machine.failure is None:
             try:
                 data = link.read()
@@ -458,8 +458,9 @@ class SerialDevice:
         if self._machine is not None and self._started:
             self._record = self._machine.describe()
         self._closing, self._started = True, False
-        lower_thread()
-        unlock_memory()
+        priority.lower_thread()
+        priority.unlock_memory()
+        priority.restore_collector()
         if self._thread is not None:
             self._thread.join(timeout=2.0)
         if self._link is not None:

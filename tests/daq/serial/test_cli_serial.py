@@ -33,9 +33,9 @@ def test_ports_says_who_answers_and_who_does_not(tmp_path, run, running):
     assert "emulator 1" in shown and f"--port {running.port}" in shown
 
 
-def test_ports_sends_nothing_when_told_to_be_quiet(tmp_path, run, running):
+def test_ports_sends_nothing_when_told_only_to_list(tmp_path, run, running):
     before = len(running.journal)
-    result = run(["ports", running.port, "--quiet"], tmp_path)
+    result = run(["ports", running.port, "--list"], tmp_path)
     assert "not asked" in result.stdout and len(running.journal) == before
 
 
