@@ -9,7 +9,6 @@ made here: the kernels are compiled for such, and would be compiled again for ot
 from __future__ import annotations
 
 import pickle
-import site
 import sys
 import sysconfig
 import types
@@ -19,6 +18,9 @@ from pathlib import Path
 from typing import Any
 
 from sysid.model import ModelError
+
+# Folders that installers make: of Python, and of Debian's packages.
+_INSTALLED = {"site-packages", "dist-packages"}
 
 
 def pack(what: str, value: Any) -> bytes:
@@ -48,17 +50,24 @@ def unpack(parcel: bytes) -> Any:
 def _not_installed() -> list[types.ModuleType]:
     """Loaded modules that another process may not find by their name."""
     known = sysconfig.get_paths()
-    places = {known[key] for key in ("stdlib", "platstdlib", "purelib", "platlib")}
-    places.add(site.getusersitepackages())
+    places = {Path(known[key]) for key in ("stdlib", "platstdlib", "purelib", "platlib")}
     own = __name__.partition(".")[0]
     found = []
     for name, module in list(sys.modules.items()):
         file = getattr(module, "__file__", None)
-        if file is None or name.partition(".")[0] in (own, "__main__"):
+        # Compiled modules have no code that could travel.
+        if file is None or not file.endswith(".py") or name.partition(".")[0] in (own, "__main__"):
             continue
-        if not any(Path(file).is_relative_to(place) for place in places):
+        if not _installed(Path(file), places):
             found.append(module)
     return found
+
+
+def _installed(file: Path, places: set[Path]) -> bool:
+    """Whether a file lies where packages are installed, be it another environment's folder."""
+    if not _INSTALLED.isdisjoint(file.parts):
+        return True
+    return any(file.is_relative_to(place) for place in places)
 
 
 @contextmanager

@@ -19,7 +19,7 @@ from daq.cli.identifying import assemble, check_writable, load_logs, write_param
 from daq.cli.preparing import Prepared, gassi_settings, prepare_models
 from daq.cli.reporting import Identified, document
 from daq.errors import ConfigError
-from sysid import Campaign, Outcome, Run, Spread, campaign
+from sysid import Campaign, ModelError, Outcome, Run, Spread, campaign
 
 _SEEDS_HELP = "write 0:10 for the seeds 0 to 9, or 3,5,8"
 _WRITE_EVERY = 2.0  # s
@@ -152,7 +152,10 @@ def run_all(
             )
             bar.update("Identification", finished, len(runs), note)
 
-        found = campaign(runs, n_jobs=jobs, on_outcome=watch)
+        try:
+            found = campaign(runs, n_jobs=jobs, on_outcome=watch)
+        except ModelError as error:  # a model that cannot travel to another process
+            raise ConfigError(str(error)) from None
     if found.failed and len(found.failed) == len(found.outcomes):
         raise ConfigError(found.failed[0].problem)
     if found.interrupted and not found.outcomes:

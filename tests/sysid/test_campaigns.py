@@ -1,6 +1,7 @@
 """Campaigns: the same results wherever they run, and nothing lost when a run fails."""
 
 import copy
+import importlib
 import os
 import sys
 import threading
@@ -13,6 +14,7 @@ import pytest
 
 import sysid.campaigns
 from sysid import GASSI, Constraint, Dataset, ModelError, Run, campaign, combinations, fit_percent
+from sysid._parcels import pack, unpack
 from tests.sysid.support import lag
 
 SETTINGS = {"population": 32, "generations": 4}
@@ -146,6 +148,17 @@ def test_a_model_of_a_users_file_and_its_neighbour_travel(tmp_path, monkeypatch)
     assert not found.failed, found.failed[0].problem
     for outcome in found.outcomes:
         assert outcome.estimator.parameters_["gain"] == pytest.approx(1.5, rel=0.02)
+
+
+@pytest.mark.parametrize("folder", ["site-packages", "dist-packages"])
+def test_what_any_installer_has_put_somewhere_travels_by_its_name(tmp_path, monkeypatch, folder):
+    place = tmp_path / folder
+    place.mkdir()
+    name = f"gains_in_{folder.replace('-', '_')}"
+    (place / f"{name}.py").write_text(NEIGHBOUR)
+    monkeypatch.syspath_prepend(place)
+    module = importlib.import_module(name)
+    assert unpack(pack("function", module.twice)) is module.twice
 
 
 def test_a_failed_run_is_kept_and_spoils_no_other(serial):

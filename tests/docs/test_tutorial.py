@@ -1,0 +1,40 @@
+"""The tutorial word for word: its commands are run, in its order, on files as it writes them."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.daq.support import environment
+
+TUTORIAL = Path(__file__).resolve().parents[2] / "docs" / "tutorial.md"
+BLOCK = re.compile(r"^```(sh|yaml)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="its commands are written for a POSIX shell")
+def test_every_command_works_as_it_stands(tmp_path):
+    folder, commands = tmp_path, 0
+    env = environment(PATH=f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
+    for kind, text in BLOCK.findall(TUTORIAL.read_text(encoding="utf-8")):
+        if kind == "yaml":
+            (folder / text.splitlines()[0].removeprefix("# ")).write_text(text)
+            continue
+        for line in text.splitlines():
+            if line.startswith("cd "):
+                folder = folder / line.removeprefix("cd ")
+                continue
+            assert shlex.split(line)[0] == "rig"
+            result = subprocess.run(
+                line, shell=True, cwd=folder, env=env, capture_output=True, text=True,
+                timeout=600, check=False,
+            )  # fmt: skip
+            assert result.returncode == 0, f"{line}\n{result.stdout}\n{result.stderr}"
+            assert "Traceback" not in result.stderr
+            commands += 1
+    assert commands >= 8
