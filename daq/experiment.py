@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import Field, PrivateAttr
 
 from daq.config.base import Section
-from daq.config.units import Hertz, Seconds, Turns
+from daq.config.units import Amperes, Hertz, Seconds, Turns
 from daq.findings import Findings
 from daq.hal import FloatArray, Mode, Samples
 
@@ -27,6 +27,15 @@ class OffsetCalibration(Section):
     """Mean of the analog inputs at zero command, taken off all later samples."""
 
     samples: int = Field(3200, ge=1, le=1_000_000, description="samples averaged")
+    motion: Turns = Field(
+        0.01, gt=0.0, description="most that the shaft may move meanwhile, being at rest"
+    )
+    current_motor: Amperes = Field(
+        0.1, gt=0.0, description="largest offset of the motor current; more is a current that flows"
+    )
+    current_brake: Amperes = Field(
+        0.05, gt=0.0, description="largest offset of the brake current; more is one that flows"
+    )
 
 
 class Homing(Section):

@@ -1,4 +1,4 @@
-"""Backends, protocols and models found by name, whichever installed package brings them."""
+"""Backends, protocols, models and limits found by name, whichever installed package brings them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, Literal
 from daq.config.yaml_file import suggestion
 from daq.errors import ConfigError
 
-Group = Literal["rig.backends", "rig.protocols", "rig.models"]
+Group = Literal["rig.backends", "rig.protocols", "rig.models", "rig.limits"]
 
 
 def installed(group: Group) -> dict[str, EntryPoint]:

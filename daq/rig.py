@@ -1,8 +1,9 @@
-"""A device with its calibration: SI units, clamps and interlocks in one place."""
+"""A device with its calibration: SI units and clamps in one place."""
 
 from __future__ import annotations
 
-import dataclasses
+import contextlib
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import TracebackType
@@ -59,6 +60,8 @@ class Rig:
         self._last_tick = -1
         self._rate = 1.0
         self._low, self._high = self._command_limits()
+        self._step: FloatArray | None = None  # V, largest from tick to tick
+        self._last = np.zeros(len(CHANNELS))  # V, the command before
         self._scale = self._scales()
         self._radians = 0.0
         self._info: DeviceInfo | None = None
@@ -105,6 +108,8 @@ class Rig:
         self._last_tick = -1
         self._rate = sample_rate
         self._low, self._high = self._command_limits()
+        self._step = self._largest_step(sample_rate)
+        self._last = np.zeros(len(CHANNELS))
         self._scale = self._scales()
         encoder = self.config.sensors.encoder
         self._radians = encoder.sign * 2.0 * np.pi / (4.0 * encoder.cycles)
@@ -113,12 +118,15 @@ class Rig:
     def send(self, tick: int, commands: FloatArray) -> None:
         """Queue commands (n, 2) [V] for consecutive ticks from ``tick``; clamped to the limits.
 
-        Ticks must follow one another without a gap.
+        Ticks must follow one another without a gap. Where the limits have a slew, a command
+        follows the one before no faster than that.
         """
         if tick != self._asked_until:
             raise DeviceError(f"commands for tick {tick} follow those until {self._asked_until}")
         commands = np.asarray(commands, dtype=np.float64)
         limited = np.minimum(np.maximum(commands, self._low), self._high)
+        if self._step is not None:
+            limited = self._slewed(limited, self._step)
         changed = limited != commands
         # Whatever is not finite is changed by the limits, or is NaN and differs from itself.
         if changed.any() and not np.isfinite(commands).all():
@@ -148,7 +156,9 @@ class Rig:
 
     def safe(self) -> None:
         """Zero both outputs now; never raises."""
-        self._device.safe()
+        # A backend's mistake here must not keep the rest of the way out from being gone.
+        with contextlib.suppress(Exception):
+            self._device.safe()
 
     def report(self) -> dict[str, Any]:
         """What the device has to say for the record of a run; nothing for most."""
@@ -156,18 +166,42 @@ class Rig:
 
     def close(self) -> None:
         """Zero the outputs and disconnect."""
-        self._device.safe()
+        self.safe()
         self._device.close()
 
     def _command_limits(self) -> tuple[FloatArray, FloatArray]:
         limits = [getattr(self.config.limits.command, name) for name in CHANNELS]
         return np.array([low for low, _ in limits]), np.array([high for _, high in limits])
 
+    def _largest_step(self, rate: float) -> FloatArray | None:
+        slew = [getattr(self.config.limits.slew, name) for name in CHANNELS]
+        if all(limit is None for limit in slew):
+            return None
+        return np.array(
+            [math.inf if limit is None else limit / rate * (1 + 1e-9) for limit in slew]
+        )
+
+    def _slewed(self, commands: FloatArray, step: FloatArray) -> FloatArray:
+        """The commands (n, 2) [V], each no further than ``step`` from the one applied before."""
+        if (
+            len(commands)
+            and not (np.abs(np.diff(commands, axis=0, prepend=[self._last])) <= step).all()
+        ):
+            commands = commands.copy()
+            last = self._last
+            for row in range(len(commands)):
+                last = np.minimum(np.maximum(commands[row], last - step), last + step)
+                commands[row] = last
+        if len(commands):
+            self._last = commands[-1]
+        return commands
+
     def _guard(self) -> Guard:
-        """Current limits as volts at the inputs, so that the device can watch them itself."""
+        """Limits of current and torque in volts, so that the device can watch them itself."""
         command_low, command_high = self._command_limits()
-        limits = self.config.limits.current
-        bounds = np.array([limits.motor, limits.brake, np.inf])
+        limits = self.config.limits
+        torque = math.inf if limits.torque is None else limits.torque
+        bounds = np.array([limits.current.motor, limits.current.brake, torque])
         volts = bounds / np.abs(self._scales())
         return Guard(
             command_low, command_high, self.offsets.volts - volts, self.offsets.volts + volts
@@ -214,32 +248,3 @@ class Rig:
             omega=raw.count_rate * self._radians,
             flags=flags,
         )
-
-
-def interlock_reason(samples: Samples, config: RigConfig) -> tuple[int, str] | None:
-    """Row and reason of the first sample beyond a current limit, or None.
-
-    A device that found one by its own measure has flagged it, and has zeroed its outputs.
-    """
-    limits = config.limits.current
-    first: tuple[int, str] | None = None
-    for name, limit in (("current_motor", limits.motor), ("current_brake", limits.brake)):
-        values = getattr(samples, name)
-        beyond = ~(np.abs(values) <= limit)
-        if beyond.any():
-            row = int(np.argmax(beyond))
-            if first is None or row < first[0]:
-                first = row, f"{name} is {values[row]:.4g} A, beyond its limit of {limit:g} A"
-    flagged = (samples.flags & int(Flag.INTERLOCK)) != 0
-    if flagged.any():
-        row = int(np.argmax(flagged))
-        if first is None or row < first[0]:
-            first = row, "the device found an input beyond its limit"
-    return first
-
-
-def mark_interlock(samples: Samples, row: int) -> Samples:
-    """The samples with the tripping row flagged."""
-    flags = samples.flags.copy()
-    flags[row] |= int(Flag.INTERLOCK)
-    return dataclasses.replace(samples, flags=flags)

@@ -3,24 +3,33 @@
 from __future__ import annotations
 
 import contextlib
-import signal
-import threading
-import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import numpy as np
 
 from daq.capture import COMPLETED, Capture
 from daq.config.rig import RigConfig
-from daq.errors import ConfigError, DeviceError, InterlockError, RigError, RunError, Terminated
-from daq.experiment import Answer, ClosedLoop, Controller, Experiment, Plan, Sample
+from daq.errors import DeviceError, InterlockError, RigError, RunError, Terminated
+from daq.experiment import (
+    Answer,
+    ClosedLoop,
+    Controller,
+    Experiment,
+    OffsetCalibration,
+    Plan,
+    Sample,
+)
 from daq.hal import CHANNELS, Device, Flag, FloatArray, Mode, Phase, Samples
+from daq.limits import Limits, mark_interlock
 from daq.log import LogWriter
-from daq.rig import Rig, interlock_reason, mark_interlock
+from daq.planning import plan
+from daq.realtime import RealTime
+from daq.rig import Rig
+from daq.stopping import Stopping
+from daq.timing import Timing
 
 _ZEROS_AHEAD = 0.05  # s of zero commands queued while waiting
 _REST_TIME = 1.0  # s that the shaft must stand still to end homing
@@ -40,70 +49,19 @@ class PhaseProgress:
 
 @dataclass(frozen=True)
 class RunResult:
-    """A completed run: its folder, what was logged, and what was noticed."""
+    """A completed run: its folder, what was logged, and how punctual it was, as in run.json."""
 
     folder: Path
     n_samples: int
     timing: dict[str, Any]
+    realtime: dict[str, Any]
 
 
 Watcher = Callable[[PhaseProgress], None]
 
 
-@dataclass
-class _Timing:
-    """Statistics of the run phase, for run.json."""
-
-    started: float = field(default_factory=time.perf_counter)
-    blocks: int = 0
-    longest_gap: float = 0.0
-    flags: dict[str, int] = field(default_factory=dict)
-    _last: float = field(default_factory=time.perf_counter)
-
-    def block(self, samples: Samples) -> None:
-        now = time.perf_counter()
-        self.longest_gap = max(self.longest_gap, now - self._last)
-        self._last = now
-        self.blocks += 1
-        for flag in Flag:
-            count = int(np.count_nonzero(samples.flags & int(flag)))
-            if count:
-                name = str(flag.name).lower()
-                self.flags[name] = self.flags.get(name, 0) + count
-
-    def summary(self) -> dict[str, Any]:
-        return {
-            "wall_seconds": round(time.perf_counter() - self.started, 6),
-            "blocks": self.blocks,
-            "longest_wait_seconds": round(self.longest_gap, 6),
-            "flagged_samples": self.flags,
-        }
-
-
-def plan(experiment: Experiment, rig: RigConfig) -> Plan:
-    """What a run will do, checked against the rig's limits.
-
-    Raises ConfigError, before anything is energised, for settings that make no run or commands
-    that the rig would clamp.
-    """
-    try:
-        planned = experiment.plan()
-    except ValueError as error:
-        raise ConfigError(str(error)) from None
-    for channel, name in enumerate(CHANNELS):
-        least, most = getattr(rig.limits.command, name)
-        low, high = planned.lowest[channel], planned.highest[channel]
-        if low < least or high > most:
-            beyond, where = (high, np.argmax) if high > most else (low, np.argmin)
-            asked = f"up to {beyond:.6g} V"
-            if planned.commands is not None:
-                asked = f"for {beyond:.6g} V in sample {where(planned.commands[:, channel])}"
-            raise ConfigError(
-                f"{name}: the plan asks {asked}, outside the rig's limits "
-                f"[{least:g}, {most:g}] V; change amplitude or offset, or "
-                f"limits.command.{name} in the rig's file if the hardware allows it"
-            )
-    return planned
+def _nobody(progress: PhaseProgress) -> None:
+    """Who watches when nobody does."""
 
 
 def run_experiment(
@@ -112,7 +70,7 @@ def run_experiment(
     rig_config: RigConfig,
     device: Device,
     root: Path,
-    watch: Watcher = lambda progress: None,
+    watch: Watcher = _nobody,
 ) -> RunResult:
     """Run an experiment on a device and log it under ``root``.
 
@@ -126,29 +84,10 @@ def run_experiment(
         name,
         {"experiment": experiment.describe(), "rig": rig_config.model_dump(mode="json")},
     )
-    run = _Run(experiment, planned, Rig(device, rig_config), capture, watch)
-    with _signals_raise():
+    limits = Limits(rig_config)
+    with Stopping() as stopping:
+        run = _Run(experiment, planned, Rig(device, rig_config), capture, limits, stopping, watch)
         return run.execute()
-
-
-@contextlib.contextmanager
-def _signals_raise() -> Iterator[None]:
-    """SIGTERM and SIGHUP end the run as Ctrl-C does: by an exception, past every ``finally``."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def terminate(number: int, frame: FrameType | None) -> None:
-        raise Terminated(signal.Signals(number).name)
-
-    # A closed terminal sends SIGHUP, where there is such a signal.
-    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
-    before = [(number, signal.signal(number, terminate)) for number in numbers]
-    try:
-        yield
-    finally:
-        for number, handler in before:
-            signal.signal(number, handler)
 
 
 class _Run:
@@ -160,15 +99,20 @@ class _Run:
         planned: Plan,
         rig: Rig,
         capture: Capture,
+        limits: Limits,
+        stopping: Stopping,
         watch: Watcher,
     ) -> None:
         self.experiment = experiment
         self.plan = planned
         self.rig = rig
         self.capture = capture
+        self.limits = limits
+        self.stopping = stopping
         self.watch = watch
         self.phase = Phase.OPEN
-        self.timing = _Timing()
+        self.timing = Timing()
+        self.realtime = RealTime()
 
     def execute(self) -> RunResult:
         """All phases; the record in the capture folder names how they ended."""
@@ -186,33 +130,60 @@ class _Run:
             self._finish("failed", reason)
             raise DeviceError(reason) from error
         self._finish(COMPLETED, None)
-        return RunResult(self.capture.folder, log.n_samples, self.capture.record["timing"])
+        record = self.capture.record
+        return RunResult(self.capture.folder, log.n_samples, record["timing"], record["realtime"])
 
     def _phases(self, log: LogWriter) -> None:
         try:
-            self._enter(Phase.OPEN)
-            info = self.rig.open()
-            self.capture.record["device"] = info.name
-            self._enter(Phase.CALIBRATION)
-            self._calibrate()
-            if self.experiment.homing.turns > 0.0:
-                self._enter(Phase.HOMING, self.experiment.homing.turns)
-                self._home()
-            self._enter(Phase.RUN)
-            if isinstance(self.experiment, ClosedLoop):
-                self._control(self.experiment, log)
-            else:
-                self._play(log)
-            self._enter(Phase.SAFE)
+            try:
+                self._work(log)
+            finally:
+                # A signal between here and the shield raises: the outer try answers that.
+                self.stopping.shield()
         except BaseException:
-            self.rig.safe()
+            self._leave()
             # A device that failed may fail to close as well; why it failed is what counts.
-            with contextlib.suppress(DeviceError):
+            broken = (Exception, KeyboardInterrupt, Terminated)
+            with contextlib.suppress(*broken), self.stopping.breakable():
                 self.rig.close()
             raise
-        self.rig.safe()
+        self._leave()
         self.phase = Phase.CLOSE
-        self.rig.close()
+        with self.stopping.breakable():
+            self.rig.close()
+
+    def _work(self, log: LogWriter) -> None:
+        self._enter(Phase.OPEN)
+        info = self.rig.open()
+        self.capture.record["device"] = info.name
+        self._schedule(info.virtual_time)
+        self._enter(Phase.CALIBRATION)
+        self._calibrate()
+        if self.experiment.homing.turns > 0.0:
+            self._enter(Phase.HOMING, self.experiment.homing.turns)
+            self._home()
+        self._enter(Phase.RUN)
+        if isinstance(self.experiment, ClosedLoop):
+            self._control(self.experiment, log)
+        else:
+            self._play(log)
+        self._enter(Phase.SAFE)
+
+    def _leave(self) -> None:
+        """Zero outputs, whatever came before; ordinary scheduling."""
+        self.rig.safe()
+        self.realtime.undo()
+
+    def _schedule(self, virtual_time: bool) -> None:
+        asked = self.rig.config.realtime
+        # A clock that waits for the host needs no haste, and would starve the machine of it.
+        self.realtime.begin("off" if virtual_time else asked)
+        self.capture.record["realtime"] = {
+            "asked": asked,
+            "needed": not virtual_time,
+            "granted": self.realtime.granted,
+            "refused": self.realtime.refused,
+        }
 
     @property
     def _columns(self) -> tuple[str, ...]:
@@ -236,28 +207,34 @@ class _Run:
             )
 
     def _calibrate(self) -> None:
-        """Mean of the inputs at zero command becomes their offset."""
-        wanted = self.experiment.calibration.samples
+        """Mean of the inputs at zero command becomes their offset, of a rig that is at rest."""
+        calibration = self.experiment.calibration
+        wanted = calibration.samples
         blocks: list[Samples] = []
+        done = 0
 
         def enough(samples: Samples) -> bool:
+            nonlocal done
             blocks.append(samples)
-            done = sum(len(block) for block in blocks)
-            self.watch(PhaseProgress(Phase.CALIBRATION, min(done, wanted), wanted, "samples"))
+            done += len(samples)
+            self._tell(Phase.CALIBRATION, min(done, wanted), wanted, "samples")
             return done >= wanted
 
         self._stream_zeros(enough)
         read = {
             name: np.concatenate([getattr(block, name) for block in blocks])
-            for name in ("current_motor", "current_brake", "torque")
+            for name in ("current_motor", "current_brake", "torque", "theta")
         }
+        moved = float(np.ptp(read.pop("theta"))) / (2.0 * np.pi)
         means = {name: float(values.mean()) for name, values in read.items()}
-        self.rig.take_offsets(means)
         # How far the offsets, and every later sample, may be trusted.
         self.capture.record["calibration"] = {
             "samples": len(read["torque"]),
             "noise": {name: float(values.std()) for name, values in read.items()},
+            "turns": moved,
         }
+        _require_rest(calibration, moved, means)
+        self.rig.take_offsets(means)
         self.capture.record["offsets"] = {
             **means,
             "volts": self.rig.offsets.volts.tolist(),
@@ -276,7 +253,7 @@ class _Run:
             turns = float(samples.theta[-1]) / (2.0 * np.pi)
             start = turns if start is None else start
             done = abs(turns - start)
-            self.watch(PhaseProgress(Phase.HOMING, min(done, homing.turns), homing.turns, "turns"))
+            self._tell(Phase.HOMING, min(done, homing.turns), homing.turns, "turns")
             if abs(turns - calm_turns) > _REST_TURNS:
                 calm_from, calm_turns = now, turns
             if done >= homing.turns and now - calm_from >= _REST_TIME:
@@ -296,7 +273,7 @@ class _Run:
         """Sample at zero command until ``enough`` says so."""
         # Sent a little ahead: zeros are safe to hold, and the host need not hurry every tick.
         ahead = max(1, round(_ZEROS_AHEAD * self.experiment.sample_rate))
-        self.rig.start(self.experiment.sample_rate, Mode.CLOSED_LOOP)
+        self._begin(Mode.CLOSED_LOOP)
         self.rig.send(0, np.zeros((ahead, len(CHANNELS))))
         asked = ahead
         while True:
@@ -323,7 +300,9 @@ class _Run:
                 chunk = waveform[sent : sent + room]
                 self.rig.send(sent, chunk)
                 sent += len(chunk)
-            samples = _first(self.rig.receive(), total)
+                if done:
+                    self.timing.answered(done - 1)
+            samples = _first(self._receive(), total)
             if len(samples) == 0:
                 break  # the last samples of the run were lost
             samples, trip = self._guarded(samples)
@@ -342,7 +321,7 @@ class _Run:
         self.rig.send(0, np.zeros((experiment.ahead, len(CHANNELS))))
         asked, done = experiment.ahead, 0
         while done < self.plan.n_samples and not answering.ended:
-            samples = _first(self.rig.receive(), self.plan.n_samples)
+            samples = _first(self._receive(), self.plan.n_samples)
             if len(samples) == 0:
                 break
             samples, trip = self._guarded(samples)
@@ -352,17 +331,33 @@ class _Run:
                 ticks = np.arange(asked, int(samples.tick[-1]) + 1 + experiment.ahead)
                 places = np.searchsorted(samples.tick + experiment.ahead, ticks)
                 self.rig.send(asked, answers.commands[places])
+                self.timing.answered(samples.tick.item(-1))
                 asked += len(ticks)
             done = self._keep(log, _first(samples, answers.end), answers.logged, trip)
         self.rig.stop()
 
     def _begin(self, mode: Mode) -> None:
-        self.rig.start(self.experiment.sample_rate, mode)
-        self.timing = _Timing()
+        rate = self.experiment.sample_rate
+        self.rig.start(rate, mode)
+        self.limits.begin(self.phase, rate)
+        self.timing = Timing()
+
+    def _receive(self) -> Samples:
+        samples = self.rig.receive()
+        self.timing.received(samples)
+        return samples
+
+    def _tell(self, phase: Phase, done: float, total: float, unit: str) -> None:
+        try:
+            self.watch(PhaseProgress(phase, done, total, unit))
+        except OSError:
+            # Its terminal or pipe is gone. That is no reason to lose a run: whoever closed it
+            # ends the run by a signal, if that was meant.
+            self.watch = _nobody
 
     def _guarded(self, samples: Samples) -> tuple[Samples, str | None]:
         """The samples up to one beyond a limit, and why; the outputs are zero by then."""
-        trip = interlock_reason(samples, self.rig.config)
+        trip = self.limits.check(samples)
         if trip is None:
             return samples, None
         self.rig.safe()
@@ -374,15 +369,15 @@ class _Run:
     ) -> int:
         """Log samples, before the next wait; how far the run is. Raises InterlockError."""
         log.append(samples, extra)
-        self.timing.block(samples)
+        self.timing.logged(samples)
         done = int(samples.tick[-1]) + 1
-        self.watch(PhaseProgress(Phase.RUN, done, self.plan.n_samples, "samples"))
+        self._tell(Phase.RUN, done, self.plan.n_samples, "samples")
         if trip is not None:
             raise InterlockError(f"interlock in sample {done - 1}: {trip}; outputs are zero")
         return done
 
     def _check(self, samples: Samples) -> None:
-        trip = interlock_reason(samples, self.rig.config)
+        trip = self.limits.check(samples)
         if trip is not None:
             self.rig.safe()
             raise InterlockError(
@@ -434,6 +429,25 @@ class _Answering:
                 f"the protocol {self._experiment.protocol!r} failed at sample {sample.tick}: "
                 f"{type(error).__name__}: {error}; outputs were set to zero"
             ) from error
+
+
+def _require_rest(calibration: OffsetCalibration, moved: float, means: dict[str, float]) -> None:
+    """Raise RunError unless what was averaged was a rig at rest."""
+    if moved > calibration.motion:
+        raise RunError(
+            f"calibration: the shaft moved by {moved:.3g} turns at zero command, more than "
+            f"calibration.motion of {calibration.motion:g} turns; let it come to rest, keep "
+            "hands off and start again"
+        )
+    for name in ("current_motor", "current_brake"):
+        most = getattr(calibration, name)
+        if not abs(means[name]) <= most:
+            raise RunError(
+                f"calibration: {name} reads {means[name]:.4g} A at zero command, more than "
+                f"calibration.{name} of {most:g} A: a current flows, or the sensor is far off. "
+                "Look at the amplifier's input and its zero, and at the sensor's wires; raise "
+                f"calibration.{name} in the experiment if it is the sensor's offset"
+            )
 
 
 def _first(samples: Samples, end_tick: int) -> Samples:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,13 +17,14 @@ from daq.cli.shipped import EXPERIMENTS, RIGS, shipped_files
 from daq.cli.user_code import from_file, locate
 from daq.config import checking, yaml_file
 from daq.config.base import Section
-from daq.config.rig import RigConfig, with_options
-from daq.config.yaml_file import YamlFile
+from daq.config.rig import OwnLimit, RigConfig, with_options
+from daq.config.yaml_file import Key, YamlFile
 from daq.errors import ConfigError
 from daq.experiment import Experiment, Plan
 from daq.hal import Device
+from daq.limits import Limit
+from daq.planning import plan
 from daq.plugins import load_plugin
-from daq.run import plan
 
 DEFAULT_RIG = "simulated.yaml"
 
@@ -128,7 +129,7 @@ def find_protocol(name: str, folder: Path) -> type[Experiment]:
 
     File names are looked up from the working folder, then from ``folder``. Raises ConfigError.
     """
-    file = _own_protocol(name)
+    file = _in_file(name)
     if file is None:
         found = load_plugin("rig.protocols", name)
     else:
@@ -146,7 +147,7 @@ def find_protocol(name: str, folder: Path) -> type[Experiment]:
 def make_experiment(file: YamlFile, kind: type[Experiment]) -> Experiment:
     """The checked content of an experiment's file."""
     content = dict(file.content)
-    own = _own_protocol(content["protocol"])
+    own = _in_file(content["protocol"])
     if own is not None:
         # The capture must find it from any folder.
         path = locate(Path(own[1]), "protocol", file.path.parent).resolve()
@@ -156,7 +157,7 @@ def make_experiment(file: YamlFile, kind: type[Experiment]) -> Experiment:
     return experiment
 
 
-def _own_protocol(name: str) -> re.Match[str] | None:
+def _in_file(name: str) -> re.Match[str] | None:
     """File and class of ``FILE.py:CLASS``."""
     # Not at the first colon: a Windows path has one behind its drive.
     return re.match(r"^(.*\.py):(\w+)$", name)
@@ -188,5 +189,42 @@ def load_rig(name: str, options: Mapping[str, Any] | None = None) -> tuple[RigCo
         raise
     config = checking.validate(file, with_options(backend.Options))
     _tell(file, f"backend {backend_name}", backend)
+    for index, own in enumerate(config.limits.own):
+        own._make = _limit_maker(file, own, ("limits", "own", index))
     device: Device = backend(config.options)
     return config, device
+
+
+def _limit_maker(file: YamlFile, own: OwnLimit, key: Key) -> Callable[[], Limit]:
+    """What makes the limit that an entry of ``limits.own`` names, its settings checked."""
+    try:
+        kind = _find_limit(own.use, file.path.parent)
+    except ConfigError as error:
+        raise file.error((*key, "use"), str(error)) from None
+    options = kind.Options
+    if options is None:
+        if own.options:
+            raise file.error((*key, "options"), f"the limit {own.use} has no settings")
+        return kind
+    settings = checking.validate(file, options, own.options, (*key, "options"))
+    make: Callable[..., Limit] = kind
+    return lambda: make(settings)
+
+
+def _find_limit(name: str, folder: Path) -> type[Limit]:
+    file = _in_file(name)
+    if file is None:
+        found = load_plugin("rig.limits", name)
+    else:
+        path = locate(Path(file[1]), "limit", folder)
+        found = from_file(path, file[2], "limit", _is_limit)
+    if not _is_limit(found):
+        raise ConfigError(
+            f"{name} is no limit; make it a class derived from daq.limits.Limit with a method check"
+        )
+    kind: type[Limit] = found
+    return kind
+
+
+def _is_limit(found: Any) -> bool:
+    return inspect.isclass(found) and issubclass(found, Limit) and not inspect.isabstract(found)

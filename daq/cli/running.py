@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from daq.cli import console
+from daq.cli import console, punctuality
 from daq.cli.analysing import analyse, as_document, next_command, show_findings
 from daq.cli.files import DEFAULT_RIG, LoadedExperiment, load_experiment, load_rig
 from daq.config.rig import RigConfig
@@ -55,7 +55,10 @@ def run_command(
     result = _run(loaded, rig_config, device, out, as_json)
     found = analyse(loaded.experiment, result.folder)
     check = _run(validation, rig_config, device, out, as_json) if validation else None
-    report = {"run": _summary(result), "validation": _summary(check) if check else None}
+    report = {
+        "run": punctuality.as_document(result),
+        "validation": punctuality.as_document(check) if check else None,
+    }
     if found is not None:
         report["findings"] = as_document(found, result.folder)
         if not as_json:
@@ -190,14 +193,6 @@ def _run(
     return result
 
 
-def _summary(result: RunResult) -> dict[str, Any]:
-    return {
-        "folder": str(result.folder),
-        "samples": result.n_samples,
-        "timing": result.timing,
-    }
-
-
 def _print_end(result: RunResult, check: RunResult | None, identified: bool) -> None:
     for label, run in (("Log", result), ("Validation log", check)):
         if run is None:
@@ -208,5 +203,10 @@ def _print_end(result: RunResult, check: RunResult | None, identified: bool) -> 
             f"{label}: {run.folder / 'log.csv'} ({run.n_samples} samples"
             + (f"; flagged: {notes})" if notes else ")")
         )
+        line = punctuality.summary_line(run)
+        if line is not None:
+            console.print_line(line)
+        for note in punctuality.notes(run):
+            console.report_note(note)
     if not identified:
         console.print_next(next_command(result.folder))

@@ -1,4 +1,4 @@
-"""Objects of a user's own Python files: models, protocols."""
+"""Objects of a user's own Python files: models, protocols, limits."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any, Literal
 from daq.config.yaml_file import suggestion
 from daq.errors import ConfigError
 
-Kind = Literal["model", "protocol"]
+Kind = Literal["model", "protocol", "limit"]
 
 
 def locate(path: Path, kind: Kind, relative_to: Path | None = None) -> Path:

@@ -2,14 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, create_model, field_validator
+from pydantic import Field, PrivateAttr, create_model, field_validator
 
 from daq.config.base import Section
-from daq.config.units import Amperes, Unit, Volts
+from daq.config.units import (
+    Amperes,
+    NewtonMetres,
+    RadiansPerSecond,
+    Seconds,
+    Turns,
+    Unit,
+    Volts,
+)
+from daq.errors import ConfigError
 
 Sign = Literal[-1, 1]
+Realtime = Literal["off", "prefer", "require"]
+VoltsPerSecond = Annotated[float, Unit("V/s")]
+AmperesPerVolt = Annotated[float, Unit("A/V")]
+SquaredCurrentTime = Annotated[float, Unit("A^2*s")]
 
 
 class AnalogInput(Section):
@@ -72,18 +86,119 @@ class CommandLimits(Section):
         return limits
 
 
+class SlewLimits(Section):
+    """Fastest change of each command; none where a key is left out.
+
+    A plan that is faster is refused; a controller's command follows no faster.
+    """
+
+    motor: VoltsPerSecond | None = Field(None, gt=0.0, description="fastest motor command")
+    brake: VoltsPerSecond | None = Field(None, gt=0.0, description="fastest brake command")
+
+
 class CurrentLimits(Section):
-    """Measured current at which the run is stopped and the outputs zeroed [A]."""
+    """Measured current at which the run is stopped and the outputs zeroed."""
 
     motor: Amperes = Field(2.4, gt=0.0, le=10.0, description="largest motor current")
-    brake: Amperes = Field(0.19, gt=0.0, le=10.0, description="largest brake current")
+    brake: Amperes = Field(0.21, gt=0.0, le=10.0, description="largest brake current")
+
+
+class Overload(Section):
+    """What a winding's heat allows: a current for ever, and so much i^2 t above it."""
+
+    continuous: Amperes = Field(gt=0.0, le=10.0, description="current that may flow for ever")
+    budget: SquaredCurrentTime = Field(
+        gt=0.0,
+        le=1e6,
+        description="i^2 t above the continuous current; a current i lasts "
+        "budget / (i^2 - continuous^2)",
+    )
+
+
+class OverloadLimits(Section):
+    """i^2 t of each channel; not watched where a key is left out."""
+
+    motor: Overload | None = Field(None, description="of the motor's winding")
+    brake: Overload | None = Field(None, description="of the brake's coil")
+
+
+class Stall(Section):
+    """A motor that must turn the shaft: current above, brake below, for so long, and no count."""
+
+    motor: Amperes = Field(gt=0.0, description="motor current that must move the shaft")
+    brake: Amperes = Field(0.03, gt=0.0, description="brake current below which it must")
+    time: Seconds = Field(0.5, gt=0.0, description="for which the encoder may stand still")
+
+
+class EncoderLimits(Section):
+    """What an encoder that works cannot show."""
+
+    fastest: RadiansPerSecond = Field(
+        1000.0, gt=0.0, description="change of the angle from sample to sample that is a jump"
+    )
+    silent: Turns = Field(
+        0.25, gt=0.0, description="turns by the speed estimate without one count of the encoder"
+    )
+    stall: Stall | None = Field(None, description="current that must move it; left out: none")
+
+
+class OwnLimit(Section):
+    """A limit of a user's own."""
+
+    use: str = Field(min_length=1, description="name of an installed limit, or FILE.py:CLASS")
+    options: dict[str, Any] = Field(default_factory=dict, description="the limit's own settings")
+    # Makes a new limit for a run; set where the name has been looked up.
+    _make: Callable[[], Any] | None = PrivateAttr(default=None)
+
+    def make(self) -> Any:
+        """A new limit for one run."""
+        if self._make is None:
+            raise ConfigError(f"limits.own: {self.use} has not been looked up; load the rig's file")
+        return self._make()
 
 
 class Limits(Section):
-    """What keeps the rig and the hand on it whole."""
+    """What keeps the rig and the hand on it whole; docs/safety.md tells each."""
 
     command: CommandLimits = Field(CommandLimits(), description="clamps of the commands")
+    slew: SlewLimits = Field(SlewLimits(), description="how fast the commands may change")
     current: CurrentLimits = Field(CurrentLimits(), description="current interlocks")
+    i2t: OverloadLimits = Field(OverloadLimits(), description="heat of the windings")
+    speed: RadiansPerSecond | None = Field(None, gt=0.0, description="fastest shaft, either way")
+    torque: NewtonMetres | None = Field(None, gt=0.0, description="largest torque, either way")
+    travel: tuple[Turns, Turns] | None = Field(
+        None, description="lowest and highest angle, from where the shaft stood at the beginning"
+    )
+    winding: Turns | None = Field(
+        None,
+        ge=0.0,
+        description="turns that must stay wound up after homing; left out where nothing unwinds",
+    )
+    encoder: EncoderLimits = Field(EncoderLimits(), description="what the encoder cannot show")
+    frozen: Seconds | None = Field(
+        0.1,
+        gt=0.0,
+        description="for which an input with noise, or one that must follow its command, may "
+        "read the same to the bit; null: not watched",
+    )
+    own: list[OwnLimit] = Field(default_factory=list, description="limits from your own code")
+
+    @field_validator("travel")
+    @classmethod
+    def _includes_start(cls, travel: tuple[float, float] | None) -> tuple[float, float] | None:
+        if travel is not None and not travel[0] < 0.0 < travel[1]:
+            raise ValueError("it counts from where the shaft stands, so it must include 0 turns")
+        return travel
+
+
+class Amplifiers(Section):
+    """Current of each amplifier per volt of its command, to check a plan before it runs.
+
+    Left out for one that gives a voltage: what current flows is then not known beforehand.
+    """
+
+    motor: AmperesPerVolt | None = Field(None, gt=0.0, description="of the motor's amplifier")
+    brake: AmperesPerVolt | None = Field(None, gt=0.0, description="of the brake's amplifier")
 
 
 class RigConfig(Section):
@@ -93,7 +208,19 @@ class RigConfig(Section):
     backend: str = Field("simulated", min_length=1, description="name of an installed backend")
     options: Any = Field(default_factory=dict, description="the backend's own settings")
     sensors: Sensors = Field(Sensors(), description="calibration of the measured channels")
+    amplifiers: Amplifiers = Field(Amplifiers(), description="gain of current-controlled ones")
     limits: Limits = Field(Limits(), description="clamps and interlocks")
+    realtime: Realtime = Field(
+        "prefer",
+        description="real-time scheduling during a run: off, prefer (as far as it is granted), "
+        "or require (no run without)",
+    )
+
+    @field_validator("realtime", mode="before")
+    @classmethod
+    def _off(cls, value: Any) -> Any:
+        # YAML reads off as a truth value.
+        return "off" if value is False else value
 
 
 def with_options(options: type[Section]) -> type[RigConfig]:

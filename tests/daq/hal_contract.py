@@ -14,7 +14,8 @@ import pytest
 from daq.config.rig import RigConfig
 from daq.errors import DeviceError
 from daq.hal import Flag, Guard, Mode, Phase
-from daq.rig import Rig, interlock_reason
+from daq.limits import Limits
+from daq.rig import Rig
 
 RATE = 800.0  # Hz
 OPEN, CLOSED = Mode.OPEN_LOOP, Mode.CLOSED_LOOP
@@ -320,7 +321,9 @@ class HalContract:
         rig.start(RATE, mode)
         rig.send(0, commands)
         played = Played(collect(rig, 300))
-        row, reason = interlock_reason(played, config)
+        limits = Limits(config)
+        limits.begin(Phase.RUN, RATE)
+        row, reason = limits.check(played)
         assert row == 31, "the current rises within one sample of the step in row 30"
         assert "current_motor" in reason and "0.15" in reason
         np.testing.assert_allclose(played.applied[:31], commands[:31], atol=bench.resolution)

@@ -10,7 +10,7 @@ import protocols
 from daq.cli.files import load_experiment
 from daq.config.rig import RigConfig
 from daq.errors import ConfigError
-from daq.run import plan
+from daq.planning import plan
 from protocols.prbs import SEQUENCE_LENGTH, Prbs, lfsr_bits
 from tests.daq.support import EXPERIMENT, merged
 

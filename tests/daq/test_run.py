@@ -96,11 +96,12 @@ def test_the_capture_folder_holds_the_run_as_resolved(completed):
     assert sorted(p.name for p in folder.iterdir()) == ["log.csv", "run.json"]
     assert {
         "status", "reason", "started", "experiment", "rig", "software", "host", "device",
-        "calibration", "offsets", "homing", "phase", "timing", "log",
+        "calibration", "offsets", "homing", "phase", "timing", "log", "realtime",
     } == set(record)  # fmt: skip
     assert (record["status"], record["reason"], record["phase"]) == ("completed", None, "close")
     assert record["experiment"] == {
         **merged(SETTINGS, {"homing": {"turns": 1.0, "timeout": 30.0}}),
+        "calibration": {"samples": 16, "motion": 0.01, "current_motor": 0.1, "current_brake": 0.05},
         "name": "",
         "validation": {},
     }
@@ -127,8 +128,9 @@ def test_offsets_are_taken_off_the_log(tmp_path):
     # 1 V of offset would be 0.5 A; the experiment commands nothing, so all that is left is noise.
     quiet = {"amplitude": 0.0, "offset": 0.0}
     write_experiment(
-        tmp_path / "e.yaml", motor=quiet, brake=quiet, calibration={"samples": 2000}, duration=2
-    )
+        tmp_path / "e.yaml", motor=quiet, brake=quiet, duration=2,
+        calibration={"samples": 2000, "current_motor": 0.6, "current_brake": 0.6},
+    )  # fmt: skip
     flaws = {"options": {"imperfections": {"offset": 1.0, "noise": 0.01}}}
     write_rig(tmp_path / "rig.yaml", **merged(flaws, {"limits": {"current": {"brake": 2.0}}}))
     result = rig("run", "e.yaml", "--rig", "rig.yaml", cwd=tmp_path)

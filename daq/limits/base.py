@@ -1,0 +1,51 @@
+"""What a limit is, and judging a block of samples at little cost."""
+
+from __future__ import annotations
+
+import abc
+import math
+
+import numpy as np
+
+from daq.config.base import Section
+from daq.hal import FloatArray, Phase, Samples
+
+Trip = tuple[int, str]
+"""Row of a block of samples that is beyond a limit, and the reason in words."""
+
+TURN = 2.0 * math.pi
+
+
+class Limit(abc.ABC):
+    """Something that must hold in every sample of every phase.
+
+    A run makes an object of its own: ``Options`` of the class, checked against the rig's file,
+    are given to the constructor; a class without them is made without arguments.
+    """
+
+    Options: type[Section] | None = None
+
+    def begin(self, phase: Phase, sample_rate: float) -> None:  # noqa: B027
+        """A phase begins: ticks and time count from zero again. sample_rate in Hz."""
+
+    @abc.abstractmethod
+    def check(self, samples: Samples) -> Trip | None:
+        """The first row of a block (n >= 1) that is beyond the limit, and why; else None.
+
+        Every sample that arrives is shown once and in order. The reason completes the sentence
+        "interlock in sample k: ...".
+        """
+
+
+def within(values: FloatArray, limit: float) -> bool:
+    """Whether all are numbers within plus or minus a limit."""
+    if len(values) == 1:
+        return -limit <= values.item() <= limit
+    return bool((np.abs(values) <= limit).all())
+
+
+def changes(values: FloatArray, last: float) -> bool:
+    """Whether each differs from the one before, the first from the last."""
+    if len(values) == 1:
+        return values.item() != last
+    return bool(values[0] != last and (values[1:] != values[:-1]).all())

@@ -1,0 +1,85 @@
+"""Signals that end a run: the first by an exception, later ones without disturbing the clean-up."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from types import FrameType, TracebackType
+from typing import Any
+
+from daq.errors import Terminated
+
+# Ctrl-C; a polite kill; a closed terminal; Ctrl-Break on Windows. Where there is such a signal.
+_NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")
+_PATIENCE = 2.0  # s after the first signal in which the outputs must have been zeroed
+
+
+class Stopping:
+    """Turns signals into exceptions while a run is on. Use as a context manager.
+
+    The first signal raises KeyboardInterrupt or ``Terminated``. From then on, and from ``shield``
+    on, nothing is raised, so that zeroing the outputs is never cut short, but in ``breakable``: a
+    second Ctrl-C ends what hangs there. A process that still does not get on is ended by the next
+    signal, and the device's watchdog zeroes the outputs. What came behind the shield without an
+    effect is raised at the end. Signals that the process ignores, as under nohup, stay ignored.
+    """
+
+    def __init__(self) -> None:
+        self._before: list[tuple[int, Any]] = []
+        self._first = 0.0  # when the first signal came
+        self._pending: BaseException | None = None
+        self._shielded = self._breakable = False
+
+    def __enter__(self) -> Stopping:
+        if threading.current_thread() is threading.main_thread():
+            numbers = [getattr(signal, name) for name in _NAMES if hasattr(signal, name)]
+            heard = [n for n in numbers if signal.getsignal(n) is not signal.SIG_IGN]
+            self._before = [(number, signal.signal(number, self._handle)) for number in heard]
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        for number, handler in self._before:
+            signal.signal(number, handler)
+        if error is None and self._pending is not None:
+            raise self._pending
+
+    def shield(self) -> None:
+        """From now on no signal raises."""
+        self._shielded = True
+
+    @contextlib.contextmanager
+    def breakable(self) -> Iterator[None]:
+        """Behind the shield, a passage that a signal may end all the same."""
+        self._breakable = True
+        try:
+            yield
+        finally:
+            self._breakable = False
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        now = time.monotonic()
+        error = _as_error(number)
+        if not self._shielded or self._breakable:
+            self._first = self._first or now
+            self._shielded, self._breakable = True, False
+            raise error
+        if self._first and now - self._first > _PATIENCE:
+            os.write(2, b"rig: the clean-up hangs; ended without it\n")
+            os._exit(1)
+        self._first = self._first or now
+        self._pending = error
+
+
+def _as_error(number: int) -> BaseException:
+    if number == signal.SIGINT:
+        return KeyboardInterrupt()
+    return Terminated(signal.Signals(number).name)
