@@ -52,7 +52,8 @@ class Plan:
     n_samples: of the run; of a closed loop the most. lowest, highest: (2,), commands [V] of motor
     and brake; of a closed loop what its controller confines itself to. commands: (n_samples, 2)
     [V], None in closed loop. references: what a controller will ask for, by column name,
-    (n_samples,) each. remarks: what else a user should know beforehand, a line each.
+    (n_samples,) each. remarks: what else a user should know beforehand, a line each. steady: the
+    samples between a rise from zero and a fall to it, of which spectra are stated.
     """
 
     n_samples: int
@@ -61,6 +62,7 @@ class Plan:
     commands: FloatArray | None = None
     references: Mapping[str, FloatArray] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
+    steady: slice = field(default_factory=lambda: slice(None))
 
 
 class Experiment(Section, abc.ABC):

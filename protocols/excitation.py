@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 import math
+from dataclasses import replace
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -11,7 +12,7 @@ from pydantic import Field
 
 from daq.config.base import Section
 from daq.config.units import Seconds, Volts
-from daq.experiment import OpenLoop
+from daq.experiment import OpenLoop, Plan
 from daq.hal import CHANNELS, FloatArray
 
 
@@ -56,9 +57,14 @@ class Excitation(OpenLoop, Generic[Channel]):
         that nothing jumps where they meet. Raises ValueError, naming the key.
         """
 
+    def plan(self) -> Plan:
+        """The commands, their peaks, and where the ramps end."""
+        lead = self._ramp_samples
+        return replace(super().plan(), steady=slice(lead, lead + self.excited_samples()))
+
     def waveform(self) -> FloatArray:
         """Both channels with their ramps, (n_samples, 2) [V]."""
-        excited, lead = self.excited_samples(), round(self.ramp * self.sample_rate)
+        excited, lead = self.excited_samples(), self._ramp_samples
         self.samples_in((excited + 2 * lead) / self.sample_rate, "ramp")
         time = np.arange(-lead, excited + lead) / self.sample_rate
         rise = smooth_rise(lead)
@@ -71,6 +77,10 @@ class Excitation(OpenLoop, Generic[Channel]):
                 commands += self.deviation(name, channel, time)
             columns.append(window * commands)
         return np.stack(columns, axis=1)
+
+    @property
+    def _ramp_samples(self) -> int:
+        return round(self.ramp * self.sample_rate)
 
     def frequency_of(self, key: str, frequency: float | None) -> float:
         """A frequency [Hz] that the sample rate can show.

@@ -152,17 +152,23 @@ def run(
     run_command(experiment, rig, port, out, identify, model, config, realtime, json)
 
 
-@app.command(epilog="Example:  rig check prbs.yaml --rig my_rig.yaml")
+@app.command(epilog="Example:  rig check prbs.yaml --plot check.png")
 def check(
     experiment: ExperimentName,
     rig: RigName = "simulated.yaml",
     port: PortName = None,
+    plot: Annotated[
+        Path | None,
+        typer.Option(
+            "--plot", metavar="FILE.png|pdf|svg", help="Draw waveforms and spectra there."
+        ),
+    ] = None,
     json: AsJson = False,
 ) -> None:
-    """Validate an experiment against a rig's limits, without energising anything."""
-    from daq.cli.running import check_command
+    """Check an experiment against a rig's limits and say what it will do; energises nothing."""
+    from daq.cli.checking import check_command
 
-    check_command(experiment, rig, port, json)
+    check_command(experiment, rig, port, plot, json)
 
 
 @app.command(epilog="Example:  rig analyse runs/20260101T120000Z-constant_velocity")

@@ -1,0 +1,167 @@
+"""What ``rig check`` states and draws, against what NumPy and SciPy say of the commands."""
+
+import json
+import os
+import pty
+import subprocess
+
+import numpy as np
+import pytest
+import yaml
+from scipy.signal import periodogram
+
+from daq.cli.checking import spectral_lines
+from daq.cli.files import load_experiment
+from daq.config.rig import RigConfig
+from tests.daq.support import RIG, environment, forked_rig, write_experiment
+
+LOOP = '''
+import numpy as np
+from daq.experiment import Answer, ClosedLoop, Plan
+
+
+class Loop(ClosedLoop):
+    """Follows a speed."""
+
+    columns = {"omega_ref": "rad/s"}
+    known: bool = True
+
+    def plan(self):
+        reference = {"omega_ref": 3.0 * np.sin(0.1 * np.arange(80))} if self.known else {}
+        return Plan(80, np.array([-2.0, 0.0]), np.array([2.0, 0.1]), references=reference,
+                    remarks=("follows a sine",))
+
+    def controller(self):
+        raise NotImplementedError
+'''
+
+
+@pytest.fixture(scope="module")
+def command():
+    with forked_rig() as run:
+        yield run
+
+
+@pytest.fixture
+def loop(tmp_path):
+    (tmp_path / "loop.py").write_text(LOOP)
+
+    def write(**changes):
+        content = {"protocol": "loop.py:Loop"} | changes
+        (tmp_path / "loop.yaml").write_text(yaml.safe_dump(content))
+        return tmp_path
+
+    return write
+
+
+def test_the_stated_numbers_are_those_of_the_commands(command, tmp_path):
+    write_experiment(tmp_path / "e.yaml", duration=2, brake={"amplitude": 0.0})
+    stated = json.loads(command(["check", "e.yaml", "--json"], tmp_path).stdout)
+    assert stated["samples"] == 1600 and stated["duration_seconds"] == 2.0
+    assert stated["resolution_hz"] == 0.5
+    motor = stated["channels"]["motor"]
+    column = load_experiment(str(tmp_path / "e.yaml")).plan(RigConfig()).commands[:, 0]
+    assert motor["lowest_volts"] == column.min() and motor["highest_volts"] == column.max()
+    assert motor["mean_volts"] == pytest.approx(column.mean())
+    assert motor["rms_volts"] == pytest.approx(np.sqrt(np.mean((column - column.mean()) ** 2)))
+    peak = np.max(np.abs(column - column.mean()))
+    assert motor["crest_factor"] == pytest.approx(peak / motor["rms_volts"])
+    frequency, density = periodogram(column, 800.0)
+    low, high = motor["power_band_hz"]
+    total = density.sum()
+    assert 0.9 <= density[(frequency >= low) & (frequency <= high)].sum() / total < 0.95
+    assert density[frequency < low].sum() / total < 0.05
+    assert density[frequency > high].sum() / total <= 0.05
+    brake = stated["channels"]["brake"]
+    assert brake["rms_volts"] == 0.0 and brake["changes"] == 0
+    assert brake["crest_factor"] is None and brake["power_band_hz"] is None
+
+
+def test_a_multisine_is_stated_without_its_ramps(command, tmp_path):
+    stated = json.loads(command(["check", "multisine.yaml", "--json"], tmp_path).stdout)
+    motor = stated["channels"]["motor"]
+    assert stated["resolution_hz"] == 0.5
+    assert f"crest factor {motor['crest_factor']:.3f}" in stated["remarks"][1]
+    assert motor["power_band_hz"][0] >= 1.0 and motor["power_band_hz"][1] <= 99.0
+
+
+@pytest.mark.parametrize("n", [400, 401])
+def test_spectral_lines_are_the_amplitudes_of_cosines(n):
+    time = np.arange(n) / 400
+    column = 0.3 + 0.5 * np.cos(2 * np.pi * 40 / n * 400 * time + 1.0)
+    column += 0.2 * np.cos(2 * np.pi * 7 / n * 400 * time)
+    frequency, sizes = spectral_lines(column, 400.0)
+    expected = np.zeros(n // 2)
+    expected[[39, 6]] = 0.5, 0.2
+    np.testing.assert_allclose(sizes, expected, atol=1e-12)
+    np.testing.assert_allclose(frequency, np.arange(1, n // 2 + 1) * 400 / n)
+    assert not spectral_lines(np.full(n, 0.1), 400.0)[1].any()
+
+
+def test_the_highest_line_of_an_even_length_is_not_doubled():
+    _, sizes = spectral_lines(np.tile([1.0, -1.0], 50), 400.0)
+    assert sizes[-1] == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("kind", ["png", "pdf", "svg"])
+def test_the_plot_is_written_where_it_was_asked_for_and_nothing_else_is(command, tmp_path, kind):
+    result = command(["check", "steps.yaml", "--plot", f"check.{kind}"], tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert f"Figure: check.{kind}" in result.stdout
+    assert [path.name for path in tmp_path.iterdir()] == [f"check.{kind}"]
+    start = {"png": b"\x89PNG", "pdf": b"%PDF", "svg": b"<?xml"}[kind]
+    content = (tmp_path / f"check.{kind}").read_bytes()
+    assert content.startswith(start) and len(content) > 5000
+
+
+def test_a_closed_loop_states_its_range_and_draws_its_references(command, loop):
+    folder = loop()
+    result = command(["check", "loop.yaml", "--plot", "loop.png"], folder)
+    assert result.returncode == 0, result.stderr
+    assert "up to 80 samples at 800 Hz, up to 0.1 s" in result.stdout
+    assert "omega_ref" in result.stdout and "rad/s" in result.stdout
+    assert "follows a sine" in result.stdout and "crest" not in result.stdout
+    assert (folder / "loop.png").stat().st_size > 5000
+    stated = json.loads(command(["check", "loop.yaml", "--json"], folder).stdout)
+    assert stated["channels"]["motor"]["highest_volts"] == 2.0
+    assert stated["references"]["omega_ref"] == pytest.approx([-3.0, 3.0], rel=1e-2)
+
+
+@pytest.mark.parametrize(
+    ("plot", "known", "message"),
+    [
+        ("c.jpg", True, "c.jpg: figures are written as"),
+        ("absent/c.png", True, "absent/c.png: cannot be written"),
+        ("c.png", False, "--plot c.png: loop.py:Loop says nothing beforehand"),
+    ],
+)
+def test_a_plot_that_cannot_be_is_refused(command, loop, plot, known, message):
+    folder = loop(known=known)
+    before = sorted(folder.iterdir())
+    result = command(["check", "loop.yaml", "--plot", plot], folder)
+    assert result.returncode == 2 and "Traceback" not in result.stderr
+    said = result.stderr.replace(f"{folder}/", "").replace(str(folder.resolve()) + "/", "")
+    assert message in said
+    assert sorted(folder.iterdir()) == before
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "cp1252"])
+def test_a_terminal_of_80_columns_shows_everything_and_a_sketch(tmp_path, encoding):
+    master, slave = pty.openpty()
+    process = subprocess.Popen(
+        [*RIG, "check", "multisine.yaml"], cwd=tmp_path, stdout=slave, stderr=slave,
+        env=environment(COLUMNS="80", PYTHONIOENCODING=encoding),
+    )  # fmt: skip
+    os.close(slave)
+    shown = b""
+    try:
+        while part := os.read(master, 65536):
+            shown += part
+    except OSError:
+        pass  # the terminal's other end is closed
+    finally:
+        os.close(master)
+    assert process.wait(30) == 0
+    text = shown.decode(encoding)
+    assert "…" not in text and "crest factor" in text
+    assert ("█" in text) == (encoding == "utf-8")
