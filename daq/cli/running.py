@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from daq.cli import console, punctuality
 from daq.cli.analysing import analyse, as_document, next_command, show_findings
