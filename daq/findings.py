@@ -25,13 +25,14 @@ class Number:
 class Table:
     """Columns of equal length under names with units, written as a CSV of that name.
 
-    columns: name -> (n,). units: of those that have one.
+    columns: name -> (n,). units: of those that have one. printed: whether a terminal shows it.
     """
 
     name: str
     title: str
     columns: Mapping[str, FloatArray]
     units: Mapping[str, str]
+    printed: bool = True
 
 
 @dataclass(frozen=True)

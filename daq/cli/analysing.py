@@ -108,7 +108,7 @@ def show_findings(found: Findings, folder: Path) -> None:
             [_number_row(number) for number in found.numbers],
             text=["unit", "meaning"],
         )
-    for table in found.tables:
+    for table in filter(lambda table: table.printed, found.tables):
         heads = [_with_unit(name, table) for name in table.columns]
         rows = zip(*(values.tolist() for values in table.columns.values()), strict=True)
         console.print_table(table.title, heads, [[console.number(v) for v in row] for row in rows])

@@ -235,7 +235,7 @@ CASES = [
     rig_file("a sign of two", "{scale: 0.706}", "{scale: 0.706, sign: 2}",
              "rig.yaml:6:26: sensors.torque.sign: it must be -1 or 1, found 2"),
     Case("missing rig", ["run", "e.yaml", "--rig", "absent.yaml"],
-         ["absent.yaml: there is no such file; check its name, or use a shipped one: serial"]),
+         ["absent.yaml: there is no such file; check its name, or use a shipped one: free_shaft"]),
     # --- identification
     settings("misspelt setting", "populaton: 20\n",
              "id.yaml:1:1: populaton: unknown key; did you mean 'population'?"),

@@ -1,0 +1,169 @@
+"""A shaft driven through a staircase of velocities, each held once it has settled."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+
+from pydantic import Field
+
+from daq.config.base import Section
+from daq.config.units import Hertz, Percent, RadiansPerSecond, Seconds
+from daq.errors import RunError
+from daq.experiment import Answer, Sample
+from protocols.pid import Pid, Ramp, SpeedTracker, VelocityGains
+
+COLUMNS = {"omega_ref": "rad/s", "omega_tracked": "rad/s", "plateau": "1", "settled": "1"}
+"""What ``Staircase`` logs: reference, speed from the angle, number of the plateau from 0 (-1
+behind the last), and 1 while the settled velocity is being measured."""
+
+
+class SettlingTest(Section):
+    """When a velocity counts as settled: so long within a band around its reference."""
+
+    tolerance: Percent = Field(3.0, ge=0.0, le=50.0, description="half the band, of the reference")
+    least: RadiansPerSecond = Field(0.3, gt=0.0, le=100.0, description="half the band at least")
+    time: Seconds = Field(0.5, ge=0.0, le=60.0, description="time within the band before it counts")
+    timeout: Seconds = Field(
+        4.0, gt=0.0, le=600.0,
+        description="time at a velocity beyond what is measured, after which it is given up",
+    )  # fmt: skip
+
+    def band(self, velocity: float) -> float:
+        """How far from its reference a settled velocity may be [rad/s]."""
+        return max(self.least, self.tolerance / 100.0 * abs(velocity))
+
+
+# How much faster a shaft may turn that the motor brakes with all its might.
+_RUNAWAY = 10.0  # rad/s
+
+# A brake let go at once would let the shaft leap.
+_BRAKE_SLOPE = 0.5  # V/s
+
+
+@dataclass(frozen=True)
+class Plateau:
+    """One step of the staircase: velocity [rad/s], brake command [V], time to measure it [s]."""
+
+    velocity: float
+    brake: float
+    measure: float
+
+
+@dataclass(frozen=True)
+class Drive:
+    """How the velocities are reached: the loop and what bounds it.
+
+    slope: of the reference [rad/s^2]. limit: largest motor command, either way [V]. fastest:
+    speed beyond which the run is ended [rad/s]. bandwidth: of the speed that the loop sees.
+    """
+
+    gains: VelocityGains
+    slope: float
+    limit: float
+    fastest: float
+    bandwidth: Hertz
+
+
+class Staircase:
+    """Controller of the motor that visits plateaus in order, and ends at rest.
+
+    A plateau begins with a ramp to its velocity. Once the tracked speed has been in its band
+    for the settling time, it is measured; a departure from the band starts that anew. What has
+    not been measured whole by its timeout is left unsettled.
+    """
+
+    def __init__(self, plateaus: tuple[Plateau, ...], drive: Drive, settling: SettlingTest) -> None:
+        self._plateaus, self._settling = plateaus, settling
+        self._fastest, self._limit = drive.fastest, drive.limit
+        self._tracker = SpeedTracker(drive.bandwidth)
+        self._ramp = Ramp(drive.slope)
+        self._brake_ramp = Ramp(_BRAKE_SLOPE)
+        self._pid = Pid(drive.gains, -drive.limit, drive.limit)
+        self._time = 0.0
+        self._braked_from = math.inf
+        self._velocity = self._brake = self._measure = self._band = 0.0
+        self._inside, self._arrived = math.inf, 0.0
+        self._index = -1
+        self._next(0.0)
+
+    def answer(self, sample: Sample) -> Answer | None:
+        """Commands that drive the shaft to the plateau's velocity."""
+        now = sample.time
+        speed = self._tracker.update(now, sample.theta)
+        reference = self._ramp.towards(self._velocity, now - self._time)
+        brake = self._brake_ramp.towards(self._brake, now - self._time)
+        self._time = now
+        settled = self._is_settled(now, reference, speed)
+        logged = (reference, speed, float(self._index), float(settled))
+        volts = self._pid.output(now, reference, speed)
+        self._check(volts, speed)
+        if self._over(now, reference, speed):
+            return None
+        return Answer(volts, brake, logged)
+
+    def _check(self, volts: float, speed: float) -> None:
+        """RunError for a shaft that is too fast, or gains speed against the motor."""
+        if abs(speed) > self._fastest:
+            raise RunError(
+                f"the shaft turns at {speed:.4g} rad/s, beyond {self._fastest:.4g} rad/s, while "
+                f"{self._ramp.value:.4g} rad/s were asked for; lower the gains under 'loop' if it "
+                "rings, and look what drives the shaft if not"
+            )
+        if volts * speed >= 0.0 or abs(volts) < self._limit:
+            self._braked_from = math.inf
+            return
+        self._braked_from = min(self._braked_from, abs(speed))
+        if abs(speed) > self._braked_from + _RUNAWAY:
+            raise RunError(
+                f"the shaft gains speed, now {speed:.4g} rad/s, against a motor command of "
+                f"{volts:.3g} V: a positive command must turn it forwards. Turn "
+                "sensors.encoder.sign round in the rig's file, or the motor's leads"
+            )
+
+    def _is_settled(self, now: float, reference: float, speed: float) -> bool:
+        """Whether the sample is one of those that count."""
+        underway = reference != self._velocity or self._brake_ramp.value != self._brake
+        if underway:
+            self._arrived = now
+        if underway or abs(speed - reference) > self._band:
+            self._inside = math.inf
+            return False
+        self._inside = min(self._inside, now)
+        return self._index >= 0 and now - self._inside >= self._settling.time
+
+    def _over(self, now: float, reference: float, speed: float) -> bool:
+        """Whether the run is over; goes on to the next plateau once this one is done with."""
+        if self._index < 0:
+            stopped = now - self._inside >= self._settling.time
+            return stopped or now - self._arrived > self._settling.timeout
+        measured = now - self._inside >= self._settling.time + self._measure
+        if measured or now - self._arrived > self._settling.timeout + self._measure:
+            self._next(now)
+        return False
+
+    def _next(self, now: float) -> None:
+        """To the next plateau; behind the last to rest."""
+        self._index += 1
+        if self._index == len(self._plateaus):
+            self._index = -1
+            step = Plateau(0.0, self._brake, 0.0)
+        else:
+            step = self._plateaus[self._index]
+        self._velocity, self._brake, self._measure = step.velocity, step.brake, step.measure
+        self._band = self._settling.band(step.velocity)
+        self._inside, self._arrived = math.inf, now
+
+
+def longest(plateaus: tuple[Plateau, ...], drive: Drive, settling: SettlingTest) -> float:
+    """The longest that a staircase can take [s]."""
+    velocities = [0.0, *(step.velocity for step in plateaus), 0.0]
+    ramps = sum(abs(b - a) for a, b in itertools.pairwise(velocities)) / drive.slope
+    brakes = sum(abs(b.brake - a.brake) for a, b in itertools.pairwise(plateaus)) / _BRAKE_SLOPE
+    return (
+        ramps
+        + brakes
+        + sum(step.measure + settling.timeout for step in plateaus)
+        + settling.timeout
+    )
