@@ -6,9 +6,10 @@ import math
 from typing import Any
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from daq.config.base import Section
+from daq.config.units import Quantity, converted
 from sim_rig.actuator import actuator
 from sim_rig.electrical import MAX_CURRENT, SUPPLY
 from sim_rig.options import (
@@ -51,9 +52,23 @@ class Plant(Section):
     load: PlantLoad = "pulley"
     sensor: Sensor = "load"
     parameter_set: ParameterSet = "rig"
-    parameters: dict[str, float] = Field(
+    parameters: dict[str, Quantity] = Field(
         default_factory=dict, description="values that differ from the set, by name"
     )
+
+    @field_validator("parameters", mode="before")
+    @classmethod
+    def _in_own_units(cls, values: Any, info: ValidationInfo) -> Any:
+        """Numbers of the parameters' units for what is written with a unit."""
+        if not isinstance(values, dict) or not any(isinstance(v, str) for v in values.values()):
+            return values
+        if len(info.data) < len(cls.model_fields) - 1:
+            return values  # without its parts there is no plant that could tell
+        units = {p.name: p.unit for p in cls(**info.data).build().parameters}
+        return {
+            name: converted(value, units[name]) if name in units else value
+            for name, value in values.items()
+        }
 
     @model_validator(mode="after")
     def _can_be_built(self) -> Plant:

@@ -12,10 +12,11 @@ from typing import Any
 from daq.cli import console, datasets, datasheets
 from daq.cli.datasets import Mapping
 from daq.cli.modelling import DEFAULT_MODEL, find_model, whole_name
+from daq.cli.quantities import in_model_units
 from daq.cli.resuming import Asked
 from daq.config import checking, yaml_file
 from daq.config.identification import IdentificationConfig, Signals
-from daq.config.yaml_file import CommandLine, YamlFile, suggestion
+from daq.config.yaml_file import CommandLine, Mistake, YamlFile, suggestion
 from daq.errors import ConfigError
 from sysid import ModelError, SearchSpace
 from sysid.model import ProcessModel
@@ -60,8 +61,9 @@ def prepare_models(
     """
     given = {key: value for key, value in options.items() if value is not None}
     file = CommandLine.of(given, more, yaml_file.load(config) if config is not None else None)
-    settings = checking.validate(file, IdentificationConfig)
-    found = [_find(config, file, settings, name) for name in names]
+    found = _find_all(config, file, names)
+    file, wrong = in_model_units(file, [model for model, _ in found])
+    settings = checking.validate(file, IdentificationConfig, others=wrong)
     for model, name in found:
         console.report_detail(f"model {name}: {model.description}")
     models = [_with_outputs(file, settings, model) for model, _ in found]
@@ -118,19 +120,34 @@ def gassi_settings(settings: IdentificationConfig) -> dict[str, Any]:
     }
 
 
-def _find(
-    config: Path | None, file: CommandLine, settings: IdentificationConfig, typed: str | None
-) -> tuple[ProcessModel, str]:
+def _find_all(
+    config: Path | None, file: CommandLine, names: Sequence[str | None]
+) -> list[tuple[ProcessModel, str]]:
+    """Models and their whole names; when one is not found, the file's other mistakes as well."""
+    try:
+        return [_find(config, file, name) for name in names]
+    except ConfigError as error:
+        if str(error).startswith(file.named(("model",))):
+            checking.validate(
+                file, IdentificationConfig, others=[Mistake(file.place(("model",)), str(error))]
+            )
+        raise
+
+
+def _find(config: Path | None, file: CommandLine, typed: str | None) -> tuple[ProcessModel, str]:
     """A model and its whole name, from the command line or else the configuration."""
+    given = file.content.get("model")
+    if given is not None and not isinstance(given, str):
+        checking.validate(file, IdentificationConfig)
     # A name on the command line is relative to where it is typed, one in a file to that file.
     if typed is None and "model" in file.typed:
-        typed = settings.model
+        typed = given
     beside = config.parent if config is not None and typed is None else None
-    name = typed or settings.model or DEFAULT_MODEL
+    name = typed or given or DEFAULT_MODEL
     try:
         return find_model(name, beside), whole_name(name, beside)
     except ConfigError as error:
-        if beside is None or settings.model is None:
+        if beside is None or given is None:
             raise
         raise file.error(("model",), str(error)) from None
 

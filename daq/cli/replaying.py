@@ -15,6 +15,7 @@ from daq.cli.datasets import Mapping
 from daq.cli.files import DEFAULT_RIG, load_rig
 from daq.cli.modelling import DEFAULT_MODEL, find_model
 from daq.cli.preparing import as_told
+from daq.cli.quantities import in_model_units
 from daq.cli.reporting import print_metrics
 from daq.config import checking, yaml_file
 from daq.config.identification import IdentificationConfig, Signals
@@ -251,7 +252,8 @@ def _mapping(config: Path | None, model: ProcessModel) -> Mapping | None:
     if config is None:
         return None
     file = yaml_file.load(config)
-    settings = checking.validate(file, IdentificationConfig)
+    file, wrong = in_model_units(file, [model])
+    settings = checking.validate(file, IdentificationConfig, others=wrong)
     if settings.columns is None:
         return None
     name = find_model(settings.model or DEFAULT_MODEL, config.parent).name

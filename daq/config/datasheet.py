@@ -2,22 +2,45 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from pydantic import Field, model_validator
 
 from daq.config.base import Section
 from daq.config.identification import Range
-from daq.config.units import Percent
+from daq.config.units import Percent, Quantity, factor, split
 
 
 class DatasheetEntry(Section):
     """One parameter: a value and how exact it is, or a range, and who says so."""
 
-    value: float | None = Field(None, description="nominal value")
+    value: Quantity | None = Field(None, description="nominal value")
     tolerance: Percent | None = Field(None, gt=0.0, description="either side of the value")
     range: Range | None = Field(None, description="in place of value and tolerance")
     fixed: bool = Field(False, description="the value is exact enough not to be searched")
     unit: str | None = Field(None, min_length=1, description="of the numbers; default the model's")
     source: str = Field("", description="which data sheet, for the table of results")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_own_unit(cls, given: Any) -> Any:
+        """Value or range written with a unit, as the number and a unit."""
+        if not isinstance(given, dict) or given.get("unit") is not None:
+            return given
+        value, ends = split(given.get("value")), given.get("range")
+        if value is not None:
+            return {**given, "value": value[0], "unit": value[1]}
+        if not isinstance(ends, list):
+            return given
+        found = [split(end) for end in ends]
+        unit = next((end[1] for end in found if end is not None), None)
+        if unit is None:
+            return given
+        same = [
+            plain if end is None else end[0] * factor(end[1], unit)
+            for plain, end in zip(ends, found, strict=True)
+        ]
+        return {**given, "range": same, "unit": unit}
 
     @model_validator(mode="after")
     def _complete(self) -> DatasheetEntry:

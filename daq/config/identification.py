@@ -15,7 +15,7 @@ from pydantic import (
 )
 
 from daq.config.base import Section
-from daq.config.units import Hertz, Part, Percent
+from daq.config.units import QUANTITY_SCHEMA, Hertz, Part, Percent, Quantity, split
 
 
 def _ordered(ends: tuple[float | None, float | None]) -> tuple[float | None, float | None]:
@@ -27,7 +27,7 @@ def _ordered(ends: tuple[float | None, float | None]) -> tuple[float | None, flo
     return ends
 
 
-Range = Annotated[tuple[float | None, float | None], AfterValidator(_ordered)]
+Range = Annotated[tuple[Quantity | None, Quantity | None], AfterValidator(_ordered)]
 
 
 def _start(value: Any) -> Any:
@@ -47,8 +47,8 @@ def _is_number(value: Any) -> bool:
 _START_SCHEMA = {
     "anyOf": [
         {"enum": ["first", "estimate"]},
-        {"type": "number"},
-        {"type": "array", "items": {"type": ["number", "null"]}, "minItems": 2, "maxItems": 2},
+        QUANTITY_SCHEMA,
+        {"type": "array", "items": QUANTITY_SCHEMA, "minItems": 2, "maxItems": 2},
     ]
 }
 StartSetting = Annotated[Any, BeforeValidator(_start), WithJsonSchema(_START_SCHEMA)]
@@ -89,9 +89,17 @@ class Column(Section):
     model_config = ConfigDict(json_schema_extra=_one_of("column", "constant"))
 
     column: str | None = Field(None, min_length=1, description="name in the CSV's header")
-    constant: float | None = Field(None, description="value in place of a column")
+    constant: Quantity | None = Field(None, description="value in place of a column")
     unit: str | None = Field(None, description="unit of the numbers; default the model's")
     sign: Literal[-1, 1] = Field(1, description="-1 turns the direction round")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _constant_with_unit(cls, given: Any) -> Any:
+        quantity = split(given.get("constant")) if isinstance(given, dict) else None
+        if quantity is None or given.get("unit") is not None:
+            return given
+        return {**given, "constant": quantity[0], "unit": quantity[1]}
 
     @model_validator(mode="after")
     def _one_source(self) -> Column:
@@ -151,12 +159,12 @@ class IdentificationConfig(Signals):
     )
     ranges: dict[str, Range] = Field(
         default_factory=dict,
-        description="search ranges in place of the model's, in its units",
-        examples=[{"K_m": [0.1, 0.2]}],
+        description="search ranges in place of the model's, in its units or with their own",
+        examples=[{"K_m": [0.1, 0.2], "L_m": ["0.2 mH", "3 mH"]}],
     )
-    fixed: dict[str, float] = Field(
+    fixed: dict[str, Quantity] = Field(
         default_factory=dict,
-        description="parameters not searched, in the model's units",
+        description="parameters not searched, in the model's units or with their own",
         examples=[{"R_m": 1.18}],
     )
     tied: dict[str, str] = Field(

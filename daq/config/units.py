@@ -5,7 +5,8 @@
     levels: list[RadiansPerSecond] = Field(min_length=1, description="speeds to visit")
 
 In YAML ``0.5``, ``0.5 V`` and ``500 mV`` are then the same. The unit stands in the reference and
-in the JSON Schema, so a description does not repeat it.
+in the JSON Schema, so a description does not repeat it. A number whose unit only a model or
+another key can tell is a ``Quantity``, as ``converted`` or ``split`` makes it a number.
 """
 
 from __future__ import annotations
@@ -26,6 +27,13 @@ _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _QUANTITY = re.compile(rf"\s*((?>{_NUMBER}))\s*([^\s\d.,].*?)\s*")
 
 
+# Bounds in a JSON Schema hold for numbers only, and patterns for text only.
+QUANTITY_SCHEMA: JsonSchemaValue = {
+    "type": ["number", "string"],
+    "pattern": rf"^\s*{_NUMBER}\s*[^\s\d.,].*$",
+}
+
+
 @dataclass(frozen=True)
 class Unit:
     """Marks a number of a configuration model as being in this unit, ``1`` for a plain part.
@@ -37,10 +45,8 @@ class Unit:
 
     def number(self, value: Any) -> Any:
         """The number that a text with a unit stands for; anything else as it is."""
-        if not isinstance(value, str) or not (quantity := _QUANTITY.fullmatch(value)):
-            return value
         try:
-            return float(quantity[1]) * factor(quantity[2], self.symbol)
+            return converted(value, self.symbol)
         except ValueError as error:
             raise PydanticCustomError("unit", "{problem}", {"problem": str(error)}) from None
 
@@ -50,9 +56,16 @@ class Unit:
     def __get_pydantic_json_schema__(
         self, schema: CoreSchema, handler: GetJsonSchemaHandler
     ) -> JsonSchemaValue:
-        # Bounds in a JSON Schema hold for numbers only, and patterns for text only.
-        quantity = {"type": ["number", "string"], "pattern": rf"^\s*{_NUMBER}\s*[^\s\d.,].*$"}
-        return {**handler(schema), **quantity, "unit": self.symbol}
+        return {**handler(schema), **QUANTITY_SCHEMA, "unit": self.symbol}
+
+
+class _UnitElsewhere:
+    """Marks a number that a schema takes with its unit, and that is one when it is checked."""
+
+    def __get_pydantic_json_schema__(
+        self, schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> JsonSchemaValue:
+        return {**handler(schema), **QUANTITY_SCHEMA}
 
 
 Volts = Annotated[float, Unit("V")]
@@ -65,11 +78,27 @@ NewtonMetres = Annotated[float, Unit("N*m")]
 Turns = Annotated[float, Unit("turn")]
 Percent = Annotated[float, Unit("%")]
 Part = Annotated[float, Unit("1")]
+Quantity = Annotated[float, _UnitElsewhere()]
 
 
 def unit_of(field: FieldInfo) -> str | None:
     """The unit of a field's numbers, wherever in its type it stands; None without one."""
     return _unit_in(field.metadata) or _unit_of_type(field.annotation)
+
+
+def converted(value: Any, unit: str) -> Any:
+    """The number of units that a text such as ``5 ms`` stands for; anything else as it is.
+
+    Raises ValueError for a unit that does not convert.
+    """
+    found = split(value)
+    return value if found is None else found[0] * factor(found[1], unit)
+
+
+def split(value: Any) -> tuple[float, str] | None:
+    """Number and unit of a text such as ``5 ms``; None for anything else."""
+    found = _QUANTITY.fullmatch(value) if isinstance(value, str) else None
+    return None if found is None else (float(found[1]), found[2])
 
 
 def factor(given: str, wanted: str) -> float:

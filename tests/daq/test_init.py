@@ -1,12 +1,17 @@
 """``rig init``: files to begin with that work as they are, and never over somebody's own."""
 
 import json
+from pathlib import Path
 
 import jsonschema
 import pytest
 import yaml
 
+from daq.cli.modelling import find_model
+from daq.cli.quantities import in_model_units
 from daq.cli.starting import settings_text
+from daq.config.identification import IdentificationConfig
+from daq.config.yaml_file import YamlFile
 from tests.daq.support import rig
 
 
@@ -54,10 +59,10 @@ def test_what_cannot_be_written_is_refused(tmp_path, args, said):
 
 
 def test_every_setting_that_stands_as_a_comment_is_one():
-    from daq.config.identification import IdentificationConfig
-
     lines = settings_text().splitlines()
     shown = [line.lstrip("#") for line in lines if line[:1] not in {"", "#"} or line[1:2].strip()]
     content = yaml.safe_load("\n".join(shown))
     assert set(content) == set(IdentificationConfig.model_fields)
-    IdentificationConfig.model_validate(content)
+    file, wrong = in_model_units(YamlFile(Path(), content, {}), [find_model("actuator")])
+    assert not wrong
+    IdentificationConfig.model_validate(file.content)

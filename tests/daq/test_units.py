@@ -8,8 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import Field, ValidationError
 
+from daq.cli.preparing import prepare
 from daq.config.base import Section
+from daq.config.identification import Column
 from daq.config.units import Hertz, Part, RadiansPerSecond, Unit, Volts, factor, unit_of
+from sim_rig.plant import Plant
 
 
 class Example(Section):
@@ -84,3 +87,38 @@ def test_factors_are_those_of_the_si():
     assert factor("mN*m", "N*m") == pytest.approx(1e-3)
     assert factor("1/min", "Hz") == pytest.approx(1 / 60)
     assert factor("V", "V") == 1.0
+
+
+def test_numbers_of_a_model_are_taken_in_its_units(tmp_path):
+    config = tmp_path / "id.yaml"
+    config.write_text(
+        "ranges: {L_m: [0.2 mH, 3 mH], K_m: [100 mN*m/A, 0.2], R_b: [null, 0.1 kohm]}\n"
+        "initial: {omega: 60 rpm}\n"
+        "datasheet: sheet.yaml\n"
+    )
+    (tmp_path / "sheet.yaml").write_text(
+        "R_m: {value: 1180 mohm, fixed: true}\nL_b: {range: [100 mH, 0.2 H]}\n"
+        "alpha0: {value: 10 mN*m, tolerance: 20 %}\n"
+    )
+    prepared = prepare(config, {}, ["fixed.K_dm=0.1 kV/A"])
+    settings = prepared.settings
+    assert settings.ranges == {
+        "L_m": pytest.approx((2e-4, 3e-3)),
+        "K_m": pytest.approx((0.1, 0.2)),
+        "R_b": (None, pytest.approx(100.0)),
+        "L_b": pytest.approx((0.1, 0.2)),
+        "alpha0": pytest.approx((0.008, 0.012)),
+    }
+    assert settings.fixed == {"K_dm": pytest.approx(100.0), "R_m": pytest.approx(1.18)}
+    states = {state.name: state for state in prepared.model.states}
+    assert states["omega"].initial == pytest.approx(2 * np.pi)
+
+
+def test_the_plants_parameters_are_taken_in_its_units():
+    plant = Plant.model_validate({"load": "free", "parameters": {"L_m": "2 mH", "R_m": 1.0}})
+    assert plant.parameters == {"L_m": pytest.approx(2e-3), "R_m": 1.0}
+
+
+def test_a_constant_column_may_have_its_unit_with_it():
+    column = Column.model_validate({"constant": "3 mm"})
+    assert (column.constant, column.unit) == (3.0, "mm")
