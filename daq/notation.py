@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import html as _html
+import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -81,17 +82,40 @@ def bracketed(unit: str) -> str:
     return f"[{text or 1}]"
 
 
+def number(value: float, digits: int = 4) -> str:
+    """A number with so many significant digits, exponents in steps of three."""
+    if not math.isfinite(value):
+        return "-"
+    if value == 0.0:
+        return "0"
+    exponent = math.floor(math.log10(abs(value)))
+    if -3 <= exponent < 5:
+        return f"{value:.{max(digits - 1 - exponent, 0)}f}"
+    mantissa, power = f"{value:.{digits - 1}e}".split("e")
+    return f"{mantissa}e{int(power)}"
+
+
+def digits(value: float, deviation: float | None) -> int:
+    """As many significant digits as an uncertainty supports; few where there is no telling."""
+    if deviation is None:
+        return 2
+    if deviation <= 0.0 or value == 0.0:
+        return 4
+    ratio = abs(value) / deviation
+    return max(2, min(7, math.floor(math.log10(max(ratio, 1e-3))) + 2))
+
+
 def number_html(text: str) -> str:
     """A printed number (``5.4e-4``) with a proper minus and power of ten, as HTML."""
     mantissa, _, power = text.partition("e")
     shown = _html.escape(mantissa.replace("-", "−"))
-    return f"{shown}×10<sup>{power.replace('-', '−')}</sup>" if power else shown
+    return f"{shown}×10<sup>{str(int(power)).replace('-', '−')}</sup>" if power else shown
 
 
 def number_tex(text: str) -> str:
     """The same as LaTeX."""
     mantissa, _, power = text.partition("e")
-    return rf"${mantissa}\times10^{{{power}}}$" if power else f"${mantissa}$"
+    return rf"${mantissa}\times10^{{{int(power)}}}$" if power else f"${mantissa}$"
 
 
 def escape_tex(text: str) -> str:

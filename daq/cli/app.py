@@ -121,6 +121,10 @@ Dask = Annotated[
     str | None,
     typer.Option("--dask", metavar="tcp://HOST:PORT", help="Compute on this dask cluster."),
 ]
+WithReport = Annotated[
+    bool,
+    typer.Option("--report/--no-report", help="Write report.html with its figures as well."),
+]
 AsJson = Annotated[bool, typer.Option("--json", help="One JSON document on standard output.")]
 
 
@@ -144,12 +148,13 @@ def run(
         bool,
         typer.Option("--realtime", help="Keep a simulated rig at the pace of the clock."),
     ] = False,
+    report: WithReport = True,
     json: AsJson = False,
 ) -> None:
     """Run an experiment on a rig and log every sample."""
     from daq.cli.running import run_command
 
-    run_command(experiment, rig, port, out, identify, model, config, realtime, json)
+    run_command(experiment, rig, port, out, identify, model, config, realtime, report, json)
 
 
 @app.command(epilog="Example:  rig check prbs.yaml --plot check.png")
@@ -233,6 +238,7 @@ def identify(
             "--resume", metavar="DIR", help="Go on with what was interrupted, as it was asked."
         ),
     ] = None,
+    report: WithReport = True,
     json: AsJson = False,
 ) -> None:
     """Identify a model's parameters from logs: one parameter set for all of them.
@@ -246,10 +252,12 @@ def identify(
             profile, guess, datasheet, settings, arx, armax, seeds, jobs, dask,
         )  # fmt: skip
         if any(others):
-            raise typer.BadParameter("--resume goes on as it was asked; give nothing but --json")
+            raise typer.BadParameter(
+                "--resume goes on as it was asked; give nothing but --json or --no-report"
+            )
         from daq.cli.identifying import resume_command
 
-        resume_command(resume, json)
+        resume_command(resume, report, json)
         return
     if not logs:
         raise typer.BadParameter("name the logs to identify from, or a folder with --resume")
@@ -270,13 +278,13 @@ def identify(
 
         compare_command(
             logs, validate or [], Ask(model or [], baselines, seeds), config, out, options,
-            settings or [], Workers(jobs, dask), json,
+            settings or [], Workers(jobs, dask), report, json,
         )  # fmt: skip
         return
     from daq.cli.identifying import identify_command
 
     options["model"] = model[0] if model else None
-    identify_command(logs, validate or [], config, out, options, settings or [], json)
+    identify_command(logs, validate or [], config, out, options, settings or [], report, json)
 
 
 @app.command(

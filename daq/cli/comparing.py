@@ -22,7 +22,12 @@ from daq.cli.campaigning import (
     parse_seeds,
     run_all,
 )
-from daq.cli.identifying import check_writable, default_folder, write_parameters
+from daq.cli.identifying import (
+    check_writable,
+    default_folder,
+    publish_report,
+    write_parameters,
+)
 from daq.cli.preparing import prepare_models
 from daq.errors import ConfigError
 from sysid import Campaign, Candidate, Comparison, ModelError, Outcome, Spread, compare
@@ -53,6 +58,7 @@ def compare_command(
     options: Mapping[str, Any],
     settings: Sequence[str],
     workers: Workers,
+    publishing: bool,
     as_json: bool,
 ) -> None:
     """Identify every structure from the logs, rank them, say which is preferred and why."""
@@ -73,7 +79,8 @@ def compare_command(
     best = {name: outcome for (name, _), outcome in found.best().items()}
     fitted = [g for g in groups if g.prepared.model_name in best]
     if alone:
-        _show_one(fitted[0], best[fitted[0].prepared.model_name], found, folder, as_json)
+        outcome = best[fitted[0].prepared.model_name]
+        _show_one(fitted[0], outcome, found, folder, publishing, as_json)
         return
     result = _compare(fitted, best, ask.baselines)
     files = {
@@ -137,18 +144,27 @@ def _compare(
         raise ConfigError(str(error)) from None
 
 
-def _show_one(group: Group, outcome: Outcome, found: Campaign, folder: Path, as_json: bool) -> None:
+def _show_one(
+    group: Group,
+    outcome: Outcome,
+    found: Campaign,
+    folder: Path,
+    publishing: bool,
+    as_json: bool,
+) -> None:
     """One structure with several seeds: the best run like any other, and the spread."""
     (spread,) = found.spread()
     result = group.result(outcome)
     report = reporting.document(result) | {"seeds": _spread_document(spread)}
     path = write_parameters(folder, report)
     report["files"] = {"parameters": str(path)}
+    if not as_json:
+        reporting.show(result, path)
+        _show_runs(found)
+    if publishing:
+        publish_report(group.prepared, result, report, folder, as_json)
     if as_json:
         console.print_json(report)
-        return
-    reporting.show(result, path)
-    _show_runs(found)
 
 
 def _document(

@@ -13,6 +13,10 @@ from contextvars import ContextVar
 from enum import IntEnum
 from typing import Any, Protocol
 
+from daq import notation
+
+number, digits = notation.number, notation.digits  # pages and tables print numbers alike
+
 
 class Volume(IntEnum):
     """How much a command says."""
@@ -131,27 +135,6 @@ def progress(quiet: bool = False) -> Iterator[Bar]:
         plain = _Plain(_volume.get() == Volume.VERBOSE)
         yield plain
         plain.finish()
-
-
-def number(value: float, digits: int = 4) -> str:
-    """A number with so many significant digits, exponents in steps of three."""
-    if not math.isfinite(value):
-        return "-"
-    if value == 0.0:
-        return "0"
-    exponent = math.floor(math.log10(abs(value)))
-    if -3 <= exponent < 5:
-        return f"{value:.{max(digits - 1 - exponent, 0)}f}"
-    mantissa, power = f"{value:.{digits - 1}e}".split("e")
-    return f"{mantissa}e{int(power)}"
-
-
-def digits(value: float, std: float) -> int:
-    """Significant digits of a value that its standard deviation supports: to the second of it."""
-    if not std > 0.0 or value == 0.0:
-        return 4
-    ratio = max(abs(value) / std, 1e-3)
-    return min(max(math.floor(math.log10(ratio)) + 2, 2), 7)
 
 
 def engineering(value: float, unit: str) -> tuple[float, str]:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import datetime
 import os
+from collections.abc import Callable, Sequence
 from collections.abc import Mapping as MappingType
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from daq.errors import ConfigError
 from sysid import Dataset, ModelError
 from sysid.assessment import examine
 from sysid.gassi import GASSI, PRESETS, Progress
+from sysid.model import FloatArray
 from sysid.uncertainty import Profile
 
 _STAGES = {
@@ -36,26 +37,28 @@ def identify_command(
     out: Path | None,
     options: MappingType[str, Any],
     settings: list[str],
+    publishing: bool,
     as_json: bool,
 ) -> None:
-    """Identify one parameter set from logs and print it."""
+    """Identify one parameter set from logs and print it; publishing: write its report as well."""
     prepared = prepare(config, options, settings)
     folder = out or default_folder(logs, prepared.model.name)
     check_writable(folder)
-    report = identify_logs(prepared, logs, validate, folder, as_json)
+    report = identify_logs(prepared, logs, validate, folder, as_json, publishing=publishing)
     if as_json:
         console.print_json(report)
 
 
-def resume_command(folder: Path, as_json: bool) -> None:
+def resume_command(folder: Path, publishing: bool, as_json: bool) -> None:
     """Go on with an identification that was interrupted, and print it."""
     folder, request = resuming.recall(folder)
     asked = request.asked
     config = Path(asked.config) if asked.config is not None else None
     prepared = prepare(config, asked.options, asked.settings)
     report = identify_logs(
-        prepared, request.training, request.validation, folder, as_json, resume=True
-    )
+        prepared, request.training, request.validation, folder, as_json, resume=True,
+        publishing=publishing,
+    )  # fmt: skip
     if as_json:
         console.print_json(report)
 
@@ -67,10 +70,12 @@ def identify_logs(
     folder: Path,
     as_json: bool,
     resume: bool = False,
+    publishing: bool = True,
 ) -> dict[str, Any]:
     """Identify, print for people unless ``as_json``, write files; the report for machines.
 
-    resume: go on from the checkpoint in the folder.
+    resume: go on from the checkpoint in the folder. publishing: write the report's files too,
+    after everything is printed.
     """
     train, check = load_logs(prepared, training, validation)
     for log in (*train, *check):
@@ -89,11 +94,28 @@ def identify_logs(
         reporting.show(result, path)
     if estimator.stopped_ != "interrupted":
         resuming.forget(folder)
+        if publishing:
+            publish_report(prepared, result, report, folder, as_json)
     elif as_json:
         report["search"]["resume"] = resuming.command(folder)
     else:
         console.print_line(f"Go on with the search: {resuming.command(folder)}")
     return report
+
+
+def publish_report(
+    prepared: Prepared,
+    result: Identified,
+    report: dict[str, Any],
+    folder: Path,
+    as_json: bool,
+) -> None:
+    """Write the report's files and name them in ``report``."""
+    from daq.cli.publishing import publish  # matplotlib: the printed result does not wait for it
+
+    report["files"] |= publish(prepared, result, report, folder, as_json)
+    if not as_json:
+        console.print_line(f"Report: {report['files']['report']}")
 
 
 def load_logs(
@@ -174,7 +196,8 @@ def assemble(
     quiet: bool,
 ) -> Identified:
     """A fitted estimator with its intervals, and how it does on every log."""
-    records = [log.dataset for log in train]
+    records, held_back = ([log.dataset for log in logs] for logs in (train, check))
+    runs, unseen_runs = ([estimator.predict(one) for one in some] for some in (records, held_back))
     refined = PRESETS[estimator.preset].refine and estimator.stopped_ != "interrupted"
     return Identified(
         model=prepared.model,
@@ -185,11 +208,21 @@ def assemble(
         estimator=estimator,
         uncertainty=estimator.uncertainty(records) if refined else None,
         profiles=_profiles(prepared, estimator, records, quiet) if refined else [],
-        training=examine(records, estimator.predict),
-        validation=examine([log.dataset for log in check], estimator.predict),
+        training=examine(records, _known(records, runs)),
+        validation=examine(held_back, _known(held_back, unseen_runs)),
         training_logs=train,
         validation_logs=check,
+        training_runs=runs,
+        validation_runs=unseen_runs,
     )
+
+
+def _known(
+    records: Sequence[Dataset], runs: Sequence[FloatArray]
+) -> Callable[[Dataset], FloatArray]:
+    """A function that knows the free run of each record."""
+    known = {id(record): run for record, run in zip(records, runs, strict=True)}
+    return lambda record: known[id(record)]
 
 
 def _profiles(

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,6 +18,7 @@ from daq.figures.convergence import convergence
 from daq.figures.loops import Loop, hysteresis_loops
 from daq.figures.parameters import Determined, Searched, correlation, intervals, ranges
 from daq.figures.picture import Picture
+from daq.figures.residuals import Remainder, residual_correlations
 from daq.figures.responses import Response, responses
 from daq.figures.signals import Panel, signals
 from daq.figures.spectra import Spectrum, spectra
@@ -27,13 +27,14 @@ from sysid import Dataset, ModelError, equilibrium, evaluate, linearize
 from sysid.frequency import FrequencyResponse, frequency_response, sampled_response
 from sysid.metrics import mean_known
 from sysid.model import BoolArray, FloatArray, ProcessModel
+from sysid.residual_tests import residual_test
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _OUTPUTS_A_FIGURE = 4
 _LOGS_A_PART = 3  # of more logs the worst, the middle and the best are shown
-_FELT = 0.3  # mean coherence below which an input is not seen in an output
+_FELT, _FEWEST = 0.5, 4  # an input is seen in an output where so many coherences exceed this
 
 Run = FloatArray
 """Outputs of a free run, (n_samples, n_outputs)."""
@@ -43,16 +44,17 @@ Run = FloatArray
 class Subject:
     """What is reported on: a finished identification as its document tells it, and its logs.
 
-    document: what ``report.json`` holds. predict: outputs of the identified model's free run on a
-    record, (n_samples, n_outputs). foreign: the logs are not the program's own captures.
-    baselines: by name, a free run for each validation log of what it is compared with.
+    document: what ``report.json`` holds. training_runs, validation_runs: the identified model's
+    free run for each log. foreign: the logs are not the program's own captures. baselines: by
+    name, a free run for each validation log of what it is compared with.
     """
 
     model: ProcessModel
     document: Mapping[str, Any]
     training: Sequence[Loaded]
     validation: Sequence[Loaded]
-    predict: Callable[[Dataset], Run]
+    training_runs: Sequence[Run]
+    validation_runs: Sequence[Run]
     foreign: bool
     baselines: Mapping[str, Sequence[Run]]
 
@@ -62,23 +64,14 @@ class Subject:
         found = self.document["parameters"]
         return np.array([float(found[name]["value"]) for name in self.model.parameter_names])
 
-    @cached_property
-    def training_runs(self) -> list[Run]:
-        """A free run for each training log."""
-        return [self.predict(log.dataset) for log in self.training]
-
-    @cached_property
-    def validation_runs(self) -> list[Run]:
-        """A free run for each validation log."""
-        return [self.predict(log.dataset) for log in self.validation]
-
 
 def pictures(subject: Subject) -> Iterator[Picture]:
     """One figure after the other, as they are drawn."""
     yield from _validation(subject)
     yield from _training(subject)
     yield from _excitation(subject)
-    yield from _search(subject.document["search"])
+    yield from _residuals(subject)
+    yield from _search(subject.document)
     yield from _parameters(subject.document)
     yield from _frequency(subject)
     yield from _torque(subject)
@@ -146,9 +139,35 @@ def _excitation(subject: Subject) -> Iterator[Picture]:
     )  # fmt: skip
 
 
-def _search(search: Mapping[str, Any]) -> Iterator[Picture]:
+def _residuals(subject: Subject) -> Iterator[Picture]:
+    part = (subject.validation, subject.validation_runs)
+    if not subject.validation:
+        part = (subject.training, subject.training_runs)
+    data, run = part[0][0].dataset, part[1][0]
+    if not np.isfinite(run).all():
+        return
+    found = residual_test(data.outputs - run, data.inputs, data.input_noise)
+    names = subject.model.input_names
+    remainders = [
+        Remainder(
+            output.name, found.auto[:, j], float(found.auto_band[j]),
+            {names[i]: (found.cross[:, j, i], float(found.cross_band[j, i]))
+             for i in range(len(names)) if found.tested[i]},
+        )
+        for j, output in enumerate(subject.model.outputs)
+    ]  # fmt: skip
+    yield Picture(
+        "residuals", "residuals",
+        f"Correlation of the residuals ({data.name}) with their own past and with past inputs, in "
+        "parts of the 95 % band (grey): a model that explains all but white noise stays inside.",
+        residual_correlations(np.asarray(found.lags * data.dt), remainders),
+    )  # fmt: skip
+
+
+def _search(document: Mapping[str, Any]) -> Iterator[Picture]:
+    search = document["search"]
     history = np.asarray(search["history"], dtype=np.float64)
-    before = float(search["error_before_refinement"])
+    before = float(document["error"]["before_refinement"])
     refined = len(history) and float(history[-1]) < before
     yield Picture(
         "convergence", "search",
@@ -235,11 +254,8 @@ def _bode(
         output, given = model.outputs[j], model.inputs[i]
         yield Picture(
             _stem("bode", output.name), "frequency",
-            f"Frequency response from {given.name} to {output.name}. Points: estimated from the "
-            f"logs ({measured.n_segments} segments, the other inputs accounted for), grey where "
-            "the coherence is below 0.3. Identified: the model's free run through the same "
-            "estimate. Linear: the model linearised at operating points, as a sampler sees it. "
-            "Coherence is the share of the output that this input explains.",
+            f"Frequency response from {given.name} to {output.name}, estimated from "
+            f"{measured.n_segments} segments of the logs.",
             bode(
                 measured.frequency,
                 Measured(
@@ -337,7 +353,7 @@ def _swing(subject: Subject) -> resisting.Swing:
 def _chosen(
     model: ProcessModel, logs: Sequence[Loaded], runs: Sequence[Run]
 ) -> list[tuple[int, str]]:
-    """Which logs are shown, and as what: all of a few, else the worst, the middle, the best."""
+    """Which logs are shown, and as what: all of a few, else the middle, the worst, the best."""
     n = len(logs)
     if n <= _LOGS_A_PART:
         return [(k, f"log {k + 1} of {n}" if n > 1 else "") for k in range(n)]
@@ -346,7 +362,7 @@ def _chosen(
         for log, run in zip(logs, runs, strict=True)
     ]
     order = [int(k) for k in np.argsort(fits)]
-    chosen = zip((0, n // 2, n - 1), ("worst", "middle", "best"), strict=True)
+    chosen = zip((n // 2, 0, n - 1), ("middle", "worst", "best"), strict=True)
     return [(order[place], f"{word} of {n} logs") for place, word in chosen]
 
 
@@ -357,10 +373,9 @@ def _stem(*words: str) -> str:
 
 def _pairs(found: FrequencyResponse) -> list[tuple[int, int]]:
     """For each output the input seen best in it, where one is seen at all."""
-    with np.errstate(invalid="ignore"):
-        seen = np.where(found.varied, found.coherence.mean(axis=0), -1.0)
+    seen = np.sum(found.coherence > _FELT, axis=0)
     best = [(j, int(np.argmax(row))) for j, row in enumerate(seen)]
-    return [(j, i) for j, i in best if seen[j, i] > _FELT]
+    return [(j, i) for j, i in best if seen[j, i] >= _FEWEST]
 
 
 def _foreign_signals(model: ProcessModel, data: Dataset) -> Figure:

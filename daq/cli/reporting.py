@@ -11,14 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from daq import capture
+from daq import capture, notation
 from daq.cli import console
 from daq.cli.datasets import Loaded
 from daq.config.identification import IdentificationConfig, Signals
 from sysid.assessment import RecordResult, Verdict, judge
 from sysid.gassi import GASSI
 from sysid.metrics import Metrics, mean_known
-from sysid.model import Parameter, ProcessModel
+from sysid.model import FloatArray, Parameter, ProcessModel
 from sysid.ranges import Range
 from sysid.uncertainty import Ambiguity, Estimate, Profile, Uncertainty
 
@@ -39,7 +39,8 @@ class Identified:
 
     sources: where each parameter's range or value stands that is not the model's own.
     uncertainty: None where the search was not refined to a minimum. training, validation: one
-    result for each log, in their order.
+    result for each log, in their order. training_runs, validation_runs: the free run on each,
+    (n_samples, n_outputs).
     """
 
     model: ProcessModel
@@ -54,6 +55,8 @@ class Identified:
     validation: Sequence[RecordResult]
     training_logs: Sequence[Loaded]
     validation_logs: Sequence[Loaded]
+    training_runs: Sequence[FloatArray]
+    validation_runs: Sequence[FloatArray]
 
     @cached_property
     def verdict(self) -> Verdict:
@@ -216,15 +219,25 @@ def _profiles(found: Sequence[Profile]) -> dict[str, Any]:
     }
 
 
+def errors_of(model: ProcessModel, metrics: Metrics) -> dict[str, dict[str, float]]:
+    """Errors of each output on one log."""
+    return {
+        name: {
+            "rmse": float(metrics.rmse[j]),
+            "msd": float(metrics.msd[j]),
+            "fit_percent": float(metrics.fit[j]),
+            "max_abs": float(metrics.scale[j]),
+        }
+        for j, name in enumerate(model.output_names)
+    }
+
+
 def _record(model: ProcessModel, record: RecordResult) -> dict[str, Any]:
-    metrics, residuals = record.metrics, record.residuals
+    residuals = record.residuals
     return {
         "outputs": {
             name: {
-                "rmse": float(metrics.rmse[j]),
-                "msd": float(metrics.msd[j]),
-                "fit_percent": float(metrics.fit[j]),
-                "max_abs": float(metrics.scale[j]),
+                **errors,
                 "residual_autocorrelation_in_band": float(residuals.white[j]),
                 "residual_independent_of": {
                     signal: float(residuals.independent[j, i])
@@ -232,13 +245,13 @@ def _record(model: ProcessModel, record: RecordResult) -> dict[str, Any]:
                     if residuals.tested[i]
                 },
             }
-            for j, name in enumerate(model.output_names)
+            for j, (name, errors) in enumerate(errors_of(model, record.metrics).items())
         }
     }
 
 
 def show(result: Identified, path: Path) -> None:
-    """Tables and sentences on standard output."""
+    """Tables and sentences on standard output; path: of the parameters that were written."""
     console.print_line()
     _show_parameters(result)
     for name, guess in result.estimator.guesses_.items():
@@ -304,7 +317,7 @@ def _span(parameter: Parameter, given: Range | None, scale: float) -> str:
 
 def _digits(estimate: Estimate) -> int:
     """As many as the uncertainty supports; few where there is no telling."""
-    return 2 if estimate.std is None else console.digits(estimate.value, estimate.std)
+    return notation.digits(estimate.value, estimate.std)
 
 
 def _interval_text(estimate: Estimate, scale: float) -> str:

@@ -28,9 +28,13 @@ def run_command(
     model: str | None,
     config: Path | None,
     realtime: bool,
+    publishing: bool,
     as_json: bool,
 ) -> None:
-    """Run an experiment; with ``identify`` record a validation run and identify the model."""
+    """Run an experiment; with ``identify`` record a validation run and identify the model.
+
+    publishing: write the identification's report as well.
+    """
     loaded = load_experiment(experiment)
     rig_config, device = rig_on(rig, port, realtime)
     loaded.plan(rig_config)
@@ -67,8 +71,9 @@ def run_command(
             )
         folders = [check.folder] if check else []
         report["identification"] = identify_logs(
-            prepared, [result.folder], folders, result.folder / "identification", as_json
-        )
+            prepared, [result.folder], folders, result.folder / "identification", as_json,
+            publishing=publishing,
+        )  # fmt: skip
     if as_json:
         console.print_json(report)
         return

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 ComplexArray = npt.NDArray[np.complex128]
+_MEASURED = "measured, 95 %"
 _Z95 = 1.959963984540054
 _SEEN = 0.3  # coherence below which a measured point is drawn faintly
 
@@ -43,7 +44,7 @@ def bode(
     magnitudes carry 95 % bars; points of low coherence are faint.
     """
     figure, (size, angle, seen) = style.stack(
-        [1.1, 0.8, 0.45], 0.1, top=0.36 if len(curves) > 1 else 0.24
+        [1.1, 0.8, 0.45], 0.1, top=style.legend_rows([_MEASURED, *curves])[1]
     )
     magnitude = np.abs(measured.response)
     good = measured.coherence >= _SEEN
@@ -57,7 +58,7 @@ def bode(
             ecolor=colour, elinewidth=0.4,
         )  # fmt: skip
         size.plot(frequency[chosen], magnitude[chosen], ".", ms=2.5, color=colour,
-                  label="measured, 95 %" if colour == style.MEASURED else None)  # fmt: skip
+                  label=_MEASURED if colour == style.MEASURED else None)  # fmt: skip
         angle.plot(frequency[chosen], _degrees(measured.response[chosen]), ".", ms=2.5,
                    color=colour)  # fmt: skip
     for k, (name, response) in enumerate(curves.items()):
@@ -76,7 +77,7 @@ def bode(
     style.name_y(size, "magnitude", f"[{_ratio(*units)}]")
     style.name_y(angle, "phase", "[°]")
     style.name_y(seen, "coherence", "[1]")
-    style.legend(figure, size, columns=2)
+    style.legend(figure, size)
     return figure
 
 

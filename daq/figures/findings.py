@@ -13,8 +13,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _LETTERS_A_LINE = 62  # of a title across a column of print
-_LETTERS_A_LEGEND = 58
-_HANDLE = 7  # what the sample of a line takes of a legend's row, in letters
 
 
 @style.styled
@@ -22,9 +20,9 @@ def draw(figure: Chart | Heatmap) -> Figure:
     """A figure of a chart or of a value over a plane."""
     title = style.wrapped(figure.title, _LETTERS_A_LINE)
     named = [series.label for series in figure.series if series.label]
-    columns = _columns(named) if len(named) > 1 or isinstance(figure, Heatmap) else 0
-    rows = -(-len(named) // columns) if columns else 0
-    top = 0.08 + 0.13 * (title.count("\n") + 1) + 0.14 * rows
+    shown = named if len(named) > 1 or isinstance(figure, Heatmap) else []
+    columns, room = style.legend_rows(shown) if shown else (0, 0.0)
+    top = 0.08 + 0.13 * (title.count("\n") + 1) + room
     right = 0.72 if isinstance(figure, Heatmap) else 0.1
     drawn, (panel,) = style.stack([2.1], top=top, right=right)
     if isinstance(figure, Heatmap):
@@ -34,17 +32,11 @@ def draw(figure: Chart | Heatmap) -> Figure:
     panel.set_xlabel(_label(figure.x))
     style.name_y(panel, notation.words(figure.y.label), notation.bracketed(figure.y.unit))
     panel.set_title(title, loc="left", x=(0.08 - style.LEFT) / (style.WIDTH - style.LEFT - right),
-                    pad=4.0 + 10.0 * rows)  # fmt: skip
-    if rows:
+                    pad=4.0 + 72.0 * room)  # fmt: skip
+    if shown:
         panel.legend(loc="lower left", bbox_to_anchor=(-0.12, 1.0), ncols=columns,
                      borderaxespad=0.2, borderpad=0.0)  # fmt: skip
     return drawn
-
-
-def _columns(labels: list[str]) -> int:
-    """As many as stand beside each other above the panel."""
-    widest = max((len(label) for label in labels), default=0) + _HANDLE
-    return max(1, min(len(labels), _LETTERS_A_LEGEND // widest))
 
 
 def _plane(drawn: Figure, panel: Axes, figure: Heatmap) -> None:

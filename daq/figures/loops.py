@@ -31,7 +31,7 @@ class Loop:
 def hysteresis_loops(loops: Sequence[Loop], points: bool = False) -> Figure:
     """Torque over angle above, over speed below; ``points`` for measured samples."""
     figure, (over_angle, over_speed) = style.stack(
-        [1.45, 1.45], 0.42, top=0.34 if len(loops) > 3 else 0.22, share_x=False
+        [1.45, 1.45], 0.42, top=style.legend_rows([loop.label for loop in loops])[1], share_x=False
     )
     for k, loop in enumerate(loops):
         look = _look(k, points)
@@ -41,7 +41,7 @@ def hysteresis_loops(loops: Sequence[Loop], points: bool = False) -> Figure:
         over_speed.plot(loop.speed[some], loop.torque[some], **look)
     _label(over_angle, "angle", "rad")
     _label(over_speed, "speed", "rad/s")
-    style.legend(figure, over_angle, columns=3)
+    style.legend(figure, over_angle)
     return figure
 
 

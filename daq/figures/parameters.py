@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_NUMBERED = 9  # parameters up to which a correlation is written into its cell
+_NUMBERED = 0.27  # in, width of a cell from which its correlation is written into it
 
 _SHORT = 9  # letters up to which names stand beside each other
 
@@ -136,11 +136,11 @@ def correlation(names: Sequence[str], matrix: FloatArray) -> Figure:
     panel.tick_params(length=0)
     for spine in panel.spines.values():
         spine.set_visible(False)
-    if n <= _NUMBERED:
+    if side / n >= _NUMBERED:
         for i, j in np.argwhere(np.isfinite(matrix)).tolist():
             dark = abs(matrix[i, j]) > 0.6
             panel.text(j, i, f"{matrix[i, j]:.2f}".replace("-", "−"), ha="center", va="center",
-                       fontsize=5.5 if n > 7 else 6.5,
+                       fontsize=5.5 if side / n < 0.36 else 6.5,
                        color="white" if dark else "black")  # fmt: skip
     box = panel.get_position()
     beside = figure.add_axes((box.x1 + 0.02, box.y0, 0.025, box.height))

@@ -43,6 +43,8 @@ DASHES = ("-", "--", "-.", ":")
 
 _LETTER = 0.058  # in, mean width of a letter of a label
 _LONGEST = 18  # letters of a row's name
+_SMALL = 0.048  # in, that of a legend's
+_HANDLE = 0.36  # in, what a legend shows beside a label
 _SPARE = 0.1  # in, by which a label may stand over its panel
 _PLAIN = 30.0  # span of a logarithmic axis below which it needs more marks than the decades
 
@@ -200,13 +202,24 @@ def note(panel: Axes, text: str) -> None:
     panel.set_title(text, loc="right", fontsize=6.5, pad=2.0)
 
 
-def legend(figure: Figure, panel: Axes, columns: int = 4, left: float = LEFT) -> None:
+def legend_rows(labels: Sequence[str]) -> tuple[int, float]:
+    """Columns of a legend above the panels, and the room in inches that it takes there."""
+    for columns in range(len(labels), 1, -1):
+        # Column by column, as matplotlib fills them.
+        rows = -(-len(labels) // columns)
+        widths = [max(map(len, labels[k : k + rows])) for k in range(0, len(labels), rows)]
+        if sum(_SMALL * width + _HANDLE for width in widths) < WIDTH - LEFT + _SPARE:
+            return columns, 0.1 + 0.14 * rows
+    return 1, 0.1 + 0.14 * len(labels)
+
+
+def legend(figure: Figure, panel: Axes, left: float = LEFT) -> None:
     """What the lines of a panel mean, at the top of the figure."""
     handles, labels = panel.get_legend_handles_labels()
-    tall = float(figure.get_size_inches()[1])
+    width, tall = figure.get_size_inches()
     figure.legend(
-        handles, labels, loc="upper left", ncols=min(columns, max(len(labels), 1)),
-        bbox_to_anchor=((left - 0.08) / float(figure.get_size_inches()[0]), 1 - 0.02 / tall),
+        handles, labels, loc="upper left", ncols=legend_rows(labels)[0],
+        bbox_to_anchor=((left - 0.08) / float(width), 1 - 0.02 / float(tall)),
         borderaxespad=0.0, borderpad=0.0,
     )  # fmt: skip
 

@@ -53,10 +53,17 @@ def environment(**extra):
     return {**env, "PYTHONWARNINGS": "error", "NO_COLOR": "1", **extra}
 
 
-def rig(*args, cwd, env=None, timeout=120, **options):
+def _words(args, report):
+    """Arguments as text; without the figures of a report, which few tests need for their time."""
+    words = list(map(str, args))
+    identifies = words[:1] == ["identify"] or "--identify" in words
+    return [*words, "--no-report"] if identifies and not report else words
+
+
+def rig(*args, cwd, env=None, timeout=120, report=False, **options):
     """Run ``rig`` to its end; a CompletedProcess with text output."""
     return subprocess.run(
-        [*RIG, *map(str, args)],
+        [*RIG, *_words(args, report)],
         cwd=cwd,
         env=environment(**(env or {})),
         capture_output=True,
@@ -70,7 +77,7 @@ def rig(*args, cwd, env=None, timeout=120, **options):
 def start_rig(*args, cwd, env=None, **options):
     """Start ``rig`` and leave it running."""
     return subprocess.Popen(
-        [*RIG, *map(str, args)],
+        [*RIG, *_words(args, report=False)],
         cwd=cwd,
         env=environment(**(env or {})),
         stdout=subprocess.PIPE,
@@ -122,10 +129,10 @@ def forked_rig():
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment(),
         )  # fmt: skip
 
-        def run(args, cwd):
+        def run(args, cwd, report=False):
             out.unlink(missing_ok=True)
             err.unlink(missing_ok=True)
-            job = {"args": list(map(str, args)), "cwd": str(cwd), "out": str(out), "err": str(err)}
+            job = {"args": _words(args, report), "cwd": str(cwd), "out": str(out), "err": str(err)}
             parent.stdin.write(json.dumps(job) + "\n")
             parent.stdin.flush()
             status = int(parent.stdout.readline())

@@ -18,7 +18,7 @@ LOGS = ROOT.parent / "shared" / "data" / "mr_damper"
 def identify(logs, tmp_path, *options):
     command = [sys.executable, "-m", "daq.cli", "identify", *map(str, logs)]
     command += ["--config", str(EXAMPLE / "identification.yaml"), "--out", str(tmp_path)]
-    command += [*options, "--json"]
+    command += [*options, "--no-report", "--json"]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr
     return json.loads(result.stdout)

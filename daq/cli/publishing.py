@@ -1,0 +1,209 @@
+"""The report of an identification: a page, figures, a LaTeX table and a JSON document."""
+
+from __future__ import annotations
+
+import datetime
+import hashlib
+import json
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from daq import capture
+from daq.cli import baselines, console
+from daq.cli.baselines import Baseline
+from daq.cli.datasets import Loaded
+from daq.cli.explaining import view
+from daq.cli.modelling import DEFAULT_MODEL
+from daq.cli.picturing import Subject, pictures
+from daq.cli.preparing import Prepared
+from daq.cli.reporting import NOTES, Identified, errors_of
+from daq.figures import style
+from daq.reports import table
+from daq.reports.page import Drawing, page
+from sysid import ModelError
+from sysid.metrics import Metrics
+
+_PAGE, _DATA, _TABLE, _FIGURES = "report.html", "report.json", "parameters.tex", "figures"
+# What a report takes, for the progress display; a few figures more or fewer do no harm.
+_STEPS = 18
+
+
+def publish(
+    prepared: Prepared,
+    result: Identified,
+    document: Mapping[str, Any],
+    folder: Path,
+    quiet: bool,
+) -> dict[str, str]:
+    """Write the report into a folder; the files by what they are.
+
+    document: as ``reporting.document`` makes it. Raises RunError where the disk refuses.
+    """
+    with console.progress(quiet) as bar:
+        bar.update("Report", 0, _STEPS, "linear baseline")
+        linear = _baseline(result)
+        whole = console.plain(_whole(prepared, result, document, linear))
+        subject = Subject(
+            model=result.model,
+            document=whole,
+            training=result.training_logs,
+            validation=result.validation_logs,
+            training_runs=result.training_runs,
+            validation_runs=result.validation_runs,
+            foreign=prepared.mapping is not None,
+            baselines={linear.name: linear.runs} if isinstance(linear, Baseline) else {},
+        )
+        drawings = []
+        for count, drawing in enumerate(_drawings(subject, folder / _FIGURES), 1):
+            bar.update("Report", min(count, _STEPS - 1), _STEPS, f"{count} figures")
+            drawings.append(drawing)
+        files = {
+            "report": (_PAGE, page(whole, view(result.model, whole), drawings)),
+            "data": (_DATA, json.dumps(whole, indent=1) + "\n"),
+            "latex": (_TABLE, table.latex(whole, NOTES)),
+        }
+        for name, content in files.values():
+            capture.write_whole(folder / name, content)
+        bar.update("Report", _STEPS, _STEPS, f"{len(drawings)} figures")
+    return {what: str(folder / name) for what, (name, _) in files.items()}
+
+
+def _drawings(subject: Subject, folder: Path) -> Iterator[Drawing]:
+    """Every figure, written as a file as well."""
+    capture.make_folder(folder)
+    for picture in pictures(subject):
+        svg = style.render(picture.figure, "svg")
+        capture.write_whole(folder / f"{picture.name}.svg", svg)
+        yield Drawing(picture.name, picture.topic, picture.caption, svg.decode())
+
+
+def _baseline(result: Identified) -> Baseline | str:
+    """A linear model of the same data, or why there is none."""
+    try:
+        return baselines.armax(
+            result.model,
+            [log.dataset for log in result.training_logs],
+            [log.dataset for log in result.validation_logs],
+        )
+    except ModelError as error:
+        return str(error)
+
+
+def _whole(
+    prepared: Prepared,
+    result: Identified,
+    document: Mapping[str, Any],
+    linear: Baseline | str,
+) -> dict[str, Any]:
+    """The document with what only the report tells."""
+    now = datetime.datetime.now(datetime.UTC)
+    meanings = {p.name: p.description for p in result.model.parameters}
+    search = {**document["search"], "history": [float(e) for e in result.estimator.history_]}
+    return {
+        **{key: value for key, value in document.items() if key != "files"},
+        "written": f"{now:%Y-%m-%d %H:%M} UTC",
+        "parameters": {
+            name: {**one, "description": meanings[name]}
+            for name, one in document["parameters"].items()
+        },
+        "search": search,
+        "comparison": _comparison(result, linear),
+        "reproduction": _reproduction(prepared, result),
+    }
+
+
+def _comparison(result: Identified, linear: Baseline | str) -> dict[str, Any]:
+    if isinstance(linear, str):
+        return {"left_out": linear}
+
+    def logs(metrics: Sequence[Metrics]) -> list[dict[str, Any]]:
+        return [{"outputs": errors_of(result.model, one)} for one in metrics]
+
+    return {
+        "name": linear.name,
+        "orders": linear.orders,
+        "metrics": {"training": logs(linear.training), "validation": logs(linear.validation)},
+    }
+
+
+def _reproduction(prepared: Prepared, result: Identified) -> dict[str, Any]:
+    """How to do it again: command, logs with their fingerprints, runs they came from."""
+    uses = (("training", result.training_logs), ("validation", result.validation_logs))
+    return {
+        "command": _command(prepared, result),
+        "folder": str(Path.cwd()),
+        "logs": [_log(log, use) for use, logs in uses for log in logs],
+        "runs": [
+            _run(record)
+            for path in _paths([*result.training_logs, *result.validation_logs])
+            if (record := capture.read_record(path)) is not None
+        ],
+    }
+
+
+def _paths(logs: Sequence[Loaded]) -> list[Path]:
+    """Their files, each once: a log of which a part is held back stands for two."""
+    return list(dict.fromkeys(log.path for log in logs))
+
+
+def _command(prepared: Prepared, result: Identified) -> str:
+    """What to type to identify the same again."""
+    asked = prepared.asked
+    training = _paths(result.training_logs)
+    words = ["rig", "identify", *map(str, training)]
+    for path in _paths(result.validation_logs):
+        if path not in training:
+            words += ["--validate", str(path)]
+    if asked.config is not None:
+        words += ["--config", asked.config]
+    for name, value in asked.options.items():
+        if name != "seed" and (name, value) != ("model", DEFAULT_MODEL):
+            words += _option(name, value)
+    words += ["--seed", str(result.settings.seed)]
+    for setting in asked.settings:
+        words += ["--set", setting]
+    return shlex.join(words)
+
+
+def _option(name: str, value: Any) -> list[str]:
+    flag = f"--{name.replace('_', '-')}"
+    if value is None or value is False:
+        return []
+    if value is True:
+        return [flag]
+    values = value if isinstance(value, list | tuple) else [value]
+    return [word for one in values for word in (flag, str(one))]
+
+
+def _log(log: Loaded, use: str) -> dict[str, Any]:
+    return {
+        "log": str(log.path),
+        "name": log.dataset.name,
+        "use": use,
+        "samples": log.dataset.n_samples,
+        "sample_rate": 1.0 / log.dataset.dt,
+        "sha256": hashlib.sha256(log.path.read_bytes()).hexdigest(),
+    }
+
+
+def _run(record: Mapping[str, Any]) -> dict[str, Any]:
+    """What is known of a capture's run; a record of another program may lack any of it."""
+    experiment, rig = (_section(record, key) for key in ("experiment", "rig"))
+    seeds = {
+        name: part["seed"]
+        for name, part in experiment.items()
+        if isinstance(part, dict) and "seed" in part
+    }
+    return {
+        "started": str(record.get("started", "")),
+        "experiment": str(experiment.get("name") or experiment.get("protocol", "")),
+        "rig": str(rig.get("name", "")),
+        "seeds": ", ".join(f"{name} {seed}" for name, seed in seeds.items()),
+    }
+
+
+def _section(record: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    found = record.get(key)
+    return found if isinstance(found, dict) else {}

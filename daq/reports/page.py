@@ -1,0 +1,83 @@
+"""A report as one HTML page that needs nothing else: figures and style are inside it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from daq import notation
+
+# In the order of the page.
+TOPICS = (
+    "parameters", "responses", "residuals", "frequency", "torque", "excitation", "search",
+)  # fmt: skip
+_TEMPLATES = Path(__file__).parent / "templates"
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A figure for the page: its name, which of ``TOPICS``, a caption, and its SVG."""
+
+    name: str
+    topic: str
+    caption: str
+    svg: str
+
+
+def page(document: Mapping[str, Any], view: Mapping[str, Any], drawings: Sequence[Drawing]) -> str:
+    """The page of a report's document.
+
+    view: what the document does not hold, such as descriptions of the model. Every number shown
+    carries the document's own in ``data-value``.
+    """
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+    from markupsafe import Markup
+
+    # Escapes all that is not marked as safe, so that no name of a user's becomes markup.
+    environment = Environment(
+        loader=FileSystemLoader(_TEMPLATES), autoescape=True, undefined=StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
+    environment.filters["symbol"] = lambda name: Markup(notation.html(name))
+    environment.filters["unit"] = notation.unit_text
+    environment.filters["number"] = lambda value, digits=3: Markup(_number(value, digits))
+    environment.filters["plain"] = lambda value: Markup(notation.number_html(f"{value:g}"))
+    environment.filters["digits"] = _digits
+    first = next((drawing for drawing in drawings if drawing.topic == "responses"), None)
+    ordered = sorted(drawings, key=lambda d: -1 if d is first else TOPICS.index(d.topic))
+    figures = [
+        {"name": d.name, "topic": d.topic, "caption": d.caption,
+         "svg": Markup(_inlined(d.svg, k)), "number": k}
+        for k, d in enumerate(ordered, 1)
+    ]  # fmt: skip
+    template = environment.get_template("report.html.j2")
+    return template.render(doc=document, figures=figures, **view)
+
+
+def _number(value: float | None, digits: int) -> str:
+    """A number for people, and the whole of it for machines."""
+    if value is None:
+        return "–"
+    shown = notation.number_html(notation.number(value, digits))
+    return f'<span class="n" data-value="{value!r}">{shown}</span>'
+
+
+def _digits(one: Mapping[str, Any]) -> int:
+    if one.get("fixed") or "tied" in one:
+        return 4
+    return notation.digits(one["value"], one.get("std"))
+
+
+def _inlined(svg: str, number: int) -> str:
+    """An SVG file as an element: without prolog, its ids apart from other figures'."""
+    body = svg[svg.index("<svg") :]
+    body = re.sub(r"<metadata>.*?</metadata>", "", body, flags=re.DOTALL)
+    return re.sub(r'(\bid="|url\(#|href="#)', partial(_apart, f"f{number}-"), body)
+
+
+def _apart(prefix: str, found: re.Match[str]) -> str:
+    return found[1] + prefix

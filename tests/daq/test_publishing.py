@@ -1,0 +1,254 @@
+"""The report of an identification: one page that needs nothing else and says what the data say."""
+
+import json
+import math
+import re
+import shlex
+import shutil
+import subprocess
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from daq import notation
+from tests.daq.support import forked_rig
+
+NASTY = "k_<b>&%$"
+# Only the product of two gains acts; names hold what HTML and LaTeX take for their own.
+MODEL = f"""
+from sysid import Input, Output, Parameter, ProcessModel, State
+
+
+def derivative(x, u, p):
+    tau, a, b, c = p
+    return ((a * b * u[0] + c * u[1] - x[0]) / tau,)
+
+
+model = ProcessModel(
+    name="lag <i>&_%",
+    description="a lag & <script>alert(1)</script>",
+    states=(State("y", "m"),),
+    inputs=(Input("u", "V"), Input("w_<x>&", "V")),
+    outputs=(Output("y", "m"),),
+    parameters=(
+        Parameter("tau", "s", 0.3, 0.05, 1.0, "log", description="time constant, 50 % & <more>"),
+        Parameter("a", "m/kg", 2.0, 0.5, 10.0, "log"),
+        Parameter("b", "kg", 1.0, 0.2, 5.0, "log"),
+        Parameter({NASTY!r}, "m/V", 0.1, 0.05, 1.0, "log"),
+    ),
+    derivative=derivative,
+)
+"""
+CONFIG = """
+model: my_model.py:model
+population: 30
+generations: 6
+columns:
+  time: {sample_rate: 50.0}
+  inputs:
+    u: {column: u}
+    w_<x>&: {column: w}
+  outputs:
+    y: {column: y}
+"""
+
+
+def record(seed, n=600):
+    rng = np.random.default_rng(seed)
+    u, w = np.sign(rng.normal(size=(2, n // 10))).repeat(10, axis=1)
+    pole = math.exp(-0.02 / 0.2)
+    driven = np.concatenate([[0.0], (2.0 * u + 0.3 * w)[:-1]])
+    y = lfilter([1.0 - pole], [1.0, -pole], driven) + 0.02 * rng.normal(size=n)
+    return np.column_stack([u, w, y])
+
+
+@pytest.fixture(scope="module")
+def work(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("report")
+    (folder / "my_model.py").write_text(MODEL)
+    (folder / "id.yaml").write_text(CONFIG)
+    for name, seed in (("train <&_%>.csv", 1), ("check.csv", 2)):
+        np.savetxt(folder / name, record(seed), delimiter=",", header="u,w,y", comments="")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def rig():
+    with forked_rig() as run:
+        yield run
+
+
+@pytest.fixture(scope="module")
+def result(work, rig):
+    args = ["identify", "train <&_%>.csv", "--validate", "check.csv", "--config", "id.yaml"]
+    done = rig([*args, "--out", "found"], cwd=work, report=True)
+    assert done.returncode == 0, done.stderr
+    return done
+
+
+@pytest.fixture(scope="module")
+def document(result, work):
+    return json.loads((work / "found/report.json").read_text())
+
+
+class Page(HTMLParser):
+    """Tags opened and closed, addresses that are fetched, and rows with their exact numbers."""
+
+    VOID = ("meta", "link", "br", "img", "hr", "input")
+
+    def __init__(self, text):
+        super().__init__(convert_charrefs=True)
+        self.open, self.tags, self.addresses, self.ids = [], [], [], []
+        self.rows, self.values, self.text = [], [], ""
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag, attrs):
+        given = dict(attrs)
+        self.tags.append(tag)
+        if tag not in self.VOID:
+            self.open.append(tag)
+        self.addresses += [v for k, v in attrs if k.split(":")[-1] in ("src", "href", "srcset")]
+        self.addresses += re.findall(r"url\(([^)]*)\)", given.get("style") or "")
+        self.ids += [given["id"]] if "id" in given else []
+        if tag == "tr":
+            self.values = []
+            self.rows.append((given, self.values))
+        if "data-value" in given:
+            self.values.append(float(given["data-value"]))
+
+    def handle_startendtag(self, tag, attrs):
+        self.handle_starttag(tag, attrs)
+        if tag not in self.VOID:
+            self.open.pop()
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text += data
+
+
+@pytest.fixture(scope="module")
+def page(result, work):
+    return Page((work / "found/report.html").read_text(encoding="utf-8"))
+
+
+def test_files_are_there_and_named_after_the_printed_result(result, work):
+    printed = result.stdout.index("Trust: ")
+    assert result.stdout.index("Report: found/report.html") > printed
+    assert {path.name for path in (work / "found").iterdir()} == {
+        "parameters.yaml", "report.html", "report.json", "parameters.tex", "figures",
+    }  # fmt: skip
+    assert re.search(r"^Report: \d+ figures \([\d.]+ s\)$", result.stderr, re.MULTILINE)
+
+
+def test_the_page_needs_nothing_else(page, work):
+    text = (work / "found/report.html").read_text(encoding="utf-8")
+    assert all(address.startswith(("#", "data:")) for address in page.addresses)
+    assert not {"script", "link", "iframe", "img", "object"} & set(page.tags)
+    assert "@import" not in text
+    assert page.open == []
+    assert len(set(page.ids)) == len(page.ids)
+    # What clips and glyphs refer to is on the page.
+    assert {a[1:] for a in page.addresses if a.startswith("#")} <= set(page.ids)
+
+
+def test_every_figure_file_is_on_the_page(page, work):
+    files = {path.stem for path in (work / "found/figures").glob("*.svg")}
+    assert {"validation", "training", "signals", "convergence", "ranges", "intervals",
+            "residuals", "spectra", "bode-y"} <= files  # fmt: skip
+    assert {i.removeprefix("figure-") for i in page.ids if i.startswith("figure-")} == files
+
+
+def test_text_from_users_is_text(page):
+    assert "lag <i>&_%" in page.text
+    assert "a lag & <script>alert(1)</script>" in page.text
+    assert "time constant, 50 % & <more>" in page.text
+    assert "train <&_%>" in page.text
+    assert NASTY in page.text
+
+
+def test_numbers_of_the_page_are_those_of_the_document(page, document):
+    rows = {given["data-parameter"]: values for given, values in page.rows
+            if "data-parameter" in given}  # fmt: skip
+    assert set(rows) == set(document["parameters"])
+    for name, one in document["parameters"].items():
+        assert rows[name] == [one["value"], *one.get("interval", [])]
+    (combination,) = [
+        values for given, values in page.rows if given.get("data-combination") == "a b"
+    ]
+    (known,) = [e for a in document["ambiguities"] for e in a["determined"]]
+    assert combination == [known["value"], *known["interval"]]
+
+
+def test_errors_stand_beside_those_of_a_linear_model(page, document):
+    shown = [values for given, values in page.rows if given.get("data-output") == "y"]
+    keys = ("rmse", "msd", "fit_percent")
+    linear = document["comparison"]["metrics"]
+    expected = [
+        [log["outputs"]["y"][key] for log in (document["metrics"][part][0], linear[part][0])
+         for key in keys]
+        for part in ("validation", "training")
+    ]  # fmt: skip
+    assert shown == expected
+    # The system is linear: neither beats the other by much.
+    ours, theirs = expected[0][0], expected[0][3]
+    assert ours == pytest.approx(theirs, rel=0.3)
+
+
+def test_verdict_in_two_sentences_and_how_to_do_it_again(page, document, work, rig):
+    assert f"Trust: {document['verdict']['trust']}." in page.text
+    assert re.search(r"determine 2 of 4 free parameters by themselves and 1 comb", page.text)
+    for log in document["reproduction"]["logs"]:
+        assert log["sha256"] in page.text
+    assert document["software"]["numpy"] in page.text
+    command = document["reproduction"]["command"]
+    assert command in page.text
+    done = rig([*shlex.split(command)[1:], "--out", "again", "--json"], cwd=work)
+    assert done.returncode == 0, done.stderr
+    again = json.loads(done.stdout)["parameters"]
+    for name, one in document["parameters"].items():
+        assert again[name]["value"] == one["value"]
+
+
+def test_latex_holds_every_parameter_and_compiles(result, document, work, tmp_path):
+    table = (work / "found/parameters.tex").read_text(encoding="utf-8")
+    rows = [line for line in table.splitlines() if line.endswith(r"\\")][1:]
+    assert len(rows) == len(document["parameters"]) + 1
+    assert r"50 \% \& \textless{}more\textgreater{}" in rows[0]
+    assert any(notation.tex(NASTY) in row for row in rows)
+    for row in rows:
+        assert len(re.findall(r"(?<!\\)&", row)) == 4
+        assert row.count("{") - row.count(r"\{") == row.count("}") - row.count(r"\}")
+        assert not re.search(r"(?<!\\)[%#]", row)
+    if shutil.which("pdflatex") is None:
+        return  # checked above as far as that goes without it
+    source = "\\documentclass{article}\\begin{document}\n" + table + "\\end{document}\n"
+    (tmp_path / "t.tex").write_text(source, encoding="utf-8")
+    done = subprocess.run(
+        ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "t.tex"],
+        cwd=tmp_path, capture_output=True, text=True, errors="replace", check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout[-2000:]
+
+
+def test_no_report_writes_none(work, rig):
+    args = ["identify", "check.csv", "--config", "id.yaml", "--generations", "2", "--no-report"]
+    done = rig([*args, "--out", "bare"], cwd=work)
+    assert done.returncode == 0, done.stderr
+    assert [path.name for path in (work / "bare").iterdir()] == ["parameters.yaml"]
+    assert "Report:" not in done.stdout
+
+
+def test_without_intervals_and_validation_the_page_says_so(work, rig):
+    args = ["identify", "check.csv", "--config", "id.yaml", "--preset", "thesis", "--json"]
+    done = rig([*args, "--generations", "3", "--out", "plain"], cwd=work, report=True)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["files"]["report"] == "plain/report.html"
+    page = Page((work / "plain/report.html").read_text(encoding="utf-8"))
+    assert "There are no intervals: the preset thesis does not refine to a minimum." in page.text
+    assert "none was held back to judge it" in page.text
+    assert not any("data-quantity" in given for given, _ in page.rows)
