@@ -1,0 +1,54 @@
+"""The examples in the documentation, run from its own text."""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+import yaml
+
+import protocols
+from daq.cli.files import load_experiment
+from daq.config.rig import RigConfig
+from daq.plugins import installed
+from tests.daq.support import forked_rig
+
+DOCS = Path(protocols.__file__).parents[1] / "docs" / "protocols"
+TEXT = (DOCS / "README.md").read_text()
+BLOCK = r"```\w+\n(.*?)```"
+
+
+def test_examples_of_own_protocols_run_as_written(tmp_path):
+    files = re.findall(rf"<!-- file: (\S+) -->\n{BLOCK}", TEXT, re.DOTALL)
+    assert {name for name, _ in files} == {
+        "square.py", "square.yaml", "angle_step.py", "angle_step.yaml"
+    }  # fmt: skip
+    for name, content in files:
+        (tmp_path / name).write_text(content)
+    commands = "\n".join(re.findall(rf"<!-- commands -->\n{BLOCK}", TEXT, re.DOTALL)).split("\n")
+    with forked_rig() as rig:
+        for command in filter(None, commands):
+            program, *arguments = shlex.split(command)
+            assert program == "rig"
+            result = rig(arguments, tmp_path)
+            assert result.returncode == 0, f"{command}\n{result.stderr}"
+            assert "Traceback" not in result.stderr
+    assert (tmp_path / "square.png").exists() and (tmp_path / "angle_step.png").exists()
+    (folder,) = (tmp_path / "runs").glob("*-angle_step")
+    found = yaml.safe_load((folder / "results" / "findings.json").read_text())["numbers"]
+    assert abs(found["rest_error"]["value"]) < 0.1, "the shaft went where it was sent"
+    assert 0.005 < found["rise_time"]["value"] < 1.0
+
+
+@pytest.mark.parametrize("name", sorted(installed("rig.protocols")))
+def test_every_protocol_has_its_file_its_page_and_a_line_in_the_index(name):
+    assert (DOCS / f"{name}.md").exists()
+    assert f"({name}.md)" in TEXT
+    assert load_experiment(f"{name}.yaml").plan(RigConfig()).n_samples > 0
+
+
+@pytest.mark.parametrize("page", sorted(DOCS.glob("*.md")), ids=lambda path: path.name)
+def test_pages_name_files_that_are_there(page):
+    for target in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
+        if not target.startswith("http"):
+            assert (page.parent / target).exists(), target
