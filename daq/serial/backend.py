@@ -351,7 +351,7 @@ class SerialDevice:
         return np.clip(codes, info.min, info.max).astype(messages.COMMAND_DTYPE)
 
     def _raw(self, blocks: list[Block]) -> RawSamples:
-        records = np.concatenate([block.records for block in blocks])
+        records = messages.joined(blocks)
         ticks: IntArray = np.concatenate(
             [np.arange(b.first, b.first + len(b.records), dtype=np.int64) for b in blocks]
         )

@@ -60,7 +60,7 @@ def decode(coded: bytes) -> Frame | None:
     if length != len(body) - _SMALLEST or reserved != 0:
         return None
     end = len(body) - _CRC.size
-    if zlib.crc32(memoryview(body)[:end]) != _CRC.unpack_from(body, end)[0]:
+    if zlib.crc32(body[:end]) != _CRC.unpack_from(body, end)[0]:
         return None
     return Frame(type_, session, seq, body[_HEADER.size : end])
 
