@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -18,7 +19,8 @@ app = CommandLine(
         "Start with:  rig run prbs.yaml --identify"
     ),
     no_args_is_help=True,
-    rich_markup_mode="rich",
+    # Frames are for people: in a pipe help and errors are plain lines.
+    rich_markup_mode="rich" if sys.stderr.isatty() else None,
     pretty_exceptions_enable=False,
     add_completion=True,
 )

@@ -130,6 +130,8 @@ class _Explainer:
             )
         if near is not None:
             return f"did you mean {near!r}?"
+        if str(key[-1]).isdigit():
+            return "between braces a comma begins the next key; write decimals with a point"
         return suggestion(str(key[-1]), self._fields(key[:-1]))
 
     def _complaint(self, item: ErrorDetails, key: Key) -> str:
