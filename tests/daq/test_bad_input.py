@@ -182,7 +182,7 @@ CASES = [
                "e.yaml:6:3: motor.amplitude: expected a number, found '0,75'; write a decimal"),
     experiment("a decimal comma between braces", "calibration: {samples: 16}",
                "homing: {turns: 2,5}",
-               "e.yaml:4:18: homing.5: unknown key; between braces a comma begins the next key"),
+               "e.yaml:4:19: homing.5: unknown key; between braces a comma begins the next key"),
     experiment("a key of a section at the top", "sample_rate: 800", "amplitude: 800",
                "e.yaml:2:1: amplitude: unknown key; it belongs under motor or brake"),
     experiment("a key of the top in a section", "  offset: 0.1", "  duration: 0.1",
