@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 from bokeh.layouts import gridplot
 from bokeh.models import (
     BasicTicker,
@@ -131,12 +132,15 @@ def names_of(column: str) -> tuple[str, str]:
 
 
 def as_data(columns: Sequence[str], view: View) -> dict[str, Any]:
-    """What the source of samples holds of a view."""
-    data: dict[str, Any] = {"t": view.time}
+    """What the source of samples holds of a view; never no points at all."""
+    # Bokeh 3.9 paints an area of steps without points in a loop that has no end.
+    nowhere = np.full((0 if len(view.time) else 1, len(columns)), np.nan)
+    low, high = np.concatenate([view.low, nowhere]), np.concatenate([view.high, nowhere])
+    data: dict[str, Any] = {"t": np.append(view.time, nowhere[:, :1])}
     for curve in itertools.chain.from_iterable(curves_of(columns)):
         place = columns.index(curve.name)
-        low, high = names_of(curve.name)
-        data[low], data[high] = view.low[:, place], view.high[:, place]
+        low_name, high_name = names_of(curve.name)
+        data[low_name], data[high_name] = low[:, place], high[:, place]
     return data
 
 

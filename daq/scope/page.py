@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from html import escape
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,7 @@ from daq.scope.figures import (
 )
 from daq.scope.history import History, View, nothing, step_for
 from daq.scope.recordings import Recording, Watch
-from daq.scope.wording import HELP, VALUE_FIELDS, heading, readout
+from daq.scope.wording import FAILED, HELP, VALUE_FIELDS, heading, readout
 
 PERIOD = 33  # ms between updates: 30 a second
 _POINTS = 500  # stretches drawn at least over the width of the page
@@ -86,12 +87,22 @@ class Page:
         page.tags = [self._sent, self._seen]
         document.add_root(page)
         document.title = "rig scope"
-        document.add_periodic_callback(self._update, PERIOD)
+        self._document = document
+        self._timer = document.add_periodic_callback(self._update, PERIOD)
         self._update()
 
     # --- 30 times a second --------------------------------------------------------------------
 
     def _update(self) -> None:
+        try:
+            self._advance()
+        except Exception as error:  # would else stop the page without a word
+            self._document.remove_periodic_callback(self._timer)
+            self._head.text = (
+                f"<b>{escape(FAILED)} {escape(f'{type(error).__name__}: {error}')}</b>"
+            )
+
+    def _advance(self) -> None:
         self._watch.poll()
         newest = self._watch.recording
         if self._live and newest is not self._recording:
@@ -159,7 +170,8 @@ class Page:
             self._drawn_step, self._ended = step, ended
             self._replace(history.view(start, last, _POINTS, to_the_end=ended))
         elif behind >= step:
-            self._append(history.since(self._drawn_end, step), rows if width else None, start)
+            view = history.since(self._drawn_end, step)
+            self._append(view, None if width is None else rows, start)
         self._time.update(start=start, end=last if width is None else max(last, first + width))
 
     def _replace(self, view: View) -> None:

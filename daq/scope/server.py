@@ -6,6 +6,8 @@ import asyncio
 import logging
 import signal
 import socket
+import sys
+import warnings
 from collections.abc import Callable
 from types import FrameType
 
@@ -28,9 +30,10 @@ def serve(watch: Watch, port: int | None, ready: Callable[[str], None]) -> None:
     that was asked for is taken.
     """
     port = _free(USUAL_PORT, or_any=True) if port is None else _free(port, or_any=False)
-    # Lines for the server's maintainers are no help to who looks at a run.
+    # A tab that is closed while it is written to is no error; what goes wrong in a page it says.
     for name in ("bokeh", "tornado"):
-        logging.getLogger(name).setLevel(logging.ERROR)
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    warnings.filterwarnings("ignore", "coroutine 'WSHandler", RuntimeWarning)
     asyncio.run(_serve(watch, port, ready))
 
 
@@ -60,6 +63,9 @@ async def _serve(watch: Watch, port: int, ready: Callable[[str], None]) -> None:
 def _free(port: int, or_any: bool) -> int:
     """The port, if nobody listens on it; else another, or ConfigError."""
     with socket.socket() as tried:
+        if sys.platform != "win32":
+            # As the server does: connections that have just ended do not count as a listener.
+            tried.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             tried.bind((HOST, port))
         except OSError as error:

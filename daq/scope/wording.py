@@ -20,6 +20,7 @@ _STATES = {
     "log": (GREY, "log without a run record"),
 }
 VALUE_FIELDS = ("row", "color", "channel", "value", "unit", "difference", "style")
+FAILED = "The page stopped by a mistake in this program; reload it, and report this:"
 HELP = (
     "Drag: zoom in time. Wheel: zoom. Click: set a mark; double click: remove it. "
     "Live, or the toolbar's reset: follow again."
