@@ -366,6 +366,27 @@ def replay(
     replay_command(log, rig, parameters, config, figure, fail_under or [], json)
 
 
+@app.command(epilog="Example:  rig figures runs/20260101T120000Z-prbs --format pdf --format png")
+def figures(
+    run: Annotated[
+        Path, typer.Argument(metavar="RUN", help="Capture folder, or that of an identification.")
+    ],
+    kinds: Annotated[
+        list[str] | None,
+        typer.Option("--format", help="pdf, png or svg; may be repeated. Default pdf and png."),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="DIR", help="Where they go; default beside the report."),
+    ] = None,
+    json: AsJson = False,
+) -> None:
+    """Draw the figures of an identification's report for papers and slides."""
+    from daq.cli.redrawing import figures_command
+
+    figures_command(run, kinds or ["pdf", "png"], out, json)
+
+
 @app.command(epilog="Example:  rig init my_rig")
 def init(
     folder: Annotated[

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from daq.cli.datasets import Loaded
 from sysid import Dataset, ModelError
 from sysid.linear import ARMAX, tuned
 from sysid.metrics import Metrics, evaluate
@@ -29,6 +30,16 @@ class Baseline:
     training: Sequence[Metrics]
     validation: Sequence[Metrics]
     runs: Sequence[FloatArray]
+
+
+def beside(
+    model: ProcessModel, training: Sequence[Loaded], validation: Sequence[Loaded]
+) -> Baseline | str:
+    """A linear model of the same logs, or why there is none."""
+    try:
+        return armax(model, [log.dataset for log in training], [log.dataset for log in validation])
+    except ModelError as error:
+        return str(error)
 
 
 def armax(

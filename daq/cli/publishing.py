@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from daq import capture
-from daq.cli import baselines, console
-from daq.cli.baselines import Baseline
+from daq.cli import console
+from daq.cli.baselines import Baseline, beside
 from daq.cli.datasets import Loaded
 from daq.cli.explaining import view
 from daq.cli.modelling import DEFAULT_MODEL
@@ -20,12 +20,14 @@ from daq.cli.picturing import Subject, pictures
 from daq.cli.preparing import Prepared
 from daq.cli.reporting import NOTES, Identified, errors_of
 from daq.figures import style
+from daq.figures.picture import Picture
+from daq.figures.style import Format
 from daq.reports import table
 from daq.reports.page import Drawing, page
-from sysid import ModelError
 from sysid.metrics import Metrics
 
-_PAGE, _DATA, _TABLE, _FIGURES = "report.html", "report.json", "parameters.tex", "figures"
+DATA, FIGURES = "report.json", "figures"
+_PAGE, _TABLE = "report.html", "parameters.tex"
 # What a report takes, for the progress display; a few figures more or fewer do no harm.
 _STEPS = 18
 
@@ -43,7 +45,7 @@ def publish(
     """
     with console.progress(quiet) as bar:
         bar.update("Report", 0, _STEPS, "linear baseline")
-        linear = _baseline(result)
+        linear = beside(result.model, result.training_logs, result.validation_logs)
         whole = console.plain(_whole(prepared, result, document, linear))
         subject = Subject(
             model=result.model,
@@ -56,39 +58,31 @@ def publish(
             baselines={linear.name: linear.runs} if isinstance(linear, Baseline) else {},
         )
         drawings = []
-        for count, drawing in enumerate(_drawings(subject, folder / _FIGURES), 1):
+        for one, files in draw(subject, folder / FIGURES, ["svg"]):
+            drawings.append(Drawing(one.name, one.topic, one.caption, files["svg"].decode()))
+            count = len(drawings)
             bar.update("Report", min(count, _STEPS - 1), _STEPS, f"{count} figures")
-            drawings.append(drawing)
-        files = {
+        pages = {
             "report": (_PAGE, page(whole, view(result.model, whole), drawings)),
-            "data": (_DATA, json.dumps(whole, indent=1) + "\n"),
+            "data": (DATA, json.dumps(whole, indent=1) + "\n"),
             "latex": (_TABLE, table.latex(whole, NOTES)),
         }
-        for name, content in files.values():
+        for name, content in pages.values():
             capture.write_whole(folder / name, content)
         bar.update("Report", _STEPS, _STEPS, f"{len(drawings)} figures")
-    return {what: str(folder / name) for what, (name, _) in files.items()}
+    return {what: str(folder / name) for what, (name, _) in pages.items()}
 
 
-def _drawings(subject: Subject, folder: Path) -> Iterator[Drawing]:
-    """Every figure, written as a file as well."""
+def draw(
+    subject: Subject, folder: Path, formats: Sequence[Format]
+) -> Iterator[tuple[Picture, dict[Format, bytes]]]:
+    """Every figure, written to files of the formats; with what is in them."""
     capture.make_folder(folder)
     for picture in pictures(subject):
-        svg = style.render(picture.figure, "svg")
-        capture.write_whole(folder / f"{picture.name}.svg", svg)
-        yield Drawing(picture.name, picture.topic, picture.caption, svg.decode())
-
-
-def _baseline(result: Identified) -> Baseline | str:
-    """A linear model of the same data, or why there is none."""
-    try:
-        return baselines.armax(
-            result.model,
-            [log.dataset for log in result.training_logs],
-            [log.dataset for log in result.validation_logs],
-        )
-    except ModelError as error:
-        return str(error)
+        contents = {kind: style.render(picture.figure, kind) for kind in formats}
+        for kind, content in contents.items():
+            capture.write_whole(folder / f"{picture.name}.{kind}", content)
+        yield picture, contents
 
 
 def _whole(
@@ -134,6 +128,8 @@ def _reproduction(prepared: Prepared, result: Identified) -> dict[str, Any]:
     return {
         "command": _command(prepared, result),
         "folder": str(Path.cwd()),
+        "columns": prepared.asked.config if prepared.mapping is not None else None,
+        "hold_back": prepared.settings.hold_back,
         "logs": [_log(log, use) for use, logs in uses for log in logs],
         "runs": [
             _run(record)

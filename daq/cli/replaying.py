@@ -71,7 +71,7 @@ def replay(
     columns of a foreign log. Raises ConfigError.
     """
     model, values = read_parameters(parameters) if parameters is not None else _rig_truth(rig)
-    loaded = datasets.load(log, model, _mapping(config, model))
+    loaded = datasets.load(log, model, columns_of(config, model))
     record = loaded.dataset
     try:
         simulated = free_run(BatchSimulator(model), model.vector(values), record)
@@ -247,7 +247,7 @@ def _rig_truth(rig: str) -> tuple[ProcessModel, dict[str, float]]:
     return model, dict(zip(model.parameter_names, model.nominal, strict=True))
 
 
-def _mapping(config: Path | None, model: ProcessModel) -> Mapping | None:
+def columns_of(config: Path | None, model: ProcessModel) -> Mapping | None:
     """The columns of a configuration, for the model as the parameters are of."""
     if config is None:
         return None

@@ -252,3 +252,42 @@ def test_without_intervals_and_validation_the_page_says_so(work, rig):
     assert "There are no intervals: the preset thesis does not refine to a minimum." in page.text
     assert "none was held back to judge it" in page.text
     assert not any("data-quantity" in given for given, _ in page.rows)
+
+
+def test_figures_are_drawn_again_in_other_formats(result, work, rig):
+    done = rig(["figures", "found", "--format", "png", "--format", "svg", "--out", "drawn",
+                "--json"], cwd=work)  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    files = json.loads(done.stdout)["figures"]
+    assert len(files) == 2 * len(list((work / "found/figures").iterdir()))
+    assert (work / "drawn/validation.png").read_bytes().startswith(b"\x89PNG")
+    for name in ("intervals", "signals", "validation"):
+        again, before = (work / place / f"{name}.svg" for place in ("drawn", "found/figures"))
+        assert again.read_bytes() == before.read_bytes()
+
+
+def test_figures_of_what_is_not_there_any_more(result, work, rig, tmp_path):
+    shutil.copytree(work / "found", tmp_path / "found")
+    data = tmp_path / "found/report.json"
+    for wrong, said in (
+        ({"folder": str(tmp_path)}, "check.csv: this log of the report is gone"),
+        ({"hold_back": "x"}, "not a readable report"),
+    ):
+        document = json.loads((work / "found/report.json").read_text())
+        document["reproduction"] |= wrong
+        document["reproduction"]["logs"].reverse()
+        data.write_text(json.dumps(document))
+        done = rig(["figures", "found"], cwd=tmp_path)
+        assert done.returncode == 2
+        assert said in done.stderr
+    (tmp_path / "copy.csv").write_text((work / "check.csv").read_text() + "0,0,0\n")
+    document = json.loads((work / "found/report.json").read_text())
+    document["reproduction"] |= {"folder": str(tmp_path)}
+    document["reproduction"]["logs"] = [
+        log | {"log": "copy.csv"} for log in document["reproduction"]["logs"]
+    ]
+    data.write_text(json.dumps(document))
+    done = rig(["figures", "found"], cwd=tmp_path)
+    assert "copy.csv: this log is another than the report's; identify again" in done.stderr
+    assert "nowhere: no report.json there" in rig(["figures", "nowhere"], cwd=tmp_path).stderr
+    assert "written as svg, pdf, png" in rig(["figures", ".", "--format", "gif"], cwd=work).stderr
