@@ -12,7 +12,7 @@ from typing import Literal
 from daq.capture import make_folder
 from daq.cli import console
 from daq.errors import RunError
-from daq.serial import priority
+from daq.realtime import RealTime
 from daq.serial.link import latency_timer, permission_cure
 from daq.serial.ports import PortFacts, list_ports, named
 
@@ -43,9 +43,7 @@ def doctor_command(names: list[str], out: Path, as_json: bool) -> None:
     ports = named(names) if names else list_ports()
     checks = [
         *(check for port in ports for check in _port(port)),
-        _scheduling(),
-        _wake_ups(),
-        _memory(),
+        *_real_time(),
         _disk(out),
     ]
     if not ports:
@@ -93,32 +91,36 @@ def _port(port: PortFacts) -> list[Check]:
     return checks
 
 
-def _scheduling() -> Check:
-    what = "real-time scheduling"
-    if not sys.platform.startswith("linux"):
-        return Check(what, "good", "left to the system")
-    allowed = priority.raise_thread()
-    priority.lower_thread()
-    if allowed:
-        return Check(what, "good", "allowed")
-    return Check(
-        what,
-        "could be better",
-        "not allowed: other programs can hold a run up until the watchdog trips",
-        "as root, write the line '@dialout - rtprio 10' to /etc/security/limits.d/rig.conf (the "
-        "group of your user), then log in again",
-    )
-
-
-def _wake_ups() -> Check:
-    """How late a program wakes up that wants to sleep shortly, scheduled as a run is."""
-    priority.raise_thread()
+def _real_time() -> list[Check]:
+    """What a run is granted, and how late a program so scheduled wakes up that sleeps shortly."""
+    run = RealTime()
+    run.begin("prefer")
     worst = 0.0
     for _ in range(_NAPS):
         begun = time.perf_counter()
         time.sleep(_NAP)
         worst = max(worst, time.perf_counter() - begun - _NAP)
-    priority.lower_thread()
+    run.undo()
+    return [
+        _granted(run, "scheduler", "real-time scheduling", "@GROUP - rtprio 50"),
+        _granted(run, "memory", "memory lock", "@GROUP - memlock unlimited"),
+        _wake_ups(worst),
+    ]
+
+
+def _granted(run: RealTime, name: str, what: str, line: str) -> Check:
+    if name not in run.refused:
+        return Check(what, "good", str(run.granted.get(name, "left to the system")))
+    cure = (
+        f"as root, write the line '{line}' with a group of your user to "
+        "/etc/security/limits.d/rig.conf, then log in again"
+    )
+    linux = sys.platform.startswith("linux")
+    found = f"not allowed ({run.refused[name]})"
+    return Check(what, "could be better", found, cure if linux else "this system has none")
+
+
+def _wake_ups(worst: float) -> Check:
     found = f"{1e3 * worst:.1f} ms late at worst, of {_NAPS}"
     if worst <= _LATE:
         return Check("wake-ups", "good", found)
@@ -127,21 +129,6 @@ def _wake_ups() -> Check:
         "bad" if worst > _TOO_LATE else "could be better",
         found,
         "end other programs; on a laptop, plug in the supply and switch energy saving off",
-    )
-
-
-def _memory() -> Check:
-    what = "memory lock"
-    if not sys.platform.startswith("linux"):
-        return Check(what, "good", "left to the system")
-    if priority.may_lock_memory():
-        return Check(what, "good", "allowed")
-    return Check(
-        what,
-        "could be better",
-        "limited: the system may swap a run out",
-        "as root, write the line '@dialout - memlock unlimited' to /etc/security/limits.d/rig.conf "
-        "(the group of your user), then log in again",
     )
 
 

@@ -16,7 +16,8 @@ from daq.cli import console
 from daq.cli.files import load_rig
 from daq.errors import ConfigError
 from daq.hal import ANALOG_INPUTS, CHANNELS, Device, Guard, IntArray, Mode, Phase
-from daq.serial import faults, messages, priority
+from daq.realtime import RealTime
+from daq.serial import faults, messages
 from daq.serial.emulator import Emulator, PtyPort, TcpPort
 from daq.serial.messages import Channel, Codes, Records, Start, Welcome
 from sim_rig import converters
@@ -112,8 +113,7 @@ def emulate_command(
     port = _port(link, tcp)
     stop = _StopRequest()
     port.connect()
-    priority.spare_collector()
-    priority.raise_thread()
+    RealTime().begin("prefer")
     note = _Journal(journal)
     emulator = Emulator(board, identity, port, chosen, 1e-6 * drift, seed, note)
     if as_json:

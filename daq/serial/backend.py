@@ -6,6 +6,7 @@ import contextlib
 import getpass
 import os
 import platform
+import sys
 import threading
 import time
 from typing import Annotated, Any
@@ -27,7 +28,7 @@ from daq.hal import (
     Phase,
     RawSamples,
 )
-from daq.serial import messages, priority
+from daq.serial import messages
 from daq.serial.host import HostMachine, refusal
 from daq.serial.link import Link, open_link
 from daq.serial.messages import Block, Codes, LoopMode, Reply, Result, Start, Type, Welcome
@@ -80,7 +81,7 @@ class SerialDevice:
         self._mode = Mode.CLOSED_LOOP
         self._started = self._gone = self._closing = False
         self._called = 0.0
-        self._tripped_before = self._realtime = self._locked = False
+        self._tripped_before = False
         self._warnings: list[str] = []
         self._record: dict[str, Any] = {}
 
@@ -103,9 +104,6 @@ class SerialDevice:
         except BaseException:
             self._disconnect()
             raise
-        # This thread as well: the other cannot run while a waiting one holds the interpreter.
-        self._realtime = priority.raise_thread()
-        self._locked = priority.lock_memory()
         low, high = self._input_range()
         return DeviceInfo(self._name(), welcome.max_rate, welcome.queue, (low, high))
 
@@ -121,6 +119,7 @@ class SerialDevice:
         start = self._start_message(sample_rate, mode, guard, welcome)
         self._limits = np.array([start.command_low, start.command_high])
         self._guard = guard
+        self._schedule_as_caller()
         with self._changed:
             self._called = time.monotonic()
             machine.start(start, self._called)
@@ -206,8 +205,6 @@ class SerialDevice:
             "serial_number": self._welcome.serial,
             "protocol_version": self._welcome.version,
             "watchdog_tripped_before": self._tripped_before,
-            "real_time_scheduling": self._realtime,
-            "memory_locked": self._locked,
             "warnings": [*self._warnings, *_losses(self._record.get("line", {}))],
             **self._record,
         }
@@ -222,7 +219,6 @@ class SerialDevice:
 
     def _connect(self) -> Welcome:
         self._link = open_link(self.options.port, self.options.baud)
-        priority.spare_collector()
         session = int.from_bytes(os.urandom(2), "little") or 1
         self._machine = HostMachine(session, f"{_user()}@{platform.node()}")
         self._closing = self._started = False
@@ -426,12 +422,19 @@ class SerialDevice:
         assert self._welcome is not None
         return f"{self._welcome.device} (firmware {self._welcome.firmware})"
 
+    def _schedule_as_caller(self) -> None:
+        """The thread is as urgent as the run is, which has asked for that after ``open``."""
+        if self._thread is None or not sys.platform.startswith("linux"):
+            return
+        with contextlib.suppress(OSError):
+            own = os.sched_getscheduler(0), os.sched_getparam(0)
+            os.sched_setscheduler(self._thread.native_id or 0, *own)
+
     # --- the thread ---------------------------------------------------------------------------
 
     def _serve(self) -> None:
         machine, link = self._connected(), self._link
         assert link is not None
-        priority.raise_thread()
         while not self._closing and machine.failure is None:
             try:
                 data = link.read()
@@ -458,9 +461,6 @@ class SerialDevice:
         if self._machine is not None and self._started:
             self._record = self._machine.describe()
         self._closing, self._started = True, False
-        priority.lower_thread()
-        priority.unlock_memory()
-        priority.restore_collector()
         if self._thread is not None:
             self._thread.join(timeout=2.0)
         if self._link is not None:

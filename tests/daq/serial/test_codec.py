@@ -4,7 +4,7 @@ import zlib
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from daq.serial import codec, messages
@@ -31,6 +31,7 @@ def consistent_overhead(data):
 
 
 @given(frames)
+@settings(deadline=None, derandomize=True)
 def test_a_frame_is_what_the_document_says(frame):
     kind, session, seq, payload = frame
     body = bytes([kind, 0])
@@ -44,7 +45,7 @@ def test_a_frame_is_what_the_document_says(frame):
 
 
 @given(st.lists(frames, max_size=6), st.data())
-@settings(max_examples=60)
+@settings(max_examples=60, deadline=None, derandomize=True)
 def test_frames_come_out_whole_and_in_order_however_reads_cut_them(sent, data):
     stream = b"".join(encode(*frame) for frame in sent)
     cuts = data.draw(st.lists(st.integers(0, len(stream)), max_size=20).map(sorted))
@@ -56,7 +57,9 @@ def test_frames_come_out_whole_and_in_order_however_reads_cut_them(sent, data):
 
 
 @given(st.lists(frames, min_size=1, max_size=4), st.data())
-@settings(max_examples=300)
+@settings(
+    max_examples=300, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
+)
 def test_what_a_bad_line_makes_of_frames_is_refused(sent, data):
     stream = bytearray(b"".join(encode(*frame) for frame in sent))
     for _ in range(data.draw(st.integers(1, 8))):
@@ -112,6 +115,7 @@ STATUS = messages.Status(7, messages.State.RUNNING, messages.Latch.NONE, 100, 20
 
 
 @given(st.integers(1, 100), st.integers(0, 2**32 - 1), st.integers(0, 2**64 - 1))
+@settings(deadline=None, derandomize=True)
 def test_a_block_of_samples_comes_back_as_it_was(n, first, time):
     rng = np.random.default_rng(n)
     records = np.zeros(n, messages.SAMPLE_DTYPE)

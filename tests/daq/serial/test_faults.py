@@ -85,12 +85,22 @@ def assert_consistent(folder, total=400):
     return frame, record_of(folder)
 
 
-@pytest.mark.parametrize("mode", ["open", "closed"])
 @pytest.mark.parametrize(
-    "fault",
-    ["bit-errors=2e-4@run", "drop=0.03", "duplicate=0.2", "split=9", "merge=0.016@run",
-     "jitter=0.01", "stall=0.3@run+0.1", "overflow=40@run+0.1", "stuck-encoder@run"],
-)  # fmt: skip
+    ("fault", "mode"),
+    [
+        ("bit-errors=2e-4@run", "open"),
+        ("bit-errors=2e-4@run", "closed"),
+        ("drop=0.03", "closed"),
+        ("duplicate=0.2", "open"),
+        ("split=9", "closed"),
+        ("merge=0.016@run", "closed"),
+        ("jitter=0.01", "open"),
+        ("stall=0.3@run+0.1", "open"),
+        ("stall=0.3@run+0.1", "closed"),
+        ("overflow=40@run+0.1", "open"),
+        ("stuck-encoder@run", "closed"),
+    ],
+)
 def test_a_run_goes_on_over_what_can_be_borne(tmp_path, emulate, rig, fault, mode):
     with emulate(tmp_path, "--fault", fault) as running:
         write_run(tmp_path, running.port, mode)
@@ -114,12 +124,16 @@ def test_a_run_goes_on_over_what_can_be_borne(tmp_path, emulate, rig, fault, mod
     assert running.journal[-1]["outputs"] == [0, 0]
 
 
-@pytest.mark.parametrize("mode", ["open", "closed"])
 @pytest.mark.parametrize(
-    ("fault", "reason"),
-    [("disconnect=0.2@{}", "the port has gone"), ("reboot@{}", "has restarted")],
+    ("fault", "reason", "phase", "mode"),
+    [
+        ("disconnect=0.2@{}", "the port has gone", "calibration", "open"),
+        ("disconnect=0.2@{}", "the port has gone", "run+0.15", "open"),
+        ("disconnect=0.2@{}", "the port has gone", "run+0.15", "closed"),
+        ("reboot@{}", "has restarted", "calibration", "closed"),
+        ("reboot@{}", "has restarted", "run+0.15", "open"),
+    ],
 )
-@pytest.mark.parametrize("phase", ["calibration", "run+0.15"])
 def test_a_run_that_cannot_go_on_says_why_and_the_next_one_just_works(
     tmp_path, emulate, rig, fault, reason, phase, mode
 ):
