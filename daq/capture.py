@@ -20,6 +20,9 @@ from daq.log import Log, load_log
 LOG_NAME = "log.csv"
 RUN_NAME = "run.json"
 
+_RESERVE = ".reserve"  # room for the last run.json on a disk that the log has filled
+_RESERVED = 64 * 1024  # bytes
+
 RUNNING = "running"
 COMPLETED = "completed"
 
@@ -49,6 +52,7 @@ class Capture:
             },
         )
         capture.save()
+        capture.reserve()
         return capture
 
     @property
@@ -60,13 +64,31 @@ class Capture:
         """Write run.json so that a reader sees the old or the new one, never half of it."""
         write_whole(self.folder / RUN_NAME, json.dumps(self.record, indent=2) + "\n")
 
+    def reserve(self) -> None:
+        """Take the room on the disk that ``finish`` will need. Raises RunError without any."""
+        path = self.folder / _RESERVE
+        try:
+            path.write_bytes(bytes(_RESERVED))
+        except OSError as error:
+            raise RunError(
+                f"{path}: cannot be written: {error.strerror}; free space on the disk, or choose "
+                "another with --out"
+            ) from None
+
     def finish(self, status: str, reason: str | None, **facts: Any) -> None:
-        """Note how the run ended, and the fingerprint of its log."""
+        """Note how the run ended, and the fingerprint of its log.
+
+        Raises RunError when the disk refuses. What ends it in between leaves a record that lacks
+        no more than the fingerprint.
+        """
         self.record.update(status=status, reason=reason, **facts)
-        if self.log_path.exists():
-            digest = hashlib.sha256(self.log_path.read_bytes()).hexdigest()
-            self.record["log"] = {"file": LOG_NAME, "sha256": digest}
+        (self.folder / _RESERVE).unlink(missing_ok=True)
         self.save()
+        if self.log_path.exists():
+            with self.log_path.open("rb") as log:
+                digest = hashlib.file_digest(log, "sha256").hexdigest()
+            self.record["log"] = {"file": LOG_NAME, "sha256": digest}
+            self.save()
 
 
 @dataclass(frozen=True)

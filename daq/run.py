@@ -196,9 +196,10 @@ class _Run:
             self.rig.announce(phase, turns)
 
     def _finish(self, status: str, reason: str | None) -> None:
-        connection = self.rig.report()
-        if connection:
-            self.capture.record["connection"] = connection
+        # A backend that failed may fail to report as well.
+        with contextlib.suppress(Exception):
+            if connection := self.rig.report():
+                self.capture.record["connection"] = connection
         # A record that cannot be written (the disk is full) must not hide why the run ended;
         # the folder then still says "running", which a reader reports as interrupted.
         with contextlib.suppress(RigError):

@@ -89,7 +89,7 @@ def start_rig(*args, cwd, env=None, **options):
 
 # Imports what the commands import, then becomes a ``rig`` process per line of standard input.
 _FORKING = """
-import json, os, sys, traceback
+import json, os, signal, sys, traceback
 import daq.cli, daq.cli.app, daq.cli.identifying, daq.cli.modelling, daq.cli.replaying
 import daq.cli.running, pandas, pint, protocols.prbs, sim_rig.actuator, sim_rig.backend
 
@@ -97,6 +97,11 @@ for line in sys.stdin:
     job = json.loads(line)
     child = os.fork()
     if child == 0:
+        # As in a terminal, whatever the tests themselves were started from.
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        for name in ("SIGTERM", "SIGHUP"):
+            if hasattr(signal, name):
+                signal.signal(getattr(signal, name), signal.SIG_DFL)
         os.chdir(job["cwd"])
         for number, name in ((0, os.devnull), (1, job["out"]), (2, job["err"])):
             os.dup2(os.open(name, os.O_RDWR | os.O_CREAT), number)
@@ -117,16 +122,17 @@ for line in sys.stdin:
 
 
 @contextmanager
-def forked_rig():
+def forked_rig(**env):
     """``rig`` processes without the second that each needs for its imports.
 
-    Gives a function of arguments and folder that returns a CompletedProcess.
+    env: of these processes. Gives a function of arguments and folder that returns a
+    CompletedProcess.
     """
     with tempfile.TemporaryDirectory() as folder:
         out, err = Path(folder) / "out", Path(folder) / "err"
         parent = subprocess.Popen(
             [sys.executable, "-c", _FORKING],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment(),
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment(**env),
         )  # fmt: skip
 
         def run(args, cwd, report=False):
@@ -273,12 +279,17 @@ class FaultyDevice(SimulatedDevice):
 
 def install_faulty(folder):
     """Make the backend ``faulty`` importable and registered from ``folder`` on PYTHONPATH."""
+    return install(folder, "faulty_backend", _FAULTY, "rig.backends", "faulty", "FaultyDevice")
+
+
+def install(folder, module, text, group, name, attribute):
+    """A distribution with one entry point in ``folder``; the environment that finds it."""
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "faulty_backend.py").write_text(_FAULTY)
-    info = folder / "faulty_backend-1.0.dist-info"
+    (folder / f"{module}.py").write_text(text)
+    info = folder / f"{module}-1.0.dist-info"
     info.mkdir(exist_ok=True)
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: faulty-backend\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text("[rig.backends]\nfaulty = faulty_backend:FaultyDevice\n")
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {module}\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(f"[{group}]\n{name} = {module}:{attribute}\n")
     paths = [str(folder), *filter(None, [os.environ.get("PYTHONPATH")])]
     return {"PYTHONPATH": os.pathsep.join(paths)}
 

@@ -1,0 +1,317 @@
+"""Every way out of a run, at every phase: zero outputs as the last act, and a record that says why.
+
+The faults come from outside the run loop: a backend that fails or misbehaves when told to, which
+also sends the process the signals, at a known place; a limit on the size of files; a full disk.
+"""
+
+import hashlib
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from daq import capture
+from daq.errors import ConfigError
+from tests.daq.support import (
+    RIG,
+    environment,
+    forked_rig,
+    install,
+    journal_of,
+    only_capture,
+    record_of,
+    running_capture,
+    write_experiment,
+    write_rig,
+)
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
+
+_BACKEND = '''
+"""The simulated rig that does something bad at a phase, and keeps a journal of its outputs."""
+import json
+import os
+import resource
+import signal
+import time
+from pathlib import Path
+
+import numpy as np
+
+from daq.errors import DeviceError
+from daq.hal import Flag, Phase
+from sim_rig.backend import SimulatedDevice, Simulation
+
+
+class Options(Simulation):
+    phase: str
+    fault: str
+
+
+class BadDevice(SimulatedDevice):
+    Options = Options
+
+    def __init__(self, options):
+        super().__init__(options)
+        self._phase = Phase.OPEN
+        self._blocks = 0
+        self._acted = False
+
+    def note(self, what, **facts):
+        with Path("journal.jsonl").open("a") as journal:
+            journal.write(json.dumps({"what": what, **facts}) + "\\n")
+
+    def open(self):
+        info = super().open()
+        self.act()
+        return info
+
+    def announce(self, phase, turns=0.0):
+        self._phase = phase
+        super().announce(phase, turns)
+        if phase is Phase.SAFE:
+            self.act()
+
+    def start(self, sample_rate, mode, guard):
+        super().start(sample_rate, mode, guard)
+        self._blocks = 0
+
+    def receive(self):
+        raw = super().receive()
+        if np.any(raw.applied[-1]):
+            self.note("energised")
+        self._blocks += 1
+        if self._blocks == 2:  # some of the phase is over
+            self.act(raw)
+        return raw
+
+    def act(self, raw=None):
+        fault = self.options.fault
+        if self.options.phase != self._phase.value:
+            return
+        self.note("fault")
+        self._acted = True
+        if fault == "unplugged":
+            raise DeviceError("the device no longer answers; check its cable")
+        if fault == "bug":
+            raise ZeroDivisionError("a mistake in the backend")
+        if fault == "interlock":
+            raw.flags[-1] |= int(Flag.INTERLOCK)
+        if fault == "nan":
+            raw.analog[-1, 2] = np.nan
+        if fault == "full":
+            resource.setrlimit(resource.RLIMIT_FSIZE, (16_384, resource.RLIM_INFINITY))
+        for name in fault.split("+")[:1]:
+            if name.startswith("SIG"):
+                os.kill(os.getpid(), getattr(signal, name))
+
+    def again(self, where):
+        """The second signal of a fault such as SIGINT+SIGINT@safe, in the clean-up."""
+        second, _, place = self.options.fault.partition("+")[2].partition("@")
+        if second and place == where and self._acted:
+            self.note("second signal")
+            os.kill(os.getpid(), getattr(signal, second))
+            if where == "close":
+                time.sleep(60)  # it hangs
+
+    def safe(self):
+        self.again("safe")
+        super().safe()
+        self.note("safe")
+
+    def close(self):
+        if self._phase is Phase.SAFE:
+            self._phase = Phase.CLOSE
+            self.act()
+        self.again("close")
+        super().close()
+        self.note("close")
+'''
+
+_PROTOCOL = '''
+import numpy as np
+from daq.experiment import Answer, ClosedLoop, Plan
+
+
+class Constant(ClosedLoop):
+    """A constant pull, with a mistake in sample 100 if asked for."""
+
+    mistaken: bool = False
+
+    def plan(self):
+        return Plan(400, np.zeros(2), np.array([0.5, 0.0]))
+
+    def controller(self):
+        return Control(self.mistaken)
+
+
+class Control:
+    def __init__(self, mistaken):
+        self.mistaken = mistaken
+
+    def answer(self, sample):
+        if self.mistaken and sample.tick == 100:
+            raise KeyError("a mistake in the protocol")
+        return Answer(0.5, 0.0)
+'''
+CLOSED_LOOP = """
+protocol: constant.py:Constant
+sample_rate: 800
+calibration: {samples: 100}
+"""
+
+# Becomes another program, on the terminal that is its standard input.
+_OWN_TERMINAL = """
+import fcntl, os, signal, sys, termios
+os.setsid()
+fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
+os.execv(sys.argv[1], sys.argv[1:])
+"""
+
+PHASES = ("open", "calibration", "homing", "run", "safe", "close")
+SIGNALS = {
+    "SIGINT": "Ctrl-C", "SIGTERM": "SIGTERM", "SIGHUP": "SIGHUP",
+    "SIGINT+SIGINT@safe": "Ctrl-C", "SIGINT+SIGINT@close": "Ctrl-C",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Exit:
+    """A fault in a phase, and what the record must say of it."""
+
+    phase: str
+    fault: str
+    status: str
+    reason: str
+    closed_loop: bool = False
+
+    def __str__(self):
+        return f"{self.fault} in {self.phase}{', closed loop' if self.closed_loop else ''}"
+
+
+def exits():
+    for phase in PHASES:
+        yield Exit(phase, "unplugged", "failed", "the device no longer answers")
+        yield Exit(phase, "bug", "failed", f"the backend failed during {phase}: ZeroDivisionError")
+        for fault, name in SIGNALS.items():
+            if not (phase == "close" and "@" in fault):
+                yield Exit(phase, fault, "stopped", f"stopped by {name} during {phase}")
+    for phase in ("calibration", "homing"):
+        yield Exit(phase, "interlock", "interlock", f"interlock during {phase}: the device found")
+        yield Exit(phase, "nan", "interlock", f"interlock during {phase}: torque is nan")
+    yield Exit("run", "interlock", "interlock", "interlock in sample")
+    yield Exit("run", "nan", "interlock", "torque is nan, which is no measurement")
+    yield Exit("run", "SIGTERM+SIGINT@safe", "stopped", "stopped by SIGTERM during run")
+    yield Exit("run", "full", "failed", "log.csv: cannot be written: File too large")
+    yield Exit("run", "unplugged", "failed", "the device no longer answers", closed_loop=True)
+    yield Exit("run", "nan", "interlock", "interlock in sample 1: torque", closed_loop=True)
+    yield Exit("run", "SIGINT", "stopped", "stopped by Ctrl-C", closed_loop=True)
+    yield Exit("run", "SIGINT+SIGINT@safe", "stopped", "stopped by Ctrl-C", closed_loop=True)
+    yield Exit("run", "full", "failed", "log.csv: cannot be written", closed_loop=True)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("plugin")
+    found = install(folder, "bad_backend", _BACKEND, "rig.backends", "bad", "BadDevice")
+    with forked_rig(**found) as run:
+        yield run
+
+
+def assert_left_safe(root):
+    """The outputs were zeroed after they were last energised, and after a fault that left a way."""
+    steps = [entry["what"] for entry in journal_of(root / "journal.jsonl")]
+    last = {what: max(i for i, step in enumerate(steps) if step == what) for what in set(steps)}
+    assert last["safe"] > last.get("energised", -1)
+    assert last["safe"] > last["fault"] or steps[last["fault"] - 1] == "safe"
+
+
+def assert_consistent(folder, status, reason):
+    """The record says how it ended and fits a log that loads as far as it goes."""
+    record = record_of(folder)
+    assert record["status"] == status and reason in record["reason"]
+    assert sorted(path.name for path in folder.iterdir()) == ["log.csv", "run.json"]
+    digest = hashlib.sha256((folder / "log.csv").read_bytes()).hexdigest()
+    assert record["log"]["sha256"] == digest
+    rows = (folder / "log.csv").read_text().splitlines()[1:]
+    if rows and "nan" in rows[-1]:
+        with pytest.raises(ConfigError, match=rf"csv:{len(rows) + 1}: torque: 'nan'.*remove"):
+            capture.load(folder)
+    elif len(rows) > 1:
+        assert f"ended early: {status}" in capture.load(folder).warning
+
+
+@pytest.mark.parametrize("exit", list(exits()), ids=str)
+def test_outputs_are_zero_and_the_record_says_why(run, tmp_path, exit):
+    if exit.closed_loop:
+        (tmp_path / "constant.py").write_text(_PROTOCOL)
+        (tmp_path / "e.yaml").write_text(CLOSED_LOOP)
+    else:
+        homing = {"turns": 0.2 * (exit.phase == "homing"), "timeout": 30}
+        write_experiment(tmp_path / "e.yaml", homing=homing, calibration={"samples": 100})
+    write_rig(
+        tmp_path / "rig.yaml", backend="bad", options={"phase": exit.phase, "fault": exit.fault}
+    )
+    result = run(["run", "e.yaml", "--rig", "rig.yaml"], tmp_path)
+    assert result.returncode == 1, result.stderr
+    assert "Traceback" not in result.stderr
+    assert_left_safe(tmp_path)
+    assert_consistent(only_capture(tmp_path), exit.status, exit.reason)
+
+
+def test_a_mistake_in_a_protocol_leaves_zero_outputs(run, tmp_path):
+    (tmp_path / "constant.py").write_text(_PROTOCOL)
+    (tmp_path / "e.yaml").write_text(CLOSED_LOOP + "mistaken: true\n")
+    write_rig(tmp_path / "rig.yaml", backend="bad", options={"phase": "open", "fault": "none"})
+    result = run(["run", "e.yaml", "--rig", "rig.yaml"], tmp_path)
+    assert result.returncode == 1 and "a mistake in the protocol" in result.stderr
+    assert_left_safe(tmp_path)
+    assert_consistent(only_capture(tmp_path), "failed", "failed at sample 100")
+
+
+def test_a_disk_that_the_log_fills_still_takes_the_reason(tmp_path):
+    """A real full disk: a small one in memory, in a name space of its own."""
+    alone = ["unshare", "--user", "--map-root-user", "--mount"]
+    size = "mount -t tmpfs -o size=256k none full"
+    (tmp_path / "full").mkdir()
+    if (
+        not shutil.which("unshare")
+        or subprocess.run(
+            [*alone, "sh", "-c", size], cwd=tmp_path, capture_output=True, check=False
+        ).returncode
+    ):
+        pytest.skip("this system lets a user mount nothing")
+    write_experiment(tmp_path / "e.yaml", duration=20)
+    command = [*RIG, "run", "e.yaml", "--out", "full"]
+    inside = f"{size} && {' '.join(command)}; echo status $?; cat full/*/run.json"
+    result = subprocess.run(
+        [*alone, "sh", "-c", inside], cwd=tmp_path, env=environment(), capture_output=True,
+        text=True, timeout=120, check=False,
+    )  # fmt: skip
+    assert "status 1" in result.stdout and "Traceback" not in result.stderr
+    assert '"status": "failed"' in result.stdout
+    assert "cannot be written: No space left on device; the first" in result.stdout
+
+
+def test_a_closed_terminal_ends_the_run_and_not_its_record(tmp_path):
+    """A real terminal that goes away, with the progress bar still writing to it."""
+    import pty
+
+    write_experiment(tmp_path / "e.yaml", duration=60)
+    write_rig(tmp_path / "rig.yaml", options={"time": "real"})
+    here, there = pty.openpty()
+    process = subprocess.Popen(
+        [sys.executable, "-c", _OWN_TERMINAL, *RIG, "run", "e.yaml", "--rig", "rig.yaml"],
+        cwd=tmp_path, env=environment(), stdin=there, stdout=there, stderr=there,
+    )  # fmt: skip
+    os.close(there)
+    folder = running_capture(tmp_path, rows=50)
+    os.close(here)
+    process.wait(timeout=60)
+    assert_consistent(folder, "stopped", "stopped by SIGHUP during run")
+    assert np.all(np.diff(capture.load(folder).log.frame["tick"]) == 1)
