@@ -11,8 +11,8 @@ import numpy as np
 
 from daq import capture
 from daq.cli import console
-from daq.cli.files import DEFAULT_RIG, load_experiment
-from daq.cli.running import rig_on
+from daq.cli.files import DEFAULT_RIG
+from daq.cli.running import plan_of
 from daq.config.rig import RigConfig
 from daq.errors import ConfigError, RunError
 from daq.experiment import ClosedLoop, Experiment, Plan
@@ -47,13 +47,9 @@ def check_command(
     experiment: str, rig: str, port: str | None, plot: Path | None, as_json: bool
 ) -> None:
     """Validate an experiment and say what it would do."""
-    loaded = load_experiment(experiment)
-    rig_config, _device = rig_on(rig, port)
-    planned = loaded.plan(rig_config)
-    validation = loaded.validation()
-    if validation is not None:
-        validation.plan(rig_config)
-    settings = loaded.experiment
+    checked = plan_of(experiment, rig, port)
+    loaded, rig_config, planned = checked.loaded, checked.rig, checked.plan
+    validation, settings = checked.validation, loaded.experiment
     channels = {name: _facts(planned, rig_config, settings, name) for name in CHANNELS}
     units = dict(settings.columns) if isinstance(settings, ClosedLoop) else {}
     if plot is not None:

@@ -124,6 +124,19 @@ def _common_settings() -> type[Section]:
     return create_model("Common", __base__=Common, **fields)
 
 
+def together(*steps: Callable[[], Any]) -> list[Any]:
+    """What each step gives; one ConfigError with the mistakes of all of them."""
+    results, told = [], []
+    for step in steps:
+        try:
+            results.append(step())
+        except ConfigError as error:
+            told += str(error).splitlines()
+    if told:
+        raise ConfigError("\n".join(dict.fromkeys(told)))
+    return results
+
+
 def find_protocol(name: str, folder: Path) -> type[Experiment]:
     """An installed protocol, or a class in a file given as ``FILE.py:CLASS``.
 

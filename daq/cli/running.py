@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from daq.cli import console, punctuality
 from daq.cli.analysing import analyse, as_document, next_command, show_findings
-from daq.cli.files import LoadedExperiment, load_experiment, load_rig
+from daq.cli.files import LoadedExperiment, load_experiment, load_rig, together
 from daq.config.rig import RigConfig
 from daq.errors import ConfigError
+from daq.experiment import Plan
 from daq.hal import Device, Phase, Reporting
 from daq.run import PhaseProgress, RunResult, run_experiment
 
@@ -35,15 +38,9 @@ def run_command(
 
     publishing: write the identification's report as well.
     """
-    loaded = load_experiment(experiment)
-    rig_config, device = rig_on(rig, port, realtime)
-    loaded.plan(rig_config)
-    validation = loaded.validation()
-    if validation is not None:
-        # Checked even where it will not run: a mistake in the file is best heard of early.
-        validation.plan(rig_config)
-    if not identify:
-        validation = None
+    planned = plan_of(experiment, rig, port, realtime)
+    loaded, rig_config, device = planned.loaded, planned.rig, planned.device
+    validation = planned.validation if identify else None
     overrides = {"model": model}
     prepared = None
     if identify:
@@ -78,6 +75,29 @@ def run_command(
         console.print_json(report)
         return
     _print_end(result, check, identify)
+
+
+@dataclass(frozen=True)
+class Planned:
+    """An experiment and the rig it is for, checked; plan: what the experiment itself will do."""
+
+    loaded: LoadedExperiment
+    validation: LoadedExperiment | None
+    rig: RigConfig
+    device: Device
+    plan: Plan
+
+
+def plan_of(experiment: str, rig: str, port: str | None, realtime: bool = False) -> Planned:
+    """Read and check an experiment, its validation run and a rig; ConfigError with all mistakes."""
+    loaded, (config, device) = together(
+        lambda: load_experiment(experiment), lambda: rig_on(rig, port, realtime)
+    )
+    # Checked even where it will not run: a mistake in the file is best heard of early.
+    validation = loaded.validation()
+    runs = [run for run in (loaded, validation) if run is not None]
+    plans = together(*[partial(run.plan, config) for run in runs])
+    return Planned(loaded, validation, config, device, plans[0])
 
 
 def rig_on(rig: str, port: str | None, realtime: bool = False) -> tuple[RigConfig, Device]:

@@ -554,6 +554,8 @@ def test_mistakes_are_told_together_wherever_they_stand_in_a_file(tmp_path):
         for line, place in zip(lines, places, strict=True):
             assert line.startswith(f"rig: {args[-1]}:{place}: ")
     assert "it belongs under options" in result.stderr
+    both = rig("check", "b.yaml", "--rig", "c.yaml", cwd=tmp_path)
+    assert len(both.stderr.splitlines()) == 4, both.stderr
 
 
 def test_quantities_with_units_are_what_they_stand_for(tmp_path):

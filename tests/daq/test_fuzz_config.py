@@ -1,0 +1,106 @@
+"""Anything at all in a file's place: it is taken, or refused by line, column and key."""
+
+import copy
+import re
+
+import pytest
+import yaml
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from daq.cli.files import load_experiment, load_rig
+from daq.cli.preparing import prepare
+from daq.cli.shipped import EXPERIMENTS, RIGS, shipped_files
+from daq.errors import ConfigError
+
+WORDS = st.sampled_from(
+    [
+        "5 V",
+        "5 parrots",
+        "0,1",
+        "1e3",
+        "yes",
+        "first",
+        "seed",
+        "motor",
+        "-",
+        "[low",
+        "m.py:X",
+        "5 %",
+    ]
+)
+SCALARS = st.one_of(
+    st.none(), st.booleans(), st.integers(-3, 3), st.floats(), st.text(max_size=4), WORDS
+)
+ANYTHING = st.recursive(
+    SCALARS,
+    lambda inner: (
+        st.lists(inner, max_size=3)
+        | st.dictionaries(st.one_of(WORDS, st.integers(-1, 2)), inner, max_size=3)
+    ),
+    max_leaves=5,
+)
+SETTINGS = {
+    "model": "actuator",
+    "ranges": {"K_m": [0.1, 0.2]},
+    "fixed": {"R_m": 1.18},
+    "initial": {"omega": "first"},
+    "hold": {"torque": "foh"},
+    "columns": {
+        "time": {"column": "t", "unit": "ms"},
+        "inputs": {"torque": {"column": "T", "sign": -1}},
+        "outputs": {"omega": {"constant": 1.0}},
+    },
+}
+
+
+def content_of(path):
+    return yaml.safe_load(path.read_text())
+
+
+FILES = [
+    *((path.name, content_of(path), load_experiment) for path in shipped_files(EXPERIMENTS)),
+    *((path.name, content_of(path), load_rig) for path in shipped_files(RIGS)),
+    ("identification.yaml", SETTINGS, lambda path: prepare(path, {})),
+]
+
+
+def keys_of(content, at=()):
+    yield at
+    if isinstance(content, dict | list):
+        for key, value in content.items() if isinstance(content, dict) else enumerate(content):
+            yield from keys_of(value, (*at, key))
+
+
+def changed(content, key, value, new_name):
+    """The content with another value at a key, or under a new name beside it."""
+    if not key:
+        return value
+    result = copy.deepcopy(content)
+    section = result
+    for part in key[:-1]:
+        section = section[part]
+    if new_name is not None and isinstance(section, dict):
+        section[new_name] = section.pop(key[-1])
+    else:
+        section[key[-1]] = value
+    return result
+
+
+@pytest.mark.parametrize(("name", "content", "load"), FILES, ids=[name for name, *_ in FILES])
+@settings(
+    deadline=None, max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(data=st.data())
+def test_anything_is_taken_or_refused_by_its_place(tmp_path, name, content, load, data):
+    key = data.draw(st.sampled_from(list(keys_of(content))))
+    new_name = data.draw(st.none() | WORDS)
+    wrong = changed(content, key, data.draw(ANYTHING), new_name)
+    path = tmp_path / name
+    path.write_text(yaml.safe_dump(wrong, sort_keys=False, allow_unicode=True), encoding="utf-8")
+    try:
+        load(path)
+    except ConfigError as error:
+        for line in str(error).splitlines():
+            assert re.match(rf"{re.escape(str(path))}(:\d+(:\d+)?)?: \S", line), line
+            assert "Input should" not in line
