@@ -15,6 +15,7 @@ from sysid.model import BoolArray, FloatArray, Hold, ModelError
 ComplexArray = npt.NDArray[np.complex128]
 
 _SHORTEST = 16  # samples of a segment
+_FEWEST = 3  # segments for each input
 _LONGEST = 4096
 _PARTS = 3.0  # segments without overlap that a record should hold at least
 # Segments grow with the root of the record: finer steps of frequency and less scatter alike.
@@ -56,18 +57,22 @@ def frequency_response(records: Sequence[Dataset]) -> FrequencyResponse:
     dt = records[0].dt
     if any(abs(record.dt - dt) > 1e-6 * dt for record in records):
         raise ModelError("records of different sample times have no common frequency response")
-    length = _segment_length(records)
-    inputs, outputs = _spectra(records, length)
     varied: BoolArray = np.array(
-        [any(np.ptp(r.inputs[:, i]) > 0.0 for r in records) for i in range(inputs.shape[2])],
+        np.any([np.ptp(record.inputs, axis=0) > 0.0 for record in records], axis=0),
         dtype=np.bool_,
     )
-    m, k = int(varied.sum()), len(inputs)
+    m, length = int(varied.sum()), _segment_length(records)
     if not m:
         raise ModelError("no input changes, so there is no frequency response")
-    if k < 2 * m + 1:
+    inputs, outputs = _spectra(records, length)
+    # Shorter segments where there would be too few: coarser frequencies rather than none.
+    while len(inputs) < _FEWEST * m and length > _SHORTEST:
+        length //= 2
+        inputs, outputs = _spectra(records, length)
+    if len(inputs) <= 2 * m:
         raise ModelError(
-            f"{k} segments of {length} samples do not tell {m} inputs apart; log for longer"
+            f"{len(inputs)} segments of {length} samples do not tell {m} inputs apart; log for "
+            "longer"
         )
     return _estimate(inputs, outputs, varied, length, dt)
 
@@ -121,9 +126,11 @@ def _spectra(records: Sequence[Dataset], length: int) -> tuple[ComplexArray, Com
             rows = slice(begin, begin + length)
             if np.isfinite(y[rows]).all():
                 found.append((_transform(u[rows], window), _transform(y[rows], window)))
-    if not found:
-        raise ModelError(f"no record has {length} samples in a row without a gap")
-    return np.stack([u for u, _ in found]), np.stack([y for _, y in found])
+    n, m, q = length // 2 - 1, records[0].inputs.shape[1], records[0].outputs.shape[1]
+    return (
+        np.array([u for u, _ in found], dtype=np.complex128).reshape(-1, n, m),
+        np.array([y for _, y in found], dtype=np.complex128).reshape(-1, n, q),
+    )
 
 
 def _transform(values: FloatArray, window: FloatArray) -> ComplexArray:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_POINTS = 2000
+_POINTS = 700
 
 
 @dataclass(frozen=True)

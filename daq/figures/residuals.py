@@ -38,8 +38,8 @@ def residual_correlations(lags: FloatArray, outputs: Sequence[Remainder]) -> Fig
     for panel, output in zip(panels, outputs, strict=True):
         panel.axhspan(-1.0, 1.0, color="#eeeeee", lw=0, zorder=0)
         panel.axhline(0.0, color="black", lw=0.4, zorder=1)
-        panel.plot(lags[1:], output.auto[1:] / output.band, color=style.MEASURED, marker=".",
-                   ms=2.0, lw=0.8, label="with its past")  # fmt: skip
+        panel.plot(lags[1:], output.auto[1:] / output.band, color=style.MEASURED,
+                   lw=0.8, label="with its past")  # fmt: skip
         for k, (name, (values, band)) in enumerate(output.cross.items()):
             panel.plot(lags, values / band, color=style.CYCLE[k % len(style.CYCLE)],
                        ls=style.DASHES[k % len(style.DASHES)], lw=0.8,

@@ -264,7 +264,9 @@ def render(figure: Figure, kind: Format) -> bytes:
         "pdf": {"CreationDate": None, "Creator": None, "Producer": None},
         "png": {"Software": None},
     }
-    target = io.BytesIO()
+    # SVG goes as text, which is encoded once rather than piece by piece.
+    target = io.StringIO() if kind == "svg" else io.BytesIO()
     with mpl.rc_context(_SETTINGS):  # type: ignore[arg-type]
         figure.savefig(target, format=kind, dpi=DPI, metadata=nameless[kind])
-    return target.getvalue()
+    content = target.getvalue()
+    return content.encode() if isinstance(content, str) else content
