@@ -98,6 +98,12 @@ class Ramp:
         return self.value
 
 
+def tracker_gains(bandwidth: float, elapsed: float) -> tuple[float, float]:
+    """alpha and beta of a critically damped tracker, by its bandwidth [Hz] and the time passed."""
+    decay = math.exp(-2.0 * math.pi * bandwidth * elapsed)
+    return 1.0 - decay * decay, (1.0 - decay) ** 2
+
+
 class SpeedTracker:
     """Speed from the encoder's angle by a critically damped tracking loop (an alpha-beta filter).
 
@@ -108,7 +114,7 @@ class SpeedTracker:
     """
 
     def __init__(self, bandwidth: Hertz) -> None:
-        self._cutoff = 2.0 * math.pi * bandwidth
+        self._bandwidth = bandwidth
         self._time = math.nan
         self._elapsed = self._alpha = self._beta = 0.0
         self._angle = self.speed = 0.0
@@ -121,9 +127,8 @@ class SpeedTracker:
             self._angle = angle
             return self.speed
         if elapsed != self._elapsed:
-            decay = math.exp(-self._cutoff * elapsed)
             self._elapsed = elapsed
-            self._alpha, self._beta = 1.0 - decay * decay, (1.0 - decay) ** 2
+            self._alpha, self._beta = tracker_gains(self._bandwidth, elapsed)
         self._angle += elapsed * self.speed
         missed = angle - self._angle
         self._angle += self._alpha * missed

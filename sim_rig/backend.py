@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
 from typing import Annotated, Literal
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import Field
+from pydantic import Field, field_validator, model_validator
 
 from daq.config.base import Section
-from daq.config.units import Part, Unit, Volts
+from daq.config.units import Part, Radians, Seconds, Unit, Volts
 from daq.errors import DeviceError
 from daq.hal import (
     ANALOG_INPUTS,
@@ -72,6 +73,11 @@ class Simulation(Section):
     plant: Plant = Field(Plant(), description="parts of the actuator and what hangs on it")
     imperfections: Imperfections = Field(Imperfections(), description="of the sensing chain")
     faults: Faults = Field(Faults(), description="of the connection")
+    hand: list[tuple[Seconds, Radians]] = Field(
+        default_factory=list,
+        description="of load 'hand': [time, angle] from the start of the run and from there on, "
+        "through which its wrist moves in straight lines",
+    )
     current_sense: Annotated[float, Unit("V/A")] = Field(
         2.0, gt=0.0, description="gain of both channels' current sensors"
     )
@@ -79,6 +85,26 @@ class Simulation(Section):
         5.0 / 3.53, gt=0.0, description="gain of the torque bridge"
     )
     encoder_cycles: int = Field(2048, ge=1, description="cycles per revolution")
+
+    @field_validator("hand")
+    @classmethod
+    def _forwards(cls, path: list[tuple[float, float]]) -> list[tuple[float, float]]:
+        for before, after in itertools.pairwise([(0.0, 0.0), *path]):
+            if after[0] <= before[0]:
+                raise ValueError(
+                    f"[{after[0]:g}, {after[1]:g}] does not follow [{before[0]:g}, {before[1]:g}]; "
+                    "write [time, angle] with times above 0 that rise"
+                )
+        return path
+
+    @model_validator(mode="after")
+    def _has_a_hand(self) -> Simulation:
+        if self.hand and self.plant.load != "hand":
+            raise ValueError(
+                f"hand: moves load 'hand', but the load is {self.plant.load!r}; "
+                "write 'load: hand' under plant, or leave it out"
+            )
+        return self
 
 
 class SimulatedDevice:
@@ -93,7 +119,7 @@ class SimulatedDevice:
     def __init__(self, options: Simulation) -> None:
         self.options = options
         self._plant = options.plant.build()
-        self._user = SimulatedUser(options.plant.load == "hand")
+        self._user = SimulatedUser(options.plant.load == "hand", options.hand)
         self._rng = np.random.default_rng(options.seed)
         self._converters = self._make_converters()
         self._noise, self._noise_used = np.empty((0, len(ANALOG_INPUTS))), 0
@@ -127,6 +153,8 @@ class SimulatedDevice:
         self._user.stop()
         if phase is Phase.HOMING and turns > 0.0:
             self._user.wind(turns, self._clock, float(self._x[_THETA]))
+        if phase is Phase.RUN:
+            self._user.move(self._clock)
 
     def start(self, sample_rate: float, mode: Mode, guard: Guard) -> None:
         """Begin with tick 0; in open loop when the first commands are there."""
