@@ -28,6 +28,7 @@ def init_command(folder: Path, protocol: str, rig: str, as_json: bool) -> None:
         experiment: _copy(EXPERIMENTS, protocol, "protocol", "experiment"),
         _RIG: _copy(RIGS, rig, "rig", "rig"),
         _SETTINGS: settings_text(),
+        **_companions(protocol),
     }
     capture.make_folder(folder)
     written = [folder / name for name, text in texts.items() if _write_new(folder / name, text)]
@@ -43,10 +44,12 @@ def init_command(folder: Path, protocol: str, rig: str, as_json: bool) -> None:
     for path in kept:
         console.print_line(f"Kept as it was: {path}")
     there = [] if folder.resolve() == Path.cwd() else [f"cd {folder}"]
+    # An experiment without a validation run is mostly not for an identification.
+    identify = f" --identify --config {_SETTINGS}" if "\nvalidation:" in texts[experiment] else ""
     console.print_next(
         *there,
         f"rig check {experiment} --rig {_RIG}",
-        f"rig run {experiment} --rig {_RIG} --identify --config {_SETTINGS}",
+        f"rig run {experiment} --rig {_RIG}{identify}",
     )
 
 
@@ -75,6 +78,15 @@ def _copy(packages: Sequence[str], name: str, option: str, kind: str) -> str:
         )
     text = shipped[name].read_text(encoding="utf-8")
     return f"{schemas.comment(kind)}\n{schemas.without_comment(text)}"
+
+
+def _companions(protocol: str) -> dict[str, str]:
+    """Tables that a shipped experiment reads, which lie beside it under its name."""
+    shipped = next(path for path in shipped_files(EXPERIMENTS) if path.stem == protocol)
+    return {
+        path.name: path.read_text(encoding="utf-8")
+        for path in shipped.parent.glob(f"{protocol}.csv")
+    }
 
 
 def _write_new(path: Path, text: str) -> bool:

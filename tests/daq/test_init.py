@@ -9,10 +9,11 @@ import yaml
 
 from daq.cli.modelling import find_model
 from daq.cli.quantities import in_model_units
+from daq.cli.shipped import EXPERIMENTS, shipped_files
 from daq.cli.starting import settings_text
 from daq.config.identification import IdentificationConfig
 from daq.config.yaml_file import YamlFile
-from tests.daq.support import rig
+from tests.daq.support import forked_rig, rig
 
 
 def test_the_files_work_as_they_are_and_the_next_commands_are_told(tmp_path):
@@ -31,6 +32,15 @@ def test_the_files_work_as_they_are_and_the_next_commands_are_told(tmp_path):
         first, content = (lab / name).read_text().split("\n", 1)
         schema = lab / first.removeprefix("# yaml-language-server: $schema=")
         jsonschema.validate(yaml.safe_load(content), json.loads(schema.read_text()))
+
+
+def test_every_shipped_experiment_can_be_begun_with(tmp_path):
+    with forked_rig() as run:
+        for name in [path.stem for path in shipped_files(EXPERIMENTS)]:
+            made = run(["init", name, "--protocol", name], tmp_path)
+            assert made.returncode == 0, made.stderr
+            checked = run(["check", f"{name}.yaml", "--rig", "rig.yaml"], tmp_path / name)
+            assert checked.returncode == 0, checked.stderr
 
 
 def test_what_is_there_stays(tmp_path):
