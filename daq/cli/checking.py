@@ -17,6 +17,7 @@ from daq.config.rig import RigConfig
 from daq.errors import ConfigError, RunError
 from daq.experiment import ClosedLoop, Experiment, Plan
 from daq.hal import CHANNELS, FloatArray
+from daq.log import UNITS
 
 _PART = 0.9  # of the power, that the stated band holds
 _BARS = " ▁▂▃▄▅▆▇█"
@@ -51,7 +52,7 @@ def check_command(
     loaded, rig_config, planned = checked.loaded, checked.rig, checked.plan
     validation, settings = checked.validation, loaded.experiment
     channels = {name: _facts(planned, rig_config, settings, name) for name in CHANNELS}
-    units = dict(settings.columns) if isinstance(settings, ClosedLoop) else {}
+    units = {**UNITS, **settings.columns} if isinstance(settings, ClosedLoop) else {}
     if plot is not None:
         _draw(planned, settings, units, plot)
     if as_json:
