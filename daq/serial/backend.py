@@ -423,12 +423,15 @@ class SerialDevice:
         return f"{self._welcome.device} (firmware {self._welcome.firmware})"
 
     def _schedule_as_caller(self) -> None:
-        """The thread is as urgent as the run is, which has asked for that after ``open``."""
+        """The thread goes just before the run, where that is scheduled in real time by now."""
         if self._thread is None or not sys.platform.startswith("linux"):
             return
-        with contextlib.suppress(OSError):
-            own = os.sched_getscheduler(0), os.sched_getparam(0)
-            os.sched_setscheduler(self._thread.native_id or 0, *own)
+        policy, priority = os.sched_getscheduler(0), os.sched_getparam(0).sched_priority
+        # The limit may be the run's own priority.
+        for urgency in (priority + 1, priority) if priority else (0,):
+            with contextlib.suppress(OSError):
+                os.sched_setscheduler(self._thread.native_id or 0, policy, os.sched_param(urgency))
+                return
 
     # --- the thread ---------------------------------------------------------------------------
 
