@@ -36,6 +36,7 @@ from daq.serial.messages import Block, Codes, LoopMode, Reply, Result, Start, Ty
 HANDSHAKE = 2.0
 """Longest time that a device may take to say who it is [s]: a board resets in less."""
 
+_FEED = 0.01  # s between two looks at what is to be sent, or sent again
 _PINGS = 6  # round trips measured before a run
 _PING_PATIENCE = 0.5  # s for all of them
 _SAFE_PATIENCE = 0.25  # s to hear that the outputs are zero
@@ -64,7 +65,8 @@ class SerialOptions(Section):
 class SerialDevice:
     """A device on a port (see ``daq.hal.Device`` for the methods).
 
-    A thread reads the port and feeds the device's watchdog, but only while the program calls:
+    One thread reads the port. Another feeds the device's watchdog, because the kernel may keep a
+    reader waiting for its own workers on a busy computer; it does so only while the program calls:
     one that hangs is no better than one that is dead.
     """
 
@@ -75,11 +77,12 @@ class SerialDevice:
         self._link: Link | None = None
         self._machine: HostMachine | None = None
         self._welcome: Welcome | None = None
-        self._thread: threading.Thread | None = None
+        self._threads: list[threading.Thread] = []
+        self._leaving = threading.Event()
         self._changed = threading.Condition()
         self._run = 0
         self._mode = Mode.CLOSED_LOOP
-        self._started = self._gone = self._closing = False
+        self._started = self._gone = False
         self._called = 0.0
         self._tripped_before = False
         self._warnings: list[str] = []
@@ -221,9 +224,14 @@ class SerialDevice:
         self._link = open_link(self.options.port, self.options.baud)
         session = int.from_bytes(os.urandom(2), "little") or 1
         self._machine = HostMachine(session, f"{_user()}@{platform.node()}")
-        self._closing = self._started = False
-        self._thread = threading.Thread(target=self._serve, name="serial rig", daemon=True)
-        self._thread.start()
+        self._started = False
+        self._leaving = threading.Event()
+        self._threads = [
+            threading.Thread(target=work, name=f"serial rig, {name}", daemon=True)
+            for name, work in (("reading", self._read), ("watchdog", self._feed))
+        ]
+        for thread in self._threads:
+            thread.start()
         try:
             self._welcome = self._shake_hands()
         except BaseException:
@@ -423,35 +431,52 @@ class SerialDevice:
         return f"{self._welcome.device} (firmware {self._welcome.firmware})"
 
     def _schedule_as_caller(self) -> None:
-        """The thread goes just before the run, where that is scheduled in real time by now."""
-        if self._thread is None or not sys.platform.startswith("linux"):
+        """The threads go just before the run, where that is scheduled in real time by now."""
+        if not sys.platform.startswith("linux"):
             return
         policy, priority = os.sched_getscheduler(0), os.sched_getparam(0).sched_priority
-        # The limit may be the run's own priority.
-        for urgency in (priority + 1, priority) if priority else (0,):
-            with contextlib.suppress(OSError):
-                os.sched_setscheduler(self._thread.native_id or 0, policy, os.sched_param(urgency))
-                return
+        for thread in self._threads:
+            # The limit may be the run's own priority.
+            for urgency in (priority + 1, priority) if priority else (0,):
+                with contextlib.suppress(OSError):
+                    os.sched_setscheduler(thread.native_id or 0, policy, os.sched_param(urgency))
+                    break
 
-    # --- the thread ---------------------------------------------------------------------------
+    # --- the threads --------------------------------------------------------------------------
 
-    def _serve(self) -> None:
+    def _read(self) -> None:
         machine, link = self._connected(), self._link
         assert link is not None
-        while not self._closing and machine.failure is None:
+        while not self._leaving.is_set() and machine.failure is None:
             try:
                 data = link.read()
+                if data:
+                    with self._changed:
+                        machine.feed(data, time.monotonic())
+                        self._write(machine)
+                        self._changed.notify_all()
+            except DeviceError as error:
+                self._fail(machine, error)
+        with self._changed:
+            self._changed.notify_all()
+
+    def _feed(self) -> None:
+        machine = self._connected()
+        while not self._leaving.wait(_FEED) and machine.failure is None:
+            try:
                 with self._changed:
                     now = time.monotonic()
-                    if data:
-                        machine.feed(data, now)
+                    waited = machine.waiting
                     machine.poll(now, keep_alive=now - self._called < _PATIENCE)
                     self._write(machine)
-                    self._changed.notify_all()
+                    if machine.failure is not None or machine.waiting != waited:
+                        self._changed.notify_all()
             except DeviceError as error:
-                with self._changed:
-                    machine.failure = machine.failure or error
+                self._fail(machine, error)
+
+    def _fail(self, machine: HostMachine, error: DeviceError) -> None:
         with self._changed:
+            machine.failure = machine.failure or error
             self._changed.notify_all()
 
     def _write(self, machine: HostMachine) -> None:
@@ -463,9 +488,10 @@ class SerialDevice:
     def _disconnect(self) -> None:
         if self._machine is not None and self._started:
             self._record = self._machine.describe()
-        self._closing, self._started = True, False
-        if self._thread is not None:
-            self._thread.join(timeout=2.0)
+        self._started = False
+        self._leaving.set()
+        for thread in self._threads:
+            thread.join(timeout=2.0)
         if self._link is not None:
             self._link.close()
         self._link = self._machine = None

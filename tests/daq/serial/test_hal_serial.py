@@ -7,6 +7,7 @@ from daq.config.rig import RigConfig
 from daq.errors import DeviceError
 from daq.rig import Rig
 from daq.serial.backend import SerialDevice, SerialOptions
+from sim_rig.backend import SimulatedDevice, Simulation
 from tests.daq.hal_contract import Bench, HalContract, free_currents, plan, play
 from tests.daq.serial.support import emulator
 from tests.daq.test_hal import _exact_currents
@@ -52,3 +53,24 @@ def test_a_tcp_port_carries_the_same(tmp_path):
             second.open()
     np.testing.assert_allclose(played.applied, commands, atol=RESOLUTION)
     assert not played.flags.any()
+
+
+def test_the_wire_adds_nothing_to_the_samples(tmp_path):
+    # Without noise, and with commands that the converters have, the same rig gives the same.
+    codes = np.random.default_rng(8).integers([-3000, 0], [3000, 1000], (60, 2))
+    commands = np.repeat(codes * (20.0 / 65536), 10, axis=0)
+    config = free_currents(RigConfig())
+    with Rig(SimulatedDevice(Simulation(ideal=True)), config) as rig:
+        here = play(rig, commands)
+    with emulator(tmp_path, plant={"ideal": True}) as running:
+        device = SerialDevice(SerialOptions(port=running.port, watchdog=WATCHDOG))
+        with Rig(device, config) as rig:
+            there = play(rig, commands)
+    assert np.array_equal(there.tick, here.tick)
+    assert np.array_equal(there.applied, here.applied)
+    # Half a step of 24 bits over 20 V, in amperes and newton metres; half a count; float32.
+    for name, step in (("current_motor", 0.5), ("current_brake", 0.5), ("torque", 0.706)):
+        error = getattr(there, name) - getattr(here, name)
+        assert np.abs(error).max() < 1.01 * step * 10.0 / 2**24, name
+    assert np.abs(there.theta - here.theta).max() < 1.01 * np.pi / 8192
+    np.testing.assert_allclose(there.omega, here.omega, rtol=1e-6, atol=1e-9)
