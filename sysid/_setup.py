@@ -16,8 +16,8 @@ class Setup:
 
     start: (n_states,). inputs: (n_samples, ...), behind those of splines how they bend. measured,
     weights: (n_samples, n_outputs), residuals being (simulated - measured) * weights; 0 where a
-    sample was lost. peak: (n_outputs,), largest measured size. extremes: samples where an input
-    is largest, and the first.
+    sample was lost. weight, peak: (n_outputs,), largest of the weights and measured size.
+    extremes: samples where an input is largest, and the first.
     """
 
     record: Dataset
@@ -25,6 +25,7 @@ class Setup:
     inputs: FloatArray
     measured: FloatArray
     weights: FloatArray
+    weight: FloatArray
     peak: FloatArray
     extremes: IntArray
 
@@ -35,12 +36,14 @@ class Setup:
         measured = np.where(missing, 0.0, record.outputs)
         # Where an input is largest is where a model driven through it is fastest.
         peaks = np.argmax(np.abs(record.inputs), axis=0) if record.inputs.shape[1] else []
+        weights = np.ones_like(measured) if scale is None else np.where(missing, 0.0, 1.0 / scale)
         return cls(
             record,
             record.initial_state(model),
             _with_bends(model, record.inputs),
             np.zeros_like(measured) if scale is None else measured,
-            np.ones_like(measured) if scale is None else np.where(missing, 0.0, 1.0 / scale),
+            weights,
+            weights.max(axis=0),
             np.abs(measured).max(axis=0),
             np.unique(np.array([0, *peaks], dtype=np.int64)),
         )

@@ -318,7 +318,8 @@ def _sensed(
     if burst.any() and at.braced < _BRACINGS:
         return _steadier(at)
     # Where more steps do not help it is the model that is unbounded there: not that way.
-    around.values[..., 1:][..., burst] = around.values[..., :1]
+    if burst.any():
+        around.values[..., 1:][..., burst] = around.values[..., :1]
     if not np.isfinite(at.error_of_round):
         at = replace(at, error_of_round=error)
     floor = _SMOOTHING[at.smoothing] * error
@@ -463,23 +464,24 @@ def _normal_equations(
     share = weights / (np.maximum(rms, floor) * np.maximum(objective.counts, 1))
     counted = np.flatnonzero(weights > 0.0)
     with np.errstate(over="ignore", invalid="ignore"):
-        slopes = (around.values[..., 1:] - around.values[..., :1]) / distance
-        hessian, gradient = _summed(slopes, around.values[..., 0], share, counted)
+        changes = around.values[..., 1:] - around.values[..., :1]
+        hessian, gradient = _summed(changes, around.values[..., 0], share, counted)
         if not np.all(np.isfinite(gradient)):
-            slopes = np.where(np.isfinite(slopes), slopes, 0.0)
-            hessian, gradient = _summed(slopes, around.values[..., 0], share, counted)
+            changes = np.where(np.isfinite(changes), changes, 0.0)
+            hessian, gradient = _summed(changes, around.values[..., 0], share, counted)
+        hessian, gradient = hessian / np.outer(distance, distance), gradient / distance
     value = float(np.where(rms > floor, rms, 0.5 * (rms**2 / floor + floor)) @ weights)
     return _Equations(hessian, gradient, value)
 
 
 def _summed(
-    slopes: FloatArray, residual: FloatArray, share: FloatArray, counted: IntArray
+    changes: FloatArray, residual: FloatArray, share: FloatArray, counted: IntArray
 ) -> tuple[FloatArray, FloatArray]:
     """Hessian and gradient of the outputs that count, each by its share."""
-    n = slopes.shape[2]
+    n = changes.shape[2]
     hessian, gradient = np.zeros((n, n)), np.zeros(n)
     for j in counted:
-        rows = slopes[:, j]
+        rows = changes[:, j]
         hessian += share[j] * (rows.T @ rows)
         gradient += share[j] * (residual[:, j] @ rows)
     return hessian, gradient

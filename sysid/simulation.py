@@ -34,6 +34,7 @@ _MAX_STEPS = 512
 # Steps per sample come from a ladder so that chromosomes of like need share a block, while
 # each one's result depends on nothing but itself.
 _LADDER = np.unique(np.round(2.0 ** np.arange(0, 20.01, 0.5)).astype(np.int64))
+_EVERY_LANE = np.arange(LANES)
 _MOST_SETUPS = 64  # records that a simulator keeps ready
 
 
@@ -348,7 +349,7 @@ class _Runner:
         Where nothing but zeros was measured it is the RMS of the simulated output, and where
         nothing was measured at all no error matters.
         """
-        weight, peak = self.setup.weights.max(axis=0), self.setup.peak
+        weight, peak = self.setup.weight, self.setup.peak
         own = np.sqrt(errors / len(self.setup.weights)) / weight
         size = np.where(peak > 0.0, peak, np.where(weight > 0.0, own, np.inf))
         filled: FloatArray = np.where(size > 0.0, size, 1.0)
@@ -364,7 +365,7 @@ class _Runner:
     ) -> tuple[FloatArray, FloatArray]:
         """Error sums and estimate sums of up to LANES chromosomes, (n, n_outputs) each."""
         setup = self.setup
-        padded = lanes if len(lanes) == LANES else np.resize(lanes, LANES)
+        padded = lanes.take(_EVERY_LANE, mode="wrap")
         p = np.ascontiguousarray(parameters[padded].T)
         start = self._start(padded)
         q = setup.measured.shape[1]

@@ -49,9 +49,9 @@ def adaptive_crossover(
 ) -> None:
     """Algorithm 4: of n random pairs, the less fit moves towards the fitter by a common ratio."""
     n = len(population)
-    ratio = rng.random()
-    for a, b in rng.integers(n, size=(n, 2)):
-        if fitness[a] > fitness[b]:
+    ratio, fit = rng.random(), fitness.tolist()
+    for a, b in rng.integers(n, size=(n, 2)).tolist():
+        if fit[a] > fit[b]:
             population[b] = ratio * population[a] + (1.0 - ratio) * population[b]
         else:
             population[a] = ratio * population[b] + (1.0 - ratio) * population[a]
@@ -65,9 +65,9 @@ def adaptive_mutation(
     sigma: (n_free,), standard deviation of the noise of each parameter.
     """
     n = len(population)
-    threshold = rng.random()
-    for a in rng.integers(n, size=n):
-        if fitness[a] < threshold:
+    threshold, fit = rng.random(), fitness.tolist()
+    for a in rng.integers(n, size=n).tolist():
+        if fit[a] < threshold:
             population[a] += threshold * rng.normal(0.0, sigma)
 
 

@@ -145,7 +145,8 @@ class GeneticSearch:
         scores = infeasibility(violations)
         behind = scores > 0.0 if self.preset.penalty else np.zeros(len(scores), dtype=bool)
         self._save_elite(errors, behind, scores == 0.0, chromosomes)
-        self._keep(errors, behind)
+        if self.preset.refine:
+            self._keep(errors, behind)
         self._check_termination()
         if self.done:
             return
@@ -159,7 +160,10 @@ class GeneticSearch:
             np.clip(self._coded, *self._bounds, out=self._coded)
 
     def promising(self, count: int) -> FloatArray:
-        """The best chromosomes yet that lie apart, best first, (at most ``count``, n_free)."""
+        """The best chromosomes yet that lie apart, best first, (at most ``count``, n_free).
+
+        They are kept for a preset that goes on with local refinement.
+        """
         return self.space.decode(self._kept[:count])
 
     def state(self) -> dict[str, Any]:
@@ -179,7 +183,7 @@ class GeneticSearch:
         # feasible or not, and the error, can be compared.
         usable = np.flatnonzero(np.isfinite(errors))
         if len(usable):
-            best = min(usable, key=lambda j: (behind[j], errors[j]))
+            best = usable[np.lexsort((errors[usable], behind[usable]))[0]]
             rank = (bool(behind[best]), float(errors[best]))
             if self._leader is None or rank < self._leader_rank:
                 self._leader, self._leader_rank = chromosomes[best].copy(), rank
