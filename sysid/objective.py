@@ -26,11 +26,12 @@ class Responses:
     """Residuals of chromosomes, (n_residuals, n_outputs, n), and their RMS, (n, n_outputs).
 
     In parts of the outputs' scales, 0 where a sample was lost, not finite where a simulation
-    failed.
+    failed. excess: (n,), the simulations' error estimates in parts of what the accuracy allows.
     """
 
     values: FloatArray
     rms: FloatArray
+    excess: FloatArray
 
 
 class Objective:
@@ -120,16 +121,22 @@ class Objective:
         """RMSE of each output in parts of its scale, (n, n_outputs), infinite where it failed."""
         return self._roots(self.evaluate(chromosomes)[1].sse.sum(axis=1))
 
-    def residuals(self, chromosomes: FloatArray, n_steps: Sequence[int] | IntArray) -> Responses:
+    def residuals(
+        self, chromosomes: FloatArray, n_steps: Sequence[int] | IntArray, *, keep: bool = True
+    ) -> Responses:
         """Residuals at given integration steps per sample, records one after another.
 
-        n_steps: (n_records,), or of each chromosome (n, n_records).
+        n_steps: (n_records,), or of each chromosome (n, n_records). Without ``keep`` only what
+        they come to, and no values.
         """
-        return self._responses(chromosomes, n_steps, keep=True)
-
-    def rms_at(self, chromosomes: FloatArray, n_steps: Sequence[int] | IntArray) -> FloatArray:
-        """The same residuals' root mean squares alone, (n, n_outputs)."""
-        return self._responses(chromosomes, n_steps, keep=False).rms
+        steps = np.broadcast_to(n_steps, (len(chromosomes), len(self.records)))
+        found = self.simulator.residuals(
+            self.space.full(chromosomes), self.records, self.scales, steps,
+            self._starts(chromosomes), keep=keep,
+        )  # fmt: skip
+        self._counter[0] += len(chromosomes)
+        rms = self._roots(found.sse.sum(axis=1))
+        return Responses(found.values, rms, found.excess.max(axis=1))
 
     def steps_needed(self, chromosomes: FloatArray) -> IntArray:
         """Integration steps per sample that each chromosome needs, (n, n_records)."""
@@ -174,17 +181,6 @@ class Objective:
             self.space.starts(chromosomes, k, record.initial_state(model))
             for k, record in enumerate(self.records)
         ]
-
-    def _responses(
-        self, chromosomes: FloatArray, n_steps: Sequence[int] | IntArray, *, keep: bool
-    ) -> Responses:
-        steps = np.broadcast_to(n_steps, (len(chromosomes), len(self.records)))
-        found = self.simulator.residuals(
-            self.space.full(chromosomes), self.records, self.scales, steps,
-            self._starts(chromosomes), keep=keep,
-        )  # fmt: skip
-        self._counter[0] += len(chromosomes)
-        return Responses(found.values, self._roots(found.sse.sum(axis=1)))
 
     def _roots(self, sse: FloatArray) -> FloatArray:
         """Root mean squares of sums of squares, (n, n_outputs)."""

@@ -37,9 +37,12 @@ _PATIENCE = 3  # iterations that do not keep their promise, the later ones with 
 # stop on it. One that has arrived goes on with the next smaller share.
 _SMOOTHING = (1e-1, 1e-2, 1e-3)
 ROUNDING = 1e-12  # errors below it are those of the arithmetic
-# After moves of more than this part of a range the integration steps are chosen anew.
+# After moves of more than this part of a range the integration steps are chosen anew,
+# unless the error estimate there says that those in use do.
 _FAR = 0.05
 _NEAR = 1e-3  # for the last time
+# Steps whose error estimate is so small a part of what is allowed are twice as many as needed.
+_LAVISH = 0.1
 # A neighbour whose outputs err by so many times their size more than the descent's has left a
 # simulation at the edge of stability: so many times the steps are taken.
 _BURST, _STEADIER, _BRACINGS = 10.0, 1.5, 3
@@ -50,10 +53,15 @@ _BATCH_BYTES = 2**28  # residuals held at once, unless one descent needs more
 
 @dataclass(frozen=True)
 class Refinement:
-    """Refined chromosome (n_free,), its error, and the iterations it took."""
+    """Refined chromosome (n_free,), its error, each output's, and the iterations it took.
+
+    rms: (n_outputs,), by a simulation with the steps that the chromosome needs; infinite where
+    it needs more than it is allowed.
+    """
 
     chromosome: FloatArray
     error: float
+    rms: FloatArray
     iterations: int
 
 
@@ -62,15 +70,18 @@ class Descent:
     """One descent between two iterations; ``advance`` returns the next.
 
     at: search coordinates (n_free,). error: the objective there, infinite before the first
-    iteration. gain: part of the error that the last iteration took away. steps: integration
-    steps per sample of each record, chosen at ``steps_at``, None where they are to be chosen;
-    braced: how often they have been raised since, for the sake of the sensitivities.
-    sure, sure_error: where they were last chosen and a simulation succeeded, and the error
-    there; further on they may not do, until the descent has finished.
+    iteration; rms: (n_outputs,), the outputs' errors, by a simulation whose error estimate is
+    ``excess`` times what the accuracy allows. gain: part of the error that the last iteration
+    took away. steps: integration steps per sample of each record, chosen at ``steps_at``, None
+    where they are to be chosen; braced: how often they have been raised since, for the sake of
+    the sensitivities. sure, sure_error: where they were last chosen and a simulation succeeded,
+    and the error there; further on they may not do, until the descent has finished.
     """
 
     at: FloatArray
     error: float = np.inf
+    rms: FloatArray | None = None
+    excess: float = np.inf
     gain: float = 0.0
     steps: tuple[int, ...] = ()
     steps_at: FloatArray | None = None
@@ -84,6 +95,11 @@ class Descent:
     finished: bool = False
     sure: FloatArray | None = None
     sure_error: float = np.inf
+
+    @property
+    def shown(self) -> FloatArray | None:
+        """``rms`` where its simulation had the steps that it needs."""
+        return self.rms if self.excess <= 1.0 else None
 
 
 def refine(
@@ -105,9 +121,10 @@ def refine(
     descent = begin(objective, chromosome)
     while not descent.finished and descent.iterations < max_iterations:
         (descent,) = advance(objective, [descent], tolerance)
-        if on_iteration is not None and np.isfinite(descent.error):
-            on_iteration(Refinement(space.decode(descent.at), descent.error, descent.iterations))
-    return Refinement(space.decode(descent.at), descent.error, descent.iterations)
+        if on_iteration is not None and descent.rms is not None and np.isfinite(descent.error):
+            at = space.decode(descent.at)
+            on_iteration(Refinement(at, descent.error, descent.rms, descent.iterations))
+    return _refined(objective, [descent])[0]
 
 
 def refine_each(
@@ -123,8 +140,25 @@ def refine_each(
         if all(descent.finished for descent in descents):
             break
         descents = advance(objective, descents, tolerance)
-    decode = objective.space.decode
-    return [Refinement(decode(d.at), d.error, d.iterations) for d in descents]
+    return _refined(objective, descents)
+
+
+def _refined(objective: Objective, descents: list[Descent]) -> list[Refinement]:
+    """Where descents have come to, simulated once more where their steps may not have done."""
+    if not descents:
+        return []
+    chromosomes = objective.space.decode(np.stack([descent.at for descent in descents]))
+    unsure = [i for i, descent in enumerate(descents) if descent.shown is None]
+    anew = iter(objective.rms(chromosomes[unsure])) if unsure else iter(())
+    return [
+        Refinement(
+            chromosome,
+            descent.error,
+            next(anew) if descent.shown is None else descent.shown,
+            descent.iterations,
+        )
+        for chromosome, descent in zip(chromosomes, descents, strict=True)
+    ]
 
 
 def begin(objective: Objective, chromosome: FloatArray) -> Descent:
@@ -145,7 +179,7 @@ def curvature(objective: Objective, at: FloatArray) -> FloatArray:
     frame = _Frame(objective)
     descents = frame.with_steps([Descent(at)])
     rows, distance = frame.perturbed(descents[0])
-    (around,) = frame.residuals(descents, [rows])
+    (around,) = frame.responses(descents, [rows])
     error = float(objective.error_of(around.rms[:1])[0])
     return _normal_equations(objective, around, distance, _SMOOTHING[0] * error).hessian
 
@@ -195,23 +229,20 @@ class _Frame:
         needed = self.objective.steps_needed(self.objective.space.decode(descent.at[None]))[0]
         return tuple(max(int(n), have) for n, have in zip(needed, descent.steps, strict=True))
 
-    def residuals(self, descents: list[Descent], rows: list[FloatArray]) -> list[Responses]:
+    def responses(
+        self, descents: list[Descent], rows: list[FloatArray], *, keep: bool = True
+    ) -> list[Responses]:
         """Responses of each descent's rows of coordinates, all in one batch."""
-        order, chromosomes, steps = self._together(descents, rows)
-        found = self.objective.residuals(chromosomes, steps)
-        ends = np.cumsum([len(rows[i]) for i in order])[:-1]
-        values = np.split(found.values, ends, axis=2)
-        parts = dict(zip(order, zip(values, np.split(found.rms, ends), strict=True), strict=True))
-        return [Responses(*parts[i]) for i in range(len(rows))]
-
-    def rms(self, descents: list[Descent], rows: list[FloatArray]) -> list[FloatArray]:
-        """The responses' root mean squares alone, (n_rows, n_outputs) each."""
         if not rows:
             return []
         order, chromosomes, steps = self._together(descents, rows)
-        found = self.objective.rms_at(chromosomes, steps)
-        ends = np.cumsum([len(rows[i]) for i in order])[:-1]
-        parts = dict(zip(order, np.split(found, ends), strict=True))
+        found = self.objective.residuals(chromosomes, steps, keep=keep)
+        parts: dict[int, Responses] = {}
+        first = 0
+        for i in order:
+            own = slice(first, first + len(rows[i]))
+            parts[i] = Responses(found.values[..., own], found.rms[own], found.excess[own])
+            first = own.stop
         return [parts[i] for i in range(len(rows))]
 
     def _together(
@@ -266,21 +297,17 @@ class _Candidates:
 
 @dataclass(frozen=True)
 class _Sensed:
-    """A descent, the outputs' errors where it is, (n_outputs,), and the quadratic around it.
-
-    place: among those that are moved together.
-    """
+    """A descent and the quadratic around it; place: among those that are moved together."""
 
     place: int
     descent: Descent
-    rms: FloatArray
     equations: _Equations
 
 
 def _iterate(frame: _Frame, descents: list[Descent], tolerance: float) -> list[Descent]:
     result: list[Descent | None] = [None] * len(descents)
     around = [frame.perturbed(descent) for descent in descents]
-    responses = frame.residuals(descents, [rows for rows, _ in around])
+    responses = frame.responses(descents, [rows for rows, _ in around])
     sensed: list[_Sensed] = []
     for i, descent in enumerate(descents):
         moved = _sensed(frame, i, descent, responses[i], around[i][1])
@@ -291,12 +318,14 @@ def _iterate(frame: _Frame, descents: list[Descent], tolerance: float) -> list[D
     tried: list[tuple[_Sensed, _Candidates]] = []
     for one, candidates in zip(sensed, _candidates(frame, sensed), strict=True):
         if len(candidates.rows) == 0 or candidates.promise <= tolerance:
-            result[one.place] = _next_round(frame, one.descent, one.rms)
+            result[one.place] = _next_round(frame, one.descent)
         else:
             tried.append((one, candidates))
-    errors = frame.rms([one.descent for one, _ in tried], [found.rows for _, found in tried])
-    for (one, candidates), rms in zip(tried, errors, strict=True):
-        result[one.place] = _judged(frame, one, candidates, rms, tolerance)
+    ends = frame.responses(
+        [one.descent for one, _ in tried], [found.rows for _, found in tried], keep=False
+    )
+    for (one, candidates), found in zip(tried, ends, strict=True):
+        result[one.place] = _judged(frame, one.descent, candidates, found, tolerance)
     return [descent for descent in result if descent is not None]
 
 
@@ -309,7 +338,14 @@ def _sensed(
     if not np.isfinite(error):
         # With more steps the simulation fails.
         return _back(descent)
-    at = replace(descent, error=error, gain=0.0, iterations=descent.iterations + 1)
+    at = replace(
+        descent,
+        error=error,
+        rms=around.rms[0],
+        excess=float(around.excess[0]),
+        gain=0.0,
+        iterations=descent.iterations + 1,
+    )
     if at.steps_at is not None and np.array_equal(at.at, at.steps_at):
         at = replace(at, sure=at.at, sure_error=error)
     if error <= ROUNDING:
@@ -324,7 +360,7 @@ def _sensed(
         at = replace(at, error_of_round=error)
     floor = _SMOOTHING[at.smoothing] * error
     equations = _normal_equations(frame.objective, around, distance, floor)
-    return _Sensed(place, at, around.rms[0], equations)
+    return _Sensed(place, at, equations)
 
 
 def _back(descent: Descent) -> Descent:
@@ -351,27 +387,26 @@ def _steadier(descent: Descent) -> Descent:
 
 
 def _judged(
-    frame: _Frame, sensed: _Sensed, candidates: _Candidates, rms: FloatArray, tolerance: float
+    frame: _Frame, descent: Descent, candidates: _Candidates, found: Responses, tolerance: float
 ) -> Descent:
-    """The descent after its candidates have been simulated; rms: (n, n_outputs), theirs."""
-    objective, descent = frame.objective, sensed.descent
+    """The descent after its candidates have been simulated."""
+    assert descent.rms is not None
+    objective, rms = frame.objective, np.stack([descent.rms, *found.rms])
     floor = _SMOOTHING[descent.smoothing] * descent.error
-    errors = objective.smoothed_error_of(rms, floor)
+    before, *errors = objective.smoothed_error_of(rms, floor).tolist()
     best = int(np.argmin(errors))
-    before = float(objective.smoothed_error_of(sensed.rms[None], floor)[0])
-    gain = (before - float(errors[best])) / before
+    gain = (before - errors[best]) / before
     moved, damping = descent, descent.damping
     if gain > 0.0:
-        at = candidates.rows[best]
-        assert descent.steps_at is not None
-        far = bool(np.any(np.abs(at - descent.steps_at) > _FAR * frame.width))
         moved = replace(
             descent,
-            at=at,
-            error=float(objective.error_of(rms[best : best + 1])[0]),
+            at=candidates.rows[best],
+            error=float(objective.error_of(found.rms[best : best + 1])[0]),
+            rms=found.rms[best],
+            excess=float(found.excess[best]),
             gain=gain,
-            steps_at=None if far else descent.steps_at,
         )
+        moved = _stepping(frame, moved)
         damping = candidates.damping[best] / np.sqrt(_FACTORS[-1])
     promising = candidates.promise > _NOTHING
     poor = gain <= 0.0 or (promising and gain < _KEPT * candidates.promise)
@@ -383,14 +418,25 @@ def _judged(
         # More damping did not help: it is the sensitivities that are wrong.
         return replace(moved, level=descent.level + 1, failures=0, damping=_FIRST_DAMPING)
     if failures >= _PATIENCE or 0.0 < gain <= tolerance:
-        return _next_round(frame, moved, rms[best] if gain > 0.0 else sensed.rms)
+        return _next_round(frame, moved)
     return moved
 
 
-def _next_round(frame: _Frame, descent: Descent, rms: FloatArray) -> Descent:
+def _stepping(frame: _Frame, descent: Descent) -> Descent:
+    """After a move: whether steps are to be chosen anew."""
+    assert descent.steps_at is not None
+    least = 0.0 if max(descent.steps) == 1 else _LAVISH
+    if least < descent.excess <= 1.0:
+        return descent
+    far = bool(np.any(np.abs(descent.at - descent.steps_at) > _FAR * frame.width))
+    return replace(descent, steps_at=None) if far else descent
+
+
+def _next_round(frame: _Frame, descent: Descent) -> Descent:
     """Finished; unless what was smoothed is not yet the error, or coarse sensitivities have
-    gained, from where fine ones may go on. rms: (n_outputs,), there."""
-    rms = rms[frame.objective.weights > 0.0]
+    gained, from where fine ones may go on."""
+    assert descent.rms is not None
+    rms = descent.rms[frame.objective.weights > 0.0]
     smoothing = descent.smoothing
     if np.any(rms < _SMOOTHING[smoothing] * descent.error) and smoothing + 1 < len(_SMOOTHING):
         return replace(descent, smoothing=smoothing + 1, failures=0)

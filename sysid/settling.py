@@ -82,7 +82,7 @@ def settle(
             best.objective, starts, max_iterations=_QUICKLY, tolerance=_ROUGHLY
         ):
             # By the best one's weights, until it turns out to matter.
-            rough = _as_found(best.objective, found.chromosome)
+            rough = _as_found(best.objective, found.chromosome, found.rms)
             if known.new(rough) and known.evidence(rough, best) < _CONCEIVABLE:
                 known.add(_weighed(objective, found.chromosome, watch))
     best, *others = known.ranked()
@@ -166,7 +166,8 @@ def _exact(minimum: _Settling) -> _Settling:
     if minimum.rms.max() > _OWN * accuracy:
         return minimum
     objective = minimum.objective.finer(max(_FINER * accuracy, _FINEST))
-    return _as_found(objective, refine(objective, minimum.chromosome).chromosome)
+    found = refine(objective, minimum.chromosome)
+    return _as_found(objective, found.chromosome, found.rms)
 
 
 def _weighed(objective: Objective, chromosome: FloatArray, watch: Watch | None) -> _Settling:
@@ -180,14 +181,13 @@ def _weighed(objective: Objective, chromosome: FloatArray, watch: Watch | None) 
         weighed = objective.weighed(weights)
         steady = np.allclose(weighed.weights, objective.weights, rtol=_STEADY)
         objective = weighed
-        chromosome = refine(objective, chromosome, on_iteration=watch).chromosome
-        rms = objective.rms(chromosome[None])[0]
+        found = refine(objective, chromosome, on_iteration=watch)
+        chromosome, rms = found.chromosome, found.rms
         if steady:
             break
-    return _as_found(objective, chromosome)
+    return _as_found(objective, chromosome, rms)
 
 
-def _as_found(objective: Objective, chromosome: FloatArray) -> _Settling:
-    rms = objective.rms(chromosome[None])[0]
+def _as_found(objective: Objective, chromosome: FloatArray, rms: FloatArray) -> _Settling:
     finite = np.where(np.isfinite(rms), rms, np.finfo(np.float64).max)
     return _Settling(objective, chromosome, finite, objective.space.feasible(chromosome))

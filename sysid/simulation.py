@@ -68,11 +68,13 @@ class Residuals:
 
     values: (n_residuals, n_outputs, n_chromosomes), records one after another, 0 where a sample
     was lost; not finite where a simulation failed. sse: (n_chromosomes, n_records, n_outputs),
-    their sums of squares.
+    their sums of squares. excess: (n_chromosomes, n_records), error estimates in parts of what
+    the accuracy allows: up to 1 the steps were enough.
     """
 
     values: FloatArray
     sse: FloatArray
+    excess: FloatArray
 
 
 class BatchSimulator:
@@ -177,23 +179,24 @@ class BatchSimulator:
         """
         parameters = self._check(parameters, records)
         n, q = len(parameters), len(self.model.outputs)
-        sse = np.empty((n, len(records), q))
+        sse, excess = np.empty((n, len(records), q)), np.empty((n, len(records)))
         ends = np.cumsum([record.n_samples for record in records])
         values = np.empty((ends[-1] if keep else 0, q, n))
         tasks = []
         for r, (record, end) in enumerate(zip(records, ends, strict=True)):
             runner = self._runner(record, scales[r], starts[r])
             part = values[end - record.n_samples : end]
-            tasks += [(runner, part, sse[:, r], *run) for run in _runs(n_steps[:, r])]
+            tasks += [(runner, part, r, *run) for run in _runs(n_steps[:, r])]
         # What takes longest is begun first.
         tasks.sort(key=lambda task: -task[4] * task[0].setup.record.n_samples)
 
-        def run(task: tuple[_Runner, FloatArray, FloatArray, slice, int]) -> None:
-            runner, part, sums, rows, steps = task
-            sums[rows] = runner.residuals(parameters, rows, steps, part[..., rows])
+        def run(task: tuple[_Runner, FloatArray, int, slice, int]) -> None:
+            runner, part, r, rows, steps = task
+            found = runner.residuals(parameters, rows, steps, part[..., rows])
+            sse[rows, r], excess[rows, r] = found
 
         self._workers.each(run, tasks)
-        return Residuals(values, sse)
+        return Residuals(values, sse, excess)
 
     def steps_of_each(self, parameters: FloatArray, record: Dataset) -> IntArray:
         """Integration steps per sample that each parameter vector needs, (n,)."""
@@ -261,16 +264,18 @@ class _Runner:
 
     def residuals(
         self, parameters: FloatArray, rows: slice, n_steps: int, values: FloatArray
-    ) -> FloatArray:
-        """Error sums (n, n_outputs) of up to LANES rows; values gets their residuals.
+    ) -> tuple[FloatArray, FloatArray]:
+        """Error sums (n, n_outputs) of up to LANES rows and error estimates in parts of what is
+        allowed, (n,); values gets their residuals.
 
         values: (n_samples, n_outputs, n), or without samples to keep none.
         """
         record = np.full((len(values), values.shape[1], LANES), np.nan)
         lanes = np.arange(rows.start, rows.stop)
-        sums = self._run(parameters, lanes, n_steps, record)[0]
+        sums, estimates = self._run(parameters, lanes, n_steps, record)
         values[:] = record[..., : len(lanes)]
-        return sums
+        taken = np.full(len(lanes), n_steps * (self.setup.record.n_samples - 1))
+        return sums, self._excess(sums, estimates, taken)
 
     def _choose(
         self, parameters: FloatArray, sse: FloatArray, spent: IntArray
@@ -337,9 +342,15 @@ class _Runner:
         self.simulator._workers.each(run, tasks)
         taken = steps[todo] * ((n_samples or self.setup.record.n_samples) - 1)
         spent[todo] += taken
-        errors = sse[todo, 0]
+        return self._excess(sse[todo, 0], estimates[todo], taken)
+
+    def _excess(self, errors: FloatArray, estimates: FloatArray, taken: IntArray) -> FloatArray:
+        """Error estimates in parts of what the accuracy allows, (n,), infinite after a failure.
+
+        errors, estimates: (n, n_outputs), sums over a simulation; taken: (n,), its steps.
+        """
         with np.errstate(all="ignore"):
-            per_step = np.sqrt(estimates[todo] / taken[:, None]) / self._size(errors)
+            per_step = np.sqrt(estimates / taken[:, None]) / self._size(errors)
         excess = np.max(per_step, axis=1) / (_ESTIMATE_LIMIT * self.simulator.accuracy)
         return np.where(np.isfinite(errors).all(axis=1), excess, np.inf)
 

@@ -175,7 +175,7 @@ class LocalSearch:
             # What remains to be smoothed matters to the last digits only.
             ended = descent.finished or descent.iterations >= _MOST_ITERATIONS
             if ended or descent.smoothing > 0:
-                self._add(descent.at, descent.error)
+                self._add(descent.at, descent.error, descent.shown)
             else:
                 self.descents.append(descent)
         least = min([self.error, *(descent.error for descent in self.descents)])
@@ -199,9 +199,13 @@ class LocalSearch:
         space = self.objective.space
         return space.feasible(space.decode(at))
 
-    def _add(self, at: FloatArray, error: float) -> None:
-        """One minimum more, unless the outputs err as in another; flat directions tell nothing."""
-        rms = self.objective.rms(self.objective.space.decode(at[None]))[0]
+    def _add(self, at: FloatArray, error: float, rms: FloatArray | None = None) -> None:
+        """One minimum more, unless the outputs err as in another; flat directions tell nothing.
+
+        rms: the outputs' errors, where they are known.
+        """
+        if rms is None:
+            rms = self.objective.rms(self.objective.space.decode(at[None]))[0]
         if not (np.isfinite(error) and np.all(np.isfinite(rms))):
             return
         self._offer(at, error)

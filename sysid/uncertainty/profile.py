@@ -132,7 +132,8 @@ class _Tracer:
 
     def _error(self, chromosome: FloatArray) -> float:
         steps = common_steps(self.objective, chromosome)
-        return float(self.objective.error_of(self.objective.rms_at(chromosome[None], steps))[0])
+        found = self.objective.residuals(chromosome[None], steps, keep=False)
+        return float(self.objective.error_of(found.rms)[0])
 
 
 def _crossing(points: list[tuple[float, float]]) -> float | None:

@@ -170,4 +170,6 @@ class Formula:
             found[:, ~np.isfinite(record.outputs)] = 0.0
             parts.append(found)
         sse = np.stack([np.sum(part**2, axis=1) for part in parts], axis=1)
-        return Residuals(np.moveaxis(np.concatenate(parts, axis=1), 0, 2).copy(), sse)
+        needed = np.stack([self.steps_of_each(vectors, record) for record in records], axis=1)
+        values = np.moveaxis(np.concatenate(parts, axis=1), 0, 2).copy()
+        return Residuals(values, sse, needed / n_steps)

@@ -60,7 +60,7 @@ def test_the_objective_of_uneven_logs_is_that_of_scipy(per_log, balance):
     # Refinement sees the same figure.
     steps = [64] * len(records)
     np.testing.assert_allclose(
-        objective.error_of(objective.rms_at(vectors, steps)), truth, rtol=1e-5
+        objective.error_of(objective.residuals(vectors, steps).rms), truth, rtol=1e-5
     )
 
 

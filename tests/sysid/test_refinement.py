@@ -225,7 +225,7 @@ def test_an_output_that_lost_most_of_its_samples_counts_as_the_error_counts_it()
     target = Objective(simulator, SearchSpace.of(model), [Dataset(u, outputs, 0.01)])
 
     def error(gain):
-        return float(target.error_of(target.rms_at(np.array([[gain]]), [1]))[0])
+        return float(target.error_of(target.residuals(np.array([[gain]]), [1]).rms)[0])
 
     exact = minimize_scalar(error, bounds=(0.5, 2.0), method="bounded", options={"xatol": 1e-9})
     found = refine(target, np.array([2.0]), tolerance=1e-12).chromosome[0]
