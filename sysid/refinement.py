@@ -37,12 +37,9 @@ _PATIENCE = 3  # iterations that do not keep their promise, the later ones with 
 # stop on it. One that has arrived goes on with the next smaller share.
 _SMOOTHING = (1e-1, 1e-2, 1e-3)
 ROUNDING = 1e-12  # errors below it are those of the arithmetic
-# After moves of more than this part of a range the integration steps are chosen anew,
-# unless the error estimate there says that those in use do.
+# After moves of more than this part of a range the integration steps are chosen anew.
 _FAR = 0.05
 _NEAR = 1e-3  # for the last time
-# Steps whose error estimate is so small a part of what is allowed are twice as many as needed.
-_LAVISH = 0.1
 # A neighbour whose outputs err by so many times their size more than the descent's has left a
 # simulation at the edge of stability: so many times the steps are taken.
 _BURST, _STEADIER, _BRACINGS = 10.0, 1.5, 3
@@ -133,13 +130,20 @@ def refine_each(
     *,
     max_iterations: int = 50,
     tolerance: float = 1e-7,
+    enough: Callable[[FloatArray], bool] = lambda chromosome: False,
 ) -> list[Refinement]:
-    """The same from each of several chromosomes (n_free,), side by side in the same batches."""
+    """The same from each of several chromosomes (n_free,), side by side in the same batches.
+
+    enough: of where a descent has come to, (n_free,), whether it need not go on.
+    """
     descents = [begin(objective, chromosome) for chromosome in chromosomes]
     for _ in range(max_iterations):
         if all(descent.finished for descent in descents):
             break
         descents = advance(objective, descents, tolerance)
+        for i, descent in enumerate(descents):
+            if not descent.finished and enough(objective.space.decode(descent.at)):
+                descents[i] = replace(descent, finished=True)
     return _refined(objective, descents)
 
 
@@ -366,11 +370,13 @@ def _sensed(
 def _back(descent: Descent) -> Descent:
     """Back from where a simulation fails with the steps it needs, to try more damping."""
     if descent.sure is None:
-        return replace(descent, error=np.inf, finished=True)
+        return replace(descent, error=np.inf, rms=None, excess=np.inf, finished=True)
     return replace(
         descent,
         at=descent.sure,
         error=descent.sure_error,
+        rms=None,
+        excess=np.inf,
         gain=0.0,
         steps_at=None,
         damping=_limited(descent.damping * _FACTORS[-1] / _FACTORS[0]),
@@ -398,15 +404,18 @@ def _judged(
     gain = (before - errors[best]) / before
     moved, damping = descent, descent.damping
     if gain > 0.0:
+        at = candidates.rows[best]
+        assert descent.steps_at is not None
+        far = bool(np.any(np.abs(at - descent.steps_at) > _FAR * frame.width))
         moved = replace(
             descent,
-            at=candidates.rows[best],
+            at=at,
             error=float(objective.error_of(found.rms[best : best + 1])[0]),
             rms=found.rms[best],
             excess=float(found.excess[best]),
             gain=gain,
+            steps_at=None if far else descent.steps_at,
         )
-        moved = _stepping(frame, moved)
         damping = candidates.damping[best] / np.sqrt(_FACTORS[-1])
     promising = candidates.promise > _NOTHING
     poor = gain <= 0.0 or (promising and gain < _KEPT * candidates.promise)
@@ -420,16 +429,6 @@ def _judged(
     if failures >= _PATIENCE or 0.0 < gain <= tolerance:
         return _next_round(frame, moved)
     return moved
-
-
-def _stepping(frame: _Frame, descent: Descent) -> Descent:
-    """After a move: whether steps are to be chosen anew."""
-    assert descent.steps_at is not None
-    least = 0.0 if max(descent.steps) == 1 else _LAVISH
-    if least < descent.excess <= 1.0:
-        return descent
-    far = bool(np.any(np.abs(descent.at - descent.steps_at) > _FAR * frame.width))
-    return replace(descent, steps_at=None) if far else descent
 
 
 def _next_round(frame: _Frame, descent: Descent) -> Descent:

@@ -77,13 +77,16 @@ def settle(
         if any(best is one for one in explored):
             break  # nothing better was found around it
         explored.append(best)
-        starts = lookalikes(best.objective, best.chromosome)
         for found in refine_each(
-            best.objective, starts, max_iterations=_QUICKLY, tolerance=_ROUGHLY
+            best.objective,
+            lookalikes(best.objective, best.chromosome),
+            max_iterations=_QUICKLY,
+            tolerance=_ROUGHLY,
+            enough=lambda chromosome: not known.new(chromosome),
         ):
             # By the best one's weights, until it turns out to matter.
             rough = _as_found(best.objective, found.chromosome, found.rms)
-            if known.new(rough) and known.evidence(rough, best) < _CONCEIVABLE:
+            if known.new(found.chromosome) and known.evidence(rough, best) < _CONCEIVABLE:
                 known.add(_weighed(objective, found.chromosome, watch))
     best, *others = known.ranked()
     best = _exact(best)
@@ -109,23 +112,20 @@ class _Known:
         self._minima: list[_Settling] = []
         self._samples: FloatArray | None = None
         self._sensitivity: Sensitivity | None = None
+        self._information: FloatArray | None = None
 
     def add(self, minimum: _Settling) -> None:
         """One more, unless it is known."""
-        if self.new(minimum):
+        if self.new(minimum.chromosome):
             self._minima.append(minimum)
 
-    def new(self, minimum: _Settling) -> bool:
+    def new(self, chromosome: FloatArray) -> bool:
         """Whether it is far from all others in directions that the data feel."""
-        if not self._minima:
-            return True
-        space, found = self._objective.space, self._first_sensitivity()
-        variance: FloatArray = np.mean(found.residual**2, axis=0)
-        variance = np.maximum(variance, max(_LEAST_SHARE**2 * variance.max(), 1e-300))
+        space = self._objective.space
         for known in self._minima:
-            moved = space.encode(known.chromosome) - space.encode(minimum.chromosome)
-            felt = found.slopes @ (moved / coordinate_units(self._objective, known.chromosome))
-            if np.sum(felt**2 / variance) < _ONE:
+            moved = space.encode(known.chromosome) - space.encode(chromosome)
+            moved /= coordinate_units(self._objective, known.chromosome)
+            if moved @ self._first_information() @ moved < _ONE:
                 return False
         return True
 
@@ -150,6 +150,16 @@ class _Known:
             weights = self._objective.weights * len(self._objective.weights)
             self._samples = weights * np.maximum(self._objective.counts / memory, _FEWEST)
         return self._samples
+
+    def _first_information(self) -> FloatArray:
+        """What the data tell of the coordinates at the minimum that was known first."""
+        if self._information is None:
+            found = self._first_sensitivity()
+            variance: FloatArray = np.mean(found.residual**2, axis=0)
+            variance = np.maximum(variance, max(_LEAST_SHARE**2 * variance.max(), 1e-300))
+            felt = (found.slopes / np.sqrt(variance)[:, None]).reshape(-1, found.slopes.shape[2])
+            self._information = felt.T @ felt
+        return self._information
 
     def _first_sensitivity(self) -> Sensitivity:
         """At the minimum that was known first."""

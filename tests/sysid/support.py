@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from sysid import Constraint, Dataset, Input, Output, Parameter, ProcessModel, State
-from sysid.simulation import Residuals
+from sysid.simulation import BatchResult, Residuals
 
 
 def lag_derivative(x, u, p):
@@ -173,3 +173,8 @@ class Formula:
         needed = np.stack([self.steps_of_each(vectors, record) for record in records], axis=1)
         values = np.moveaxis(np.concatenate(parts, axis=1), 0, 2).copy()
         return Residuals(values, sse, needed / n_steps)
+
+    def errors(self, vectors, records, scales, starts):
+        needed = np.stack([self.steps_of_each(vectors, record) for record in records], axis=1)
+        sse = self.residuals(vectors, records, scales, needed, starts).sse
+        return BatchResult(sse, np.zeros(len(vectors), dtype=int), needed.sum(axis=1))
