@@ -1,0 +1,259 @@
+"""Limits: where each trips, that none does falsely, and that blocks of any size agree."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from daq.config.rig import RigConfig
+from daq.hal import Flag, Mode, Phase, Samples
+from daq.limits import Limits
+from daq.limits.load import i2t_levels
+from daq.rig import Rig
+from sim_rig.backend import SimulatedDevice, Simulation
+
+RATE = 800.0
+TURN = 2.0 * math.pi
+EVERYTHING = {
+    "i2t": {
+        "motor": {"continuous": 1.8, "budget": 5.0},
+        "brake": {"continuous": 0.15, "budget": 0.5},
+    },
+    "speed": 170.0,
+    "torque": 3.5,
+    "travel": [-40.0, 40.0],
+    "winding": 0.25,
+    "encoder": {"stall": {"motor": 1.0}},
+}
+
+
+def samples(n=400, tick=None, **columns):
+    """Samples of a rig at work, with noise; some columns as given, in full or as one value."""
+    rng = np.random.default_rng(4)
+    time = np.arange(n) / RATE
+    usual = {
+        "current_motor": 0.3 + 0.005 * rng.standard_normal(n),
+        "current_brake": 0.1 + 0.005 * rng.standard_normal(n),
+        "torque": 0.02 * rng.standard_normal(n),
+        "theta": 10.0 * time,
+        "omega": 10.0 + 0.0 * time,
+        "flags": np.zeros(n, dtype=np.int64),
+    }
+    zero = np.zeros(n)
+    given = {name: np.broadcast_to(values, n).copy() for name, values in columns.items()}
+    return Samples(
+        **{
+            "tick": np.arange(n) if tick is None else tick,
+            "time": time,
+            "cmd_voltage_motor": zero,
+            "cmd_voltage_brake": zero,
+            "applied_voltage_motor": zero,
+            "applied_voltage_brake": zero,
+            **usual,
+            **given,
+        }
+    )
+
+
+def part(whole, rows):
+    names = [field.name for field in dataclasses.fields(whole)]
+    return Samples(**{name: getattr(whole, name)[rows] for name in names})
+
+
+def joined(blocks):
+    names = [field.name for field in dataclasses.fields(Samples)]
+    return Samples(**{n: np.concatenate([getattr(b, n) for b in blocks]) for n in names})
+
+
+def first_trip(limits, whole, cuts=()):
+    """The first tick beyond a limit, and the reason, of samples that arrive cut into blocks."""
+    ends = sorted({*cuts, len(whole)} - {0})
+    for start, end in zip([0, *ends[:-1]], ends, strict=True):
+        trip = limits.check(part(whole, slice(start, end)))
+        if trip is not None:
+            return start + trip[0], trip[1]
+    return None
+
+
+def limits_of(phase=Phase.RUN, calibrated=True, **changes):
+    limits = Limits(RigConfig(limits=changes))
+    limits.begin(Phase.CALIBRATION, RATE)
+    if calibrated:
+        limits.check(samples(800, theta=0.0, omega=0.0))
+    limits.begin(phase, RATE)
+    return limits
+
+
+def step(at, before, after, n=400):
+    return np.where(np.arange(n) < at, before, after)
+
+
+RAMP = 1e-6 * np.arange(400)  # never twice the same
+STILL = {"theta": 3.0, "omega": 0.0}
+CASES = {
+    "motor current": ({}, {"current_motor": step(100, math.nan, -2.5)}, 100, "-2.5 A, beyond its"),
+    "brake current": ({}, {"current_brake": step(50, 0.1, 0.22)}, 50, "limit of 0.21 A"),
+    "a current that is no number": (
+        {}, {"current_motor": step(9, 0.3, math.nan)}, 9, "current_motor is nan, which is no"),
+    "an infinite torque": ({}, {"torque": step(9, 0.0, math.inf)}, 9, "torque is inf, which is"),
+    "torque": ({"torque": 0.5}, {"torque": step(7, 0.0, -0.6)}, 7, "limit of 0.5 N*m"),
+    "speed": ({"speed": 20.0}, {"omega": step(30, 10.0, -21.0)}, 30, "omega is -21 rad/s"),
+    "the device's own": (
+        {}, {"flags": step(12, 0, int(Flag.INTERLOCK))}, 12, "the device found an input"),
+    "travel": (
+        {"travel": [-1, 1]}, {"theta": 5.0 + np.arange(400) * 0.1}, 63, "1.003 turns from where"),
+    "a jump": ({}, {"theta": 0.01 * np.arange(400) + step(77, 0, 2.0)}, 77, "jumped by 2.01 rad"),
+    # A quarter of a turn at 10 rad/s takes 126 ticks of 1/800 s.
+    "a silent encoder": ({}, {"theta": step(40, 0.0, 1.0)}, 40 + 126, "count stands still"),
+    "a blocked shaft": (
+        {"encoder": {"stall": {"motor": 1.0, "time": 0.25}}},
+        {**STILL, "current_motor": step(20, 0.3, 1.2) + RAMP, "current_brake": RAMP},
+        20 + 199, "stood still for 0.25 s at a motor current of 1.2 A"),
+    "a frozen torque": ({}, {"torque": step(60, math.nan, 0.01)}, 60 + 80, "its noise never let"),
+    "a frozen motor current": (
+        {}, {"current_motor": step(60, math.nan, 0.3)}, 60 + 80, "current_motor has read 0.3 to"),
+    "a motor current that does not follow": (
+        {"calibrated": False},
+        {"current_motor": 0.0, "applied_voltage_motor": step(100, 0.0, 0.5)},
+        179, "under a changed command"),
+}  # fmt: skip
+
+
+def with_noise(columns):
+    """Not-a-numbers at the beginning of a frozen signal stand for the usual noise."""
+    usual = samples()
+    return {
+        name: np.where(np.isnan(values), getattr(usual, name), values)
+        if np.ndim(values) and np.isnan(values[0]) else values
+        for name, values in columns.items()
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("size", [1, 37, 400])
+def test_a_limit_trips_at_its_sample_with_the_reason(name, size):
+    changes, columns, tick, reason = CASES[name]
+    whole = samples(**with_noise(columns))
+    trip = first_trip(limits_of(**changes), whole, range(size, 400, size))
+    assert trip is not None and trip[0] == tick
+    assert reason in trip[1]
+
+
+@given(st.lists(st.integers(1, 399), max_size=12), st.sampled_from(sorted(CASES)))
+@settings(max_examples=60, deadline=None)
+def test_where_the_samples_are_cut_into_blocks_changes_nothing(cuts, name):
+    changes, columns, tick, _ = CASES[name]
+    trip = first_trip(limits_of(**changes), samples(**with_noise(columns)), cuts)
+    assert trip is not None and trip[0] == tick
+
+
+@given(
+    st.lists(st.floats(0.0, 3.0), min_size=1, max_size=60),
+    st.floats(0.1, 2.0), st.floats(0.0, 1.0),
+)  # fmt: skip
+def test_i2t_is_a_sum_that_never_falls_below_zero(currents, continuous, start):
+    seconds = np.full(len(currents), 0.25)
+    level, expected = start, []
+    for current in currents:
+        level = max(0.0, level + (current**2 - continuous**2) * 0.25)
+        expected.append(level)
+    found = i2t_levels(start, np.array(currents), seconds, continuous)
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("size", [1, 64])
+def test_i2t_allows_a_constant_current_for_as_long_as_its_budget_says(size):
+    load = {"i2t": {"motor": {"continuous": 1.5, "budget": 0.7}}}
+    whole = samples(400, current_motor=2.0 + 1e-6 * np.arange(400))
+    trip = first_trip(limits_of(**load), whole, range(size, 400, size))
+    assert trip is not None
+    assert (trip[0] + 1) / RATE == pytest.approx(0.7 / (2.0**2 - 1.5**2), abs=1.5 / RATE)
+
+
+def test_lost_samples_count_for_the_time_they_lack():
+    tick = np.arange(400) * 5
+    load = {"i2t": {"motor": {"continuous": 1.5, "budget": 0.7}}}
+    whole = samples(400, tick=tick, theta=50.0 / RATE * np.arange(400), current_motor=2.0)
+    whole.current_motor[::2] += 1e-6
+    assert tick[first_trip(limits_of(**load), whole)[0]] / RATE == pytest.approx(0.4, abs=0.01)
+    # A shaft that a gap lets go far has not jumped.
+    fast = samples(400, tick=tick, theta=4.0 * np.arange(400))
+    assert first_trip(limits_of(), fast) is None
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_cable_nearly_unwound_stops_the_run_and_not_the_homing(sign):
+    limits = limits_of(Phase.HOMING, winding=0.5)
+    wound = sign * np.linspace(7.0, 7.0 + 3.0 * TURN, 400)
+    assert first_trip(limits, samples(theta=wound)) is None
+    limits.begin(Phase.RUN, RATE)
+    # The device may count from zero again.
+    unwound = sign * np.linspace(0.0, -3.0 * TURN, 400)
+    row, reason = first_trip(limits, samples(theta=unwound))
+    assert unwound[row] * sign < -2.5 * TURN <= unwound[row - 1] * sign
+    assert "nearly unwound" in reason and "of 3 turns are left" in reason
+
+
+def test_without_a_homing_nothing_counts_as_unwound():
+    limits = limits_of(winding=0.5)
+    assert first_trip(limits, samples(theta=np.linspace(0.0, -30.0, 400))) is None
+
+
+QUIET = [
+    *(({}, load, "closed") for load in ("pulley", "free", "hand", "locked")),
+    *(({"ideal": True}, load, "closed") for load in ("pulley", "free", "hand", "locked")),
+    *((options, "pulley", "open") for options in ({}, {"ideal": True})),
+    ({"imperfections": {"bits": 8}}, "pulley", "closed"),
+]
+
+
+@pytest.mark.parametrize(("options", "load", "driver"), QUIET, ids=str)
+def test_nothing_trips_on_a_simulated_rig_that_rests_works_and_rests(options, load, driver):
+    plant = {"load": load, "driver_motor": driver, "driver_brake": driver}
+    config = RigConfig(limits=EVERYTHING | {"current": {"motor": 10.0, "brake": 10.0}})
+    if load == "locked":  # which a limit of stalling is there to find
+        config = RigConfig(limits=config.limits.model_dump() | {"encoder": {"stall": None}})
+    rig = Rig(SimulatedDevice(Simulation(**options, plant=plant)), config)
+    limits = Limits(config)
+    rest = np.zeros((400, 2))
+    work = np.repeat(np.random.default_rng(1).uniform([-0.5, 0], [0.7, 0.2], (40, 2)), 20, axis=0)
+    with rig:
+        for phase, commands in (
+            (Phase.CALIBRATION, rest),
+            (Phase.RUN, np.concatenate([rest, work, rest, work])),
+        ):
+            rig.start(RATE, Mode.OPEN_LOOP)
+            limits.begin(phase, RATE)
+            rig.send(0, commands)
+            seen = 0
+            while seen < len(commands):
+                block = rig.receive()
+                seen += len(block)
+                assert limits.check(block) is None
+            rig.stop()
+
+
+def test_commands_follow_no_faster_than_the_slew():
+    config = RigConfig(limits={"slew": {"motor": 80.0}})
+    commands = np.zeros((60, 2))
+    commands[5:30, 0], commands[30:, 0] = 0.55, -0.2
+    commands[7:, 1] = 0.2
+    rows = []
+    with Rig(SimulatedDevice(Simulation(ideal=True)), config) as rig:
+        rig.start(RATE, Mode.CLOSED_LOOP)
+        for tick, command in enumerate(commands):
+            rig.send(tick, command[None])
+            rows.append(rig.receive())
+    played = joined(rows)
+    expected, now = [], 0.0
+    for wanted in commands[:, 0]:
+        now = min(max(wanted, now - 0.1), now + 0.1)
+        expected.append(now)
+    np.testing.assert_allclose(played.applied_voltage_motor, expected, atol=1e-12)
+    np.testing.assert_allclose(played.applied_voltage_brake, commands[:, 1], atol=1e-12)
+    np.testing.assert_allclose(played.cmd_voltage_motor, commands[:, 0])
+    clamped = (played.flags & int(Flag.CLAMPED)) != 0
+    np.testing.assert_array_equal(clamped, ~np.isclose(expected, commands[:, 0]))
