@@ -45,6 +45,21 @@ def html(expression: str) -> str:
     return _translated(expression, _html_atom, _html_rest)
 
 
+def equation(text: str) -> str:
+    """An equation in names (``L_m di_m/dt = v_m - R_m*i_m``) as HTML."""
+    parts = re.split(r"(\bd[A-Za-z]\w*/dt)", text)
+    return "".join(
+        f"d{_html_atom(part[1:-3])}/d<i>t</i>" if k % 2 else _spaced(html(part))
+        for k, part in enumerate(parts)
+    )
+
+
+def _spaced(text: str) -> str:
+    """Products without their signs, and a minus that is one."""
+    text = re.sub(r"(?<![\w;])-(?=[\s<\w(])", "−", text)
+    return text.replace("*", "\u2009")
+
+
 def tex(expression: str) -> str:
     """The same as LaTeX, to stand in text."""
     return _translated(expression, _tex_atom, _tex_rest)

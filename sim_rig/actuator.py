@@ -29,6 +29,7 @@ from sim_rig.options import (
     Smooth,
 )
 from sim_rig.parts import Layout, known, log_range
+from sim_rig.wording import equations
 from sysid import Constraint, Input, ModelError, Output, ProcessModel, State
 from sysid.model import picker
 
@@ -120,6 +121,9 @@ def actuator(
         output=_output(outputs, shaft) if "torque" in outputs else None,
         constraints=_constraints(parts, layout),
         guesses=guesses(driver_motor, driver_brake, load, friction),
+        equations=equations(
+            driver_motor, driver_brake, hysteresis, smooth, exponent, friction, load
+        ),
     )
     known_here = values.named(parameters, driver_motor, driver_brake, hysteresis, exponent)
     changes = {k: {"nominal": v} for k, v in known_here.items() if k in model.parameter_names}

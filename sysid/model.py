@@ -143,6 +143,7 @@ class ProcessModel:
     tuple; it may use ``math`` and helper functions of its own. ``output(x, u, p)`` likewise
     returns the outputs; without it each output is the state of the same name.
     ``guesses(records, known)`` reads starting ranges from data, see ``sysid.guessing``.
+    ``equations`` say to people what the functions compute, one text each.
 
     Raises ModelError when names repeat, an output has no state, or a function returns the
     wrong number of values at the nominal parameters.
@@ -158,10 +159,11 @@ class ProcessModel:
     constraints: tuple[Constraint, ...] = ()
     description: str = ""
     guesses: Callable[[Any, Any], Mapping[str, Any]] | None = None
+    equations: tuple[str, ...] = ()
     _output_states: tuple[int, ...] | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
-        for kind in ("states", "inputs", "outputs", "parameters", "constraints"):
+        for kind in ("states", "inputs", "outputs", "parameters", "constraints", "equations"):
             object.__setattr__(self, kind, _several(self.name, kind, getattr(self, kind)))
         for kind in ("states", "inputs", "outputs", "parameters"):
             _check_names(self.name, kind, [item.name for item in getattr(self, kind)])

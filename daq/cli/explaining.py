@@ -26,6 +26,7 @@ def view(model: ProcessModel, document: Mapping[str, Any]) -> dict[str, Any]:
         "recorded": _recorded(document["reproduction"]["runs"]),
         "model_name": model.name,
         "description": model.description,
+        "equations": model.equations,
         "inputs": model.inputs,
         "outputs": model.outputs,
         "n_free": len(free),

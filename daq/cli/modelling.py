@@ -126,6 +126,7 @@ def describe(model: ProcessModel) -> dict[str, Any]:
     return {
         "name": model.name,
         "description": model.description,
+        "equations": list(model.equations),
         **signals,
         "parameters": parameters,
         "constraints": [constraint.text for constraint in model.constraints],
@@ -139,6 +140,10 @@ def _describe(name: str, model: ProcessModel, as_json: bool) -> None:
         console.print_json({**describe(model), "options": choices})
         return
     console.print_line(f"{model.name}: {model.description}")
+    for equation in model.equations:
+        console.print_line(f"  {equation}")
+    if model.equations:
+        console.print_line()
     rows = [["state", s.name, s.unit, _start(s)] for s in model.states]
     rows += [["input", s.name, s.unit, s.hold] for s in model.inputs]
     rows += [["output", s.name, s.unit, s.description] for s in model.outputs]

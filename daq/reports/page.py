@@ -43,6 +43,7 @@ def page(document: Mapping[str, Any], view: Mapping[str, Any], drawings: Sequenc
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
     environment.filters["symbol"] = lambda name: Markup(notation.html(name))
+    environment.filters["equation"] = lambda text: Markup(notation.equation(text))
     environment.filters["unit"] = notation.unit_text
     environment.filters["number"] = lambda value, digits=3: Markup(_number(value, digits))
     environment.filters["plain"] = lambda value: Markup(notation.number_html(f"{value:g}"))

@@ -71,3 +71,10 @@ def test_no_name_brings_html_or_latex_of_its_own(name):
     tex = notation.escape_tex(name)
     for sign in "%&#_":
         assert tex.count(sign) == tex.count("\\" + sign)
+
+
+def test_equations_have_derivatives_and_no_signs_of_products():
+    assert notation.equation("L_m di_m/dt = -R_m*i_m - |z|^2") == (
+        "<i>L</i><sub>m</sub> d<i>i</i><sub>m</sub>/d<i>t</i> = "
+        "−<i>R</i><sub>m</sub>\u2009<i>i</i><sub>m</sub> − |<i>z</i>|<sup>2</sup>"
+    )

@@ -39,6 +39,7 @@ model = ProcessModel(
         Parameter({NASTY!r}, "m/V", 0.1, 0.05, 1.0, "log"),
     ),
     derivative=derivative,
+    equations=("tau dy/dt = a*b*u - y + <b>k</b>*w",),
 )
 """
 CONFIG = """
@@ -166,6 +167,7 @@ def test_every_figure_file_is_on_the_page(page, work):
 def test_text_from_users_is_text(page):
     assert "lag <i>&_%" in page.text
     assert "a lag & <script>alert(1)</script>" in page.text
+    assert "τ dy/dt = a\u2009b\u2009u − y + <b>k</b>\u2009w" in page.text
     assert "time constant, 50 % & <more>" in page.text
     assert "train <&_%>" in page.text
     assert NASTY in page.text

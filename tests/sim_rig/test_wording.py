@@ -1,0 +1,71 @@
+"""The actuator's equations as people read them are those that are computed."""
+
+import itertools
+import math
+import re
+
+import numpy as np
+import pytest
+
+from sim_rig.actuator import actuator
+
+FUNCTIONS = {"abs": abs, "tanh": math.tanh, "exp": math.exp, "cos": math.cos, "sin": math.sin}
+STATES = ("v_m", "v_b", "i_m", "i_b", "omega", "z", "theta")
+
+
+def evaluated(text, known):
+    python = re.sub(r"\|([^|]*)\|", r"abs(\1)", text.replace("^", "**"))
+    python = python.replace("dz/dt", "dz_dt")
+    return eval(python, {"__builtins__": {}}, FUNCTIONS | known)
+
+
+def derivative(model, x, u):
+    """The text's own: definitions first, then each dX/dt."""
+    known = dict(zip(STATES, x, strict=True))
+    known |= dict(zip(("u_m", "u_b", "torque"), u, strict=False))
+    known |= dict(zip(model.parameter_names, model.nominal, strict=True))
+    pairs = [line.split(" = ") for line in model.equations if " = " in line]
+    slopes = {}
+    # The rate of z stands in LuGre's torque, the torques in the shaft's equation.
+    order = sorted(pairs, key=lambda pair: (pair[0] != "dz/dt", "/dt" in pair[0]))
+    for left, right in order:
+        found = re.fullmatch(r"(?:(.+) )?d(\w+)/dt", left)
+        if found is None:
+            known[left] = evaluated(right, known)
+            continue
+        slope = evaluated(right, known) / (evaluated(found[1], known) if found[1] else 1.0)
+        slopes[found[2]] = slope
+        known[f"d{found[2]}_dt"] = slope
+    return np.array([slopes[name] for name in STATES])
+
+
+CASES = [
+    *(
+        {"hysteresis": kind, "smooth": smooth, "friction": friction}
+        for kind, smooth, friction in itertools.product(
+            ("bouc-wen", "dahl", "lugre"), (False, True), ("none", "stribeck", "cyclic")
+        )
+    ),
+    {"exponent": 1.5},
+    {"exponent": 2.0, "smooth": True},
+    {"driver_motor": "open"},
+    {"driver_brake": "open", "load": "free"},
+]
+
+
+@pytest.mark.parametrize("options", CASES, ids=str)
+def test_the_text_says_what_is_computed(options):
+    model = actuator(**options)
+    if "F_cos" in model.parameter_names:
+        model = model.with_parameters(F_cos={"nominal": 0.01}, F_sin={"nominal": -0.004})
+    rng = np.random.default_rng(1)
+    for _ in range(5):
+        x = rng.normal(size=7) * (5.0, 5.0, 1.0, 0.1, 3.0, 0.5, 2.0)
+        u = rng.normal(size=len(model.inputs))
+        computed = model.derivative(tuple(x.tolist()), tuple(u.tolist()), tuple(model.nominal))
+        assert derivative(model, x.tolist(), u.tolist()) == pytest.approx(computed, rel=1e-9)
+
+
+def test_loads_of_their_own_are_named():
+    assert any("tau_load" in line for line in actuator(load="pulley").equations)
+    assert "domega/dt = 0" in actuator(load="locked").equations
