@@ -111,7 +111,8 @@ class LocalSearch:
     def rivals(self, most: int) -> list[FloatArray]:
         """The likeliest of the minima hardly worse than the best, so many, (n_free,) each.
 
-        By the likelihood where they are: the mean logarithm of the outputs' errors.
+        Feasible before infeasible, then by the likelihood where they are: the mean logarithm of
+        the outputs' errors.
         """
         rms = self.objective.rms(self.objective.space.decode(self.best[None]))[0]
         near = [m for m in self.minima if m.error <= (1.0 + _NEAR) * self.error]
@@ -119,7 +120,12 @@ class LocalSearch:
         near = [Minimum(self.best, self.error, rms), *near]
         weights = self.objective.weights
         with np.errstate(divide="ignore"):  # of an output explained exactly
-            near.sort(key=lambda m: float(np.log(m.rms[weights > 0.0]) @ weights[weights > 0.0]))
+            near.sort(
+                key=lambda m: (
+                    not self._feasible(m.at),
+                    float(np.log(m.rms[weights > 0.0]) @ weights[weights > 0.0]),
+                )
+            )
         return [minimum.at for minimum in near[:most]]
 
     def step(self) -> None:

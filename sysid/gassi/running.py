@@ -73,7 +73,7 @@ class Run:
         if local is None:
             return found
         space = self.objective.space
-        if (not local.feasible, local.error) < (not found.feasible, found.error):
+        if self._gained(local):
             return Best(space, space.decode(local.best), local.error, local.feasible)
         whole = space.with_nominal_starts(found.chromosome)
         return Best(space, whole, found.error, found.feasible)
@@ -83,10 +83,16 @@ class Run:
         """The best chromosome (n_free,) and others far from it that are nearly as good."""
         best, local = self.best, self.local
         assert best is not None
-        if local is None:
+        if local is None or not self._gained(local):
             return [best.chromosome]
         space = self.objective.space
         return [space.decode(at) for at in local.rivals(_MOST_RIVALS)]
+
+    def _gained(self, local: LocalSearch) -> bool:
+        """Whether the local refinement found anything better than the search: feasible first."""
+        search = self.search
+        rank = (not local.feasible, local.error)
+        return rank < (not search.elite_feasible, search.elite_error)
 
     def step(self) -> None:
         """The next generation, or the next step of the local refinement."""

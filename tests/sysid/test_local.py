@@ -18,7 +18,9 @@ from sysid import (
     ProcessModel,
     State,
 )
-from sysid.gassi.local import LocalSearch
+from sysid.gassi import PRESETS, GeneticSearch
+from sysid.gassi.local import LocalSearch, Minimum
+from sysid.gassi.running import Run
 from sysid.objective import Objective
 from sysid.refinement import advance, begin, refine
 from sysid.space import SearchSpace
@@ -189,3 +191,23 @@ def test_it_slides_along_a_constraint():
     )
     expected = refine(objective(line, record, 1e-6), start[1:], max_iterations=200)
     assert found.error == pytest.approx(expected.error, rel=1e-3)
+
+
+def test_where_only_the_search_found_something_feasible_it_goes_on_from_there():
+    limit = Constraint("resistance >= 1.05", lambda p: 1.05 - p[0])
+    model, rng = motor(2.0, (limit,)), np.random.default_rng(2)
+    objective = Objective(BatchSimulator(model), SearchSpace.of(model), [motor_record()])
+    search = GeneticSearch(objective.space, PRESETS["default"], 40, 1, rng)
+    run = Run(objective, PRESETS["default"], search, 6, rng, likelihood=True)
+    while run.local is None:
+        run.step()
+    assert search.elite_feasible
+    beyond = objective.space.encode(model.nominal)  # a resistance of 1
+    run.local.best, run.local.error, run.local.feasible = beyond, 1e-9, False
+    run.local.minima = [Minimum(beyond, 1e-9, np.full(2, 1e-9))]
+    (kept,) = run.minima
+    np.testing.assert_array_equal(kept, search.elite)
+    # Once a descent has found a feasible one, it comes before the likelier infeasible one.
+    inside = objective.space.encode(search.elite)
+    run.local.best, run.local.error, run.local.feasible = inside, 1e-9, True
+    np.testing.assert_allclose(run.minima[0], search.elite)
