@@ -257,11 +257,7 @@ class _Conclusion:
                 meaning = "viscous damping of the motor"
                 numbers.append(_number("B_m", line.damping, "N*m*s/rad", meaning))
         if self._slowest is not None:
-            found = self._slowest[1]
-            reach = 1.96 * found.error
-            low, high = max(found.amplitude - reach, 0.0), found.amplitude + reach
-            meaning = f"torque that recurs {found.periods} times a turn, amplitude"
-            numbers.append(Number("cyclic", found.amplitude, "N*m", low, high, meaning))
+            numbers.append(_cyclic(self._slowest[1]))
         return tuple(numbers)
 
     def _by_brake(self, line: Line) -> Table:
@@ -388,7 +384,7 @@ class _Conclusion:
         return motor is not None and motor.damping == 0.0
 
     def _remarks(self) -> tuple[str, ...]:
-        remarks = [self._unsettled(), self._no_line]
+        remarks = [*self._unsettled(), self._no_line]
         if self._line is not None and self._line.misfit > 2.0:
             remarks.append(
                 f"The torque is no straight line in the velocity: its residuals are "
@@ -397,7 +393,7 @@ class _Conclusion:
             )
         if self._slowest is not None:
             found = self._slowest[1]
-            if found.amplitude > _SURE * found.error:
+            if _is_there(found):
                 remarks.append(
                     f"The torque follows the shaft's angle by ±{found.amplitude:.2g} N*m, "
                     f"{found.periods} times a turn: uneven friction, such as of worn brushes. "
@@ -405,20 +401,32 @@ class _Conclusion:
                 )
         if self._settings.torque_sensor == "load":
             remarks += self._loaded()
+        elif self._line is not None and self._line.constant is None:
+            remarks.append(
+                "The motor's constant and losses are not told apart, so c0 rests on the torque "
+                "sensor alone: visit several brake commands to have the motor's current as well."
+            )
         return tuple(filter(None, remarks))
 
-    def _unsettled(self) -> str:
+    def _unsettled(self) -> list[str]:
+        """The plateaus without a result: given up, or not done when the run ended."""
         found = {level.index for level in self._levels}
-        visited = set(np.unique(self._extra["plateau"]).astype(int))
-        missing = [
+        last = int(self._extra["plateau"][-1])
+        done = last if last >= 0 else len(self._plateaus)
+        given_up = [
             f"{step.velocity:g} rad/s at {step.brake:g} V"
-            + ("" if index in visited else " (not reached)")
-            for index, step in enumerate(self._plateaus)
+            for index, step in enumerate(self._plateaus[:done])
             if index not in found
         ]
-        if not missing:
-            return ""
-        return f"Not settled, and left out: {', '.join(missing)}."
+        remarks = []
+        if given_up:
+            remarks.append(f"Not settled, and left out: {', '.join(given_up)}.")
+        if done < len(self._plateaus):
+            total = len(self._plateaus)
+            remarks.append(
+                f"The run ended before the last {total - done} of {total} plateaus were measured."
+            )
+        return remarks
 
     def _loaded(self) -> list[str]:
         """What a torque sensor at the load says of a shaft that should be free."""
@@ -434,3 +442,17 @@ class _Conclusion:
 
 def _number(name: str, found: Estimate, unit: str, meaning: str) -> Number:
     return Number(name, found.value, unit, found.low, found.high, meaning)
+
+
+def _is_there(found: Ripple) -> bool:
+    """Whether a part of the torque recurs beyond doubt; the strongest of many is never zero."""
+    return found.amplitude > _SURE * found.error
+
+
+def _cyclic(found: Ripple) -> Number:
+    reach = 1.96 * found.error
+    low, meaning = 0.0, "torque that recurs with every turn, amplitude: none beyond noise"
+    if _is_there(found):
+        low = found.amplitude - reach
+        meaning = f"torque that recurs {found.periods} times a turn, amplitude"
+    return Number("cyclic", found.amplitude, "N*m", low, found.amplitude + reach, meaning)

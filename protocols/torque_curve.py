@@ -145,7 +145,7 @@ class Line:
     c0 [N*m*s/rad] and c1 [N*m*s/(rad*A)], None with one brake command. commands (m,) [V],
     currents (m,) [A], kappa (m,), the hysteretic torque while sliding [N*m], kappa_errors (m,).
     misfit: of the residuals, in parts of what noise explains. constant, damping: of the motor,
-    where the run tells them.
+    where the run tells them: with the sensor between, and several brake commands.
     """
 
     c0: Estimate
@@ -209,8 +209,8 @@ def fit(levels: Sequence[Level], plateaus: Sequence[Plateau], motor: Motor | Non
         kappa=solved.values[:m],
         kappa_errors=solved.errors[:m],
         misfit=solved.misfit,
-        constant=None if motor else solved.estimate(m + 4),
-        damping=None if motor else solved.estimate(m + 5),
+        constant=None if motor else solved.told(m + 4),
+        damping=None if motor else solved.told(m + 5),
     )
 
 
@@ -256,6 +256,11 @@ class _Solved:
         reach = float(t.ppf(0.975, self.freedom)) * float(self.errors[place])
         value = float(self.values[place])
         return Estimate(value, value - reach, value + reach)
+
+    def told(self, place: int) -> Estimate | None:
+        """The estimate where the rows tell it to a half, None elsewhere."""
+        found = self.estimate(place)
+        return found if found.high - found.value < 0.5 * found.value else None
 
 
 def _solve(matrix: FloatArray, sides: FloatArray, errors: FloatArray) -> _Solved:

@@ -66,6 +66,11 @@ def test_the_torque_of_every_plateau_is_the_plants(between):
     np.testing.assert_allclose(own["torque_spread"], 0.00706, rtol=0.1)
 
 
+def test_noise_is_not_called_a_ripple(between):
+    cyclic = numbers(between[3])["cyclic"]
+    assert cyclic.low == 0.0 and "none beyond noise" in cyclic.meaning
+
+
 def test_ranges_hold_the_truth_and_name_what_the_model_has(between):
     ranges = between[3].ranges
     for name, truth in (("c0", C0), ("c1", C1), ("K_m", K_M), ("B_m", B_M)):
@@ -134,6 +139,17 @@ def test_what_does_not_settle_is_named_and_left_out(tmp_path):
     assert table.columns["settled"].tolist() == [1.0, 1.0, 0.0, 0.0]
     assert np.isnan(table.columns["torque"][2:]).all()
     assert np.abs(samples.cmd_voltage_motor).max() == settings.motor_limit
+
+
+def test_a_run_cut_short_concludes_from_what_it_has(between):
+    settings, samples, extra, whole = between
+    end = int(np.argmax(extra["plateau"] == 6.0)) + 900  # half-way through the seventh
+    cut = Samples(**{name: getattr(samples, name)[:end] for name in samples.__dataclass_fields__})
+    found = settings.findings(cut, {name: values[:end] for name, values in extra.items()})
+    assert found.remarks == ("The run ended before the last 6 of 12 plateaus were measured.",)
+    np.testing.assert_array_equal(
+        found.tables[1].columns["torque"][:6], whole.tables[1].columns["torque"][:6]
+    )
 
 
 def test_a_loop_that_runs_away_is_ended(tmp_path):
@@ -288,6 +304,13 @@ def test_the_motors_dry_friction_is_not_taken_for_the_brakes():
     np.testing.assert_allclose(line.kappa, RESIDUAL + PER_AMPERE * line.currents, rtol=1e-6)
 
 
+def test_with_one_brake_command_nothing_is_said_of_the_motor():
+    plateaus, levels = synthetic(np.random.default_rng(3), 1.0)
+    line = fit([level for level in levels if level.brake_current == 0.0], plateaus, None)
+    assert line.constant is None and line.damping is None and line.c1 is None
+    assert line.c0.low < C0 < line.c0.high
+
+
 @pytest.mark.parametrize("motor", [None, Motor(K_M, B_M)])
 def test_intervals_hold_the_truth_at_least_as_often_as_they_say(motor):
     rng = np.random.default_rng(5)
@@ -313,7 +336,7 @@ def test_a_ripple_is_told_from_noise():
     assert found.periods == 3
     assert found.amplitude == pytest.approx(0.004, abs=3.0 * found.error)
     assert found.error == pytest.approx(0.007 * math.sqrt(2.0 / 2400), rel=0.05)
-    none = ripple(theta, 0.02 + noise)
+    none = ripple(theta, 0.02 + noise)  # twelve harmonics, of which the strongest is taken
     assert none.amplitude < 4.0 * none.error
 
 
