@@ -8,7 +8,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import ConfigDict, create_model
 
@@ -24,7 +24,7 @@ from daq.experiment import Experiment, Plan
 from daq.hal import Device
 from daq.limits import Limit
 from daq.planning import plan
-from daq.plugins import load_plugin
+from daq.plugins import Group, load_plugin
 
 DEFAULT_RIG = "simulated.yaml"
 
@@ -142,19 +142,46 @@ def find_protocol(name: str, folder: Path) -> type[Experiment]:
 
     File names are looked up from the working folder, then from ``folder``. Raises ConfigError.
     """
+    cure = (
+        "make it a class derived from daq.experiment.Timed, OpenLoop or ClosedLoop, with all of "
+        "its methods"
+    )
+    found: type[Experiment] = _find("protocol", name, folder, _is_protocol, cure)
+    return found
+
+
+def _find_limit(name: str, folder: Path) -> type[Limit]:
+    cure = "make it a class derived from daq.limits.Limit with a method check"
+    found: type[Limit] = _find("limit", name, folder, _is_limit, cure)
+    return found
+
+
+def _find_backend(name: str, folder: Path) -> Any:
+    cure = "make it a class with Options and the methods of daq.hal.Device"
+    return _find("backend", name, folder, _is_backend, cure)
+
+
+def _find(
+    kind: Literal["backend", "limit", "protocol"],
+    name: str,
+    folder: Path,
+    is_one: Callable[[Any], bool],
+    cure: str,
+) -> Any:
+    """What is installed under a name, or a class of ``FILE.py:CLASS``; ConfigError with a cure."""
+    groups: dict[str, Group] = {
+        "backend": "rig.backends",
+        "limit": "rig.limits",
+        "protocol": "rig.protocols",
+    }
     file = _in_file(name)
     if file is None:
-        found = load_plugin("rig.protocols", name)
+        found = load_plugin(groups[kind], name)
     else:
-        path = locate(Path(file[1]), "protocol", folder)
-        found = from_file(path, file[2], "protocol", _is_protocol)
-    if not _is_protocol(found):
-        raise ConfigError(
-            f"{name} is no protocol; make it a class derived from daq.experiment.Timed, OpenLoop "
-            "or ClosedLoop, with all of its methods"
-        )
-    kind: type[Experiment] = found
-    return kind
+        found = from_file(locate(Path(file[1]), kind, folder), file[2], kind, is_one)
+    if not is_one(found):
+        raise ConfigError(f"{name} is no {kind}; {cure}")
+    return found
 
 
 def make_experiment(file: YamlFile, kind: type[Experiment]) -> Experiment:
@@ -195,7 +222,7 @@ def load_rig(name: str, options: Mapping[str, Any] | None = None) -> tuple[RigCo
     if not isinstance(backend_name, str):
         checking.validate(file, RigConfig)
     try:
-        backend = load_plugin("rig.backends", backend_name)
+        backend = _find_backend(backend_name, file.path.parent)
     except ConfigError as error:
         unknown = file.mistake(("backend",), str(error))
         checking.validate(file, RigConfig, others=[unknown])
@@ -224,20 +251,13 @@ def _limit_maker(file: YamlFile, own: OwnLimit, key: Key) -> Callable[[], Limit]
     return lambda: make(settings)
 
 
-def _find_limit(name: str, folder: Path) -> type[Limit]:
-    file = _in_file(name)
-    if file is None:
-        found = load_plugin("rig.limits", name)
-    else:
-        path = locate(Path(file[1]), "limit", folder)
-        found = from_file(path, file[2], "limit", _is_limit)
-    if not _is_limit(found):
-        raise ConfigError(
-            f"{name} is no limit; make it a class derived from daq.limits.Limit with a method check"
-        )
-    kind: type[Limit] = found
-    return kind
-
-
 def _is_limit(found: Any) -> bool:
     return inspect.isclass(found) and issubclass(found, Limit) and not inspect.isabstract(found)
+
+
+def _is_backend(found: Any) -> bool:
+    options = getattr(found, "Options", None)
+    methods = [name for name, value in vars(Device).items() if inspect.isfunction(value)]
+    own = [name for name in methods if not name.startswith("_")]
+    is_section = inspect.isclass(options) and issubclass(options, Section)
+    return inspect.isclass(found) and is_section and all(hasattr(found, name) for name in own)

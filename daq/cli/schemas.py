@@ -24,6 +24,8 @@ from daq.plugins import Group, installed, load_plugin
 
 FOLDER = "schemas"
 
+_OF_ONES_OWN = {"type": "string", "pattern": r"\.py:\w+$", "description": "FILE.py:CLASS"}
+
 
 def schema_command(
     folder: Path, write_pages: Callable[[], list[Path]] | None, as_json: bool
@@ -105,9 +107,8 @@ def experiment_schema(protocols: Mapping[str, type[Experiment]]) -> Schema:
         {"const": name, "description": inspect.getdoc(kind) or ""}
         for name, kind in protocols.items()
     ]
-    own = {"type": "string", "pattern": r"\.py:\w+$", "description": "FILE.py:CLASS"}
     common = json_schema(Experiment)["properties"]
-    common["protocol"] = {**common["protocol"], "oneOf": [*named, own]}
+    common["protocol"] = {**common["protocol"], "oneOf": [*named, _OF_ONES_OWN]}
     return {
         "type": "object",
         "properties": common,
@@ -133,7 +134,8 @@ def rig_schema(backends: Mapping[str, type[Section]]) -> Schema:
     default = RigConfig.model_fields["backend"].default
     for name in ("backend", "options"):
         common["properties"][name].pop("default", None)
-    common["properties"]["backend"] |= {"enum": list(backends), "default": default}
+    named = [{"const": name} for name in backends]
+    common["properties"]["backend"] |= {"oneOf": [*named, _OF_ONES_OWN], "default": default}
     common["allOf"] = [
         _when(
             "backend",

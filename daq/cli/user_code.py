@@ -12,7 +12,7 @@ from typing import Any, Literal
 from daq.config.yaml_file import suggestion
 from daq.errors import ConfigError
 
-Kind = Literal["model", "protocol", "limit"]
+Kind = Literal["backend", "limit", "model", "protocol"]
 
 
 def locate(path: Path, kind: Kind, relative_to: Path | None = None) -> Path:

@@ -205,7 +205,9 @@ class RigConfig(Section):
     """A rig: the backend that talks to it, its calibration and its limits."""
 
     name: str = Field("rig", min_length=1, max_length=80, description="shown in captures")
-    backend: str = Field("simulated", min_length=1, description="name of an installed backend")
+    backend: str = Field(
+        "simulated", min_length=1, description="name of a backend, or FILE.py:CLASS"
+    )
     options: Any = Field(default_factory=dict, description="the backend's own settings")
     sensors: Sensors = Field(Sensors(), description="calibration of the measured channels")
     amplifiers: Amplifiers = Field(Amplifiers(), description="gain of current-controlled ones")
