@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import io
-import itertools
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,6 +20,7 @@ if TYPE_CHECKING:
 
 COMMENTS = ("#", "%", "//")
 _CURE = "mend or remove these lines (removed lines count as lost samples)"
+_HEAD = 1 << 20  # bytes in which a header stands
 _TEXT_CONTROLS = b"\t\n\r\f"
 
 
@@ -51,7 +51,7 @@ class Layout:
 
 def column_names(path: Path) -> list[str]:
     """Names in a table's header; raises ConfigError for a file that is no text."""
-    return layout_of(_complete_lines(path)[0]).names
+    return layout_of(_complete_lines(path, _HEAD)[0]).names
 
 
 def read_table(path: Path, columns: Sequence[str] = (), cure: str = _CURE) -> Table:
@@ -71,6 +71,11 @@ def read_table(path: Path, columns: Sequence[str] = (), cure: str = _CURE) -> Ta
     layout = layout_of(text)
     header, separator = layout.names, layout.separator
     _check_header(path, layout, columns)
+    wanted = list(columns) or [name for name in header if name]
+    first = layout.line + 1
+    plain = _plain_numbers(text, layout)
+    if plain is not None:
+        return Table(path, plain[wanted], first, torn)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", pd.errors.ParserWarning)
@@ -91,22 +96,45 @@ def read_table(path: Path, columns: Sequence[str] = (), cure: str = _CURE) -> Ta
     except pd.errors.ParserError as error:
         reason = str(error).removeprefix("Error tokenizing data. C error: ").strip()
         raise ConfigError(f"{path}: not a table: {reason}") from None
-    wanted = list(columns) or [name for name in header if name]
-    first = layout.line + 1
     numbers = {name: _numbers(path, name, frame[name], first, separator, cure) for name in wanted}
     return Table(path, pd.DataFrame(numbers), first, torn)
 
 
+def _plain_numbers(text: str, layout: Layout) -> pd.DataFrame | None:
+    """The table where it is nothing but finite numbers, as a rig writes it: in a tenth of the time.
+
+    None for any other, of which the long way says what it is or what is wrong with it.
+    """
+    import pandas as pd
+
+    if layout.separator != ",":
+        return None
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", pd.errors.ParserWarning)
+            frame = pd.read_csv(
+                io.BytesIO(text.encode()), skipinitialspace=True, header=None,
+                skiprows=layout.line, names=_apart(layout.names), index_col=False,
+                dtype=np.float64, keep_default_na=False, skip_blank_lines=False,
+                on_bad_lines="error", low_memory=False,
+            )  # fmt: skip
+    except (ValueError, pd.errors.ParserWarning):
+        return None
+    finite = all(np.isfinite(frame[name].to_numpy()).all() for name in frame)
+    return frame if finite else None
+
+
 def layout_of(text: str) -> Layout:
     """Where the header of a table's text stands, the names in it and what is between them."""
-    lines = text.split("\n")
-    leading = list(
-        itertools.takewhile(lambda s: not s.strip() or s.lstrip().startswith(COMMENTS), lines)
-    )
+    leading, header = [], None
+    for line in _lines(text):
+        if line.strip() and not line.lstrip().startswith(COMMENTS):
+            header = line
+            break
+        leading.append(line)
     at = len(leading)
-    if at == len(lines):
-        return Layout(1, [lines[0]], ",")
-    header = lines[at]
+    if header is None:
+        return Layout(1, leading[:1] or [""], ",")
     numbers = _cells(header, _separator(header))
     if leading and all(map(_is_number, numbers)):
         named = leading[-1].strip().lstrip("#%/").strip()
@@ -114,6 +142,15 @@ def layout_of(text: str) -> Layout:
             at, header = at - 1, named
     separator = _separator(header)
     return Layout(at + 1, _cells(header, separator), separator)
+
+
+def _lines(text: str) -> Iterator[str]:
+    """The lines one after the other: a long table has its header in front."""
+    begin = 0
+    while (end := text.find("\n", begin)) >= 0:
+        yield text[begin:end]
+        begin = end + 1
+    yield text[begin:]
 
 
 def _separator(line: str) -> str:
@@ -129,10 +166,14 @@ def _apart(header: list[str]) -> list[str | int]:
     return [name or place for place, name in enumerate(header)]
 
 
-def _complete_lines(path: Path) -> tuple[str, bool]:
-    """The file's text up to its last complete line, and whether something was cut off."""
+def _complete_lines(path: Path, most: int = -1) -> tuple[str, bool]:
+    """The file's text up to its last complete line, and whether something was cut off.
+
+    most: bytes to read, -1 for all.
+    """
     try:
-        data = path.read_bytes()
+        with path.open("rb") as file:
+            data = file.read(most)
     except FileNotFoundError:
         raise ConfigError(
             f"{path}: there is no such log; name a capture folder or a CSV file"
@@ -141,8 +182,13 @@ def _complete_lines(path: Path) -> tuple[str, bool]:
         raise ConfigError(f"{path}: this is a folder without a log.csv in it") from None
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
-    text = _decoded(path, data).replace("\r\n", "\n")
-    if not text.strip():
+    if len(data) == most:
+        # Not in the middle of a character.
+        data = data[: data.rfind(b"\n") + 1] or data
+    text = _decoded(path, data)
+    if "\r" in text:
+        text = text.replace("\r\n", "\n")
+    if not text or text.isspace():
         raise ConfigError(f"{path}: the log is empty; it must start with a line of column names")
     cut = text.rfind("\n") + 1
     tail = text[cut:]
@@ -151,7 +197,9 @@ def _complete_lines(path: Path) -> tuple[str, bool]:
     if "\0" in complete:
         line = complete[: complete.index("\0")].count("\n") + 1
         raise ConfigError(f"{path}:{line}: not a text file: it holds bytes of zero")
-    return complete.rstrip("\n") + "\n", bool(tail.strip())
+    if complete.endswith("\n\n") or not complete.endswith("\n"):
+        complete = complete.rstrip("\n") + "\n"
+    return complete, bool(tail.strip())
 
 
 def _decoded(path: Path, data: bytes) -> str:
