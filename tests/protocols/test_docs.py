@@ -11,14 +11,13 @@ import protocols
 from daq.cli.files import load_experiment
 from daq.config.rig import RigConfig
 from daq.plugins import installed
-from tests.daq.support import forked_rig
 
 DOCS = Path(protocols.__file__).parents[1] / "docs" / "protocols"
 TEXT = (DOCS / "README.md").read_text()
 BLOCK = r"```\w+\n(.*?)```"
 
 
-def test_examples_of_own_protocols_run_as_written(tmp_path):
+def test_examples_of_own_protocols_run_as_written(tmp_path, command):
     files = re.findall(rf"<!-- file: (\S+) -->\n{BLOCK}", TEXT, re.DOTALL)
     assert {name for name, _ in files} == {
         "square.py", "square.yaml", "angle_step.py", "angle_step.yaml"
@@ -26,13 +25,12 @@ def test_examples_of_own_protocols_run_as_written(tmp_path):
     for name, content in files:
         (tmp_path / name).write_text(content)
     commands = "\n".join(re.findall(rf"<!-- commands -->\n{BLOCK}", TEXT, re.DOTALL)).split("\n")
-    with forked_rig() as rig:
-        for command in filter(None, commands):
-            program, *arguments = shlex.split(command)
-            assert program == "rig"
-            result = rig(arguments, tmp_path)
-            assert result.returncode == 0, f"{command}\n{result.stderr}"
-            assert "Traceback" not in result.stderr
+    for line in filter(None, commands):
+        program, *arguments = shlex.split(line)
+        assert program == "rig"
+        result = command(arguments, tmp_path)
+        assert result.returncode == 0, f"{line}\n{result.stderr}"
+        assert "Traceback" not in result.stderr
     assert (tmp_path / "square.png").exists() and (tmp_path / "angle_step.png").exists()
     (folder,) = (tmp_path / "runs").glob("*-angle_step")
     found = yaml.safe_load((folder / "results" / "findings.json").read_text())["numbers"]

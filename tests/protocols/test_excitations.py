@@ -14,7 +14,7 @@ from daq.cli.files import load_experiment
 from daq.config.rig import RigConfig
 from daq.errors import ConfigError
 from daq.plugins import load_plugin
-from tests.daq.support import forked_rig, only_capture, record_of
+from tests.daq.support import only_capture, record_of
 from tests.protocols.support import loaded, planned
 
 HELD = {"offset": 0.1}
@@ -331,12 +331,6 @@ def test_any_settings_give_a_clear_error_or_commands_within_what_they_declare(co
 
 
 # --- on the simulated rig -----------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def command():
-    with forked_rig() as run:
-        yield run
 
 
 @pytest.mark.parametrize("name", ["multisine", "chirp", "sine", "steps", "play", "prbs"])

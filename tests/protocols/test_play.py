@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from daq.errors import ConfigError
-from tests.daq.support import forked_rig, only_capture, record_of
+from tests.daq.support import only_capture, record_of
 from tests.protocols.support import loaded, planned
 
 RATE = 800
@@ -53,17 +53,16 @@ def test_resampling_holds_rows_or_joins_them(tmp_path):
     np.testing.assert_allclose(joined[-1], [-1, 0.3])
 
 
-def test_the_log_of_a_run_is_played_again(tmp_path):
-    with forked_rig() as run:
-        first = run(["run", "sine.yaml"], tmp_path)
-        assert first.returncode == 0, first.stderr
-        log = only_capture(tmp_path) / "log.csv"
-        again = tmp_path / "again"
-        again.mkdir()
-        (again / "e.yaml").write_text(
-            f"protocol: play\nfile: ../{log.relative_to(tmp_path)}\ncalibration: {{samples: 16}}\n"
-        )
-        assert run(["run", "again/e.yaml", "--out", "again/runs"], tmp_path).returncode == 0
+def test_the_log_of_a_run_is_played_again(tmp_path, command):
+    first = command(["run", "sine.yaml"], tmp_path)
+    assert first.returncode == 0, first.stderr
+    log = only_capture(tmp_path) / "log.csv"
+    again = tmp_path / "again"
+    again.mkdir()
+    (again / "e.yaml").write_text(
+        f"protocol: play\nfile: ../{log.relative_to(tmp_path)}\ncalibration: {{samples: 16}}\n"
+    )
+    assert command(["run", "again/e.yaml", "--out", "again/runs"], tmp_path).returncode == 0
     replayed = only_capture(again)
     one, other = (
         np.loadtxt(path, delimiter=",", skiprows=1, usecols=(1, 2))
