@@ -72,11 +72,14 @@ def _determined(document: Mapping[str, Any], free: Sequence[Mapping[str, Any]]) 
     own = sum("interval" in one for one in free)
     together = sum(len(a["determined"]) for a in document["ambiguities"])
     combined = f" and {_count(together, 'combination')} of others" if together else ""
+    spite = "" if document["verdict"]["trust"] == "poor" else (
+        ", though the model's outputs are as good"
+    )  # fmt: skip
     if own == len(free):
         return f"The data determine all {own} free parameters, each by itself."
     return (
         f"The data determine {own} of {_count(len(free), 'free parameter')} by themselves{combined}"
-        "; the others are not to be used one by one, though the model's outputs are as good."
+        f"; the others are not to be used one by one{spite}."
     )
 
 
@@ -113,12 +116,13 @@ def _errors(
 def _mean_errors(logs: Sequence[Mapping[str, Any]], output: str) -> dict[str, float | None]:
     if len(logs) == 1:
         return {key: logs[0]["outputs"][output][key] for key in _FIGURES}
-    return {
+    means = {
         key: float(
             mean_known(np.array([log["outputs"][output][key] for log in logs], dtype=np.float64))
         )
         for key in _FIGURES
     }
+    return {key: value if np.isfinite(value) else None for key, value in means.items()}
 
 
 def _baseline_sentence(comparison: Mapping[str, Any]) -> str:

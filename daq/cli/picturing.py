@@ -120,7 +120,7 @@ def _responses(
 def _response(model: ProcessModel, log: Dataset, simulated: Mapping[str, Run], j: int) -> Response:
     output = model.outputs[j]
     fits = [float(evaluate(log.outputs, run).fit[j]) for run in simulated.values()]
-    shown = " / ".join(f"{fit:.1f}" for fit in fits).replace("-", "−")
+    shown = " / ".join(_percent(fit) for fit in fits)
     return Response(
         output.name,
         output.unit,
@@ -128,6 +128,10 @@ def _response(model: ProcessModel, log: Dataset, simulated: Mapping[str, Run], j
         {name: run[:, j] for name, run in simulated.items()},
         f"fit {shown} %",
     )
+
+
+def _percent(fit: float) -> str:
+    return f"{fit:.1f}".replace("-", "−") if np.isfinite(fit) else "–"
 
 
 def _excitation(subject: Subject) -> Iterator[Picture]:

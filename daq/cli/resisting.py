@@ -36,7 +36,10 @@ def loops(model: ProcessModel, parameters: FloatArray, swing: Swing) -> list[Loo
     if not (swing.speed > 0.0 and swing.current > 0.0):
         return []
     shaft = _Driven(model, tuple(float(v) for v in parameters), swing.speed)
-    return [shaft.loop(level * swing.current) for level in _LEVELS]
+    try:
+        return [shaft.loop(level * swing.current) for level in _LEVELS]
+    except (ArithmeticError, ValueError):
+        return []  # names alike, but no torque that turns the shaft
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from tests.daq.support import (
 )
 from tests.daq.test_bad_input import MODEL
 
-COMMANDS = ("run", "check", "identify", "campaign", "replay", "models", "scope")
+COMMANDS = ("run", "check", "identify", "figures", "campaign", "replay", "models", "scope")
 
 
 @pytest.fixture(scope="module")
