@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 import re
@@ -35,6 +36,7 @@ _PREFIXES = {-9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M"}
 # A power would be of the prefix as well: mm^2 is no thousandth of m^2.
 _PREFIXABLE = re.compile(r"(V|A|ohm|H|F|N|W|J|s|Hz|Pa|T|Wb|m|rad)(?![\w^])")
 _PLAIN = (0.1, 1000.0)
+_ANY_WIDTH = 100_000  # wider than any table
 
 
 @contextmanager
@@ -97,27 +99,34 @@ def print_line(text: str = "") -> None:
 def print_table(
     title: str, head: Sequence[str], rows: Sequence[Sequence[str]], text: Sequence[str] = ()
 ) -> None:
-    """A table: with rules on a terminal, aligned plain text otherwise.
+    """A table: with rules on a terminal, in a pipe a line for each row however long.
 
-    The first column and those named in ``text`` are text, the others numbers.
+    The first column and those named in ``text`` are text, the others numbers. On a narrow terminal
+    text is wrapped between words; nothing is cut.
     """
     from rich import box
     from rich.console import Console
     from rich.table import Table
 
-    console = Console(file=sys.stdout, highlight=False)
-    if not console.is_terminal:
-        # A pipe has no width: nothing may be cut.
-        console = Console(file=sys.stdout, highlight=False, width=200, no_color=True)
+    # A unit in brackets is no markup, nor is text between colons an emoji.
+    make = functools.partial(Console, file=sys.stdout, highlight=False, markup=False, emoji=False)
+    console = make()
     table = Table(
         header_style="bold",
         box=box.SIMPLE_HEAD if console.is_terminal else box.SIMPLE, pad_edge=False,
     )  # fmt: skip
     for index, name in enumerate(head):
         words = index == 0 or name in text
-        table.add_column(name, justify="left" if words else "right", no_wrap=not words)
+        table.add_column(
+            name, justify="left" if words else "right", no_wrap=not words, overflow="fold"
+        )
     for row in rows:
         table.add_row(*row)
+    room = console.measure(table, options=console.options.update(width=_ANY_WIDTH))
+    if console.is_terminal:
+        console = make(width=max(console.width, room.minimum + len(head)))
+    else:
+        console = make(width=room.maximum, no_color=True)
     # Above the table rather than in it, where a long title would wrap to the table's width.
     console.print(title, style="bold", soft_wrap=True)
     console.print(table)

@@ -1,6 +1,8 @@
 """What every command has in common at a terminal: how much it says, and what Tab offers."""
 
+import os
 import subprocess
+import sys
 import sysconfig
 from pathlib import Path
 
@@ -88,3 +90,37 @@ def test_tab_offers_what_can_stand_there(tmp_path, typed, offered, not_offered):
     found = set(result.stdout.split())
     assert offered <= found and not found & not_offered
     assert result.stderr == ""
+
+
+TABLE = """
+from daq.cli.console import print_table
+print_table("Title [rad/s]", ["name", "omega [rad/s]", "meaning"],
+            [["K_m", "0.135 .. 0.151", "[low, high] of a :smile:" * 9]], text=["meaning"])
+"""
+
+
+def test_a_table_in_a_pipe_has_a_line_for_each_row_and_takes_nothing_for_markup(tmp_path):
+    said = subprocess.run(
+        [sys.executable, "-c", TABLE], env=environment(), capture_output=True, text=True, check=True
+    ).stdout.splitlines()
+    assert said[0] == "Title [rad/s]"
+    (row,) = [line for line in said if "K_m" in line]
+    assert "0.135 .. 0.151" in row and "[low, high] of a :smile:" * 9 in row
+    assert any("omega [rad/s]" in line for line in said)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a pseudo-terminal is needed")
+def test_a_narrow_terminal_cuts_nothing():
+    import pty
+
+    main, other = pty.openpty()
+    with subprocess.Popen(
+        [sys.executable, "-c", TABLE], env=environment(COLUMNS="30", TERM="xterm"), stdout=other
+    ) as running:
+        assert running.wait(60) == 0
+    os.close(other)
+    shown = os.read(main, 100_000).decode()
+    os.close(main)
+    assert "…" not in shown
+    assert "0.135 .. 0.151" in shown and "omega [rad/s]" in shown
+    assert shown.count(":smile:") >= 9
