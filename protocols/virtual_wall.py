@@ -301,13 +301,13 @@ def _visited(
 ) -> list[_Visit]:
     """The cells that were watched to their end or left at once."""
     visits = []
-    whole = 0.5 * settings.ringing.watch * settings.sample_rate
+    whole = 0.9 * 0.5 * settings.ringing.watch  # samples may be lost at its ends
     for index, cell in enumerate(settings.cells):
         own = extra["cell"] == index
         watched = own & (extra["state"] == _WATCHED)
         if (own & (extra["state"] == _ABORTED)).any():
             visits.append(_Visit(cell, math.inf, math.nan))
-        elif watched.sum() > 0.98 * whole:
+        elif watched.any() and np.ptp(samples.time[watched]) > whole:
             depth = extra["penetration"][watched]
             amplitude = _amplitude(samples.time[watched], depth)
             visits.append(_Visit(cell, amplitude, float(np.mean(depth > 0.0))))

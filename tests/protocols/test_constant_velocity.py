@@ -1,5 +1,6 @@
 """Torque against velocity: the staircase, what of it counts, and c0 and c1 against the plant's."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -302,6 +303,13 @@ def test_the_motors_dry_friction_is_not_taken_for_the_brakes():
     line = fit(levels, plateaus, None)
     assert line.c0.value == pytest.approx(C0, rel=1e-6)
     np.testing.assert_allclose(line.kappa, RESIDUAL + PER_AMPERE * line.currents, rtol=1e-6)
+
+
+@pytest.mark.parametrize("offset", [-3e-4, 3e-4])
+def test_what_the_brake_sensors_zero_is_off_stays_out_of_c1(offset):
+    plateaus, levels = synthetic(np.random.default_rng(0), 0.0)
+    shifted = [dataclasses.replace(x, brake_current=x.brake_current + offset) for x in levels]
+    assert fit(shifted, plateaus, Motor(K_M, B_M)).c1.value == pytest.approx(C1, rel=1e-6)
 
 
 def test_with_one_brake_command_nothing_is_said_of_the_motor():
