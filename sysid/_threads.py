@@ -45,7 +45,9 @@ class Workers:
         try:
             work()
             for worker in workers:
-                worker.result()
+                # One that has not woken yet has nothing left to do.
+                if not worker.cancel():
+                    worker.result()
         finally:
             deque(queue, maxlen=0)  # after an interrupt nothing more is begun
 

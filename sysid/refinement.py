@@ -580,8 +580,8 @@ def _within(
     high: FloatArray,
 ) -> FloatArray:  # fmt: skip
     """A move that slides along the constraints it would cross, bounds kept."""
-    free = np.flatnonzero((move > low) & (move < high))
-    held = np.setdiff1d(np.arange(len(move)), free)
+    between = (move > low) & (move < high)
+    free, held = np.flatnonzero(between), ~between
     rest = Constraints(limits.value + limits.slope[:, held] @ move[held], limits.slope)
     inverse: FloatArray = np.linalg.inv(curvature[np.ix_(free, free)]).astype(np.float64)
     slid = move.copy()
