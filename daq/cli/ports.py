@@ -33,9 +33,8 @@ def ports_command(names: list[str], unasked: bool, baud: int, as_json: bool) -> 
     )
     there = next((answer.port for answer in answers if answer.welcome is not None), None)
     if there is not None:
-        console.print_line(
-            f"Next: rig run prbs.yaml --rig serial.yaml --port {there.lasting_name or there.name}"
-        )
+        port = there.lasting_name or there.name
+        console.print_next(f"rig run prbs.yaml --rig serial.yaml --port {port}")
 
 
 def _document(answer: Answer, asked: bool) -> dict[str, Any]:

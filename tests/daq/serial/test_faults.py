@@ -11,7 +11,7 @@ import pytest
 
 from daq import capture
 from daq.errors import ConfigError, DeviceError
-from daq.hal import Flag
+from daq.hal import Flag, Guard, Mode
 from daq.serial import faults
 from daq.serial.backend import SerialDevice, SerialOptions
 from tests.daq.serial.support import forked_emulators, write_serial_rig
@@ -238,6 +238,24 @@ def test_a_killed_host_means_zero_outputs_within_the_watchdogs_time(tmp_path, em
         write_run(tmp_path, running.port, mode)
         again = rig(["run", "e.yaml", "--rig", "rig.yaml", "--out", "again"], tmp_path)
         assert again.returncode == 0, again.stderr
+
+
+def test_a_program_that_hangs_is_no_better_than_a_dead_one(tmp_path, emulate):
+    with emulate(tmp_path) as running:
+        device = SerialDevice(SerialOptions(port=running.port, watchdog=WATCHDOG))
+        device.open()
+        wide = np.full(3, 1e9)
+        guard = Guard(np.array([-5.0, 0.0]), np.array([5.0, 0.38]), -wide, wide)
+        device.start(800.0, Mode.CLOSED_LOOP, guard)
+        device.send(0, np.full((8, 2), 0.1))
+        device.receive()
+        # Its threads live on, but nobody asks for samples any more.
+        until(lambda: running.journal[-1]["latch"] == "WATCHDOG", "the watchdog")
+        assert running.journal[-1]["outputs"] == [0, 0]
+        with pytest.raises(DeviceError, match="watchdog has zeroed the outputs"):
+            while True:
+                device.receive()
+        device.close()
 
 
 @pytest.mark.parametrize(
