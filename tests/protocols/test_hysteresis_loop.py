@@ -4,6 +4,8 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from scipy.integrate import quad, solve_ivp
 
 from daq.config.rig import RigConfig
@@ -115,11 +117,11 @@ def test_the_energy_is_the_closed_forms():
     ],
 )
 def test_a_run_finds_the_plants_parameters(tmp_path, plant, changes):
-    settings = experiment(**changes)
-    samples, extra = run(settings, tmp_path, plant, seed=2)
-    assert len(samples) == settings.plan().n_samples
-    np.testing.assert_allclose(extra["omega_ref"], settings.plan().references["omega_ref"])
-    found = settings.findings(samples, extra)
+    chosen = experiment(**changes)
+    samples, extra = run(chosen, tmp_path, plant, seed=2)
+    assert len(samples) == chosen.plan().n_samples
+    np.testing.assert_allclose(extra["omega_ref"], chosen.plan().references["omega_ref"])
+    found = chosen.findings(samples, extra)
     by_name = numbers(found)
     assert by_name["rate"].value == pytest.approx(RATE, rel=0.1)
     assert by_name["kappa0"].value == pytest.approx(TRUTH["alpha0"] * SATURATION, rel=0.3)
@@ -146,24 +148,24 @@ def test_an_encoder_that_counts_the_other_way_ends_the_run(tmp_path):
 
 
 def test_a_run_that_ended_early_concludes_from_what_there_is(tmp_path):
-    settings = experiment()
-    samples, extra = run(settings, tmp_path, {"load": "free"}, ideal=True)
+    chosen = experiment()
+    samples, extra = run(chosen, tmp_path, {"load": "free"}, ideal=True)
 
     def first(n):
         fields = {name: getattr(samples, name)[:n] for name in samples.__dataclass_fields__}
         return type(samples)(**fields), {name: values[:n] for name, values in extra.items()}
 
     one = int(np.argmax(extra["level"] == 1)) + 1600
-    found = settings.findings(*first(one))
+    found = chosen.findings(*first(one))
     assert set(found.ranges) == {"gamma", "beta", "A"}
     assert any("1 brake command" in remark for remark in found.remarks)
     with pytest.raises(ValueError, match="two whole cycles"):
-        settings.findings(*first(1600))
+        chosen.findings(*first(1600))
 
 
 def test_the_plan_is_what_is_asked_of_the_shaft():
-    settings = experiment(brake_commands=[0.1, 0.0, 0.12])
-    planned = settings.plan()
+    chosen = experiment(brake_commands=[0.1, 0.0, 0.12])
+    planned = chosen.plan()
     brake, speed = planned.references["cmd_voltage_brake"], planned.references["omega_ref"]
     assert np.max(np.abs(np.diff(brake))) <= 0.5 / 800 * 1.05, "the brake is ramped"
     assert brake[0] == brake[-1] == 0.0 and planned.highest.tolist() == [4.5, 0.12]
@@ -185,3 +187,34 @@ def test_settings_that_make_no_run_are_refused(changes, message):
     with pytest.raises(ConfigError) as refused:
         plan(experiment(**changes), RigConfig())
     assert message in str(refused.value)
+
+
+@settings(max_examples=40, deadline=None, derandomize=True,
+          suppress_health_check=[HealthCheck.too_slow])  # fmt: skip
+@given(
+    st.fixed_dictionaries(
+        {
+            "brake_commands": st.lists(st.floats(0.0, 0.2), min_size=1, max_size=4),
+            "amplitude": st.floats(0.1, 50.0),
+            "shape": st.sampled_from(["sine", "triangle"]),
+            "period": st.floats(0.05, 3.0).map(lambda x: round(x, 2)),
+            "cycles": st.integers(3, 6),
+            "sample_rate": st.sampled_from([100, 800]),
+        }
+    )
+)
+def test_any_settings_give_a_clear_error_or_a_plan_within_what_it_declares(changes):
+    chosen = experiment(**changes)
+    try:
+        planned = chosen.plan()
+    except ValueError as error:
+        assert str(error).split(":")[0] in {"brake_commands", "period"}
+        return
+    speed = planned.references["omega_ref"]
+    brake = planned.references["cmd_voltage_brake"]
+    assert planned.n_samples == len(speed) == len(brake)
+    assert np.max(np.abs(speed)) <= changes["amplitude"]
+    assert planned.lowest[1] <= brake.min() and brake.max() <= planned.highest[1]
+    assert speed[0] == speed[-1] == brake[-1] == 0.0
+    # By rounding one sample more than the slope.
+    assert max(brake[0], np.max(np.abs(np.diff(brake)))) <= 0.5 / changes["sample_rate"] * 2.0
