@@ -328,12 +328,15 @@ class _Run:
             samples, trip = self._guarded(samples)
             answers = answering.to(samples)
             if trip is None and not answering.ended:
-                # A lost sample has no answer: the one after it serves its tick too.
-                ticks = np.arange(asked, int(samples.tick[-1]) + 1 + experiment.ahead)
-                places = np.searchsorted(samples.tick + experiment.ahead, ticks)
-                self.rig.send(asked, answers.commands[places])
+                until = samples.tick.item(-1) + 1 + experiment.ahead
+                commands = answers.commands
+                if until - asked != len(commands):
+                    # A lost sample has no answer: the one after it serves its tick too.
+                    ticks = np.arange(asked, until)
+                    commands = commands[np.searchsorted(samples.tick + experiment.ahead, ticks)]
+                self.rig.send(asked, commands)
                 self.timing.answered(samples.tick.item(-1))
-                asked += len(ticks)
+                asked = until
             done = self._keep(log, _first(samples, answers.end), answers.logged, trip)
         self.rig.stop()
 
@@ -407,7 +410,7 @@ class _Answering:
     def to(self, samples: Samples) -> _Answers:
         """Answers to some samples; ``ended`` once the controller has none."""
         rows: list[Answer] = []
-        for values in zip(*(getattr(samples, name).tolist() for name in _SAMPLE), strict=True):
+        for values in zip(*[getattr(samples, name).tolist() for name in _SAMPLE], strict=True):
             answer = self._ask(Sample(*values))
             if answer is None:
                 self.ended = True
@@ -453,9 +456,9 @@ def _require_rest(calibration: OffsetCalibration, moved: float, means: dict[str,
 
 def _first(samples: Samples, end_tick: int) -> Samples:
     """The samples with ticks before ``end_tick``."""
-    keep = samples.tick < end_tick
-    if keep.all():
+    if samples.tick.item(-1) < end_tick:
         return samples
+    keep = samples.tick < end_tick
     return Samples(**{name: getattr(samples, name)[keep] for name in samples.__dataclass_fields__})
 
 
