@@ -12,10 +12,13 @@ import subprocess
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from daq.errors import ConfigError, RunError
 from daq.log import Log, load_log
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 LOG_NAME = "log.csv"
 RUN_NAME = "run.json"
@@ -108,6 +111,16 @@ class Recording:
         path = self.log.path
         return path.parent.name if path.name == LOG_NAME else path.stem
 
+    @property
+    def frame(self) -> pd.DataFrame:
+        """The samples as a table; columns and units are those of ``daq.log``."""
+        return self.log.frame
+
+    @property
+    def folder(self) -> Path:
+        """Where the log stands."""
+        return self.log.path.parent
+
     def noise(self, channel: str) -> tuple[float, float]:
         """Standard deviations of a channel's noise and of its zero, as the calibration found them.
 
@@ -127,12 +140,12 @@ class Recording:
         return deviation, deviation / math.sqrt(samples)
 
 
-def load(path: Path) -> Recording:
+def load(path: str | Path) -> Recording:
     """Read a capture folder, its log.csv, or a lone CSV in either program's format.
 
     Raises ConfigError when there is no readable log.
     """
-    csv = log_path(path)
+    csv = log_path(Path(path))
     log = load_log(csv)
     return Recording(log, read_record(csv), describe_end(csv, log.torn))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,6 +18,9 @@ from daq.log import Log, require_rows, time_base
 from daq.table import Table, read_table
 from sysid.data import Dataset
 from sysid.model import Input, ModelError, Output, ProcessModel
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 @dataclass(frozen=True)
@@ -57,11 +61,34 @@ def load(path: Path, model: ProcessModel, mapping: Mapping | None) -> Loaded:
     try:
         if mapping is not None:
             return _load_foreign(capture.log_path(path), model, mapping)
-        recording = capture.load(path)
-        dataset = _with_noise(_from_log(recording.log, model, recording.name), recording, model)
-        return Loaded(dataset, recording.log.path, recording.warning)
+        return from_recording(capture.load(path), model)
     except ModelError as error:
         raise ConfigError(f"{path}: {error}") from None
+
+
+def from_recording(recording: capture.Recording, model: ProcessModel) -> Loaded:
+    """A log that has been read as a record; ConfigError, ModelError."""
+    dataset = _with_noise(_from_log(recording.log, model, recording.name), recording, model)
+    return Loaded(dataset, recording.log.path, recording.warning)
+
+
+def from_frame(frame: pd.DataFrame, name: str, model: ProcessModel) -> Loaded:
+    """A table with time ``t`` [s] and the model's signals by name; ConfigError, ModelError."""
+    path, wanted = Path(name), ("t", *model.input_names, *model.output_names)
+    for column in wanted:
+        if column not in frame:
+            raise ConfigError(
+                f"{name}: model {model.name} needs the column {column!r}; the table has "
+                f"{', '.join(map(str, frame.columns))}. Rename or add it"
+            )
+    require_rows(path, len(frame))
+    try:
+        numbers = frame.loc[:, list(wanted)].astype(np.float64)
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"{name}: a column is not of numbers: {error}") from None
+    tick, dt = time_base(path, numbers["t"].to_numpy(), first_line=0)
+    log = Log(path, numbers.assign(tick=tick), dt, torn=False)
+    return Loaded(_from_log(log, model, name), path, None)
 
 
 def hold_back(logs: list[Loaded], part: float) -> tuple[list[Loaded], list[Loaded]]:

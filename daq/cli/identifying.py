@@ -129,11 +129,12 @@ def load_logs(
         ]
 
     train, check = loaded(training), loaded(validation)
-    _no_overlap(train, check)
+    refuse_overlap(train, check)
     return train, check
 
 
-def _no_overlap(train: list[Loaded], check: list[Loaded]) -> None:
+def refuse_overlap(train: list[Loaded], check: list[Loaded]) -> None:
+    """Raise ConfigError when a log is given for training and for validation."""
     known = {log.path.resolve() for log in train}
     for log in check:
         if log.path.resolve() in known:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from daq import capture
 from daq.cli import console, datasets
-from daq.cli.datasets import Mapping
+from daq.cli.datasets import Loaded, Mapping
 from daq.cli.files import DEFAULT_RIG, load_rig
 from daq.cli.modelling import DEFAULT_MODEL, find_model
 from daq.cli.preparing import as_told
@@ -24,6 +24,9 @@ from daq.errors import ConfigError, RunError
 from daq.hal import FloatArray
 from sysid import BatchSimulator, Metrics, ModelError, evaluate, free_run
 from sysid.model import ProcessModel
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 @dataclass(frozen=True)
@@ -58,6 +61,17 @@ class Replay:
         """Mean signed deviation of each output in parts of its largest measured value."""
         return self._named(self.metrics.msd)
 
+    @property
+    def frame(self) -> pd.DataFrame:
+        """A table: ``t`` [s], each output as measured, and as ``<output>_simulated``."""
+        import pandas as pd
+
+        names = self.model.output_names
+        table = {"t": self.time, **dict(zip(names, self.measured.T, strict=True))}
+        for name, values in zip(names, self.simulated.T, strict=True):
+            table[f"{name}_simulated"] = values
+        return pd.DataFrame(table)
+
     def _named(self, values: FloatArray) -> dict[str, float]:
         return dict(zip(self.model.output_names, values.tolist(), strict=True))
 
@@ -70,8 +84,24 @@ def replay(
     parameters: of an identification; default those of the simulated rig. config: names the
     columns of a foreign log. Raises ConfigError.
     """
-    model, values = read_parameters(parameters) if parameters is not None else _rig_truth(rig)
+    model, values, source = told_parameters(rig, parameters)
     loaded = datasets.load(log, model, columns_of(config, model))
+    return replay_values(loaded, model, values, source)
+
+
+def told_parameters(
+    rig: str, parameters: Path | None
+) -> tuple[ProcessModel, dict[str, float], str]:
+    """Model and values of an identification or else of a simulated rig, and whose they are."""
+    if parameters is None:
+        return *_rig_truth(rig), rig
+    return *read_parameters(parameters), str(parameters)
+
+
+def replay_values(
+    loaded: Loaded, model: ProcessModel, values: dict[str, float], source: str
+) -> Replay:
+    """Simulate a record's inputs with these parameters; source: whose they are. ConfigError."""
     record = loaded.dataset
     try:
         simulated = free_run(BatchSimulator(model), model.vector(values), record)
@@ -80,7 +110,7 @@ def replay(
     return Replay(
         loaded.path,
         model,
-        rig if parameters is None else str(parameters),
+        source,
         np.arange(record.n_samples, dtype=np.float64) * record.dt,
         record.outputs,
         simulated,

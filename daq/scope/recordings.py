@@ -54,7 +54,7 @@ class Recording:
     @property
     def name(self) -> str:
         """Folder of a run, or file of a lone log."""
-        return self.log.parent.name if self.log.name == LOG_NAME else self.log.name
+        return self.log.resolve().parent.name if self.log.name == LOG_NAME else self.log.name
 
     @property
     def loading(self) -> float | None:

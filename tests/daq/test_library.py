@@ -1,0 +1,140 @@
+"""What the commands do as functions: ``from daq import ...``, tables in and out."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import daq
+from daq import ConfigError, identify, load, record, replay
+from tests.daq.support import environment, rig, write_experiment, write_rig
+
+QUICK = {"population": 16, "generations": 2, "seed": 1}
+NOTEBOOK = Path(__file__).parents[2] / "examples" / "notebook.ipynb"
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """A run and its validation run, recorded in Python, and where."""
+    root = tmp_path_factory.mktemp("recorded")
+    write_experiment(root / "e.yaml", validation={"motor": {"seed": 77}})
+    write_rig(root / "rig.yaml")
+    where = {"rig": root / "rig.yaml", "out": root / "runs"}
+    training = record(root / "e.yaml", **where)
+    return root, training, record(str(root / "e.yaml"), validation=True, **where)
+
+
+@pytest.fixture(scope="module")
+def found(recorded):
+    _, training, validation = recorded
+    return identify(training, validation, fixed={"R_m": 1.2}, **QUICK)
+
+
+def test_a_recorded_run_is_the_one_the_command_records(recorded):
+    root, training, validation = recorded
+    rig("run", "e.yaml", "--rig", "rig.yaml", "--out", "others", cwd=root)
+    (other,) = (root / "others").iterdir()
+    pd.testing.assert_frame_equal(load(other).frame, training.frame)
+    assert len(training.frame) == 400 and training.record["status"] == "completed"
+    assert training.folder.parent == root / "runs" and training.warning is None
+    assert not validation.frame["cmd_voltage_motor"].equals(training.frame["cmd_voltage_motor"])
+
+
+def test_an_identification_is_the_one_the_command_makes(recorded, found):
+    root, training, validation = recorded
+    options = [f"--{name}={value}" for name, value in QUICK.items()]
+    options += ["--set", "fixed.R_m=1.2", "--validate", validation.folder]
+    result = rig("identify", training.folder, *options, "--json", cwd=root)
+    told = json.loads(result.stdout)
+    table = found.parameters
+    assert list(table.columns) == ["value", "low", "high", "unit", "note"]
+    for name, entry in told["parameters"].items():
+        assert table.loc[name, "value"] == entry["value"]
+        low, high = entry.get("interval") or (np.nan, np.nan)
+        np.testing.assert_equal(table.loc[name, ["low", "high"]].tolist(), [low, high])
+    fit = found.metrics.loc[("validation", validation.name, "omega"), "fit_percent"]
+    assert fit == told["metrics"]["validation"][0]["outputs"]["omega"]["fit_percent"]
+    assert found.trust == told["verdict"]["trust"]
+    assert list(found.reasons) == told["verdict"]["reasons"]
+
+
+def test_a_table_does_for_a_log(recorded):
+    _, training, validation = recorded
+    columns = ["t", "applied_voltage_motor", "applied_voltage_brake", "torque"]
+    columns += ["omega", "current_brake", "current_motor"]  # the order does not matter
+    from_table = identify(training.frame[columns], [validation.frame], **QUICK)
+    from_log = identify(training.log.path, [validation.folder], **QUICK)
+    # A table says nothing of noise: the values are the same, the intervals are not.
+    assert from_table.parameters["value"].equals(from_log.parameters["value"])
+
+
+def test_a_replay_is_the_same_from_the_result_and_from_its_file(recorded, found, tmp_path):
+    _, _, validation = recorded
+    replayed = replay(validation, found)
+    again = replay(validation.folder, found.save(tmp_path / "identification"))
+    pd.testing.assert_frame_equal(replayed.frame, again.frame)
+    omega = replayed.frame["omega"]
+    error = omega - replayed.frame["omega_simulated"]
+    fit = 100.0 * (1.0 - np.linalg.norm(error) / np.linalg.norm(omega - omega.mean()))
+    assert replayed.fit["omega"] == pytest.approx(fit)
+    assert replay(validation).fit["omega"] != fit  # by the simulated rig's own parameters
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda f: f.drop(columns="torque"), "needs the column 'torque'"),
+        (lambda f: f.assign(omega="fast"), "a column is not of numbers"),
+        (lambda f: f.iloc[::-1], "time does not advance"),
+        (lambda f: f.assign(torque=np.nan), "an input is not finite"),
+        (lambda f: f.iloc[:1], "at least 2 are needed"),
+    ],
+    ids=["no column", "text", "backwards", "missing input", "one row"],
+)
+def test_a_table_that_will_not_do_is_refused(recorded, change, words):
+    _, training, _ = recorded
+    with pytest.raises(ConfigError, match=words):
+        identify(change(training.frame), **QUICK)
+
+
+def test_mistakes_are_told_before_anything_moves(recorded, tmp_path):
+    _, training, _ = recorded
+    with pytest.raises(ConfigError, match="same log is given for training and for validation"):
+        identify(training, training, **QUICK)
+    with pytest.raises(ConfigError, match="poplation"):
+        identify(training, poplation=3)
+    write_experiment(tmp_path / "e.yaml")
+    with pytest.raises(ConfigError, match="no 'validation' section"):
+        record(tmp_path / "e.yaml", validation=True, out=tmp_path / "runs")
+    assert not (tmp_path / "runs").exists()
+    with pytest.raises(AttributeError, match="no attribute 'identfy'"):
+        daq.identfy  # noqa: B018
+
+
+def test_importing_daq_imports_nothing_heavy(tmp_path):
+    code = "import sys, daq; dir(daq); print([m for m in sys.modules if m in sys.argv[1:]])"
+    heavy = ("numpy", "pandas", "scipy", "numba", "sklearn", "sysid", "sim_rig")
+    result = subprocess.run(
+        [sys.executable, "-c", code, *heavy],
+        cwd=tmp_path, env=environment(), capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert result.stdout == "[]\n"
+
+
+def test_the_notebook_does_what_it_shows(tmp_path, monkeypatch):
+    cells = json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]
+    code = [cell for cell in cells if cell["cell_type"] == "code"]
+    assert all(cell["execution_count"] and cell["outputs"] for cell in code)
+    assert not any(out["output_type"] == "error" for cell in code for out in cell["outputs"])
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(os.environ, "MPLBACKEND", "agg")
+    names = {}
+    for cell in code:
+        source = "".join(cell["source"]).replace("seed=0", "population=16, generations=2, seed=0")
+        exec(source, names)
+    assert names["found"].parameters.loc["K_m", "unit"] == "N*m/A"
