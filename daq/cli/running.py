@@ -127,7 +127,7 @@ def _run(
         def watch(step: PhaseProgress) -> None:
             done = f"{step.done:.0f}" if step.unit == "samples" else f"{step.done:.1f}"
             bar.update(
-                _TITLES[step.phase], step.done, step.total, f"{done}/{step.total:g} {step.unit}"
+                _TITLES[step.phase], step.done, step.total, f"{done}/{step.total:.10g} {step.unit}"
             )
 
         result = run_experiment(loaded.experiment, loaded.name, rig, device, out, watch)
