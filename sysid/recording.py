@@ -64,8 +64,11 @@ class RecordEstimator(RegressorMixin, BaseEstimator):  # type: ignore[misc]
             return self._arrays(X, y, records, dt, reset)
         if y is not None:
             raise ModelError("Datasets bring their outputs: leave y out")
-        if reset:
+        if reset and data[0].inputs.shape[1] > 0:
             self._inputs(data[0].inputs, reset=True)
+        elif reset:
+            # A free motion: scikit-learn knows no table without columns.
+            self.n_features_in_ = 0
         return data
 
     def _arrays(self, X: Any, y: Any, records: Any, dt: float | None, reset: bool) -> list[Dataset]:

@@ -112,7 +112,9 @@ class Columns(Section):
     """Names, units and signs of a foreign CSV's columns, by the model's signal names."""
 
     time: TimeColumn = Field(description="the column of time, or the rate of the rows")
-    inputs: dict[str, Column] = Field(description="for each input of the model")
+    inputs: dict[str, Column] = Field(
+        default_factory=dict, description="for each input of the model"
+    )
     outputs: dict[str, Column] = Field(description="for each output that counts")
 
 

@@ -5,7 +5,16 @@ import pytest
 from sklearn.base import clone
 from sklearn.exceptions import NotFittedError
 
-from sysid import GASSI, Constraint, Dataset, ModelError, Parameter
+from sysid import (
+    GASSI,
+    Constraint,
+    Dataset,
+    ModelError,
+    Output,
+    Parameter,
+    ProcessModel,
+    State,
+)
 from tests.sysid.support import INFEASIBLE, MOTOR, lag, motor, motor_record
 
 TRUE = np.array(list(MOTOR.values()))
@@ -287,3 +296,26 @@ def test_score_is_the_mean_fit():
 def test_fit_returns_itself():
     found = quick()
     assert found.fit(motor_record()) is found
+
+
+def test_a_free_motion_has_no_inputs():
+    """y = exp(-a t) cos(w t), from an unknown speed at the start."""
+    model = ProcessModel(
+        name="swing",
+        states=(State("y", "1"), State("v", "1/s", initial_range=(-2.0, 2.0))),
+        inputs=(),
+        outputs=(Output("y", "1"),),
+        parameters=(
+            Parameter("k", "1/s^2", 20.0, 1.0, 500.0, "log"),
+            Parameter("c", "1/s", 2.0, 0.1, 10.0, "log"),
+        ),
+        derivative=lambda x, u, p: (x[1], -p[0] * x[0] - p[1] * x[1]),
+    )
+    t, decay, frequency = 0.01 * np.arange(400), 0.5, 8.0
+    y = np.exp(-decay * t) * np.cos(frequency * t)
+    record = Dataset(np.empty((400, 0)), y, 0.01)
+    found = GASSI(model, population=40, generations=10).fit(record)
+    assert found.parameters_["c"] == pytest.approx(2.0 * decay, rel=1e-6)
+    assert found.parameters_["k"] == pytest.approx(frequency**2 + decay**2, rel=1e-6)
+    assert found.n_features_in_ == 0
+    np.testing.assert_allclose(found.predict(record)[:, 0], y, atol=1e-5)
