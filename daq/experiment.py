@@ -78,6 +78,9 @@ class Experiment(Section, abc.ABC):
         "", max_length=80, description="name of the capture folder; default the file's"
     )
     protocol: str = Field(min_length=1, description="name of a protocol, or FILE.py:CLASS")
+    rig: str = Field(
+        "", max_length=200, description="rig file that it is for, where the command names no other"
+    )
     sample_rate: Hertz = Field(800.0, gt=0.0, le=1e6, description="samples per second")
     calibration: OffsetCalibration = Field(OffsetCalibration(), description="offset calibration")
     homing: Homing = Field(Homing(), description="winding of the load")

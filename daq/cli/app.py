@@ -42,6 +42,15 @@ RigName = Annotated[
         autocompletion=completing.rigs,
     ),
 ]
+RigOfRun = Annotated[
+    str | None,
+    typer.Option(
+        "--rig",
+        metavar="RIG.yaml",
+        help="Rig file; default what the experiment names, or the simulated rig.",
+        autocompletion=completing.rigs,
+    ),
+]
 PortName = Annotated[
     str | None,
     typer.Option(
@@ -133,7 +142,7 @@ AsJson = Annotated[bool, typer.Option("--json", help="One JSON document on stand
 @app.command(epilog="Example:  rig run prbs.yaml --identify")
 def run(
     experiment: ExperimentName,
-    rig: RigName = "simulated.yaml",
+    rig: RigOfRun = None,
     port: PortName = None,
     out: Annotated[
         Path, typer.Option("--out", metavar="DIR", help="Where capture folders go.")
@@ -162,7 +171,7 @@ def run(
 @app.command(epilog="Example:  rig check prbs.yaml --plot check.png")
 def check(
     experiment: ExperimentName,
-    rig: RigName = "simulated.yaml",
+    rig: RigOfRun = None,
     port: PortName = None,
     plot: Annotated[
         Path | None,

@@ -11,7 +11,6 @@ import numpy as np
 
 from daq import capture
 from daq.cli import console
-from daq.cli.files import DEFAULT_RIG
 from daq.cli.running import plan_of
 from daq.config.rig import RigConfig
 from daq.errors import ConfigError, RunError
@@ -45,7 +44,7 @@ class ChannelFacts:
 
 
 def check_command(
-    experiment: str, rig: str, port: str | None, plot: Path | None, as_json: bool
+    experiment: str, rig: str | None, port: str | None, plot: Path | None, as_json: bool
 ) -> None:
     """Validate an experiment and say what it would do."""
     checked = plan_of(experiment, rig, port)
@@ -83,7 +82,7 @@ def check_command(
     )  # fmt: skip
     if plot is not None:
         console.print_line(f"Figure: {plot}")
-    on = f" --rig {rig}" if rig != DEFAULT_RIG else ""
+    on = f" --rig {rig}" if rig is not None else ""
     on += f" --port {port}" if port is not None else ""
     console.print_next(f"rig run {experiment}{on} --identify")
 

@@ -80,6 +80,19 @@ def find(name: str, packages: Iterable[str]) -> Path:
     )
 
 
+def rig_for(experiment: str) -> str:
+    """The rig file that an experiment's file says it is for; the simulated rig's without."""
+    try:
+        file = yaml_file.load(find(experiment, EXPERIMENTS))
+    except ConfigError:
+        return DEFAULT_RIG  # what is wrong with the experiment is told when it is loaded
+    name = file.content.get("rig")
+    if not isinstance(name, str) or not name:
+        return DEFAULT_RIG
+    beside = file.path.parent / name
+    return str(beside) if beside.exists() else name
+
+
 def load_experiment(name: str) -> LoadedExperiment:
     """Read and check an experiment; ConfigError names file, line, key and cure."""
     file = yaml_file.load(find(name, EXPERIMENTS))

@@ -13,7 +13,7 @@ from daq import capture
 from daq.capture import Recording
 from daq.cli import datasets
 from daq.cli.datasets import Loaded, Mapping
-from daq.cli.files import DEFAULT_RIG, load_experiment, load_rig
+from daq.cli.files import DEFAULT_RIG, load_experiment, load_rig, rig_for
 from daq.cli.identifying import assemble, refuse_overlap, write_parameters
 from daq.cli.preparing import Prepared, gassi_settings, prepare
 from daq.cli.replaying import Replay, columns_of, replay_values, told_parameters
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 def record(
     experiment: str | Path,
-    rig: str | Path = DEFAULT_RIG,
+    rig: str | Path | None = None,
     out: str | Path = "runs",
     validation: bool = False,
 ) -> Recording:
@@ -47,7 +47,7 @@ def record(
         if changed is None:
             raise ConfigError(f"{loaded.file.path}: it has no 'validation' section; add one")
         loaded = changed
-    config, device = load_rig(str(rig))
+    config, device = load_rig(str(rig or rig_for(str(experiment))))
     loaded.plan(config)
     result = run_experiment(loaded.experiment, loaded.name, config, device, Path(out))
     return capture.load(result.folder)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from daq.cli import console, punctuality
 from daq.cli.analysing import analyse, as_document, next_command, show_findings
-from daq.cli.files import LoadedExperiment, load_experiment, load_rig, together
+from daq.cli.files import LoadedExperiment, load_experiment, load_rig, rig_for, together
 from daq.config.rig import RigConfig
 from daq.errors import ConfigError
 from daq.experiment import Plan
@@ -24,7 +24,7 @@ _TITLES = {
 
 def run_command(
     experiment: str,
-    rig: str,
+    rig: str | None,
     port: str | None,
     out: Path,
     identify: bool,
@@ -88,10 +88,14 @@ class Planned:
     plan: Plan
 
 
-def plan_of(experiment: str, rig: str, port: str | None, realtime: bool = False) -> Planned:
-    """Read and check an experiment, its validation run and a rig; ConfigError with all mistakes."""
+def plan_of(experiment: str, rig: str | None, port: str | None, realtime: bool = False) -> Planned:
+    """Read and check an experiment, its validation run and a rig; ConfigError with all mistakes.
+
+    rig: default what the experiment's file says it is for.
+    """
     loaded, (config, device) = together(
-        lambda: load_experiment(experiment), lambda: rig_on(rig, port, realtime)
+        lambda: load_experiment(experiment),
+        lambda: rig_on(rig or rig_for(experiment), port, realtime),
     )
     # Checked even where it will not run: a mistake in the file is best heard of early.
     validation = loaded.validation()

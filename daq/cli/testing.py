@@ -47,7 +47,9 @@ class SimulatedRig:
     tests: Path
     root: Path
 
-    def run(self, experiment: str | Path, rig: str | Path = _RIG, **options: Any) -> Recorded:
+    def run(
+        self, experiment: str | Path, rig: str | Path | None = None, **options: Any
+    ) -> Recorded:
         """Run an experiment's YAML to its end.
 
         options: of the simulated rig, over those of its file, such as ``ideal=True`` or
@@ -55,11 +57,12 @@ class SimulatedRig:
         DeviceError, RunError.
         """
         from daq.cli.analysing import analyse
-        from daq.cli.files import load_experiment, load_rig
+        from daq.cli.files import load_experiment, load_rig, rig_for
         from daq.run import run_experiment
 
         loaded = load_experiment(_found(self.tests, experiment))
-        config, device = load_rig(_found(self.tests, rig), {"seed": self.seed, **options})
+        name = rig_for(_found(self.tests, experiment)) if rig is None else _found(self.tests, rig)
+        config, device = load_rig(name, {"seed": self.seed, **options})
         loaded.plan(config)
         result = run_experiment(loaded.experiment, loaded.name, config, device, self.root)
         return Recorded(result.folder, analyse(loaded.experiment, result.folder))

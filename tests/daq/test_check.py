@@ -165,3 +165,37 @@ def test_a_terminal_of_80_columns_shows_everything_and_a_sketch(tmp_path, encodi
     text = shown.decode(encoding)
     assert "…" not in text and "crest factor" in text
     assert ("█" in text) == (encoding == "utf-8")
+
+
+# --- which rig --------------------------------------------------------------------------------
+
+
+def rig_of(command, folder, *options):
+    result = command(["check", *options, "--json"], folder)
+    assert result.returncode == 0, result.stderr
+    return json.loads(result.stdout)["rig"]
+
+
+def test_an_experiment_may_name_its_rig_and_the_command_another(command, tmp_path):
+    assert rig_of(command, tmp_path, "constant_velocity.yaml") == "simulated rig, free shaft"
+    named = ("constant_velocity.yaml", "--rig", "simulated.yaml")
+    assert rig_of(command, tmp_path, *named) == "simulated rig"
+    write_experiment(tmp_path / "e.yaml")
+    assert rig_of(command, tmp_path, "e.yaml") == "simulated rig"
+    # One beside the experiment is meant, from whatever folder.
+    lab = tmp_path / "lab"
+    lab.mkdir()
+    write_experiment(lab / "e.yaml", rig="ours.yaml")
+    (lab / "ours.yaml").write_text("name: ours\n")
+    assert rig_of(command, tmp_path, "lab/e.yaml") == "ours"
+
+
+@pytest.mark.parametrize(
+    ("name", "message"), [("absent.yaml", "absent.yaml: there is no such file"), (7, "e.yaml:")]
+)
+def test_a_rig_that_is_not_there_is_told(command, tmp_path, name, message):
+    write_experiment(tmp_path / "e.yaml", rig=name)
+    result = command(["check", "e.yaml"], tmp_path)
+    assert result.returncode == 2
+    assert message in result.stderr
+    assert "Traceback" not in result.stderr
