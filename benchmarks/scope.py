@@ -34,7 +34,8 @@ RIG = (sys.executable, "-m", "daq.cli")
 RATE = 800.0  # Hz
 _SEEN = "return Bokeh.documents[0].get_model_by_name('seen').start"
 _LAST = (
-    "const t = Bokeh.documents[0].get_model_by_name('samples').data.t ?? [];"
+    "if (!(window.Bokeh?.documents?.length)) return [0, null];"
+    "const t = Bokeh.documents[0].get_model_by_name('samples')?.data.t ?? [];"
     "return [t.length, t[t.length - 1]]"
 )
 _EXPERIMENT = """
@@ -56,8 +57,10 @@ def scope(root: Path, *args: str) -> Iterator[tuple[psutil.Process, str]]:
     )  # fmt: skip
     with process:
         assert process.stdout is not None
-        yield psutil.Process(process.pid), process.stdout.readline().split()[0]
-        process.terminate()
+        try:
+            yield psutil.Process(process.pid), process.stdout.readline().split()[0]
+        finally:
+            process.terminate()
 
 
 @contextlib.contextmanager
