@@ -84,7 +84,8 @@ def check_command(
         console.print_line(f"Figure: {plot}")
     on = f" --rig {rig}" if rig is not None else ""
     on += f" --port {port}" if port is not None else ""
-    console.print_next(f"rig run {experiment}{on} --identify")
+    identify = " --identify" if validation else ""
+    console.print_next(f"rig run {experiment}{on}{identify}")
 
 
 def _resolution(planned: Plan, settings: Experiment) -> float:

@@ -18,8 +18,13 @@ class Section(BaseModel):
     def _truth_is_no_number(cls, value: Any, info: ValidationInfo) -> Any:
         # YAML reads yes, no, on and off as truth values, and pydantic those as 1 and 0.
         kind = cls.model_fields[info.field_name or ""].annotation
-        if not _takes_truth(kind) and any(isinstance(v, bool) for v in _values(value, kind)):
-            raise ValueError("yes, no, on, off, true and false are no value for this key")
+        if _takes_truth(kind):
+            return value
+        for place, part in _parts(value, kind):
+            if isinstance(part, bool):
+                raise ValueError(
+                    f"{place}yes, no, on, off, true and false are no value for this key"
+                )
         return value
 
 
@@ -27,10 +32,10 @@ def _takes_truth(kind: Any) -> bool:
     return kind in {bool, Any} or any(_takes_truth(part) for part in get_args(kind))
 
 
-def _values(value: Any, kind: Any) -> Iterable[Any]:
-    """The value, or those in a list or under keys of its own."""
+def _parts(value: Any, kind: Any) -> Iterable[tuple[str, Any]]:
+    """The value, or those in a list or under keys of its own, behind what names each."""
     if isinstance(value, list):
-        return value
+        return [("", part) for part in value]
     if isinstance(value, dict) and get_origin(kind) is dict:
-        return value.values()
-    return (value,)
+        return [(f"{key}: ", part) for key, part in value.items()]
+    return [("", value)]

@@ -388,7 +388,9 @@ def test_a_full_disk_ends_the_run_safely_with_a_log_that_loads(tmp_path):
     write_rig(tmp_path / "rig.yaml", backend="faulty", options={"journal": "/dev/shm/" + str(
         abs(hash(tmp_path)))})  # fmt: skip
     journal = Path(f"/dev/shm/{abs(hash(tmp_path))}")
-    limit = 60_000  # bytes a file may grow to; Python ignores the signal that comes with it
+    # Bytes a file may grow to; Python ignores the signal that comes with it. Room for what a
+    # capture keeps for its last words, and for a part of the log.
+    limit = 100_000
 
     def small_disk():
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
