@@ -36,13 +36,19 @@ def analyse_command(folder: Path, as_json: bool) -> None:
         console.print_json(as_document(found, folder))
         return
     show_findings(found, folder)
-    console.print_next(next_command(folder))
+    console.print_next(*next_commands(folder))
 
 
-def next_command(folder: Path) -> str:
-    """The identification from a capture, in the ranges that its protocol found if it did."""
-    ranges = folder / RESULTS / "ranges.yaml"
-    return f"rig identify {folder}" + (f" --config {ranges}" if ranges.exists() else "")
+def next_commands(folder: Path) -> list[str]:
+    """What serves after a run: the identification from it, or one in the ranges that it found.
+
+    A protocol that concludes something itself was not meant to excite everything.
+    """
+    results = folder / RESULTS
+    if not results.exists():
+        return [f"rig identify {folder}"]
+    ranges = results / "ranges.yaml"
+    return [f"rig run prbs.yaml --identify --config {ranges}"] if ranges.exists() else []
 
 
 def recorded_experiment(folder: Path) -> Experiment:

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 
 from daq.cli import console, punctuality
-from daq.cli.analysing import analyse, as_document, next_command, show_findings
+from daq.cli.analysing import analyse, as_document, next_commands, show_findings
 from daq.cli.files import LoadedExperiment, load_experiment, load_rig, rig_for, together
 from daq.config.rig import RigConfig
 from daq.errors import ConfigError
@@ -157,4 +157,4 @@ def _print_end(result: RunResult, check: RunResult | None, identified: bool) -> 
         for note in punctuality.notes(run):
             console.report_note(note)
     if not identified:
-        console.print_next(next_command(result.folder))
+        console.print_next(*next_commands(result.folder))
