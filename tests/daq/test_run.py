@@ -103,6 +103,7 @@ def test_the_capture_folder_holds_the_run_as_resolved(completed):
         **merged(SETTINGS, {"homing": {"turns": 1.0, "timeout": 30.0}}),
         "calibration": {"samples": 16, "motion": 0.01, "current_motor": 0.1, "current_brake": 0.05},
         "name": "",
+        "rig": "",
         "validation": {},
     }
     assert record["rig"]["sensors"]["encoder"] == {"cycles": 2048, "sign": 1}, "defaults too"
