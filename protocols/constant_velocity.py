@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 from pydantic import Field
 
-from daq.config.base import Section
-from daq.config.units import Hertz, RadiansPerSecond, Seconds, Turns, Unit, Volts
-from daq.experiment import ClosedLoop, Controller, Plan
+from daq.config.units import RadiansPerSecond, Seconds, Turns, Unit, Volts
+from daq.experiment import Controller, Plan
 from daq.findings import Axis, Chart, Findings, Number, Series, Table
 from daq.hal import FloatArray, Samples
 from protocols import staircase
-from protocols.pid import VelocityGains
 from protocols.staircase import Drive, Plateau, SettlingTest, Staircase
 from protocols.torque_curve import Estimate, Level, Line, Motor, Ripple, fit, levels_of, ripple
+from protocols.velocity_loop import VelocityLoop
 
 _OVERSPEED = 1.5  # of the fastest velocity asked for: beyond it something is wrong
 _SPEED_MARGIN = 10.0  # rad/s, the same for slow velocities
@@ -25,21 +24,7 @@ _DRAWN = 4000  # points of a trace in a figure
 _SURE = 5.0  # standard errors from which a part of the torque counts as there
 
 
-class Ratings(Section):
-    """What data sheets say: for the check of the commands and, at the load, for the torque."""
-
-    torque_constant: Annotated[float, Unit("N*m/A")] | None = Field(
-        None, gt=0.0, description="of the motor: rated torque by rated current"
-    )
-    motor_damping: Annotated[float, Unit("N*m*s/rad")] = Field(
-        0.0, ge=0.0, description="viscous damping of the motor, where it is known"
-    )
-    brake_constant: Annotated[float, Unit("N*m/A")] | None = Field(
-        None, gt=0.0, description="of the brake: rated torque by rated current"
-    )
-
-
-class ConstantVelocity(ClosedLoop):
+class ConstantVelocity(VelocityLoop):
     """Velocity loop on the motor; torque against velocity at each brake command."""
 
     columns = staircase.COLUMNS
@@ -60,17 +45,6 @@ class ConstantVelocity(ClosedLoop):
         1.0, ge=0.0, le=1000.0, description="turns measured at least, however slow"
     )
     settling: SettlingTest = Field(SettlingTest(), description="when a velocity counts as settled")
-    loop: VelocityGains = Field(description="gains of the velocity loop")
-    speed_filter: Hertz = Field(
-        150.0, gt=0.0, le=1e4, description="bandwidth of the speed that the loop sees"
-    )
-    motor_limit: Volts = Field(
-        4.5, gt=0.0, le=10.0, description="largest motor command, either way"
-    )
-    torque_sensor: Literal["between", "load"] = Field(
-        description="between motor and brake, or at the load"
-    )
-    ratings: Ratings = Field(Ratings(), description="what data sheets say of motor and brake")
     fit_from: RadiansPerSecond = Field(
         0.0, ge=0.0, le=1e4,
         description="speed from which plateaus count for c0 and c1; slower ones are only shown",

@@ -9,15 +9,15 @@ from typing import Literal, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from daq.config.units import Hertz, RadiansPerSecond, Seconds, Volts
+from daq.config.units import RadiansPerSecond, Seconds, Volts
 from daq.errors import RunError
-from daq.experiment import Answer, ClosedLoop, Controller, Plan, Sample
+from daq.experiment import Answer, Controller, Plan, Sample
 from daq.findings import Axis, Chart, Findings, Number, Series, Table
 from daq.hal import FloatArray, IntArray, Samples
 from protocols.bouc_wen_loop import Cycles, Estimate, fit, motion
-from protocols.constant_velocity import Ratings
 from protocols.excitation import whole_samples
-from protocols.pid import Pid, SpeedTracker, VelocityGains
+from protocols.pid import Pid, SpeedTracker
+from protocols.velocity_loop import VelocityLoop
 
 _REST = 0.5  # s before and after the cycles of a level
 _BRAKE_SLOPE = 0.5  # V/s
@@ -41,7 +41,7 @@ class _Schedule(NamedTuple):
     cycle: IntArray
 
 
-class HysteresisLoop(ClosedLoop):
+class HysteresisLoop(VelocityLoop):
     """Torque over angle and velocity at each brake command, with the loops' energy and shape."""
 
     columns = COLUMNS
@@ -57,17 +57,6 @@ class HysteresisLoop(ClosedLoop):
     cycles: int = Field(
         6, ge=3, le=1000, description="at each brake command; the first is not counted"
     )
-    loop: VelocityGains = Field(description="gains of the velocity loop")
-    speed_filter: Hertz = Field(
-        150.0, gt=0.0, le=1e4, description="bandwidth of the speed that the loop sees"
-    )
-    motor_limit: Volts = Field(
-        4.5, gt=0.0, le=10.0, description="largest motor command, either way"
-    )
-    torque_sensor: Literal["between", "load"] = Field(
-        description="between motor and brake, or at the load"
-    )
-    ratings: Ratings = Field(Ratings(), description="what data sheets say of motor and brake")
 
     def plan(self) -> Plan:
         """How long it takes, what the shaft is asked for, and how far it turns."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping as MappingType
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -35,11 +36,13 @@ def record(
     rig: str | Path | None = None,
     out: str | Path = "runs",
     validation: bool = False,
+    options: MappingType[str, Any] | None = None,
 ) -> Recording:
     """Run an experiment on a rig; what it logged, ``frame`` as a table.
 
     Files as for ``rig run``, shipped ones among them. validation: the experiment with what its
-    ``validation`` section changes. Raises RigError with cause and cure; outputs are zero then.
+    ``validation`` section changes. options: of the rig's backend, over those of its file. Raises
+    RigError with cause and cure; outputs are zero then.
     """
     loaded = load_experiment(str(experiment))
     if validation:
@@ -47,7 +50,7 @@ def record(
         if changed is None:
             raise ConfigError(f"{loaded.file.path}: it has no 'validation' section; add one")
         loaded = changed
-    config, device = load_rig(str(rig or rig_for(str(experiment))))
+    config, device = load_rig(str(rig or rig_for(str(experiment))), options)
     loaded.plan(config)
     result = run_experiment(loaded.experiment, loaded.name, config, device, Path(out))
     return capture.load(result.folder)

@@ -15,6 +15,7 @@ import pytest
 if TYPE_CHECKING:
     import pandas as pd
 
+    from daq.capture import Recording
     from daq.cli.replaying import Replay
     from daq.findings import Findings
 
@@ -23,17 +24,20 @@ _RIG = "simulated.yaml"
 
 @dataclass(frozen=True)
 class Recorded:
-    """A run on the simulated rig: its capture folder and what its protocol concluded."""
+    """A run on the simulated rig: its recording and what its protocol concluded."""
 
-    folder: Path
+    recording: Recording
     findings: Findings | None
+
+    @property
+    def folder(self) -> Path:
+        """Its capture folder."""
+        return self.recording.log.path.parent
 
     @property
     def frame(self) -> pd.DataFrame:
         """The log in SI units, one row per sample."""
-        from daq import capture
-
-        return capture.load(self.folder).log.frame
+        return self.recording.log.frame
 
 
 @dataclass(frozen=True)
@@ -56,16 +60,17 @@ class SimulatedRig:
         ``plant={"load": "free"}``. Raises what ``rig run`` reports: ConfigError, InterlockError,
         DeviceError, RunError.
         """
-        from daq.cli.analysing import analyse
-        from daq.cli.files import load_experiment, load_rig, rig_for
-        from daq.run import run_experiment
+        from daq.cli.analysing import analyse, recorded_experiment
+        from daq.cli.library import record
 
-        loaded = load_experiment(_found(self.tests, experiment))
-        name = rig_for(_found(self.tests, experiment)) if rig is None else _found(self.tests, rig)
-        config, device = load_rig(name, {"seed": self.seed, **options})
-        loaded.plan(config)
-        result = run_experiment(loaded.experiment, loaded.name, config, device, self.root)
-        return Recorded(result.folder, analyse(loaded.experiment, result.folder))
+        recording = record(
+            _found(self.tests, experiment),
+            None if rig is None else _found(self.tests, rig),
+            self.root,
+            options={"seed": self.seed, **options},
+        )
+        folder = recording.log.path.parent
+        return Recorded(recording, analyse(recorded_experiment(folder), folder))
 
 
 @dataclass(frozen=True)

@@ -20,11 +20,11 @@ class Section(BaseModel):
         kind = cls.model_fields[info.field_name or ""].annotation
         if _takes_truth(kind):
             return value
-        for place, part in _parts(value, kind):
+        for name, part in _parts(value, kind):
             if isinstance(part, bool):
-                raise ValueError(
-                    f"{place}yes, no, on, off, true and false are no value for this key"
-                )
+                # Of ``parameters``: parameter R_m.
+                one = f"{(info.field_name or '').removesuffix('s')} {name}: " if name else ""
+                raise ValueError(f"{one}yes, no, on, off, true and false are no value for this key")
         return value
 
 
@@ -33,9 +33,9 @@ def _takes_truth(kind: Any) -> bool:
 
 
 def _parts(value: Any, kind: Any) -> Iterable[tuple[str, Any]]:
-    """The value, or those in a list or under keys of its own, behind what names each."""
+    """The value, or those in a list or under keys of its own; each behind its name, if any."""
     if isinstance(value, list):
         return [("", part) for part in value]
     if isinstance(value, dict) and get_origin(kind) is dict:
-        return [(f"{key}: ", part) for key, part in value.items()]
+        return [(str(key), part) for key, part in value.items()]
     return [("", value)]
