@@ -11,6 +11,7 @@ and interlocks around any device, so that those exist once.
 from __future__ import annotations
 
 import enum
+import math
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
@@ -106,16 +107,22 @@ class Samples:
 
 @dataclass(frozen=True)
 class Guard:
-    """Limits that the device itself enforces within one tick, in volts.
+    """Limits that the device itself enforces within one tick, in volts and counts.
 
-    command_low/high: (2,), outputs are clamped to them. analog_low/high: (3,), a latched input
-    beyond them zeroes both outputs until the next ``start`` and flags INTERLOCK.
+    command_low/high: (2,), outputs are clamped to them. A latched input beyond one of the others
+    zeroes both outputs until the next ``start`` and flags INTERLOCK: analog_low/high, (3,);
+    counts_low/high, of the counter since tick 0; count_rate, of the rate's magnitude [1/s];
+    count_step, of the counter's change from tick to tick. Infinity: not watched.
     """
 
     command_low: FloatArray
     command_high: FloatArray
     analog_low: FloatArray
     analog_high: FloatArray
+    counts_low: float = -math.inf
+    counts_high: float = math.inf
+    count_rate: float = math.inf
+    count_step: float = math.inf
 
 
 @dataclass(frozen=True)

@@ -94,8 +94,17 @@ class Rig:
         """Tell the device which phase of the run begins."""
         self._device.announce(phase, turns)
 
-    def start(self, sample_rate: float, mode: Mode) -> None:
-        """Begin sampling at ``sample_rate`` [Hz]; tick 0 is the first sample."""
+    def start(
+        self,
+        sample_rate: float,
+        mode: Mode,
+        window: tuple[float, float] = (-math.inf, math.inf),
+    ) -> None:
+        """Begin sampling at ``sample_rate`` [Hz]; tick 0 is the first sample.
+
+        window: angles [rad] from the first sample's which the device shall not let the shaft
+        leave under power.
+        """
         if sample_rate > self.info.max_rate:
             raise DeviceError(
                 f"{self.info.name} samples at up to {self.info.max_rate:g} Hz; "
@@ -113,7 +122,7 @@ class Rig:
         self._scale = self._scales()
         encoder = self.config.sensors.encoder
         self._radians = encoder.sign * 2.0 * np.pi / (4.0 * encoder.cycles)
-        self._device.start(sample_rate, mode, self._guard())
+        self._device.start(sample_rate, mode, self._guard(window))
 
     def send(self, tick: int, commands: FloatArray) -> None:
         """Queue commands (n, 2) [V] for consecutive ticks from ``tick``; clamped to the limits.
@@ -196,15 +205,24 @@ class Rig:
             self._last = commands[-1]
         return commands
 
-    def _guard(self) -> Guard:
-        """Limits of current and torque in volts, so that the device can watch them itself."""
+    def _guard(self, window: tuple[float, float]) -> Guard:
+        """Limits in volts and counts, so that the device can watch them itself."""
         command_low, command_high = self._command_limits()
         limits = self.config.limits
         torque = math.inf if limits.torque is None else limits.torque
         bounds = np.array([limits.current.motor, limits.current.brake, torque])
         volts = bounds / np.abs(self._scales())
+        counts_low, counts_high = sorted(angle / self._radians for angle in window)
+        speed = math.inf if limits.speed is None else limits.speed
         return Guard(
-            command_low, command_high, self.offsets.volts - volts, self.offsets.volts + volts
+            command_low,
+            command_high,
+            self.offsets.volts - volts,
+            self.offsets.volts + volts,
+            counts_low,
+            counts_high,
+            speed / abs(self._radians),
+            limits.encoder.fastest / self._rate / abs(self._radians),
         )
 
     def _scales(self) -> FloatArray:

@@ -342,8 +342,8 @@ class _Run:
 
     def _begin(self, mode: Mode) -> None:
         rate = self.experiment.sample_rate
-        self.rig.start(rate, mode)
         self.limits.begin(self.phase, rate)
+        self.rig.start(rate, mode, self.limits.window())
         self.timing = Timing()
 
     def _receive(self) -> Samples:

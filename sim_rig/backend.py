@@ -30,6 +30,7 @@ from sim_rig import command_queue, converters
 from sim_rig.command_queue import CommandQueue
 from sim_rig.converters import Converters
 from sim_rig.encoder import EncoderCounter
+from sim_rig.guarding import Watch
 from sim_rig.plant import Plant, state_sizes
 from sim_rig.user import SimulatedUser
 from sysid import Stepper
@@ -169,7 +170,7 @@ class SimulatedDevice:
                 accuracy=_ACCURACY,
             )
         self._stepper = self._steppers[sample_rate]
-        self._rate, self._guard = sample_rate, guard
+        self._rate, self._guard, self._watch = sample_rate, guard, Watch(guard)
         self._waits_for_commands = mode is Mode.OPEN_LOOP
         self._origin = self._clock
         self._queue.restart(mode)
@@ -263,14 +264,15 @@ class SimulatedDevice:
         """Simulate the ticks; where an input passes its guard, again with zeros from there."""
         n = len(applied)
         noise, encoder = self._unit_noise(n), self._encoder.copy()
-        raw, row, trace = self._simulate(applied, flags, noise)
-        if guarded and row < n:
+        raw, trace = self._simulate(applied, flags, noise)
+        row = self._watch.first_beyond(raw.analog, raw.counts, raw.count_rate) if guarded else n
+        if row < n:
             applied[row:] = 0.0
             flags[row:] = 0
             flags[row] = _INTERLOCK
             # The trace begins with where the ticks began.
             self._x, self._encoder = trace[0].copy(), encoder
-            raw, _, _ = self._simulate(applied, flags, noise)
+            raw, _ = self._simulate(applied, flags, noise)
             self._queue.latch()
         self._queue.advance(n)
         # Not summed up tick by tick: rounding would make it depend on the size of the blocks.
@@ -279,11 +281,8 @@ class SimulatedDevice:
 
     def _simulate(
         self, applied: FloatArray, flags: IntArray, noise: FloatArray
-    ) -> tuple[RawSamples, int, FloatArray]:
-        """Latch, apply, advance: n ticks of plant and sensing chain.
-
-        Returns the samples, the first row beyond the guard or n, and the plant's trace.
-        """
+    ) -> tuple[RawSamples, FloatArray]:
+        """Latch, apply, advance: the samples of n ticks, and the plant's trace."""
         n, tick, per_tick = len(applied), self._queue.tick, self._stepper.n_steps
         trace, true = self._stepper.advance(self._x, self._inputs(applied))
         counts, rates = self._encoder.latch(
@@ -297,10 +296,9 @@ class SimulatedDevice:
         if self.options.ideal:
             per_radian = self._encoder.counts_per_turn / (2.0 * math.pi)
             counts, rates = true[:, 3] * per_radian, true[:, 4] * per_radian
-        volts = np.empty((n, len(ANALOG_INPUTS)))
-        row = self._converters.read(true, noise, flags, self._guard, volts)
+        volts = self._converters.read(true, noise, flags)
         ticks = np.arange(tick, tick + n, dtype=np.int64)
-        return RawSamples(ticks, volts, counts, rates, applied, flags), row, trace
+        return RawSamples(ticks, volts, counts, rates, applied, flags), trace
 
     def _inputs(self, applied: FloatArray) -> FloatArray:
         """The plant's inputs at the ticks and at the one that follows, (n + 1, n_inputs)."""

@@ -33,20 +33,14 @@ class Converters:
         _give(volts, self.resolution, guard.command_low, guard.command_high, given)
         return given
 
-    def read(
-        self, true: FloatArray, noise: FloatArray, flags: IntArray, guard: Guard, volts: FloatArray
-    ) -> int:
-        """Convert the plant's outputs true, (n, >= 3), into volts, (n, 3); flags are added to.
+    def read(self, true: FloatArray, noise: FloatArray, flags: IntArray) -> FloatArray:
+        """Volts, (n, 3), of the plant's outputs true, (n, >= 3); flags are added to.
 
-        noise: (n, 3), of unit variance. Returns the first row with an input beyond the guard's
-        limits, or n.
+        noise: (n, 3), of unit variance.
         """
-        return int(
-            _read(
-                true, self.senses, self.offsets, self.noise, self.resolution, noise,
-                guard.analog_low, guard.analog_high, volts, flags,
-            )
-        )  # fmt: skip
+        volts = np.empty(noise.shape)
+        _read(true, self.senses, self.offsets, self.noise, self.resolution, noise, volts, flags)
+        return volts
 
 
 @njit(cache=True, nogil=True)
@@ -69,14 +63,10 @@ def _read(
     deviation: float,
     resolution: float,
     noise: FloatArray,
-    low: FloatArray,
-    high: FloatArray,
     volts: FloatArray,
     flags: IntArray,
-) -> int:
-    n = volts.shape[0]
-    beyond: int = n
-    for i in range(n):
+) -> None:
+    for i in range(volts.shape[0]):
         for j in range(volts.shape[1]):
             value = true[i, j] * senses[j]
             if resolution > 0.0:
@@ -86,6 +76,3 @@ def _read(
                 value = np.rint(value / resolution) * resolution
                 value = min(max(value, -RANGE), RANGE - resolution)
             volts[i, j] = value
-            if not low[j] <= value <= high[j]:
-                beyond = min(beyond, i)
-    return beyond

@@ -57,6 +57,10 @@ class SimulatedBoard:
             np.array(limits.command_high) * self._out_scale,
             np.array(limits.analog_low) * self._in_scale,
             np.array(limits.analog_high) * self._in_scale,
+            limits.counts_low,
+            limits.counts_high,
+            limits.count_rate,
+            limits.count_step,
         )
         # Each tick comes with its command: missing ones are the machine's matter.
         self._device.start(rate, Mode.CLOSED_LOOP, guard)

@@ -34,6 +34,11 @@ class Limits:
         for limit in self._limits:
             limit.begin(phase, sample_rate)
 
+    def window(self) -> tuple[float, float]:
+        """Angles [rad] from the first of the phase that no limit wants the shaft to leave."""
+        lows, highs = zip(*(limit.window() for limit in self._limits), strict=True)
+        return max(lows), min(highs)
+
     def check(self, samples: Samples) -> Trip | None:
         """The first row beyond any limit, and why; the earlier limit of two in one row."""
         first: Trip | None = None
@@ -53,7 +58,6 @@ def _built_in(config: RigConfig) -> list[Limit]:
         Magnitude("torque", limits.torque, "N*m"),
         Magnitude("omega", limits.speed, "rad/s"),
         Magnitude("theta", None, "rad"),
-        DeviceFound(),
         Jump(encoder.fastest),
         Silence(encoder.silent),
     ]
@@ -69,6 +73,7 @@ def _built_in(config: RigConfig) -> list[Limit]:
         follows = {"motor": "current_motor", "brake": "current_brake"}
         found += [Frozen(name, limits.frozen, channel) for channel, name in follows.items()]
         found.append(Frozen("torque", limits.frozen, None))
+    found.append(DeviceFound())  # last, for the others know more of what it found
     return found
 
 
@@ -89,6 +94,14 @@ class _Named(Limit):
         """Pass it on."""
         with self._blamed():
             self._own.begin(phase, sample_rate)
+
+    def window(self) -> tuple[float, float]:
+        """Pass it on."""
+        with self._blamed():
+            low, high = self._own.window()
+            if not low <= high:
+                raise ValueError(f"its window ({low!r}, {high!r}) is none")
+            return float(low), float(high)
 
     def check(self, samples: Samples) -> Trip | None:
         """Pass it on, and see that the answer is one."""

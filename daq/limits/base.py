@@ -28,6 +28,13 @@ class Limit(abc.ABC):
     def begin(self, phase: Phase, sample_rate: float) -> None:  # noqa: B027
         """A phase begins: ticks and time count from zero again. sample_rate in Hz."""
 
+    def window(self) -> tuple[float, float]:
+        """Angles [rad] from the first of the phase that has begun which the shaft may not leave.
+
+        The device watches them itself, where it can, beside ``check``.
+        """
+        return -math.inf, math.inf
+
     @abc.abstractmethod
     def check(self, samples: Samples) -> Trip | None:
         """The first row of a block (n >= 1) that is beyond the limit, and why; else None.

@@ -31,9 +31,13 @@ class _Position:
             return True
         return False
 
+    def ahead(self, turns: float) -> float:
+        """How far [rad] from the first angle of the phase the shaft has so many turns."""
+        return (turns - self.before) * TURN
+
     def angle(self, turns: float) -> float:
         """The angle [rad] of this phase at which the shaft has so many turns."""
-        return self._first + (turns - self.before) * TURN
+        return self._first + self.ahead(turns)
 
     def turns(self, angle: float) -> float:
         """The other way round."""
@@ -51,6 +55,10 @@ class Travel(Limit):
     def begin(self, phase: Phase, sample_rate: float) -> None:
         """Turns are counted on."""
         self._position.restart()
+
+    def window(self) -> tuple[float, float]:
+        """The two ends."""
+        return self._position.ahead(self._low), self._position.ahead(self._high)
 
     def check(self, samples: Samples) -> Trip | None:
         """Compare the angle with the two ends."""
@@ -85,6 +93,13 @@ class Winding(Limit):
             self._position.restart()
             if phase is Phase.RUN:
                 self._sign = math.copysign(1.0, self._position.before)
+
+    def window(self) -> tuple[float, float]:
+        """Open to where more is wound up."""
+        if self._position is None or self._sign == 0.0:
+            return -math.inf, math.inf
+        end = self._position.ahead(self._sign * self._least_turns)
+        return (end, math.inf) if self._sign > 0.0 else (-math.inf, end)
 
     def check(self, samples: Samples) -> Trip | None:
         """Compare the angle with where the cable is nearly wound off."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import getpass
+import math
 import os
 import platform
 import sys
@@ -38,6 +39,7 @@ HANDSHAKE = 2.0
 
 _FEED = 0.01  # s between two looks at what is to be sent, or sent again
 _PINGS = 6  # round trips measured before a run
+_LARGEST_RATE = float(np.finfo(np.float32).max)  # 1/s
 _PING_PATIENCE = 0.5  # s for all of them
 _SAFE_PATIENCE = 0.25  # s to hear that the outputs are zero
 _PATIENCE = 1.0  # s without a call from the run until the watchdog is no longer fed
@@ -312,6 +314,9 @@ class SerialDevice:
         low = np.ceil(_ratio(guard.command_low - offset, scale) - 1e-9)
         high = np.floor(_ratio(guard.command_high - offset, scale) + 1e-9)
         inside = np.iinfo(np.int32)
+        counts = np.array([np.ceil(guard.counts_low), np.floor(guard.counts_high)])
+        fewest, most = _whole(counts, inside)
+        (step,) = _whole(np.floor([guard.count_step]), np.iinfo(np.uint32))
         return Start(
             self._run,
             LoopMode.OPEN if mode is Mode.OPEN_LOOP else LoopMode.CLOSED,
@@ -321,6 +326,10 @@ class SerialDevice:
             _whole(high, np.iinfo(np.int16)),
             _whole(np.ceil(_ratio(guard.analog_low - in_offset, in_scale) - 1e-9), inside),
             _whole(np.floor(_ratio(guard.analog_high - in_offset, in_scale) + 1e-9), inside),
+            counts_low=fewest,
+            counts_high=most,
+            count_rate=guard.count_rate if guard.count_rate < _LARGEST_RATE else math.inf,
+            count_step=step,
         )
 
     # --- volts and codes ----------------------------------------------------------------------

@@ -60,8 +60,8 @@ class Board(Protocol):
     def play(self, commands: Codes) -> Records:
         """The next n ticks with commands (n, 2), in the timer's interrupt; n samples.
 
-        In each tick, in this order: latch all inputs and the counter; if an input is beyond the
-        guard, put zero in place of this and every later command until ``start`` and flag
+        In each tick, in this order: latch all inputs and the counter; if one of them is beyond
+        the guard, put zero in place of this and every later command until ``start`` and flag
         INTERLOCK, once; apply the command; note what was latched and applied.
         """
 

@@ -103,7 +103,7 @@ _WELCOME = struct.Struct("<4sHBBIfIHHHH32s32s32s")
 _CHANNEL = struct.Struct("<16s8sdddd")
 _STATUS = struct.Struct("<HBBIIIII")
 _REPLY = struct.Struct("<BBH")
-_START = struct.Struct("<HBBIHH2h2h3i3i")
+_START = struct.Struct("<HBBIHH2h2h3i3i2ifI")
 _RUN = struct.Struct("<H")
 _ANNOUNCE = struct.Struct("<B3xf")
 _COMMANDS = struct.Struct("<HHI")
@@ -282,9 +282,10 @@ def unpack_reply(payload: bytes) -> tuple[Reply, Status] | None:
 
 @dataclass(frozen=True)
 class Start:
-    """Arm a run. period: clock ticks per sample. watchdog [ms]. The rest are converter codes.
+    """Arm a run. period: clock ticks per sample. watchdog [ms].
 
-    Clamps and guard as ``daq.hal.Guard``; a device narrows the clamps to its own limits.
+    Clamps and guard as ``daq.hal.Guard``, in converter codes and counts; a device narrows the
+    clamps to its own limits. The ends of a number's range stand for what is not watched.
     """
 
     run: int
@@ -295,12 +296,17 @@ class Start:
     command_high: tuple[int, ...]
     analog_low: tuple[int, ...]
     analog_high: tuple[int, ...]
+    counts_low: int
+    counts_high: int
+    count_rate: float
+    count_step: int
 
     def pack(self) -> bytes:
         """Payload of the frame."""
         return _START.pack(
             self.run, self.mode, 0, self.period, self.watchdog, 0,
             *self.command_low, *self.command_high, *self.analog_low, *self.analog_high,
+            self.counts_low, self.counts_high, self.count_rate, self.count_step,
         )  # fmt: skip
 
     @classmethod
@@ -308,13 +314,13 @@ class Start:
         """The message, or None."""
         if len(payload) != _START.size:
             return None
-        run, mode, _, period, watchdog, _, *codes = _START.unpack(payload)
+        run, mode, _, period, watchdog, _, *codes, fewest, most, rate, step = _START.unpack(payload)
         if mode not in list(LoopMode):
             return None
         low, high, under, over = codes[0:2], codes[2:4], codes[4:7], codes[7:10]
         return cls(
             run, LoopMode(mode), period, watchdog,
-            tuple(low), tuple(high), tuple(under), tuple(over),
+            tuple(low), tuple(high), tuple(under), tuple(over), fewest, most, rate, step,
         )  # fmt: skip
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from daq.config.rig import RigConfig
+from daq.config.rig import EncoderLimits, RigConfig
 from daq.errors import DeviceError
 from daq.hal import Flag, Guard, Mode, Phase
 from daq.limits import Limits
@@ -346,6 +346,49 @@ class HalContract:
         played = play(rig, levels(200, brake=0.3))
         row = int(np.flatnonzero(played.flagged(Flag.INTERLOCK))[0])
         assert not played.applied[row:].any() and played.applied[row - 1, 1] > 0.2
+
+    @pytest.mark.parametrize("mode", [OPEN, CLOSED])
+    @pytest.mark.parametrize(
+        ("changes", "word"),
+        [
+            ({"speed": 5.0}, "omega"),
+            ({"travel": (-0.5, 0.05)}, "travel"),
+            ({"encoder": EncoderLimits(fastest=10.0)}, "jumped"),
+        ],
+        ids=["speed", "travel", "jump"],
+    )
+    def test_a_shaft_beyond_a_limit_zeroes_the_outputs_from_that_row_on(
+        self, bench, device, mode, changes, word
+    ):
+        config = free_currents(bench.config)
+        config = config.model_copy(update={"limits": config.limits.model_copy(update=changes)})
+        limits = Limits(config)
+        rig = Rig(device, config)
+        rig.open()
+        limits.begin(Phase.RUN, RATE)
+        rig.start(RATE, mode, limits.window())
+        commands = zeros(400)
+        commands[30:, 0] = 2.0
+        rig.send(0, commands)
+        played = Played(collect(rig, 300))
+        row, reason = limits.check(played)
+        assert word in reason
+        assert row > 30 and np.flatnonzero(played.flagged(Flag.INTERLOCK)).tolist() == [row]
+        assert played.applied[row - 1, 0] > 1.0
+        assert not played.applied[row:].any(), "zero from the very row that tripped"
+
+    def test_travel_is_counted_from_the_first_sample_of_each_start(self, bench, device):
+        rig = Rig(device, free_currents(bench.config))
+        rig.open()
+        play(rig, levels(100, motor=2.0))
+        turned = 2.0 * np.pi * 0.05
+        rig.stop()
+        rig.start(RATE, OPEN, (-np.inf, turned))
+        rig.send(0, levels(400, motor=2.0))
+        played = Played(collect(rig, 300))
+        row = int(np.flatnonzero(played.flagged(Flag.INTERLOCK))[0])
+        moved = played.theta - played.theta[0]
+        assert (moved[:row] <= turned).all() and moved[row] > turned
 
     def test_outputs_are_zero_at_the_first_tick_of_a_start(self, rig):
         play(rig, levels(50, motor=0.5, brake=0.1))

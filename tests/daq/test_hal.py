@@ -5,6 +5,7 @@ import pytest
 from scipy.linalg import expm
 
 from daq.config.rig import RigConfig
+from daq.hal import Mode
 from daq.rig import Offsets, Rig
 from sim_rig.actuator import actuator
 from sim_rig.backend import SimulatedDevice, Simulation
@@ -121,6 +122,14 @@ def test_sign_and_cycles_of_the_encoder_act_on_angle_and_speed():
     np.testing.assert_allclose(two.omega, -2.0 * one.omega, rtol=1e-12)
 
 
+class Guarded(SimulatedDevice):
+    """Keeps the guard that it was started with."""
+
+    def start(self, sample_rate, mode, guard):
+        super().start(sample_rate, mode, guard)
+        self.guard = guard
+
+
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_offsets_do_not_move_the_current_limit(sign):
     # An input that reads 3 V at zero current must still trip at the limit in amperes.
@@ -130,8 +139,28 @@ def test_offsets_do_not_move_the_current_limit(sign):
             "sensors": {"current_motor": {"scale": 0.5, "sign": sign}},
         }
     )
-    rig = Rig(SimulatedDevice(Simulation()), config)
-    rig.offsets = Offsets(np.array([3.0, 0.0, 0.0]))
-    guard = rig._guard()
+    device = Guarded(Simulation())
+    with Rig(device, config) as rig:
+        rig.offsets = Offsets(np.array([3.0, 0.0, 0.0]))
+        rig.start(800.0, Mode.OPEN_LOOP)
+    guard = device.guard
     np.testing.assert_allclose([guard.analog_low[0], guard.analog_high[0]], [2.4, 3.6])
     assert np.isinf(guard.analog_high[2]), "torque has no limit"
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_limits_of_the_shaft_reach_the_device_in_counts(sign):
+    config = RigConfig.model_validate(
+        {
+            "limits": {"speed": "60 rpm", "encoder": {"fastest": 100.0}},
+            "sensors": {"encoder": {"cycles": 500, "sign": sign}},
+        }
+    )
+    device = Guarded(Simulation())
+    with Rig(device, config) as rig:
+        rig.start(800.0, Mode.OPEN_LOOP, (-0.5 * np.pi, np.inf))
+    guard = device.guard
+    window = (-500.0, np.inf) if sign > 0 else (-np.inf, 500.0)
+    np.testing.assert_allclose((guard.counts_low, guard.counts_high), window)
+    np.testing.assert_allclose(guard.count_rate, 2000.0)
+    np.testing.assert_allclose(guard.count_step, 100.0 / 800.0 / (2.0 * np.pi) * 2000.0)

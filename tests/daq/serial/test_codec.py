@@ -141,7 +141,8 @@ def test_a_block_of_samples_comes_back_as_it_was(n, first, time):
         (messages.unpack_run, messages.pack_run(3)),
         (messages.unpack_ping, messages.pack_ping(3)),
         (messages.Start.unpack, messages.Start(
-            1, messages.LoopMode.OPEN, 60_000, 100, (-1, 0), (1, 1), (-5,) * 3, (5,) * 3).pack()),
+            1, messages.LoopMode.OPEN, 60_000, 100, (-1, 0), (1, 1), (-5,) * 3, (5,) * 3,
+            -9, 9, 1e3, 4).pack()),
         (messages.Welcome.unpack, messages.Welcome(
             "d", "f", "s", 1, 1.0, 1, 64, 100, 1000,
             (messages.Channel("a", "V", 1.0, 0.0, 0.0, 1.0),)).pack()),

@@ -70,6 +70,7 @@ def start_message(mode, run=1, **changes):
     facts = {
         "run": run, "mode": mode, "period": PERIOD, "watchdog": 100, "command_low": (-5000, 0),
         "command_high": (5000, 380), "analog_low": (-wide,) * 3, "analog_high": (wide,) * 3,
+        "counts_low": -wide, "counts_high": wide, "count_rate": np.inf, "count_step": 2 * wide,
     }  # fmt: skip
     return Start(**{**facts, **changes})
 
