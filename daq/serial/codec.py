@@ -22,6 +22,8 @@ _HEADER = struct.Struct("<BBHHH")
 _CRC = struct.Struct("<I")
 _SMALLEST = _HEADER.size + _CRC.size
 # COBS adds one byte per 254 and one more.
+# CRC-32 of whatever ends with its own CRC-32, in the order of bytes on the wire.
+_RESIDUE = 0x2144DF1C
 _LONGEST = _SMALLEST + MAX_PAYLOAD + (_SMALLEST + MAX_PAYLOAD) // 254 + 1
 
 
@@ -59,10 +61,9 @@ def decode(coded: bytes) -> Frame | None:
     type_, reserved, session, seq, length = _HEADER.unpack_from(body)
     if length != len(body) - _SMALLEST or reserved != 0:
         return None
-    end = len(body) - _CRC.size
-    if zlib.crc32(body[:end]) != _CRC.unpack_from(body, end)[0]:
+    if zlib.crc32(body) != _RESIDUE:
         return None
-    return Frame(type_, session, seq, body[_HEADER.size : end])
+    return Frame(type_, session, seq, body[_HEADER.size : -_CRC.size])
 
 
 @dataclass

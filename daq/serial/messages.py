@@ -110,9 +110,10 @@ _COMMANDS = struct.Struct("<HHI")
 _PING = struct.Struct("<Q")
 _PONG = struct.Struct("<QQQ")
 _SAMPLES = struct.Struct("<IHHQ")
+_SAMPLES_HEAD = struct.Struct(_STATUS.format + _SAMPLES.format[1:])
 
 COMMANDS_OVERHEAD = _COMMANDS.size
-SAMPLES_OVERHEAD = _STATUS.size + _SAMPLES.size
+SAMPLES_OVERHEAD = _SAMPLES_HEAD.size
 
 
 def version_of(payload: bytes) -> int | None:
@@ -258,7 +259,11 @@ _STATES, _LATCHES = tuple(State), tuple(Latch)  # by their numbers, quicker than
 
 
 def _status(payload: bytes, at: int = 0) -> Status | None:
-    run, state, latch, *numbers = _STATUS.unpack_from(payload, at)
+    return _known(*_STATUS.unpack_from(payload, at))
+
+
+def _known(run: int, state: int, latch: int, *numbers: int) -> Status | None:
+    """A status whose state and latch there are."""
     if state >= len(_STATES) or latch >= len(_LATCHES):
         return None
     return Status(run, _STATES[state], _LATCHES[latch], *numbers)
@@ -415,8 +420,8 @@ def unpack_samples(payload: bytes) -> Block | None:
     """A SAMPLES payload; the records are a view of it."""
     if len(payload) < SAMPLES_OVERHEAD:
         return None
-    status = _status(payload)
-    first, count, _, time = _SAMPLES.unpack_from(payload, _STATUS.size)
+    *numbers, first, count, _, time = _SAMPLES_HEAD.unpack_from(payload)
+    status = _known(*numbers)
     right = len(payload) == SAMPLES_OVERHEAD + count * SAMPLE_DTYPE.itemsize and count > 0
     if status is None or not right:
         return None
