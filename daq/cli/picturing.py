@@ -119,14 +119,15 @@ def _responses(
 
 def _response(model: ProcessModel, log: Dataset, simulated: Mapping[str, Run], j: int) -> Response:
     output = model.outputs[j]
-    fits = [float(evaluate(log.outputs, run).fit[j]) for run in simulated.values()]
-    shown = " / ".join(_percent(fit) for fit in fits)
+    fits = {name: float(evaluate(log.outputs, run).fit[j]) for name, run in simulated.items()}
+    several = len(fits) > 1
+    shown = ", ".join(f"{name} " * several + f"{_percent(fit)} %" for name, fit in fits.items())
     return Response(
         output.name,
         output.unit,
         log.outputs[:, j],
         {name: run[:, j] for name, run in simulated.items()},
-        f"fit {shown} %",
+        f"fit: {shown}",
     )
 
 

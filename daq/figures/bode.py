@@ -44,7 +44,7 @@ def bode(
     magnitudes carry 95 % bars; points of low coherence are faint.
     """
     figure, (size, angle, seen) = style.stack(
-        [1.1, 0.8, 0.45], 0.1, top=style.legend_rows([_MEASURED, *curves])[1]
+        [1.1, 0.8, 0.45], 0.1, top=style.legend_room([_MEASURED, *curves])
     )
     magnitude = np.abs(measured.response)
     good = measured.coherence >= _SEEN

@@ -30,7 +30,7 @@ def convergence(
                       label="genetic search alone")  # fmt: skip
     style.logarithmic(panel.yaxis, errors)
     panel.ticklabel_format(axis="x", style="plain")
-    panel.set_xlabel("simulations of one parameter set [1]")
+    panel.set_xlabel("parameter sets simulated [1]")
     style.name_y(panel, "mean RMSE / max|y|", "[1]")
     style.legend(figure, panel)
     return figure

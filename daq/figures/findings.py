@@ -13,29 +13,32 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _LETTERS_A_LINE = 62  # of a title across a column of print
+_LEFT, _SHORT = 0.6, 34  # in, left of a panel, and letters of a label on one line
+_SCALE = 0.12  # in, for a power of ten above the panel
+_EDGE = 0.16  # in, where the legend's room begins
 
 
 @style.styled
 def draw(figure: Chart | Heatmap) -> Figure:
     """A figure of a chart or of a value over a plane."""
     title = style.wrapped(figure.title, _LETTERS_A_LINE)
+    said = 0.05 + 0.13 * (title.count("\n") + 1)
     named = [series.label for series in figure.series if series.label]
     shown = named if len(named) > 1 or isinstance(figure, Heatmap) else []
-    columns, room = style.legend_rows(shown) if shown else (0, 0.0)
-    top = 0.08 + 0.13 * (title.count("\n") + 1) + room
+    room = style.legend_room([notation.words(label) for label in shown], _EDGE) if shown else 0.0
     right = 0.72 if isinstance(figure, Heatmap) else 0.1
-    drawn, (panel,) = style.stack([2.1], top=top, right=right)
+    left = _LEFT if len(figure.y.label) + len(figure.y.unit) < _SHORT else style.LEFT
+    drawn, (panel,) = style.stack([2.1], left=left, top=said + room + _SCALE, right=right)
     if isinstance(figure, Heatmap):
         _plane(drawn, panel, figure)
     for k, series in enumerate(figure.series):
         _add(panel, series, k, over=isinstance(figure, Heatmap))
     panel.set_xlabel(_label(figure.x))
     style.name_y(panel, notation.words(figure.y.label), notation.bracketed(figure.y.unit))
-    panel.set_title(title, loc="left", x=(0.08 - style.LEFT) / (style.WIDTH - style.LEFT - right),
-                    pad=4.0 + 72.0 * room)  # fmt: skip
+    tall = float(drawn.get_size_inches()[1])
+    drawn.text(0.08 / style.WIDTH, 1 - 0.03 / tall, title, va="top", linespacing=1.15)
     if shown:
-        panel.legend(loc="lower left", bbox_to_anchor=(-0.12, 1.0), ncols=columns,
-                     borderaxespad=0.2, borderpad=0.0)  # fmt: skip
+        style.legend(drawn, panel, _EDGE, above=said - 0.02)
     return drawn
 
 

@@ -31,7 +31,7 @@ class Loop:
 def hysteresis_loops(loops: Sequence[Loop], points: bool = False) -> Figure:
     """Torque over angle above, over speed below; ``points`` for measured samples."""
     figure, (over_angle, over_speed) = style.stack(
-        [1.45, 1.45], 0.42, top=style.legend_rows([loop.label for loop in loops])[1], share_x=False
+        [1.45, 1.45], 0.42, top=style.legend_room([loop.label for loop in loops]), share_x=False
     )
     for k, loop in enumerate(loops):
         look = _look(k, points)

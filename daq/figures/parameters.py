@@ -63,7 +63,7 @@ def ranges(parameters: Sequence[Searched]) -> Figure:
             mfc=style.IDENTIFIED if known else "white", mec=style.IDENTIFIED, mew=0.8,
         )  # fmt: skip
         if one.note:
-            panel.text(1.05, row, one.note, va="center", fontsize=6.0)
+            panel.text(1.07, row, one.note, va="center", fontsize=6.0)
     _legend_of_ranges(figure, panel)
     panel.set_yticks(range(len(parameters)), names)
     panel.set_ylim(len(parameters) - 0.4, -0.6)
@@ -79,8 +79,8 @@ def _legend_of_ranges(figure: Figure, panel: Axes) -> None:
     panel.plot([], [], color=style.FAINT, lw=3.0, label="range")
     panel.plot([], [], color=style.BASELINE, lw=3.0, label="95 % interval")
     panel.plot([], [], "o", ms=3.2, mfc=style.IDENTIFIED, mec=style.IDENTIFIED, label="value")
-    panel.plot([], [], "o", ms=3.2, mfc="white", mec=style.IDENTIFIED, label="open")
-    style.legend(figure, panel, left=0.3)
+    panel.plot([], [], "o", ms=3.2, mfc="white", mec=style.IDENTIFIED, label="no interval")
+    style.legend(figure, panel, left=0.2)
 
 
 def _place(one: Searched, value: float) -> float:

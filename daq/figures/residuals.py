@@ -34,7 +34,7 @@ def residual_correlations(lags: FloatArray, outputs: Sequence[Remainder]) -> Fig
     lags: seconds. Inside ±1 is what chance alone leaves, 95 times in 100.
     """
     labels = ["with its past", *(f"with {name}" for name in outputs[0].cross)]
-    figure, panels = style.stack([0.85] * len(outputs), 0.14, top=style.legend_rows(labels)[1])
+    figure, panels = style.stack([0.85] * len(outputs), 0.14, top=style.legend_room(labels))
     for panel, output in zip(panels, outputs, strict=True):
         panel.axhspan(-1.0, 1.0, color="#eeeeee", lw=0, zorder=0)
         panel.axhline(0.0, color="black", lw=0.4, zorder=1)

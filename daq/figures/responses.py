@@ -79,7 +79,7 @@ def _around(output: Response) -> tuple[float, float]:
     values = np.concatenate([output.measured, first])
     values = values[np.isfinite(values)]
     low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 1.0)
-    room = 0.06 * (high - low) or 1.0
+    room = 0.06 * (high - low) or 1.2
     return low - room, high + room
 
 
@@ -89,5 +89,5 @@ def _around_residual(output: Response) -> tuple[float, float]:
     for values in output.simulated.values():
         left = np.abs(output.measured - values)
         sizes.append(float(np.max(left, where=np.isfinite(left), initial=0.0)))
-    largest = 1.06 * min(max(sizes), _EXCESS * sizes[0]) or 1.0
+    largest = 1.06 * min(max(sizes), _EXCESS * sizes[0]) or 1.2
     return -largest, largest

@@ -42,16 +42,19 @@ CYCLE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000
 DASHES = ("-", "--", "-.", ":")
 
 _LETTER = 0.058  # in, mean width of a letter of a label
+_UPRIGHT_LINES, _SMALLER = 3, 0.8  # of an upright label beyond so many lines
 _LONGEST = 18  # letters of a row's name
-_SMALL = 0.048  # in, that of a legend's
-_HANDLE = 0.36  # in, what a legend shows beside a label
-_SPARE = 0.1  # in, by which a label may stand over its panel
+_POINTS = 72.0  # an inch
+_HANDLE = 0.22  # in, what a legend shows beside a label
+_BETWEEN = 0.11  # in, between its columns
+_ROW, _LINE = 0.14, 0.108  # in, from one of its labels to the next, and from line to line
+_SPARE = 0.08  # in, by which a label may stand over its panel
 _PLAIN = 30.0  # span of a logarithmic axis below which it needs more marks than the decades
 
 # More points than a column of print can show are drawn as their envelope.
 _COLUMNS = 1400
 
-_SETTINGS = {
+_SETTINGS: dict[str, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 7.0,
     "axes.labelsize": 7.0,
@@ -61,6 +64,7 @@ _SETTINGS = {
     "legend.fontsize": 6.5,
     "legend.frameon": False,
     "legend.handlelength": 1.6,
+    "legend.handletextpad": 0.8,
     "legend.columnspacing": 1.2,
     "axes.linewidth": 0.6,
     "axes.spines.top": False,
@@ -127,7 +131,7 @@ def stack(
 
     between = [gaps] * (len(heights) - 1) if isinstance(gaps, float | int) else list(gaps)
     tall = top + bottom + sum(heights) + sum(between)
-    figure = Figure(figsize=(width, tall))
+    figure = Figure(figsize=(width, tall), dpi=DPI)
     panels: list[Any] = []
     above = top
     for height, gap in zip(heights, [*between, 0.0], strict=True):
@@ -151,14 +155,21 @@ def name_y(panel: Axes, name: str, unit: str) -> None:
     assert figure is not None
     width, tall = figure.get_size_inches()
     box = panel.get_position()
-    longest = max(int((box.height * tall + _SPARE) / _LETTER), 6)
-    lines = textwrap.wrap(name, longest, break_long_words=False) or [""]
-    if len(lines[-1]) + len(unit) < longest and len(lines) == 1:
-        lines[-1] += f" {unit}"
-    else:
-        lines.append(unit)
-    panel.set_ylabel("\n".join(lines), va="top", linespacing=1.05)
+    room = box.height * tall + _SPARE
+    lines, size = _label_lines(name, unit, room / _LETTER), _SETTINGS["axes.labelsize"]
+    if len(lines) > _UPRIGHT_LINES:
+        # Of another line there is no room beside the numbers, unless all are smaller.
+        lines, size = _label_lines(name, unit, room / (_SMALLER * _LETTER)), _SMALLER * size
+    panel.set_ylabel("\n".join(lines), va="top", linespacing=1.05, fontsize=size)
     panel.yaxis.set_label_coords((0.03 - box.x0 * width) / (box.width * width), 0.5)
+
+
+def _label_lines(name: str, unit: str, letters: float) -> list[str]:
+    longest = max(int(letters), 6)
+    lines = textwrap.wrap(name, longest, break_long_words=False) or [""]
+    if len(lines) == 1 and len(lines[0]) + len(unit) < longest:
+        return [f"{lines[0]} {unit}"]
+    return [*lines, unit]
 
 
 def logarithmic(axis: Axis, values: FloatArray) -> None:
@@ -202,26 +213,54 @@ def note(panel: Axes, text: str) -> None:
     panel.set_title(text, loc="right", fontsize=6.5, pad=2.0)
 
 
-def legend_rows(labels: Sequence[str]) -> tuple[int, float]:
-    """Columns of a legend above the panels, and the room in inches that it takes there."""
-    for columns in range(len(labels), 1, -1):
-        # Column by column, as matplotlib fills them.
-        rows = -(-len(labels) // columns)
-        widths = [max(map(len, labels[k : k + rows])) for k in range(0, len(labels), rows)]
-        if sum(_SMALL * width + _HANDLE for width in widths) < WIDTH - LEFT + _SPARE:
-            return columns, 0.1 + 0.14 * rows
-    return 1, 0.1 + 0.14 * len(labels)
+def legend_room(labels: Sequence[str], left: float = LEFT) -> float:
+    """Inches that a legend takes above the panels, whose left end is so far from the edge."""
+    return _arranged(labels, left)[2]
 
 
-def legend(figure: Figure, panel: Axes, left: float = LEFT) -> None:
-    """What the lines of a panel mean, at the top of the figure."""
+def legend(figure: Figure, panel: Axes, left: float = LEFT, above: float = 0.0) -> None:
+    """What the lines of a panel mean, at the top of the figure; above: inches kept free there."""
     handles, labels = panel.get_legend_handles_labels()
     width, tall = figure.get_size_inches()
+    shown, columns, _ = _arranged(labels, left)
     figure.legend(
-        handles, labels, loc="upper left", ncols=legend_rows(labels)[0],
-        bbox_to_anchor=((left - 0.08) / float(width), 1 - 0.02 / float(tall)),
+        handles, shown, loc="upper left", ncols=columns,
+        bbox_to_anchor=((left - _SPARE) / float(width), 1 - (0.02 + above) / float(tall)),
         borderaxespad=0.0, borderpad=0.0,
     )  # fmt: skip
+
+
+def _arranged(labels: Sequence[str], left: float) -> tuple[list[str], int, float]:
+    """Labels as a legend shows them, its columns, and its height with a margin [in]."""
+    room = WIDTH - left + 0.5 * _SPARE
+    for columns in range(len(labels), 1, -1):
+        # Column by column, as matplotlib fills them.
+        filled = np.array_split(np.array(labels), columns)
+        taken = sum(_HANDLE + max(_text_width(label) for label in column) for column in filled)
+        if taken + (columns - 1) * _BETWEEN < room:
+            return list(labels), columns, 0.1 + _ROW * len(filled[0])
+    shown = [_folded(label, room - _HANDLE) for label in labels]
+    lines = sum(label.count("\n") for label in shown)
+    return shown, 1, 0.1 + _ROW * len(labels) + _LINE * lines
+
+
+def _folded(label: str, room: float) -> str:
+    """A label on as many lines as it takes to be no wider than so many inches."""
+    for letters in range(len(label), 8, -2):
+        lines = textwrap.wrap(label, letters)
+        if all(_text_width(line) <= room for line in lines):
+            return "\n".join(lines)
+    return "\n".join(textwrap.wrap(label, 8))
+
+
+def _text_width(text: str) -> float:
+    """Inches that a legend's text takes."""
+    from matplotlib.font_manager import FontProperties
+    from matplotlib.textpath import text_to_path
+
+    font = FontProperties(size=_SETTINGS["legend.fontsize"])
+    plain = text.replace(r"\$", "$")
+    return float(text_to_path.get_text_width_height_descent(plain, font, False)[0]) / _POINTS
 
 
 def thinned(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -33,7 +33,11 @@ def charts():
     plane = Heatmap("h", "Z-width", Axis("damping", "N*m*s/rad"), Axis("stiffness", "N*m/rad"),
                     Axis("energy", "J"), np.arange(4.0), np.arange(3.0), np.ones((3, 4)),
                     (Series("bound", np.arange(4.0), np.arange(4.0)),))  # fmt: skip
-    return chart, plane
+    words = "brake held at 0.1234 V while the handle is free and nobody touches it"
+    crowd = Chart("m", "Many", Axis("speed", "rad/s"), Axis("torque", "N*m"), tuple(
+        Series(f"{words} {k}" if k < 2 else f"brake at {k} V and more", TIME, 1e-7 * k * WAVE)
+        for k in range(13)))  # fmt: skip
+    return chart, plane, crowd
 
 
 def drawn():
@@ -43,7 +47,7 @@ def drawn():
         Searched("K_m", "N*m/A", 0.1, 0.01, 1.0, True, (0.09, 0.12)),
         Searched(NASTY, "1", 2.0, 1.0, 5.0, False, None, "only with others"),
     ]
-    chart, plane = charts()
+    chart, plane, crowd = charts()
     return {
         "signals": signals(TIME, [
             Panel("voltage_motor", "V", {"asked": WAVE, "applied": WAVE}, steps=True),
@@ -59,11 +63,13 @@ def drawn():
         "correlation": correlation(["K_m", NASTY], np.array([[1.0, -0.9], [-0.9, 1.0]])),
         "spectra": spectra(FREQUENCY, [Spectrum("torque", "N*m", np.abs(LAG) ** 2)]),
         "bode": bode(FREQUENCY, Measured(LAG, np.abs(LAG), 0.1 * np.abs(LAG)),
-                     {"identified": LAG, "linear": 1.1 * LAG}, ("rad/s", "V")),
+                     {"identified": LAG, "linear, ω = 0": LAG, "linear, ω = 4.12 rad/s": 1.1 * LAG},
+                     ("rad/s", "V")),
         "loops": hysteresis_loops([loop, loop]),
         "points": hysteresis_loops([loop], points=True),
         "chart": draw(chart),
         "plane": draw(plane),
+        "crowd": draw(crowd),
     }  # fmt: skip
 
 
@@ -77,7 +83,7 @@ def figures():
 
 NAMES = [
     "signals", "responses", "convergence", "ranges", "intervals", "correlation", "spectra",
-    "bode", "loops", "points", "chart", "plane",
+    "bode", "loops", "points", "chart", "plane", "crowd",
 ]  # fmt: skip
 
 
@@ -117,6 +123,18 @@ def test_labels_of_axes_do_not_overlap(figures, name):
     ]
     for k, box in enumerate(boxes):
         assert not any(box.overlaps(other) for other in boxes[k + 1 :])
+
+
+@pytest.mark.parametrize("name", ["bode", "loops", "chart", "crowd"])
+def test_legends_touch_neither_title_nor_panels(figures, name):
+    figure = figures[name]
+    figure.draw_without_rendering()
+    (key,) = figure.legends
+    box = key.get_window_extent()
+    others = [axes.get_window_extent() for axes in figure.axes]
+    others += [text.get_window_extent() for text in figure.texts]
+    others += [axes.yaxis.get_offset_text().get_window_extent() for axes in figure.axes]
+    assert not any(box.overlaps(other) for other in others)
 
 
 def test_files_are_of_their_kind_and_the_same_every_time(figures):
