@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 COMMENTS = ("#", "%", "//")
 _CURE = "mend or remove these lines (removed lines count as lost samples)"
 _HEAD = 1 << 20  # bytes in which a header stands
+_PIECE = 1 << 22  # bytes parsed at a time: what pandas makes of them stays in the processor's cache
 _TEXT_CONTROLS = b"\t\n\r\f"
 
 
@@ -67,15 +68,16 @@ def read_table(path: Path, columns: Sequence[str] = (), cure: str = _CURE) -> Ta
     """
     import pandas as pd
 
-    text, torn = _complete_lines(path)
-    layout = layout_of(text)
+    layout = layout_of(_complete_lines(path, _HEAD)[0])
     header, separator = layout.names, layout.separator
     _check_header(path, layout, columns)
     wanted = list(columns) or [name for name in header if name]
     first = layout.line + 1
-    plain = _plain_numbers(text, layout)
+    plain = _plain_numbers(path, layout)
     if plain is not None:
-        return Table(path, plain[wanted], first, torn)
+        frame, torn = plain
+        return Table(path, frame[wanted], first, torn)
+    text, torn = _complete_lines(path)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", pd.errors.ParserWarning)
@@ -100,28 +102,46 @@ def read_table(path: Path, columns: Sequence[str] = (), cure: str = _CURE) -> Ta
     return Table(path, pd.DataFrame(numbers), first, torn)
 
 
-def _plain_numbers(text: str, layout: Layout) -> pd.DataFrame | None:
-    """The table where it is nothing but finite numbers, as a rig writes it: in a tenth of the time.
+def _plain_numbers(path: Path, layout: Layout) -> tuple[pd.DataFrame, bool] | None:
+    """The table where it is nothing but finite numbers, as a rig writes it, and whether it is torn.
 
-    None for any other, of which the long way says what it is or what is wrong with it.
+    Many times faster than the long way, and rounded as ``float`` does it. None for any other table:
+    the long way says what it is or what is wrong with it.
     """
     import pandas as pd
 
     if layout.separator != ",":
         return None
+    parts, torn = [], False
     try:
-        with warnings.catch_warnings():
+        with path.open("rb") as file, warnings.catch_warnings():
             warnings.simplefilter("error", pd.errors.ParserWarning)
-            frame = pd.read_csv(
-                io.BytesIO(text.encode()), skipinitialspace=True, header=None,
-                skiprows=layout.line, names=_apart(layout.names), index_col=False,
-                dtype=np.float64, keep_default_na=False, skip_blank_lines=False,
-                on_bad_lines="error", low_memory=False,
-            )  # fmt: skip
-    except (ValueError, pd.errors.ParserWarning):
+            for _ in range(layout.line):
+                file.readline()
+            while piece := file.read(_PIECE) + file.readline():
+                rows = piece[: piece.rfind(b"\n") + 1]
+                torn = bool(piece[len(rows) :].strip())
+                if len(piece) < _PIECE:
+                    rows = rows.rstrip(b"\r\n")  # the file's end: empty lines there are no rows
+                if rows:
+                    parts.append(_finite_rows(rows, layout))
+    except (OSError, ValueError, pd.errors.ParserWarning):
         return None
-    finite = all(np.isfinite(frame[name].to_numpy()).all() for name in frame)
-    return frame if finite else None
+    return (pd.concat(parts, ignore_index=True), torn) if parts else None
+
+
+def _finite_rows(rows: bytes, layout: Layout) -> pd.DataFrame:
+    """Lines of finite numbers, one for each name; raises ValueError or a warning for others."""
+    import pandas as pd
+
+    frame = pd.read_csv(
+        io.BytesIO(rows), skipinitialspace=True, header=None, names=_apart(layout.names),
+        index_col=False, dtype=np.float64, keep_default_na=False, skip_blank_lines=False,
+        on_bad_lines="error", low_memory=False,
+    )  # fmt: skip
+    if b"\0" in rows or not np.isfinite(frame.to_numpy()).all():
+        raise ValueError
+    return frame
 
 
 def layout_of(text: str) -> Layout:

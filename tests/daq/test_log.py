@@ -103,6 +103,46 @@ def test_what_is_written_is_read_back_to_the_bit(tmp_path, cells, rate, first, c
     assert loaded.dt == pytest.approx(1.0 / rate, rel=1e-6)
 
 
+decimals = st.from_regex(
+    r"[+-]?([0-9]{1,30}(\.[0-9]{0,30})?|\.[0-9]{1,30})([eE][+-]?[0-9]{1,3})?", fullmatch=True
+)
+
+
+@settings(
+    max_examples=80,
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+@given(cells=st.lists(decimals.filter(lambda cell: math.isfinite(float(cell))), min_size=1))
+def test_any_decimal_is_read_as_python_reads_it(tmp_path, cells):
+    path = tmp_path / "table.csv"
+    path.write_text("x,y\n" + "".join(f"{cell},1\n" for cell in cells))
+    read = read_table(path).frame["x"].to_numpy()
+    assert read.tobytes() == np.array([float(cell) for cell in cells]).tobytes()
+
+
+def test_a_long_log_is_read_whole_and_its_mistakes_found(tmp_path):
+    path = tmp_path / "long.csv"
+    rng, n = np.random.default_rng(5), 75_000
+    written = samples(n, torque=rng.normal(size=n), omega=rng.normal(size=n))
+    with LogWriter(path) as log:
+        log.append(written)
+    data = path.read_bytes()
+    assert len(data) > 4_500_000  # which is more than is read at a time
+    for text, torn in ((data, False), (data + b"\n\n", False), (data + b"93.75,0.0,0.", True)):
+        path.write_bytes(text)
+        loaded = load_log(path)
+        assert loaded.torn == torn and len(loaded.frame) == n
+        for column in ("tick", "torque", "omega"):
+            assert loaded.frame[column].to_numpy().tobytes() == getattr(written, column).tobytes()
+    lines = data.decode().splitlines()
+    for wrong, said in (("", "t: ''"), ("1.0,oops", "cmd_voltage_motor: 'oops'")):
+        path.write_text("\n".join([*lines[:70_000], wrong, *lines[70_001:]]) + "\n")
+        with pytest.raises(ConfigError, match=f"long.csv:70001: {said} is not a finite number"):
+            load_log(path)
+
+
 def test_a_log_is_never_overwritten(tmp_path):
     path = tmp_path / "log.csv"
     path.write_text("precious")
