@@ -264,14 +264,11 @@ class DeviceMachine:
     def _carry_out(self, frame: Frame, now: int) -> Result:
         if frame.type == Type.START:
             return self._arm(Start.unpack(frame.payload))
-        if frame.type == Type.GO:
-            return self._go(messages.unpack_run(frame.payload), now)
+        if frame.type in (Type.GO, Type.STOP):
+            return self._go_or_stop(frame, now)
         if frame.type == Type.ANNOUNCE:
             return self._announce(messages.unpack_announce(frame.payload))
-        if frame.type == Type.STOP:
-            if messages.unpack_run(frame.payload) == self._run:
-                self._end()
-        elif frame.type == Type.SAFE:
+        if frame.type == Type.SAFE:
             self._hold_at_zero(Latch.SAFE if self.latch is Latch.NONE else self.latch)
         elif frame.type == Type.CLEAR:
             # What clears a latch ends the run as well: nothing plays on from where it stood.
@@ -279,6 +276,16 @@ class DeviceMachine:
             self.latch = Latch.NONE
         else:
             return Result.UNKNOWN
+        return Result.OK
+
+    def _go_or_stop(self, frame: Frame, now: int) -> Result:
+        run = messages.unpack_run(frame.payload)
+        if run is None:
+            return Result.BAD_VALUE
+        if frame.type == Type.GO:
+            return self._go(run, now)
+        if run == self._run:
+            self._end()
         return Result.OK
 
     def _announce(self, announced: tuple[int, float] | None) -> Result:
@@ -329,7 +336,7 @@ class DeviceMachine:
         high = tuple(map(min, start.command_high, own_high))
         return Start(**{**vars(start), "command_low": low, "command_high": high})
 
-    def _go(self, run: int | None, now: int) -> Result:
+    def _go(self, run: int, now: int) -> Result:
         if run != self._run or self.state is State.IDLE:
             return Result.WRONG_STATE
         if self.state is State.ARMED:

@@ -27,7 +27,7 @@ class Bench:
 
     make: a new, closed device. config: its calibration and limits. resolution: largest
     difference between a command and what is applied for it [V]. noise: largest deviation of a
-    current at rest from zero [A].
+    current at rest from zero [A]. step: least motor current one sample after a step of 1 V [A].
     """
 
     name: str
@@ -35,6 +35,7 @@ class Bench:
     config: RigConfig
     resolution: float
     noise: float
+    step: float = 0.2
 
 
 def free_currents(config):
@@ -95,6 +96,13 @@ def play(rig, commands, mode=OPEN, sizes=None):
     return first(Played(collect(rig, len(commands))), len(commands))
 
 
+def fill(rig, at, commands):
+    """Send commands from tick ``at`` on, as many as it has room for; the tick after the last."""
+    n = min(len(commands), rig.room())
+    rig.send(at, commands[:n])
+    return at + n
+
+
 def first(played, n):
     for name, values in vars(played).items():
         setattr(played, name, values[:n])
@@ -108,11 +116,16 @@ def plan(n, seed):
 
 
 class HalContract:
-    """The tests. ``bench`` is a fixture of the subclass."""
+    """The tests. ``bench`` is a fixture of the subclass, and ``actuator_currents`` may be."""
 
     @pytest.fixture
     def bench(self):
         raise NotImplementedError("a backend's test module provides the fixture 'bench'")
+
+    @pytest.fixture
+    def actuator_currents(self):
+        """Function of applied commands (n, 2) [V] and speed (n,) [rad/s]: currents (n, 2) [A]."""
+        pytest.skip("no simulation of the currents to compare the alignment of rows with")
 
     @pytest.fixture
     def device(self, bench):
@@ -145,12 +158,12 @@ class HalContract:
         played = play(rig, commands)
         np.testing.assert_allclose(played.applied, commands, atol=bench.resolution)
         assert np.abs(played.current_motor[: k + 1]).max() < bench.noise, "row k is before u_k"
-        assert played.current_motor[k + 1] > 0.2, "row k+1 must show the command of row k"
+        assert played.current_motor[k + 1] > bench.step, "row k+1 must show the command of row k"
 
     def test_the_very_first_command_acts_after_tick_zero(self, bench, rig):
         played = play(rig, levels(10, motor=1.0))
         assert abs(played.current_motor[0]) < bench.noise
-        assert played.current_motor[1] > 0.2
+        assert played.current_motor[1] > bench.step
 
     def test_the_log_is_aligned_with_an_independent_simulation(self, rig, actuator_currents):
         # Both channels switch at random; a simulation shifted by one sample must fit worse.
@@ -252,14 +265,15 @@ class HalContract:
         blocks = collect(rig, 20)
         behind = int(blocks[-1].tick[-1]) + 1
         # From the tick after the last one sent; those for ticks already past come too late.
-        rig.send(3, ramp[3:])
-        while blocks[-1].flags[-1] & int(Flag.HELD) and blocks[-1].tick[-1] < 1900:
+        end = fill(rig, 3, ramp[3:])
+        while blocks[-1].flags[-1] & int(Flag.HELD) and blocks[-1].tick[-1] < end - 30:
             blocks.append(rig.receive())
         played = Played(collect(rig, sum(map(len, blocks)) + 20, blocks))
         held = played.flagged(Flag.HELD)
         assert held[3:behind].all() and not held[:3].any()
         caught_up = int(np.flatnonzero(~held[behind:])[0]) + behind
-        assert not held[caught_up:].any()
+        assert not held[caught_up:end].any()
+        played, held = first(played, end), held[:end]
         on_time = played.tick[~held]
         np.testing.assert_allclose(
             played.applied[~held], ramp[on_time], atol=bench.resolution + 1e-12
@@ -291,14 +305,14 @@ class HalContract:
     @pytest.mark.parametrize("mode", [OPEN, CLOSED])
     def test_safe_zeroes_the_outputs_until_the_next_start(self, rig, mode):
         rig.start(RATE, mode)
-        rig.send(0, levels(2000, motor=0.5, brake=0.1))
+        end = fill(rig, 0, levels(2000, motor=0.5, brake=0.1))
         blocks = collect(rig, 20)
         rig.safe()
         rig.safe()
         before = sum(map(len, blocks))
         # What was already on its way when safe came may still show the old command.
         blocks = collect(rig, before + 60, blocks)
-        rig.send(2000, levels(2000, motor=0.5, brake=0.1))
+        fill(rig, end, levels(2000, motor=0.5, brake=0.1))
         played = Played(collect(rig, before + 120, blocks))
         assert played.applied[0, 0] > 0.4
         assert not played.applied[before + 40 :].any()
@@ -310,8 +324,9 @@ class HalContract:
     def test_a_current_beyond_its_limit_zeroes_the_outputs_from_that_row_on(
         self, bench, device, mode
     ):
+        most = 0.75 * bench.step
         limits = bench.config.limits.model_copy(
-            update={"current": bench.config.limits.current.model_copy(update={"motor": 0.15})}
+            update={"current": bench.config.limits.current.model_copy(update={"motor": most})}
         )
         config = bench.config.model_copy(update={"limits": limits})
         rig = Rig(device, config)
@@ -325,7 +340,7 @@ class HalContract:
         limits.begin(Phase.RUN, RATE)
         row, reason = limits.check(played)
         assert row == 31, "the current rises within one sample of the step in row 30"
-        assert "current_motor" in reason and "0.15" in reason
+        assert "current_motor" in reason and f"{most:g}" in reason
         np.testing.assert_allclose(played.applied[:31], commands[:31], atol=bench.resolution)
         assert not played.applied[31:].any(), "zero from the very row that tripped"
         assert np.flatnonzero(played.flagged(Flag.INTERLOCK)).tolist() == [31]
@@ -420,7 +435,7 @@ class HalContract:
 
     def test_commands_left_over_at_a_stop_do_not_play_after_the_next_start(self, rig):
         rig.start(RATE, OPEN)
-        rig.send(0, levels(3000, motor=0.5))
+        fill(rig, 0, levels(3000, motor=0.5))
         collect(rig, 10)
         rig.stop()
         played = play(rig, zeros(100))

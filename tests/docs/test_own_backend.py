@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -18,9 +20,10 @@ DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "own-backend.md"
 @pytest.fixture
 def lab(tmp_path):
     text = DOCUMENT.read_text(encoding="utf-8")
-    (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    code, suite = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     (settings,) = re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)
     (tmp_path / "my_board.py").write_text(code)
+    (tmp_path / "test_my_board.py").write_text(suite)
     (tmp_path / "my_rig.yaml").write_text(settings)
     write_experiment(tmp_path / "e.yaml")
     return tmp_path
@@ -36,6 +39,13 @@ def test_it_runs_and_its_rows_are_latched_before_they_are_applied(lab):
     predicted = keep * current + (1.0 - keep) * applied
     np.testing.assert_allclose(current[1:], predicted[:-1], atol=1e-12)
     assert json.loads((only_capture(lab) / "run.json").read_text())["device"] == "my board"
+
+
+def test_it_passes_what_every_backend_passes(lab):
+    command = [sys.executable, "-m", "pytest", "-n", "0", "-q", "test_my_board.py"]
+    result = subprocess.run(command, cwd=lab, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stdout
+    assert "skipped" not in result.stdout
 
 
 @pytest.mark.parametrize(
