@@ -42,10 +42,11 @@ def test_it_runs_and_its_rows_are_latched_before_they_are_applied(lab):
 
 
 def test_it_passes_what_every_backend_passes(lab):
-    command = [sys.executable, "-m", "pytest", "-n", "0", "-q", "test_my_board.py"]
+    command = [sys.executable, "-m", "pytest", "-n", "0", "-rs", "test_my_board.py"]
     result = subprocess.run(command, cwd=lab, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stdout
-    assert "skipped" not in result.stdout
+    skipped = re.findall(r"SKIPPED .*: (.*)", result.stdout)
+    assert set(skipped) == {"my board watches no encoder"}
 
 
 @pytest.mark.parametrize(
