@@ -65,7 +65,7 @@ class RealTime:
         self.granted["garbage_collector"] = "off"
 
     def _raise_scheduler(self) -> None:
-        if not hasattr(os, "sched_setscheduler"):
+        if sys.platform != "linux":
             self.refused["scheduler"] = f"{sys.platform} has no real-time scheduler for processes"
             return
         before, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
@@ -105,7 +105,7 @@ def _highest_priority() -> int:
     """What the limit of this user allows; a privileged one is not bound by it."""
     import resource
 
-    if not hasattr(resource, "RLIMIT_RTPRIO"):
+    if sys.platform != "linux":
         return _PRIORITY
     soft, _ = resource.getrlimit(resource.RLIMIT_RTPRIO)
     return soft if 0 < soft < _PRIORITY else _PRIORITY

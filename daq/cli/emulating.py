@@ -185,8 +185,7 @@ class _StopRequest:
 
 
 def _port(link: Path | None, tcp: int | None) -> PtyPort | TcpPort:
-    has_pty = hasattr(os, "openpty")
-    if tcp is not None or not has_pty:
+    if tcp is not None or sys.platform == "win32":
         if link is not None:
             raise ConfigError("--link names a pty; leave it out where a TCP port is served")
         return TcpPort(tcp or 0)

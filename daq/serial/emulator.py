@@ -9,6 +9,7 @@ import contextlib
 import os
 import select
 import socket
+import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -77,6 +78,8 @@ class PtyPort:
 
     def connect(self) -> None:
         """Open a new pty."""
+        if sys.platform == "win32":
+            raise NotImplementedError("there are no pseudo-terminals; serve a TcpPort")
         import tty
 
         self._master, self._slave = os.openpty()

@@ -113,6 +113,8 @@ class SerialLink:
 
     def _keep_line_up(self) -> None:
         """Do not lower DTR on closing: boards that reset on its edge stay as they are."""
+        if sys.platform == "win32":
+            return
         import termios
 
         with contextlib.suppress(termios.error, *self._failures):
@@ -203,10 +205,11 @@ def _not_opened(port: str, error: Exception) -> DeviceError:
 def permission_cure(port: str) -> str:
     """What gives a user access to a port on this system."""
     group = "dialout"
-    with contextlib.suppress(ImportError, OSError, KeyError):
+    if sys.platform != "win32":
         import grp
 
-        group = grp.getgrgid(Path(port).stat().st_gid).gr_name
+        with contextlib.suppress(OSError, KeyError):
+            group = grp.getgrgid(Path(port).stat().st_gid).gr_name
     return f"sudo usermod -a -G {group} $USER, then log out and in again"
 
 
