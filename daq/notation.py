@@ -105,7 +105,8 @@ def number(value: float, digits: int = 4) -> str:
         return "0"
     exponent = math.floor(math.log10(abs(value)))
     if -3 <= exponent < 5:
-        return f"{value:.{max(digits - 1 - exponent, 0)}f}"
+        places = digits - 1 - exponent
+        return f"{round(value, places):.{max(places, 0)}f}"
     mantissa, power = f"{value:.{digits - 1}e}".split("e")
     return f"{mantissa}e{int(power)}"
 

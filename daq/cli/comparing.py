@@ -165,6 +165,8 @@ def _show_one(
         publish_report(group.prepared, result, report, folder, as_json)
     if as_json:
         console.print_json(report)
+    else:
+        reporting.show_next(result, path)
 
 
 def _document(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,21 @@ from sysid.metrics import mean_known
 from sysid.model import ProcessModel
 
 _FIGURES = ("rmse", "msd", "fit_percent")
+_ENDED = {
+    "generations": "it spent them all",
+    "converged": "it ended where nothing better came any more",
+    "interrupted": "it was interrupted",
+}
+
+
+@dataclass(frozen=True)
+class Step:
+    """Something to do with a result: a sentence around symbols, and a command."""
+
+    before: str
+    names: Sequence[str] = ()
+    after: str = ""
+    command: str = ""
 
 
 def view(model: ProcessModel, document: Mapping[str, Any]) -> dict[str, Any]:
@@ -44,6 +60,9 @@ def view(model: ProcessModel, document: Mapping[str, Any]) -> dict[str, Any]:
         "vagues": [a for a in found if a["kind"] == "vague"],
         "rivals": _rivals(document),
         "tested": _tested(document),
+        "starts": _starts(model, document),
+        "steps": _steps(document),
+        "ended": _ENDED[document["search"]["stopped"]],
     }
 
 
@@ -73,13 +92,13 @@ def _determined(document: Mapping[str, Any], free: Sequence[Mapping[str, Any]]) 
     together = sum(len(a["determined"]) for a in document["ambiguities"])
     combined = f" and {_count(together, 'combination')} of others" if together else ""
     spite = "" if document["verdict"]["trust"] == "poor" else (
-        ", though the model's outputs are as good"
+        "; the model's outputs are as good with any of their values that fit"
     )  # fmt: skip
     if own == len(free):
         return f"The data determine all {own} free parameters, each by itself."
     return (
         f"The data determine {own} of {_count(len(free), 'free parameter')} by themselves{combined}"
-        f"; the others are not to be used one by one{spite}."
+        f". The others are not to be used one by one{spite}."
     )
 
 
@@ -94,8 +113,15 @@ def _data_sentence(logs: Sequence[Mapping[str, Any]]) -> str:
         if own:
             seconds = sum(log["samples"] / log["sample_rate"] for log in own)
             samples = sum(log["samples"] for log in own)
-            parts.append(f"{said} {_count(len(own), 'log')} of {samples} samples ({seconds:.3g} s)")
-    end = "" if len(parts) > 1 else "; none was held back to judge it"
+            rates = sorted({log["sample_rate"] for log in own})
+            rate = " to ".join(f"{rate:.4g}" for rate in dict.fromkeys((rates[0], rates[-1])))
+            parts.append(
+                f"{said} {_count(len(own), 'log')} of {samples} samples ({seconds:.3g} s at "
+                f"{rate} Hz)"
+            )
+    end = (
+        ", which took no part in the fit" if len(parts) > 1 else "; none was held back to judge it"
+    )
     return ", ".join(parts) + f"{end}."
 
 
@@ -131,7 +157,8 @@ def _baseline_sentence(comparison: Mapping[str, Any]) -> str:
     orders = ", ".join(f"{name} = {order}" for name, order in comparison["orders"].items())
     return (
         f"{comparison['name']} is a linear model of the same data that knows no physics "
-        f"(A(q) y = B(q) u + C(q) e, {orders}): what the equations must beat."
+        f"(A(q) y = B(q) u + C(q) e with the shift q, white noise e and the orders {orders}): what "
+        "the equations must beat."
     )
 
 
@@ -176,3 +203,56 @@ def _tested(document: Mapping[str, Any]) -> dict[str, Any]:
 def _mean_share(shares: Sequence[float | None]) -> float | None:
     known = [share for share in shares if share is not None]
     return sum(known) / len(known) if known else None
+
+
+def _starts(model: ProcessModel, document: Mapping[str, Any]) -> dict[str, str]:
+    """States that a combination holds the start of: the start's name by the state's."""
+    said = " ".join(one["name"] for one in _quantities(document))
+    return {name: f"{name}(0)" for name in model.state_names if f"{name}(0)" in said}
+
+
+def _steps(document: Mapping[str, Any]) -> list[Step]:
+    """What a reader may do with the result, or to better it: the most useful first."""
+    steps = [*_cures(document)]
+    trust = document["verdict"]["trust"]
+    if trust != "poor":
+        steps.insert(0, Step(
+            "Use the model for inputs like those of the logs; it is proven for no others. To "
+            "simulate it on another log of the rig:", command=_replay(document),
+        ))  # fmt: skip
+    elif not steps:
+        steps.append(Step("See in the residuals below when and where the model errs."))
+    if not document["metrics"]["validation"]:
+        steps.insert(0, Step(
+            "Judge it on data that it has not seen, with another log:", command="--validate LOG",
+        ))  # fmt: skip
+    return steps
+
+
+def _cures(document: Mapping[str, Any]) -> list[Step]:
+    """What would determine more of the parameters."""
+    found = document.get("ambiguities", [])
+    measure = [name for a in found if a["kind"] in ("product", "sum") for name in a["measure"]]
+    vague = [name for a in found if a["kind"] == "vague" for name in a["parameters"]]
+    rival = [a["measure"][0] for a in found if a["kind"] == "rival"]
+    held = [name for name, one in document["parameters"].items() if one.get("on_bound")]
+    return [
+        Step(before, list(dict.fromkeys(names)), after)
+        for names, before, after in (
+            (held, "Give ", " more room under ranges, or a value under fixed: an end of the range "
+             "decides them now."),
+            (rival, "Measure ", ", to tell which of the sets of parameters below it is."),
+            (measure, "Measure ", " by other means (an ohmmeter, a scale, a data sheet) and give "
+             "the values under fixed in a file for --config: then those that act together get "
+             "intervals of their own. To simulate, this is not needed."),
+            (vague, "Record an experiment that makes ", " matter, larger or slower or faster than "
+             "this one: these data hardly feel them."),
+        ) if names
+    ]  # fmt: skip
+
+
+def _replay(document: Mapping[str, Any]) -> str:
+    columns = document["reproduction"]["columns"]
+    return "rig replay LOG --parameters parameters.yaml" + (
+        f" --config {columns}" if columns else ""
+    )

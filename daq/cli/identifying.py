@@ -96,6 +96,8 @@ def identify_logs(
         resuming.forget(folder)
         if publishing:
             publish_report(prepared, result, report, folder, as_json)
+        if not as_json:
+            reporting.show_next(result, path)
     elif as_json:
         report["search"]["resume"] = resuming.command(folder)
     else:

@@ -263,6 +263,10 @@ def show(result: Identified, path: Path) -> None:
     _show_residuals(result)
     _show_notes(result)
     console.print_line(f"Parameters: {path}")
+
+
+def show_next(result: Identified, path: Path) -> None:
+    """What to do with the parameters that were written to a file."""
     columns = f" --config {result.columns_file}" if result.columns_file is not None else ""
     log = (*result.validation_logs, *result.training_logs)[0].path
     console.print_next(f"rig replay {log} --parameters {path}{columns}")
@@ -355,19 +359,23 @@ def _show_rivals(found: Uncertainty) -> None:
     for ambiguity in found.ambiguities:
         if ambiguity.kind != "rival":
             continue
-        here = {estimate.name: estimate.value for estimate in found.parameters}
-        sets = [here, *found.rivals]
+        here = {estimate.name: estimate for estimate in found.parameters}
         console.print_table(
             "Sets of parameters that explain these data alike",
-            ["parameter", "this one", *["another"] * len(found.rivals)],
-            [
-                [name, *(console.number(values[name], 3) for values in sets)]
-                for name in ambiguity.parameters
-            ],
+            ["parameter", "this one", *["another"] * len(found.rivals), "unit"],
+            [_rival_row(here[name], found.rivals) for name in ambiguity.parameters],
+            text=["unit"],
         )
         console.print_line(
             f"A measured {ambiguity.measure[0]}, given under 'fixed', would tell which it is.\n"
         )
+
+
+def _rival_row(here: Estimate, rivals: Sequence[Mapping[str, float]]) -> list[str]:
+    """One parameter in each of the sets, all in the unit of the first."""
+    scale, unit = console.engineering(here.value, here.unit)
+    values = (here.value, *(rival[here.name] for rival in rivals))
+    return [here.name, *(console.number(scale * value, 3) for value in values), unit]
 
 
 def _exact_lines(ambiguity: Ambiguity) -> list[str]:
@@ -460,10 +468,12 @@ def _show_notes(result: Identified) -> None:
     verdict = result.verdict
     console.print_line(f"Trust: {verdict.trust}. {' '.join(verdict.reasons)}")
     if (found := result.uncertainty) is not None:
-        own = sum(not estimate.why for estimate in found.parameters)
-        together = len(found.determined()) - own
-        also = f", and {together} combinations" if together else ""
-        console.print_line(f"Determined: {own} of {len(found.parameters)} by themselves{also}.")
+        free = [e for e in found.parameters if e.name in result.model.parameter_names]
+        own = sum(not estimate.why for estimate in free)
+        together = sum(len(a.determined) for a in found.ambiguities)
+        several = "s" if together != 1 else ""
+        also = f", and {together} combination{several} of others" if together else ""
+        console.print_line(f"Determined: {own} of {len(free)} free parameters by themselves{also}.")
 
 
 def print_metrics(

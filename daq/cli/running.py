@@ -59,6 +59,8 @@ def run_command(
         report["findings"] = as_document(found, result.folder)
         if not as_json:
             show_findings(found, result.folder)
+    if not as_json:
+        _print_end(result, check, identify)
     if prepared is not None:
         from daq.cli.identifying import identify_logs
 
@@ -73,8 +75,6 @@ def run_command(
         )  # fmt: skip
     if as_json:
         console.print_json(report)
-        return
-    _print_end(result, check, identify)
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from sysid.uncertainty.directions import PART, Directions, directions
 from sysid.uncertainty.estimate import Z95, Estimate, Why, product_text, sum_text
 from sysid.uncertainty.relations import Kind, Relation, named, overlapping, relations, sparse
 from sysid.uncertainty.sensitivity import common_steps, coordinate_units, sensitivity
+from sysid.uncertainty.units import product_unit
 
 _ALIKE = 0.05  # rivals closer than this are one
 _WHOLE = 1e-3  # a factor this close to a whole number is meant to be one
@@ -200,7 +201,10 @@ class _Teller:
         deviation = self._deviation(exponents * self._relative_slope)
         terms = self._terms(exponents)
         ends = value * np.exp(-Z95 * deviation), value * np.exp(Z95 * deviation)
-        unit = self.space.parameters[used[0]].unit if len(used) == 1 else ""
+        units = [self.space.parameters[i].unit for i in used]
+        unit = (
+            units[0] if len(used) == 1 else product_unit(zip(units, exponents[used], strict=True))
+        )
         return Estimate(
             product_text(terms), unit, value, terms, "product",
             abs(value) * deviation, min(ends), max(ends),

@@ -43,6 +43,15 @@ def test_units_that_take_a_prefix_get_one_and_others_do_not(value, unit, text):
     assert engineering(np.nan, unit) == (1.0, unit)
 
 
+@pytest.mark.parametrize(
+    ("value", "shown", "text"),
+    [(1264.0, 2, "1300"), (11510.0, 2, "12000"), (820.4, 2, "820"), (-545.0, 4, "-545.0"),
+     (99960.0, 3, "100000"), (123456.0, 3, "1.23e5")],
+)  # fmt: skip
+def test_large_numbers_have_no_more_digits_than_asked_for(value, shown, text):
+    assert number(value, shown) == text
+
+
 @given(st.floats(1e-6, 1e6), st.floats(1e-6, 1e3))
 def test_the_last_digit_is_the_second_of_the_uncertainty_at_most(value, ratio):
     std = value / ratio

@@ -184,6 +184,7 @@ def test_numbers_of_the_page_are_those_of_the_document(page, document):
     ]
     (known,) = [e for a in document["ambiguities"] for e in a["determined"]]
     assert combination == [known["value"], *known["interval"]]
+    assert known["unit"] == "m"
 
 
 def test_errors_stand_beside_those_of_a_linear_model(page, document):
@@ -204,6 +205,10 @@ def test_errors_stand_beside_those_of_a_linear_model(page, document):
 def test_verdict_in_two_sentences_and_how_to_do_it_again(page, document, work, rig):
     assert f"Trust: {document['verdict']['trust']}." in page.text
     assert re.search(r"determine 2 of 4 free parameters by themselves and 1 comb", page.text)
+    # What would tell more is known: one of the two that act together.
+    (ambiguity,) = document["ambiguities"]
+    assert re.search(rf"Measure {ambiguity['measure'][0]} by other means", page.text)
+    assert re.search(r"rig replay LOG --parameters parameters.yaml --config \S*id.yaml", page.text)
     for log in document["reproduction"]["logs"]:
         assert log["sha256"] in page.text
     assert document["software"]["numpy"] in page.text

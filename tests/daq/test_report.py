@@ -147,14 +147,14 @@ def test_what_acts_only_together_is_told_with_what_would_help(told):
     assert product["name"] == "a b" and low < GAIN < high
     assert (vague["kind"], vague["parameters"]) == ("vague", ["idle"])
     assert "  b, a act only together." in text
-    (shown,) = re.findall(r"a b = (\S+), 95 % interval (\S+ \.\. \S+)", text)
+    (shown,) = re.findall(r"a b = (\S+) m, 95 % interval (\S+ \.\. \S+)", text)
     assert float(shown[0]) == pytest.approx(product["value"], abs=0.51 * product["std"])
     assert ends(shown[1]) == pytest.approx((low, high), abs=0.51 * product["std"])
     assert "measure b by other means" in text and "under 'fixed'" in text
     assert "Hardly felt by these data: idle." in text
     # Of tau, a b, and neither idle nor what is at its end.
     assert document["determined_directions"] == 2
-    assert "Determined: 1 of 5 by themselves, and 1 combinations." in text
+    assert "Determined: 1 of 5 free parameters by themselves, and 1 combination of others." in text
     assert [p["parameters"] for p in document["correlations"]] == []
 
 
