@@ -174,7 +174,7 @@ def read_record(csv: Path) -> dict[str, Any] | None:
 def describe_end(csv: Path, torn: bool) -> str | None:
     """One line on a run that did not complete, or None."""
     record = read_record(csv) or {}
-    cut = "; its last line was cut and is left out" if torn else ""
+    cut = "; its last line is incomplete and is left out" if torn else ""
     status = record.get("status", COMPLETED)
     if status == RUNNING:
         return f"{csv}: the run was interrupted (killed, or still running){cut}"

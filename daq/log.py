@@ -125,7 +125,7 @@ class Log:
 
     frame: one row per sample with at least the original program's columns and ``tick``,
     ``applied_voltage_motor``, ``applied_voltage_brake``, ``flags``. dt: sample time [s].
-    torn: the last line was cut.
+    torn: the last line was cut, or broken by a measurement that is no number, and left out.
     """
 
     path: Path

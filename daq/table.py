@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 COMMENTS = ("#", "%", "//")
 _CURE = "mend or remove these lines (removed lines count as lost samples)"
+_NO_NUMBERS = ("nan", "inf", "-inf")  # what a broken sensor may end a log with
 _HEAD = 1 << 20  # bytes in which a header stands
 _PIECE = 1 << 22  # bytes parsed at a time: what pandas makes of them stays in the processor's cache
 _TEXT_CONTROLS = b"\t\n\r\f"
@@ -29,7 +30,8 @@ _TEXT_CONTROLS = b"\t\n\r\f"
 class Table:
     """Columns of a CSV as numbers.
 
-    first_line: the line of the first row. torn: the last line was cut and is left out.
+    first_line: the line of the first row. torn: the last line was cut, or broken by a measurement
+    that is no number, and is left out.
     """
 
     path: Path
@@ -98,6 +100,8 @@ def read_table(path: Path, columns: Sequence[str] = (), cure: str = _CURE) -> Ta
     except pd.errors.ParserError as error:
         reason = str(error).removeprefix("Error tokenizing data. C error: ").strip()
         raise ConfigError(f"{path}: not a table: {reason}") from None
+    if len(frame) and frame.iloc[-1].str.strip().str.lower().isin(_NO_NUMBERS).any():
+        frame, torn = frame.iloc[:-1], True
     numbers = {name: _numbers(path, name, frame[name], first, separator, cure) for name in wanted}
     return Table(path, pd.DataFrame(numbers), first, torn)
 

@@ -221,7 +221,7 @@ def test_a_log_cut_anywhere_loads_without_a_wrong_number_or_says_why(real_log, t
 def test_a_cut_log_is_named_interrupted(real_log, tmp_path):
     path = tmp_path / "lone.csv"
     path.write_bytes(real_log.read_bytes()[:-5])
-    assert "interrupted; its last line was cut and is left out" in capture.load(path).warning
+    assert "interrupted; its last line is incomplete and is left out" in capture.load(path).warning
 
 
 def test_blocks_of_zero_bytes_after_a_power_failure_are_left_out(real_log, tmp_path):
