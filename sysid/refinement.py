@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sysid._quadratic import Quadratic, damped_steps, quadratic_at, slid_within
 from sysid.constrained import Constraints
 from sysid.model import BoolArray, FloatArray, IntArray
 from sysid.objective import Objective, Responses
@@ -44,7 +45,6 @@ _NEAR = 1e-3  # for the last time
 # simulation at the edge of stability: so many times the steps are taken.
 _BURST, _STEADIER, _BRACINGS = 10.0, 1.5, 3
 _RETREAT, _RETREATS = 0.4, 6
-_HOLDING_ROUNDS = 4
 _BATCH_BYTES = 2**28  # residuals held at once, unless one descent needs more
 
 
@@ -185,7 +185,7 @@ def curvature(objective: Objective, at: FloatArray) -> FloatArray:
     rows, distance = frame.perturbed(descents[0])
     (around,) = frame.responses(descents, [rows])
     error = float(objective.error_of(around.rms[:1])[0])
-    return _normal_equations(objective, around, distance, _SMOOTHING[0] * error).hessian
+    return quadratic_at(objective, around, distance, _SMOOTHING[0] * error).hessian
 
 
 def advance(
@@ -276,18 +276,6 @@ class _Frame:
 
 
 @dataclass(frozen=True)
-class _Equations:
-    """The quadratic around a point: Hessian (n_free, n_free), gradient (n_free,), value.
-
-    Coordinates in units of the ranges.
-    """
-
-    hessian: FloatArray
-    gradient: FloatArray
-    value: float
-
-
-@dataclass(frozen=True)
 class _Candidates:
     """Rows (n, n_free) that may follow, with their damping.
 
@@ -305,7 +293,7 @@ class _Sensed:
 
     place: int
     descent: Descent
-    equations: _Equations
+    equations: Quadratic
 
 
 def _iterate(frame: _Frame, descents: list[Descent], tolerance: float) -> list[Descent]:
@@ -363,7 +351,7 @@ def _sensed(
     if not np.isfinite(at.error_of_round):
         at = replace(at, error_of_round=error)
     floor = _SMOOTHING[at.smoothing] * error
-    equations = _normal_equations(frame.objective, around, distance, floor)
+    equations = quadratic_at(frame.objective, around, distance, floor)
     return _Sensed(place, at, equations)
 
 
@@ -457,7 +445,7 @@ def _candidates(frame: _Frame, sensed: list[_Sensed]) -> list[_Candidates]:
     n = len(frame.width)
     found = [_Candidates(np.empty((0, n)), np.empty(0), 0.0)] * len(sensed)
     # Sensitivities may be too large to square at the edge of instability: then stay.
-    usable = [k for k, one in enumerate(sensed) if _leads_somewhere(one.equations)]
+    usable = [k for k, one in enumerate(sensed) if one.equations.leads_somewhere]
     if not usable:
         return found
     equations = [sensed[k].equations for k in usable]
@@ -470,14 +458,14 @@ def _candidates(frame: _Frame, sensed: list[_Sensed]) -> list[_Candidates]:
     diagonal = np.diagonal(hessian, axis1=1, axis2=2)
     scale = np.maximum(diagonal, 1e-12 * diagonal.max(axis=1, keepdims=True))
     added = damping[:, :, None] * scale[:, None]
-    moves = _steps(hessian, gradient, added, low, high)
+    moves = damped_steps(hessian, gradient, added, low, high)
     bad = frame.infeasible(at + moves * frame.width)
     if bad.any() and frame.objective.space.model.constraints:
         for k in np.flatnonzero(bad.any(axis=1)).tolist():
             limits = Constraints.at(frame.objective.space, at[k, 0], frame.width)
             for j in np.flatnonzero(bad[k]).tolist():
                 curvature = hessian[k] + np.diag(added[k, j])
-                moves[k, j] = _within(limits, moves[k, j], curvature, low[k, 0], high[k, 0])
+                moves[k, j] = slid_within(limits, moves[k, j], curvature, low[k, 0], high[k, 0])
     for _ in range(_RETREATS):
         if not bad.any():
             break
@@ -490,100 +478,3 @@ def _candidates(frame: _Frame, sensed: list[_Sensed]) -> list[_Candidates]:
         kept = np.flatnonzero(~bad[place, :-1] & (promise[:-1] > 0.0))
         found[k] = _Candidates(rows[place, kept], damping[place, kept], float(promise.max()))
     return found
-
-
-def _leads_somewhere(equations: _Equations) -> bool:
-    """Whether the quadratic is one, and not flat."""
-    finite = np.isfinite(equations.hessian).all() and np.isfinite(equations.gradient).all()
-    return bool(finite and np.diag(equations.hessian).max() > 0.0)
-
-
-def _normal_equations(
-    objective: Objective, around: Responses, distance: FloatArray, floor: float
-) -> _Equations:
-    """The quadratic that bounds the smoothed error from above.
-
-    around: responses of the point and its neighbours, at distances (n_free,) from it.
-    """
-    rms, weights = around.rms[0], objective.weights
-    share = weights / (np.maximum(rms, floor) * np.maximum(objective.counts, 1))
-    counted = np.flatnonzero(weights > 0.0)
-    with np.errstate(over="ignore", invalid="ignore"):
-        changes = around.values[..., 1:] - around.values[..., :1]
-        hessian, gradient = _summed(changes, around.values[..., 0], share, counted)
-        if not np.all(np.isfinite(gradient)):
-            changes = np.where(np.isfinite(changes), changes, 0.0)
-            hessian, gradient = _summed(changes, around.values[..., 0], share, counted)
-        hessian, gradient = hessian / np.outer(distance, distance), gradient / distance
-    value = float(np.where(rms > floor, rms, 0.5 * (rms**2 / floor + floor)) @ weights)
-    return _Equations(hessian, gradient, value)
-
-
-def _summed(
-    changes: FloatArray, residual: FloatArray, share: FloatArray, counted: IntArray
-) -> tuple[FloatArray, FloatArray]:
-    """Hessian and gradient of the outputs that count, each by its share."""
-    n = changes.shape[2]
-    hessian, gradient = np.zeros((n, n)), np.zeros(n)
-    for j in counted:
-        rows = changes[:, j]
-        hessian += share[j] * (rows.T @ rows)
-        gradient += share[j] * (residual[:, j] @ rows)
-    return hessian, gradient
-
-
-def _steps(
-    hessian: FloatArray, gradient: FloatArray, damping: FloatArray, low: FloatArray,
-    high: FloatArray,
-) -> FloatArray:  # fmt: skip
-    """Minima of damped quadratics between bounds on the step, by holding what hits them.
-
-    hessian: (m, n_free, n_free), gradient: (m, n_free, 1); damping: (m, n, n_free), so many steps
-    of each; low, high: (m, 1, n_free).
-    """
-    down = -gradient[:, None, :, 0]
-    # A direction held by a bound and pushed against it would only shorten the step.
-    pushed = ((low >= 0.0) & (down < 0.0)) | ((high <= 0.0) & (down > 0.0))
-    held = np.repeat(pushed, damping.shape[1], axis=1)
-    moves = np.zeros(damping.shape)
-    diagonal = np.arange(damping.shape[2])
-    live = np.arange(len(hessian))
-    for _ in range(_HOLDING_ROUNDS):
-        if len(live) == 0:
-            break
-        stay = held[live]
-        # A held coordinate's row says that it moves as far as it does.
-        systems = np.where(stay[..., None], 0.0, hessian[live, None])
-        systems[..., diagonal, diagonal] += np.where(stay, 1.0, damping[live])
-        found = _solved(systems, np.where(stay, moves[live], down[live]))
-        out = ~stay & ((found < low[live]) | (found > high[live]))
-        moves[live] = np.clip(found, low[live], high[live])
-        held[live] |= out
-        live = live[out.any(axis=(1, 2))]
-    return np.where(np.isfinite(moves), moves, 0.0)
-
-
-def _solved(systems: FloatArray, right: FloatArray) -> FloatArray:
-    """Solutions (m, n, n_free) of linear systems, NaN for all of one of the m with a singular."""
-    try:
-        found: FloatArray = np.linalg.solve(systems, right[..., None])[..., 0].astype(np.float64)
-        return found
-    except np.linalg.LinAlgError:
-        if len(systems) == 1:
-            return np.full(right.shape, np.nan)
-    pairs = zip(systems[:, None], right[:, None], strict=True)
-    return np.concatenate([_solved(system, side) for system, side in pairs])
-
-
-def _within(
-    limits: Constraints, move: FloatArray, curvature: FloatArray, low: FloatArray,
-    high: FloatArray,
-) -> FloatArray:  # fmt: skip
-    """A move that slides along the constraints it would cross, bounds kept."""
-    between = (move > low) & (move < high)
-    free, held = np.flatnonzero(between), ~between
-    rest = Constraints(limits.value + limits.slope[:, held] @ move[held], limits.slope)
-    inverse: FloatArray = np.linalg.inv(curvature[np.ix_(free, free)]).astype(np.float64)
-    slid = move.copy()
-    slid[free] = rest.among(free).nearest(move[free], inverse)
-    return np.clip(slid, low, high)
