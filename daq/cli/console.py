@@ -36,7 +36,6 @@ _PREFIXES = {-9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M"}
 # A power would be of the prefix as well: mm^2 is no thousandth of m^2.
 _PREFIXABLE = re.compile(r"(V|A|ohm|H|F|N|W|J|s|Hz|Pa|T|Wb|m|rad)(?![\w^])")
 _PLAIN = (0.1, 1000.0)
-_ANY_WIDTH = 100_000  # wider than any table
 
 
 @contextmanager
@@ -102,7 +101,7 @@ def print_table(
     """A table: with rules on a terminal, in a pipe a line for each row however long.
 
     The first column and those named in ``text`` are text, the others numbers. On a narrow terminal
-    text is wrapped between words; nothing is cut.
+    heads and text are wrapped between words; nothing is cut.
     """
     from rich import box
     from rich.console import Console
@@ -111,25 +110,66 @@ def print_table(
     # A unit in brackets is no markup, nor is text between colons an emoji.
     make = functools.partial(Console, file=sys.stdout, highlight=False, markup=False, emoji=False)
     console = make()
+    words = [index == 0 or name in text for index, name in enumerate(head)]
+    columns = [[name, *(row[index] for row in rows)] for index, name in enumerate(head)]
+    whole = [max(map(len, column)) for column in columns]
+    narrow = console.is_terminal and sum(whole) + 3 * len(head) > console.width
+    room = console.width - 2 * len(head)
+    widths = _narrowed(columns, words, room) if narrow else whole
     table = Table(
-        header_style="bold",
-        box=box.SIMPLE_HEAD if console.is_terminal else box.SIMPLE, pad_edge=False,
+        header_style="bold", pad_edge=False, padding=(0, 1, 0, 0) if narrow else (0, 1),
+        box=box.SIMPLE_HEAD if console.is_terminal else box.SIMPLE,
     )  # fmt: skip
-    for index, name in enumerate(head):
-        words = index == 0 or name in text
+    for name, width, is_text in zip(head, widths, words, strict=True):
         table.add_column(
-            name, justify="left" if words else "right", no_wrap=not words, overflow="fold"
-        )
+            _folded(name, width), width=width, justify="left" if is_text else "right",
+            overflow="fold",
+        )  # fmt: skip
     for row in rows:
         table.add_row(*row)
-    room = console.measure(table, options=console.options.update(width=_ANY_WIDTH))
-    if console.is_terminal:
-        console = make(width=max(console.width, room.minimum + len(head)))
-    else:
-        console = make(width=room.maximum, no_color=True)
+    # Where even the longest words have no room, the terminal breaks the lines.
+    console = make(
+        width=max(console.width, sum(widths) + 3 * len(head)),
+        no_color=None if console.is_terminal else True,
+    )
     # Above the table rather than in it, where a long title would wrap to the table's width.
     console.print(title, style="bold", soft_wrap=True)
     console.print(table)
+
+
+def _narrowed(columns: Sequence[Sequence[str]], words: Sequence[bool], room: int) -> list[int]:
+    """Widths of columns, heads first, that together take no more than the room, if they can.
+
+    Numbers stay whole, and words of text: what is left goes to text first, which takes a line for
+    each row it is wrapped in, heads only one in all.
+    """
+    widths = []
+    for cells, is_text in zip(columns, words, strict=True):
+        parts = " ".join(cells[1:]).split() if is_text else list(cells[1:])
+        widths.append(max(map(len, [*parts, *_parts(cells[0])]), default=0))
+    for index in sorted(range(len(columns)), key=lambda i: not words[i]):
+        spare = max(room - sum(widths), 0)
+        widths[index] += min(spare, max(map(len, columns[index])) - widths[index])
+    return widths
+
+
+def _parts(head: str) -> list[str]:
+    """Where a head may be wrapped: between words, and of a name behind an underscore."""
+    return [part for part in re.split(r"(?<=_)| +", head) if part]
+
+
+def _folded(head: str, width: int) -> str:
+    """A head on lines no wider than that, as far as its parts allow."""
+    if len(head) <= width:
+        return head
+    lines = [""]
+    for part in _parts(head):
+        between = "" if lines[-1].endswith("_") or not lines[-1] else " "
+        if len(lines[-1] + between + part) <= width or not lines[-1]:
+            lines[-1] += between + part
+        else:
+            lines.append(part)
+    return "\n".join(lines)
 
 
 @contextmanager

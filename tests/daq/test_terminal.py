@@ -1,6 +1,7 @@
 """What every command has in common at a terminal: how much it says, and what Tab offers."""
 
 import os
+import re
 import subprocess
 import sys
 import sysconfig
@@ -96,6 +97,8 @@ TABLE = """
 from daq.cli.console import print_table
 print_table("Title [rad/s]", ["name", "omega [rad/s]", "meaning"],
             [["K_m", "0.135 .. 0.151", "[low, high] of a :smile:" * 9]], text=["meaning"])
+print_table("Wide", ["output", "RMSE, training", "with applied_voltage_motor", "fit [%]"],
+            [["current_motor", "0.00969", "100 %", "98.7"]])
 """
 
 
@@ -110,17 +113,25 @@ def test_a_table_in_a_pipe_has_a_line_for_each_row_and_takes_nothing_for_markup(
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="a pseudo-terminal is needed")
-def test_a_narrow_terminal_cuts_nothing():
+@pytest.mark.parametrize("columns", [30, 50])
+def test_a_narrow_terminal_cuts_nothing(columns):
     import pty
 
     main, other = pty.openpty()
     with subprocess.Popen(
-        [sys.executable, "-c", TABLE], env=environment(COLUMNS="30", TERM="xterm"), stdout=other
+        [sys.executable, "-c", TABLE],
+        env=environment(COLUMNS=str(columns), TERM="xterm"),
+        stdout=other,
     ) as running:
         assert running.wait(60) == 0
     os.close(other)
-    shown = os.read(main, 100_000).decode()
+    shown = re.sub(r"\x1b\[[\d;]*m", "", os.read(main, 100_000).decode())
     os.close(main)
     assert "…" not in shown
     assert "0.135 .. 0.151" in shown and "omega [rad/s]" in shown
     assert shown.count(":smile:") >= 9
+    # Heads are folded, where they have parts, and names of rows are not.
+    assert re.search("current_motor +0.00969 ", shown)
+    assert "with applied_voltage_motor" not in shown and "voltage_" in shown
+    wide = shown[shown.index("Wide") :].splitlines()
+    assert columns == 30 or max(map(len, wide)) <= columns
