@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import hashlib
 import importlib.metadata
@@ -203,8 +204,13 @@ def write_whole(path: Path, content: str | bytes) -> None:
         temporary.write_bytes(content.encode() if isinstance(content, str) else content)
         temporary.replace(path)
     except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise RunError(f"{path}: cannot be written: {error.strerror}") from None
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        folder = path.parent
+        reason = (
+            error.strerror if folder.is_dir() else f"there is no folder {folder}, make it first"
+        )
+        raise RunError(f"{path}: cannot be written: {reason}") from None
 
 
 def _git_commit() -> str | None:

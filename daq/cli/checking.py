@@ -249,4 +249,4 @@ def _draw(planned: Plan, settings: Experiment, units: dict[str, str], path: Path
     try:
         capture.write_whole(path, style.render(drawn, kind))
     except RunError as error:
-        raise ConfigError(f"{error}; choose another place with --plot FILE.png") from None
+        raise ConfigError(f"{error}; or choose another place with --plot FILE.png") from None

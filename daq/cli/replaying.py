@@ -216,7 +216,7 @@ def _draw(found: Replay, path: Path | None) -> Path | None:
         capture.write_whole(chosen, style.render(responses(found.time, outputs), kind))
     except RunError as error:
         if path is not None:
-            raise ConfigError(f"{error}; choose another with --figure FILE.png") from None
+            raise ConfigError(f"{error}; or choose another with --figure FILE.png") from None
         console.report_warning(str(error))
         return None
     return chosen

@@ -131,7 +131,8 @@ def test_a_closed_loop_states_its_range_and_draws_its_references(command, loop):
     ("plot", "known", "message"),
     [
         ("c.jpg", True, "c.jpg: figures are written as"),
-        ("absent/c.png", True, "absent/c.png: cannot be written"),
+        ("absent/c.png", True, "absent/c.png: cannot be written: there is no folder absent, make"),
+        ("loop.yaml/c.png", True, "there is no folder loop.yaml, make it first; or choose another"),
         ("c.png", False, "--plot c.png: loop.py:Loop says nothing beforehand"),
     ],
 )
