@@ -18,7 +18,7 @@ from pydantic import Field, PrivateAttr
 from daq.config.base import Section
 from daq.config.units import Amperes, Hertz, Seconds, Turns
 from daq.findings import Findings
-from daq.hal import FloatArray, Mode, Samples
+from daq.hal import CHANNELS, FloatArray, Mode, Samples
 
 MOST_SAMPLES = 20_000_000
 
@@ -147,9 +147,21 @@ class OpenLoop(Experiment):
 
     def plan(self) -> Plan:
         """The commands and their peaks."""
-        commands = self.waveform()
+        commands = _as_commands(self.waveform())
         lowest, highest = np.min(commands, axis=0), np.max(commands, axis=0)
         return Plan(len(commands), lowest, highest, commands, remarks=self.remarks())
+
+
+def _as_commands(values: Any) -> FloatArray:
+    """A waveform, (n_samples, 2). Raises TypeError for what is none."""
+    array = np.asarray(values)
+    numbers = array.dtype.kind in "fiu"
+    if not numbers or array.ndim != 2 or array.shape[1] != len(CHANNELS) or len(array) < 2:
+        raise TypeError(
+            f"waveform() returned shape {array.shape} of {array.dtype}; expected (n_samples, 2) "
+            "numbers, motor and brake in volts, two samples at least"
+        )
+    return array.astype(np.float64)
 
 
 class Timed(OpenLoop):

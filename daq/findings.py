@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
+
+import numpy as np
 
 from daq.hal import FloatArray
 
@@ -20,6 +23,13 @@ class Number:
     high: float | None = None
     meaning: str = ""
 
+    def __post_init__(self) -> None:
+        """Raises TypeError for a value that is no number."""
+        for name in ("value", "low", "high"):
+            value = getattr(self, name)
+            if value is not None or name == "value":
+                object.__setattr__(self, name, float(value))
+
 
 @dataclass(frozen=True)
 class Table:
@@ -31,8 +41,16 @@ class Table:
     name: str
     title: str
     columns: Mapping[str, FloatArray]
-    units: Mapping[str, str]
+    units: Mapping[str, str] = field(default_factory=dict)
     printed: bool = True
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for columns that make no table."""
+        _require_file_name(self.name)
+        of = f"table {self.name!r}"
+        columns = {name: _numbers(f"{of}: {name}", values) for name, values in self.columns.items()}
+        _require_alike(of, columns)
+        object.__setattr__(self, "columns", columns)
 
 
 @dataclass(frozen=True)
@@ -53,6 +71,15 @@ class Series:
     spread: FloatArray | None = None
     style: Literal["line", "points"] = "line"
 
+    def __post_init__(self) -> None:
+        """Raises ValueError for points that are none."""
+        of = f"series {self.label!r}"
+        given = {"x": self.x, "y": self.y, "spread": self.spread}
+        points = {n: _numbers(f"{of}: {n}", v) for n, v in given.items() if v is not None}
+        _require_alike(of, points)
+        for name, values in points.items():
+            object.__setattr__(self, name, values)
+
 
 @dataclass(frozen=True)
 class Chart:
@@ -63,6 +90,10 @@ class Chart:
     x: Axis
     y: Axis
     series: tuple[Series, ...]
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for a name that no file can have."""
+        _require_file_name(self.name)
 
 
 @dataclass(frozen=True)
@@ -82,6 +113,15 @@ class Heatmap:
     values: FloatArray
     series: tuple[Series, ...] = ()
 
+    def __post_init__(self) -> None:
+        """Raises ValueError for values that do not belong to the plane."""
+        _require_file_name(self.name)
+        if np.shape(self.values) != (len(self.up), len(self.across)):
+            raise ValueError(
+                f"heatmap {self.name!r}: values are of shape {np.shape(self.values)}, where up has "
+                f"{len(self.up)} and across {len(self.across)}"
+            )
+
 
 @dataclass(frozen=True)
 class Findings:
@@ -95,3 +135,29 @@ class Findings:
     figures: tuple[Chart | Heatmap, ...] = ()
     ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for ranges that are none, and a text in place of a tuple of texts."""
+        if isinstance(self.remarks, str):
+            raise ValueError("remarks: write a tuple of texts, a line each: ('...',)")
+        for name, (low, high) in self.ranges.items():
+            if not low < high:
+                raise ValueError(f"ranges: {name}: {low:g} is not below {high:g}")
+
+
+def _numbers(what: str, values: Any) -> FloatArray:
+    array = np.asarray(values, dtype=np.float64)
+    if array.ndim != 1:
+        raise ValueError(f"{what} is of shape {array.shape}; expected (n,)")
+    return array
+
+
+def _require_alike(what: str, columns: Mapping[str, FloatArray]) -> None:
+    if len({len(values) for values in columns.values()}) > 1:
+        lengths = ", ".join(f"{name} has {len(values)}" for name, values in columns.items())
+        raise ValueError(f"{what}: its columns must be of one length; {lengths} values")
+
+
+def _require_file_name(name: str) -> None:
+    if not re.fullmatch(r"[\w-][\w.-]*", name):
+        raise ValueError(f"{name!r} becomes a file's name: write letters, digits, _ and - only")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from daq.asking import plan_of
 from daq.config.rig import RigConfig
 from daq.errors import ConfigError
 from daq.experiment import ClosedLoop, Experiment, Plan
@@ -20,10 +21,7 @@ def plan(experiment: Experiment, rig: RigConfig) -> Plan:
     plan that breaks one of the rig's limits: the sample and the value, as far as they are known
     beforehand.
     """
-    try:
-        planned = experiment.plan()
-    except ValueError as error:
-        raise ConfigError(str(error)) from None
+    planned = plan_of(experiment)
     _check_homing(experiment.homing.turns, rig)
     for channel, name in enumerate(CHANNELS):
         _check_range(planned, rig, channel, name)

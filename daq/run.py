@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
+from daq.asking import MISTAKES, controller_of, description_of, mistake
 from daq.capture import COMPLETED, Capture
 from daq.config.rig import RigConfig
 from daq.errors import DeviceError, InterlockError, RigError, RunError, Terminated
 from daq.experiment import (
     Answer,
     ClosedLoop,
-    Controller,
     Experiment,
     OffsetCalibration,
     Plan,
@@ -35,6 +36,7 @@ _ZEROS_AHEAD = 0.05  # s of zero commands queued while waiting
 _REST_TIME = 1.0  # s that the shaft must stand still to end homing
 _REST_TURNS = 0.01  # turns it may creep meanwhile
 _SAMPLE = Sample._fields
+_ROUNDING = 1e-9  # of a plan's bounds
 
 
 @dataclass(frozen=True)
@@ -76,17 +78,20 @@ def run_experiment(
 
     Whatever ends it, both outputs are zeroed first and the capture folder says why. Raises
     ConfigError before energising; DeviceError, InterlockError, RunError, KeyboardInterrupt or
-    Terminated afterwards.
+    Terminated afterwards, with a note (``__notes__``) on the folder.
     """
     planned = plan(experiment, rig_config)
+    described = description_of(experiment)
+    answering = _Answering(experiment, planned) if isinstance(experiment, ClosedLoop) else None
     capture = Capture.create(
         root,
         name,
-        {"experiment": experiment.describe(), "rig": rig_config.model_dump(mode="json")},
+        {"experiment": described, "rig": rig_config.model_dump(mode="json")},
     )
     limits = Limits(rig_config)
     with Stopping() as stopping:
-        run = _Run(experiment, planned, Rig(device, rig_config), capture, limits, stopping, watch)
+        rig = Rig(device, rig_config)
+        run = _Run(experiment, planned, answering, rig, capture, limits, stopping, watch)
         return run.execute()
 
 
@@ -97,6 +102,7 @@ class _Run:
         self,
         experiment: Experiment,
         planned: Plan,
+        answering: _Answering | None,
         rig: Rig,
         capture: Capture,
         limits: Limits,
@@ -105,6 +111,7 @@ class _Run:
     ) -> None:
         self.experiment = experiment
         self.plan = planned
+        self.answering = answering
         self.rig = rig
         self.capture = capture
         self.limits = limits
@@ -116,22 +123,31 @@ class _Run:
 
     def execute(self) -> RunResult:
         """All phases; the record in the capture folder names how they ended."""
+        log = None
         try:
             with LogWriter(self.capture.log_path, self._columns) as log:
                 self._phases(log)
         except (RigError, KeyboardInterrupt, Terminated) as error:
             self._finish(*_outcome(error, self.phase))
+            error.add_note(self._kept(log))
             raise
-        except Exception as error:
+        except MISTAKES as error:
             reason = (
                 f"the backend failed during {self.phase.value}: {type(error).__name__}: {error}; "
                 "outputs were set to zero. Mend the backend, or report this to who maintains it"
             )
             self._finish("failed", reason)
-            raise DeviceError(reason) from error
+            failed = DeviceError(reason)
+            failed.add_note(self._kept(log))
+            raise failed from error
         self._finish(COMPLETED, None)
         record = self.capture.record
         return RunResult(self.capture.folder, log.n_samples, record["timing"], record["realtime"])
+
+    def _kept(self, log: LogWriter | None) -> str:
+        """Where the record of a run is that ended early."""
+        n = log.n_samples if log is not None else 0
+        return f"what was recorded until then: {self.capture.folder} ({n} samples of the run)"
 
     def _phases(self, log: LogWriter) -> None:
         try:
@@ -163,8 +179,8 @@ class _Run:
             self._enter(Phase.HOMING, self.experiment.homing.turns)
             self._home()
         self._enter(Phase.RUN)
-        if isinstance(self.experiment, ClosedLoop):
-            self._control(self.experiment, log)
+        if self.answering is not None:
+            self._control(self.answering, log)
         else:
             self._play(log)
         self._enter(Phase.SAFE)
@@ -315,12 +331,12 @@ class _Run:
                 )
         self.rig.stop()
 
-    def _control(self, experiment: ClosedLoop, log: LogWriter) -> None:
+    def _control(self, answering: _Answering, log: LogWriter) -> None:
         """Answer every sample with a command until the controller, or the plan, is at its end."""
-        answering = _Answering(experiment)
+        ahead = answering.ahead
         self._begin(Mode.CLOSED_LOOP)
-        self.rig.send(0, np.zeros((experiment.ahead, len(CHANNELS))))
-        asked, done = experiment.ahead, 0
+        self.rig.send(0, np.zeros((ahead, len(CHANNELS))))
+        asked, done = ahead, 0
         while done < self.plan.n_samples and not answering.ended:
             samples = _first(self._receive(), self.plan.n_samples)
             if len(samples) == 0:
@@ -328,12 +344,12 @@ class _Run:
             samples, trip = self._guarded(samples)
             answers = answering.to(samples)
             if trip is None and not answering.ended:
-                until = samples.tick.item(-1) + 1 + experiment.ahead
+                until = samples.tick.item(-1) + 1 + ahead
                 commands = answers.commands
                 if until - asked != len(commands):
                     # A lost sample has no answer: the one after it serves its tick too.
                     ticks = np.arange(asked, until)
-                    commands = commands[np.searchsorted(samples.tick + experiment.ahead, ticks)]
+                    commands = commands[np.searchsorted(samples.tick + ahead, ticks)]
                 self.rig.send(asked, commands)
                 self.timing.answered(samples.tick.item(-1))
                 asked = until
@@ -401,11 +417,17 @@ class _Answers:
 class _Answering:
     """A controller asked for one sample after the other."""
 
-    def __init__(self, experiment: ClosedLoop) -> None:
-        self._experiment = experiment
-        self._controller: Controller = experiment.controller()
-        self._last = Answer(0.0, 0.0, (0.0,) * len(experiment.columns))
+    def __init__(self, experiment: ClosedLoop, planned: Plan) -> None:
+        self.ahead = experiment.ahead
         self.ended = False
+        self._experiment = experiment
+        self._columns = tuple(experiment.columns)
+        self._controller = controller_of(experiment)
+        self._plan = planned
+        self._last = Answer(0.0, 0.0, (0.0,) * len(self._columns))
+        reach = _ROUNDING * np.max(np.abs([planned.lowest, planned.highest]), axis=0)
+        ends = np.stack([planned.lowest - reach, planned.highest + reach], axis=1)
+        self._bounds: list[list[float]] = ends.tolist()
 
     def to(self, samples: Samples) -> _Answers:
         """Answers to some samples; ``ended`` once the controller has none."""
@@ -418,21 +440,47 @@ class _Answering:
                 break
             self._last = answer
             rows.append(answer)
-        commands = np.array([(row.motor, row.brake) for row in rows], dtype=np.float64)
-        logged = np.array([row.logged for row in rows], dtype=np.float64)
-        logged = logged.reshape(len(rows), len(self._experiment.columns))
+        try:
+            commands = np.array([(row.motor, row.brake) for row in rows], dtype=np.float64)
+            logged = np.array([row.logged for row in rows], dtype=np.float64)
+            logged = logged.reshape(len(rows), len(self._columns))
+        except (TypeError, ValueError) as error:
+            raise self._failed(samples.tick.item(0), error) from error
         return _Answers(commands, list(logged.T), int(samples.tick[len(rows) - 1]) + 1)
 
     def _ask(self, sample: Sample) -> Answer | None:
         try:
-            return self._controller.answer(sample)
+            answer = self._controller.answer(sample)
+            if answer is not None:
+                self._check(answer)
         except RigError:
             raise
-        except Exception as error:
-            raise RunError(
-                f"the protocol {self._experiment.protocol!r} failed at sample {sample.tick}: "
-                f"{type(error).__name__}: {error}; outputs were set to zero"
-            ) from error
+        except MISTAKES as error:
+            raise self._failed(sample.tick, error) from error
+        return answer
+
+    def _failed(self, tick: int, error: BaseException) -> RunError:
+        reason = mistake(self._experiment, f"at sample {tick}", error)
+        return RunError(f"{reason}; outputs were set to zero")
+
+    def _check(self, answer: Answer) -> None:
+        """ValueError, or TypeError, for what can be no answer, or is beyond the plan."""
+        if not isinstance(answer, Answer):
+            raise TypeError(f"it answered {answer!r}; answer with a daq.experiment.Answer or None")
+        (motor_low, motor_high), (brake_low, brake_high) = self._bounds
+        if not (
+            motor_low <= answer.motor <= motor_high and brake_low <= answer.brake <= brake_high
+        ):
+            (motor_low, brake_low), (motor_high, brake_high) = self._plan.lowest, self._plan.highest
+            raise ValueError(
+                f"it answered motor {answer.motor!r} V, brake {answer.brake!r} V, and its plan "
+                f"says {motor_low:g} to {motor_high:g} V and {brake_low:g} to {brake_high:g} V"
+            )
+        if len(answer.logged) != len(self._columns) or not all(map(math.isfinite, answer.logged)):
+            raise ValueError(
+                f"it logged {answer.logged!r}; a finite number for each of its columns is "
+                f"expected: {', '.join(self._columns) or 'none'}"
+            )
 
 
 def _require_rest(calibration: OffsetCalibration, moved: float, means: dict[str, float]) -> None:

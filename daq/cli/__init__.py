@@ -17,21 +17,34 @@ def main() -> None:
     try:
         app()
     except RigError as error:
+        _report_notes(error)
         report_error(str(error))
         sys.exit(error.exit_status)
     except Terminated as signal:
+        _report_notes(signal)
         report_error(f"stopped by {signal}; outputs are zero")
         sys.exit(1)
-    except KeyboardInterrupt:
-        _stopped()
+    except KeyboardInterrupt as interrupt:
+        _stopped(interrupt)
     except SystemExit as exit:
         if exit.code == _INTERRUPTED:
-            _stopped()
+            _stopped(exit)
         raise
 
 
-def _stopped() -> NoReturn:
+def _stopped(error: BaseException) -> NoReturn:
     from daq.cli.console import report_error
 
+    _report_notes(error)
     report_error("stopped by Ctrl-C")
     sys.exit(1)
+
+
+def _report_notes(error: BaseException | None) -> None:
+    """What an error, or the one behind it, has to say besides."""
+    from daq.cli.console import report_error
+
+    while error is not None:
+        for note in getattr(error, "__notes__", ()):
+            report_error(note)
+        error = error.__context__

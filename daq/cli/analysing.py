@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from daq import capture
+from daq.asking import MISTAKES, mistake, place
 from daq.cli import console
 from daq.cli.files import find_protocol
-from daq.errors import ConfigError
+from daq.errors import ConfigError, RigError, RunError
 from daq.experiment import ClosedLoop, Experiment
 from daq.findings import Findings, Number, Table
 from daq.log import load_log
@@ -26,7 +28,7 @@ def analyse_command(folder: Path, as_json: bool) -> None:
     if warning is not None:
         console.report_warning(warning)
     experiment = recorded_experiment(folder)
-    found = analyse(experiment, folder)
+    found = _conclude(experiment, folder)
     if found is None:
         raise ConfigError(
             f"{folder}: the protocol {experiment.protocol!r} only excites, and concludes nothing "
@@ -71,7 +73,20 @@ def recorded_experiment(folder: Path) -> Experiment:
 
 
 def analyse(experiment: Experiment, folder: Path) -> Findings | None:
-    """What an experiment's protocol concludes from a capture, written to its ``results``."""
+    """What follows from a run that has just ended; a warning says why nothing does."""
+    try:
+        return _conclude(experiment, folder)
+    except RigError as error:
+        console.report_warning(str(error))
+        return None
+
+
+def _conclude(experiment: Experiment, folder: Path) -> Findings | None:
+    """What an experiment's protocol concludes from a capture, written to its ``results``.
+
+    None of a protocol that only excites. Raises RunError where nothing follows, or the protocol
+    has a mistake.
+    """
     if type(experiment).findings is Experiment.findings:
         return None
     extra = tuple(experiment.columns) if isinstance(experiment, ClosedLoop) else ()
@@ -79,9 +94,15 @@ def analyse(experiment: Experiment, folder: Path) -> Findings | None:
     columns = {name: log.frame[name].to_numpy() for name in extra if name in log.frame}
     try:
         found = experiment.findings(log.samples(), columns)
+        if found is not None and not isinstance(found, Findings):
+            raise TypeError(f"it returned {found!r}; return daq.findings.Findings or None")
     except ValueError as error:
-        console.report_warning(f"{folder}: no result: {error}")
-        return None
+        at = place(error, type(experiment))
+        raise RunError(f"{folder}: no result: {error}{at}") from None
+    except MISTAKES as error:
+        raise RunError(
+            f"{folder}: no result: {mistake(experiment, 'in findings()', error)}"
+        ) from error
     if found is not None:
         _write(found, folder / RESULTS)
     return found
@@ -127,7 +148,8 @@ def _number_row(number: Number) -> list[str]:
     scale, unit = console.engineering(number.value, number.unit)
     value, interval, digits = scale * number.value, "-", 4
     if number.low is not None and number.high is not None:
-        digits = console.digits(number.value, (number.high - number.low) / _WIDTH)
+        if math.isfinite(number.high - number.low):
+            digits = console.digits(number.value, (number.high - number.low) / _WIDTH)
         ends = (console.number(scale * end, digits) for end in (number.low, number.high))
         interval = " .. ".join(ends)
     return [number.name, console.number(value, digits), interval, unit, number.meaning]

@@ -11,6 +11,7 @@ import contextlib
 import dataclasses
 from collections.abc import Iterator
 
+from daq.asking import MISTAKES, place
 from daq.config.rig import RigConfig
 from daq.errors import RigError, RunError
 from daq.hal import Flag, Phase, Samples
@@ -126,8 +127,8 @@ class _Named(Limit):
             yield
         except RigError:
             raise
-        except Exception as error:
+        except MISTAKES as error:
             raise RunError(
-                f"the limit {type(self._own).__name__} failed: {type(error).__name__}: {error}; "
-                "outputs were set to zero"
+                f"the limit {type(self._own).__name__} failed: {type(error).__name__}: {error}"
+                f"{place(error, type(self._own))}; outputs were set to zero"
             ) from error

@@ -1,0 +1,121 @@
+"""Asking a protocol, whose code may be anybody's: its answers are checked, its mistakes placed."""
+
+from __future__ import annotations
+
+import contextlib
+import inspect
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from daq.errors import ConfigError, RigError
+from daq.experiment import MOST_SAMPLES, ClosedLoop, Controller, Experiment, Plan
+from daq.hal import CHANNELS
+
+MISTAKES = (Exception, SystemExit)
+"""What code of a user's own may raise without meaning to end the program."""
+
+
+def place(error: BaseException, kind: type) -> str:
+    """`` (FILE:LINE)``, the last line of a class's own file that an error passed through.
+
+    Nothing where it did not, or where the class comes with this program.
+    """
+    try:
+        file = inspect.getfile(kind)
+    except (OSError, TypeError):
+        return ""
+    if Path(file).is_relative_to(Path(__file__).parent.parent):
+        return ""
+    line, trace = None, error.__traceback__
+    while trace is not None:
+        if trace.tb_frame.f_code.co_filename == file:
+            line = trace.tb_lineno
+        trace = trace.tb_next
+    return f" ({file}:{line})" if line is not None else ""
+
+
+def mistake(experiment: Experiment, doing: str, error: BaseException) -> str:
+    """The sentence on an error in a protocol's code: which, where, what."""
+    return (
+        f"the protocol {experiment.protocol!r} failed {doing}: {type(error).__name__}: {error}"
+        f"{place(error, type(experiment))}"
+    )
+
+
+def plan_of(experiment: Experiment) -> Plan:
+    """What a protocol plans. Raises ConfigError for settings that make no run, or its mistakes."""
+    with _before_the_run(experiment, "in plan()"):
+        try:
+            planned = experiment.plan()
+        except ValueError as error:
+            raise ConfigError(f"{error}{place(error, type(experiment))}") from None
+        _check_form(planned, experiment)
+    return planned
+
+
+def description_of(experiment: Experiment) -> dict[str, Any]:
+    """What a protocol says of itself, of types that JSON has. Raises ConfigError."""
+    with _before_the_run(experiment, "in describe()"):
+        described: dict[str, Any] = json.loads(json.dumps(experiment.describe(), default=_plain))
+    return described
+
+
+def controller_of(experiment: ClosedLoop) -> Controller:
+    """A new controller. Raises ConfigError."""
+    with _before_the_run(experiment, "in controller()"):
+        controller = experiment.controller()
+        if not callable(getattr(controller, "answer", None)):
+            raise TypeError(
+                f"it returned {controller!r}; return an object with a method answer(sample)"
+            )
+    return controller
+
+
+@contextlib.contextmanager
+def _before_the_run(experiment: Experiment, doing: str) -> Iterator[None]:
+    try:
+        yield
+    except RigError:
+        raise
+    except MISTAKES as error:
+        raise ConfigError(mistake(experiment, doing, error)) from error
+
+
+def _plain(value: Any) -> Any:
+    """Arrays and numbers of numpy as lists and numbers."""
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    raise TypeError(f"{value!r} is of no type that JSON has")
+
+
+def _check_form(planned: Any, experiment: Experiment) -> None:
+    """TypeError unless it is a plan whose parts fit each other."""
+    if not isinstance(planned, Plan):
+        raise TypeError(f"it returned {planned!r}; return a daq.experiment.Plan")
+    n = planned.n_samples
+    if not isinstance(n, int | np.integer) or not 2 <= n <= MOST_SAMPLES:
+        raise TypeError(f"n_samples is {n!r}; a whole number from 2 to {MOST_SAMPLES} is possible")
+    for name in ("lowest", "highest"):
+        _require(name, getattr(planned, name), (len(CHANNELS),), "one for each channel, in volts")
+    if np.any(np.greater(planned.lowest, planned.highest)):
+        raise TypeError(f"lowest, {planned.lowest}, is above highest, {planned.highest}")
+    if isinstance(experiment, ClosedLoop) == (planned.commands is not None):
+        raise TypeError("commands belong to a protocol in open loop, and only there")
+    if planned.commands is not None:
+        _require("commands", planned.commands, (n, len(CHANNELS)), "in volts")
+    for name, values in planned.references.items():
+        _require(f"references[{name!r}]", values, (n,), "n_samples of them")
+    if isinstance(planned.remarks, str):
+        raise TypeError("remarks is a text; write a tuple of texts, a line each: ('...',)")
+
+
+def _require(name: str, values: Any, shape: tuple[int, ...], what: str) -> None:
+    array = np.asarray(values)
+    if array.dtype.kind not in "fiu" or array.shape != shape:
+        raise TypeError(
+            f"{name} is of shape {array.shape} and type {array.dtype}; expected {shape}: {what}"
+        )
