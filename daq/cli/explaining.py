@@ -53,6 +53,7 @@ def view(model: ProcessModel, document: Mapping[str, Any]) -> dict[str, Any]:
         "baseline": baseline,
         "baseline_sentence": _baseline_sentence(comparison),
         "meanings": {p.name: p.description for p in model.parameters},
+        "described": any(p.description for p in model.parameters),
         "notes": {name: _note(one) for name, one in parameters.items()},
         "has_intervals": "determined_directions" in document,
         "no_intervals": _no_intervals(document["search"]),
@@ -98,7 +99,7 @@ def _determined(document: Mapping[str, Any], free: Sequence[Mapping[str, Any]]) 
         return f"The data determine all {own} free parameters, each by itself."
     return (
         f"The data determine {own} of {_count(len(free), 'free parameter')} by themselves{combined}"
-        f". The others are not to be used one by one{spite}."
+        f". The rest is not to be used one by one{spite}."
     )
 
 

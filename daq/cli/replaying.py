@@ -13,7 +13,7 @@ from daq import capture
 from daq.cli import console, datasets
 from daq.cli.datasets import Loaded, Mapping
 from daq.cli.files import DEFAULT_RIG, load_rig
-from daq.cli.modelling import DEFAULT_MODEL, find_model
+from daq.cli.modelling import find_model
 from daq.cli.preparing import as_told
 from daq.cli.quantities import in_model_units
 from daq.cli.reporting import print_metrics
@@ -152,7 +152,8 @@ def replay_command(
         if drawn is not None:
             console.print_line(f"Figure: {drawn}")
         if not missed:
-            given = f"rig replay ANOTHER_LOG --parameters {parameters}"
+            columns = f" --config {config}" if config is not None else ""
+            given = f"rig replay ANOTHER_LOG --parameters {parameters}{columns}"
             console.print_next(given if parameters else f"rig identify {log}")
     if missed:
         raise RunError(
@@ -278,7 +279,10 @@ def _rig_truth(rig: str) -> tuple[ProcessModel, dict[str, float]]:
 
 
 def columns_of(config: Path | None, model: ProcessModel) -> Mapping | None:
-    """The columns of a configuration, for the model as the parameters are of."""
+    """The columns of a configuration, for the model that the parameters are of.
+
+    The file may name another, for which the columns serve as well; ConfigError where they do not.
+    """
     if config is None:
         return None
     file = yaml_file.load(config)
@@ -286,12 +290,6 @@ def columns_of(config: Path | None, model: ProcessModel) -> Mapping | None:
     settings = checking.validate(file, IdentificationConfig, others=wrong)
     if settings.columns is None:
         return None
-    name = find_model(settings.model or DEFAULT_MODEL, config.parent).name
-    if name != model.name:
-        raise ConfigError(
-            f"{config}: its columns are those of model {name}, "
-            f"but the parameters are of {model.name}"
-        )
     mapping = Mapping(file, settings.columns)
     # The file may be of a comparison, in which other models have other signals.
     columns = settings.columns

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 _NUMBERED = 0.27  # in, width of a cell from which its correlation is written into it
 
+_WIDEST = 8.0  # times the median width to which intervals are drawn
+
 _SHORT = 9  # letters up to which names stand beside each other
 
 
@@ -98,23 +100,32 @@ def intervals(quantities: Sequence[Determined]) -> Figure:
     """The 95 % interval of every determined quantity, in per cent of its value."""
     names, left = style.row_names([quantity.name for quantity in quantities])
     figure, (panel,) = style.stack([0.17 * len(quantities) + 0.1], left=left, top=0.1)
-    widest = 0.0
-    for row, one in enumerate(quantities):
-        size = abs(one.value) or 1.0
-        below, above = (100.0 * (end - one.value) / size for end in (one.low, one.high))
-        widest = max(widest, abs(below), abs(above))
+    ends = np.array([_relative(one) for one in quantities])
+    widths = np.abs(ends).max(axis=1)
+    # One that is hardly known must not flatten the others: it leaves the panel, with its width.
+    limit = min(float(widths.max()), _WIDEST * float(np.median(widths)))
+    for row, (below, above) in enumerate(ends.tolist()):
         panel.errorbar(
             0.0, row, xerr=[[abs(below)], [abs(above)]], fmt="o", ms=3.0, capsize=2.0,
             color=style.IDENTIFIED, ecolor=style.BASELINE, elinewidth=1.2, capthick=0.8,
         )  # fmt: skip
+        if widths[row] > limit:
+            shown = f"{below:.0f} .. +{above:.0f} %".replace("-", "−")
+            panel.text(limit, row - 0.1, shown, ha="right", va="bottom", fontsize=6.0)
     panel.axvline(0.0, color="black", lw=0.4, zorder=1)
     panel.set_yticks(range(len(quantities)), names)
     panel.set_ylim(len(quantities) - 0.4, -0.6)
-    panel.set_xlim(-1.1 * widest, 1.1 * widest) if widest > 0.0 else None
+    panel.set_xlim(-1.1 * limit, 1.1 * limit) if limit > 0.0 else None
     panel.set_xlabel("95 % interval, distance from the value [%]")
     panel.grid(visible=False, axis="y")
     panel.tick_params(axis="y", length=0)
     return figure
+
+
+def _relative(one: Determined) -> tuple[float, float]:
+    """Ends of an interval, in per cent of the value away from it."""
+    size = abs(one.value) or 1.0
+    return 100.0 * (one.low - one.value) / size, 100.0 * (one.high - one.value) / size
 
 
 @style.styled
@@ -139,7 +150,7 @@ def correlation(names: Sequence[str], matrix: FloatArray) -> Figure:
     if side / n >= _NUMBERED:
         for i, j in np.argwhere(np.isfinite(matrix)).tolist():
             dark = abs(matrix[i, j]) > 0.6
-            panel.text(j, i, f"{matrix[i, j]:.2f}".replace("-", "−"), ha="center", va="center",
+            panel.text(j, i, f"{round(matrix[i, j], 2) + 0.0:.2f}".replace("-", "−"), ha="center", va="center",
                        fontsize=5.5 if side / n < 0.36 else 6.5,
                        color="white" if dark else "black")  # fmt: skip
     box = panel.get_position()

@@ -273,6 +273,14 @@ def test_figures_are_drawn_again_in_other_formats(result, work, rig):
         assert again.read_bytes() == before.read_bytes()
 
 
+def test_columns_of_a_file_for_another_model_of_the_same_signals_serve(result, work, rig):
+    (work / "other.yaml").write_text(CONFIG.replace("my_model.py:model", "actuator"))
+    args = ["replay", "check.csv", "--parameters", "found/parameters.yaml"]
+    done = rig([*args, "--config", "other.yaml", "--figure", "replay.png"], cwd=work)
+    assert done.returncode == 0, done.stderr
+    assert re.search(r"Next: rig replay ANOTHER_LOG .* --config \S*other.yaml\n", done.stdout)
+
+
 def test_figures_of_what_is_not_there_any_more(result, work, rig, tmp_path):
     shutil.copytree(work / "found", tmp_path / "found")
     data = tmp_path / "found/report.json"
