@@ -150,7 +150,8 @@ def correlation(names: Sequence[str], matrix: FloatArray) -> Figure:
     if side / n >= _NUMBERED:
         for i, j in np.argwhere(np.isfinite(matrix)).tolist():
             dark = abs(matrix[i, j]) > 0.6
-            panel.text(j, i, f"{round(matrix[i, j], 2) + 0.0:.2f}".replace("-", "−"), ha="center", va="center",
+            shown = f"{round(matrix[i, j], 2) + 0.0:.2f}".replace("-", "−")
+            panel.text(j, i, shown, ha="center", va="center",
                        fontsize=5.5 if side / n < 0.36 else 6.5,
                        color="white" if dark else "black")  # fmt: skip
     box = panel.get_position()
