@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -13,14 +14,13 @@ from bokeh.models import (
     BasicTicker,
     ColumnDataSource,
     CrosshairTool,
-    DataRange1d,
     FactorRange,
     Range1d,
 )
 from bokeh.models.annotations import Span
 from bokeh.plotting import figure
 
-from daq.hal import Flag
+from daq.hal import Flag, FloatArray
 from daq.log import UNITS
 from daq.scope.history import View
 
@@ -35,17 +35,22 @@ _FLAG_COLORS = {
     Flag.UNDERFLOW: RED,
     Flag.SATURATED: PURPLE,
 }
+_CALM = 0.03  # of a column's span that a stretch may cover and still be drawn as broad: 3 pixels
+_MARGIN, _FILLED = 0.06, 0.7  # parts of a figure's height: free at each end, filled at least
 _GRAVE = Flag.LOST | Flag.INTERLOCK | Flag.UNDERFLOW  # marked across all figures
 
 
 @dataclass(frozen=True)
 class Curve:
-    """A column and how it is drawn; held: it keeps its value between samples."""
+    """A column and how it is drawn.
+
+    held: it keeps its value between samples. wanted: what was asked for, behind what came of it.
+    """
 
     name: str
     color: str
-    width: float
     held: bool
+    wanted: bool
 
 
 @dataclass(frozen=True)
@@ -73,9 +78,8 @@ def curves_of(columns: Sequence[str]) -> list[list[Curve]]:
         if name in ("t", "tick", "flags"):
             continue
         held = name.startswith(("cmd_", "applied_"))
-        # What was asked or wanted lies, broad and pale, behind what came of it.
         wanted = name.startswith("cmd_") or name.endswith("_ref")
-        curve = Curve(name, ORANGE if wanted else BLUE, 3.0 if wanted else 1.2, held)
+        curve = Curve(name, ORANGE if wanted else BLUE, held, wanted)
         group = groups.setdefault(_quantity(name), [])
         group.insert(0 if wanted else len(group), curve)
     return list(groups.values())
@@ -90,9 +94,10 @@ def make_figures(
     if "flags" in columns:
         plots.append(_flag_strip(sources, time, cursor))
     last = plots[-1]
-    last.xaxis.visible = True
     last.xaxis.axis_label = "t [s]"
     last.height = (last.height or 0) + 45
+    for plot in plots[:-1]:
+        plot.below = []  # an axis that is only invisible is measured and placed all the same
     marks = []
     for plot in plots:
         mark = Span(dimension="height", line_color="black", line_dash="dashed", visible=False)
@@ -105,12 +110,29 @@ def make_figures(
     return grid, plots, marks
 
 
+def fit(plot: figure, sources: Sources) -> None:
+    """Have a figure's curves fill its height, without moving its axis at every little change."""
+    drawn = [np.asarray(sources.samples.data[name]) for name in plot.tags]
+    if not drawn or not len(drawn[0]):
+        return
+    low, high = float(np.fmin.reduce(drawn, None)), float(np.fmax.reduce(drawn, None))
+    if not high - low > 0.0:
+        low, high = low - 1.0, high + 1.0
+    shown: Any = plot.y_range
+    fits = shown.start <= low and high <= shown.end
+    if math.isfinite(high - low) and not (
+        fits and high - low > _FILLED * (shown.end - shown.start)
+    ):
+        margin = _MARGIN * (high - low)
+        shown.update(start=low - margin, end=high + margin)
+
+
 def make_value_table(values: ColumnDataSource, n_rows: int) -> figure:
     """The values at one time, drawn: new cells in a page's text would have it laid out anew."""
     table = figure(
         width=390, height=24 * n_rows, x_range=Range1d(start=0, end=390),
         y_range=Range1d(start=n_rows - 0.5, end=-0.5), tools="",
-        toolbar_location=None, outline_line_color=None, min_border=0, name="table",
+        title=None, toolbar_location=None, outline_line_color=None, min_border=0, name="table",
     )  # fmt: skip
     table.axis.visible = False
     table.grid.visible = False
@@ -126,21 +148,34 @@ def make_value_table(values: ColumnDataSource, n_rows: int) -> figure:
     return table
 
 
-def names_of(column: str) -> tuple[str, str]:
-    """What a column's lowest and highest values are called in the source of samples."""
-    return f"{column} low", f"{column} high"
+def broad_name(column: str) -> str:
+    """What a column is called where it is drawn broad in the source of samples."""
+    return f"{column} broad"
 
 
-def as_data(columns: Sequence[str], view: View) -> dict[str, Any]:
-    """What the source of samples holds of a view; never no points at all."""
-    # Bokeh 3.9 paints an area of steps without points in a loop that has no end.
-    nowhere = np.full((0 if len(view.time) else 1, len(columns)), np.nan)
-    low, high = np.concatenate([view.low, nowhere]), np.concatenate([view.high, nowhere])
-    data: dict[str, Any] = {"t": np.append(view.time, nowhere[:, :1])}
+def points_of(view: View) -> int:
+    """Points drawn of each stretch: its lowest and highest value, which may be one and the same."""
+    return 1 if view.step == 1 else 2
+
+
+def as_data(columns: Sequence[str], view: View, span: FloatArray) -> dict[str, Any]:
+    """What the source of samples holds of a view.
+
+    A line goes from the lowest to the highest value of each stretch. span: (n_columns,), from the
+    lowest to the highest value of all there is.
+    """
+    each = points_of(view)
+    values = np.stack([view.low, view.high], axis=1)[:, :each].reshape(
+        each * len(view.time), len(columns)
+    )
+    data: dict[str, Any] = {"t": np.repeat(view.time, each)}
     for curve in itertools.chain.from_iterable(curves_of(columns)):
         place = columns.index(curve.name)
-        low_name, high_name = names_of(curve.name)
-        data[low_name], data[high_name] = low[:, place], high[:, place]
+        data[curve.name] = values[:, place]
+        if curve.wanted:
+            low, high = view.low[:, place], view.high[:, place]
+            calm = high - low <= _CALM * span[place]
+            data[broad_name(curve.name)] = np.repeat(np.where(calm, low, np.nan), each)
     return data
 
 
@@ -168,25 +203,27 @@ def _quantity(name: str) -> str:
 
 
 def _curve_figure(curves: Sequence[Curve], sources: Sources, time: Range1d, cursor: Span) -> figure:
-    plot = _empty(time, cursor, 108, DataRange1d(range_padding=0.08))
+    plot = _empty(time, cursor, 108, Range1d(start=0.0, end=0.0))
     unit = UNITS.get(curves[-1].name)
     label = _quantity(curves[-1].name).replace("_", " ")
     plot.yaxis.axis_label = label + (f"\n[{unit}]" if unit else "")
     plot.yaxis.ticker = BasicTicker(desired_num_ticks=3)
     for curve in curves:
-        low, high = names_of(curve.name)
-        look: dict[str, Any] = {"source": sources.samples}
-        line = {**look, "line_color": curve.color, "line_width": curve.width}
-        area = {**look, "fill_color": curve.color}
-        # Areas between low and high cost a browser a tenth of lines that go up and down.
-        if curve.held:
-            plot.varea_step("t", low, high, step_mode="after", **area)
-            plot.step("t", low, mode="after", **line)
-        else:
-            plot.varea("t", low, high, **area)
-            plot.line("t", low, **line)
+        if curve.wanted:
+            _draw(plot, sources, curve, broad_name(curve.name), 3.0)
+        # A line of one pixel costs a browser without a graphics card a tenth of one of 1.2 pixels.
+        _draw(plot, sources, curve, curve.name, 1.0)
+    plot.name, plot.tags = f"figure of {label}", [curve.name for curve in curves]
     plot.vspan(x="time", source=sources.grave, line_color=RED, line_alpha=0.6)
     return plot
+
+
+def _draw(plot: figure, sources: Sources, curve: Curve, name: str, width: float) -> None:
+    look: dict[str, Any] = {"line_color": curve.color, "line_width": width}
+    if curve.held:
+        plot.step("t", name, mode="after", source=sources.samples, **look)
+    else:
+        plot.line("t", name, source=sources.samples, **look)
 
 
 def _flag_strip(sources: Sources, time: Range1d, cursor: Span) -> figure:
@@ -199,12 +236,11 @@ def _flag_strip(sources: Sources, time: Range1d, cursor: Span) -> figure:
 
 def _empty(time: Range1d, cursor: Span, height: int, y_range: Any) -> figure:
     plot = figure(
-        height=height, x_range=time, y_range=y_range, min_border_left=95, min_border_bottom=6,
-        tools="xbox_zoom,xpan,xwheel_zoom,reset,save", active_scroll="xwheel_zoom",
-        active_drag="xbox_zoom",
+        title=None, height=height, x_range=time, y_range=y_range, min_border_left=95,
+        min_border_bottom=6, tools="xbox_zoom,xpan,xwheel_zoom,reset,save",
+        active_scroll="xwheel_zoom", active_drag="xbox_zoom",
     )  # fmt: skip
     plot.add_tools(CrosshairTool(overlay=cursor))
-    plot.xaxis.visible = False
     plot.yaxis.axis_label_text_font_style = "normal"
     plot.outline_line_color = "#cccccc"
     return plot

@@ -58,6 +58,7 @@ class History:
         self._pending = np.empty((0, n))  # rows of the bucket that is not full yet
         self._pending_starts = np.empty(0, dtype=np.int64)
         self._end_byte = 0
+        self._lowest, self._highest = np.full(n, np.nan), np.full(n, np.nan)
 
     @property
     def span(self) -> tuple[float, float]:
@@ -73,12 +74,20 @@ class History:
         time = self._recent_rows()[:, self._time]
         return float((time[-1] - time[0]) / (len(time) - 1)) if len(time) > 1 else 0.0
 
+    @property
+    def spread(self) -> FloatArray:
+        """From the lowest to the highest value of each column so far, (n_columns,)."""
+        spread: FloatArray = self._highest - self._lowest
+        return spread
+
     def add(self, values: FloatArray, starts: IntArray) -> None:
         """Take rows (n, n_columns) whose lines begin at ``starts`` (n + 1,)."""
         if not len(values):
             return
         self._add_recent(values)
         self._add_buckets(values, starts[:-1])
+        self._lowest = np.fmin(self._lowest, np.fmin.reduce(values))
+        self._highest = np.fmax(self._highest, np.fmax.reduce(values))
         self._end_byte = int(starts[-1])
         self.n_rows += len(values)
 

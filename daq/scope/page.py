@@ -14,14 +14,18 @@ from bokeh.layouts import column, row
 from bokeh.models import ColumnDataSource, Range1d
 from bokeh.models.annotations import Span
 from bokeh.models.widgets import Button, Div, RadioButtonGroup
+from bokeh.plotting import figure
 
+from daq.hal import FloatArray
 from daq.scope.figures import (
     GREY,
     Sources,
     as_data,
+    fit,
     flag_marks,
     make_figures,
     make_value_table,
+    points_of,
 )
 from daq.scope.history import History, View, nothing, step_for
 from daq.scope.recordings import Recording, Watch
@@ -65,6 +69,7 @@ class Page:
         self._tick = 0
         self._sources = Sources.empty()
         self._time = Range1d(start=0.0, end=1.0, name="time")
+        self._plots: list[figure] = []
         self._mark_lines: list[Span] = []
         self._head = Div(name="head", sizing_mode="stretch_width")
         self._values = ColumnDataSource({name: [] for name in VALUE_FIELDS}, name="values")
@@ -153,7 +158,7 @@ class Page:
             self._zoomed_to = None
             margin = _MARGIN * (end - start)
             points = round(_POINTS * (1.0 + 2.0 * _MARGIN))
-            self._replace(history.view(start - margin, end + margin, points))
+            self._replace(history.view(start - margin, end + margin, points), history.spread)
 
     def _draw_live(self, recording: Recording, history: History) -> None:
         """Add what has come since; draw all anew where stretches change their length."""
@@ -168,23 +173,26 @@ class Page:
         behind = history.n_rows - self._drawn_end
         if self._drawn_step != step or ended != self._ended or behind < 0:
             self._drawn_step, self._ended = step, ended
-            self._replace(history.view(start, last, _POINTS, to_the_end=ended))
+            view = history.view(start, last, _POINTS, to_the_end=ended)
+            self._replace(view, history.spread)
         elif behind >= step:
             view = history.since(self._drawn_end, step)
-            self._append(view, None if width is None else rows, start)
+            self._append(view, history.spread, None if width is None else rows, start)
         self._time.update(start=start, end=last if width is None else max(last, first + width))
 
-    def _replace(self, view: View) -> None:
+    def _replace(self, view: View, spread: FloatArray) -> None:
         self._drawn_end = view.end
-        self._sources.samples.data = as_data(self._columns, view)
+        self._sources.samples.data = as_data(self._columns, view, spread)
+        self._fit()
         marks, grave = flag_marks(view)
         self._sources.flags.data, self._sources.grave.data = {**marks}, {**grave}
 
-    def _append(self, view: View, rows: int | None, start: float) -> None:
+    def _append(self, view: View, spread: FloatArray, rows: int | None, start: float) -> None:
         """Add to what is drawn; of the samples keep ``rows``, of the flags those from ``start``."""
         self._drawn_end = view.end
-        keep = None if rows is None else rows // view.step + 2
-        self._sources.samples.stream(as_data(self._columns, view), rollover=keep)
+        keep = None if rows is None else points_of(view) * (rows // view.step + 2)
+        self._sources.samples.stream(as_data(self._columns, view, spread), rollover=keep)
+        self._fit()
         drawn = (self._sources.flags, self._sources.grave)
         for source, new in zip(drawn, flag_marks(view), strict=True):
             kept = np.asarray(source.data["time"]) >= start
@@ -194,15 +202,20 @@ class Page:
                     for name, values in new.items()
                 }
 
+    def _fit(self) -> None:
+        for plot in self._plots:
+            fit(plot, self._sources)
+
     def _clear(self) -> None:
         self._drawn_step = 0
-        self._replace(nothing(len(self._columns)))
+        n = len(self._columns)
+        self._replace(nothing(n), np.zeros(n))
 
     def _make_figures(self, columns: tuple[str, ...]) -> None:
-        self._columns = columns
+        self._columns, self._plots = columns, []
         self._clear()
-        grid, plots, self._mark_lines = make_figures(columns, self._sources, self._time)
-        for plot in plots:
+        grid, self._plots, self._mark_lines = make_figures(columns, self._sources, self._time)
+        for plot in self._plots:
             plot.on_event(RangesUpdate, self._zoom)
             plot.on_event(Reset, lambda event: self._follow())
             plot.on_event(MouseMove, self._move)

@@ -81,6 +81,10 @@ class Tab:
     def time(self):
         return tuple(self.model("time", "[m.start, m.end]"))
 
+    def height(self, quantity):
+        """The lowest and the highest value that a figure has room for."""
+        return tuple(self.model(f"figure of {quantity}", "[m.y_range.start, m.y_range.end]"))
+
     def button(self):
         return self.model("pause", "m.label")
 
@@ -149,8 +153,8 @@ def test_it_follows_a_run_of_the_rig_from_its_beginning_to_its_end(scope, tmp_pa
     last = log["t"].iloc[-1]
     until(lambda: tab.time() == (0.0, last) and tab.drawn()[-1] > last - 0.3, "the whole run")
     for column in ("current_motor", "omega", "applied_voltage_brake"):
-        assert tab.drawn(f"{column} low").min() == log[column].min()
-        assert tab.drawn(f"{column} high").max() == log[column].max()
+        assert tab.drawn(column).min() == log[column].min()
+        assert tab.drawn(column).max() == log[column].max()
     until(lambda: tab.values().get("tick") == str(log["tick"].iloc[-1]), "the newest values")
     assert float(tab.values()["theta"]) == pytest.approx(log["theta"].iloc[-1], rel=1e-5)
     loaded = tab.driver.execute_script(
@@ -198,8 +202,9 @@ def test_a_finished_run_is_shown_whole_and_magnified_to_its_samples(scope, tmp_p
         log.append(block)
     tab = scope(capture.folder)
     until(lambda: len(t := tab.drawn()) and t[-1] > 124.0, "the whole run")
-    assert len(tab.drawn()) < 1500  # light, and yet the spike of one sample is there
-    assert tab.drawn("torque high").max() == 9.0 and tab.time() == (0.0, (n - 1) / RATE)
+    assert len(tab.drawn()) < 2100  # light, and yet the spike of one sample is there
+    assert tab.drawn("torque").max() == 9.0 and tab.time() == (0.0, (n - 1) / RATE)
+    assert 9.0 < tab.height("torque")[1] < 11.0
     times, names = tab.flags()
     assert names == ["lost", "saturated"]
     assert times == pytest.approx([60_000 / RATE, 30_000 / RATE], abs=0.2)
@@ -218,11 +223,15 @@ def test_a_finished_run_is_shown_whole_and_magnified_to_its_samples(scope, tmp_p
     until(lambda: np.ptp(tab.time()) < 0.1 * np.ptp(narrower), "a second")
     start, end = tab.time()
     until(lambda: len(t := tab.drawn()) and np.diff(t).max() < 1.01 / RATE, "single samples")
-    drawn, shown = tab.drawn(), tab.drawn("omega low")
+    drawn, shown = tab.drawn(), tab.drawn("omega")
     assert drawn[0] <= start + 1 / RATE and drawn[-1] >= end - 1 / RATE
     np.testing.assert_array_equal(shown, block.omega[np.round(drawn * RATE).astype(int)])
-    tab.press()
+    bottom, top = tab.height("torque")
+    visible = block.torque[np.round(drawn * RATE).astype(int)]
+    assert bottom < visible.min() and visible.max() < top < visible.max() + 0.5 * np.ptp(visible)
+    tab.find(".bk-tool-icon-reset").click()
     until(lambda: tab.time() == (0.0, (n - 1) / RATE), "the whole run again")
+    until(lambda: tab.height("torque")[1] > 9.0, "its height")
 
 
 def test_the_values_are_those_under_the_cursor_and_from_the_mark(scope, tmp_path):
