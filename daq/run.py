@@ -276,10 +276,11 @@ class _Run:
             if done >= homing.turns and now - calm_from >= _REST_TIME:
                 return True
             if now > homing.timeout:
+                still = "; the shaft did not stand still then" if done >= homing.turns else ""
                 raise RunError(
                     f"homing: {done:.2f} of {homing.turns:g} turns were wound in "
-                    f"{homing.timeout:g} s; wind the load and start again, or raise "
-                    "homing.timeout in the experiment"
+                    f"{homing.timeout:g} s{still}; wind the load, hold it until the run goes on "
+                    "and start again, or raise homing.timeout in the experiment"
                 )
             return False
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from daq.cli import console, punctuality
+from daq.cli import console, plausible, punctuality
 from daq.cli.analysing import analyse, as_document, next_commands, show_findings
 from daq.cli.files import LoadedExperiment, load_experiment, load_rig, rig_for, together
 from daq.config.rig import RigConfig
@@ -51,16 +51,18 @@ def run_command(
     result = _run(loaded, rig_config, device, out, as_json)
     found = analyse(loaded.experiment, result.folder)
     check = _run(validation, rig_config, device, out, as_json) if validation else None
+    doubts = plausible.notes(result.folder / "log.csv", rig_config)
     report = {
         "run": punctuality.as_document(result),
         "validation": punctuality.as_document(check) if check else None,
+        "warnings": doubts,
     }
     if found is not None:
         report["findings"] = as_document(found, result.folder)
         if not as_json:
             show_findings(found, result.folder)
     if not as_json:
-        _print_end(result, check, identify)
+        _print_end(result, check, identify, doubts)
     if prepared is not None:
         from daq.cli.identifying import identify_logs
 
@@ -141,7 +143,9 @@ def _run(
     return result
 
 
-def _print_end(result: RunResult, check: RunResult | None, identified: bool) -> None:
+def _print_end(
+    result: RunResult, check: RunResult | None, identified: bool, doubts: list[str]
+) -> None:
     for label, run in (("Log", result), ("Validation log", check)):
         if run is None:
             continue
@@ -156,5 +160,7 @@ def _print_end(result: RunResult, check: RunResult | None, identified: bool) -> 
             console.print_line(line)
         for note in punctuality.notes(run):
             console.report_note(note)
+    for doubt in doubts:
+        console.report_warning(doubt)
     if not identified:
         console.print_next(*next_commands(result.folder))

@@ -270,12 +270,20 @@ class SerialDevice:
         limit = 0.5 * self.options.watchdog
         for _ in range(_PINGS):
             with self._changed:
-                before = machine.clock.round_trips
-                machine.ping(time.monotonic())
+                before, now = machine.clock.round_trips, time.monotonic()
+                # One that is lost must not use up the time of the others.
+                next_at = min(deadline, now + _PING_PATIENCE / _PINGS)
+                machine.ping(now)
                 self._write(machine)
-                while machine.clock.round_trips == before and time.monotonic() < deadline:
+                while machine.clock.round_trips == before and time.monotonic() < next_at:
                     self._changed.wait(0.02)
         if machine.clock.quickest > limit:
+            if not machine.clock.round_trips and machine.decoder.rejected:
+                raise DeviceError(
+                    f"{self.options.port}: {machine.decoder.rejected} damaged frames came, and not "
+                    f"one answer in {1e3 * _PING_PATIENCE:.0f} ms; check cable, connectors and "
+                    "baud rate"
+                )
             took = (
                 f"took {1e3 * machine.clock.quickest:.0f} ms to answer"
                 if machine.clock.round_trips

@@ -6,12 +6,14 @@ It knows no plant: whoever starts it brings the ``Board``.
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import select
 import socket
 import sys
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -189,12 +191,20 @@ class TcpPort:
             self._host = None
 
 
+_NO_COUNTS: dict[str, Any] = {
+    "counts_low": -(2**31), "counts_high": 2**31 - 1,
+    "count_rate": math.inf, "count_step": 2**32 - 1,
+}  # fmt: skip
+"""Of START: nothing of the counter is watched."""
+
+
 class WatchedBoard:
     """A board with a counter that can be stuck; it tells the phase and what its outputs are."""
 
-    def __init__(self, board: Board) -> None:
+    def __init__(self, board: Board, sticks: bool = False) -> None:
         self.phase = Phase.OPEN
         self.stuck = False
+        self._sticks = sticks  # sooner or later, and no guard of the board's sees the shaft then
         self.outputs = [0] * len(CHANNELS)
         self._board = board
         self._count = 0
@@ -212,7 +222,7 @@ class WatchedBoard:
 
     def start(self, rate: float, limits: Start) -> None:
         """Prepare a run."""
-        self._board.start(rate, limits)
+        self._board.start(rate, replace(limits, **_NO_COUNTS) if self._sticks else limits)
 
     def play(self, commands: Codes) -> Records:
         """The next ticks."""
@@ -246,7 +256,7 @@ class Emulator:
         seed: int = 0,
         journal: Callable[[dict[str, Any]], None] = lambda entry: None,
     ) -> None:
-        self._board = WatchedBoard(board)
+        self._board = WatchedBoard(board, any(fault.name == "stuck-encoder" for fault in faults))
         self._identity = identity
         self._port = port
         self._rate = identity.clock * (1.0 + drift)

@@ -104,6 +104,7 @@ class HostMachine:
         self._asked = self._sent = self._taken = self._credit = 0
         self._progress = self._rewound = self._pinged = 0.0
         self._sample_at = self._frame_at = 0.0
+        self._rejected = 0  # damaged frames, by the time of the last good one
 
     # --- the program around it ----------------------------------------------------------------
 
@@ -239,7 +240,7 @@ class HostMachine:
     # --- what comes in ------------------------------------------------------------------------
 
     def _take(self, frame: Frame, now: float) -> None:
-        self._frame_at = now
+        self._frame_at, self._rejected = now, self.decoder.rejected
         if frame.type == Type.SAMPLES:
             understood = self._samples(frame, now)
         elif frame.type == Type.PONG:
@@ -383,14 +384,23 @@ class HostMachine:
         if now >= request.give_up:
             self._request = None
             if request.type is not Type.HELLO:
-                self._fail(
-                    f"the device does not answer {request.type.name} any more; check its cable "
-                    "and its supply. It makes itself safe when it hears nothing"
-                )
+                self._fail(self._unanswered(request.type.name, now))
         elif now - request.sent >= request.interval:
             request.sent = now
             self.counters.retries += 1
             self._outbox.append(request.frame)
+
+    def _unanswered(self, name: str, now: float) -> str:
+        if now - self._frame_at < 0.5 * GIVE_UP:
+            return (
+                f"the device goes on sending but does not answer {name}: what it sends waits for a "
+                "line too slow for this sample_rate, or the line loses what it is told. Raise the "
+                "baud rate, here and in the firmware, lower sample_rate, or check the cable"
+            )
+        return (
+            f"the device does not answer {name} any more; check its cable and its supply. It makes "
+            "itself safe when it hears nothing"
+        )
 
     def _why_tripped(self, now: float, watchdog: int) -> str:
         tripped = (
@@ -409,6 +419,13 @@ class HostMachine:
         )
 
     def _silence(self, now: float) -> str:
+        damaged = self.decoder.rejected - self._rejected
+        if damaged > 1:
+            return (
+                f"nothing but damaged frames ({damaged}) has come from the device for {SILENCE:g} "
+                "s; check cable, connectors and its supply. It makes itself safe when it hears "
+                "nothing"
+            )
         if now - self._frame_at > 0.5 * SILENCE:
             return (
                 f"nothing has come from the device for {SILENCE:g} s; check its cable and its "

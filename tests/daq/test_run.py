@@ -234,6 +234,52 @@ def test_a_current_beyond_its_limit_before_the_run_is_an_interlock_too(tmp_path)
     assert (record["status"], record["phase"]) == ("interlock", "calibration")
 
 
+CROSSED = """
+import dataclasses
+
+from sim_rig.backend import SimulatedDevice
+
+
+class Crossed(SimulatedDevice):
+    def receive(self):
+        raw = super().receive()
+        return dataclasses.replace(raw, analog=raw.analog[:, [1, 0, 2]])
+"""
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"sensors": {"current_motor": {"scale": 0.5, "sign": -1}}},
+            "'sign: -1' of sensors.current_motor",
+        ),
+        (
+            {"sensors": {"current_brake": {"scale": 1.0}}},
+            "correct sensors.current_brake.scale",
+        ),
+        (
+            {"backend": "crossed.py:Crossed"},
+            "inputs or the outputs of the two channels are swapped",
+        ),
+        ({}, None),
+    ],
+    ids=["sign", "scale", "swapped", "right"],
+)
+def test_currents_that_do_not_follow_their_commands_are_named_with_the_cure(
+    tmp_path, changes, message
+):
+    (tmp_path / "crossed.py").write_text(CROSSED)
+    write_experiment(tmp_path / "e.yaml", calibration={"samples": 400})
+    gains = {"motor": 0.5, "brake": 0.5}
+    limits = {"current": {"motor": 5.0, "brake": 5.0}}
+    write_rig(tmp_path / "rig.yaml", amplifiers=gains, limits=limits, **changes)
+    result = rig("run", "e.yaml", "--rig", "rig.yaml", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    warned = "amplifiers." in result.stderr
+    assert (message in result.stderr) if message else not warned
+
+
 def test_an_interlock_that_only_the_device_saw_ends_the_run(tmp_path, plugin):
     result = run_with(tmp_path, plugin, "own interlock", at=150)
     assert result.returncode == 1
