@@ -13,6 +13,7 @@ import numpy as np
 
 from daq.errors import ConfigError, RigError
 from daq.experiment import MOST_SAMPLES, ClosedLoop, Controller, Experiment, Plan
+from daq.findings import Chart, Heatmap
 from daq.hal import CHANNELS
 
 MISTAKES = (Exception, SystemExit)
@@ -75,6 +76,12 @@ def controller_of(experiment: ClosedLoop) -> Controller:
     return controller
 
 
+def preview_of(experiment: ClosedLoop) -> Chart | Heatmap | None:
+    """What a protocol draws beforehand. Raises ConfigError."""
+    with _before_the_run(experiment, "in preview()"):
+        return experiment.preview()
+
+
 @contextlib.contextmanager
 def _before_the_run(experiment: Experiment, doing: str) -> Iterator[None]:
     try:
@@ -108,7 +115,8 @@ def _check_form(planned: Any, experiment: Experiment) -> None:
     if planned.commands is not None:
         _require("commands", planned.commands, (n, len(CHANNELS)), "in volts")
     for name, values in planned.references.items():
-        _require(f"references[{name!r}]", values, (n,), "n_samples of them")
+        m = min(n, max(map(len, planned.references.values())))
+        _require(f"references[{name!r}]", values, (m,), "as many as the others, n_samples at most")
     if isinstance(planned.remarks, str):
         raise TypeError("remarks is a text; write a tuple of texts, a line each: ('...',)")
 

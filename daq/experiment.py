@@ -17,7 +17,7 @@ from pydantic import Field, PrivateAttr
 
 from daq.config.base import Section
 from daq.config.units import Amperes, Hertz, Seconds, Turns
-from daq.findings import Findings
+from daq.findings import Chart, Findings, Heatmap
 from daq.hal import CHANNELS, FloatArray, Mode, Samples
 
 MOST_SAMPLES = 20_000_000
@@ -51,9 +51,10 @@ class Plan:
 
     n_samples: of the run; of a closed loop the most. lowest, highest: (2,), commands [V] of motor
     and brake; of a closed loop what its controller confines itself to. commands: (n_samples, 2)
-    [V], None in closed loop. references: what a controller will ask for, by column name,
-    (n_samples,) each. remarks: what else a user should know beforehand, a line each. steady: the
-    samples between a rise from zero and a fall to it, of which spectra are stated.
+    [V], None in closed loop. references: what a controller will ask for if nothing holds it up, by
+    column name, (m,) each, m at most n_samples. remarks: what else a user should know beforehand,
+    a line each. steady: the samples between a rise from zero and a fall to it, of which spectra
+    are stated.
     """
 
     n_samples: int
@@ -225,6 +226,10 @@ class ClosedLoop(Experiment):
     ahead: int = Field(
         1, ge=1, le=20, description="ticks from a sample to the command that answers it"
     )
+
+    def preview(self) -> Chart | Heatmap | None:
+        """What ``rig check --plot`` draws where the plan has no references; None for nothing."""
+        return None
 
     @abc.abstractmethod
     def controller(self) -> Controller:

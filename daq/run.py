@@ -83,12 +83,12 @@ def run_experiment(
     planned = plan(experiment, rig_config)
     described = description_of(experiment)
     answering = _Answering(experiment, planned) if isinstance(experiment, ClosedLoop) else None
+    limits = Limits(rig_config)
     capture = Capture.create(
         root,
         name,
         {"experiment": described, "rig": rig_config.model_dump(mode="json")},
     )
-    limits = Limits(rig_config)
     with Stopping() as stopping:
         rig = Rig(device, rig_config)
         run = _Run(experiment, planned, answering, rig, capture, limits, stopping, watch)

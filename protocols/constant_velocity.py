@@ -74,12 +74,22 @@ class ConstantVelocity(VelocityLoop):
     def plan(self) -> Plan:
         """The longest that it can take, the bounds of its commands, and how far the shaft turns."""
         self._check()
-        n_samples = self.samples_in(staircase.longest(self.plateaus, self.drive, self.settling))
+        longest = staircase.longest(self.plateaus, self.drive, self.settling)
+        n_samples = self.samples_in(longest, "measure")
+        velocity, brake = staircase.quickest(
+            self.plateaus, self.drive, self.settling, self.sample_rate
+        )
         return Plan(
             n_samples,
             np.array([-self.motor_limit, min(0.0, *self.brake_commands)]),
             np.array([self.motor_limit, max(0.0, *self.brake_commands)]),
-            remarks=(self._travel(), self._needed()),
+            references={"omega_ref": velocity, "cmd_voltage_brake": brake},
+            remarks=(
+                f"It takes {len(velocity) / self.sample_rate:.4g} s if every velocity settles at "
+                f"once, {longest:.4g} s at most.",
+                self._travel(),
+                self._needed(),
+            ),
         )
 
     def controller(self) -> Controller:
@@ -425,8 +435,10 @@ def _is_there(found: Ripple) -> bool:
 
 def _cyclic(found: Ripple) -> Number:
     reach = 1.96 * found.error
-    low, meaning = 0.0, "torque that recurs with every turn, amplitude: none beyond noise"
-    if _is_there(found):
-        low = found.amplitude - reach
-        meaning = f"torque that recurs {found.periods} times a turn, amplitude"
-    return Number("cyclic", found.amplitude, "N*m", low, found.amplitude + reach, meaning)
+    low, high = found.amplitude - reach, found.amplitude + reach
+    if not _is_there(found):
+        # The strongest of a dozen amplitudes of noise is one of noise: it only bounds what is.
+        meaning = "torque that recurs with every turn, amplitude: none seen above the noise"
+        return Number("cyclic", 0.0, "N*m", 0.0, high, meaning)
+    meaning = f"torque that recurs {found.periods} times a turn, amplitude"
+    return Number("cyclic", found.amplitude, "N*m", low, high, meaning)

@@ -43,12 +43,30 @@ class Prbs(Timed):
         columns = []
         for name in CHANNELS:
             channel: PrbsChannel = getattr(self, name)
-            period = channel.minimum_period
-            hold = whole_samples(f"{name}.minimum_period", period, self.sample_rate)
-            bits = lfsr_bits(channel.seed, math.ceil(n_samples / hold))
+            bits, hold = self._bits(name)
             levels = channel.offset + channel.amplitude * (2.0 * bits - 1.0)
             columns.append(np.repeat(levels, hold)[:n_samples])
         return np.stack(columns, axis=1)
+
+    def remarks(self) -> tuple[str, ...]:
+        """How evenly each channel is at its two levels."""
+        return tuple(self._evenness(name) for name in CHANNELS if getattr(self, name).amplitude)
+
+    def _evenness(self, name: str) -> str:
+        bits, hold = self._bits(name)
+        ends = np.flatnonzero(np.diff(bits, prepend=-1, append=-1))
+        longest = float(np.diff(ends).max()) * hold / self.sample_rate
+        return (
+            f"{name}: {len(bits)} bits, {100.0 * bits.mean():.0f} % of them high; at one level for "
+            f"{longest:.3g} s at most"
+        )
+
+    def _bits(self, name: str) -> tuple[IntArray, int]:
+        """The bits of a channel, and for how many samples each is held."""
+        channel: PrbsChannel = getattr(self, name)
+        period = channel.minimum_period
+        hold = whole_samples(f"{name}.minimum_period", period, self.sample_rate)
+        return lfsr_bits(channel.seed, math.ceil(self.n_samples / hold)), hold
 
 
 def lfsr_bits(seed: int, n: int) -> IntArray:

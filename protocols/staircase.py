@@ -6,12 +6,14 @@ import itertools
 import math
 from dataclasses import dataclass
 
-from pydantic import Field
+import numpy as np
+from pydantic import Field, model_validator
 
 from daq.config.base import Section
 from daq.config.units import Hertz, Percent, RadiansPerSecond, Seconds
 from daq.errors import RunError
 from daq.experiment import Answer, Sample
+from daq.hal import FloatArray
 from protocols.pid import Pid, Ramp, SpeedTracker, VelocityGains
 
 COLUMNS = {"omega_ref": "rad/s", "omega_tracked": "rad/s", "plateau": "1", "settled": "1"}
@@ -29,6 +31,15 @@ class SettlingTest(Section):
         4.0, gt=0.0, le=600.0,
         description="time at a velocity beyond what is measured, after which it is given up",
     )  # fmt: skip
+
+    @model_validator(mode="after")
+    def _possible(self) -> SettlingTest:
+        if self.timeout < self.time:
+            raise ValueError(
+                f"timeout of {self.timeout:g} s is shorter than time, {self.time:g} s: no velocity "
+                "could settle; make it longer"
+            )
+        return self
 
     def band(self, velocity: float) -> float:
         """How far from its reference a settled velocity may be [rad/s]."""
@@ -167,3 +178,21 @@ def longest(plateaus: tuple[Plateau, ...], drive: Drive, settling: SettlingTest)
         + sum(step.measure + settling.timeout for step in plateaus)
         + settling.timeout
     )
+
+
+def quickest(
+    plateaus: tuple[Plateau, ...], drive: Drive, settling: SettlingTest, rate: float
+) -> tuple[FloatArray, FloatArray]:
+    """Reference [rad/s] and brake command [V], (m,) each, where every velocity settles at once."""
+    rest = Plateau(0.0, plateaus[-1].brake, 0.0)
+    velocity, brake, at = [], [], Plateau(0.0, 0.0, 0.0)
+    for step in (*plateaus, rest):
+        turn, pull = step.velocity - at.velocity, step.brake - at.brake
+        ramps = max(abs(turn) / drive.slope, abs(pull) / _BRAKE_SLOPE)
+        time = np.arange(1, round((ramps + settling.time + step.measure) * rate) + 1) / rate
+        velocity.append(at.velocity + np.clip(math.copysign(drive.slope, turn) * time,
+                                              min(turn, 0.0), max(turn, 0.0)))  # fmt: skip
+        brake.append(at.brake + np.clip(math.copysign(_BRAKE_SLOPE, pull) * time,
+                                        min(pull, 0.0), max(pull, 0.0)))  # fmt: skip
+        at = step
+    return np.concatenate(velocity), np.concatenate(brake)

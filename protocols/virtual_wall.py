@@ -85,7 +85,9 @@ class VirtualWall(ClosedLoop):
         "penetration": "rad",
     }  # fmt: skip
 
-    position: Radians = Field(0.2, description="of the wall, from where the shaft is at first")
+    position: Radians = Field(
+        0.2, ge=0.0, le=100.0, description="of the wall, from where the shaft is at first"
+    )
     stiffnesses: list[Stiffness] = Field(
         min_length=1, max_length=100, description="rising; of the walls"
     )
@@ -124,6 +126,7 @@ class VirtualWall(ClosedLoop):
         """The longest that it can take, and what (1.1) says of the grid."""
         if any(b <= a for a, b in zip(self.stiffnesses, self.stiffnesses[1:], strict=False)):
             raise ValueError("stiffnesses: write them rising, so that soft walls come first")
+        self._check_times()
         cell = 2.0 * self.rest.time + self.tap.time + self.ringing.watch
         seconds = self.patience + len(self.cells) * cell + self.rest.time
         return Plan(
@@ -132,6 +135,17 @@ class VirtualWall(ClosedLoop):
             np.array([self.motor_limit, max(0.0, *self.brake_commands)]),
             remarks=tuple(self._bound(brake) for brake in self.brake_commands),
         )
+
+    def preview(self) -> Chart:
+        """The walls that will be tried, beside what theory says of them."""
+        stiff, damped = np.meshgrid(self.stiffnesses, self.dampings)
+        walls = Series("walls to be tried", damped.ravel(), stiff.ravel(), style="points")
+        brake = self.brake_commands[0]
+        return Chart(
+            "walls", f"Walls to be tried, and theory with the brake at {brake:g} V",
+            Axis("damping", "N*m*s/rad"), Axis("stiffness", "N*m/rad"),
+            (walls, *_theory(self, brake)),
+        )  # fmt: skip
 
     def controller(self) -> Controller:
         """The renderer of the walls."""
@@ -159,6 +173,17 @@ class VirtualWall(ClosedLoop):
             self.ahead,
             self.speed_filter,
         )
+
+    def _check_times(self) -> None:
+        """ValueError for times in which too few samples come to tell anything."""
+        shortest = {"rest.time": (self.rest.time, 2), "tap.time": (self.tap.time, 1),
+                    "ringing.watch": (self.ringing.watch, 40)}  # fmt: skip
+        for key, (seconds, least) in shortest.items():
+            if round(seconds * self.sample_rate) < least:
+                raise ValueError(
+                    f"{key}: {seconds:g} s is less than {least} samples at "
+                    f"{self.sample_rate:g} Hz; make it {least / self.sample_rate:.3g} s at least"
+                )
 
     def _bound(self, brake: float) -> str:
         b = self.physical(brake)
@@ -314,6 +339,27 @@ def _visited(
     return visits
 
 
+def _theory(settings: VirtualWall, brake: float) -> tuple[Series, ...]:
+    """Bounds of stability and passivity over the damping."""
+    dampings = np.linspace(min(settings.dampings), max(settings.dampings), 60)
+    most = settings.stiffnesses[-1]
+    lines = []
+    for label, hand in (("stable, handle held", True), ("stable, handle free", False)):
+        loop = settings.loop(brake, hand)
+        bound = np.array([loop.critical_stiffness(d) for d in dampings])
+        lines.append(Series(label, dampings, np.where(bound <= most, bound, math.nan)))
+    b = settings.physical(brake)
+    limit = passive_stiffness(b, 0.0, 1.0 / settings.sample_rate)
+    lines.append(
+        Series(
+            "passive by (1.1)" if brake == 0.0 else "passive by (1.2)",
+            np.array([0.0, b]),
+            np.array([limit, 0.0]),
+        )
+    )
+    return tuple(lines)
+
+
 class _Map:
     """Which walls are stable."""
 
@@ -394,31 +440,12 @@ class _Map:
                 values[place, settings.dampings.index(v.cell.damping)] = 1e3 * shown
         return Heatmap(
             "z_width" if k == 0 else f"z_width_{k + 1}",
-            f"Oscillation of the wall, brake at {brake:g} V",
+            f"Oscillation of the wall, brake at {brake:g} V; it rings above "
+            f"{1e3 * self._limit:.3g} mrad",
             Axis("damping", "N*m*s/rad"), Axis("stiffness", "N*m/rad"), Axis("amplitude", "mrad"),
             np.array(settings.dampings), np.array(settings.stiffnesses), values,
-            self._lines(brake),
+            _theory(settings, brake),
         )  # fmt: skip
-
-    def _lines(self, brake: float) -> tuple[Series, ...]:
-        settings = self._settings
-        dampings = np.linspace(min(settings.dampings), max(settings.dampings), 60)
-        most = settings.stiffnesses[-1]
-        lines = []
-        for label, hand in (("stable, handle held", True), ("stable, handle free", False)):
-            loop = settings.loop(brake, hand)
-            bound = np.array([loop.critical_stiffness(d) for d in dampings])
-            lines.append(Series(label, dampings, np.where(bound <= most, bound, math.nan)))
-        b = settings.physical(brake)
-        limit = passive_stiffness(b, 0.0, 1.0 / settings.sample_rate)
-        lines.append(
-            Series(
-                "passive by (1.1)" if brake == 0.0 else "passive by (1.2)",
-                np.array([0.0, b]),
-                np.array([limit, 0.0]),
-            )
-        )
-        return tuple(lines)
 
     def _remarks(self) -> tuple[str, ...]:
         left = sum(math.isinf(v.amplitude) for v in self._visits)

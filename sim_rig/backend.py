@@ -87,6 +87,11 @@ class Simulation(Section):
     )
     encoder_cycles: int = Field(2048, ge=1, description="cycles per revolution")
 
+    @property
+    def cable(self) -> bool:
+        """Whether what hangs on the shaft has a cable that can be wound off."""
+        return self.plant.load == "pulley"
+
     @field_validator("hand")
     @classmethod
     def _forwards(cls, path: list[tuple[float, float]]) -> list[tuple[float, float]]:

@@ -10,11 +10,13 @@ from typing import Any
 import numpy as np
 
 from daq import capture
+from daq.asking import preview_of
 from daq.cli import console
 from daq.cli.running import plan_of
 from daq.config.rig import RigConfig
 from daq.errors import ConfigError, RunError
 from daq.experiment import ClosedLoop, Experiment, Plan
+from daq.findings import Chart, Heatmap
 from daq.hal import CHANNELS, FloatArray
 from daq.log import UNITS
 
@@ -226,9 +228,14 @@ def _bars(frequency: FloatArray, sizes: FloatArray) -> str:
     return "".join(_BARS[int(step)] for step in np.clip(steps, 0, len(_BARS) - 1))
 
 
+def _preview(settings: Experiment) -> Chart | Heatmap | None:
+    return preview_of(settings) if isinstance(settings, ClosedLoop) else None
+
+
 def _draw(planned: Plan, settings: Experiment, units: dict[str, str], path: Path) -> None:
-    """Waveforms and spectra, or a closed loop's references, in a figure at a path."""
+    """Waveforms and spectra, or what a closed loop can show, in a figure at a path."""
     from daq.figures import style
+    from daq.figures.findings import draw
     from daq.figures.plans import Waveform, planned_commands, planned_references
 
     kind = style.format_of(path)
@@ -240,11 +247,15 @@ def _draw(planned: Plan, settings: Experiment, units: dict[str, str], path: Path
             channels.append(Waveform(name, column, sizes))
         drawn = planned_commands(time, frequency, channels)
     elif planned.references:
-        drawn = planned_references(time, planned.references, units)
+        m = max(map(len, planned.references.values()))
+        drawn = planned_references(time[:m], planned.references, units)
+    elif (preview := _preview(settings)) is not None:
+        drawn = draw(preview)
     else:
         raise ConfigError(
             f"--plot {path}: {settings.protocol} says nothing beforehand of what its controller "
-            "will ask for, so there is nothing to draw; leave --plot out"
+            "will ask for, so there is nothing to draw; leave --plot out, or give the plan "
+            "'references' or the protocol a method 'preview'"
         )
     try:
         capture.write_whole(path, style.render(drawn, kind))

@@ -244,8 +244,21 @@ def load_rig(name: str, options: Mapping[str, Any] | None = None) -> tuple[RigCo
     _tell(file, f"backend {backend_name}", backend)
     for index, own in enumerate(config.limits.own):
         own._make = _limit_maker(file, own, ("limits", "own", index))
+    config = _with_fitting_limits(config)
     device: Device = backend(config.options)
     return config, device
+
+
+def _with_fitting_limits(config: RigConfig) -> RigConfig:
+    """Without the limit of a cable where the simulated plant has none."""
+    least = config.limits.winding
+    if least is None or getattr(config.options, "cable", True):
+        return config
+    console.report_note(
+        f"limits.winding of {least:g} turns is left out: options.plant.load is without a cable"
+    )
+    limits = config.limits.model_copy(update={"winding": None})
+    return config.model_copy(update={"limits": limits})
 
 
 def _limit_maker(file: YamlFile, own: OwnLimit, key: Key) -> Callable[[], Limit]:

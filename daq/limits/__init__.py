@@ -12,8 +12,8 @@ import dataclasses
 from collections.abc import Iterator
 
 from daq.asking import MISTAKES, place
-from daq.config.rig import RigConfig
-from daq.errors import RigError, RunError
+from daq.config.rig import OwnLimit, RigConfig
+from daq.errors import ConfigError, RigError, RunError
 from daq.hal import Flag, Phase, Samples
 from daq.limits.base import Limit, Trip
 from daq.limits.load import DeviceFound, I2t, Magnitude
@@ -27,7 +27,7 @@ class Limits:
     """All limits of a rig, asked together."""
 
     def __init__(self, config: RigConfig) -> None:
-        own = [_Named(item.make()) for item in config.limits.own]
+        own = [_Named(_made(item)) for item in config.limits.own]
         self._limits: list[Limit] = [*_built_in(config), *own]
 
     def begin(self, phase: Phase, sample_rate: float) -> None:
@@ -48,6 +48,19 @@ class Limits:
             if trip is not None and (first is None or trip[0] < first[0]):
                 first = trip
         return first
+
+
+def _made(item: OwnLimit) -> Limit:
+    """A user's own limit. Raises ConfigError for a mistake in its constructor."""
+    try:
+        made: Limit = item.make()
+    except RigError:
+        raise
+    except MISTAKES as error:
+        raise ConfigError(
+            f"limits.own: {item.use} cannot be made: {type(error).__name__}: {error}"
+        ) from error
+    return made
 
 
 def _built_in(config: RigConfig) -> list[Limit]:

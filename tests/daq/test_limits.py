@@ -8,7 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from daq.cli.files import load_rig
 from daq.config.rig import RigConfig
+from daq.errors import ConfigError
 from daq.hal import Flag, Mode, Phase, Samples
 from daq.limits import Limits
 from daq.limits.load import i2t_levels
@@ -257,3 +259,24 @@ def test_commands_follow_no_faster_than_the_slew():
     np.testing.assert_allclose(played.cmd_voltage_motor, commands[:, 0])
     clamped = (played.flags & int(Flag.CLAMPED)) != 0
     np.testing.assert_array_equal(clamped, ~np.isclose(expected, commands[:, 0]))
+
+
+def test_a_cables_limit_is_left_out_where_the_plant_has_no_cable(capsys):
+    config, _ = load_rig("simulated.yaml", {"plant": {"load": "free"}})
+    assert config.limits.winding is None
+    assert "limits.winding of 0.25 turns is left out" in capsys.readouterr().err
+    config, _ = load_rig("simulated.yaml")
+    assert config.limits.winding == 0.25 and not capsys.readouterr().err
+
+
+def test_a_limit_of_ones_own_that_cannot_be_made_is_told_before_the_run(tmp_path):
+    (tmp_path / "own.py").write_text(
+        "from daq.limits import Limit\n\n\nclass Own(Limit):\n"
+        "    def __init__(self):\n        self.a = {}['a']\n\n"
+        "    def check(self, samples):\n        return None\n"
+    )
+    path = tmp_path / "rig.yaml"
+    path.write_text("backend: simulated\nlimits: {own: [{use: own.py:Own}]}\n")
+    config, _ = load_rig(str(path))
+    with pytest.raises(ConfigError, match=r"own\.py:Own cannot be made: KeyError: 'a'"):
+        Limits(config)

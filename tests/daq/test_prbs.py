@@ -133,6 +133,13 @@ def test_the_shipped_file_is_the_thesiss_experiment():
     assert shipped.brake.model_dump() == {
         "amplitude": 0.07, "offset": 0.07, "minimum_period": 0.05, "seed": 5,
     }  # fmt: skip
+    motor, brake = shipped.plan().remarks
+    assert motor.startswith("motor: 250 bits, 46 % of them high")
+    levels = shipped.waveform()[:, 1]
+    longest = max(len(part) for part in np.split(levels, np.flatnonzero(np.diff(levels)) + 1))
+    assert brake == (
+        f"brake: 25 bits, 12 % of them high; at one level for {longest / 800:.3g} s at most"
+    )
     assert shipped.homing.turns == 5 and shipped.calibration.samples >= 100
 
 

@@ -69,7 +69,8 @@ def test_the_torque_of_every_plateau_is_the_plants(between):
 
 def test_noise_is_not_called_a_ripple(between):
     cyclic = numbers(between[3])["cyclic"]
-    assert cyclic.low == 0.0 and "none beyond noise" in cyclic.meaning
+    assert cyclic.low == cyclic.value == 0.0 and "none seen above" in cyclic.meaning
+    assert 0.0 < cyclic.high < 2.5e-3, "what there could be all the same"
 
 
 def test_ranges_hold_the_truth_and_name_what_the_model_has(between):
@@ -360,18 +361,38 @@ def test_a_ripple_is_told_from_noise():
         ({"brake_commands": [0.2]}, r"brake_commands: at 0\.2 V the brake takes about 5\.1 V"),
         ({"brake_commands": [-0.1]}, r"brake: the plan asks"),
         ({"motor_limit": 6}, r"motor: the plan asks up to 6 V"),
-        ({"measure": 3600, "sample_rate": 20000}, "samples"),
+        ({"measure": 3600, "sample_rate": 20000}, "^measure: .* samples"),
+        ({"velocities": [160]}, r"omega_ref: the plan asks for 160 rad/s"),
     ],
 )
 def test_what_cannot_be_is_refused_before_anything_moves(changes, message):
     with pytest.raises(ConfigError, match=message):
-        plan(experiment(**changes), RigConfig())
+        plan(experiment(**changes), RigConfig.model_validate({"limits": {"speed": 150}}))
+
+
+def test_a_settling_that_has_no_time_is_refused():
+    with pytest.raises(ValueError, match=r"timeout of 0\.1 s is shorter than time, 0.5 s"):
+        experiment(settling={"timeout": 0.1})
+
+
+def test_the_plan_draws_the_staircase_where_every_velocity_settles_at_once():
+    settings = experiment(velocities=[10, -5], brake_commands=[0, 0.1], slope=50, measure=2)
+    planned = plan(settings, RigConfig())
+    velocity, brake = planned.references["omega_ref"], planned.references["cmd_voltage_brake"]
+    # Ramps of 0.2, 0.3, 0.3, 0.3 and 0.1 s; four plateaus of 0.5 + 2 s, and 0.5 s at rest.
+    assert len(velocity) == len(brake) == pytest.approx(800 * (1.2 + 4 * 2.5 + 0.5), abs=5)
+    assert len(velocity) < planned.n_samples
+    assert np.abs(np.diff(velocity, prepend=0.0)).max() <= 50 / 800 * (1.0 + 1e-9)
+    held = [np.count_nonzero((velocity == v) & (brake == b)) for b in (0, 0.1) for v in (10, -5)]
+    assert min(held) >= 2.5 * 800 - 2
+    assert velocity[-1] == 0.0 and brake[-1] == pytest.approx(0.1)
+    assert planned.remarks[0].startswith(f"It takes {len(velocity) / 800:.4g} s if")
 
 
 def test_the_plan_says_how_far_the_shaft_turns_and_what_the_brake_takes():
     planned = plan(experiment(), RigConfig())
-    travel, needed = planned.remarks
+    _, travel, needed = planned.remarks
     assert "turns in all" in travel and "take the load off" in travel
     assert "3.03 V" in needed
     unknown = plan(experiment(ratings={"brake_constant": None}), RigConfig())
-    assert "not known" in unknown.remarks[1]
+    assert "not known" in unknown.remarks[2]

@@ -14,17 +14,18 @@ from daq.plugins import installed
 
 DOCS = Path(protocols.__file__).parents[1] / "docs" / "protocols"
 TEXT = (DOCS / "README.md").read_text()
+OWN = (DOCS.parent / "own-protocol.md").read_text()
 BLOCK = r"```\w+\n(.*?)```"
 
 
 def test_examples_of_own_protocols_run_as_written(tmp_path, command):
-    files = re.findall(rf"<!-- file: (\S+) -->\n{BLOCK}", TEXT, re.DOTALL)
+    files = re.findall(rf"<!-- file: (\S+) -->\n{BLOCK}", OWN, re.DOTALL)
     assert {name for name, _ in files} == {
         "square.py", "square.yaml", "angle_step.py", "angle_step.yaml"
     }  # fmt: skip
     for name, content in files:
         (tmp_path / name).write_text(content)
-    commands = "\n".join(re.findall(rf"<!-- commands -->\n{BLOCK}", TEXT, re.DOTALL)).split("\n")
+    commands = "\n".join(re.findall(rf"<!-- commands -->\n{BLOCK}", OWN, re.DOTALL)).split("\n")
     for line in filter(None, commands):
         program, *arguments = shlex.split(line)
         assert program == "rig"

@@ -159,6 +159,10 @@ def test_the_plan_says_what_is_passive_before_anything_moves():
     without, with_brake = plan(settings, RigConfig()).remarks
     # 2 (b - B) / T: 3.2 and 1.6 N*m/rad without the brake, 4.8 and 3.2 with its 0.001 more.
     assert "(1.1)" in without and "K = 3.2 N*m/rad" in without and "3 of the 6" in without
+    drawn = settings.preview()
+    walls, held, free, passive = drawn.series
+    assert len(walls.x) == 6 and walls.style == "points"
+    assert (held.y >= free.y)[np.isfinite(held.y)].all() and passive.y[0] == pytest.approx(3.2)
     assert "(1.2)" in with_brake and "K = 4.8 N*m/rad" in with_brake and "5 of the 6" in with_brake
 
 
@@ -167,6 +171,8 @@ def test_the_plan_says_what_is_passive_before_anything_moves():
     [
         ({"stiffnesses": [2, 1]}, "stiffnesses: write them rising"),
         ({"brake_commands": [0.5]}, "brake: the plan asks"),
+        ({"ringing": {"watch": 0.01}}, "ringing.watch: 0.01 s is less than 40 samples"),
+        ({"tap": {"time": 1e-6}}, "tap.time: 1e-06 s is less than 1 samples"),
     ],
 )
 def test_what_cannot_be_is_refused(changes, message):
