@@ -65,14 +65,14 @@ def bode(
         look = {"color": style.CYCLE[(1, 0, 2, 3)[k % 4]], "ls": style.DASHES[k % 4]}
         size.plot(frequency, np.abs(response), label=name, **look)  # type: ignore[arg-type]
         angle.plot(frequency, _degrees(response), **look)  # type: ignore[arg-type]
-    style.logarithmic(size.xaxis, frequency)
     limits = _limits(magnitude, good, curves)
-    style.logarithmic(size.yaxis, np.array(limits))
     size.set_ylim(*limits)
+    style.logarithmic(size.yaxis, np.array(limits))
     angle.set_ylim(-190, 190)
     angle.set_yticks([-180, -90, 0, 90, 180])
     seen.plot(frequency, measured.coherence, color=style.MEASURED, lw=0.8)
     seen.set_ylim(-0.05, 1.05)
+    style.logarithmic(seen.xaxis, frequency)
     seen.set_xlabel("frequency [Hz]")
     style.name_y(size, "magnitude", f"[{_ratio(*units)}]")
     style.name_y(angle, "phase", "[°]")

@@ -71,8 +71,8 @@ def _lines(panel: Axes, frequency: FloatArray, channel: Waveform) -> None:
     style.name_y(panel, f"{channel.name} amplitude", "[V]")
     if largest == 0.0:
         panel.set_yticks([])
-        style.logarithmic(panel.xaxis, frequency)
         panel.set_xlim(0.9 * frequency[0], 1.1 * frequency[-1])
+        style.logarithmic(panel.xaxis, frequency)
         panel.text(0.5, 0.5, "held", ha="center", va="center", transform=panel.transAxes)
         return
     floor = _DEEPEST * largest
@@ -83,10 +83,10 @@ def _lines(panel: Axes, frequency: FloatArray, channel: Waveform) -> None:
         panel.plot(frequency[there], channel.lines[there], "o", ms=1.6, color=style.BASELINE)
     else:
         panel.plot(frequency, np.maximum(channel.lines, floor), color=style.BASELINE, lw=0.6)
-    style.logarithmic(panel.yaxis, np.array([floor, largest]))
-    style.logarithmic(panel.xaxis, frequency)
     panel.set_ylim(floor, 2.0 * largest)
     panel.set_xlim(0.9 * frequency[0], 1.1 * frequency[-1])
+    style.logarithmic(panel.yaxis, np.array([floor, largest]))
+    style.logarithmic(panel.xaxis, frequency)
 
 
 def _common(panels: Sequence[Axes], label: str) -> None:

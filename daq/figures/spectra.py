@@ -29,12 +29,12 @@ def spectra(frequency: FloatArray, signals: Sequence[Spectrum]) -> Figure:
     figure, panels = style.stack([0.75] * len(signals), 0.13, top=0.1)
     for panel, signal in zip(panels, signals, strict=True):
         panel.plot(frequency, signal.density, color=style.MEASURED)
+        panel.margins(x=0.01)
         style.logarithmic(panel.yaxis, signal.density)
-        style.logarithmic(panel.xaxis, frequency)
         unit = notation.unit_text(signal.unit) or "1"
         squared = f"({unit})²" if any(sign in unit for sign in "·/") else f"{unit}²"
         style.name_y(panel, notation.words(signal.name), f"[{squared}/Hz]")
         panel.grid(visible=True, which="major")
-        panel.margins(x=0.01)
+    style.logarithmic(panels[-1].xaxis, frequency)
     panels[-1].set_xlabel("frequency [Hz]")
     return figure
