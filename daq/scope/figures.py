@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -37,7 +37,7 @@ _FLAG_COLORS = {
 }
 _CALM = 0.03  # of a column's span that a stretch may cover and still be drawn as broad: 3 pixels
 _MARGIN, _FILLED = 0.06, 0.7  # parts of a figure's height: free at each end, filled at least
-_GRAVE = Flag.LOST | Flag.INTERLOCK | Flag.UNDERFLOW  # marked across all figures
+_GRAVE = ("lost", "interlock", "underflow")  # marked across all figures
 
 
 @dataclass(frozen=True)
@@ -55,11 +55,11 @@ class Curve:
 
 @dataclass(frozen=True)
 class Sources:
-    """What the figures draw: samples, where flags stand, and the grave ones of these."""
+    """What the figures draw: samples, where flags stand, and lines across all figures."""
 
     samples: ColumnDataSource
     flags: ColumnDataSource
-    grave: ColumnDataSource
+    lines: ColumnDataSource
 
     @classmethod
     def empty(cls) -> Sources:
@@ -67,7 +67,7 @@ class Sources:
         return cls(
             ColumnDataSource({"t": []}, name="samples"),
             ColumnDataSource({"time": [], "flag": [], "color": []}, name="flags"),
-            ColumnDataSource({"time": []}, name="grave"),
+            ColumnDataSource({"time": [], "color": [], "dash": []}, name="lines"),
         )
 
 
@@ -87,8 +87,8 @@ def curves_of(columns: Sequence[str]) -> list[list[Curve]]:
 
 def make_figures(
     columns: Sequence[str], sources: Sources, time: Range1d
-) -> tuple[Any, list[figure], list[Span]]:
-    """The figures in a grid with one toolbar, each by itself, and their lines for a mark."""
+) -> tuple[Any, list[figure]]:
+    """The figures in a grid with one toolbar, and each by itself."""
     cursor = Span(dimension="height", line_color=GREY, line_dash="dotted")
     plots = [_curve_figure(curves, sources, time, cursor) for curves in curves_of(columns)]
     if "flags" in columns:
@@ -98,16 +98,15 @@ def make_figures(
     last.height = (last.height or 0) + 45
     for plot in plots[:-1]:
         plot.below = []  # an axis that is only invisible is measured and placed all the same
-    marks = []
     for plot in plots:
-        mark = Span(dimension="height", line_color="black", line_dash="dashed", visible=False)
-        plot.add_layout(mark)
-        marks.append(mark)
+        plot.vspan(
+            x="time", source=sources.lines, line_color="color", line_dash="dash", line_alpha=0.7
+        )
     grid = gridplot(
         [[plot] for plot in plots], merge_tools=True, toolbar_location="above",
         sizing_mode="stretch_width", toolbar_options={"logo": None},
     )  # fmt: skip
-    return grid, plots, marks
+    return grid, plots
 
 
 def fit(plot: figure, sources: Sources) -> None:
@@ -184,18 +183,29 @@ def flag_name(flag: Flag) -> str:
     return str(flag.name).lower()
 
 
-def flag_marks(view: View) -> tuple[dict[str, list[Any]], dict[str, list[Any]]]:
-    """Where which flag stands, and where one of the grave ones does."""
+def flag_marks(view: View) -> dict[str, list[Any]]:
+    """Where which flag stands."""
     marks: dict[str, list[Any]] = {"time": [], "flag": [], "color": []}
-    time, flags = view.time, view.flags
-    if not flags.any():
-        return marks, {"time": []}
+    if not view.flags.any():
+        return marks
     for flag, color in _FLAG_COLORS.items():
-        at = time[(flags & int(flag)) != 0].tolist()
+        at = view.time[(view.flags & int(flag)) != 0].tolist()
         marks["time"] += at
         marks["flag"] += [flag_name(flag)] * len(at)
         marks["color"] += [color] * len(at)
-    return marks, {"time": time[(flags & int(_GRAVE)) != 0].tolist()}
+    return marks
+
+
+def lines_at(flags: Mapping[str, Any], mark: float | None) -> dict[str, list[Any]]:
+    """Lines across all figures: where a grave flag stands, and at the mark that was set."""
+    flagged = zip(flags["time"], flags["flag"], strict=True)
+    grave = sorted({time for time, name in flagged if name in _GRAVE})
+    marks = [] if mark is None else [mark]
+    return {
+        "time": [*grave, *marks],
+        "color": [RED] * len(grave) + ["black"] * len(marks),
+        "dash": ["solid"] * len(grave) + ["dashed"] * len(marks),
+    }
 
 
 def _quantity(name: str) -> str:
@@ -207,14 +217,13 @@ def _curve_figure(curves: Sequence[Curve], sources: Sources, time: Range1d, curs
     unit = UNITS.get(curves[-1].name)
     label = _quantity(curves[-1].name).replace("_", " ")
     plot.yaxis.axis_label = label + (f"\n[{unit}]" if unit else "")
-    plot.yaxis.ticker = BasicTicker(desired_num_ticks=3)
+    plot.yaxis.ticker = BasicTicker(desired_num_ticks=4)  # with three there may be but one
     for curve in curves:
         if curve.wanted:
             _draw(plot, sources, curve, broad_name(curve.name), 3.0)
         # A line of one pixel costs a browser without a graphics card a tenth of one of 1.2 pixels.
         _draw(plot, sources, curve, curve.name, 1.0)
     plot.name, plot.tags = f"figure of {label}", [curve.name for curve in curves]
-    plot.vspan(x="time", source=sources.grave, line_color=RED, line_alpha=0.6)
     return plot
 
 

@@ -12,7 +12,6 @@ from bokeh.document import Document
 from bokeh.events import DoubleTap, MouseLeave, MouseMove, RangesUpdate, Reset, Tap
 from bokeh.layouts import column, row
 from bokeh.models import ColumnDataSource, Range1d
-from bokeh.models.annotations import Span
 from bokeh.models.widgets import Button, Div, RadioButtonGroup
 from bokeh.plotting import figure
 
@@ -23,6 +22,7 @@ from daq.scope.figures import (
     as_data,
     fit,
     flag_marks,
+    lines_at,
     make_figures,
     make_value_table,
     points_of,
@@ -31,7 +31,7 @@ from daq.scope.history import History, View, nothing, step_for
 from daq.scope.recordings import Recording, Watch
 from daq.scope.wording import FAILED, HELP, VALUE_FIELDS, heading, readout
 
-PERIOD = 33  # ms between updates: 30 a second
+PERIOD = 30  # ms between updates: 30 a second and some, for no timer is exact
 _POINTS = 500  # stretches drawn at least over the width of the page
 _WINDOWS: tuple[tuple[str, float | None], ...] = (
     ("2 s", 2.0), ("10 s", 10.0), ("60 s", 60.0), ("whole run", None),
@@ -70,7 +70,6 @@ class Page:
         self._sources = Sources.empty()
         self._time = Range1d(start=0.0, end=1.0, name="time")
         self._plots: list[figure] = []
-        self._mark_lines: list[Span] = []
         self._head = Div(name="head", sizing_mode="stretch_width")
         self._values = ColumnDataSource({name: [] for name in VALUE_FIELDS}, name="values")
         # The browser copies the number of an update when it has come to it.
@@ -184,8 +183,7 @@ class Page:
         self._drawn_end = view.end
         self._sources.samples.data = as_data(self._columns, view, spread)
         self._fit()
-        marks, grave = flag_marks(view)
-        self._sources.flags.data, self._sources.grave.data = {**marks}, {**grave}
+        self._mark_flags(flag_marks(view))
 
     def _append(self, view: View, spread: FloatArray, rows: int | None, start: float) -> None:
         """Add to what is drawn; of the samples keep ``rows``, of the flags those from ``start``."""
@@ -193,14 +191,18 @@ class Page:
         keep = None if rows is None else points_of(view) * (rows // view.step + 2)
         self._sources.samples.stream(as_data(self._columns, view, spread), rollover=keep)
         self._fit()
-        drawn = (self._sources.flags, self._sources.grave)
-        for source, new in zip(drawn, flag_marks(view), strict=True):
-            kept = np.asarray(source.data["time"]) >= start
-            if new["time"] or not kept.all():
-                source.data = {
-                    name: [*np.asarray(source.data[name])[kept].tolist(), *values]
-                    for name, values in new.items()
-                }
+        drawn, new = self._sources.flags.data, flag_marks(view)
+        kept = np.asarray(drawn["time"]) >= start
+        if new["time"] or not kept.all():
+            self._mark_flags({k: [*np.asarray(drawn[k])[kept].tolist(), *new[k]] for k in new})
+
+    def _mark_flags(self, flags: dict[str, list[Any]]) -> None:
+        self._sources.flags.data = {**flags}
+        self._draw_lines()
+
+    def _draw_lines(self) -> None:
+        flags: Any = self._sources.flags.data
+        self._sources.lines.data = {**lines_at(flags, self._mark)}
 
     def _fit(self) -> None:
         for plot in self._plots:
@@ -214,7 +216,7 @@ class Page:
     def _make_figures(self, columns: tuple[str, ...]) -> None:
         self._columns, self._plots = columns, []
         self._clear()
-        grid, self._plots, self._mark_lines = make_figures(columns, self._sources, self._time)
+        grid, self._plots = make_figures(columns, self._sources, self._time)
         for plot in self._plots:
             plot.on_event(RangesUpdate, self._zoom)
             plot.on_event(Reset, lambda event: self._follow())
@@ -274,5 +276,4 @@ class Page:
 
     def _set_mark(self, at: float | None) -> None:
         self._mark = at
-        for line in self._mark_lines:
-            line.update(location=at, visible=at is not None)
+        self._draw_lines()

@@ -207,6 +207,7 @@ def test_a_finished_run_is_shown_whole_and_magnified_to_its_samples(scope, tmp_p
     assert 9.0 < tab.height("torque")[1] < 11.0
     times, names = tab.flags()
     assert names == ["lost", "saturated"]
+    assert tab.model("lines", "[m.data.time, m.data.color]") == [[times[0]], ["#D55E00"]]
     assert times == pytest.approx([60_000 / RATE, 30_000 / RATE], abs=0.2)
 
     canvas = tab.canvas()
@@ -246,6 +247,7 @@ def test_the_values_are_those_under_the_cursor_and_from_the_mark(scope, tmp_path
     until(lambda: "at the cursor" in tab.values().values(), "the cursor")
     marked = int(tab.values()["tick"])
     assert 300 < marked < 500
+    assert tab.model("lines", "m.data.time") == pytest.approx([marked / RATE], abs=1 / RATE)
     ActionChains(tab.driver).move_to_element_with_offset(canvas, 100, 0).perform()
     until(lambda: int(tab.values()["tick"]) > marked + 10, "the cursor elsewhere")
     row = int(tab.values()["tick"])
