@@ -136,7 +136,18 @@ WithReport = Annotated[
     bool,
     typer.Option("--report/--no-report", help="Write report.html with its figures as well."),
 ]
+Version = Annotated[bool, typer.Option("--version", help="Print the version and exit.")]
 AsJson = Annotated[bool, typer.Option("--json", help="One JSON document on standard output.")]
+
+
+@app.callback(invoke_without_command=True)
+def program(version: Version = False) -> None:
+    """Nothing but its version, without a command."""
+    if version:
+        from importlib.metadata import version as installed
+
+        print(f"hybrid-rig {installed('hybrid-rig')}")
+        raise typer.Exit
 
 
 @app.command(epilog="Example:  rig run prbs.yaml --identify")
@@ -181,7 +192,10 @@ def check(
     ] = None,
     json: AsJson = False,
 ) -> None:
-    """Check an experiment against a rig's limits and say what it will do; energises nothing."""
+    """Say what an experiment will do, and energise nothing.
+
+    It is checked against the rig's limits as before a run: duration, peaks, spectrum.
+    """
     from daq.cli.checking import check_command
 
     check_command(experiment, rig, port, plot, json)
@@ -192,7 +206,10 @@ def analyse(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="Capture folder.")],
     json: AsJson = False,
 ) -> None:
-    """Conclude from a run's log what its protocol concludes: tables, figures, numbers."""
+    """Conclude from a log what its protocol is for.
+
+    Tables, figures and numbers, as at the end of the run; for a log of whatever age.
+    """
     from daq.cli.analysing import analyse_command
 
     analyse_command(run, json)
@@ -252,10 +269,10 @@ def identify(
     report: WithReport = True,
     json: AsJson = False,
 ) -> None:
-    """Identify a model's parameters from logs: one parameter set for all of them.
+    """Identify a model's parameters from one or more logs.
 
-    Several models, or linear ones, are ranked: which explains the validation data best, by more
-    than chance, and with how many parameters.
+    All logs together have one parameter set. Several models, or linear ones, are ranked: which
+    explains the validation data best, by more than chance, and with how many parameters.
     """
     if resume is not None:
         others = (
@@ -324,7 +341,10 @@ def campaign(
     dask: Dask = None,
     json: AsJson = False,
 ) -> None:
-    """Identify every log with every model and seed, over all cores or a dask cluster."""
+    """Identify every log with every model and seed.
+
+    Runs over all cores, or a dask cluster.
+    """
     from daq.cli.campaigning import Workers, campaign_command
 
     options = {
@@ -369,7 +389,10 @@ def replay(
     ] = None,
     json: AsJson = False,
 ) -> None:
-    """Simulate a log's applied commands and measured load, and say how close the outputs are."""
+    """Simulate a log's commands, and say how well that fits it.
+
+    The model is given the applied commands and the measured load torque, never the outputs.
+    """
     from daq.cli.replaying import replay_command
 
     replay_command(log, rig, parameters, config, figure, fail_under or [], json)
@@ -390,7 +413,7 @@ def figures(
     ] = None,
     json: AsJson = False,
 ) -> None:
-    """Draw the figures of an identification's report for papers and slides."""
+    """Draw an identification's figures for papers and slides."""
     from daq.cli.redrawing import figures_command
 
     figures_command(run, kinds or ["pdf", "png"], out, json)
@@ -421,7 +444,7 @@ def init(
     ] = "simulated",
     json: AsJson = False,
 ) -> None:
-    """Write a commented experiment, rig and identification file to begin with.
+    """Write commented YAML files to begin with.
 
     What is there already stays as it is. Editors complete and check the files by the JSON Schemas
     written beside them.
@@ -444,7 +467,10 @@ def schema(
     ] = None,
     json: AsJson = False,
 ) -> None:
-    """Write JSON Schemas of all kinds of YAML, for the installed protocols and backends."""
+    """Write JSON Schemas of the YAML files, for editors.
+
+    They know the installed protocols and backends.
+    """
     from daq.cli.reference import write_reference
     from daq.cli.schemas import schema_command
 
@@ -464,7 +490,10 @@ def models(
     ] = None,
     json: AsJson = False,
 ) -> None:
-    """List the installed process models, or one with its states, signals and parameters."""
+    """List the installed models, or describe one.
+
+    With its states, signals, parameters, units, ranges and options.
+    """
     from daq.cli.modelling import models_command
 
     models_command(name, json)
@@ -503,9 +532,10 @@ def emulate(
     ] = None,
     json: AsJson = False,
 ) -> None:
-    """Put the simulated rig behind the serial protocol, in real time, until Ctrl-C.
+    """Put the simulated rig behind the serial protocol.
 
-    Prints the port that rig run --rig serial.yaml --port takes.
+    It serves in real time until Ctrl-C, and prints the port that rig run --rig serial.yaml --port
+    takes.
     """
     from daq.cli.emulating import emulate_command
 
@@ -532,7 +562,7 @@ def scope(
     ] = True,
     json: AsJson = False,
 ) -> None:
-    """Show a run while it is recorded, or afterwards, on a page of this machine."""
+    """Show a run in the browser, also while it is recorded."""
     from daq.cli.scoping import scope_command
 
     scope_command(run, out, port, browser, json)
@@ -567,7 +597,10 @@ def doctor(
     ] = Path("runs"),
     json: AsJson = False,
 ) -> None:
-    """Check whether this computer suits a rig in real time, with a cure for what does not."""
+    """Check whether this computer suits a rig in real time.
+
+    What does not is told with its cure.
+    """
     from daq.cli.doctor import doctor_command
 
     doctor_command(names or [], out, json)

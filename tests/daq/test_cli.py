@@ -25,6 +25,7 @@ from tests.daq.support import (
 )
 from tests.daq.test_bad_input import MODEL
 
+PROJECT = Path(__file__).parents[2] / "pyproject.toml"
 COMMANDS = ("run", "check", "identify", "figures", "campaign", "replay", "models", "scope")
 
 
@@ -66,6 +67,8 @@ def test_the_installed_command_is_the_module(tmp_path):
         check=True,
     )  # fmt: skip
     assert installed.stdout == rig("models", cwd=tmp_path).stdout
+    version = re.search(r'^version = "(.+)"', PROJECT.read_text(), re.M)[1]
+    assert rig("--version", cwd=tmp_path).stdout == f"hybrid-rig {version}\n"
 
 
 # --- JSON ---------------------------------------------------------------------------------
