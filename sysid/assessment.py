@@ -25,6 +25,9 @@ _EXACT = 99.0  # fit [%] above which an error several times as large is still a 
 # Correlation with an input below which what is left is found in long records, but is nothing to
 # mend: one per cent of the residuals' variance.
 _NOTICEABLE = 0.1
+# Of an output's variance, beyond which what a model leaves may have moved its parameters, and share
+# of the autocorrelations inside their band, below which it is no noise of that output's sensor.
+_MUCH, _WANDERS = 0.05, 0.25
 
 
 @dataclass(frozen=True)
@@ -87,6 +90,7 @@ def judge(
     if not validation:
         light.append("No data were held back for validation: the errors are those of the fit.")
     light += _left_over(model, validation or training)
+    light += _wandering(model, validation or training)
     if uncertainty is not None:
         light += _open(uncertainty)
     if grave:
@@ -138,6 +142,22 @@ def _left_over(model: ProcessModel, results: Sequence[RecordResult]) -> list[str
             found.append(
                 f"Residuals of {output} still follow {' and '.join(follows)}: the model lacks "
                 "dynamics there."
+            )
+    return found
+
+
+def _wandering(model: ProcessModel, results: Sequence[RecordResult]) -> list[str]:
+    """Outputs of which much is left that has a memory: it has hidden in the parameters as well."""
+    fits = mean_known(np.array([result.metrics.fit for result in results]), 0)
+    shares = np.mean([result.residuals.white for result in results], axis=0)
+    found = []
+    for output, fit, share in zip(model.output_names, fits, shares, strict=True):
+        left = (1.0 - fit / 100.0) ** 2
+        if left > _MUCH and share < _WANDERS:
+            found.append(
+                f"{100.0 * left:.0f} % of {output}'s variance is left, and wanders: noise of "
+                "a measured input that came through the plant, or dynamics that the model lacks. "
+                "Parameters that act on it may be off by more than their intervals."
             )
     return found
 

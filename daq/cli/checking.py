@@ -78,7 +78,10 @@ def check_command(
     if planned.commands is not None:
         console.print_line(f"Frequency resolution: {_resolution(planned, settings):.4g} Hz")
     console.print_line(_before(settings))
+    # What concludes something itself was not meant to excite everything.
+    excites = type(settings).findings is Experiment.findings
     console.print_line(
+        "It concludes by itself: results stand in the run's folder." if not excites else
         "With --identify a validation run follows." if validation else
         "It has no 'validation' section: rig run --identify will identify without validation."
     )  # fmt: skip
@@ -86,7 +89,7 @@ def check_command(
         console.print_line(f"Figure: {plot}")
     on = f" --rig {rig}" if rig is not None else ""
     on += f" --port {port}" if port is not None else ""
-    identify = " --identify" if validation else ""
+    identify = " --identify" if validation and excites else ""
     console.print_next(f"rig run {experiment}{on}{identify}")
 
 

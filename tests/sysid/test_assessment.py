@@ -222,3 +222,25 @@ def test_a_free_run_that_fails_is_no_proof_of_anything():
         found = verdict(validation=validation)
         assert found.trust == "poor"
         assert "failing" in found.reasons[0] and "cannot be simulated" in found.reasons[0]
+
+
+@pytest.mark.parametrize(
+    ("size", "pole", "trust"),
+    [(0.4, 0.98, "limited"), (0.4, 0.0, "good"), (0.15, 0.98, "good")],
+    ids=["much that wanders", "much that is white", "little that wanders"],
+)
+def test_much_that_wanders_makes_parameters_doubtful(size, pole, trust):
+    def slow(seed):
+        data = record(seed)
+        noise = np.random.default_rng([seed, 3]).standard_normal((N, 2))
+        wrong = lfilter([1.0], [1.0, -pole], noise, axis=0)
+        wrong -= wrong.mean(axis=0)
+        wrong *= [size, NOISE] / wrong.std(axis=0)
+        (found,) = examine([data], lambda r: r.outputs - wrong)
+        return found
+
+    found = verdict([slow(1)], [slow(2)])
+    assert found.trust == trust, found.reasons
+    if trust == "limited":
+        (reason,) = found.reasons
+        assert " % of speed's variance is left, and wanders" in reason
