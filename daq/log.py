@@ -90,6 +90,18 @@ class LogWriter:
         rows = [",".join(map(repr, row)) for row in zip(*columns, strict=True)]
         self._write("\n".join(rows) + "\n", counts=True)
 
+    def require_there(self) -> None:
+        """Raise RunError if the file is no longer where it was made."""
+        try:
+            there = os.path.samestat(self.path.stat(), os.fstat(self._file.fileno()))
+        except OSError:
+            there = False
+        if not there:
+            raise RunError(
+                f"{self.path}: it was deleted, moved or replaced while the run was on; leave the "
+                "folder of a run alone until it has ended"
+            )
+
     def close(self) -> None:
         """Have the log on the disk itself, then let go of it."""
         if self._file.closed:

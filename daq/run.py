@@ -127,6 +127,7 @@ class _Run:
         try:
             with LogWriter(self.capture.log_path, self._columns) as log:
                 self._phases(log)
+                log.require_there()
         except (RigError, KeyboardInterrupt, Terminated) as error:
             self._finish(*_outcome(error, self.phase))
             error.add_note(self._kept(log))
@@ -147,7 +148,10 @@ class _Run:
     def _kept(self, log: LogWriter | None) -> str:
         """Where the record of a run is that ended early."""
         n = log.n_samples if log is not None else 0
-        return f"what was recorded until then: {self.capture.folder} ({n} samples of the run)"
+        late = self.timing.flags.get("held", 0)
+        punctual = f", {late} commands came too late" if late else ""
+        folder = self.capture.folder
+        return f"what was recorded until then: {folder} ({n} samples of the run{punctual})"
 
     def _phases(self, log: LogWriter) -> None:
         try:

@@ -13,8 +13,9 @@ from typing import Any
 
 from daq.errors import Terminated
 
-# Ctrl-C; a polite kill; a closed terminal; Ctrl-Break on Windows. Where there is such a signal.
-_NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")
+# Ctrl-C; a polite kill; a closed terminal; Ctrl-Break on Windows; Ctrl-\ and Ctrl-Z on a terminal:
+# a program that is suspended watches no limits. Where there is such a signal.
+_NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK", "SIGQUIT", "SIGTSTP")
 _PATIENCE = 2.0  # s after the first signal in which the outputs must have been zeroed
 
 

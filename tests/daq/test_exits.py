@@ -102,6 +102,8 @@ class BadDevice(SimulatedDevice):
             raw.flags[-1] |= int(Flag.INTERLOCK)
         if fault == "nan":
             raw.analog[-1, 2] = np.nan
+        if fault == "log deleted":
+            next(Path("runs").glob("*/log.csv")).unlink()
         if fault == "full":
             resource.setrlimit(resource.RLIMIT_FSIZE, (16_384, resource.RLIM_INFINITY))
         for name in fault.split("+")[:1]:
@@ -205,6 +207,8 @@ def exits():
         yield Exit(phase, "nan", "interlock", f"interlock during {phase}: torque is nan")
     yield Exit("run", "interlock", "interlock", "interlock in sample")
     yield Exit("run", "nan", "interlock", "torque is nan, which is no measurement")
+    yield Exit("run", "SIGQUIT", "stopped", "stopped by SIGQUIT during run")
+    yield Exit("run", "SIGTSTP", "stopped", "stopped by SIGTSTP during run")
     yield Exit("run", "SIGTERM+SIGINT@safe", "stopped", "stopped by SIGTERM during run")
     yield Exit("run", "full", "failed", "log.csv: cannot be written: File too large")
     yield Exit("run", "unplugged", "failed", "the device no longer answers", closed_loop=True)
@@ -316,3 +320,15 @@ def test_a_closed_terminal_ends_the_run_and_not_its_record(tmp_path):
     process.wait(timeout=60)
     assert_consistent(folder, "stopped", "stopped by SIGHUP during run")
     assert np.all(np.diff(capture.load(folder).log.frame["tick"]) == 1)
+
+
+def test_a_log_deleted_during_the_run_is_no_completed_run(run, tmp_path):
+    write_experiment(tmp_path / "e.yaml", homing={"turns": 0}, calibration={"samples": 100})
+    write_rig(
+        tmp_path / "rig.yaml", backend="bad", options={"phase": "run", "fault": "log deleted"}
+    )
+    result = run(["run", "e.yaml", "--rig", "rig.yaml"], tmp_path)
+    assert result.returncode == 1 and "Traceback" not in result.stderr
+    assert "log.csv: it was deleted, moved or replaced" in result.stderr
+    record = record_of(only_capture(tmp_path))
+    assert record["status"] == "failed" and "it was deleted" in record["reason"]
