@@ -154,8 +154,8 @@ class Comparison:
         for row in equals:
             if row.dbic - chosen.dbic > _BIC_STRONG and row.n_effective <= chosen.n_effective:
                 said.append(
-                    f"Its BIC on the training data, {row.dbic - chosen.dbic:.3g} above that of "
-                    f"{chosen.name}, is strong evidence against {row.name}."
+                    f"The BIC of {row.name} on the training data, {row.dbic - chosen.dbic:.3g} "
+                    f"above that of {chosen.name}, is strong evidence against it."
                 )
         if chosen is not self.rows[0] and not said:
             said.append(

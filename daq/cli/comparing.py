@@ -82,7 +82,8 @@ def compare_command(
         outcome = best[fitted[0].prepared.model_name]
         _show_one(fitted[0], outcome, found, folder, publishing, as_json)
         return
-    result = _compare(fitted, best, ask.baselines)
+    candidates = _candidates(fitted, best, ask.baselines)
+    result = _compare(fitted[0], candidates)
     files = {
         group.prepared.model_name: write_parameters(
             folder / _folder_name(place, group.prepared.model_name),
@@ -92,10 +93,21 @@ def compare_command(
     }
     report = _document(result, groups[0], found, files)
     report["files"] = {"comparison": str(_write(folder, report))}
+    if not as_json:
+        _show(result, groups[0].prepared.model.output_names, found, files, folder)
+    if publishing:
+        from daq.cli.ranking import publish_comparison  # matplotlib, as for reports
+
+        asked = [f"--{name.lower()}" for name in ask.baselines]
+        asked += ["--seeds", ask.seeds] if ask.seeds is not None else ["--seed", f"{seeds[0]}"]
+        page = publish_comparison(report, groups[0], candidates, asked, folder)
+        report["files"]["page"] = page
+        if not as_json:
+            console.print_line(f"Page: {page}")
     if as_json:
         console.print_json(report)
-    else:
-        _show(result, groups[0].prepared.model.output_names, found, files, folder)
+    elif result.preferred in files:
+        console.print_next(f"rig replay LOG --parameters {files[result.preferred]}")
 
 
 def _same_outputs(groups: Sequence[Group]) -> None:
@@ -111,9 +123,10 @@ def _same_outputs(groups: Sequence[Group]) -> None:
             )
 
 
-def _compare(
+def _candidates(
     groups: Sequence[Group], best: Mapping[str, Outcome], baselines: Sequence[str]
-) -> Comparison:
+) -> list[Candidate]:
+    """Every structure fitted, with its free runs."""
     training = [log.dataset for log in groups[0].training]
     validation = [log.dataset for log in groups[0].validation]
     candidates = []
@@ -131,13 +144,17 @@ def _compare(
             continue
         orders = ",".join(f"{name}={order}" for name, order in selection.best.orders.items())
         candidates.append(Candidate.of(f"{kind}:{orders}", selection.model, training, validation))
-    weights = groups[0].prepared.settings.weights
-    names = groups[0].prepared.model.output_names
+    return candidates
+
+
+def _compare(group: Group, candidates: Sequence[Candidate]) -> Comparison:
+    weights = group.prepared.settings.weights
+    names = group.prepared.model.output_names
     try:
         return compare(
             candidates,
-            training,
-            validation,
+            [log.dataset for log in group.training],
+            [log.dataset for log in group.validation],
             weights=np.array([weights.get(name, 1.0) for name in names]),
         )
     except ModelError as error:
@@ -273,8 +290,6 @@ def _show(
     for name, path in files.items():
         console.print_line(f"Parameters of {name}: {path}")
     console.print_line(f"Comparison: {folder / 'comparison.yaml'}")
-    if result.preferred in files:
-        console.print_next(f"rig replay LOG --parameters {files[result.preferred]}")
 
 
 def _show_runs(found: Campaign) -> None:

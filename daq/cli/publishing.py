@@ -19,6 +19,7 @@ from daq.cli.modelling import DEFAULT_MODEL
 from daq.cli.picturing import Subject, pictures
 from daq.cli.preparing import Prepared
 from daq.cli.reporting import NOTES, Identified, errors_of
+from daq.cli.resuming import Asked
 from daq.figures import style
 from daq.figures.picture import Picture
 from daq.figures.style import Format
@@ -124,13 +125,17 @@ def _comparison(result: Identified, linear: Baseline | str) -> dict[str, Any]:
 
 def _reproduction(prepared: Prepared, result: Identified) -> dict[str, Any]:
     """How to do it again: command, logs with their fingerprints, runs they came from."""
-    uses = (("training", result.training_logs), ("validation", result.validation_logs))
+    asked = prepared.asked
+    model = asked.options.get("model")
+    models = [] if model in (None, DEFAULT_MODEL) else [model]
+    seed = ["--seed", str(result.settings.seed)]
+    training, validation = result.training_logs, result.validation_logs
     return {
-        "command": _command(prepared, result),
+        "command": command_of(asked, training, validation, models, seed),
         "folder": str(Path.cwd()),
-        "columns": prepared.asked.config if prepared.mapping is not None else None,
+        "columns": asked.config if prepared.mapping is not None else None,
         "hold_back": prepared.settings.hold_back,
-        "logs": [_log(log, use) for use, logs in uses for log in logs],
+        "logs": fingerprints(training, validation),
         "runs": [
             _run(record)
             for path in _paths([*result.training_logs, *result.validation_logs])
@@ -144,23 +149,35 @@ def _paths(logs: Sequence[Loaded]) -> list[Path]:
     return list(dict.fromkeys(log.path for log in logs))
 
 
-def _command(prepared: Prepared, result: Identified) -> str:
-    """What to type to identify the same again."""
-    asked = prepared.asked
-    training = _paths(result.training_logs)
-    words = ["rig", "identify", *map(str, training)]
-    for path in _paths(result.validation_logs):
-        if path not in training:
+def command_of(
+    asked: Asked,
+    training: Sequence[Loaded],
+    validation: Sequence[Loaded],
+    models: Sequence[str],
+    more: Sequence[str],
+) -> str:
+    """What to type to identify the same again; more: words behind the options that were asked."""
+    paths = _paths(training)
+    words = ["rig", "identify", *map(str, paths)]
+    for path in _paths(validation):
+        if path not in paths:
             words += ["--validate", str(path)]
     if asked.config is not None:
         words += ["--config", asked.config]
+    words += _option("model", list(models))
     for name, value in asked.options.items():
-        if name != "seed" and (name, value) != ("model", DEFAULT_MODEL):
+        if name not in ("seed", "model"):
             words += _option(name, value)
-    words += ["--seed", str(result.settings.seed)]
+    words += more
     for setting in asked.settings:
         words += ["--set", setting]
     return shlex.join(words)
+
+
+def fingerprints(training: Sequence[Loaded], validation: Sequence[Loaded]) -> list[dict[str, Any]]:
+    """What is said of each log, so that it is known again."""
+    uses = (("training", training), ("validation", validation))
+    return [_log(log, use) for use, logs in uses for log in logs]
 
 
 def _option(name: str, value: Any) -> list[str]:

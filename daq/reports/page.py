@@ -34,6 +34,21 @@ def page(document: Mapping[str, Any], view: Mapping[str, Any], drawings: Sequenc
     view: what the document does not hold, such as descriptions of the model. Every number shown
     carries the document's own in ``data-value``.
     """
+    first = next((drawing for drawing in drawings if drawing.topic == "responses"), None)
+    ordered = sorted(drawings, key=lambda d: -1 if d is first else TOPICS.index(d.topic))
+    return _rendered("report.html.j2", document, view, ordered)
+
+
+def comparison_page(
+    document: Mapping[str, Any], view: Mapping[str, Any], drawings: Sequence[Drawing]
+) -> str:
+    """The page of a comparison's document, likewise; figures in their order."""
+    return _rendered("comparison.html.j2", document, view, drawings)
+
+
+def _rendered(
+    name: str, document: Mapping[str, Any], view: Mapping[str, Any], drawings: Sequence[Drawing]
+) -> str:
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup
 
@@ -48,15 +63,12 @@ def page(document: Mapping[str, Any], view: Mapping[str, Any], drawings: Sequenc
     environment.filters["number"] = lambda value, digits=3: Markup(_number(value, digits))
     environment.filters["plain"] = lambda value: Markup(notation.number_html(f"{value:g}"))
     environment.filters["digits"] = _digits
-    first = next((drawing for drawing in drawings if drawing.topic == "responses"), None)
-    ordered = sorted(drawings, key=lambda d: -1 if d is first else TOPICS.index(d.topic))
     figures = [
         {"name": d.name, "topic": d.topic, "caption": d.caption,
          "svg": Markup(_inlined(d.svg, k)), "number": k}
-        for k, d in enumerate(ordered, 1)
+        for k, d in enumerate(drawings, 1)
     ]  # fmt: skip
-    template = environment.get_template("report.html.j2")
-    return template.render(doc=document, figures=figures, **view)
+    return environment.get_template(name).render(doc=document, figures=figures, **view)
 
 
 def _number(value: float | None, digits: int) -> str:

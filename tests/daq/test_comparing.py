@@ -1,6 +1,8 @@
 """``rig identify`` with several models: a ranking that says how sure it is."""
 
 import json
+import re
+import shlex
 
 import numpy as np
 import pandas as pd
@@ -9,6 +11,7 @@ import yaml
 
 from tests.daq.support import rig
 from tests.daq.test_campaign import DOUBLE, LAG, MODELS, SETTINGS
+from tests.daq.test_publishing import Page
 
 OTHER = """
 def pair():
@@ -102,9 +105,25 @@ def test_structures_and_a_linear_model_are_ranked_on_validation(folder):
     assert found["parameters"]["tau"]["value"] == pytest.approx(0.1, rel=0.02)
 
 
-def test_tables_for_people(folder):
-    models = ("--model", DOUBLE, "--model", LAG, "--arx")
-    text = identify(folder, "--validate", "validation.csv", *models).stdout
+def test_tables_for_people_and_a_page_that_says_how_to_do_it_again(folder):
+    args = ("identify", "training.csv", "--validate", "validation.csv", "--config", "id.yaml",
+            "--model", DOUBLE, "--model", LAG, "--arx", "--out", "found")  # fmt: skip
+    text = rig(*args, cwd=folder, report=True).stdout
+    page = Page((folder / "found/comparison.html").read_text(encoding="utf-8"))
+    assert "Page: found/comparison.html\n" in text and page.open == []
+    assert not {"script", "link", "img"} & set(page.tags)
+    assert {"figure-ratios", "figure-validation"} <= set(page.ids)
+    kept = yaml.safe_load((folder / "found/comparison.yaml").read_text())
+    shown = {given["data-structure"]: values for given, values in page.rows
+             if "data-structure" in given}  # fmt: skip
+    for row in kept["structures"]:
+        errors = row["outputs"]["y"]
+        assert shown[row["name"]][:2] == [errors["rmse"], errors["fit_percent"]]
+    (command,) = re.findall(r"rig (identify training.csv .*)", page.text)
+    again = rig(*shlex.split(command), "--out", "again", "--json", cwd=folder)
+    assert (
+        json.loads(again.stdout)["structures"][0]["outputs"] == (kept["structures"][0]["outputs"])
+    )
     assert "Validation, free run: RMSE in parts of max|y| (fit in %)" in text
     assert "dAIC" in text and "dBIC" in text and "worse, by more than chance" in text
     assert "ARX:na=" in text and "comparison.yaml" in text

@@ -167,7 +167,7 @@ def test_strong_evidence_of_the_training_data_outweighs_simplicity():
     assert [ahead.rows[0].name, behind.rows[0].name] == ["plain", "rich"]
     for result in (ahead, behind):
         assert result.rows[1].verdict == "as good" and result.preferred == "rich"
-        assert result.verdict.endswith("strong evidence against plain. rich is preferred.")
+        assert result.verdict.endswith("is strong evidence against it. rich is preferred.")
 
 
 def test_a_difference_nobody_would_notice_makes_none():
