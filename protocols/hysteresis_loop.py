@@ -22,6 +22,7 @@ from protocols.velocity_loop import VelocityLoop
 _REST = 0.5  # s before and after the cycles of a level
 _BRAKE_SLOPE = 0.5  # V/s
 _OVERSPEED, _SPEED_MARGIN = 2.0, 10.0  # of the amplitude, and rad/s, beyond which a run is ended
+_THERE = 0.95  # of the samples of a cycle that must have arrived for it to count
 _GUESS = 2.0  # either side of what was found, where an identification may search
 
 COLUMNS = {"omega_ref": "rad/s", "omega_tracked": "rad/s", "level": "1", "cycle": "1"}
@@ -78,10 +79,10 @@ class HysteresisLoop(VelocityLoop):
 
     def findings(self, samples: Samples, extra: Mapping[str, FloatArray]) -> Findings:
         """Loops of each brake command, their energy, and what the hysteresis's parameters are."""
-        levels = self._cycles(samples, extra)
+        levels = self._cycles(samples)
         if not levels:
             raise ValueError(
-                "fewer than two whole cycles behind the first were logged at any level"
+                "no level has two cycles behind the first of which nearly all samples were logged"
             )
         return _Conclusion(self, levels).findings()
 
@@ -132,22 +133,24 @@ class HysteresisLoop(VelocityLoop):
         nothing = np.full(len(commands), -1)
         return _Schedule(np.zeros(len(commands)), commands, nothing, nothing)
 
-    def _cycles(self, samples: Samples, extra: Mapping[str, FloatArray]) -> list[Cycles]:
-        """Counted cycles of each level; those with lost samples are left out."""
+    def _cycles(self, samples: Samples) -> list[Cycles]:
+        """Counted cycles of each level; a few lost samples are filled in by straight lines."""
         n = whole_samples("period", self.period, self.sample_rate)
-        torque, found = self._torque(samples), []
+        schedule, torque, found = self._schedule(), self._torque(samples), []
         for index, command in enumerate(self.brake_commands):
-            rows = [
-                np.flatnonzero((extra["level"] == index) & (extra["cycle"] == cycle))
-                for cycle in range(1, self.cycles)
-            ]
-            whole = [r for r in rows if len(r) == n]
-            if len(whole) < 2:
+            first = np.flatnonzero(schedule.level == index)[0] + n * np.arange(1, self.cycles)
+            ticks = first[:, None] + np.arange(n)
+            there = np.isin(ticks, samples.tick).mean(axis=1)
+            ticks = ticks[there >= _THERE]
+            if len(ticks) < 2:
                 continue
-            at = np.stack(whole)
-            current = float(samples.current_brake[at].mean())
-            angle, moved = samples.theta[at], torque[at]
-            found.append(Cycles(command, current, angle, moved, 1.0 / self.sample_rate))
+            angle, moved, current = (
+                np.interp(ticks, samples.tick, values)
+                for values in (samples.theta, torque, samples.current_brake)
+            )
+            found.append(
+                Cycles(command, float(current.mean()), angle, moved, 1.0 / self.sample_rate)
+            )
         return found
 
     def _torque(self, samples: Samples) -> FloatArray:

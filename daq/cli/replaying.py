@@ -192,6 +192,8 @@ def _bounds(texts: list[str]) -> dict[str, float]:
         name, _, value = text.partition("=")
         try:
             bounds[name.strip()] = float(value)
+            if not math.isfinite(bounds[name.strip()]):
+                raise ValueError
         except ValueError:
             raise ConfigError(
                 f"--fail-under {text}: write OUTPUT=PERCENT, for example omega=80"

@@ -68,6 +68,7 @@ def test_the_figure_is_written_beside_the_log(rig, capture, tmp_path):
         (["--fail-under", "omga=80"], "did you mean 'omega'"),
         (["--fail-under", "omega"], "write OUTPUT=PERCENT"),
         (["--fail-under", "omega=high"], "write OUTPUT=PERCENT"),
+        (["--fail-under", "omega=nan"], "write OUTPUT=PERCENT"),
         (["--figure", "absent/figure.png"], "choose another with --figure"),
         (["--figure", "figure.docx"], "figures are written as"),
     ],

@@ -159,8 +159,24 @@ def test_a_run_that_ended_early_concludes_from_what_there_is(tmp_path):
     found = chosen.findings(*first(one))
     assert set(found.ranges) == {"gamma", "beta", "A"}
     assert any("1 brake command" in remark for remark in found.remarks)
-    with pytest.raises(ValueError, match="two whole cycles"):
+    with pytest.raises(ValueError, match="two cycles behind the first"):
         chosen.findings(*first(1600))
+
+
+def test_a_few_lost_samples_do_not_cost_their_cycles(tmp_path):
+    chosen = experiment()
+    samples, extra = run(chosen, tmp_path, {"load": "free"}, ideal=True)
+
+    def without(share):
+        kept = np.random.default_rng(1).random(len(samples)) >= share
+        fields = {name: getattr(samples, name)[kept] for name in samples.__dataclass_fields__}
+        return type(samples)(**fields), {name: values[kept] for name, values in extra.items()}
+
+    whole, thinned = (numbers(chosen.findings(*without(share))) for share in (0.0, 0.02))
+    for name in ("rate", "kappa0", "kappa1"):
+        assert thinned[name].value == pytest.approx(whole[name].value, rel=0.02), name
+    with pytest.raises(ValueError, match="nearly all samples"):
+        chosen.findings(*without(0.1))
 
 
 def test_the_plan_is_what_is_asked_of_the_shaft():
