@@ -178,16 +178,24 @@ def load_log(path: Path, extra: Sequence[str] = ()) -> Log:
 
 
 def time_base(
-    path: Path, time: FloatArray, tick: FloatArray | None = None, *, first_line: int = 2
+    path: Path,
+    time: FloatArray,
+    tick: FloatArray | None = None,
+    *,
+    first_line: int = 2,
+    column: str = "t",
+    cure: str = "resample the log to a constant rate",
 ) -> tuple[IntArray, float]:
     """Sequence numbers and sample time [s] of a log's rows; gaps in time are gaps in number.
 
     tick: the log's own sequence numbers, where it has them. first_line: line of the first row.
+    column: the name of time in it. cure: for rows at no constant rate.
+
     Raises ConfigError, naming the line, for time that does not advance, or rows that fit no
     constant rate.
     """
     steps, second = np.diff(time), first_line + 1
-    _refuse(path, ~(steps > 0.0), "t: time does not advance from the line before", second)
+    _refuse(path, ~(steps > 0.0), f"{column}: time does not advance from the line before", second)
     if tick is not None:
         _refuse(path, tick != np.round(tick), "tick: it must be a whole number", first_line)
         _refuse(
@@ -203,8 +211,8 @@ def time_base(
     if wrong.any():
         row = int(np.argmax(wrong))
         raise ConfigError(
-            f"{path}:{row + second}: t: samples are {dt:g} s apart elsewhere but {steps[row]:g} s "
-            f"for {counted[row]:g} of them here; resample the log to a constant rate"
+            f"{path}:{row + second}: {column}: samples are {dt:g} s apart elsewhere but "
+            f"{steps[row]:g} s for {counted[row]:g} of them here; {cure}"
         )
     ticks: IntArray = np.zeros(len(time), dtype=np.int64)
     ticks[1:] = np.cumsum(counted)

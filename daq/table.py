@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 COMMENTS = ("#", "%", "//")
+_NOTHING = ("", "nan", "na", "n/a", "null", "none")
 _CURE = "mend or remove these lines (removed lines count as lost samples)"
 _NO_NUMBERS = ("nan", "inf", "-inf")  # what a broken sensor may end a log with
 _HEAD = 1 << 20  # bytes in which a header stands
@@ -53,14 +54,22 @@ class Layout:
 
 
 def column_names(path: Path) -> list[str]:
-    """Names in a table's header; raises ConfigError for a file that is no text."""
-    return layout_of(_complete_lines(path, _HEAD)[0]).names
+    """Names in a table's header; raises ConfigError for a file without one."""
+    layout = layout_of(_complete_lines(path, _HEAD)[0])
+    _check_header(path, layout, ())
+    return layout.names
 
 
-def read_table(path: Path, columns: Sequence[str] = (), cure: str = _CURE) -> Table:
+def read_table(
+    path: Path,
+    columns: Sequence[str] = (),
+    cure: str = _CURE,
+    gaps: Collection[str] = (),
+) -> Table:
     """Read a CSV of numbers with a header line.
 
-    cure: what to do about cells that hold no number, for the error's end.
+    cure: what to do about cells that hold no number, for the error's end. gaps: columns that may
+    have cells without one, empty or as in ``_NOTHING``; NaN in the table.
 
     Cells are separated by commas, semicolons or tabs (then decimals may have a comma), and
     separators may be followed by blanks. Lines of comments may stand before the header, or the
@@ -100,9 +109,13 @@ def read_table(path: Path, columns: Sequence[str] = (), cure: str = _CURE) -> Ta
     except pd.errors.ParserError as error:
         reason = str(error).removeprefix("Error tokenizing data. C error: ").strip()
         raise ConfigError(f"{path}: not a table: {reason}") from None
-    if len(frame) and frame.iloc[-1].str.strip().str.lower().isin(_NO_NUMBERS).any():
+    held = [name for name in frame if name not in gaps]
+    if len(frame) and frame[held].iloc[-1].str.strip().str.lower().isin(_NO_NUMBERS).any():
         frame, torn = frame.iloc[:-1], True
-    numbers = {name: _numbers(path, name, frame[name], first, separator, cure) for name in wanted}
+    numbers = {
+        name: _numbers(path, name, frame[name], first, separator, cure, name in gaps)
+        for name in wanted
+    }
     return Table(path, pd.DataFrame(numbers), first, torn)
 
 
@@ -258,7 +271,13 @@ def _check_header(path: Path, layout: Layout, columns: Sequence[str]) -> None:
 
 
 def _numbers(
-    path: Path, name: str, column: pd.Series, first_line: int, separator: str, cure: str
+    path: Path,
+    name: str,
+    column: pd.Series,
+    first_line: int,
+    separator: str,
+    cure: str,
+    with_gaps: bool,
 ) -> FloatArray:
     import pandas as pd
 
@@ -266,7 +285,10 @@ def _numbers(
     if separator != ",":
         text = text.str.replace(",", ".", regex=False)
     values = pd.to_numeric(text, errors="coerce").to_numpy(dtype=np.float64)
-    bad = np.flatnonzero(~np.isfinite(values))
+    wrong = ~np.isfinite(values)
+    if with_gaps:
+        wrong &= ~text.str.lower().isin(_NOTHING).to_numpy()
+    bad = np.flatnonzero(wrong)
     if len(bad):
         row = int(bad[0])
         more = f", and in {len(bad) - 1} more lines" if len(bad) > 1 else ""

@@ -18,9 +18,6 @@ from sysid.space import SearchSpace
 Balance = Literal["samples", "logs"]
 
 
-_MOST_STEPS = 4096  # a sample, where accuracy is asked for
-
-
 @dataclass(frozen=True)
 class Responses:
     """Residuals of chromosomes, (n_residuals, n_outputs, n), and their RMS, (n, n_outputs).
@@ -100,13 +97,7 @@ class Objective:
     def finer(self, accuracy: float) -> Objective:
         """The same objective by simulations of another accuracy, stiff ones given the steps."""
         other = copy.copy(self)
-        old = self.simulator
-        other.simulator = BatchSimulator(
-            old.model,
-            accuracy=accuracy,
-            threads=old.threads,
-            max_steps=max(old.max_steps, _MOST_STEPS),
-        )
+        other.simulator = self.simulator.finer(accuracy)
         return other
 
     def evaluate(self, chromosomes: FloatArray) -> tuple[FloatArray, BatchResult]:

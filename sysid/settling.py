@@ -20,6 +20,7 @@ from sysid.lookalikes import lookalikes
 from sysid.model import FloatArray
 from sysid.objective import Objective
 from sysid.refinement import Refinement, refine, refine_each
+from sysid.starting import FINER, FINEST
 from sysid.uncertainty.colour import colour, longest_memory
 from sysid.uncertainty.sensitivity import (
     Sensitivity,
@@ -68,6 +69,7 @@ def settle(
     objective: Objective, minima: Sequence[FloatArray], watch: Watch | None = None
 ) -> Settled:
     """The likeliest of some minima (n_free,) of the mean RMSE and of their lookalikes."""
+    objective = _resolved(objective, minima[0])
     known = _Known(objective)
     for minimum in minima:
         known.add(_weighed(objective, minimum, watch))
@@ -168,6 +170,25 @@ class _Known:
             steps = common_steps(first.objective, first.chromosome)
             self._sensitivity = sensitivity(first.objective, first.chromosome, steps)
         return self._sensitivity
+
+
+def _resolved(objective: Objective, chromosome: FloatArray) -> Objective:
+    """The objective with simulations as accurate as they are meant to be, at a chromosome.
+
+    The steps are chosen by what each of them errs. Where little is damped, as in a pendulum that
+    swings freely, such errors add up along the record; twice the steps show by how much.
+    """
+    accuracy = objective.simulator.accuracy
+    while objective.simulator.accuracy >= FINEST:
+        steps = objective.steps_needed(chromosome[None])[0]
+        coarse = objective.residuals(chromosome[None], steps).values
+        error = np.sqrt(
+            np.mean((coarse - objective.residuals(chromosome[None], 2 * steps).values) ** 2, axis=0)
+        )
+        if not np.max(error) > accuracy:
+            break
+        objective = objective.finer(FINER * objective.simulator.accuracy)
+    return objective
 
 
 def _exact(minimum: _Settling) -> _Settling:

@@ -31,6 +31,7 @@ _MAX_ROUNDS = 6
 _PILOT_PART = 8
 _PILOT_LEAST = 32  # samples
 _MAX_STEPS = 512
+_MOST_STEPS = 4096  # a sample, where accuracy is asked for
 # Steps per sample come from a ladder so that chromosomes of like need share a block, while
 # each one's result depends on nothing but itself.
 _LADDER = np.unique(np.round(2.0 ** np.arange(0, 20.01, 0.5)).astype(np.int64))
@@ -105,6 +106,15 @@ class BatchSimulator:
         self._kernels = kernels(model)
         self._workers = Workers(self.threads)
         self._setups: dict[tuple[int, bytes], Setup] = {}
+
+    def finer(self, accuracy: float) -> BatchSimulator:
+        """The same simulations at another accuracy, stiff ones given the steps."""
+        return BatchSimulator(
+            self.model,
+            accuracy=accuracy,
+            threads=self.threads,
+            max_steps=max(self.max_steps, _MOST_STEPS),
+        )
 
     def errors(
         self,

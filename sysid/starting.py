@@ -11,15 +11,27 @@ from sysid.refinement import refine
 from sysid.simulation import BatchSimulator
 from sysid.space import SearchSpace
 
+# How accuracies go on where the errors of single steps add up, and where that ends.
+FINER, FINEST = 0.1, 1e-9
+
 
 def free_run(simulator: BatchSimulator, vector: FloatArray, record: Dataset) -> FloatArray:
     """Outputs of a record's inputs, (n_samples, n_outputs), from where the record starts.
 
-    Initial states that the model leaves to be estimated are, from the record's outputs.
+    Initial states that the model leaves to be estimated are, from the record's outputs. The
+    simulator's accuracy holds for the whole run, also where the errors of its steps add up.
     """
-    start = estimate_start(simulator, vector, record)
-    outputs: FloatArray = simulator.trajectories(vector, record, starts=start[None])[0]
-    return outputs
+    wanted = simulator.accuracy
+    while True:
+        start = estimate_start(simulator, vector, record)
+        outputs: FloatArray = simulator.trajectories(vector, record, starts=start[None])[0]
+        twice = 2 * int(simulator.steps_of_each(vector, record).max())
+        finer = simulator.trajectories(vector, record, twice, start[None])[0]
+        error = np.sqrt(np.mean((finer - outputs) ** 2, axis=0))
+        size = np.maximum(np.max(np.abs(finer), axis=0), 1e-300)
+        if not np.max(error / size) > wanted or simulator.accuracy < FINEST:
+            return outputs
+        simulator = simulator.finer(FINER * simulator.accuracy)
 
 
 def estimate_start(simulator: BatchSimulator, vector: FloatArray, record: Dataset) -> FloatArray:

@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq import capture
+from daq.config.checking import refuse
 from daq.config.identification import Column, Columns
 from daq.config.units import factor
-from daq.config.yaml_file import YamlFile, suggestion
+from daq.config.yaml_file import Key, YamlFile, suggestion
 from daq.errors import ConfigError
 from daq.hal import FloatArray, IntArray
 from daq.log import Log, require_rows, time_base
-from daq.table import Table, read_table
+from daq.table import Table, column_names, read_table
 from sysid.data import Dataset
 from sysid.model import Input, ModelError, Output, ProcessModel
 
@@ -184,10 +185,17 @@ def _with_noise(dataset: Dataset, recording: capture.Recording, model: ProcessMo
 
 def _load_foreign(path: Path, model: ProcessModel, mapping: Mapping) -> Loaded:
     columns = mapping.columns
-    sources = [columns.inputs[name] for name in model.input_names]
-    sources += [columns.outputs[name] for name in model.output_names]
-    used = (columns.time.column, *(c.column for c in sources))
-    table = read_table(path, list(dict.fromkeys(name for name in used if name is not None)))
+    _check_columns(path, model, mapping)
+    inputs_from = {columns.inputs[name].column for name in model.input_names}
+    outputs_from = {columns.outputs[name].column for name in model.output_names}
+    known = {columns.time.column, *inputs_from}
+    used = sorted(name for name in known | outputs_from if name is not None)
+    table = read_table(
+        path,
+        used,
+        "mend these cells or remove their lines (removed lines count as lost samples)",
+        gaps=[name for name in used if name not in known],
+    )
     frame = table.frame
     require_rows(path, len(frame))
     tick, dt = _foreign_time(table, mapping)
@@ -214,6 +222,28 @@ def _load_foreign(path: Path, model: ProcessModel, mapping: Mapping) -> Loaded:
     return Loaded(dataset, path, capture.describe_end(path, table.torn))
 
 
+def _check_columns(path: Path, model: ProcessModel, mapping: Mapping) -> None:
+    """Raise ConfigError at each key that names a column which a file does not have."""
+    present = column_names(path)
+    columns = mapping.columns
+    wanted: list[tuple[Key, str | None]] = [(("columns", "time", "column"), columns.time.column)]
+    for group, given, names in (
+        ("inputs", columns.inputs, model.input_names),
+        ("outputs", columns.outputs, model.output_names),
+    ):
+        wanted += [(("columns", group, name, "column"), given[name].column) for name in names]
+    refuse(
+        [
+            mapping.file.mistake(
+                key,
+                f"{path} has no column {name!r}; {suggestion(name, list(filter(None, present)))}",
+            )
+            for key, name in wanted
+            if name is not None and name not in present
+        ]
+    )
+
+
 def _foreign_time(table: Table, mapping: Mapping) -> tuple[IntArray, float]:
     """Sequence numbers and sample time [s] of a foreign table's rows."""
     time = mapping.columns.time
@@ -222,7 +252,23 @@ def _foreign_time(table: Table, mapping: Mapping) -> tuple[IntArray, float]:
         return np.arange(len(table.frame), dtype=np.int64), 1.0 / time.sample_rate
     seconds = unit_factor(mapping.file, ("columns", "time", "unit"), time.unit, "s")
     values = table.frame[time.column].to_numpy() * seconds
-    return time_base(table.path, values, first_line=table.first_line)
+    cure = (
+        "say 'grid: 0.001' (s) in 'columns: time:' to round uneven times to multiples of it, or "
+        "resample the log to a constant rate"
+    )
+    tick = None
+    if time.grid is not None:
+        tick = np.round((values - values[0]) / time.grid)
+        if np.any(np.diff(tick) == 0.0) and np.all(np.diff(values) > 0.0):
+            raise mapping.file.error(
+                ("columns", "time", "grid"),
+                f"{time.grid:g} s is too coarse: rows of {table.path} are "
+                f"{np.diff(values).min():g} s apart; take a tenth of that",
+            )
+        values = tick * time.grid
+    return time_base(
+        table.path, values, tick, first_line=table.first_line, column=time.column, cure=cure
+    )
 
 
 def _dataset(
@@ -234,7 +280,7 @@ def _dataset(
     dt: float,
     name: str,
 ) -> Dataset:
-    """A record in which lost samples keep their place: inputs held, outputs missing."""
+    """A record in which lost samples keep their place: inputs go on, outputs are missing."""
     rows = tick - tick[0]
     length = int(rows[-1]) + 1
     if length > 50 * len(rows) + 1000:
@@ -246,7 +292,11 @@ def _dataset(
     whole[rows] = outputs
     latest = np.zeros(length, dtype=np.int64)
     latest[rows] = np.arange(len(rows))
-    return Dataset(inputs[np.maximum.accumulate(latest)], whole, dt, name)
+    filled = inputs[np.maximum.accumulate(latest)]
+    for column, signal in enumerate(model.inputs):
+        if signal.hold != "zoh":
+            filled[:, column] = np.interp(np.arange(length), rows, inputs[:, column])
+    return Dataset(filled, whole, dt, name)
 
 
 def unit_factor(file: YamlFile, key: tuple[str, ...], unit: str | None, wanted: str) -> float:

@@ -6,7 +6,7 @@ import dataclasses
 import inspect
 import re
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -54,12 +54,26 @@ class LoadedExperiment:
         return LoadedExperiment(file, experiment, f"{self.name}-validation")
 
 
+@dataclass(frozen=True)
+class _Validation(YamlFile):
+    """An experiment's file with ``changed`` keys of its ``validation`` section over the others."""
+
+    changed: frozenset[Key] = field(default_factory=frozenset)
+
+    def named(self, key: Key) -> str:
+        """Place and name of a key, under the section that it stands in."""
+        if key and key in self.changed:
+            return f"{self.where(key)}: validation.{yaml_file.dotted(key)}"
+        return super().named(key)
+
+
 def _validation_file(file: YamlFile) -> YamlFile:
     """An experiment's file as if its ``validation`` section stood over the rest."""
     changes = file.content["validation"]
     content = yaml_file.merge(file.content, {**changes, "validation": {}})
     moved = {key[1:]: place for key, place in file.places.items() if key[:1] == ("validation",)}
-    return YamlFile(file.path, content, {**file.places, **moved, (): file.place(())})
+    places = {**file.places, **moved, (): file.place(())}
+    return _Validation(file.path, content, places, changed=frozenset(moved))
 
 
 def find(name: str, packages: Iterable[str]) -> Path:
@@ -75,9 +89,9 @@ def find(name: str, packages: Iterable[str]) -> Path:
             if candidate in shipped:
                 console.report_detail(f"{name}: the shipped {shipped[candidate]}")
                 return shipped[candidate]
-    raise ConfigError(
-        f"{name}: there is no such file; check its name, or use a shipped one: {', '.join(shipped)}"
-    )
+    cure = yaml_file.nearest_file(path, list(shipped) if path.name == name else [])
+    cure = cure or f"check its name, or use a shipped one: {', '.join(shipped)}"
+    raise ConfigError(f"{name}: there is no such file; {cure}")
 
 
 def rig_for(experiment: str) -> str:
@@ -96,6 +110,7 @@ def rig_for(experiment: str) -> str:
 def load_experiment(name: str) -> LoadedExperiment:
     """Read and check an experiment; ConfigError names file, line, key and cure."""
     file = yaml_file.load(find(name, EXPERIMENTS))
+    checking.refuse_other_kind(file, "an experiment")
     try:
         kind = find_protocol(_protocol_name(file), file.path.parent)
     except ConfigError as error:
@@ -227,6 +242,7 @@ def load_rig(name: str, options: Mapping[str, Any] | None = None) -> tuple[RigCo
     options: the backend's own settings that take precedence over the file's.
     """
     file = yaml_file.load(find(name, RIGS))
+    checking.refuse_other_kind(file, "a rig")
     if options:
         file = dataclasses.replace(
             file, content=yaml_file.merge(file.content, {"options": options})

@@ -60,7 +60,10 @@ def prepare_models(
     are mistakes.
     """
     given = {key: value for key, value in options.items() if value is not None}
-    file = CommandLine.of(given, more, yaml_file.load(config) if config is not None else None)
+    written = yaml_file.load(config) if config is not None else None
+    if written is not None:
+        checking.refuse_other_kind(written, "an identification's settings")
+    file = CommandLine.of(given, more, written)
     found = _find_all(config, file, names)
     file, wrong = in_model_units(file, [model for model, _ in found])
     settings = checking.validate(file, IdentificationConfig, others=wrong)

@@ -9,8 +9,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Literal
 
-from daq.config.yaml_file import suggestion
+from daq.config.yaml_file import nearest_file, suggestion
 from daq.errors import ConfigError
+from sysid.model import ModelError
 
 Kind = Literal["backend", "limit", "model", "protocol"]
 
@@ -20,7 +21,8 @@ def locate(path: Path, kind: Kind, relative_to: Path | None = None) -> Path:
     for candidate in (path, *([relative_to / path] if relative_to else [])):
         if candidate.is_file():
             return candidate
-    raise ConfigError(f"{path}: there is no such {kind} file")
+    cure = nearest_file(path) or (nearest_file(relative_to / path) if relative_to else "")
+    raise ConfigError(f"{path}: there is no such {kind} file; {cure or 'check its name'}")
 
 
 def from_file(path: Path, attribute: str, kind: Kind, is_one: Callable[[Any], bool]) -> Any:
@@ -52,8 +54,12 @@ def _import(path: Path, kind: Kind) -> ModuleType:
         spec.loader.exec_module(module)
     except (Exception, SystemExit) as error:
         del sys.modules[spec.name]
-        raise ConfigError(f"{_place(path, error)}: the {kind} file does not import: "
-                          f"{type(error).__name__}: {error}") from None  # fmt: skip
+        what = (
+            str(error)
+            if isinstance(error, ModelError)
+            else f"the {kind} file does not import: {type(error).__name__}: {error}"
+        )
+        raise ConfigError(f"{_place(path, error)}: {what}") from None
     finally:
         sys.path.remove(folder)
     return module
@@ -63,12 +69,19 @@ def _place(path: Path, error: BaseException) -> str:
     """``file:line`` of the last line of the user's file that the error passed through."""
     if isinstance(error, SyntaxError) and _same(error.filename, path):
         return f"{path}:{error.lineno}"
+    # What a model's function raised is where to look, not where the model is declared.
+    raised = error.__context__ if isinstance(error, ModelError) else None
+    line = (_line(path, raised) if raised is not None else None) or _line(path, error)
+    return f"{path}:{line}" if line is not None else str(path)
+
+
+def _line(path: Path, error: BaseException) -> int | None:
     line, trace = None, error.__traceback__
     while trace is not None:
         if _same(trace.tb_frame.f_code.co_filename, path):
             line = trace.tb_lineno
         trace = trace.tb_next
-    return f"{path}:{line}" if line is not None else str(path)
+    return line
 
 
 def _same(file: str | None, path: Path) -> bool:

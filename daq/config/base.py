@@ -18,18 +18,24 @@ class Section(BaseModel):
     def _truth_is_no_number(cls, value: Any, info: ValidationInfo) -> Any:
         # YAML reads yes, no, on and off as truth values, and pydantic those as 1 and 0.
         kind = cls.model_fields[info.field_name or ""].annotation
-        if _takes_truth(kind):
+        if _has(kind, {bool, Any}):
             return value
         for name, part in _parts(value, kind):
             if isinstance(part, bool):
                 # Of ``parameters``: parameter R_m.
                 one = f"{(info.field_name or '').removesuffix('s')} {name}: " if name else ""
-                raise ValueError(f"{one}yes, no, on, off, true and false are no value for this key")
+                raise ValueError(
+                    f"{one}{_expected(kind)}; YAML reads yes, no, on and off as true and false"
+                )
         return value
 
 
-def _takes_truth(kind: Any) -> bool:
-    return kind in {bool, Any} or any(_takes_truth(part) for part in get_args(kind))
+def _expected(kind: Any) -> str:
+    return "expected a number" if _has(kind, {float, int}) else "put text in quotes"
+
+
+def _has(kind: Any, wanted: set[Any]) -> bool:
+    return kind in wanted or any(_has(part, wanted) for part in get_args(kind))
 
 
 def _parts(value: Any, kind: Any) -> Iterable[tuple[str, Any]]:

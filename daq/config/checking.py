@@ -55,6 +55,29 @@ def refuse(mistakes: Sequence[Mistake]) -> None:
         raise ConfigError("\n".join(mistake.text for mistake in sorted(set(mistakes))))
 
 
+# Keys by which each kind of file is known when it is given in another's place, and the cure.
+_KINDS = {
+    "an experiment": ({"protocol"}, "name it behind rig run or rig check"),
+    "a rig": ({"backend", "limits", "sensors"}, "give it with --rig"),
+    "an identification's settings": (
+        {"model", "columns", "ranges", "fixed", "population", "preset"}, "give it with --config"
+    ),
+}  # fmt: skip
+
+
+def refuse_other_kind(file: YamlFile, wanted: str) -> None:
+    """Raise ConfigError for a file of another kind than the wanted one, named as in ``_KINDS``."""
+    if any(key in file.content for key in _KINDS[wanted][0]):
+        return
+    for kind, (marks, cure) in _KINDS.items():
+        for key in file.content:
+            if key in marks:
+                raise ConfigError(
+                    f"{file.where((key,))}: this file holds {kind}, and should hold {wanted}; "
+                    f"{cure}"
+                )
+
+
 class _Explainer:
     """What pydantic found wrong with data, told by file, key, value and cure."""
 

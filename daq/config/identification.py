@@ -15,7 +15,7 @@ from pydantic import (
 )
 
 from daq.config.base import Section
-from daq.config.units import QUANTITY_SCHEMA, Hertz, Part, Percent, Quantity, split
+from daq.config.units import QUANTITY_SCHEMA, Hertz, Part, Percent, Quantity, Seconds, split
 
 
 def _ordered(ends: tuple[float | None, float | None]) -> tuple[float | None, float | None]:
@@ -73,6 +73,12 @@ class TimeColumn(Section):
     column: str | None = Field(None, min_length=1, description="name in the CSV's header")
     unit: str = Field("s", min_length=1, description="unit of the numbers")
     sample_rate: Hertz | None = Field(None, gt=0.0, description="rows per second")
+    grid: Seconds | None = Field(
+        None,
+        gt=0.0,
+        description="uneven times are rounded to multiples of this; outputs between rows count as "
+        "not measured",
+    )
 
     @model_validator(mode="after")
     def _one_source(self) -> TimeColumn:
@@ -80,6 +86,8 @@ class TimeColumn(Section):
             raise ValueError(
                 "give either 'column' (a name in the CSV) or 'sample_rate' (rows per second)"
             )
+        if self.grid is not None and self.column is None:
+            raise ValueError("'grid' is for a column of times; leave it out")
         return self
 
 
@@ -189,7 +197,7 @@ class IdentificationConfig(Signals):
         description="scales to search on in place of the model's",
         examples=[{"K_m": "log"}],
     )
-    weights: dict[str, Part] = Field(
+    weights: dict[str, Annotated[Part, Field(ge=0.0)]] = Field(
         default_factory=dict,
         description="relative importance of the outputs",
         examples=[{"omega": 2.0}],

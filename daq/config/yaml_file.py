@@ -15,6 +15,7 @@ from daq.errors import ConfigError
 
 Key = tuple[str | int, ...]
 _DEEPEST = 20  # levels of nesting
+_MOST_COPIES = 10_000  # of keys and values by aliases; a few lines of them could make billions
 _LISTED = 8  # line numbers in a message
 _LOOK = "{problem}; check the indentation, colons and quotes here and in the line before"
 
@@ -158,11 +159,16 @@ def load(path: Path) -> YamlFile:
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
-        raise ConfigError(f"{path}: there is no such file; check its name") from None
+        cure = nearest_file(path) or "check its name"
+        raise ConfigError(f"{path}: there is no such file; {cure}") from None
     except IsADirectoryError:
         raise ConfigError(f"{path}: this is a folder; name a YAML file") from None
     except UnicodeDecodeError as error:
-        raise ConfigError(f"{path}: not a text file in UTF-8 (byte {error.start})") from None
+        line = error.object[: error.start].count(b"\n") + 1
+        raise ConfigError(
+            f"{path}:{line}: not text in UTF-8; save the file with this "
+            "encoding, or name the right one"
+        ) from None
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
     try:
@@ -191,10 +197,21 @@ def merge(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]
 
 def suggestion(name: str, known: Sequence[str]) -> str:
     """What a misspelt name may have meant, as the end of an error message."""
-    near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+    near = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
     if near:
         return f"did you mean {near[0]!r}?"
     return f"known are {', '.join(sorted(known))}" if known else "none are known"
+
+
+def nearest_file(path: Path, others: Sequence[str] = ()) -> str:
+    """Which file beside a missing one, or which of other names, it may mean; nothing without."""
+    try:
+        beside = {each.stem: each for each in path.parent.iterdir() if each.suffix == path.suffix}
+    except OSError:
+        beside = {}
+    known = {**{Path(name).stem: Path(name) for name in others}, **beside}
+    near = difflib.get_close_matches(path.stem, known, n=1, cutoff=0.7)
+    return f"did you mean {str(known[near[0]])!r}?" if near else ""
 
 
 class _Places:
@@ -204,6 +221,8 @@ class _Places:
         self.places: dict[Key, tuple[int, int]] = {}
         self.repeated: list[Mistake] = []
         self._path = path
+        self._met: set[int] = set()
+        self._copies = 0
 
     def collect(self, node: yaml.Node, key: Key) -> None:
         """Note the places of all keys below a node; ConfigError where there is no end to them."""
@@ -211,6 +230,13 @@ class _Places:
             raise ConfigError(
                 f"{self._path}:{node.start_mark.line + 1}: nested too deeply; does an alias "
                 "(*name) stand inside its own anchor (&name)?"
+            )
+        self._copies += id(node) in self._met
+        self._met.add(id(node))
+        if self._copies > _MOST_COPIES:
+            raise ConfigError(
+                f"{self._path}:{node.start_mark.line + 1}: aliases (*name) repeat this more than "
+                f"{_MOST_COPIES} times over; write out what is meant"
             )
         self.places.setdefault(key, _place(node))
         if isinstance(node, yaml.MappingNode):
@@ -265,6 +291,9 @@ _CURES = {
     "found undefined alias": "*name stands for what &name marks, and there is no such mark; put "
     "text that begins with * in quotes",
     "found character": "{problem}; put text that begins so in quotes",
+    "but found another document": "a second document begins with '---'; keep one in a file",
+    "could not determine a constructor": "text behind '!' is a tag, of which none is known here; "
+    "leave it out, or put text that begins so in quotes",
 }
 
 

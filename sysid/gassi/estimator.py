@@ -240,17 +240,20 @@ class GASSI(RecordEstimator):
         except KeyboardInterrupt:
             self.stopped_ = "interrupted"
             return
+        self._final_accuracy = settled.objective.simulator.accuracy
+        objective = run.objective
+        if self._final_accuracy < self.accuracy:
+            objective = objective.finer(self._final_accuracy)
         self._set(
             Best(
-                run.objective.space,
+                objective.space,
                 settled.chromosome,
-                float(run.objective.evaluate(settled.chromosome[None])[0][0]),
+                float(objective.evaluate(settled.chromosome[None])[0][0]),
                 run.objective.space.feasible(settled.chromosome),
             )
         )
         self.output_weights_ = settled.objective.weights
         self._rivals = settled.rivals
-        self._final_accuracy = settled.objective.simulator.accuracy
         self.n_simulations_ = run.objective.simulations
 
     def predict(self, X: Dataset | FloatArray, *, records: Any = None) -> FloatArray:

@@ -21,7 +21,15 @@ from sysid.objective import Objective
 from sysid.space import SearchSpace
 from sysid.uncertainty.directions import PART, Directions, directions
 from sysid.uncertainty.estimate import Z95, Estimate, Why, product_text, sum_text
-from sysid.uncertainty.relations import Kind, Relation, named, overlapping, relations, sparse
+from sysid.uncertainty.relations import (
+    Kind,
+    Relation,
+    named,
+    overlapping,
+    overlooked,
+    relations,
+    sparse,
+)
 from sysid.uncertainty.sensitivity import common_steps, coordinate_units, sensitivity
 from sysid.uncertainty.units import product_unit
 
@@ -95,6 +103,10 @@ def uncertainty(
     told = directions(objective, chromosome, steps, found, ends)
     units = coordinate_units(objective, chromosome)
     slope = np.where(objective.space.log, chromosome, units)
+    still = overlooked(objective, chromosome, steps, found, slope, told.lost)
+    if len(still):
+        found = replace(found, slopes=found.slopes - found.slopes @ still.T @ still)
+        told = directions(objective, chromosome, steps, found, ends)
     hidden = relations(objective, chromosome, steps, found, slope, told)
     result = _Teller(objective.space, chromosome, slope, told, hidden).result()
     names = objective.space.names

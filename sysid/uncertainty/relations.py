@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -25,6 +25,9 @@ _NOTHING = 3e-3  # entries of a direction below this are rounding
 _SHARES = (0.1, 0.03, 0.01, 0.003)
 _NEARLY = 0.02  # of a whole number
 _NEW = 0.1  # part of a direction that others must leave unexplained
+# Singular values below this share of the largest may be nothing but errors of the slopes.
+_WEAK = 0.05
+_FIRMLY = 0.25  # share of such a direction's largest entry above which a parameter is part of it
 _SHARE = 0.1  # entries of a vague direction below this share of its largest are not worth naming
 
 
@@ -78,6 +81,34 @@ def relations(
     return exact + [Relation(_simplest(vector, exact), "vague") for vector in vague]
 
 
+def overlooked(
+    objective: Objective,
+    chromosome: FloatArray,
+    steps: list[int],
+    found: Sensitivity,
+    slope: FloatArray,
+    lost: FloatArray,
+) -> FloatArray:
+    """Exact directions that errors of the slopes let look determined, (n, n_free), orthonormal.
+
+    Dry friction makes the slope of each parameter jagged while all of them together, followed
+    in whole numbers, move nothing. slope: as for ``relations``. lost: (n_lost, n_free), those
+    known not to be determined.
+    """
+    rows = found.slopes[:, objective.weights > 0.0].reshape(-1, len(chromosome))
+    follower = _Follower(objective, chromosome, steps, slope, rows)
+    _, values, vectors = np.linalg.svd(rows, full_matrices=False)
+    known = [*lost]
+    for vector in vectors[values < _WEAK * values[0]]:
+        for candidate in follower.rounded(vector):
+            rest = _beyond(candidate, known)
+            if np.linalg.norm(rest) > _NEW * np.linalg.norm(candidate) and (
+                follower.kind(candidate) != "vague"
+            ):
+                known.append(rest / np.linalg.norm(rest))
+    return np.array(known[len(lost) :]).reshape(-1, len(chromosome))
+
+
 def overlapping(supports: list[BoolArray]) -> list[list[int]]:
     """Indices of supports that hang together through shared parameters."""
     groups: list[list[int]] = []
@@ -110,7 +141,7 @@ class _Follower:
                 continue
             tried.append(members)
             for candidate in self._candidates(vector, members):
-                kind = self._kind(candidate)
+                kind = self.kind(candidate)
                 if kind != "vague" and _is_new(candidate, known):
                     return Relation(candidate, kind)
         return None
@@ -132,7 +163,21 @@ class _Follower:
                     snapped[members] = whole * unit[members] / self.slope[members]
                     yield snapped / np.max(np.abs(snapped))
 
-    def _kind(self, vector: FloatArray) -> Kind:
+    def rounded(self, vector: FloatArray) -> Iterator[FloatArray]:
+        """Small whole powers, or multiples, of the parameters that a direction comes near."""
+        taking = np.abs(vector) > _FIRMLY * np.max(np.abs(vector))
+        for unit in (self.chromosome, np.ones_like(vector)):
+            usable = taking & (unit != 0.0)
+            if not usable.any():
+                continue
+            ratios = np.zeros_like(vector)
+            np.divide(vector * self.slope, unit, out=ratios, where=usable)
+            for factor in (1.0, 2.0):
+                whole = np.round(factor * ratios / np.max(np.abs(ratios)))
+                if np.count_nonzero(whole) > 1:
+                    yield whole * unit / self.slope
+
+    def kind(self, vector: FloatArray) -> Kind:
         """Follow a direction as a product and as a sum; what leaves the outputs alone."""
         step = vector * self.slope
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -140,7 +185,9 @@ class _Follower:
         if not np.all(np.isfinite(relative)):
             return "vague"
         relative *= _FOLLOW / np.max(np.abs(relative))
-        alone = np.where(np.abs(relative) == np.max(np.abs(relative)), relative, 0.0)
+        alone = np.zeros_like(relative)
+        one = np.argmax(np.abs(relative))
+        alone[one] = relative[one]
         moved = self.chromosome * np.stack(
             [np.ones_like(relative), np.exp(relative), 1.0 + relative, 1.0 + alone]
         )
@@ -157,8 +204,15 @@ def _is_new(vector: FloatArray, known: list[Relation]) -> bool:
     if not known:
         return True
     basis = np.linalg.qr(np.stack([relation.vector for relation in known]).T)[0]
-    rest = vector - basis @ (basis.T @ vector)
+    rest = _beyond(vector, [*basis.T])
     return bool(np.linalg.norm(rest) > _NEW * np.linalg.norm(vector))
+
+
+def _beyond(vector: FloatArray, basis: Sequence[FloatArray]) -> FloatArray:
+    """What orthonormal directions leave unexplained of a direction."""
+    axes = np.array(basis).reshape(-1, len(vector))
+    rest: FloatArray = vector - axes.T @ (axes @ vector)
+    return rest
 
 
 def _whole(ratios: FloatArray) -> FloatArray | None:

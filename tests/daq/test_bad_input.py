@@ -115,6 +115,9 @@ columns:
     y: {column: theta}
 """
 
+ALIASES = "a0: &a0 [0]\n" + "".join(
+    f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]\n" for k in range(1, 9)
+)
 CASES = [
     # --- experiments
     experiment("unknown protocol", "prbs", "prbx", "e.yaml:1:1: protocol: unknown protocol 'prbx'",
@@ -134,7 +137,7 @@ CASES = [
     experiment("a fraction for a whole number", "seed: 4", "seed: 4.5",
                "e.yaml:9:3: motor.seed: expected a whole number, found 4.5"),
     experiment("yes for a number", "duration: 0.5", "duration: yes",
-               "e.yaml:3:1: duration: yes, no, on, off, true and false are no value"),
+               "e.yaml:3:1: duration: expected a number; YAML reads yes, no"),
     experiment("a number for a section", "calibration: {samples: 16}", "calibration: 16",
                "e.yaml:4:1: calibration: expected 'key: value' lines, found 16"),
     experiment("an empty section", "calibration: {samples: 16}", "calibration:",
@@ -157,7 +160,15 @@ CASES = [
                "e.yaml:3:1: duration: 0.0001 s at 800 Hz makes 0 samples; 2 to"),
     experiment("a validation run with a misspelt key", "  seed: 5",
                "  seed: 5\nvalidation:\n  motor: {sead: 3}",
-               "e.yaml:16:11: motor.sead: unknown key; did you mean 'seed'?", command="check"),
+               "e.yaml:16:11: validation.motor.sead: unknown key; did you mean 'seed'?",
+               command="check"),
+    experiment("aliases without end", "motor:", f"{ALIASES}motor:",
+               "aliases (*name) repeat this more than 10000 times over"),
+    experiment("two documents", "motor:", "---\nmotor:", "a second document begins with '---'"),
+    Case("a rig for an experiment", ["check", "rig.yaml"],
+         ["rig.yaml:2:1: this file holds a rig, and should hold an experiment; give it with"]),
+    Case("almost the name of a file", ["check", "prsb.yaml"],
+         ["prsb.yaml: there is no such file; did you mean 'prbs.yaml'?"]),
     experiment("no YAML", "motor:", "motor: [", "e.yaml:7:9: not valid YAML",
                "a bracket opened in line 5 is not closed"),
     experiment("a quote without end", "motor:", 'motor: "', "not valid YAML",
@@ -207,7 +218,8 @@ CASES = [
     Case("a folder for an experiment", ["run", "folder"],
          ["folder: this is a folder; name a YAML file"]),
     Case("binary for an experiment", ["run", "e.yaml"],
-         ["e.yaml: not a text file in UTF-8"], {"e.yaml": b"\xff\xfe\x00p"}),
+         ["e.yaml:1: not text in UTF-8; save the file with this encoding"],
+         {"e.yaml": b"\xff\xfe\x00p"}),
     Case("no experiment", ["run"], ["EXPERIMENT.yaml", "--help"]),
     Case("an unknown option", ["run", "e.yaml", "--identfy"], ["--identfy", "--identify"]),
     Case("captures below a file", ["run", "e.yaml", "--out", "rig.yaml"],
@@ -388,7 +400,7 @@ CASES = [
     settings("a unit of another kind", COLUMNS.replace("column: theta", "column: theta, unit: kg"),
              "id.yaml:7:24: columns.outputs.y.unit: 'kg' does not convert to 'm'"),
     settings("a column that is not there", COLUMNS.replace("theta", "thet"),
-             "log.csv:1: column 'thet' is missing; did you mean 'theta'?"),
+             "id.yaml:7:9: columns.outputs.y.column: log.csv has no column 'thet'; did you mean"),
     Case("missing configuration", ["identify", "log.csv", "--config", "absent.yaml"],
          ["absent.yaml: there is no such file; check its name"]),
     Case("an unknown preset", ["identify", "log.csv", "--preset", "thesys"],
@@ -541,7 +553,7 @@ def test_mistakes_are_told_together_wherever_they_stand_in_a_file(tmp_path):
     lay_out(tmp_path, Case("", [], [], files))
     expected = {
         ("a.yaml",): ["1:1: protocol", "3:1: sample_rate"],
-        ("b.yaml",): ["9:3: motor.seed", "15:22: brake.sead"],
+        ("b.yaml",): ["9:3: motor.seed", "15:22: validation.brake.sead"],
         ("e.yaml", "--rig", "c.yaml"): ["2:1: backend", "6:12: sensors.torque.scale"],
         ("e.yaml", "--rig", "d.yaml"): [
             "4:3: options.plan", "6:12: sensors.torque.scale", "10:1: plant",

@@ -279,6 +279,30 @@ def test_a_model_and_a_csv_of_ones_own_work_like_the_built_in(tmp_path):
     assert json.loads(replayed.stdout)["outputs"]["y"]["fit_percent"] > 99.0
 
 
+def test_uneven_times_and_cells_without_a_number_are_taken_as_they_are(tmp_path):
+    foreign_log(tmp_path / "even.csv")
+    head, *rows = (tmp_path / "even.csv").read_text().splitlines()
+    kept = [row for k, row in enumerate(rows) if k % 7 not in {2, 3} or k % 20 == 0]
+    kept[9] = kept[9].rsplit(",", 1)[0] + ", "
+    times = [int(row.split(",")[0]) + k % 4 for k, row in enumerate(kept)]
+    shifted = [f"{t},{row.split(',', 1)[1]}" for t, row in zip(times, kept, strict=True)]
+    (tmp_path / "bench.csv").write_text("\n".join([head, *shifted]) + "\n")
+    (tmp_path / "lag.py").write_text(OWN_MODEL)
+    (tmp_path / "id.yaml").write_text(OWN_CONFIG)
+    command = ["identify", "bench.csv", "--config", "id.yaml", "--out", "found", "--no-report"]
+    uneven = rig(*command, cwd=tmp_path)
+    assert uneven.returncode == 2 and "bench.csv:6: Time (ms): samples are" in uneven.stderr
+    assert "say 'grid: 0.001' (s) in 'columns: time:'" in uneven.stderr
+    (tmp_path / "id.yaml").write_text(OWN_CONFIG.replace("unit: ms", "unit: ms, grid: 50 ms"))
+    coarse = rig(*command, cwd=tmp_path)
+    assert coarse.returncode == 2 and "id.yaml:5:39: columns.time.grid: 0.05 s" in coarse.stderr
+    (tmp_path / "id.yaml").write_text(OWN_CONFIG.replace("unit: ms", "unit: ms, grid: 10 ms"))
+    result = rig(*command, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    found = yaml.safe_load((tmp_path / "found" / "parameters.yaml").read_text())
+    assert found["parameters"]["tau"]["value"] == pytest.approx(0.2, rel=1e-3)
+
+
 @pytest.mark.parametrize(
     "chosen",
     [

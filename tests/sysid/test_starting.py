@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -19,7 +20,9 @@ from sysid import (
 )
 from sysid.objective import Objective
 from sysid.refinement import refine
-from sysid.starting import estimate_start
+from sysid.settling import settle
+from sysid.starting import estimate_start, free_run
+from sysid.uncertainty import uncertainty
 
 
 def chain(hidden_range=(-5.0, 5.0)):
@@ -218,3 +221,74 @@ def test_the_span_of_a_still_or_unmeasured_output():
 def test_starts_that_make_no_sense(starts, message):
     with pytest.raises(ModelError, match=message):
         chain(None).with_initial(starts)
+
+
+# --- what is hardly damped: a pendulum with dry friction that swings freely ---------------------
+
+SWING = np.array([0.02, 0.6, 0.002, 0.008])  # of which only the ratios act
+
+
+def pendulum():
+    def derivative(x, u, p):
+        angle, speed = x
+        inertia, weight, viscous, dry = p
+        friction = viscous * speed + dry * max(-1.0, min(1.0, speed / 1e-3))
+        return speed, (-weight * math.sin(angle) - friction) / inertia
+
+    return ProcessModel(
+        name="pendulum",
+        states=(
+            State("angle", "rad", initial_range=(-3.0, 3.0)),
+            State("speed", "rad/s", initial_range=(-1.0, 1.0)),
+        ),
+        inputs=(),
+        outputs=(Output("angle", "rad"),),
+        parameters=tuple(
+            Parameter(name, unit, value, value / 10.0, value * 10.0, "log")
+            for name, unit, value in zip(
+                ("inertia", "weight", "viscous", "dry"),
+                ("kg*m^2", "N*m", "N*m*s/rad", "N*m"),
+                SWING,
+                strict=True,
+            )
+        ),
+        derivative=derivative,
+    )
+
+
+@pytest.fixture(scope="module")
+def swinging():
+    """720 samples over ten periods by SciPy, without and with noise."""
+    from scipy.integrate import solve_ivp
+
+    model = pendulum()
+    t = np.arange(720) / 60.0
+    truth = solve_ivp(
+        lambda _, x: model.derivative(tuple(x), (), tuple(SWING)), (0.0, t[-1]), [1.2, 0.0],
+        t_eval=t, rtol=1e-8, atol=1e-9, max_step=2e-3,
+    ).y[0]  # fmt: skip
+    noise = np.random.default_rng(0).normal(0.0, 0.005, len(t))
+    records = [Dataset(np.zeros((len(t), 0)), y[:, None], 1 / 60) for y in (truth, truth + noise)]
+    return model, *records
+
+
+def test_errors_of_single_steps_do_not_add_up_beyond_the_accuracy(swinging):
+    model, exact, _ = swinging
+    outputs = free_run(BatchSimulator(model), SWING, exact)
+    assert np.sqrt(np.mean((outputs - exact.outputs) ** 2)) < 1e-3 * 1.2
+
+
+def test_what_acts_only_together_is_told_where_slopes_are_jagged(swinging):
+    model, _, noisy = swinging
+    space = SearchSpace.of(model).with_starts([noisy])
+    objective = Objective(BatchSimulator(model), space, [noisy])
+    settled = settle(objective, [np.array([*SWING * 1.3, 1.2, 0.0])])
+    found = uncertainty(settled.objective, settled.chromosome, settled.rivals)
+    (ambiguity,) = found.ambiguities
+    assert ambiguity.kind == "product"
+    assert set(ambiguity.parameters) == {"inertia", "weight", "viscous", "dry"}
+    assert len(ambiguity.determined) == 3 and len(ambiguity.measure) == 1
+    truth = dict(zip(model.parameter_names, SWING.tolist(), strict=True))
+    for estimate in ambiguity.determined:
+        # Four standard deviations: of one record that is fixed.
+        assert abs(estimate.at(truth) - estimate.value) < 4.0 * estimate.std
