@@ -63,13 +63,16 @@ class Axis:
 
 @dataclass(frozen=True)
 class Series:
-    """Points of a chart, (n,) each; spread: half the height of their error bars."""
+    """Points of a chart, (n,) each; spread: half the height of their error bars.
+
+    style: ``model`` of what was computed, drawn in black over what was measured.
+    """
 
     label: str
     x: FloatArray
     y: FloatArray
     spread: FloatArray | None = None
-    style: Literal["line", "points"] = "line"
+    style: Literal["line", "points", "model"] = "line"
 
     def __post_init__(self) -> None:
         """Raises ValueError for points that are none."""

@@ -323,7 +323,7 @@ class _Conclusion:
                     ends = sign * np.array([1e-9, fastest])
                     x += [*ends, math.nan]
                     y += [*line.torque(place, ends), math.nan]
-        return Series("line by c0 and c1", np.array(x), np.array(y))
+        return Series("line by c0 and c1", np.array(x), np.array(y), style="model")
 
     def _trace(self) -> Chart:
         """The tracked speed beside its reference."""

@@ -258,7 +258,7 @@ class _Conclusion:
             np.concatenate([np.append(values, math.nan) for values in column])
             for column in zip(*fitted, strict=True)
         )
-        angle.append(Series("fitted", ways, torques))
+        angle.append(Series("fitted", ways, torques, style="model"))
         torque_axis, of = Axis("torque", "N*m"), "at each brake command, mean of cycles"
         return (
             Chart("torque_angle", f"Torque over the angle {of}", Axis("angle", "rad"),

@@ -28,7 +28,9 @@ def draw(figure: Chart | Heatmap) -> Figure:
     room = style.legend_room([notation.words(label) for label in shown], _EDGE) if shown else 0.0
     right = 0.72 if isinstance(figure, Heatmap) else 0.1
     left = _LEFT if len(figure.y.label) + len(figure.y.unit) < _SHORT else style.LEFT
-    drawn, (panel,) = style.stack([2.1], left=left, top=said + room + _SCALE, right=right)
+    drawn, (panel,) = style.stack(
+        [2.1], left=left, top=said + max(room + 0.03, _SCALE), right=right
+    )
     if isinstance(figure, Heatmap):
         _plane(drawn, panel, figure)
     for k, series in enumerate(figure.series):
@@ -69,6 +71,9 @@ def _add(panel: Axes, series: Series, k: int, over: bool) -> None:
                        **marker, **look)  # fmt: skip
     elif series.style == "points":
         panel.plot(series.x, series.y, **marker, **look)
+    elif series.style == "model" and not over:
+        look |= {"color": "black", "lw": 0.6, "zorder": 3}
+        panel.plot(*style.thinned(series.x, series.y), **look)
     else:
         dash = style.DASHES[k % len(style.DASHES)]
         panel.plot(*style.thinned(series.x, series.y), ls=dash, **look)

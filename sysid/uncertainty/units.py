@@ -8,6 +8,11 @@ from collections.abc import Iterable
 
 _FACTOR = re.compile(r"([^\W\d]+|1)(?:\^(-?\d+))?")
 _WRITTEN = re.compile(r"(?P<above>[^/()]+)(?:/(?:\((?P<all>[^/()]+)\)|(?P<one>[^/()*]+)))?")
+# Units made of others, which cancel the one named second.
+_MADE_OF: tuple[tuple[str, str, dict[str, int]], ...] = (
+    ("H", "ohm", {"ohm": 1, "s": 1}),
+    ("ohm", "V", {"V": 1, "A": -1}),
+)
 
 
 def product_unit(factors: Iterable[tuple[str, float]]) -> str:
@@ -23,10 +28,10 @@ def product_unit(factors: Iterable[tuple[str, float]]) -> str:
             return ""
         for name, times in own.items():
             powers[name] += int(power) * times
-    if powers["ohm"] * powers["H"] < 0:
-        # An ohm is a henry per second.
-        henries = powers.pop("H")
-        powers.update({"ohm": henries, "s": henries})
+    for unit, against, parts in _MADE_OF:
+        if powers[unit] * powers[against] < 0:
+            times = powers.pop(unit)
+            powers.update({name: times * part for name, part in parts.items()})
     above = [_power(name, times) for name, times in powers.items() if times > 0]
     below = [_power(name, -times) for name, times in powers.items() if times < 0]
     bottom = "*".join(below)

@@ -27,6 +27,7 @@ def test_the_unit_of_a_product_is_the_product_of_the_units(factors):
         ([("1/rad", 1), ("N*m/A", 1)], "N*m/(rad*A)"),
         ([("ohm", 1), ("H", -1)], "1/s"),
         ([("A", 1), ("A", -1)], "1"),
+        ([("V/A", 1), ("ohm", -1)], "1"),
         ([("m s^-1", 1), ("A", 1)], ""),
         ([("A", 0.5)], ""),
     ],
