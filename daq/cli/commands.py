@@ -9,7 +9,7 @@ from typing import Annotated, Any, TypeVar
 
 import typer
 
-from daq.cli.console import Volume, volume
+from daq.cli.console import Volume, documents_alone, volume
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 Quiet = Annotated[
@@ -40,7 +40,7 @@ def _with_volume(function: Callable[..., Any]) -> Callable[..., Any]:
         if quiet and verbose:
             raise typer.BadParameter("give --quiet or --verbose, not both")
         level = Volume.QUIET if quiet else Volume.VERBOSE if verbose else Volume.NORMAL
-        with volume(level):
+        with volume(level), documents_alone(options.get("json", False)):
             return function(*args, **options)
 
     # Typer reads the options from the signature and the annotations.

@@ -9,10 +9,10 @@ import re
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext, redirect_stdout
 from contextvars import ContextVar
 from enum import IntEnum
-from typing import Any, Protocol
+from typing import Any, Protocol, TextIO
 
 from daq import notation
 
@@ -31,6 +31,7 @@ class Volume(IntEnum):
 
 
 _volume: ContextVar[Volume] = ContextVar("volume", default=Volume.NORMAL)
+_documents: ContextVar[TextIO | None] = ContextVar("documents", default=None)
 _VERBOSE_PERIOD = 1.0  # s between lines of progress
 _PREFIXES = {-9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M"}
 # A power would be of the prefix as well: mm^2 is no thousandth of m^2.
@@ -46,6 +47,18 @@ def volume(level: Volume) -> Iterator[None]:
         yield
     finally:
         _volume.reset(token)
+
+
+@contextmanager
+def documents_alone(asked: bool) -> Iterator[None]:
+    """Within it, where asked, standard output is for documents: what else is printed, such as by a
+    user's own protocol, goes to standard error."""
+    token = _documents.set(sys.stdout if asked else None)
+    try:
+        with redirect_stdout(sys.stderr) if asked else nullcontext():
+            yield
+    finally:
+        _documents.reset(token)
 
 
 class Bar(Protocol):
@@ -87,7 +100,9 @@ def print_next(*commands: str) -> None:
 
 def print_json(document: Any) -> None:
     """One JSON document; numbers JSON cannot hold become null."""
-    sys.stdout.write(json.dumps(plain(document), indent=2) + "\n")
+    out = _documents.get() or sys.stdout
+    out.write(json.dumps(plain(document), indent=2) + "\n")
+    out.flush()
 
 
 def print_line(text: str = "") -> None:

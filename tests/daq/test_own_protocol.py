@@ -54,7 +54,7 @@ _FINDINGS = {
     "no file name": lambda: Findings((), (Table("a/b", "T", {"a": np.zeros(2)}),)),
     "uneven series": lambda: Series("s", np.zeros(2), np.zeros(3)),
     "empty range": lambda: Findings(ranges={"K_m": (2.0, 1.0)}),
-    "lists": lambda: Findings(
+    "lists": lambda: print("a word") or Findings(
         (Number("n", 1, "s", 0.0, math.inf),), (Table("t", "T", {"a": [1]}),)
     ),
 }
@@ -181,7 +181,7 @@ def test_an_answer_that_is_none_ends_the_run_and_names_sample_and_folder(
 
 def test_mistakes_in_findings_leave_the_run_and_name_their_line(written, tmp_path, monkeypatch):
     done = rig("run", str(written("lists")), "--json", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    assert done.returncode == 0 and "a word" in done.stderr, done.stderr
     assert json.loads(done.stdout)["findings"]["numbers"]["n"]["value"] == 1.0
     folder = only_capture(tmp_path)
     for kind, says in {
