@@ -43,6 +43,8 @@ def heading(recording: Recording | None, root: Path, newer: bool) -> str:
         lines.append(f"reading the log: {recording.loading:.0%}")
     elif recording.state.running and not _rows(recording):
         lines.append("waiting for the first sample: offset calibration, winding of the load")
+    elif not _rows(recording) and not recording.complaints():
+        lines.append("no sample in this log yet; what is written to it will be shown")
     lines += [
         f'<span style="color:#a33c00">&#9888; {escape(text)}</span>'
         for text in recording.complaints()
@@ -59,11 +61,11 @@ def readout(
     rows: list[tuple[Any, ...]] = [(0, "transparent", "", where, "", from_mark, "bold")]
     colors = {curve.name: curve.color for group in curves_of(columns) for curve in group}
     for place, name in enumerate(columns):
-        value, unit, difference = f"{values[place]:.6g}", UNITS.get(name, ""), ""
+        value, unit, difference = _figures(name, values[place]), UNITS.get(name, ""), ""
         if name == "flags":
             value = _flags(values[place])
         elif marked is not None:
-            difference = f"{values[place] - marked[place]:+.5g}"
+            difference = _figures(name, values[place] - marked[place], sign="+")
         color = colors.get(name, "transparent")
         rows.append((place + 1, color, name, value, unit, difference, "normal"))
     return {
@@ -89,6 +91,12 @@ def _title(recording: Recording) -> str:
 
 def _rows(recording: Recording) -> int:
     return recording.history.n_rows if recording.history else 0
+
+
+def _figures(name: str, value: float, sign: str = "") -> str:
+    # After half an hour six digits would tell neighbouring samples no longer apart.
+    digits = 10 if name in ("t", "tick") else 6
+    return f"{value:{sign}.{digits}g}"
 
 
 def _flags(value: float) -> str:

@@ -202,6 +202,7 @@ def test_a_finished_run_is_shown_whole_and_magnified_to_its_samples(scope, tmp_p
         log.append(block)
     tab = scope(capture.folder)
     until(lambda: len(t := tab.drawn()) and t[-1] > 124.0, "the whole run")
+    until(lambda: tab.values().get("t") == repr((n - 1) / RATE), "all digits of the time")
     assert len(tab.drawn()) < 2100  # light, and yet the spike of one sample is there
     assert tab.drawn("torque").max() == 9.0 and tab.time() == (0.0, (n - 1) / RATE)
     assert 9.0 < tab.height("torque")[1] < 11.0
@@ -276,8 +277,10 @@ def test_a_log_of_the_original_program_is_shown(scope, tmp_path):
     names = (*names, "torque", "theta", "omega")
     rows = [", ".join([f"{k / 800!r}", *["0.5"] * 7]) for k in range(100)]
     path = tmp_path / "old.csv"
-    path.write_text("\n".join([", ".join(names), *rows]) + "\n")
+    path.write_text("")
     tab = scope(path)
+    until(lambda: "no sample in this log yet" in tab.head(), "word of an empty log")
+    path.write_text("\n".join([", ".join(names), *rows]) + "\n")
     until(lambda: len(tab.drawn()) == 100, "the log")
     assert "log without a run record" in tab.head() and "&#9888;" not in tab.head()
     path.write_text("a,b\n1,2\n")  # another file in its place, and no log
