@@ -5,16 +5,18 @@ from __future__ import annotations
 import sys
 from typing import NoReturn
 
+from daq.errors import RigError, Terminated
+
 _INTERRUPTED = 130  # what Typer makes of Ctrl-C
 
 
 def main() -> None:
     """Run the command line; expected errors end it with their message and exit status."""
-    from daq.cli.app import app
-    from daq.cli.console import report_error
-    from daq.errors import RigError, Terminated
-
     try:
+        # Ctrl-C may come while these are imported, too.
+        from daq.cli.app import app
+        from daq.cli.console import report_error
+
         app()
     except RigError as error:
         _report_notes(error)

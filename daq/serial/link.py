@@ -46,8 +46,10 @@ def open_link(port: str, baud: int) -> Link:
 
 
 def _gone(port: str, error: Exception) -> DeviceError:
+    # What pyserial says of a cable that was pulled guesses at more than it knows.
+    said = "" if "returned no data" in str(error) else f" ({error})"
     return DeviceError(
-        f"{port}: the port has gone ({error}); check the cable and the device's supply. The device "
+        f"{port}: the port has gone{said}; check the cable and the device's supply. The device "
         "makes itself safe when it hears nothing"
     )
 
@@ -197,6 +199,8 @@ def _not_opened(port: str, error: Exception) -> DeviceError:
             cure = f"no permission; {permission_cure(port)}"
     elif number in {errno.EAGAIN, errno.EBUSY} or "exclusively lock" in text:
         cure = f"another program has it open{_holder(port)}; close that first"
+    elif number in {errno.ENOTTY, errno.EISDIR} or f"({errno.ENOTTY}," in text:
+        cure = "that is no serial port; 'rig ports' lists those that there are"
     else:
         cure = f"it cannot be opened ({text}); 'rig ports' lists the ports that there are"
     return DeviceError(f"{port}: {cure}")

@@ -332,3 +332,21 @@ def test_a_log_deleted_during_the_run_is_no_completed_run(run, tmp_path):
     assert "log.csv: it was deleted, moved or replaced" in result.stderr
     record = record_of(only_capture(tmp_path))
     assert record["status"] == "failed" and "it was deleted" in record["reason"]
+
+
+def test_ctrl_c_while_the_program_is_still_being_imported_is_no_traceback():
+    code = (
+        "import sys\n"
+        "class Impatient:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name == 'daq.cli.app':\n"
+        "            raise KeyboardInterrupt\n"
+        "sys.meta_path.insert(0, Impatient())\n"
+        "from daq.cli import main\n"
+        "main()\n"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False
+    )
+    assert result.returncode == 1
+    assert result.stderr.strip() == "rig: stopped by Ctrl-C"
