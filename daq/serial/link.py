@@ -87,7 +87,9 @@ class SerialLink:
     def write(self, data: bytes) -> None:
         """Send all of it."""
         try:
-            self._serial.write(data)
+            left = data[self._write_now(data) :]
+            if left:
+                self._serial.write(left)
         except self._failures as error:
             raise _gone(self._port, error) from None
 
@@ -95,6 +97,21 @@ class SerialLink:
         """Disconnect; never raises."""
         with contextlib.suppress(*self._failures):
             self._serial.close()
+
+    def _write_now(self, data: bytes) -> int:
+        """What the port takes without waiting.
+
+        pyserial asks after every write whether there is room for more, and asking a terminal waits
+        for the kernel's worker that hands on what came from the device: tens of milliseconds on a
+        busy computer, whatever the priority of who asks.
+        """
+        descriptor = getattr(self._serial, "fd", None)
+        if os.name != "posix" or not isinstance(descriptor, int):
+            return 0
+        try:
+            return os.write(descriptor, data)
+        except BlockingIOError:
+            return 0
 
     def _prepare(self) -> None:
         """What was said before is not for us; no delay in the adapter; no reset on closing."""
