@@ -4,6 +4,7 @@ import itertools
 import os
 import signal
 import sys
+import threading
 import time
 
 import numpy as np
@@ -14,6 +15,7 @@ from daq.errors import ConfigError, DeviceError
 from daq.hal import Flag, Guard, Mode
 from daq.serial import faults
 from daq.serial.backend import SerialDevice, SerialOptions
+from daq.serial.link import open_link
 from tests.daq.serial.support import forked_emulators, write_serial_rig
 from tests.daq.support import (
     forked_rig,
@@ -271,3 +273,23 @@ def test_a_program_that_hangs_is_no_better_than_a_dead_one(tmp_path, emulate):
 def test_a_fault_that_is_none_is_refused_with_what_was_meant(text, said):
     with pytest.raises(ConfigError, match=said):
         faults.parse(text)
+
+
+def test_more_than_a_port_takes_at_once_is_written_in_full():
+    import pty
+    import tty
+
+    ours, theirs = pty.openpty()
+    tty.setraw(ours)
+    tty.setraw(theirs)
+    link, said = open_link(os.ttyname(theirs), 115_200), os.urandom(100_000)
+    writer = threading.Thread(target=link.write, args=(said,))
+    writer.start()
+    heard = bytearray()
+    while len(heard) < len(said):
+        heard += os.read(ours, 4096)
+    writer.join()
+    assert heard == said
+    link.close()
+    os.close(ours)
+    os.close(theirs)
