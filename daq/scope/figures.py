@@ -141,8 +141,8 @@ def make_value_table(values: ColumnDataSource, n_rows: int) -> figure:
     }  # fmt: skip
     table.scatter(x=10, y="row", source=values, marker="square", size=10, color="color")
     table.text(x=22, text="channel", **look)
-    table.text(x=270, text="value", text_align="right", **look)
-    table.text(x=276, text="unit", **look)
+    table.text(x=256, text="value", text_align="right", **look)
+    table.text(x=262, text="unit", **look)
     table.text(x=388, text="difference", text_align="right", **look)
     return table
 

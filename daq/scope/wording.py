@@ -61,11 +61,11 @@ def readout(
     rows: list[tuple[Any, ...]] = [(0, "transparent", "", where, "", from_mark, "bold")]
     colors = {curve.name: curve.color for group in curves_of(columns) for curve in group}
     for place, name in enumerate(columns):
-        value, unit, difference = _figures(name, values[place]), UNITS.get(name, ""), ""
+        value, unit, difference = _figures(name, values[place], 6), UNITS.get(name, ""), ""
         if name == "flags":
             value = _flags(values[place])
         elif marked is not None:
-            difference = _figures(name, values[place] - marked[place], sign="+")
+            difference = _figures(name, values[place] - marked[place], 5, "+")
         color = colors.get(name, "transparent")
         rows.append((place + 1, color, name, value, unit, difference, "normal"))
     return {
@@ -93,9 +93,9 @@ def _rows(recording: Recording) -> int:
     return recording.history.n_rows if recording.history else 0
 
 
-def _figures(name: str, value: float, sign: str = "") -> str:
+def _figures(name: str, value: float, digits: int, sign: str = "") -> str:
     # After half an hour six digits would tell neighbouring samples no longer apart.
-    digits = 10 if name in ("t", "tick") else 6
+    digits = 10 if name in ("t", "tick") else digits
     return f"{value:{sign}.{digits}g}"
 
 
