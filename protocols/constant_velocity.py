@@ -420,7 +420,8 @@ class _Conclusion:
             return []
         return [
             f"The torque sensor at the load reads {torque:.2g} N*m at {worst.omega:.3g} rad/s: "
-            "something hangs on the shaft, and its torque is counted as the brake's."
+            "something hangs on the shaft, and its torque is counted as the brake's. Or the sensor "
+            "is between motor and brake: write 'torque_sensor: between'."
         ]
 
 

@@ -23,6 +23,8 @@ _REST = 0.5  # s before and after the cycles of a level
 _BRAKE_SLOPE = 0.5  # V/s
 _OVERSPEED, _SPEED_MARGIN = 2.0, 10.0  # of the amplitude, and rad/s, beyond which a run is ended
 _THERE = 0.95  # of the samples of a cycle that must have arrived for it to count
+_LITTLE = 0.8  # of the torque's variance explained, below which a loop is no brake's
+_UNLIKE = 1.6  # times a rated value, or a part of it, beyond which something is mixed up
 _GUESS = 2.0  # either side of what was found, where an identification may search
 
 COLUMNS = {"omega_ref": "rad/s", "omega_tracked": "rad/s", "level": "1", "cycle": "1"}
@@ -269,6 +271,8 @@ class _Conclusion:
 
     def _ranges(self) -> dict[str, tuple[float, float]]:
         """Where an identification may search, with z scaled to saturate near 1."""
+        if self._fit.explained < _LITTLE:
+            return {}
         found, rate, part = self._fit, self._fit.rate, self._fit.part
         guesses = {
             "gamma": rate.value * part.value,
@@ -286,6 +290,20 @@ class _Conclusion:
             f"The Bouc-Wen loop explains {100.0 * found.explained:.1f} % of the torque's variance. "
             "Intervals are by the scatter between cycles alone."
         ]
+        if found.explained < _LITTLE:
+            other = "load" if self._settings.torque_sensor == "between" else "between"
+            remarks.append(
+                "That is too little for ranges. Is the torque sensor where 'torque_sensor' says? "
+                f"Else write 'torque_sensor: {other}'. With the brake off little else than noise "
+                "may be left."
+            )
+        rated = self._settings.ratings.brake_constant
+        if rated and found.kappa1 and not rated / _UNLIKE < found.kappa1.value < _UNLIKE * rated:
+            remarks.append(
+                f"kappa1 is {found.kappa1.value:.3g} N*m/A where ratings.brake_constant says "
+                f"{rated:g}: look at 'torque_sensor', ratings.torque_constant and the scales in "
+                "the rig's file."
+            )
         missing = len(self._settings.brake_commands) - len(self._even)
         if missing:
             remarks.append(f"{missing} brake command(s) without two whole cycles are left out.")

@@ -175,6 +175,8 @@ def _write(found: Findings, folder: Path) -> None:
             capture.write_whole(folder / f"{figure.name}.{kind}", style.render(drawn, kind))
     text = json.dumps(console.plain(_contents(found)), indent=2)
     capture.write_whole(folder / "findings.json", text + "\n")
+    # Of an earlier analysis with another protocol's text.
+    (folder / "ranges.yaml").unlink(missing_ok=True)
     if found.ranges:
         lines = ["# Starting ranges for rig identify --config", "ranges:"]
         lines += [f"  {k}: [{low:.6g}, {high:.6g}]" for k, (low, high) in found.ranges.items()]

@@ -234,3 +234,18 @@ def test_any_settings_give_a_clear_error_or_a_plan_within_what_it_declares(chang
     assert speed[0] == speed[-1] == brake[-1] == 0.0
     # By rounding one sample more than the slope.
     assert max(brake[0], np.max(np.abs(np.diff(brake)))) <= 0.5 / changes["sample_rate"] * 2.0
+
+
+@pytest.mark.parametrize(
+    ("said", "place", "told"),
+    [
+        ("between", "load", "That is too little for ranges. Is the torque sensor"),
+        ("load", "between", "where ratings.brake_constant says 3.568"),
+    ],
+)
+def test_a_torque_sensor_that_is_elsewhere_is_suspected(tmp_path, said, place, told):
+    chosen = experiment(torque_sensor=said, brake_commands=[0.05, 0.1])
+    samples, extra = run(chosen, tmp_path, {"load": "free", "sensor": place})
+    found = chosen.findings(samples, extra)
+    assert any(told in remark for remark in found.remarks), found.remarks
+    assert bool(found.ranges) == (said == "load")
