@@ -275,6 +275,7 @@ def _describe(
         if driver_motor == driver_brake
         else f"{driver_motor}-loop motor and {driver_brake}-loop brake driver"
     )
-    brake = f"DC motor, MR brake with {'smooth ' * smooth}{hysteresis} hysteresis"
+    named = {"bouc-wen": "Bouc-Wen", "dahl": "Dahl", "lugre": "LuGre"}[hysteresis]
+    brake = f"DC motor, magnetorheological brake with {'smooth ' * smooth}{named} hysteresis"
     rubbing = {"none": "", "stribeck": ", brush friction", "cyclic": ", cyclic brush friction"}
     return f"{drivers}, {brake}{rubbing[friction]}, {load} load"

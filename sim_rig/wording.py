@@ -38,7 +38,10 @@ def equations(
     )
 
 
-_WHERE = "u: commands, v: voltages and i: currents of motor (m) and brake (b); theta: angle"
+_WHERE = (
+    "u: commands, v: voltages and i: currents of motor (m) and brake (b); z: hysteresis; "
+    "theta: angle"
+)
 _OF_LOAD = "tau_load and J_load: torque and inertia of the load"
 _SHARED = "(alpha0 + alpha1*|i_b|)*z + (c0 + c1*|i_b|)*omega"
 _DEFLECTION = "(epsilon0 + epsilon1*|i_b|)*(dz/dt)"

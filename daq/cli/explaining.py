@@ -240,11 +240,11 @@ def _cures(document: Mapping[str, Any]) -> list[Step]:
     return [
         Step(before, list(dict.fromkeys(names)), after)
         for names, before, after in (
-            (held, "Give ", " more room under ranges, or a value under fixed: an end of the range "
-             "decides them now."),
+            (held, "Give ", " more room under `ranges`, or a value under `fixed`: an end of the "
+             "range decides now."),
             (rival, "Measure ", ", to tell which of the sets of parameters below it is."),
             (measure, "Measure ", " by other means (an ohmmeter, a scale, a data sheet) and give "
-             "the values under fixed in a file for --config: then those that act together get "
+             "the values under `fixed` in a file for `--config`: then those that act together get "
              "intervals of their own. To simulate, this is not needed."),
             (vague, "Record an experiment that makes ", " matter, larger or slower or faster than "
              "this one: these data hardly feel them."),

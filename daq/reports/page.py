@@ -15,6 +15,7 @@ from daq import notation
 TOPICS = (
     "parameters", "responses", "residuals", "frequency", "torque", "excitation", "search",
 )  # fmt: skip
+_CODE = re.compile("`([^`]+)`")  # what is typed, in sentences
 _TEMPLATES = Path(__file__).parent / "templates"
 
 
@@ -50,7 +51,7 @@ def _rendered(
     name: str, document: Mapping[str, Any], view: Mapping[str, Any], drawings: Sequence[Drawing]
 ) -> str:
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
-    from markupsafe import Markup
+    from markupsafe import Markup, escape
 
     # Escapes all that is not marked as safe, so that no name of a user's becomes markup.
     environment = Environment(
@@ -63,6 +64,7 @@ def _rendered(
     environment.filters["number"] = lambda value, digits=3: Markup(_number(value, digits))
     environment.filters["plain"] = lambda value: Markup(notation.number_html(f"{value:g}"))
     environment.filters["digits"] = _digits
+    environment.filters["marked"] = lambda text: Markup(_CODE.sub(r"<code>\1</code>", escape(text)))
     figures = [
         {"name": d.name, "topic": d.topic, "caption": d.caption,
          "svg": Markup(_inlined(d.svg, k)), "number": k}

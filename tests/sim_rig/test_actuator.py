@@ -73,11 +73,11 @@ def test_what_does_not_go_together_is_refused(settings, message):
 
 def test_the_description_says_what_was_chosen():
     text = Parts("open", "closed", "dahl", 1.0, True, "cyclic", "pulley").build().description
-    for word in ("open", "closed", "smooth dahl", "cyclic", "pulley"):
+    for word in ("open", "closed", "smooth Dahl", "cyclic", "pulley"):
         assert word in text
     plain = Parts().build().description
     assert "closed-loop drivers" in plain
-    assert not any(word in plain for word in ("smooth", "friction", "open", "dahl"))
+    assert not any(word in plain for word in ("smooth", "friction", "open", "Dahl"))
 
 
 # --- named sets -----------------------------------------------------------------------------
