@@ -7,6 +7,7 @@ from typing import Any
 from daq.run import RunResult
 
 _SHOWN = 5  # ticks named in a note
+_IN_LOTS = 3.0  # samples that come at once, on average
 
 
 def summary_line(run: RunResult) -> str | None:
@@ -50,6 +51,12 @@ def notes(run: RunResult) -> list[str]:
 def _haste(run: RunResult) -> str:
     if not run.realtime["needed"]:
         return ""
+    apart = run.timing["arrival"]["mean_seconds"]
+    if apart > _IN_LOTS * run.timing["wall_seconds"] / run.n_samples:
+        return (
+            f" Samples come in lots, {_short(apart)} apart: the line or its adapter holds them "
+            "back. 'rig doctor' looks at an adapter's latency timer"
+        )
     cure = " Raise 'ahead' or lower 'sample_rate' in the experiment"
     if run.realtime["refused"] or run.realtime["asked"] == "off":
         cure += ", or allow real-time scheduling (docs/safety.md)"
