@@ -64,7 +64,9 @@ def _rendered(
     environment.filters["number"] = lambda value, digits=3: Markup(_number(value, digits))
     environment.filters["plain"] = lambda value: Markup(notation.number_html(f"{value:g}"))
     environment.filters["digits"] = _digits
-    environment.filters["marked"] = lambda text: Markup(_CODE.sub(r"<code>\1</code>", escape(text)))
+    environment.filters["marked"] = lambda text: Markup(
+        _CODE.sub(r"<code>\1</code>", str(escape(text)))
+    )
     figures = [
         {"name": d.name, "topic": d.topic, "caption": d.caption,
          "svg": Markup(_inlined(d.svg, k)), "number": k}

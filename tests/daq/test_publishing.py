@@ -97,7 +97,7 @@ def document(result, work):
 class Page(HTMLParser):
     """Tags opened and closed, addresses that are fetched, and rows with their exact numbers."""
 
-    VOID = ("meta", "link", "br", "img", "hr", "input")
+    VOID = ("meta", "link", "br", "img", "hr", "input", "wbr")
 
     def __init__(self, text):
         super().__init__(convert_charrefs=True)
@@ -208,6 +208,7 @@ def test_verdict_in_two_sentences_and_how_to_do_it_again(page, document, work, r
     # What would tell more is known: one of the two that act together.
     (ambiguity,) = document["ambiguities"]
     assert re.search(rf"Measure {ambiguity['measure'][0]} by other means", page.text)
+    assert "give the values under fixed in a file for --config:" in page.text
     assert re.search(r"rig replay LOG --parameters parameters.yaml --config \S*id.yaml", page.text)
     for log in document["reproduction"]["logs"]:
         assert log["sha256"] in page.text
