@@ -128,9 +128,7 @@ def _progress(
 
 def _left_over(model: ProcessModel, results: Sequence[RecordResult]) -> list[str]:
     """Outputs whose residuals still follow an input."""
-    # Over the records: of many, one is outside by chance.
-    shares = mean_known(np.array([result.residuals.independent for result in results]), 0)
-    sizes = np.mean([np.abs(result.residuals.cross).max(axis=0) for result in results], axis=0)
+    shares, sizes = _correlations(results)
     found = []
     for output, own, size in zip(model.output_names, shares, sizes, strict=True):
         follows = [
@@ -144,6 +142,16 @@ def _left_over(model: ProcessModel, results: Sequence[RecordResult]) -> list[str
                 "dynamics there."
             )
     return found
+
+
+def _correlations(results: Sequence[RecordResult]) -> tuple[FloatArray, FloatArray]:
+    """Share of each input's correlations inside their band, and the largest of them.
+
+    Both (n_outputs, n_inputs), means over the records: of many, one is outside by chance.
+    """
+    shares = mean_known(np.array([result.residuals.independent for result in results]), 0)
+    sizes = np.mean([np.abs(result.residuals.cross).max(axis=0) for result in results], axis=0)
+    return shares, sizes
 
 
 def _wandering(model: ProcessModel, results: Sequence[RecordResult]) -> list[str]:
@@ -175,5 +183,19 @@ def _praise(validation: Sequence[RecordResult]) -> tuple[str, ...]:
     fit = float(mean_known(np.array([result.metrics.fit for result in validation])))
     return (
         f"Data not used in the fit are explained as well as those that were (mean fit {fit:.1f} "
-        "%), and nothing of the inputs is left in the residuals.",
+        f"%){_of_inputs(validation)}.",
     )
+
+
+def _of_inputs(results: Sequence[RecordResult]) -> str:
+    """What good residuals hold of the inputs; nothing to say of models without."""
+    shares, sizes = _correlations(results)
+    if not np.isfinite(shares).any():
+        return ""
+    traces = sizes[shares < _INDEPENDENT]
+    if len(traces):
+        return (
+            ", and of the inputs no more than a trace is left in the residuals (correlations of "
+            f"at most {traces.max():.2f})"
+        )
+    return ", and nothing of the inputs is left in the residuals"

@@ -103,7 +103,7 @@ def uncertainty(
     told = directions(objective, chromosome, steps, found, ends)
     units = coordinate_units(objective, chromosome)
     slope = np.where(objective.space.log, chromosome, units)
-    still = overlooked(objective, chromosome, steps, found, slope, told.lost)
+    still = overlooked(objective, chromosome, steps, found, slope, told.lost, rivals)
     if len(still):
         found = replace(found, slopes=found.slopes - found.slopes @ still.T @ still)
         told = directions(objective, chromosome, steps, found, ends)

@@ -12,7 +12,7 @@ import numpy as np
 from sysid.model import BoolArray, FloatArray, IntArray
 from sysid.objective import Objective
 from sysid.uncertainty.directions import Directions
-from sysid.uncertainty.sensitivity import Sensitivity
+from sysid.uncertainty.sensitivity import Sensitivity, coordinate_units
 
 Kind = Literal["product", "sum", "vague"]
 
@@ -88,18 +88,22 @@ def overlooked(
     found: Sensitivity,
     slope: FloatArray,
     lost: FloatArray,
+    rivals: Sequence[FloatArray] = (),
 ) -> FloatArray:
     """Exact directions that errors of the slopes let look determined, (n, n_free), orthonormal.
 
     Dry friction makes the slope of each parameter jagged while all of them together, followed
     in whole numbers, move nothing. slope: as for ``relations``. lost: (n_lost, n_free), those
-    known not to be determined.
+    known not to be determined. rivals: other minima; one that is another point of the same valley
+    lies along such a direction.
     """
     rows = found.slopes[:, objective.weights > 0.0].reshape(-1, len(chromosome))
     follower = _Follower(objective, chromosome, steps, slope, rows)
     _, values, vectors = np.linalg.svd(rows, full_matrices=False)
+    at, units = objective.space.encode(chromosome), coordinate_units(objective, chromosome)
+    ways = [(objective.space.encode(rival) - at) / units for rival in rivals]
     known = [*lost]
-    for vector in vectors[values < _WEAK * values[0]]:
+    for vector in [*ways, *vectors[values < _WEAK * values[0]]]:
         for candidate in follower.rounded(vector):
             rest = _beyond(candidate, known)
             if np.linalg.norm(rest) > _NEW * np.linalg.norm(candidate) and (

@@ -164,7 +164,8 @@ def test_a_trace_of_an_input_in_a_long_record_is_nothing_to_mend():
 
     trace, much = long(0.07), long(0.3)
     assert np.all(trace.residuals.independent < 0.1)
-    assert verdict([trace], [trace]).trust == "good"
+    told = verdict([trace], [trace])
+    assert told.trust == "good" and "no more than a trace is left" in told.reasons[0]
     assert "follow" in verdict([much], [much]).reasons[0]
 
 
