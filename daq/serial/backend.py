@@ -479,7 +479,8 @@ class SerialDevice:
 
     def _feed(self) -> None:
         machine = self._connected()
-        while not self._leaving.wait(_FEED) and machine.failure is None:
+        pause = min(_FEED, 0.2 * self.options.watchdog)
+        while not self._leaving.wait(pause) and machine.failure is None:
             try:
                 with self._changed:
                     now = time.monotonic()
