@@ -411,8 +411,8 @@ class HostMachine:
         if pause < 0.9e-3 * watchdog:
             return (
                 f"{tripped}, which has spoken every {1e3 * pause:.0f} ms at least: the line fails "
-                "towards the device. Check cable, connectors and baud rate; of an emulator, whether "
-                "the computer is too busy to carry it"
+                "towards the device. Check cable, connectors and baud rate; of an emulator, "
+                "whether the computer is too busy to carry it"
             )
         return (
             f"{tripped}, which the computer had held up for {1e3 * pause:.0f} ms. 'rig doctor' "
