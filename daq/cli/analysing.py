@@ -140,7 +140,7 @@ def show_findings(found: Findings, folder: Path) -> None:
         rows = zip(*(values.tolist() for values in table.columns.values()), strict=True)
         console.print_table(table.title, heads, [[console.number(v) for v in row] for row in rows])
     for remark in found.remarks:
-        console.print_line(remark)
+        console.print_text(remark)
     console.print_line(f"Results: {folder / RESULTS}")
 
 

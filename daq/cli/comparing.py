@@ -281,11 +281,11 @@ def _show(
         ["structure", "free parameters", "effective", "mean RMSE", "dAIC", "dBIC"],
         [_training_row(row) for row in result.rows],
     )
-    console.print_line(
+    console.print_text(
         f"AIC and BIC count {result.n_samples} training samples as "
         f"{result.n_independent:.0f} independent ones."
     )
-    console.print_line(result.verdict)
+    console.print_text(result.verdict)
     _show_runs(found)
     for name, path in files.items():
         console.print_line(f"Parameters of {name}: {path}")
@@ -295,12 +295,12 @@ def _show(
 def _show_runs(found: Campaign) -> None:
     for spread in found.spread():
         if spread.runs > 1:
-            console.print_line(
+            console.print_text(
                 f"{spread.model}: error of {spread.runs} seeds {console.number(spread.best)} to "
                 f"{console.number(spread.worst)}, {spread.agreeing} within 1 % of the best."
             )
     for problem in dict.fromkeys(f"{o.run.name}: {o.problem}" for o in found.failed):
-        console.print_line(f"Failed: {problem}")
+        console.print_text(f"Failed: {problem}")
     if found.interrupted:
         console.print_line(f"Stopped by Ctrl-C after {len(found.outcomes)} runs.")
 

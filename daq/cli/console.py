@@ -6,7 +6,9 @@ import functools
 import json
 import math
 import re
+import shutil
 import sys
+import textwrap
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext, redirect_stdout
@@ -108,6 +110,17 @@ def print_json(document: Any) -> None:
 def print_line(text: str = "") -> None:
     """One line of result on standard output."""
     sys.stdout.write(text + "\n")
+
+
+def print_text(text: str) -> None:
+    """Sentences: on a terminal wrapped between words, its indent kept, in a pipe one line."""
+    if sys.stdout.isatty():
+        indent = " " * (len(text) - len(text.lstrip()))
+        text = textwrap.fill(
+            text.strip(), shutil.get_terminal_size().columns, initial_indent=indent,
+            subsequent_indent=indent, break_long_words=False, break_on_hyphens=False,
+        )  # fmt: skip
+    print_line(text)
 
 
 def print_table(

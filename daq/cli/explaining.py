@@ -14,7 +14,7 @@ from sysid.model import ProcessModel
 
 _FIGURES = ("rmse", "msd", "fit_percent")
 _ENDED = {
-    "generations": "it spent them all",
+    "generations": "it ended with the budget given",
     "converged": "it ended where nothing better came any more",
     "interrupted": "it was interrupted",
 }

@@ -255,7 +255,7 @@ def show(result: Identified, path: Path) -> None:
     console.print_line()
     _show_parameters(result)
     for name, guess in result.estimator.guesses_.items():
-        console.print_line(f"{name} searched as the data suggest: {guess.source}.")
+        console.print_text(f"{name} searched as the data suggest: {guess.source}.")
     if result.uncertainty is not None:
         _show_open_questions(result.uncertainty)
     _show_profiles(result.profiles)
@@ -341,14 +341,14 @@ def _show_open_questions(found: Uncertainty) -> None:
         console.print_line("What these data cannot tell apart:")
     for ambiguity in exact:
         for line in _exact_lines(ambiguity):
-            console.print_line(line)
+            console.print_text(line)
     vague = [a for a in found.ambiguities if a.kind == "vague"]
     if vague:
         names = "; ".join(" with ".join(a.parameters) for a in vague)
-        console.print_line(f"Hardly felt by these data: {names}.")
+        console.print_text(f"Hardly felt by these data: {names}.")
     close = _close_pairs(found)
     if close:
-        console.print_line(f"Known mostly together (correlation above {_STRONG:g}): "
+        console.print_text(f"Known mostly together (correlation above {_STRONG:g}): "
                            f"{'; '.join(close)}.")  # fmt: skip
     if exact or vague or close:
         console.print_line()
@@ -366,9 +366,10 @@ def _show_rivals(found: Uncertainty) -> None:
             [_rival_row(here[name], found.rivals) for name in ambiguity.parameters],
             text=["unit"],
         )
-        console.print_line(
-            f"A measured {ambiguity.measure[0]}, given under 'fixed', would tell which it is.\n"
+        console.print_text(
+            f"A measured {ambiguity.measure[0]}, given under 'fixed', would tell which it is."
         )
+        console.print_line()
 
 
 def _rival_row(here: Estimate, rivals: Sequence[Mapping[str, float]]) -> list[str]:
@@ -456,24 +457,24 @@ def _show_residuals(result: Identified) -> None:
 def _show_notes(result: Identified) -> None:
     estimator = result.estimator
     if estimator.stopped_ == "interrupted":
-        console.print_line(
+        console.print_text(
             f"Stopped by Ctrl-C after {len(estimator.history_)} generations: "
             "these are the best parameters until then."
         )
     if any(result.on_bound(name) for name in estimator.space_.names):
-        console.print_line(
+        console.print_text(
             "At the end of its range: the data want more room there. Set 'ranges' in a file "
             "given with --config."
         )
     verdict = result.verdict
-    console.print_line(f"Trust: {verdict.trust}. {' '.join(verdict.reasons)}")
+    console.print_text(f"Trust: {verdict.trust}. {' '.join(verdict.reasons)}")
     if (found := result.uncertainty) is not None:
         free = [e for e in found.parameters if e.name in result.model.parameter_names]
         own = sum(not estimate.why for estimate in free)
         together = sum(len(a.determined) for a in found.ambiguities)
         several = "s" if together != 1 else ""
         also = f", and {together} combination{several} of others" if together else ""
-        console.print_line(f"Determined: {own} of {len(free)} free parameters by themselves{also}.")
+        console.print_text(f"Determined: {own} of {len(free)} free parameters by themselves{also}.")
 
 
 def print_metrics(

@@ -94,11 +94,12 @@ def test_tab_offers_what_can_stand_there(tmp_path, typed, offered, not_offered):
 
 
 TABLE = """
-from daq.cli.console import print_table
+from daq.cli.console import print_table, print_text
 print_table("Title [rad/s]", ["name", "omega [rad/s]", "meaning"],
             [["K_m", "0.135 .. 0.151", "[low, high] of a :smile:" * 9]], text=["meaning"])
 print_table("Wide", ["output", "RMSE, training", "with applied_voltage_motor", "fit [%]"],
             [["current_motor", "0.00969", "100 %", "98.7"]])
+print_text("  " + "Trust: good. " * 9)
 """
 
 
@@ -110,6 +111,7 @@ def test_a_table_in_a_pipe_has_a_line_for_each_row_and_takes_nothing_for_markup(
     (row,) = [line for line in said if "K_m" in line]
     assert "0.135 .. 0.151" in row and "[low, high] of a :smile:" * 9 in row
     assert any("omega [rad/s]" in line for line in said)
+    assert said[-1].count("Trust: good.") == 9
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="a pseudo-terminal is needed")
@@ -133,5 +135,8 @@ def test_a_narrow_terminal_cuts_nothing(columns):
     # Heads are folded, where they have parts, and names of rows are not.
     assert re.search("current_motor +0.00969 ", shown)
     assert "with applied_voltage_motor" not in shown and "voltage_" in shown
+    sentences = [line for line in shown.splitlines() if "good." in line]
+    assert len(sentences) > 2 and all(line.startswith("  ") for line in sentences)
+    assert max(map(len, sentences)) <= columns
     wide = shown[shown.index("Wide") :].splitlines()
     assert columns == 30 or max(map(len, wide)) <= columns
