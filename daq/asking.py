@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import inspect
 import json
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,12 +13,22 @@ from typing import Any
 import numpy as np
 
 from daq.errors import ConfigError, RigError
-from daq.experiment import MOST_SAMPLES, ClosedLoop, Controller, Experiment, Plan
+from daq.experiment import (
+    MOST_SAMPLES,
+    Answer,
+    ClosedLoop,
+    Controller,
+    Experiment,
+    Plan,
+    Sample,
+)
 from daq.findings import Chart, Heatmap
 from daq.hal import CHANNELS
 
 MISTAKES = (Exception, SystemExit)
 """What code of a user's own may raise without meaning to end the program."""
+
+_ROUNDING = 1e-9  # of a plan's bounds
 
 
 def place(error: BaseException, kind: type) -> str:
@@ -74,6 +85,48 @@ def controller_of(experiment: ClosedLoop) -> Controller:
                 f"it returned {controller!r}; return an object with a method answer(sample)"
             )
     return controller
+
+
+def rehearse(experiment: ClosedLoop, planned: Plan) -> None:
+    """Ask a controller of its own for its first answer, to a shaft at rest.
+
+    Most mistakes in one show there. Raises ConfigError.
+    """
+    controller = controller_of(experiment)
+    with _before_the_run(experiment, "when asked for its first answer, at rest"):
+        answer = controller.answer(Sample(0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0))
+        if answer is not None:
+            AnswerCheck(experiment, planned)(answer)
+
+
+class AnswerCheck:
+    """Whether an answer is one, and within the plan; made once for a run, as it is asked often."""
+
+    def __init__(self, experiment: ClosedLoop, planned: Plan) -> None:
+        self._plan = planned
+        self._columns = tuple(experiment.columns)
+        reach = _ROUNDING * np.max(np.abs([planned.lowest, planned.highest]), axis=0)
+        ends = np.stack([planned.lowest - reach, planned.highest + reach], axis=1)
+        self._bounds: list[list[float]] = ends.tolist()
+
+    def __call__(self, answer: Answer) -> None:
+        """Raises TypeError or ValueError."""
+        if not isinstance(answer, Answer):
+            raise TypeError(f"it answered {answer!r}; answer with a daq.experiment.Answer or None")
+        (motor_low, motor_high), (brake_low, brake_high) = self._bounds
+        if not (
+            motor_low <= answer.motor <= motor_high and brake_low <= answer.brake <= brake_high
+        ):
+            (motor_low, brake_low), (motor_high, brake_high) = self._plan.lowest, self._plan.highest
+            raise ValueError(
+                f"it answered motor {answer.motor!r} V, brake {answer.brake!r} V, and its plan "
+                f"says {motor_low:g} to {motor_high:g} V and {brake_low:g} to {brake_high:g} V"
+            )
+        if len(answer.logged) != len(self._columns) or not all(map(math.isfinite, answer.logged)):
+            raise ValueError(
+                f"it logged {answer.logged!r}; a finite number for each of its columns is "
+                f"expected: {', '.join(self._columns) or 'none'}"
+            )
 
 
 def preview_of(experiment: ClosedLoop) -> Chart | Heatmap | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from daq.asking import plan_of
+from daq.asking import description_of, plan_of, rehearse
 from daq.config.rig import RigConfig
 from daq.errors import ConfigError
 from daq.experiment import ClosedLoop, Experiment, Plan
@@ -22,6 +22,9 @@ def plan(experiment: Experiment, rig: RigConfig) -> Plan:
     beforehand.
     """
     planned = plan_of(experiment)
+    description_of(experiment)
+    if isinstance(experiment, ClosedLoop):
+        rehearse(experiment, planned)
     _check_homing(experiment.homing.turns, rig)
     for channel, name in enumerate(CHANNELS):
         _check_range(planned, rig, channel, name)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from daq.asking import MISTAKES, controller_of, description_of, mistake
+from daq.asking import MISTAKES, AnswerCheck, controller_of, description_of, mistake
 from daq.capture import COMPLETED, Capture
 from daq.config.rig import RigConfig
 from daq.errors import DeviceError, InterlockError, RigError, RunError, Terminated
@@ -36,7 +35,6 @@ _ZEROS_AHEAD = 0.05  # s of zero commands queued while waiting
 _REST_TIME = 1.0  # s that the shaft must stand still to end homing
 _REST_TURNS = 0.01  # turns it may creep meanwhile
 _SAMPLE = Sample._fields
-_ROUNDING = 1e-9  # of a plan's bounds
 
 
 @dataclass(frozen=True)
@@ -428,11 +426,8 @@ class _Answering:
         self._experiment = experiment
         self._columns = tuple(experiment.columns)
         self._controller = controller_of(experiment)
-        self._plan = planned
+        self._check = AnswerCheck(experiment, planned)
         self._last = Answer(0.0, 0.0, (0.0,) * len(self._columns))
-        reach = _ROUNDING * np.max(np.abs([planned.lowest, planned.highest]), axis=0)
-        ends = np.stack([planned.lowest - reach, planned.highest + reach], axis=1)
-        self._bounds: list[list[float]] = ends.tolist()
 
     def to(self, samples: Samples) -> _Answers:
         """Answers to some samples; ``ended`` once the controller has none."""
@@ -467,25 +462,6 @@ class _Answering:
     def _failed(self, tick: int, error: BaseException) -> RunError:
         reason = mistake(self._experiment, f"at sample {tick}", error)
         return RunError(f"{reason}; outputs were set to zero")
-
-    def _check(self, answer: Answer) -> None:
-        """ValueError, or TypeError, for what can be no answer, or is beyond the plan."""
-        if not isinstance(answer, Answer):
-            raise TypeError(f"it answered {answer!r}; answer with a daq.experiment.Answer or None")
-        (motor_low, motor_high), (brake_low, brake_high) = self._bounds
-        if not (
-            motor_low <= answer.motor <= motor_high and brake_low <= answer.brake <= brake_high
-        ):
-            (motor_low, brake_low), (motor_high, brake_high) = self._plan.lowest, self._plan.highest
-            raise ValueError(
-                f"it answered motor {answer.motor!r} V, brake {answer.brake!r} V, and its plan "
-                f"says {motor_low:g} to {motor_high:g} V and {brake_low:g} to {brake_high:g} V"
-            )
-        if len(answer.logged) != len(self._columns) or not all(map(math.isfinite, answer.logged)):
-            raise ValueError(
-                f"it logged {answer.logged!r}; a finite number for each of its columns is "
-                f"expected: {', '.join(self._columns) or 'none'}"
-            )
 
 
 def _require_rest(calibration: OffsetCalibration, moved: float, means: dict[str, float]) -> None:

@@ -32,7 +32,10 @@ class Loop(ClosedLoop):
                     remarks=("follows a sine",))
 
     def controller(self):
-        raise NotImplementedError
+        return self
+
+    def answer(self, sample):
+        return Answer(0.0, 0.0, (0.0,))
 '''
 
 

@@ -32,7 +32,7 @@ _PLANS = {
     "no length": lambda n: Plan(0, np.zeros(2), np.ones(2)),
     "one bound": lambda n: Plan(n, np.zeros(1), np.ones(1)),
     "turned round": lambda n: Plan(n, np.ones(2), np.zeros(2)),
-    "short reference": lambda n: Plan(n, np.zeros(2), np.ones(2), references={"a": np.zeros(3)}),
+    "long reference": lambda n: Plan(n, np.zeros(2), np.ones(2), references={"a": np.zeros(n + 1)}),
     "a text": lambda n: Plan(n, np.zeros(2), np.array([1.0, 0.1]), remarks="a text"),
 }
 _ANSWERS = {
@@ -95,6 +95,8 @@ class Controller:
         self.kind = kind
 
     def answer(self, sample):
+        if self.kind == "misspelt":
+            return Answr(0.1, 0.0)
         if sample.tick < 50 or self.kind not in _ANSWERS:
             return Answer(0.1, 0.0, (0.0,))
         return _ANSWERS[self.kind]()
@@ -130,9 +132,10 @@ _BEFORE = [
     ("Loop", "no length", "n_samples is 0"),
     ("Loop", "one bound", "lowest is of shape (1,)"),
     ("Loop", "turned round", "is above highest"),
-    ("Loop", "short reference", "references['a'] is of shape (3,)"),
+    ("Loop", "long reference", "references['a'] is of shape (101,)"),
     ("Loop", "a text", "write a tuple of texts"),
     ("Loop", "no controller", "a method answer(sample)"),
+    ("Loop", "misspelt", "when asked for its first answer, at rest: NameError: name 'Answr'"),
     ("Loop", "not JSON", "no type that JSON has"),
 ]
 
@@ -145,7 +148,7 @@ def test_what_can_be_known_before_the_run_is_told_before_it(
     with pytest.raises(ConfigError) as refused:
         record(written(kind, named))
     assert says in str(refused.value)
-    assert f"own.py:{named}' failed in " in str(refused.value)
+    assert f"own.py:{named}' failed " in str(refused.value)
     assert not (tmp_path / "runs").exists()
 
 
