@@ -20,8 +20,9 @@ def experiments(incomplete: str) -> list[Offer]:
 
 
 def rigs(incomplete: str) -> list[Offer]:
-    """Shipped rigs, and YAML files here that name a backend."""
-    return _matching(incomplete, [*_shipped(RIGS), *_local(incomplete, ".yaml", "backend:")])
+    """Shipped rigs, and YAML files here that name a backend or have its options."""
+    own = _local(incomplete, ".yaml", "backend:", "options:")
+    return _matching(incomplete, [*_shipped(RIGS), *own])
 
 
 def rig_names(incomplete: str) -> list[Offer]:
@@ -64,12 +65,12 @@ def _shipped(packages: Iterable[str]) -> Iterator[Offer]:
         yield path.name, _about(path)
 
 
-def _local(incomplete: str, suffix: str, key: str) -> Iterator[Offer]:
-    """Files of a kind that have a key, and folders, in the folder that is being typed."""
+def _local(incomplete: str, suffix: str, *keys: str) -> Iterator[Offer]:
+    """Files of a kind that have one of the keys, and folders, in the folder that is being typed."""
     for path in _beside(incomplete, suffix):
         if path.is_dir():
             yield f"{path.as_posix()}/", "folder"
-        elif key in _beginning(path):
+        elif any(key in _beginning(path) for key in keys):
             yield path.as_posix(), _about(path)
 
 

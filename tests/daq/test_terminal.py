@@ -61,7 +61,11 @@ TAB = [
     ("rig run ", {"prbs.yaml", "mine.yaml", "folder/"}, {"bench.yaml", "notes.yaml"}),
     ("rig run m", {"mine.yaml"}, {"prbs.yaml"}),
     ("rig run folder/", {"folder/inner.yaml"}, {"prbs.yaml"}),
-    ("rig check mine.yaml --rig ", {"simulated.yaml", "bench.yaml", "folder/"}, {"mine.yaml"}),
+    (
+        "rig check mine.yaml --rig ",
+        {"simulated.yaml", "bench.yaml", "worn.yaml", "folder/"},
+        {"mine.yaml"},
+    ),
     ("rig identify log.csv --preset ", {"default", "thesis", "cega", "classic"}, set()),
     ("rig identify log.csv --model ", {"actuator", "lag.py", "folder/"}, {"mine.yaml"}),
     ("rig models a", {"actuator"}, {"lag.py"}),
@@ -78,6 +82,7 @@ def test_tab_offers_what_can_stand_there(tmp_path, typed, offered, not_offered):
     write_experiment(tmp_path / "mine.yaml")
     write_experiment(tmp_path / "folder" / "inner.yaml")
     write_rig(tmp_path / "bench.yaml")
+    (tmp_path / "worn.yaml").write_text("options: {ideal: true}\n")
     (tmp_path / "notes.yaml").write_text("a: 1\n")
     (tmp_path / "lag.py").write_text("")
     (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe")
@@ -140,3 +145,14 @@ def test_a_narrow_terminal_cuts_nothing(columns):
     assert max(map(len, sentences)) <= columns
     wide = shown[shown.index("Wide") :].splitlines()
     assert columns == 30 or max(map(len, wide)) <= columns
+
+
+def test_the_package_starts_as_the_command_does():
+    said = [
+        subprocess.run(
+            [sys.executable, "-m", module, "--version"],
+            env=environment(), capture_output=True, text=True, check=True,
+        ).stdout
+        for module in ("daq", "daq.cli")
+    ]  # fmt: skip
+    assert said[0] == said[1] != ""
