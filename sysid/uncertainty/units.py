@@ -12,6 +12,7 @@ _WRITTEN = re.compile(r"(?P<above>[^/()]+)(?:/(?:\((?P<all>[^/()]+)\)|(?P<one>[^
 _MADE_OF: tuple[tuple[str, str, dict[str, int]], ...] = (
     ("H", "ohm", {"ohm": 1, "s": 1}),
     ("ohm", "V", {"V": 1, "A": -1}),
+    ("N", "kg", {"kg": 1, "m": 1, "s": -2}),
 )
 
 

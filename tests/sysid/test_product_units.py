@@ -28,6 +28,7 @@ def test_the_unit_of_a_product_is_the_product_of_the_units(factors):
         ([("ohm", 1), ("H", -1)], "1/s"),
         ([("A", 1), ("A", -1)], "1"),
         ([("V/A", 1), ("ohm", -1)], "1"),
+        ([("kg*m^2", 1), ("N*m*s/rad", -1)], "s*rad"),
         ([("m s^-1", 1), ("A", 1)], ""),
         ([("A", 0.5)], ""),
     ],
