@@ -45,9 +45,8 @@ def open_link(port: str, baud: int) -> Link:
     return SerialLink(port, baud)
 
 
-def _gone(port: str, error: Exception) -> DeviceError:
-    # What pyserial says of a cable that was pulled guesses at more than it knows.
-    said = "" if "returned no data" in str(error) else f" ({error})"
+def _gone(port: str, error: Exception | None = None) -> DeviceError:
+    said = "" if error is None else f" ({error})"
     return DeviceError(
         f"{port}: the port has gone{said}; check the cable and the device's supply. The device "
         "makes itself safe when it hears nothing"
@@ -72,17 +71,31 @@ class SerialLink:
             )
         except (OSError, ValueError) as error:
             raise _not_opened(port, error) from None
-        self._failures = (serial.SerialException, OSError, TypeError)
+        self._failures = (serial.SerialException, OSError, TypeError, ValueError)
+        # pyserial asks before every read and after every write whether the port is ready. To ask a
+        # terminal is to wait for the kernel's worker that hands on what has come: tens of
+        # milliseconds on a busy computer, however urgent who asks. So ask no more than needed.
+        descriptor = getattr(self._serial, "fd", None) if os.name == "posix" else None
+        self._descriptor = descriptor if isinstance(descriptor, int) else None
         self._prepare()
 
     def read(self) -> bytes:
         """What has come, or nothing after ``PATIENCE``."""
         try:
-            first: bytes = self._serial.read(1)
-            waiting = self._serial.in_waiting if first else 0
-            return first + self._serial.read(waiting) if waiting else first
+            if self._descriptor is None:
+                first: bytes = self._serial.read(1)
+                waiting = self._serial.in_waiting if first else 0
+                return first + self._serial.read(waiting) if waiting else first
+            if not select.select([self._descriptor], [], [], PATIENCE)[0]:
+                return b""
+            data = os.read(self._descriptor, 65_536)
+        except BlockingIOError:
+            return b""  # taken by somebody else, or a false alarm
         except self._failures as error:
             raise _gone(self._port, error) from None
+        if not data:
+            raise _gone(self._port)
+        return data
 
     def write(self, data: bytes) -> None:
         """Send all of it."""
@@ -95,21 +108,16 @@ class SerialLink:
 
     def close(self) -> None:
         """Disconnect; never raises."""
+        self._descriptor = None  # a number that the system may give to another file
         with contextlib.suppress(*self._failures):
             self._serial.close()
 
     def _write_now(self, data: bytes) -> int:
-        """What the port takes without waiting.
-
-        pyserial asks after every write whether there is room for more, and asking a terminal waits
-        for the kernel's worker that hands on what came from the device: tens of milliseconds on a
-        busy computer, whatever the priority of who asks.
-        """
-        descriptor = getattr(self._serial, "fd", None)
-        if os.name != "posix" or not isinstance(descriptor, int):
+        """What the port takes without waiting."""
+        if self._descriptor is None:
             return 0
         try:
-            return os.write(descriptor, data)
+            return os.write(self._descriptor, data)
         except BlockingIOError:
             return 0
 
