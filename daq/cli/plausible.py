@@ -11,7 +11,9 @@ from daq.config.rig import RigConfig
 from daq.hal import CHANNELS, FloatArray
 
 _ROWS = 20_000  # of a log, from its beginning: enough to tell a gain
-_TAPS = 4  # samples before, in which a current comes to follow its command
+_BLOCK = 5e-3  # s that are averaged
+_TAPS = 5  # blocks, its own among them, in which a current comes to follow its command
+_FEWEST = 50  # blocks
 _CERTAIN = 5.0  # standard errors
 _ALIKE = 0.95  # cosine of two commands of which nobody can say which a current follows
 _OFF = 1.4  # ratio of gains, either way, that no data sheet's tolerance explains
@@ -65,26 +67,30 @@ def _judge(name: str, row: int, stated: float, gains: FloatArray, errors: FloatA
 def _gains(log: Path) -> tuple[FloatArray, FloatArray] | None:
     """A per V of both currents by both commands, (2, 2), and standard errors; infinite: unknown.
 
-    By least squares of each current on the applied commands of the samples before, in the slower
-    half of the run: at speed the back EMF may leave an amplifier short of voltage. There is no
-    constant: the calibration has made the current at zero command zero.
+    By least squares of each current on the applied commands of the last 25 ms, in the slower half
+    of the run: at speed the back EMF may leave an amplifier short of voltage. There is no constant:
+    the calibration has made the current at zero command zero.
     """
     with log.open(encoding="ascii") as file:
         names = file.readline().strip().split(",")
         wanted = [f"current_{name}" for name in CHANNELS]
-        wanted += [*(f"applied_voltage_{name}" for name in CHANNELS), "omega"]
+        wanted += [*(f"applied_voltage_{name}" for name in CHANNELS), "omega", "t"]
         columns = [names.index(name) for name in wanted]
         rows = np.loadtxt(file, delimiter=",", usecols=columns, max_rows=_ROWS, ndmin=2)
-    if len(rows) < 20 * _TAPS:
+    if len(rows) < _FEWEST:
         return None
-    speed = np.abs(rows[_TAPS:, 4])
+    size = max(1, round(_BLOCK * (len(rows) - 1) / (rows[-1, 5] - rows[0, 5])))
+    blocks = rows[: len(rows) // size * size].reshape(-1, size, rows.shape[1]).mean(axis=1)
+    if len(blocks) < _FEWEST:
+        return None
+    speed = np.abs(blocks[_TAPS:, 4])
     slow = np.flatnonzero(speed <= np.median(speed)) + _TAPS
-    current, command = rows[slow, :2], rows[:, 2:4]
-    size = np.linalg.norm(command, axis=0)
-    there = np.flatnonzero(size > 0.0)
-    if not len(there) or abs(command[:, 0] @ command[:, 1]) > _ALIKE * size[0] * size[1] > 0.0:
+    current, command = blocks[slow, :2], blocks[:, 2:4]
+    norm = np.linalg.norm(command, axis=0)
+    there = np.flatnonzero(norm > 0.0)
+    if not len(there) or abs(command[:, 0] @ command[:, 1]) > _ALIKE * norm[0] * norm[1] > 0.0:
         return None
-    lags = [command[np.ix_(slow - k, there)] for k in range(1, _TAPS + 1)]
+    lags = [command[np.ix_(slow - k, there)] for k in range(_TAPS)]
     design = np.concatenate(lags, axis=1)
     inverse = np.linalg.pinv(design.T @ design)
     solution = inverse @ design.T @ current
