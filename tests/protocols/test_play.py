@@ -84,7 +84,7 @@ GOOD = "time,motor,brake\n0,0,0\n0.00125,1,0\n0.0025,1,0.1\n0.00375,1,0.1\n"
         ("", "c.csv: the log is empty"),
         ("time,motor,brake\n", "c.csv: it holds 0 rows; at least 2 are needed"),
         ("time,motor\n0,1\n1,2\n", "c.csv: its columns are time, motor; name them time, motor, br"),
-        ("0,0,0\n1,1,1\n", "c.csv: its columns are 0, 0, 0; name them"),
+        ("0,0,0\n1,1,1\n", "c.csv:1: the first line holds numbers; it must hold the column"),
         (GOOD.replace("0.0025,1", "0.0025,nan"), "c.csv:4: motor: 'nan' is not a finite number"),
         (GOOD.replace("0.0025,1", "0.0025,"), "c.csv:4: motor: '' is not a finite number; a comma"),
         (GOOD.replace("0.0025,1", "0.0025,inf"), "c.csv:4: motor: 'inf' is not a finite number"),
