@@ -177,7 +177,7 @@ class HalContract:
         commands = np.stack(
             [
                 np.repeat(rng.choice([-0.5, 0.5], 60), 10),
-                np.repeat(rng.choice([0.0, 0.14], 60), 10),
+                np.repeat(rng.choice([0.0, 0.3], 60), 10),
             ],
             axis=1,
         )
