@@ -66,6 +66,7 @@ def jacobians(model: ProcessModel, x: FloatArray, u: FloatArray, p: FloatArray) 
     """df/dx at one point under each of several parameter vectors, (m, n_states, n_states).
 
     p: (m, n_parameters). All at once, unless the equations branch on what differs between them.
+    NaN where there is no slope, as of a root at zero.
     """
     states, n = len(x), len(p)
     seeds = np.eye(states)[:, :, None]
@@ -77,6 +78,8 @@ def jacobians(model: ProcessModel, x: FloatArray, u: FloatArray, p: FloatArray) 
                 tuple(float(v) for v in u),
                 columns,
             )
+    except ArithmeticError:
+        return np.full((n, states, states), np.nan)
     except (TypeError, ValueError):
         return np.stack([jacobian(model, x, u, row) for row in p])
     slopes = [np.broadcast_to(getattr(v, "slope", np.zeros((1, 1))), (states, n)) for v in values]

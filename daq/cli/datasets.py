@@ -209,13 +209,17 @@ def _load_foreign(path: Path, model: ProcessModel, mapping: Mapping) -> Loaded:
         return np.asarray(frame[source.column].to_numpy() * factor)
 
     inputs = [values(s, "inputs", columns.inputs[s.name]) for s in model.inputs]
-    outputs = [values(s, "outputs", columns.outputs[s.name]) for s in model.outputs]
+    outputs = np.stack(
+        [values(s, "outputs", columns.outputs[s.name]) for s in model.outputs], axis=1
+    )
+    # The first sample tells where the model starts.
+    begin = int(np.argmax(np.isfinite(outputs).all(axis=1)))
     dataset = _dataset(
         path,
         model,
-        np.stack(inputs, axis=1) if inputs else np.zeros((len(frame), 0)),
-        np.stack(outputs, axis=1),
-        tick,
+        (np.stack(inputs, axis=1) if inputs else np.zeros((len(frame), 0)))[begin:],
+        outputs[begin:],
+        tick[begin:],
         dt,
         path.stem,
     )

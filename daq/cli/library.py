@@ -165,7 +165,7 @@ def replay(
 
 def _loaded(given: Source | Sequence[Source], name: str, prepared: Prepared) -> list[Loaded]:
     sources = _sources(given)
-    labels = [f"{name} {k}" for k in range(1, len(sources) + 1)] if len(sources) > 1 else [name]
+    labels = [f"{name} {k}" for k in range(1, len(sources) + 1)] if len(sources) != 1 else [name]
     return [
         _take(source, label, prepared.model, prepared.mapping)
         for source, label in zip(sources, labels, strict=True)

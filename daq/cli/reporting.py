@@ -384,10 +384,9 @@ def _exact_lines(ambiguity: Ambiguity) -> list[str]:
     for estimate in ambiguity.determined:
         scale, unit = console.engineering(estimate.value, estimate.unit)
         value = console.number(scale * estimate.value, _digits(estimate))
+        quantity = value if unit in {"", "1"} else f"{value} {unit}"
         interval = _interval_text(estimate, scale)
-        lines.append(
-            f"    {estimate.name} = {f'{value} {unit}'.rstrip()}, 95 % interval {interval}"
-        )
+        lines.append(f"    {estimate.name} = {quantity}, 95 % interval {interval}")
     lines.append(
         f"    To tell them apart, measure {' and '.join(ambiguity.measure)} by other means (or "
         "choose a value) and give it under 'fixed'."

@@ -114,6 +114,19 @@ def test_jacobians_of_many_are_those_of_each(name, seed):
     np.testing.assert_allclose(jacobians(model, x, u, p), expected, rtol=1e-9, atol=1e-300)
 
 
+def test_of_a_root_at_zero_no_slope_is_known():
+    tank = ProcessModel(
+        name="tank",
+        states=(State("level", "m"),),
+        inputs=(Input("flow", "m/s"),),
+        outputs=(Output("level", "m"),),
+        parameters=(Parameter("a", "m^0.5/s", 1.0, 0.1, 10.0),),
+        derivative=lambda x, u, p: (u[0] - p[0] * math.sqrt(max(x[0], 0.0)),),
+    )
+    found = jacobians(tank, np.zeros(1), np.ones(1), np.ones((3, 1)))
+    assert found.shape == (3, 1, 1) and np.isnan(found).all()
+
+
 def elementary(x, u, p):
     a, b = x
     k, n = p
