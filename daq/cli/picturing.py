@@ -127,7 +127,7 @@ def _response(model: ProcessModel, log: Dataset, simulated: Mapping[str, Run], j
         output.unit,
         log.outputs[:, j],
         {name: run[:, j] for name, run in simulated.items()},
-        f"fit: {shown}",
+        f"fit{':' * several} {shown}",
     )
 
 
