@@ -15,9 +15,9 @@ from typing import Any
 from daq import capture
 from daq.cli import console, datasets
 from daq.cli.datasets import Loaded
+from daq.cli.identified import Identified, document
 from daq.cli.identifying import assemble, check_writable, load_logs, write_parameters
 from daq.cli.preparing import Prepared, gassi_settings, prepare_models
-from daq.cli.reporting import Identified, document
 from daq.errors import ConfigError
 from sysid import Campaign, ModelError, Outcome, Run, Spread, campaign
 

@@ -22,6 +22,7 @@ from daq.cli.campaigning import (
     parse_seeds,
     run_all,
 )
+from daq.cli.identified import document
 from daq.cli.identifying import (
     check_writable,
     default_folder,
@@ -172,7 +173,7 @@ def _show_one(
     """One structure with several seeds: the best run like any other, and the spread."""
     (spread,) = found.spread()
     result = group.result(outcome)
-    report = reporting.document(result) | {"seeds": _spread_document(spread)}
+    report = document(result) | {"seeds": _spread_document(spread)}
     path = write_parameters(folder, report)
     report["files"] = {"parameters": str(path)}
     if not as_json:

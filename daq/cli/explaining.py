@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from daq.cli.reporting import NOTES
+from daq.cli.identified import NOTES
 from sysid.metrics import mean_known
 from sysid.model import ProcessModel
 

@@ -14,8 +14,8 @@ import yaml
 from daq import capture
 from daq.cli import console, datasets, reporting, resuming
 from daq.cli.datasets import Loaded
+from daq.cli.identified import Identified, document
 from daq.cli.preparing import Prepared, gassi_settings, prepare
-from daq.cli.reporting import Identified
 from daq.errors import ConfigError
 from sysid import Dataset, ModelError
 from sysid.assessment import examine
@@ -87,7 +87,7 @@ def identify_logs(
         resuming.remember(folder, prepared.asked, training, validation)
     estimator = _fit(prepared, train, folder, as_json, resume)
     result = assemble(prepared, estimator, train, check, as_json)
-    report = reporting.document(result)
+    report = document(result)
     path = write_parameters(folder, report)
     report["files"] = {"parameters": str(path)}
     if not as_json:

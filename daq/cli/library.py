@@ -15,10 +15,10 @@ from daq.capture import Recording
 from daq.cli import datasets
 from daq.cli.datasets import Loaded, Mapping
 from daq.cli.files import DEFAULT_RIG, load_experiment, load_rig, rig_for
+from daq.cli.identified import NOTES, Identified, document
 from daq.cli.identifying import assemble, refuse_overlap, write_parameters
 from daq.cli.preparing import Prepared, gassi_settings, prepare
 from daq.cli.replaying import Replay, columns_of, replay_values, told_parameters
-from daq.cli.reporting import NOTES, Identified, document
 from daq.errors import ConfigError
 from daq.run import run_experiment
 from sysid import GASSI, ModelError, ProcessModel

@@ -12,7 +12,7 @@ import numpy as np
 from daq import capture
 from daq.cli import resisting
 from daq.cli.datasets import Loaded
-from daq.cli.reporting import NOTES
+from daq.cli.identified import NOTES
 from daq.figures.bode import ComplexArray, Measured, bode
 from daq.figures.convergence import convergence
 from daq.figures.loops import Loop, hysteresis_loops

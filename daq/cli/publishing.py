@@ -15,10 +15,10 @@ from daq.cli import console
 from daq.cli.baselines import Baseline, beside
 from daq.cli.datasets import Loaded
 from daq.cli.explaining import view
+from daq.cli.identified import NOTES, Identified, errors_of
 from daq.cli.modelling import DEFAULT_MODEL
 from daq.cli.picturing import Subject, pictures
 from daq.cli.preparing import Prepared
-from daq.cli.reporting import NOTES, Identified, errors_of
 from daq.cli.resuming import Asked
 from daq.figures import style
 from daq.figures.picture import Picture
