@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import getpass
-import math
 import os
 import platform
 import sys
@@ -19,12 +18,9 @@ from daq.config.base import Section
 from daq.config.units import Seconds, Unit
 from daq.errors import DeviceError
 from daq.hal import (
-    ANALOG_INPUTS,
-    CHANNELS,
     DeviceInfo,
     FloatArray,
     Guard,
-    IntArray,
     Mode,
     Phase,
     RawSamples,
@@ -32,19 +28,18 @@ from daq.hal import (
 from daq.serial import messages
 from daq.serial.host import HostMachine, refusal
 from daq.serial.link import Link, open_link
-from daq.serial.messages import Block, Codes, LoopMode, Reply, Result, Start, Type, Welcome
+from daq.serial.messages import LoopMode, Reply, Result, Start, Type, Welcome
+from daq.serial.scaling import Scaling
 
 HANDSHAKE = 2.0
 """Longest time that a device may take to say who it is [s]: a board resets in less."""
 
 _FEED = 0.01  # s between two looks at what is to be sent, or sent again
 _PINGS = 6  # round trips measured before a run
-_LARGEST_RATE = float(np.finfo(np.float32).max)  # 1/s
 _PING_PATIENCE = 0.5  # s for all of them
 _SAFE_PATIENCE = 0.25  # s to hear that the outputs are zero
 _PATIENCE = 1.0  # s without a call from the run until the watchdog is no longer fed
 _RATE_TOLERANCE = 5e-5  # as good as a quartz
-_N_IN, _N_OUT = len(ANALOG_INPUTS), len(CHANNELS)
 
 
 class SerialOptions(Section):
@@ -109,8 +104,9 @@ class SerialDevice:
         except BaseException:
             self._disconnect()
             raise
-        low, high = self._input_range()
-        return DeviceInfo(self._name(), welcome.max_rate, welcome.queue, (low, high))
+        self._scaling = Scaling(welcome.channels)
+        volts_in = self._scaling.input_range
+        return DeviceInfo(self._name(), welcome.max_rate, welcome.queue, volts_in)
 
     def announce(self, phase: Phase, turns: float = 0.0) -> None:
         """Tell the device which phase begins; an emulator's user winds the handle then."""
@@ -122,8 +118,6 @@ class SerialDevice:
         self._run = (self._run + 1) & 0xFFFF
         self._mode, self._gone = mode, False
         start = self._start_message(sample_rate, mode, guard, welcome)
-        self._limits = np.array([start.command_low, start.command_high])
-        self._guard = guard
         self._schedule_as_caller()
         with self._changed:
             self._called = time.monotonic()
@@ -135,7 +129,7 @@ class SerialDevice:
     def send(self, tick: int, commands: FloatArray) -> None:
         """Queue commands (n, 2) [V]; what the device has no room for yet waits here."""
         machine = self._sampling()
-        codes = self._codes(np.asarray(commands, dtype=np.float64))
+        codes = self._scaling.commands(np.asarray(commands, dtype=np.float64))
         with self._changed:
             self._called = time.monotonic()
             machine.send(tick, codes, self._called)
@@ -162,7 +156,7 @@ class SerialDevice:
             self._called = time.monotonic()
             blocks = list(machine.blocks)
             machine.blocks.clear()
-        return self._raw(blocks)
+        return self._scaling.samples(blocks)
 
     def stop(self) -> None:
         """End sampling; outputs are zero."""
@@ -316,75 +310,12 @@ class SerialDevice:
                 f"options.watchdog: {self._name()} waits {welcome.watchdog_longest} ms at most, "
                 f"not {watchdog} ms"
             )
-        scale, offset = self._out_scale()
-        in_scale, in_offset = self._in_scale()
-        # Half a code beyond a limit would be beyond the limit.
-        low = np.ceil(_ratio(guard.command_low - offset, scale) - 1e-9)
-        high = np.floor(_ratio(guard.command_high - offset, scale) + 1e-9)
-        inside = np.iinfo(np.int32)
-        counts = np.array([np.ceil(guard.counts_low), np.floor(guard.counts_high)])
-        fewest, most = _whole(counts, inside)
-        (step,) = _whole(np.floor([guard.count_step]), np.iinfo(np.uint32))
         return Start(
             self._run,
             LoopMode.OPEN if mode is Mode.OPEN_LOOP else LoopMode.CLOSED,
             period,
             watchdog,
-            _whole(low, np.iinfo(np.int16)),
-            _whole(high, np.iinfo(np.int16)),
-            _whole(np.ceil(_ratio(guard.analog_low - in_offset, in_scale) - 1e-9), inside),
-            _whole(np.floor(_ratio(guard.analog_high - in_offset, in_scale) + 1e-9), inside),
-            counts_low=fewest,
-            counts_high=most,
-            count_rate=guard.count_rate if guard.count_rate < _LARGEST_RATE else math.inf,
-            count_step=step,
-        )
-
-    # --- volts and codes ----------------------------------------------------------------------
-
-    def _out_scale(self) -> tuple[FloatArray, FloatArray]:
-        return self._table(slice(_N_IN, _N_IN + _N_OUT))
-
-    def _in_scale(self) -> tuple[FloatArray, FloatArray]:
-        return self._table(slice(_N_IN))
-
-    def _table(self, rows: slice) -> tuple[FloatArray, FloatArray]:
-        assert self._welcome is not None
-        channels = self._welcome.channels[rows]
-        return np.array([c.scale for c in channels]), np.array([c.offset for c in channels])
-
-    def _input_range(self) -> tuple[float, float]:
-        assert self._welcome is not None
-        inputs = self._welcome.channels[:_N_IN]
-        return max(c.low for c in inputs), min(c.high for c in inputs)
-
-    def _codes(self, volts: FloatArray) -> Codes:
-        """Converter codes (n, 2) of the commands, the nearest to each.
-
-        A command within the clamps is not rounded to beyond them, where the device would flag it.
-        """
-        scale, offset = self._out_scale()
-        codes = np.rint((volts - offset) / scale)
-        low, high = self._limits
-        codes = np.where(volts <= self._guard.command_high, np.minimum(codes, high), codes)
-        codes = np.where(volts >= self._guard.command_low, np.maximum(codes, low), codes)
-        info = np.iinfo(np.int16)
-        return np.clip(codes, info.min, info.max).astype(messages.COMMAND_DTYPE)
-
-    def _raw(self, blocks: list[Block]) -> RawSamples:
-        records = messages.joined(blocks)
-        ticks: IntArray = np.concatenate(
-            [np.arange(b.first, b.first + len(b.records), dtype=np.int64) for b in blocks]
-        )
-        in_scale, in_offset = self._in_scale()
-        out_scale, out_offset = self._out_scale()
-        return RawSamples(
-            tick=ticks,
-            analog=records["analog"] * in_scale + in_offset,
-            counts=records["counts"].astype(np.float64),
-            count_rate=records["count_rate"].astype(np.float64),
-            applied=records["applied"] * out_scale + out_offset,
-            flags=records["flags"].astype(np.int64),
+            *self._scaling.guarded(guard),
         )
 
     # --- requests -----------------------------------------------------------------------------
@@ -513,15 +444,6 @@ class SerialDevice:
         if self._link is not None:
             self._link.close()
         self._link = self._machine = None
-
-
-def _ratio(volts: FloatArray, scale: FloatArray) -> FloatArray:
-    return np.asarray(volts / scale, dtype=np.float64)
-
-
-def _whole(values: FloatArray, bounds: np.iinfo[Any]) -> tuple[int, ...]:
-    """Whole numbers within a type's range; limits that are infinite become its ends."""
-    return tuple(int(value) for value in np.clip(values, bounds.min, bounds.max))
 
 
 def _user() -> str:
