@@ -216,7 +216,8 @@ def test_a_finished_run_is_shown_whole_and_magnified_to_its_samples(scope, tmp_p
     drag = ActionChains(tab.driver).move_to_element_with_offset(canvas, -width // 5, 0)
     drag.click_and_hold().move_by_offset(width // 8, 0).release().perform()
     start, end = until(lambda: t if (t := tab.time())[1] < 90.0 else None, "a stretch of time")
-    assert 0.0 < start < 30_000 / RATE < end and tab.button() == "Live"
+    assert 0.0 < start < 30_000 / RATE < end
+    until(lambda: tab.button() == "Live", "the pause")
     origin = ScrollOrigin.from_element(canvas)
     ActionChains(tab.driver).scroll_from_origin(origin, 0, -200).perform()
     narrower = until(lambda: t if np.ptp(t := tab.time()) < end - start else None, "the wheel")
@@ -248,6 +249,7 @@ def test_the_values_are_those_under_the_cursor_and_from_the_mark(scope, tmp_path
     until(lambda: "at the cursor" in tab.values().values(), "the cursor")
     marked = int(tab.values()["tick"])
     assert 300 < marked < 500
+    until(lambda: tab.model("lines", "m.data.time"), "the mark")
     assert tab.model("lines", "m.data.time") == pytest.approx([marked / RATE], abs=1 / RATE)
     ActionChains(tab.driver).move_to_element_with_offset(canvas, 100, 0).perform()
     until(lambda: int(tab.values()["tick"]) > marked + 10, "the cursor elsewhere")

@@ -163,7 +163,7 @@ def test_a_brake_that_never_slides_still_has_sizes(kind, values):
         ({"parameters": {"R_m": math.inf}}, r"parameters\.R_m\s+Input should be a finite number"),
         ({"parameters": {"R_m": math.nan}}, r"parameters\.R_m\s+Input should be a finite number"),
         ({"parameters": {"R_m": "much"}}, r"parameters\.R_m\s+Input should be a valid number"),
-        ({"parameters": {"R_m": True}}, "parameter R_m: yes, no"),
+        ({"parameters": {"R_m": True}}, "parameter R_m: .* yes, no"),
         ({"parameters": {"R_m": -1.0}}, r"parameter R_m: .* -1\.0 is outside its physical limits"),
         ({"parameters": {"mass": -0.1}}, "parameter mass: .* outside its physical limits"),
         ({"parameters": {"L_m": 0.0}}, "parameter L_m: .* divides by zero"),
