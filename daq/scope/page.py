@@ -248,25 +248,26 @@ class Page:
 
     def _toggle(self) -> None:
         if self._live:
-            self._hold(self._time.start, self._time.end)
+            self._hold()
         else:
             self._follow()
 
     def _follow(self) -> None:
         """Show the end of the run as it grows, or all of it."""
-        self._live = True
+        self._live, self._zoomed_to = True, None
         self._drawn_step = 0
         self._button.update(label="Pause", button_type="primary")
 
-    def _hold(self, start: Any, end: Any) -> None:
-        """Stay with this stretch of time, in as much detail as the page has room for."""
+    def _hold(self) -> None:
+        """Stay with what is drawn."""
         self._live = False
-        self._zoomed_to = float(start), float(end)
         self._button.update(label="Live", button_type="warning")
 
     def _zoom(self, event: Any) -> None:
+        """Stay with this stretch of time, in as much detail as the page has room for."""
         self._time.update(start=event.x0, end=event.x1)
-        self._hold(event.x0, event.x1)
+        self._zoomed_to = float(event.x0), float(event.x1)
+        self._hold()
 
     def _move(self, event: Any) -> None:
         self._cursor = event.x
