@@ -31,7 +31,7 @@ from daq.scope.history import History, View, nothing, step_for
 from daq.scope.recordings import Recording, Watch
 from daq.scope.wording import FAILED, HELP, VALUE_FIELDS, heading, readout
 
-PERIOD = 30  # ms between updates: 30 a second and some, for no timer is exact
+PERIOD = 28  # ms between updates: 30 a second and some, for no timer is exact
 _POINTS = 500  # stretches drawn at least over the width of the page
 _WINDOWS: tuple[tuple[str, float | None], ...] = (
     ("2 s", 2.0), ("10 s", 10.0), ("60 s", 60.0), ("whole run", None),

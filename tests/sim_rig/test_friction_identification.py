@@ -11,7 +11,7 @@ ORDERS = {"na": (2, 3, 5), "nb": (2, 3), "nc": (2, 3), "nk": (0, 1)}
 @pytest.fixture(scope="module")
 def found():
     """One pair of logs; a smaller search and fewer orders than the benchmark's."""
-    return measure(0, orders=ORDERS, settings={"population": 200, "generations": 30})
+    return measure(0, orders=ORDERS, settings={"population": 120, "generations": 15})
 
 
 def test_it_beats_armax_on_every_output(found):
