@@ -109,7 +109,7 @@ def read_table(
     except pd.errors.ParserError as error:
         reason = str(error).removeprefix("Error tokenizing data. C error: ").strip()
         raise ConfigError(f"{path}: not a table: {reason}") from None
-    held = [name for name in frame if name not in gaps]
+    held = [name for name in wanted if name not in gaps]
     if len(frame) and frame[held].iloc[-1].str.strip().str.lower().isin(_NO_NUMBERS).any():
         frame, torn = frame.iloc[:-1], True
     numbers = {

@@ -474,3 +474,10 @@ def test_a_disk_full_from_the_start_is_no_traceback(tmp_path):
 def test_flags_are_the_documented_bits():
     assert [flag.value for flag in Flag] == [1, 2, 4, 8, 16, 32]
     assert math.log2(max(Flag)) < 63 and sys.maxsize > max(Flag)
+
+
+def test_a_last_cell_without_a_number_costs_no_row_in_a_column_that_is_not_read(tmp_path):
+    path = tmp_path / "other.csv"
+    path.write_text("t,y,remark\n0,1.5,ok\n1,2.5,nan\n")
+    read = read_table(path, ["t", "y"])
+    assert read.frame["y"].tolist() == [1.5, 2.5] and not read.torn
