@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from daq.errors import ConfigError, RigError
+from daq.errors import ConfigError, RigError, line_in
 from daq.experiment import (
     MOST_SAMPLES,
     Answer,
@@ -37,16 +37,12 @@ def place(error: BaseException, kind: type) -> str:
     Nothing where it did not, or where the class comes with this program.
     """
     try:
-        file = inspect.getfile(kind)
+        file = Path(inspect.getfile(kind))
     except (OSError, TypeError):
         return ""
-    if Path(file).is_relative_to(Path(__file__).parent.parent):
+    if file.is_relative_to(Path(__file__).parent.parent):
         return ""
-    line, trace = None, error.__traceback__
-    while trace is not None:
-        if trace.tb_frame.f_code.co_filename == file:
-            line = trace.tb_lineno
-        trace = trace.tb_next
+    line = line_in(error, file)
     return f" ({file}:{line})" if line is not None else ""
 
 

@@ -135,7 +135,7 @@ class Recording:
                 raise ValueError
         except (AttributeError, OverflowError, TypeError, ValueError):
             raise ConfigError(
-                f"{self.log.path.parent / RUN_NAME}: 'calibration' must hold 'samples' and, for "
+                f"{self.folder / RUN_NAME}: 'calibration' must hold 'samples' and, for "
                 f"{channel}, a 'noise' of 0 or more; delete it to go without"
             ) from None
         return deviation, deviation / math.sqrt(samples)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 
 class RigError(Exception):
     """Base of all expected errors; the message names what is wrong and the cure."""
@@ -32,3 +34,18 @@ class Terminated(BaseException):
 
     ``str`` of it is the signal's name, for example SIGTERM.
     """
+
+
+def line_in(error: BaseException, file: Path) -> int | None:
+    """The last line of a file that an error passed through; None where it did not."""
+    line, trace = None, error.__traceback__
+    while trace is not None:
+        if same_file(trace.tb_frame.f_code.co_filename, file):
+            line = trace.tb_lineno
+        trace = trace.tb_next
+    return line
+
+
+def same_file(name: str | None, path: Path) -> bool:
+    """Whether the name of a file in an error means a path."""
+    return name is not None and Path(name).resolve() == path.resolve()

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from daq.capture import LOG_NAME
 from daq.cli import console, plausible, punctuality
 from daq.cli.analysing import analyse, as_document, next_commands, show_findings
 from daq.cli.files import LoadedExperiment, load_experiment, load_rig, rig_for, together
@@ -51,7 +52,7 @@ def run_command(
     result = _run(loaded, rig_config, device, out, as_json)
     found = analyse(loaded.experiment, result.folder)
     check = _run(validation, rig_config, device, out, as_json) if validation else None
-    doubts = plausible.notes(result.folder / "log.csv", rig_config)
+    doubts = plausible.notes(result.folder / LOG_NAME, rig_config)
     report = {
         "run": punctuality.as_document(result),
         "validation": punctuality.as_document(check) if check else None,

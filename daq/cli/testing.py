@@ -32,12 +32,12 @@ class Recorded:
     @property
     def folder(self) -> Path:
         """Its capture folder."""
-        return self.recording.log.path.parent
+        return self.recording.folder
 
     @property
     def frame(self) -> pd.DataFrame:
         """The log in SI units, one row per sample."""
-        return self.recording.log.frame
+        return self.recording.frame
 
 
 @dataclass(frozen=True)
@@ -69,8 +69,8 @@ class SimulatedRig:
             self.root,
             options={"seed": self.seed, **options},
         )
-        folder = recording.log.path.parent
-        return Recorded(recording, analyse(recorded_experiment(folder), folder))
+        run = recorded_experiment(recording.folder)
+        return Recorded(recording, analyse(run, recording.folder))
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from types import ModuleType
 from typing import Any, Literal
 
 from daq.config.yaml_file import nearest_file, suggestion
-from daq.errors import ConfigError
+from daq.errors import ConfigError, line_in, same_file
 from sysid.model import ModelError
 
 Kind = Literal["backend", "limit", "model", "protocol"]
@@ -67,22 +67,9 @@ def _import(path: Path, kind: Kind) -> ModuleType:
 
 def _place(path: Path, error: BaseException) -> str:
     """``file:line`` of the last line of the user's file that the error passed through."""
-    if isinstance(error, SyntaxError) and _same(error.filename, path):
+    if isinstance(error, SyntaxError) and same_file(error.filename, path):
         return f"{path}:{error.lineno}"
     # What a model's function raised is where to look, not where the model is declared.
     raised = error.__context__ if isinstance(error, ModelError) else None
-    line = (_line(path, raised) if raised is not None else None) or _line(path, error)
+    line = (line_in(raised, path) if raised is not None else None) or line_in(error, path)
     return f"{path}:{line}" if line is not None else str(path)
-
-
-def _line(path: Path, error: BaseException) -> int | None:
-    line, trace = None, error.__traceback__
-    while trace is not None:
-        if _same(trace.tb_frame.f_code.co_filename, path):
-            line = trace.tb_lineno
-        trace = trace.tb_next
-    return line
-
-
-def _same(file: str | None, path: Path) -> bool:
-    return file is not None and Path(file).resolve() == path.resolve()

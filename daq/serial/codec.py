@@ -21,9 +21,9 @@ MAX_PAYLOAD = 4096
 _HEADER = struct.Struct("<BBHHH")
 _CRC = struct.Struct("<I")
 _SMALLEST = _HEADER.size + _CRC.size
-# COBS adds one byte per 254 and one more.
 # CRC-32 of whatever ends with its own CRC-32, in the order of bytes on the wire.
 _RESIDUE = 0x2144DF1C
+# COBS adds one byte per 254 and one more.
 _LONGEST = _SMALLEST + MAX_PAYLOAD + (_SMALLEST + MAX_PAYLOAD) // 254 + 1
 
 
