@@ -12,14 +12,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from daq import capture
-from daq.cli import datasets
-from daq.cli.files import load_experiment, load_rig
-from daq.run import run_experiment
+from daq.identification import records as datasets
+from daq.logs import capture
+from daq.lookup.files import load_experiment, load_rig
+from daq.run.runner import run_experiment
 from sim_rig.backend import SimulatedDevice
 from sysid import Dataset
-from sysid.model import ProcessModel
-from sysid.simulation import available_cores
+from sysid.engine.simulation import available_cores
+from sysid.problem.model import ProcessModel
 
 
 def arguments(description: str) -> argparse.ArgumentParser:

@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 
 from sysid import BatchSimulator, Dataset
-from sysid._compile import kernels
-from sysid._lanes import LANES
-from sysid.model import FloatArray, ProcessModel
-from sysid.reference import simulate
+from sysid.arrays import FloatArray
+from sysid.engine.compiler import kernels
+from sysid.engine.lanes import LANES
+from sysid.problem.model import ProcessModel
+from tests.sysid.reference import simulate
 
 RK4_STEPS = 32  # per sample, of the C code and of ours beside it
 PEER_SAMPLES = 100  # slow peers run the record's start; their time per sample is constant
@@ -131,7 +132,7 @@ def _short(record: Dataset) -> Dataset:
 
 def _derivative(model: ProcessModel) -> Any:
     """The model's derivative compiled, on arrays, with nominal parameters."""
-    from sysid._compile import _jit
+    from sysid.engine.compiler import _jit
 
     compiled = _jit(model.derivative)
     p = tuple(float(v) for v in model.nominal)
@@ -144,7 +145,7 @@ def _scipy(
     short = _short(record)
     chosen = model
     if compiled:
-        from sysid._compile import _jit
+        from sysid.engine.compiler import _jit
 
         chosen = replace(model, derivative=_jit(model.derivative))
 

@@ -18,8 +18,9 @@ import numpy as np
 from benchmarks._common import arguments, report, simulated_logs, timed
 from sim_rig.actuator import actuator
 from sysid import BatchSimulator, Dataset
+from sysid.arrays import FloatArray
 from sysid.gassi import GASSI
-from sysid.model import FloatArray, ProcessModel
+from sysid.problem.model import ProcessModel
 from sysid.uncertainty import Estimate
 
 _HYSTERESIS_START = -1.1  # where the wound load leaves z

@@ -21,12 +21,13 @@ from typing import Any
 import numpy as np
 
 from benchmarks._common import arguments, report, timed
-from daq.cli import datasets
-from daq.cli.preparing import prepare
+from daq.identification import records as datasets
+from daq.identification.settings import prepare
 from sysid import GASSI, BatchSimulator, Dataset, SearchSpace, evaluate, free_run
-from sysid.model import FloatArray, ProcessModel
-from sysid.objective import Objective
-from sysid.refinement import refine
+from sysid.arrays import FloatArray
+from sysid.fitting.objective import Objective
+from sysid.fitting.refinement import refine
+from sysid.problem.model import ProcessModel
 
 ROOT = Path(__file__).resolve().parent.parent
 CONFIG = ROOT / "examples" / "mr_damper" / "identification.yaml"

@@ -33,7 +33,7 @@ from sysid import (
     free_run,
     select_orders,
 )
-from sysid.comparison import Row
+from sysid.judging.comparison import Row
 from sysid.linear.selection import TRIED, tuned
 
 WITH, WITHOUT, LINEAR = "with friction", "without friction", "ARMAX"

@@ -18,9 +18,9 @@ from sim_rig.actuator import actuator
 from sysid import BatchSimulator, Dataset, evaluate, free_run
 from sysid.gassi import GASSI, PresetName
 from sysid.gassi.estimator import Criterion
-from sysid.model import ProcessModel
-from sysid.reference import simulate
-from sysid.space import SearchSpace
+from sysid.problem.model import ProcessModel
+from sysid.problem.space import SearchSpace
+from tests.sysid.reference import simulate
 
 GENERATIONS, POPULATION = 40, 300
 THESIS_RMSE = {"current_motor": 0.0112, "current_brake": 0.136, "omega": 0.151}

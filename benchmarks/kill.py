@@ -23,8 +23,8 @@ from pathlib import Path
 
 import numpy as np
 
-from daq import capture
 from daq.errors import ConfigError
+from daq.logs import capture
 
 RATE = 800.0  # Hz
 LONGEST = 2.0  # s into the run phase that a kill may come

@@ -30,10 +30,11 @@ from benchmarks import damper
 from benchmarks._common import arguments, report, simulated_logs, timed
 from sim_rig.actuator import actuator
 from sysid import BatchSimulator, Dataset, SearchSpace
+from sysid.arrays import FloatArray
+from sysid.fitting.objective import Objective
 from sysid.gassi import PRESETS, GeneticSearch, Preset
 from sysid.gassi.running import Run
-from sysid.model import FloatArray, ProcessModel
-from sysid.objective import Objective
+from sysid.problem.model import ProcessModel
 
 LOGS = damper.ROOT.parent / "shared" / "data" / "mr_damper"
 OURS = "ours"

@@ -26,8 +26,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks import _common
-from daq import capture
 from daq.hal import Flag
+from daq.logs import capture
 from daq.serial import codec, messages
 from daq.serial.codec import Decoder
 from daq.serial.messages import Block, Latch, State, Status, Type

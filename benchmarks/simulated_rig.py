@@ -21,7 +21,7 @@ from daq.hal import Guard, Mode
 from daq.rig import Rig
 from sim_rig.backend import SimulatedDevice, Simulation
 from sim_rig.plant import Plant
-from sysid.model import FloatArray
+from sysid.arrays import FloatArray
 
 RATE = 800.0
 PEER_TICKS = 400
@@ -110,7 +110,7 @@ def _peer(plant: Plant, commands: FloatArray) -> float:
     """SciPy, with the derivative compiled."""
     from scipy.integrate import solve_ivp
 
-    from sysid._compile import _jit
+    from sysid.engine.compiler import _jit
 
     model = plant.build()
     compiled = _jit(model.derivative)

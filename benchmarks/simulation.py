@@ -24,8 +24,9 @@ from benchmarks._common import arguments, report, timed
 from benchmarks._peers import engines, fixed_steps
 from sim_rig.actuator import actuator
 from sysid import BatchSimulator, Dataset
-from sysid.model import FloatArray, ProcessModel
-from sysid.space import SearchSpace
+from sysid.arrays import FloatArray
+from sysid.problem.model import ProcessModel
+from sysid.problem.space import SearchSpace
 
 SAMPLES, RATE = 1000, 800.0
 TIGHT_STEPS = 256  # of the exponential scheme: within 1e-8 of DOP853 at 1e-10

@@ -10,21 +10,21 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from daq.capture import Recording, load
-    from daq.cli.library import Identification, identify, record, replay
-    from daq.cli.replaying import Replay
+    from daq.api import Identification, identify, record, replay
+    from daq.cli.replay import Replay
     from daq.errors import ConfigError, RigError
+    from daq.logs.capture import Recording, load
 
 _HOMES = {
     "ConfigError": "daq.errors",
-    "Identification": "daq.cli.library",
-    "Recording": "daq.capture",
-    "Replay": "daq.cli.replaying",
+    "Identification": "daq.api",
+    "Recording": "daq.logs.capture",
+    "Replay": "daq.cli.replay",
     "RigError": "daq.errors",
-    "identify": "daq.cli.library",
-    "load": "daq.capture",
-    "record": "daq.cli.library",
-    "replay": "daq.cli.library",
+    "identify": "daq.api",
+    "load": "daq.logs.capture",
+    "record": "daq.api",
+    "replay": "daq.api",
 }
 
 __all__ = [

@@ -7,7 +7,7 @@ converter holds it, and load torque, interpolated because it changes smoothly.
 import numpy as np
 
 from sysid import Guess, Input, Output, Parameter, ProcessModel, State
-from sysid.guessing import regression
+from sysid.problem.guesses import regression
 
 
 def derivative(x, u, p):

@@ -12,7 +12,7 @@ from pydantic import Field
 from daq.errors import ConfigError
 from daq.experiment import OpenLoop
 from daq.hal import FloatArray
-from daq.table import column_names, read_table
+from daq.logs.table import column_names, read_table
 
 # Names in a file of one's own, and in a log.
 _COLUMNS = (("time", "motor", "brake"), ("t", "cmd_voltage_motor", "cmd_voltage_brake"))

@@ -31,7 +31,7 @@ from sim_rig.options import (
 from sim_rig.parts import Layout, known, log_range
 from sim_rig.wording import equations
 from sysid import Constraint, Input, ModelError, Output, ProcessModel, State
-from sysid.model import picker
+from sysid.problem.model import picker
 
 OUTPUTS = (
     Output("current_motor", "A"),

@@ -29,8 +29,8 @@ import numpy.typing as npt
 
 from sim_rig.options import DriverKind, FrictionKind, LoadKind
 from sysid import Guess
-from sysid.guessing import Guesses, Known, Measured, regression
-from sysid.model import FloatArray, IntArray
+from sysid.arrays import FloatArray, IntArray
+from sysid.problem.guesses import Guesses, Known, Measured, regression
 
 _SIGMAS = 3.0
 _PER_OCTAVE = 8  # steps of an impulse response before they become twice as long

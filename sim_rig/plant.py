@@ -25,7 +25,7 @@ from sim_rig.options import (
     Smooth,
 )
 from sysid import ModelError, ProcessModel
-from sysid.model import FloatArray
+from sysid.arrays import FloatArray
 
 # Sizes of the states that matter, for the accuracy of the simulation.
 _SIZES = {

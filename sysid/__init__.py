@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from sysid.campaigns import Campaign, Outcome, Run, Spread, campaign, combinations
-from sysid.comparison import Candidate, Comparison, compare
-from sysid.data import Dataset, output_scale
-from sysid.guessing import Guess, guess_ranges
-from sysid.linearization import LinearModel, equilibrium, jacobian, linearize
-from sysid.metrics import Metrics, evaluate, fit_percent, msd, rmse
-from sysid.model import (
+from sysid.campaigns.campaign import Campaign, Outcome, Run, Spread, campaign, combinations
+from sysid.engine.simulation import BatchResult, BatchSimulator, Status
+from sysid.engine.stepper import Stepper
+from sysid.fitting.free_run import free_run
+from sysid.judging.comparison import Candidate, Comparison, compare
+from sysid.problem.data import Dataset, output_scale
+from sysid.problem.guesses import Guess, guess_ranges, regression
+from sysid.problem.metrics import Metrics, evaluate, fit_percent, msd, rmse
+from sysid.problem.model import (
     Constraint,
     Input,
     ModelError,
@@ -19,10 +21,8 @@ from sysid.model import (
     ProcessModel,
     State,
 )
-from sysid.simulation import BatchResult, BatchSimulator, Status
-from sysid.space import SearchSpace
-from sysid.starting import free_run
-from sysid.stepping import Stepper
+from sysid.problem.space import SearchSpace
+from sysid.response.linearization import LinearModel, equilibrium, jacobian, linearize
 
 if TYPE_CHECKING:
     from sysid.gassi import GASSI
@@ -66,6 +66,7 @@ __all__ = [
     "linearize",
     "msd",
     "output_scale",
+    "regression",
     "rmse",
     "select_orders",
 ]

@@ -15,7 +15,7 @@ def main() -> None:
     try:
         # Ctrl-C may come while these are imported, too.
         from daq.cli.app import app
-        from daq.cli.console import report_error
+        from daq.cli.terminal import report_error
 
         app()
     except RigError as error:
@@ -35,7 +35,7 @@ def main() -> None:
 
 
 def _stopped(error: BaseException) -> NoReturn:
-    from daq.cli.console import report_error
+    from daq.cli.terminal import report_error
 
     _report_notes(error)
     report_error("stopped by Ctrl-C")
@@ -44,7 +44,7 @@ def _stopped(error: BaseException) -> NoReturn:
 
 def _report_notes(error: BaseException | None) -> None:
     """What an error, or the one behind it, has to say besides."""
-    from daq.cli.console import report_error
+    from daq.cli.terminal import report_error
 
     while error is not None:
         for note in getattr(error, "__notes__", ()):

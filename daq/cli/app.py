@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 
-from daq.cli import completing
-from daq.cli.commands import CommandLine
+from daq.cli import completion as completing
+from daq.cli.command_line import CommandLine
 
 app = CommandLine(
     name="rig",
@@ -174,7 +174,7 @@ def run(
     json: AsJson = False,
 ) -> None:
     """Run an experiment on a rig and log every sample."""
-    from daq.cli.running import run_command
+    from daq.cli.run import run_command
 
     run_command(experiment, rig, port, out, identify, model, config, realtime, report, json)
 
@@ -196,7 +196,7 @@ def check(
 
     It is checked against the rig's limits as before a run: duration, peaks, spectrum.
     """
-    from daq.cli.checking import check_command
+    from daq.cli.check import check_command
 
     check_command(experiment, rig, port, plot, json)
 
@@ -210,7 +210,7 @@ def analyse(
 
     Tables, figures and numbers, as at the end of the run; for a log of whatever age.
     """
-    from daq.cli.analysing import analyse_command
+    from daq.cli.analyse import analyse_command
 
     analyse_command(run, json)
 
@@ -283,7 +283,7 @@ def identify(
             raise typer.BadParameter(
                 "--resume goes on as it was asked; give nothing but --json or --no-report"
             )
-        from daq.cli.identifying import resume_command
+        from daq.cli.identify import resume_command
 
         resume_command(resume, report, json)
         return
@@ -301,15 +301,15 @@ def identify(
     }
     baselines = [name for name, asked in (("ARX", arx), ("ARMAX", armax)) if asked]
     if len(model or []) > 1 or baselines or seeds is not None:
-        from daq.cli.campaigning import Workers
-        from daq.cli.comparing import Ask, compare_command
+        from daq.cli.campaign import Workers
+        from daq.cli.compare import Ask, compare_command
 
         compare_command(
             logs, validate or [], Ask(model or [], baselines, seeds), config, out, options,
             settings or [], Workers(jobs, dask), report, json,
         )  # fmt: skip
         return
-    from daq.cli.identifying import identify_command
+    from daq.cli.identify import identify_command
 
     options["model"] = model[0] if model else None
     identify_command(logs, validate or [], config, out, options, settings or [], report, json)
@@ -345,7 +345,7 @@ def campaign(
 
     Runs over all cores, or a dask cluster.
     """
-    from daq.cli.campaigning import Workers, campaign_command
+    from daq.cli.campaign import Workers, campaign_command
 
     options = {
         "preset": preset,
@@ -393,7 +393,7 @@ def replay(
 
     The model is given the applied commands and the measured load torque, never the outputs.
     """
-    from daq.cli.replaying import replay_command
+    from daq.cli.replay import replay_command
 
     replay_command(log, rig, parameters, config, figure, fail_under or [], json)
 
@@ -414,7 +414,7 @@ def figures(
     json: AsJson = False,
 ) -> None:
     """Draw an identification's figures for papers and slides."""
-    from daq.cli.redrawing import figures_command
+    from daq.cli.figures import figures_command
 
     figures_command(run, kinds or ["pdf", "png"], out, json)
 
@@ -449,7 +449,7 @@ def init(
     What is there already stays as it is. Editors complete and check the files by the JSON Schemas
     written beside them.
     """
-    from daq.cli.starting import init_command
+    from daq.cli.init import init_command
 
     init_command(folder, protocol, rig, json)
 
@@ -472,7 +472,7 @@ def schema(
     They know the installed protocols and backends.
     """
     from daq.cli.reference import write_reference
-    from daq.cli.schemas import schema_command
+    from daq.lookup.schemas import schema_command
 
     pages = None if reference is None else lambda: write_reference(reference, app)
     schema_command(folder, pages, json)
@@ -494,7 +494,7 @@ def models(
 
     With its states, signals, parameters, units, ranges and options.
     """
-    from daq.cli.modelling import models_command
+    from daq.cli.models import models_command
 
     models_command(name, json)
 
@@ -537,7 +537,7 @@ def emulate(
     It serves in real time until Ctrl-C, and prints the port that rig run --rig serial.yaml --port
     takes.
     """
-    from daq.cli.emulating import emulate_command
+    from daq.cli.emulate import emulate_command
 
     emulate_command(rig, link, tcp, fault or [], drift, seed, journal, json)
 
@@ -563,7 +563,7 @@ def scope(
     json: AsJson = False,
 ) -> None:
     """Show a run in the browser, also while it is recorded."""
-    from daq.cli.scoping import scope_command
+    from daq.cli.scope import scope_command
 
     scope_command(run, out, port, browser, json)
 

@@ -9,10 +9,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
-from daq.capture import make_folder
-from daq.cli import console
+from daq.cli import terminal as console
 from daq.errors import RunError
-from daq.realtime import RealTime
+from daq.logs.capture import make_folder
+from daq.run.realtime import RealTime
 from daq.serial.link import latency_timer, permission_cure
 from daq.serial.ports import PortFacts, list_ports, named
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import Any
 
-from daq.cli import console
+from daq.cli import terminal as console
 from daq.serial.ports import Answer, ask, list_ports, named
 
 

@@ -11,10 +11,10 @@ from typing import Any
 
 import typer
 
-from daq import capture
-from daq.cli import schemas
 from daq.config.schema import Schema, branches, unit_in
 from daq.experiment import ClosedLoop, Experiment
+from daq.logs import capture
+from daq.lookup import schemas
 
 _HEAD = "<!-- Made by `rig schema --reference`; what it says stands in the code. Do not edit. -->\n"
 _TABLE = "| key | value | unit | default | allowed | meaning |\n|---|---|---|---|---|---|\n"

@@ -11,7 +11,6 @@ import contextlib
 import dataclasses
 from collections.abc import Iterator
 
-from daq.asking import MISTAKES, place
 from daq.config.rig import OwnLimit, RigConfig
 from daq.errors import ConfigError, RigError, RunError
 from daq.hal import Flag, Phase, Samples
@@ -19,6 +18,7 @@ from daq.limits.base import Limit, Trip
 from daq.limits.load import DeviceFound, I2t, Magnitude
 from daq.limits.sensors import Frozen, Jump, Silence, Stalled
 from daq.limits.shaft import Travel, Winding
+from daq.run.protocol_calls import MISTAKES, place
 
 __all__ = ["Limit", "Limits", "Trip", "mark_interlock"]
 

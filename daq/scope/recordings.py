@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from daq.capture import LOG_NAME, RUN_NAME, RUNNING, log_path, read_record
 from daq.errors import ConfigError
+from daq.logs.capture import LOG_NAME, RUN_NAME, RUNNING, log_path, read_record
 from daq.scope.history import History
 from daq.scope.tail import LogTail
 

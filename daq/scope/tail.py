@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from daq.hal import FloatArray, IntArray
-from daq.log import ORIGINAL_COLUMNS
-from daq.table import COMMENTS, Layout, layout_of
+from daq.logs.log import ORIGINAL_COLUMNS
+from daq.logs.table import COMMENTS, Layout, layout_of
 
 CHUNK = 2_000_000  # bytes read at a time: some 20 ms of parsing, so that the page stays alive
 _HEAD = 65_536  # bytes in which a header must have ended

@@ -19,9 +19,9 @@ from typing import Any
 
 import numpy as np
 
-from sysid._compile import fingerprint
-from sysid.data import Dataset
-from sysid.model import ModelError, ProcessModel
+from sysid.engine.compiler import fingerprint
+from sysid.problem.data import Dataset
+from sysid.problem.model import ModelError, ProcessModel
 
 FORMAT = 1
 INTERVAL = 0.5  # s between two writings

@@ -10,22 +10,23 @@ from typing import Any, Literal, get_args
 import numpy as np
 from sklearn.utils.validation import check_is_fitted
 
-from sysid._threads import one_thread
-from sysid.data import Dataset
+from sysid.arrays import FloatArray
+from sysid.engine.simulation import BatchSimulator
+from sysid.fitting.free_run import free_run
+from sysid.fitting.objective import Balance, Objective
+from sysid.fitting.refinement import Refinement
 from sysid.gassi.checkpoint import Checkpoint, load, origin
 from sysid.gassi.running import Best, Run
 from sysid.gassi.search import PRESETS, GeneticSearch, Preset, PresetName
-from sysid.guessing import Guess, guess_ranges
-from sysid.metrics import fit_percent
-from sysid.model import FloatArray, ModelError, ProcessModel, Scale
-from sysid.objective import Balance, Objective
-from sysid.ranges import Range
-from sysid.recording import Data, RecordEstimator, split
-from sysid.refinement import Refinement
-from sysid.settling import settle
-from sysid.simulation import BatchSimulator
-from sysid.space import SearchSpace
-from sysid.starting import free_run
+from sysid.gassi.settling import settle
+from sysid.problem.data import Dataset
+from sysid.problem.guesses import Guess, guess_ranges
+from sysid.problem.metrics import fit_percent
+from sysid.problem.model import ModelError, ProcessModel, Scale
+from sysid.problem.ranges import Range
+from sysid.problem.records import Data, RecordEstimator, split
+from sysid.problem.space import SearchSpace
+from sysid.threads import one_thread
 from sysid.uncertainty import Profile, Uncertainty, profile, uncertainty
 
 Criterion = Literal["likelihood", "error"]

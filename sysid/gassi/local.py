@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from sysid import refinement
-from sysid.model import FloatArray
-from sysid.objective import Objective
-from sysid.refinement import ROUNDING, Descent
+from sysid.arrays import FloatArray
+from sysid.fitting import refinement
+from sysid.fitting.objective import Objective
+from sysid.fitting.refinement import ROUNDING, Descent
 
 AT_ONCE = 6  # descents under way together
 # A descent is given up when so many iterations more, each as good as its last, would not take it

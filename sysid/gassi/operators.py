@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sysid.model import BoolArray, FloatArray
+from sysid.arrays import BoolArray, FloatArray
 
 
 def uniform(n: int, lower: FloatArray, upper: FloatArray, rng: np.random.Generator) -> FloatArray:

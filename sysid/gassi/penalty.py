@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sysid.model import BoolArray, FloatArray
+from sysid.arrays import BoolArray, FloatArray
 
 
 def infeasibility(violations: FloatArray) -> FloatArray:

@@ -8,13 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from sysid.arrays import FloatArray
+from sysid.engine.simulation import Status
+from sysid.fitting.objective import Objective
+from sysid.fitting.refinement import simulations_per_iteration
 from sysid.gassi.local import AT_ONCE, LocalSearch
 from sysid.gassi.search import GeneticSearch, Preset
-from sysid.model import FloatArray, ModelError
-from sysid.objective import Objective
-from sysid.refinement import simulations_per_iteration
-from sysid.simulation import Status
-from sysid.space import SearchSpace
+from sysid.problem.model import ModelError
+from sysid.problem.space import SearchSpace
 
 # Minima of the mean RMSE so close to the best are left for the likelihood to tell apart, and
 # iterations kept for each.

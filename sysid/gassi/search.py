@@ -13,10 +13,11 @@ from typing import Any, Literal
 
 import numpy as np
 
+from sysid.arrays import BoolArray, FloatArray
 from sysid.gassi import operators
 from sysid.gassi.penalty import infeasibility, penalise
-from sysid.model import BoolArray, FloatArray, ModelError
-from sysid.space import SearchSpace
+from sysid.problem.model import ModelError
+from sysid.problem.space import SearchSpace
 
 PresetName = Literal["default", "thesis", "cega", "classic"]
 

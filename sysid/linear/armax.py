@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from sysid.linear.base import PolynomialModel
 from sysid.linear.orders import Order, Orders
-from sysid.model import ModelError
+from sysid.problem.model import ModelError
 
 
 class ARMAX(PolynomialModel):

@@ -9,16 +9,17 @@ from typing import Any, Self
 import numpy as np
 from sklearn.utils.validation import check_is_fitted
 
-from sysid._threads import one_thread
-from sysid.data import Dataset
+from sysid.arrays import FloatArray
 from sysid.linear.identification import Coefficients, Estimate, identify
 from sysid.linear.orders import Orders
 from sysid.linear.polynomials import poles
 from sysid.linear.predictor import Predictor
 from sysid.linear.records import check_alike, check_columns, check_sample_time
-from sysid.metrics import fit_percent
-from sysid.model import FloatArray, ModelError
-from sysid.recording import Data, RecordEstimator, given_datasets, split
+from sysid.problem.data import Dataset
+from sysid.problem.metrics import fit_percent
+from sysid.problem.model import ModelError
+from sysid.problem.records import Data, RecordEstimator, given_datasets, split
+from sysid.threads import one_thread
 
 
 class PolynomialModel(RecordEstimator):

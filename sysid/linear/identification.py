@@ -7,14 +7,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sysid.data import Dataset
+from sysid.arrays import FloatArray
 from sysid.linear.noise_start import first_guesses
 from sysid.linear.orders import Orders
 from sysid.linear.polynomials import reflect_poles
 from sysid.linear.precision import Precision
 from sysid.linear.prediction_error import RowFit, fit_row
 from sysid.linear.regression import Equations, equations
-from sysid.model import FloatArray, ModelError
+from sysid.problem.data import Dataset
+from sysid.problem.model import ModelError
 
 
 @dataclass(frozen=True)

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sysid.data import Dataset
+from sysid.arrays import FloatArray, IntArray
 from sysid.linear.orders import Orders
 from sysid.linear.regression import Equations, delayed, equations, least_squares
-from sysid.model import FloatArray, IntArray
+from sysid.problem.data import Dataset
 
 
 def first_guesses(

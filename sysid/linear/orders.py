@@ -8,7 +8,8 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from sysid.model import IntArray, ModelError
+from sysid.arrays import IntArray
+from sysid.problem.model import ModelError
 
 # One number for every entry, or a table with one number for each.
 Order = int | Sequence[int] | Sequence[Sequence[int]] | IntArray

@@ -9,13 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-import numpy.typing as npt
 import scipy.linalg
 from scipy.linalg import lapack
 
-from sysid.model import FloatArray
-
-ComplexArray = npt.NDArray[np.complex128]
+from sysid.arrays import ComplexArray, FloatArray
 
 # A noise model that forgets more slowly than this needs thousands of samples to start.
 NOISE_RADIUS = 0.999

@@ -7,9 +7,9 @@ from functools import reduce
 
 import numpy as np
 
+from sysid.arrays import FloatArray, IntArray
 from sysid.linear.prediction_error import RowFit
 from sysid.linear.regression import influence
-from sysid.model import FloatArray, IntArray
 
 
 class Precision:

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sysid.arrays import FloatArray
 from sysid.linear.polynomials import limit_noise, reflect_noise
 from sysid.linear.regression import Equations, LeastSquares, least_squares
 from sysid.linear.whitening import Whitener
-from sysid.model import FloatArray
 
 # An iteration is not worth it when it promises to move the coefficients by less than this share
 # of their standard errors.

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sysid.arrays import FloatArray
 from sysid.linear import recursion
-from sysid.model import FloatArray
 
 # A response to a start beyond this many times the start is that of an unstable model.
 _GROWN = 1e6

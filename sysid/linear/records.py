@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sysid.data import Dataset
-from sysid.model import ModelError
+from sysid.problem.data import Dataset
+from sysid.problem.model import ModelError
 
 
 def check_alike(records: Sequence[Dataset]) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import blas
 
-from sysid.model import FloatArray
+from sysid.arrays import FloatArray
 
 # Rows solved at a time; bounds the memory of the band matrix.
 _BLOCK = 4096

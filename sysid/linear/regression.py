@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
-from sysid.data import Dataset
+from sysid.arrays import BoolArray, FloatArray, IntArray
 from sysid.linear.orders import Orders, Term
-from sysid.model import BoolArray, FloatArray, IntArray
+from sysid.problem.data import Dataset
 
 
 @dataclass(frozen=True)

@@ -11,14 +11,15 @@ from typing import Any, Literal
 import numpy as np
 from sklearn.base import clone
 
-from sysid._threads import one_thread
-from sysid.data import Dataset
+from sysid.arrays import FloatArray
 from sysid.linear.base import PolynomialModel
 from sysid.linear.orders import Order
 from sysid.linear.records import check_alike
-from sysid.metrics import evaluate
-from sysid.model import FloatArray, ModelError
-from sysid.recording import given_datasets
+from sysid.problem.data import Dataset
+from sysid.problem.metrics import evaluate
+from sysid.problem.model import ModelError
+from sysid.problem.records import given_datasets
+from sysid.threads import one_thread
 
 Criterion = Literal["fit", "aic", "bic"]
 

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 from scipy.linalg import lapack
 
-from sysid.model import FloatArray, IntArray
+from sysid.arrays import FloatArray, IntArray
 
 
 class Whitener:

@@ -16,9 +16,9 @@ from typing import Literal
 import numpy as np
 from scipy.linalg import null_space
 
-from sysid.model import FloatArray, IntArray
-from sysid.objective import Objective
-from sysid.space import SearchSpace
+from sysid.arrays import FloatArray, IntArray
+from sysid.fitting.objective import Objective
+from sysid.problem.space import SearchSpace
 from sysid.uncertainty.directions import PART, Directions, directions
 from sysid.uncertainty.estimate import Z95, Estimate, Why, product_text, sum_text
 from sysid.uncertainty.relations import (

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import lapack
 
-from sysid.model import BoolArray, FloatArray
+from sysid.arrays import BoolArray, FloatArray
 
 _LARGEST_ORDER = 12
 

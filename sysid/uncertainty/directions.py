@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sysid.model import BoolArray, FloatArray
-from sysid.objective import Objective
+from sysid.arrays import BoolArray, FloatArray
+from sysid.fitting.objective import Objective
 from sysid.uncertainty.colour import colour, score_covariance
 from sysid.uncertainty.sensitivity import Sensitivity, input_noises, zero_errors
 

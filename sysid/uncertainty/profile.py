@@ -7,10 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sysid.model import FloatArray, ModelError
-from sysid.objective import Objective
-from sysid.refinement import refine
-from sysid.space import HeldSpace
+from sysid.arrays import FloatArray
+from sysid.fitting.objective import Objective
+from sysid.fitting.refinement import refine
+from sysid.problem.model import ModelError
+from sysid.problem.space import HeldSpace
 from sysid.uncertainty.directions import directions
 from sysid.uncertainty.estimate import Z95
 from sysid.uncertainty.sensitivity import common_steps, coordinate_units, sensitivity

@@ -9,8 +9,8 @@ from typing import Literal
 
 import numpy as np
 
-from sysid.model import BoolArray, FloatArray, IntArray
-from sysid.objective import Objective
+from sysid.arrays import BoolArray, FloatArray, IntArray
+from sysid.fitting.objective import Objective
 from sysid.uncertainty.directions import Directions
 from sysid.uncertainty.sensitivity import Sensitivity, coordinate_units
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sysid.data import Dataset
-from sysid.model import BoolArray, FloatArray
-from sysid.objective import Objective
+from sysid.arrays import BoolArray, FloatArray
+from sysid.fitting.objective import Objective
+from sysid.problem.data import Dataset
 
 # Central differences in search coordinates: truncation and rounding both near 1e-8.
 _PERTURBATION = 1e-5

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from daq import capture
+from daq.logs import capture
 from tests.daq.support import (
     RIG,
     environment,

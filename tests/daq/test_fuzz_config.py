@@ -8,10 +8,10 @@ import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from daq.cli.files import load_experiment, load_rig
-from daq.cli.preparing import prepare
-from daq.cli.shipped import EXPERIMENTS, RIGS, shipped_files
 from daq.errors import ConfigError
+from daq.identification.settings import prepare
+from daq.lookup.files import load_experiment, load_rig
+from daq.lookup.shipped import EXPERIMENTS, RIGS, shipped_files
 
 WORDS = st.sampled_from(
     [

@@ -7,12 +7,12 @@ import jsonschema
 import pytest
 import yaml
 
-from daq.cli.modelling import find_model
-from daq.cli.quantities import in_model_units
-from daq.cli.shipped import EXPERIMENTS, shipped_files
-from daq.cli.starting import settings_text
+from daq.cli.init import settings_text
+from daq.cli.models import find_model
 from daq.config.identification import IdentificationConfig
 from daq.config.yaml_file import YamlFile
+from daq.identification.quantities import in_model_units
+from daq.lookup.shipped import EXPERIMENTS, shipped_files
 from tests.daq.support import forked_rig, rig
 
 

@@ -8,12 +8,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from daq.cli.files import load_rig
 from daq.config.rig import RigConfig
 from daq.errors import ConfigError
 from daq.hal import Flag, Mode, Phase, Samples
 from daq.limits import Limits
 from daq.limits.load import i2t_levels
+from daq.lookup.files import load_rig
 from daq.rig import Rig
 from sim_rig.backend import SimulatedDevice, Simulation
 

@@ -11,12 +11,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from daq import capture
-from daq.cli import datasets
 from daq.errors import ConfigError, RunError
 from daq.hal import Flag, Samples
-from daq.log import COLUMNS, ORIGINAL_COLUMNS, LogWriter, load_log
-from daq.table import read_table
+from daq.identification import records as datasets
+from daq.logs import capture
+from daq.logs.log import COLUMNS, ORIGINAL_COLUMNS, LogWriter, load_log
+from daq.logs.table import read_table
 from sim_rig.actuator import actuator
 from tests.daq.support import (
     install_faulty,

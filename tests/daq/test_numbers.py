@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from daq.cli.console import digits, engineering, number
+from daq.cli.terminal import digits, engineering, number
 from daq.config.units import factor
 
 

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from daq import record
-from daq.cli.analysing import analyse_command
+from daq.cli.analyse import analyse_command
 from daq.errors import ConfigError, RunError
 from tests.daq.support import only_capture, record_of, rig
 

@@ -9,9 +9,9 @@ import pytest
 import yaml
 from scipy.signal import lfilter
 
-from daq import capture
-from daq.cli import datasets
 from daq.errors import ConfigError
+from daq.identification import records as datasets
+from daq.logs import capture
 from sim_rig.actuator import actuator
 from tests.daq.support import forked_rig, only_capture, write_experiment
 

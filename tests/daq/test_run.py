@@ -8,9 +8,9 @@ import signal
 import numpy as np
 import pytest
 
-from daq import capture
 from daq.errors import ConfigError
 from daq.hal import Flag
+from daq.logs import capture
 from tests.daq.support import EXPERIMENT as SETTINGS
 from tests.daq.support import (
     install_faulty,

@@ -15,9 +15,9 @@ import pytest
 from daq.config.rig import RigConfig
 from daq.errors import RunError
 from daq.hal import Flag, Phase
-from daq.realtime import RealTime
-from daq.run import run_experiment
-from daq.timing import Histogram
+from daq.run.realtime import RealTime
+from daq.run.runner import run_experiment
+from daq.run.timing import Histogram
 from protocols.prbs import Prbs
 from sim_rig.backend import SimulatedDevice, Simulation
 from tests.daq.support import (

@@ -9,8 +9,9 @@ import jsonschema
 import pytest
 import yaml
 
-from daq.cli import reference, schemas
+from daq.cli import reference
 from daq.cli.app import app
+from daq.lookup import schemas
 from tests.daq.support import rig
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from tornado import httpclient, websocket
 
 from daq.hal import Samples
-from daq.log import COLUMNS, LogWriter, load_log
+from daq.logs.log import COLUMNS, LogWriter, load_log
 from daq.scope.history import History
 from daq.scope.recordings import Recording, Watch
 from daq.scope.tail import LogTail

@@ -11,9 +11,9 @@ from selenium.webdriver.chrome.service import Service
 from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.actions.wheel_input import ScrollOrigin
 
-from daq.capture import Capture
 from daq.hal import Flag
-from daq.log import LogWriter, load_log
+from daq.logs.capture import Capture
+from daq.logs.log import LogWriter, load_log
 from tests.daq.support import start_rig, until, write_experiment, write_rig
 from tests.daq.test_scope import RATE, samples, start_scope
 

@@ -99,7 +99,7 @@ def test_tab_offers_what_can_stand_there(tmp_path, typed, offered, not_offered):
 
 
 TABLE = """
-from daq.cli.console import print_table, print_text
+from daq.cli.terminal import print_table, print_text
 print_table("Title [rad/s]", ["name", "omega [rad/s]", "meaning"],
             [["K_m", "0.135 .. 0.151", "[low, high] of a :smile:" * 9]], text=["meaning"])
 print_table("Wide", ["output", "RMSE, training", "with applied_voltage_motor", "fit [%]"],

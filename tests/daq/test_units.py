@@ -8,10 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import Field, ValidationError
 
-from daq.cli.preparing import prepare
 from daq.config.base import Section
 from daq.config.identification import Column
 from daq.config.units import Hertz, Part, RadiansPerSecond, Unit, Volts, factor, unit_of
+from daq.identification.settings import prepare
 from sim_rig.plant import Plant
 
 

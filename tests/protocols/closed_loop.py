@@ -6,8 +6,8 @@ import yaml
 
 import protocols
 from daq.config.rig import RigConfig
-from daq.log import load_log
-from daq.run import run_experiment
+from daq.logs.log import load_log
+from daq.run.runner import run_experiment
 from sim_rig.backend import SimulatedDevice, Simulation
 from tests.daq.support import merged
 

@@ -2,8 +2,8 @@
 
 import yaml
 
-from daq.cli.files import load_experiment
 from daq.config.rig import RigConfig
+from daq.lookup.files import load_experiment
 
 SHORT = {"calibration": {"samples": 16}}
 

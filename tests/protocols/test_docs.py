@@ -8,8 +8,8 @@ import pytest
 import yaml
 
 import protocols
-from daq.cli.files import load_experiment
 from daq.config.rig import RigConfig
+from daq.lookup.files import load_experiment
 from daq.plugins import installed
 
 DOCS = Path(protocols.__file__).parents[1] / "docs" / "protocols"

@@ -10,9 +10,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.signal import chirp as scipy_chirp
 
-from daq.cli.files import load_experiment
 from daq.config.rig import RigConfig
 from daq.errors import ConfigError
+from daq.lookup.files import load_experiment
 from daq.plugins import load_plugin
 from tests.daq.support import only_capture, record_of
 from tests.protocols.support import loaded, planned

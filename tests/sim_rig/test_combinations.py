@@ -10,9 +10,9 @@ import pytest
 
 from sim_rig.actuator import actuator
 from sysid import BatchSimulator, Dataset, ModelError, SearchSpace
-from sysid.reference import simulate as reference
 from tests.sim_rig import equations
 from tests.sim_rig.support import ALL, HYSTERESES, LOADS, PLANTS, Parts, combinations, random_point
+from tests.sysid.reference import simulate as reference
 
 
 @pytest.mark.parametrize("load", LOADS)

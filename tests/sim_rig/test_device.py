@@ -10,8 +10,8 @@ from daq.hal import Flag, Guard, Mode, Phase, RawSamples
 from sim_rig.backend import Imperfections, SimulatedDevice, Simulation
 from sim_rig.plant import Plant
 from sysid import Dataset
-from sysid.reference import simulate as reference
 from tests.sim_rig.support import PLANTS
+from tests.sysid.reference import simulate as reference
 
 OPEN_GUARD = Guard(
     np.array([-10.0, -10.0]), np.array([10.0, 10.0]), np.full(3, -99.0), np.full(3, 99.0)

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from sysid import Constraint, Dataset, Input, Output, Parameter, ProcessModel, State
-from sysid.simulation import BatchResult, Residuals
+from sysid.engine.simulation import BatchResult, Residuals
 
 
 def lag_derivative(x, u, p):

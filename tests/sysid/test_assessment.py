@@ -9,7 +9,7 @@ import pytest
 from scipy.signal import lfilter
 
 from sysid import Dataset, Input, Output, Parameter, ProcessModel, State
-from sysid.assessment import examine, judge
+from sysid.judging.assessment import examine, judge
 from sysid.uncertainty import Ambiguity, Estimate, Uncertainty
 
 MODEL = ProcessModel(

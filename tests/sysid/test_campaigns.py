@@ -12,9 +12,9 @@ import joblib
 import numpy as np
 import pytest
 
-import sysid.campaigns
+import sysid.campaigns.campaign
 from sysid import GASSI, Constraint, Dataset, ModelError, Run, campaign, combinations, fit_percent
-from sysid._parcels import pack, unpack
+from sysid.campaigns.parcels import pack, unpack
 from tests.sysid.support import lag
 
 SETTINGS = {"population": 32, "generations": 4}

@@ -11,8 +11,8 @@ from scipy import stats
 from scipy.signal import lfilter
 
 from sysid import ARX, GASSI, Dataset, ModelError, Parameter, fit_percent
-from sysid.comparison import Candidate, compare
-from sysid.evidence import independent_samples, ratio_of_means
+from sysid.judging.comparison import Candidate, compare
+from sysid.judging.evidence import independent_samples, ratio_of_means
 from tests.sysid.support import lag
 
 

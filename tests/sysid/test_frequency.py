@@ -5,7 +5,7 @@ import pytest
 from scipy import signal
 
 from sysid import Dataset, LinearModel, ModelError
-from sysid.frequency import frequency_response, sampled_response
+from sysid.response.frequency import frequency_response, sampled_response
 
 DT = 0.01
 # A resonance driven by two inputs, one of them four times as strong.

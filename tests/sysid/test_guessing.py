@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sysid import GASSI, Dataset, Guess, ModelError, Parameter, guess_ranges
-from sysid.guessing import regression
+from sysid.problem.guesses import regression
 from tests.sysid.support import MOTOR, lag, motor, motor_record
 
 RECORD = Dataset(np.ones(20), np.linspace(0.0, 2.0, 20), 0.1, "bench")

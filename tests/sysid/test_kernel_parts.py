@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from sysid import _vector_math
-from sysid._lanes import LANES
-from sysid._phi import scheme_matrices
+from sysid.engine import vector_math as _vector_math
+from sysid.engine.lanes import LANES
+from sysid.engine.phi import scheme_matrices
 
 
 def tables(pattern):

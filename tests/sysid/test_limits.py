@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sysid import BatchSimulator, Dataset, Input, Output, Parameter, ProcessModel, State, Stepper
-from sysid.reference import simulate as reference
+from tests.sysid.reference import simulate as reference
 from tests.sysid.support import blank, linear_response, prbs
 
 DT = 1.0 / 800.0

@@ -20,7 +20,7 @@ from sysid import (
     jacobian,
     linearize,
 )
-from sysid.linearization import jacobians
+from sysid.response.linearization import jacobians
 from tests.sysid.support import motor, motor_matrices
 
 MODELS = {

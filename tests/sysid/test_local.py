@@ -18,12 +18,12 @@ from sysid import (
     ProcessModel,
     State,
 )
+from sysid.fitting.objective import Objective
+from sysid.fitting.refinement import advance, begin, refine
 from sysid.gassi import PRESETS, GeneticSearch
 from sysid.gassi.local import LocalSearch, Minimum
 from sysid.gassi.running import Run
-from sysid.objective import Objective
-from sysid.refinement import advance, begin, refine
-from sysid.space import SearchSpace
+from sysid.problem.space import SearchSpace
 from tests.sysid.support import MOTOR, lag, motor, motor_record
 
 DT = 0.01

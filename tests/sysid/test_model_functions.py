@@ -17,7 +17,7 @@ from sysid import (
     ProcessModel,
     State,
 )
-from sysid.reference import simulate as reference
+from tests.sysid.reference import simulate as reference
 from tests.sysid.support import blank, normalised_rms, prbs
 
 STIFFNESS = 30.0

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from sysid import GASSI, BatchSimulator, Dataset, ModelError, SearchSpace
-from sysid.objective import Objective
-from sysid.reference import simulate as reference
+from sysid.fitting.objective import Objective
+from tests.sysid.reference import simulate as reference
 from tests.sysid.support import motor, motor_inputs, motor_record
 
 WEIGHTS = np.array([3.0, 1.0])

@@ -17,8 +17,8 @@ from sysid import (
     SearchSpace,
     State,
 )
-from sysid.objective import Objective
-from sysid.refinement import refine
+from sysid.fitting.objective import Objective
+from sysid.fitting.refinement import refine
 from tests.sysid.support import MOTOR, Formula, draw, lag, motor, motor_record
 
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
-from sysid.residual_tests import residual_test
+from sysid.judging.residual_tests import residual_test
 
 
 def coloured(rng, n, a):

@@ -7,11 +7,11 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 from sysid import GASSI, BatchSimulator, Dataset, Input, Output, Parameter, ProcessModel, State
-from sysid.linearization import jacobian
-from sysid.lookalikes import lookalikes
-from sysid.objective import Objective
-from sysid.settling import settle
-from sysid.space import SearchSpace
+from sysid.fitting.objective import Objective
+from sysid.gassi.lookalikes import lookalikes
+from sysid.gassi.settling import settle
+from sysid.problem.space import SearchSpace
+from sysid.response.linearization import jacobian
 from tests.sysid.support import prbs
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sysid import BatchSimulator, Dataset, ModelError, Output
-from sysid.reference import simulate as reference
+from tests.sysid.reference import simulate as reference
 from tests.sysid.support import lag, motor, motor_inputs
 
 

@@ -22,7 +22,7 @@ from sysid import (
     State,
     Status,
 )
-from sysid.reference import simulate as reference
+from tests.sysid.reference import simulate as reference
 from tests.sysid.support import (
     MOTOR,
     blank,

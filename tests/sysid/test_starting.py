@@ -18,10 +18,10 @@ from sysid import (
     SearchSpace,
     State,
 )
-from sysid.objective import Objective
-from sysid.refinement import refine
-from sysid.settling import settle
-from sysid.starting import estimate_start, free_run
+from sysid.fitting.free_run import estimate_start, free_run
+from sysid.fitting.objective import Objective
+from sysid.fitting.refinement import refine
+from sysid.gassi.settling import settle
 from sysid.uncertainty import uncertainty
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from sim_rig.actuator import actuator
 from sysid import Input, ModelError, Output, Parameter, ProcessModel, State, Stepper
-from sysid.reference import simulate as reference
+from tests.sysid.reference import simulate as reference
 from tests.sysid.support import blank, lag, motor, motor_inputs, prbs
 
 DT = 1.0 / 800.0

@@ -9,7 +9,7 @@ import pytest
 
 from sim_rig.actuator import actuator
 from sysid import Input, Output, Parameter, ProcessModel, State
-from sysid._structure import analyse
+from sysid.engine.structure import analyse
 
 
 def model_of(derivative, hold="zoh", output=None):

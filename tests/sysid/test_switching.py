@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from sysid import BatchSimulator, Dataset, Input, Output, Parameter, ProcessModel, State
+from sysid.fitting.objective import Objective
+from sysid.fitting.refinement import refine
 from sysid.gassi import GASSI
-from sysid.objective import Objective
-from sysid.refinement import refine
-from sysid.space import SearchSpace
+from sysid.problem.space import SearchSpace
 
 MASS, FRICTION, OFFSET = 2.0, 3.0, 0.4
 

@@ -29,8 +29,8 @@ from sysid import (
     SearchSpace,
     State,
 )
-from sysid.objective import Objective
-from sysid.refinement import refine
+from sysid.fitting.objective import Objective
+from sysid.fitting.refinement import refine
 from sysid.uncertainty import uncertainty
 from sysid.uncertainty.colour import Autoregression, colour, score_covariance
 from tests.sysid.support import Formula, lag, linear_response, prbs

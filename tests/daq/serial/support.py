@@ -61,10 +61,10 @@ def emulator(folder, *arguments, plant=None):
 # Imports and compiles what an emulator needs, then becomes one per line of standard input.
 _FORKING = """
 import json, os, signal, sys, traceback
-import daq.cli, daq.cli.app, daq.cli.emulating
+import daq.cli, daq.cli.app, daq.cli.emulate
 from sim_rig.backend import SimulatedDevice, Simulation
 
-daq.cli.emulating._warm_up(SimulatedDevice(Simulation()))
+daq.cli.emulate._warm_up(SimulatedDevice(Simulation()))
 signal.signal(signal.SIGCHLD, signal.SIG_IGN)
 for line in sys.stdin:
     job = json.loads(line)

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from daq.hal import Phase
-from daq.serial import codec, device, host, messages
+from daq.serial import codec, host, messages
+from daq.serial.emulation import machine as device
 from daq.serial.messages import (
     Block,
     Channel,

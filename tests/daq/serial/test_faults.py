@@ -10,11 +10,11 @@ import time
 import numpy as np
 import pytest
 
-from daq import capture
 from daq.errors import ConfigError, DeviceError
 from daq.hal import Flag, Guard, Mode
-from daq.serial import faults
+from daq.logs import capture
 from daq.serial.backend import SerialDevice, SerialOptions
+from daq.serial.emulation import faults
 from daq.serial.link import open_link
 from tests.daq.serial.support import forked_emulators, write_serial_rig
 from tests.daq.support import (

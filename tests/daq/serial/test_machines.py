@@ -5,8 +5,8 @@ import pytest
 
 from daq.hal import ANALOG_INPUTS, CHANNELS, Flag
 from daq.serial import codec, messages
-from daq.serial.device import DeviceMachine
-from daq.serial.faults import Line
+from daq.serial.emulation.faults import Line
+from daq.serial.emulation.machine import DeviceMachine
 from daq.serial.host import HostMachine
 from daq.serial.messages import Channel, Latch, LoopMode, Result, Start, State, Type, Welcome
 

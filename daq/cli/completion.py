@@ -1,0 +1,98 @@
+"""What the shell offers for a value when Tab is pressed (see ``rig --install-completion``)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from daq.lookup.shipped import EXPERIMENTS, RIGS, shipped_files
+
+Offer = tuple[str, str]  # a value and what it is
+
+_FIRST = 4096  # characters of a file that say what kind it is
+
+
+def experiments(incomplete: str) -> list[Offer]:
+    """Shipped experiments, and YAML files here that name a protocol."""
+    return _matching(
+        incomplete, [*_shipped(EXPERIMENTS), *_local(incomplete, ".yaml", "protocol:")]
+    )
+
+
+def rigs(incomplete: str) -> list[Offer]:
+    """Shipped rigs, and YAML files here that name a backend or have its options."""
+    own = _local(incomplete, ".yaml", "backend:", "options:")
+    return _matching(incomplete, [*_shipped(RIGS), *own])
+
+
+def rig_names(incomplete: str) -> list[Offer]:
+    """Shipped rigs by name."""
+    found = _shipped(RIGS)
+    return _matching(incomplete, [(name.removesuffix(".yaml"), text) for name, text in found])
+
+
+def protocols(incomplete: str) -> list[Offer]:
+    """Shipped experiments by protocol."""
+    found = _shipped(EXPERIMENTS)
+    return _matching(incomplete, [(name.removesuffix(".yaml"), text) for name, text in found])
+
+
+def models(incomplete: str) -> list[Offer]:
+    """Installed models, and Python files here."""
+    from daq.plugins import installed
+
+    names = [(name, point.value) for name, point in installed("rig.models").items()]
+    return _matching(incomplete, [*names, *_local(incomplete, ".py", "")])
+
+
+def presets(incomplete: str) -> list[Offer]:
+    """Presets of the search."""
+    from typing import get_args
+
+    from daq.config.identification import Preset
+
+    return _matching(incomplete, [(name, "") for name in get_args(Preset)])
+
+
+def _matching(incomplete: str, offers: Iterable[Offer]) -> list[Offer]:
+    # What stands here goes before what is shipped by the same name.
+    found = {name: text for name, text in offers if name.startswith(incomplete)}
+    return list(found.items())
+
+
+def _shipped(packages: Iterable[str]) -> Iterator[Offer]:
+    for path in shipped_files(packages):
+        yield path.name, _about(path)
+
+
+def _local(incomplete: str, suffix: str, *keys: str) -> Iterator[Offer]:
+    """Files of a kind that have one of the keys, and folders, in the folder that is being typed."""
+    for path in _beside(incomplete, suffix):
+        if path.is_dir():
+            yield f"{path.as_posix()}/", "folder"
+        elif any(key in _beginning(path) for key in keys):
+            yield path.as_posix(), _about(path)
+
+
+def _beside(incomplete: str, suffix: str) -> list[Path]:
+    folder = Path(incomplete) if incomplete.endswith("/") else Path(incomplete).parent
+    if not folder.is_dir():
+        return []
+    return sorted(
+        path for path in folder.iterdir()
+        if not path.name.startswith(".") and (path.suffix == suffix or path.is_dir())
+    )  # fmt: skip
+
+
+def _about(path: Path) -> str:
+    """The first comment of a file that is meant for people."""
+    comments = (line[1:].strip() for line in _beginning(path).splitlines() if line[:1] == "#")
+    return next((text for text in comments if not text.startswith("yaml-language-server")), "")
+
+
+def _beginning(path: Path) -> str:
+    try:
+        with path.open(encoding="utf-8") as file:
+            return file.read(_FIRST)
+    except (OSError, UnicodeDecodeError):
+        return ""

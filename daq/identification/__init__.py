@@ -1,0 +1,1 @@
+"""From logs to parameters: settings, records, the fit, its result; replays and comparisons."""

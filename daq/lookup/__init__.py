@@ -1,0 +1,1 @@
+"""From names that users write to experiments, rigs, models and files."""

@@ -1,0 +1,75 @@
+"""Objects of a user's own Python files: models, protocols, limits."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Literal
+
+from daq.config.yaml_file import nearest_file, suggestion
+from daq.errors import ConfigError, line_in, same_file
+from sysid.problem.model import ModelError
+
+Kind = Literal["backend", "limit", "model", "protocol"]
+
+
+def locate(path: Path, kind: Kind, relative_to: Path | None = None) -> Path:
+    """A file looked up from the working folder, then from ``relative_to``; else ConfigError."""
+    for candidate in (path, *([relative_to / path] if relative_to else [])):
+        if candidate.is_file():
+            return candidate
+    cure = nearest_file(path) or (nearest_file(relative_to / path) if relative_to else "")
+    raise ConfigError(f"{path}: there is no such {kind} file; {cure or 'check its name'}")
+
+
+def from_file(path: Path, attribute: str, kind: Kind, is_one: Callable[[Any], bool]) -> Any:
+    """An object of a Python file.
+
+    is_one: whether an object is of the kind, for suggestions. Raises ConfigError naming file,
+    line and cause.
+    """
+    module = _import(path, kind)
+    if not hasattr(module, attribute):
+        names = [key for key, value in vars(module).items() if is_one(value)]
+        raise ConfigError(
+            f"{path}: it defines no {attribute!r}; {suggestion(attribute, names)} "
+            f"(FILE.py:NAME names a {kind} in it)"
+        )
+    return getattr(module, attribute)
+
+
+def _import(path: Path, kind: Kind) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(f"_rig_{kind}_{path.stem}", path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    # Such a file may import its neighbours, as a script in that folder could.
+    folder = str(path.resolve().parent)
+    sys.path.insert(0, folder)
+    # Typed settings look up the module that their annotations are written in.
+    sys.modules[spec.name] = module
+    try:
+        spec.loader.exec_module(module)
+    except (Exception, SystemExit) as error:
+        del sys.modules[spec.name]
+        what = (
+            str(error)
+            if isinstance(error, ModelError)
+            else f"the {kind} file does not import: {type(error).__name__}: {error}"
+        )
+        raise ConfigError(f"{_place(path, error)}: {what}") from None
+    finally:
+        sys.path.remove(folder)
+    return module
+
+
+def _place(path: Path, error: BaseException) -> str:
+    """``file:line`` of the last line of the user's file that the error passed through."""
+    if isinstance(error, SyntaxError) and same_file(error.filename, path):
+        return f"{path}:{error.lineno}"
+    # What a model's function raised is where to look, not where the model is declared.
+    raised = error.__context__ if isinstance(error, ModelError) else None
+    line = (line_in(raised, path) if raised is not None else None) or line_in(error, path)
+    return f"{path}:{line}" if line is not None else str(path)

@@ -1,0 +1,1 @@
+"""A result as rows, and what renders them: page, LaTeX table, figures, document."""

@@ -1,1 +1,0 @@
-"""Reports of identifications: a page for people, a table for papers."""

@@ -1,0 +1,1 @@
+"""One run: a protocol asked for commands, a rig sampled, limits watched, everything logged."""

@@ -1,0 +1,124 @@
+"""What a run will do, checked against the rig's limits before anything is energised."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from daq.config.rig import RigConfig
+from daq.errors import ConfigError
+from daq.experiment import ClosedLoop, Experiment, Plan
+from daq.hal import CHANNELS, FloatArray
+from daq.limits.load import i2t_levels
+from daq.run.protocol_calls import description_of, plan_of, rehearse
+
+_ROUNDING = 1.0 + 1e-9
+
+
+def plan(experiment: Experiment, rig: RigConfig) -> Plan:
+    """What a run will do.
+
+    Raises ConfigError, its text beginning with the key, for settings that make no run, and for a
+    plan that breaks one of the rig's limits: the sample and the value, as far as they are known
+    beforehand.
+    """
+    planned = plan_of(experiment)
+    description_of(experiment)
+    if isinstance(experiment, ClosedLoop):
+        rehearse(experiment, planned)
+    _check_homing(experiment.homing.turns, rig)
+    for channel, name in enumerate(CHANNELS):
+        _check_range(planned, rig, channel, name)
+        if planned.commands is not None:
+            volts = planned.commands[:, channel]
+            _check_slew(volts, experiment.sample_rate, rig, name)
+            _check_current(volts, experiment.sample_rate, rig, name)
+    if isinstance(experiment, ClosedLoop) and rig.limits.speed is not None:
+        for name, values in planned.references.items():
+            _check_speed(name, values, experiment, rig.limits.speed)
+    return planned
+
+
+def _check_homing(turns: float, rig: RigConfig) -> None:
+    least, travel = rig.limits.winding, rig.limits.travel
+    if turns > 0.0 and least is not None and turns <= least:
+        raise ConfigError(
+            f"homing.turns: {turns:g} turns are wound, and limits.winding of the rig's file wants "
+            f"{least:g} left; wind more"
+        )
+    if travel is not None and turns > max(-travel[0], travel[1]):
+        raise ConfigError(
+            f"homing.turns: {turns:g} turns are outside limits.travel of the rig's file, "
+            f"[{travel[0]:g}, {travel[1]:g}] turns; wind less"
+        )
+
+
+def _check_range(planned: Plan, rig: RigConfig, channel: int, name: str) -> None:
+    least, most = getattr(rig.limits.command, name)
+    low, high = planned.lowest[channel], planned.highest[channel]
+    if low >= least and high <= most:
+        return
+    beyond, where = (high, np.argmax) if high > most else (low, np.argmin)
+    asked = f"up to {beyond:.6g} V"
+    if planned.commands is not None:
+        asked = f"for {beyond:.6g} V in sample {where(planned.commands[:, channel])}"
+    raise ConfigError(
+        f"{name}: the plan asks {asked}, outside the rig's limits "
+        f"[{least:g}, {most:g}] V; change amplitude or offset, or "
+        f"limits.command.{name} in the rig's file if the hardware allows it"
+    )
+
+
+def _check_slew(volts: FloatArray, rate: float, rig: RigConfig, name: str) -> None:
+    limit = getattr(rig.limits.slew, name)
+    if limit is None:
+        return
+    slopes = np.abs(np.diff(volts, prepend=0.0)) * rate
+    if (slopes <= limit * _ROUNDING).all():
+        return
+    row = int(np.argmax(slopes))
+    raise ConfigError(
+        f"{name}: the plan changes the command at {slopes[row]:.6g} V/s in sample {row} (from "
+        f"{volts[row - 1] if row else 0.0:.6g} V to {volts[row]:.6g} V), faster than the rig's "
+        f"limit of {limit:g} V/s; make smaller or slower steps, or change limits.slew.{name} in "
+        "the rig's file if the hardware allows it"
+    )
+
+
+def _check_current(volts: FloatArray, rate: float, rig: RigConfig, name: str) -> None:
+    """Current and i^2 t, where the amplifier's gain tells them; what flows in fact is less."""
+    gain = getattr(rig.amplifiers, name)
+    if gain is None:
+        return
+    current, most = np.abs(volts) * gain, getattr(rig.limits.current, name)
+    row = int(np.argmax(current))
+    if current[row] > most * _ROUNDING:
+        raise ConfigError(
+            f"{name}: the plan asks for {volts[row]:.6g} V in sample {row}, which is "
+            f"{current[row]:.4g} A by amplifiers.{name}, beyond limits.current.{name} of "
+            f"{most:g} A; change amplitude or offset"
+        )
+    load = getattr(rig.limits.i2t, name)
+    if load is None:
+        return
+    levels = i2t_levels(0.0, current, np.full(len(current), 1.0 / rate), load.continuous)
+    beyond = levels > load.budget
+    if beyond.any():
+        row = int(np.argmax(beyond))
+        raise ConfigError(
+            f"{name}: by sample {row} ({row / rate:.4g} s) the plan has reached "
+            f"{levels[row]:.4g} A^2*s above {load.continuous:g} A, beyond the budget of "
+            f"limits.i2t.{name}, {load.budget:g} A^2*s; make it shorter or smaller, or pause "
+            "for the winding to cool down"
+        )
+
+
+def _check_speed(name: str, values: FloatArray, experiment: ClosedLoop, limit: float) -> None:
+    if experiment.columns.get(name) != "rad/s":
+        return
+    row = int(np.argmax(np.abs(values)))
+    if not abs(values[row]) <= limit * _ROUNDING:
+        raise ConfigError(
+            f"{name}: the plan asks for {values[row]:.4g} rad/s in sample {row}, beyond "
+            f"limits.speed of {limit:g} rad/s; ask for less, or change limits.speed in the "
+            "rig's file if the hardware allows it"
+        )

@@ -1,0 +1,378 @@
+"""Campaigns: logs x model structures x seeds, spread over cores or machines by joblib.
+
+Whatever joblib runs on, a campaign runs on: the cores of this machine by ``n_jobs``, a dask
+cluster by ``joblib.parallel_config(backend="dask")`` around the call. One seed gives one result
+on all of them.
+"""
+
+from __future__ import annotations
+
+import functools
+import time
+import warnings
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sysid.campaigns.parcels import pack, unpack
+from sysid.problem.data import Dataset
+from sysid.problem.metrics import Metrics, evaluate
+from sysid.problem.model import ModelError, ProcessModel
+from sysid.engine.simulation import available_cores
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from sysid.gassi import GASSI
+
+# Two seeds whose errors differ by no more than this share found the same minimum.
+_SAME = 0.01
+
+
+@dataclass(frozen=True)
+class Run:
+    """One identification: a model, the records it is fitted to, settings and seed.
+
+    settings: arguments of ``GASSI``. name: of the model structure, default the model's. data:
+    of the records, default their names. validation: records it is judged by and never fitted to.
+    """
+
+    model: ProcessModel
+    records: Sequence[Dataset]
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    seed: int = 0
+    name: str = ""
+    data: str = ""
+    validation: Sequence[Dataset] = ()
+
+    def __post_init__(self) -> None:
+        records = (self.records,) if isinstance(self.records, Dataset) else tuple(self.records)
+        object.__setattr__(self, "records", records)
+        object.__setattr__(self, "validation", tuple(self.validation))
+        object.__setattr__(self, "name", self.name or self.model.name)
+        object.__setattr__(self, "data", self.data or ", ".join(r.name for r in records))
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a run: a fitted estimator, or the problem that kept it from one.
+
+    training, validation: metrics of the free run of each record. seconds: it took.
+    """
+
+    run: Run
+    estimator: GASSI | None
+    training: tuple[Metrics, ...]
+    validation: tuple[Metrics, ...]
+    seconds: float
+    problem: str = ""
+
+    @property
+    def error(self) -> float:
+        """The error that was minimised; infinite for a run that failed."""
+        return np.inf if self.estimator is None else self.estimator.error_
+
+    def row(self) -> dict[str, Any]:
+        """Everything as one flat row of a table."""
+        row: dict[str, Any] = {
+            "model": self.run.name,
+            "data": self.run.data,
+            "seed": self.run.seed,
+            "error": self.error,
+            "fit": _mean_fit(self.training),
+            "validation_fit": _mean_fit(self.validation),
+            "seconds": self.seconds,
+            "problem": self.problem,
+        }
+        if self.estimator is not None:
+            row["feasible"] = self.estimator.feasible_
+            row["stopped"] = self.estimator.stopped_
+            row["simulations"] = self.estimator.n_simulations_
+            row |= self.estimator.parameters_
+        return row
+
+
+@dataclass(frozen=True)
+class Spread:
+    """One structure on one set of records over its seeds.
+
+    best, median, worst: errors of the runs that did not fail. agreeing: how many of them came
+    within 1 % of the best. parameters: {name: (lowest, highest)} among those.
+    """
+
+    model: str
+    data: str
+    runs: int
+    failed: int
+    best: float
+    median: float
+    worst: float
+    agreeing: int
+    parameters: dict[str, tuple[float, float]]
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """Outcomes in the order of the runs; without those that Ctrl-C left undone."""
+
+    outcomes: tuple[Outcome, ...]
+    interrupted: bool = False
+
+    @property
+    def failed(self) -> tuple[Outcome, ...]:
+        """The outcomes that have a problem in place of a result."""
+        return tuple(outcome for outcome in self.outcomes if outcome.estimator is None)
+
+    def best(self) -> dict[tuple[str, str], Outcome]:
+        """For each structure and set of records, by names, the run with the lowest error.
+
+        What satisfies the model's constraints comes before what does not.
+        """
+        return {
+            key: min(done, key=_rank)
+            for key, group in self._groups().items()
+            if (done := [o for o in group if o.estimator is not None])
+        }
+
+    def spread(self) -> list[Spread]:
+        """Each structure on each set of records over its seeds."""
+        return [_spread(*key, group) for key, group in self._groups().items()]
+
+    def frame(self) -> pd.DataFrame:
+        """A row for each outcome: names, seed, error, fit %, parameters, problem."""
+        import pandas as pd
+
+        return pd.DataFrame([outcome.row() for outcome in self.outcomes])
+
+    def _groups(self) -> dict[tuple[str, str], list[Outcome]]:
+        groups: dict[tuple[str, str], list[Outcome]] = {}
+        for outcome in self.outcomes:
+            groups.setdefault((outcome.run.name, outcome.run.data), []).append(outcome)
+        return groups
+
+
+def combinations(
+    models: Mapping[str, ProcessModel],
+    records: Mapping[str, Sequence[Dataset]],
+    seeds: Iterable[int] = (0,),
+    settings: Mapping[str, Any] | None = None,
+    validation: Sequence[Dataset] = (),
+) -> list[Run]:
+    """Runs of every model on every set of records with every seed.
+
+    models: by the names they get in tables. records: by name, what one parameter set is fitted
+    to. settings: arguments of ``GASSI`` for all.
+    """
+    seeds = list(seeds)
+    return [
+        Run(model, group, settings or {}, seed, name, data, validation)
+        for name, model in models.items()
+        for data, group in records.items()
+        for seed in seeds
+    ]
+
+
+def campaign(
+    runs: Sequence[Run],
+    *,
+    n_jobs: int | None = None,
+    on_outcome: Callable[[Outcome], None] | None = None,
+) -> Campaign:
+    """Identify each of the runs, several at a time.
+
+    n_jobs: processes, -1 for all cores; default what ``joblib.parallel_config`` says, else one.
+    Each run gets its share of the cores unless its settings name ``threads``; on a cluster,
+    where a run has a worker's thread, one. A run that fails is kept with its problem. Ctrl-C
+    ends the campaign and keeps what is finished. on_outcome: told each outcome as it comes.
+    Raises ModelError when there is nothing to do, or a model cannot be sent to another process.
+    """
+    import joblib
+
+    if not runs:
+        raise ModelError("a campaign needs at least one run")
+    threads = _threads(n_jobs, len(runs))
+    packed = _Packed()
+    jobs = [
+        joblib.delayed(_identify)(place, *packed.arguments(runs[place]), runs[place].seed, threads)
+        for place in _order(runs)
+    ]
+    found: dict[int, Outcome] = {}
+    interrupted, problem = False, ""
+    results = _parallel(n_jobs)(jobs)
+    try:
+        for parcel in results:
+            place, outcome = _outcome(runs, parcel)
+            found[place] = outcome
+            if on_outcome is not None:
+                on_outcome(outcome)
+            if outcome.estimator is not None and outcome.estimator.stopped_ == "interrupted":
+                # The search took the Ctrl-C for itself, to keep its best so far.
+                raise KeyboardInterrupt
+    except KeyboardInterrupt:
+        interrupted = True
+    except Exception as error:
+        # A worker that died, or one that lacks something, takes the others with it.
+        problem = _described(error)
+    finally:
+        _close(results)
+    if not interrupted:
+        for place in set(range(len(runs))) - set(found):
+            found[place] = Outcome(runs[place], None, (), (), 0.0, problem)
+    return Campaign(tuple(found[place] for place in sorted(found)), interrupted)
+
+
+class _Packed:
+    """Parcels of what runs share, each packed once."""
+
+    def __init__(self) -> None:
+        self._parcels: dict[tuple[int, ...], bytes] = {}
+
+    def arguments(self, run: Run) -> tuple[bytes, bytes, bytes]:
+        """Model, records and settings."""
+        records = tuple(map(id, (*run.records, None, *run.validation)))
+        return (
+            self._parcel(f"model {run.name}", (id(run.model),), run.model),
+            self._parcel("the records", records, (run.records, run.validation)),
+            self._parcel(f"settings of {run.name}", (id(run.settings),), dict(run.settings)),
+        )
+
+    def _parcel(self, what: str, key: tuple[int, ...], value: Any) -> bytes:
+        if key not in self._parcels:
+            self._parcels[key] = pack(what, value)
+        return self._parcels[key]
+
+
+def _identify(
+    place: int, model: bytes, data: bytes, settings: bytes, seed: int, threads: int
+) -> bytes:
+    """What a worker does: fit, judge, and send back all but the model, which needs no journey."""
+    from sysid.gassi import GASSI
+
+    started = time.perf_counter()
+    fitted: GASSI | None = None
+    scores: list[tuple[Metrics, ...]] = [(), ()]
+    problem = ""
+    try:
+        groups = unpack(data)
+        given = {"threads": threads, **unpack(settings), "random_state": seed}
+        estimator = GASSI(_model(model), **given)
+        fitted = estimator.fit(groups[0])
+        scores = [
+            tuple(evaluate(record.outputs, estimator.predict(record)) for record in group)
+            for group in groups
+        ]
+        fitted.model = None
+        fitted.space_ = replace(fitted.space_, model=None)  # type: ignore[arg-type]
+    except Exception as error:
+        fitted, problem = None, _described(error)
+    seconds = time.perf_counter() - started
+    return pack("result", (place, fitted, *scores, seconds, problem))
+
+
+@functools.lru_cache(maxsize=8)
+def _model(parcel: bytes) -> ProcessModel:
+    """The same object for all runs of a worker, so that its kernels are made once."""
+    model: ProcessModel = unpack(parcel)
+    return model
+
+
+def _outcome(runs: Sequence[Run], parcel: bytes) -> tuple[int, Outcome]:
+    place, fitted, training, validation, seconds, problem = unpack(parcel)
+    run = runs[place]
+    if fitted is not None:
+        fitted.model = run.model
+        fitted.space_ = replace(fitted.space_, model=run.model)
+        fitted.threads = run.settings.get("threads")
+    return place, Outcome(run, fitted, training, validation, seconds, problem)
+
+
+def _parallel(n_jobs: int | None) -> Any:
+    """joblib's Parallel that hands out results as they come, where its backend can."""
+    import joblib
+
+    # Each run by itself: a batch of several would only be finished as a whole.
+    settings: dict[str, Any] = {"n_jobs": n_jobs, "batch_size": 1}
+    try:
+        return joblib.Parallel(return_as="generator_unordered", **settings)
+    except ValueError:
+        return joblib.Parallel(**settings)
+
+
+def _threads(n_jobs: int | None, n_runs: int) -> int:
+    """Cores of this machine for each of the runs that go on at a time; 1 on a cluster."""
+    import joblib
+    from joblib.parallel import (
+        LokyBackend,
+        MultiprocessingBackend,
+        SequentialBackend,
+        ThreadingBackend,
+        get_active_backend,
+    )
+
+    local = (LokyBackend, MultiprocessingBackend, SequentialBackend, ThreadingBackend)
+    if not isinstance(get_active_backend()[0], local):
+        return 1
+    at_a_time = min(int(joblib.effective_n_jobs(n_jobs)), n_runs)
+    return max(1, available_cores() // at_a_time)
+
+
+def _order(runs: Sequence[Run]) -> list[int]:
+    """Places of the runs with unlike models behind one another.
+
+    Workers then compile different models at the same time, not all of them the first one.
+    """
+    turn: dict[int, int] = {}
+    turns = []
+    for run in runs:
+        turns.append(turn.get(id(run.model), 0))
+        turn[id(run.model)] = turns[-1] + 1
+    return sorted(range(len(runs)), key=lambda place: turns[place])
+
+
+def _close(results: Any) -> None:
+    """Let go of runs that are not finished."""
+    if isinstance(results, Generator):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # that some were not, which is known
+            results.close()
+
+
+def _described(error: Exception) -> str:
+    if isinstance(error, ModelError):
+        return str(error)
+    return f"{type(error).__name__}: {error}"
+
+
+def _mean_fit(metrics: Sequence[Metrics]) -> float:
+    """Mean fit % over outputs and records, NaN without any."""
+    fits = np.array([m.fit for m in metrics]).ravel()
+    known = fits[~np.isnan(fits)]
+    return float(known.mean()) if len(known) else np.nan
+
+
+def _rank(outcome: Outcome) -> tuple[bool, float, int]:
+    assert outcome.estimator is not None
+    return (not outcome.estimator.feasible_, outcome.error, outcome.run.seed)
+
+
+def _spread(model: str, data: str, group: Sequence[Outcome]) -> Spread:
+    done = sorted((o for o in group if o.estimator is not None), key=_rank)
+    errors = np.array([o.error for o in done]) if done else np.array([np.nan])
+    same = [o.estimator for o in done if o.error <= (1.0 + _SAME) * errors.min()]
+    values = {
+        name: [e.parameters_[name] for e in same if e is not None]
+        for name in (done[0].run.model.parameter_names if done else ())
+    }
+    return Spread(
+        model,
+        data,
+        len(group),
+        len(group) - len(done),
+        float(errors.min()),
+        float(np.median(errors)),
+        float(errors.max()),
+        len(same),
+        {name: (min(found), max(found)) for name, found in values.items()},
+    )

@@ -1,0 +1,85 @@
+"""Models on their way to another process.
+
+A process model is made of plain functions: of a user's file that no other machine has, of a
+closure, of a script. What is not installed travels as code; what is (the standard library,
+packages, this one) as its name. An array unpickled from a parcel may be written to, as may one
+made here: the kernels are compiled for such, and would be compiled again for others.
+"""
+
+from __future__ import annotations
+
+import pickle
+import sys
+import sysconfig
+import types
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from sysid.problem.model import ModelError
+
+# Folders that installers make: of Python, and of Debian's packages.
+_INSTALLED = {"site-packages", "dist-packages"}
+
+
+def pack(what: str, value: Any) -> bytes:
+    """Bytes from which any process with this package makes ``value`` again by ``unpack``.
+
+    what: name of it for the ModelError raised when it cannot travel.
+    """
+    import cloudpickle
+
+    try:
+        with _by_value(_not_installed()):
+            parcel: bytes = cloudpickle.dumps(value)
+    except (pickle.PicklingError, TypeError, ValueError) as error:
+        raise ModelError(
+            f"{what} cannot be sent to another process: {error}\n"
+            "  Its functions and settings may refer to numbers, functions and modules; not to "
+            "open files, locks or connections."
+        ) from None
+    return parcel
+
+
+def unpack(parcel: bytes) -> Any:
+    """What was packed, equal and independent."""
+    return pickle.loads(parcel)
+
+
+def _not_installed() -> list[types.ModuleType]:
+    """Loaded modules that another process may not find by their name."""
+    known = sysconfig.get_paths()
+    places = {Path(known[key]) for key in ("stdlib", "platstdlib", "purelib", "platlib")}
+    own = __name__.partition(".")[0]
+    found = []
+    for name, module in list(sys.modules.items()):
+        file = getattr(module, "__file__", None)
+        # Compiled modules have no code that could travel.
+        if file is None or not file.endswith(".py") or name.partition(".")[0] in (own, "__main__"):
+            continue
+        if not _installed(Path(file), places):
+            found.append(module)
+    return found
+
+
+def _installed(file: Path, places: set[Path]) -> bool:
+    """Whether a file lies where packages are installed, be it another environment's folder."""
+    if not _INSTALLED.isdisjoint(file.parts):
+        return True
+    return any(file.is_relative_to(place) for place in places)
+
+
+@contextmanager
+def _by_value(modules: list[types.ModuleType]) -> Iterator[None]:
+    import cloudpickle
+
+    known = cloudpickle.list_registry_pickle_by_value()
+    added = [m for m in modules if m.__name__ in sys.modules and m.__name__ not in known]
+    for module in added:
+        cloudpickle.register_pickle_by_value(module)
+    try:
+        yield
+    finally:
+        for module in added:
+            cloudpickle.unregister_pickle_by_value(module)

@@ -1,0 +1,272 @@
+"""From a model's plain Python to machine code, kept on disk between runs.
+
+The compiled kernels live in the user's cache folder under a name that is a fingerprint of their
+text and of those of the model's functions that it calls, with all that these call in turn. A
+changed model file therefore gets a new name, and an old kernel is never used for it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import hashlib
+import importlib
+import os
+import tempfile
+import types
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from sysid.arrays import IntArray
+from sysid.engine import batch_kernel as _kernel
+from sysid.engine import trajectory_kernel as _trajectory_kernel
+from sysid.engine.scheme import Shape
+from sysid.engine.structure import analyse
+from sysid.engine.substitution import KNOWN_MODULES, names_in, rebuilt
+from sysid.problem.model import ModelError, ProcessModel
+
+_OPTIONS: dict[str, Any] = {
+    # IEEE division instead of exceptions, and none of the flags that would let the compiler
+    # assume away the NaN and infinity by which a failed simulation is recognised.
+    "error_model": "numpy",
+    "fastmath": {"contract", "arcp", "nsz"},
+}
+
+
+Tables = tuple[IntArray, IntArray, IntArray]
+
+
+class Guarded:
+    """A compiled function that turns the compiler's complaints into a ModelError.
+
+    compiled: the function itself, for those who have called it before and count microseconds.
+    """
+
+    def __init__(self, model: ProcessModel, compiled: Callable[..., None]) -> None:
+        self.compiled = compiled
+        self._model = model
+
+    def __call__(self, *args: Any) -> None:
+        """Run the kernel; ModelError for a model that does not compile."""
+        from numba.core.errors import NumbaError
+
+        try:
+            self.compiled(*args)
+        except NumbaError as error:
+            raise ModelError(_explain(self._model, error)) from None
+
+
+@dataclass(frozen=True)
+class Kernels:
+    """Compiled functions of one model, the floats of the work areas and the tables they need.
+
+    simulate, spectrum, work_rows and tables: see ``_kernel``; levels, advance, levels_size and
+    levels_tables: see ``_trajectory_kernel``. fewest_steps: see ``_kernel_text.Shape``. guarded:
+    whether there are limits that fast linear parts may run into.
+    """
+
+    simulate: Guarded
+    spectrum: Guarded
+    work_rows: int
+    tables: Tables
+    levels: Guarded
+    advance: Guarded
+    levels_size: int
+    levels_tables: Tables
+    fewest_steps: int
+    guarded: bool
+
+
+@functools.lru_cache(maxsize=8)
+def kernels(model: ProcessModel, *, exact: bool = True) -> Kernels:
+    """Compile a model's kernels, or load them from the cache folder.
+
+    Compilation itself happens at the first call. Without ``exact`` nothing is integrated
+    exactly. Raises ModelError when the model's functions use something that cannot be compiled.
+    """
+    shape = Shape.of(model, analyse(model, exact=exact))
+    text, called = _text(model, shape)
+    path = _source_file(f"{_safe(model.name)}_{_key(text, called)}.py", text)
+    scope = _scope(called)
+    exec(compile(text, str(path or "<kernel>"), "exec"), scope)
+    for name in ("constants", "remainder", "observe", "margins"):
+        if name in scope:
+            scope[name] = _njit(scope[name])
+    guarded = {
+        name: Guarded(model, _njit(scope[name], nogil=True, cache=path is not None))
+        for name in ("simulate", "spectrum", "levels", "advance")
+    }
+    return Kernels(
+        **guarded,
+        work_rows=_kernel.work_rows(shape),
+        tables=_tables(shape, _kernel.first_entry(shape)),
+        levels_size=_trajectory_kernel.work_size(shape),
+        levels_tables=_tables(shape, 0),
+        fewest_steps=shape.fewest_steps,
+        guarded=bool(shape.structure.guards),
+    )
+
+
+def fingerprint(model: ProcessModel) -> str:
+    """What decides every digit of a model's simulations and constraints, as a hash.
+
+    The equations, the constraints, and how this computer's processor is made use of.
+    """
+    text, called = _text(model, Shape.of(model, analyse(model, exact=True)))
+    key = hashlib.sha256(_key(text, called).encode())
+    for constraint in model.constraints:
+        _fingerprint(constraint.function, key, set())
+    return key.hexdigest()
+
+
+def _text(model: ProcessModel, shape: Shape) -> tuple[str, dict[str, Any]]:
+    """Text of a model's kernels, and the model's functions that it calls."""
+    # Numba is slow to import.
+    from sysid.engine.intrinsics import many_registers
+
+    program = shape.structure.program
+    batch = _kernel.source(shape, many_registers=many_registers())
+    text = "\n\n".join((program.text, batch, _trajectory_kernel.source(shape)))
+    return text, {name: getattr(model, name) for name in sorted(program.calls)}
+
+
+def _tables(shape: Shape, first: int) -> Tables:
+    """Tables of ``scheme_matrices`` for matrices that stand from row ``first`` on."""
+    import numpy as np
+
+    entries = np.array(shape.structure.closure(shape.n_states), dtype=np.int64)
+    triples = np.array(shape.structure.products(shape.n_states), dtype=np.int64)
+    return entries, triples, np.array(shape.places(first), dtype=np.int64)
+
+
+def _key(text: str, called: Mapping[str, Any]) -> str:
+    """Fingerprint of all that decides what the kernels do."""
+    import numba
+
+    key = hashlib.sha256(f"{numba.__version__}\n{text}".encode())
+    for library in ("intrinsics.py", "phi.py", "vector_math.py"):
+        key.update(Path(__file__).with_name(library).read_bytes())
+    for function in called.values():
+        _fingerprint(function, key, set())
+    return key.hexdigest()[:24]
+
+
+def _scope(called: Mapping[str, Any]) -> dict[str, Any]:
+    """Globals of the kernels' text."""
+    import numpy as np
+
+    from sysid.engine import intrinsics as _intrinsics
+    from sysid.engine.phi import scheme_matrices
+
+    return {
+        "np": np,
+        "math": _vector_math(),
+        "scheme_matrices": scheme_matrices,
+        "wide_vectors": _intrinsics.wide_vectors,
+        "always_inline": _intrinsics.always_inline,
+        "__name__": __name__,  # a module that exists when Numba loads the kernel from its cache
+        **{name: _jit(function) for name, function in called.items()},
+    }
+
+
+def _njit(function: Any, *, nogil: bool = False, cache: bool = False) -> Any:
+    import numba
+
+    if cache:
+        # RuntimeError: neither beside the text nor elsewhere can the compiler write.
+        with contextlib.suppress(RuntimeError):
+            return numba.njit(nogil=nogil, cache=True, **_OPTIONS)(function)
+    return numba.njit(nogil=nogil, **_OPTIONS)(function)
+
+
+def cache_folder() -> Path:
+    """Where compiled kernels are kept: RIG_CACHE_DIR, or the user's cache folder."""
+    import platformdirs
+
+    chosen = os.environ.get("RIG_CACHE_DIR")
+    return Path(chosen) if chosen else Path(platformdirs.user_cache_dir("hybrid-rig", False))
+
+
+def _explain(model: ProcessModel, error: Exception) -> str:
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    cause = next((s for s in lines if "File " not in s and "pipeline" not in s), "unknown cause")
+    place = next((s for s in lines if s.startswith('File "') and "<kernel>" not in s), "")
+    return (
+        f"model {model.name}: its functions cannot be compiled: {cause} {place}\n"
+        "  They may use floats, tuples, math functions, conditions and helper functions of the "
+        "same kind; not lists, dictionaries, strings or objects."
+    )
+
+
+def _jit(function: Any) -> Any:
+    """Compile a function and every plain function it refers to, also through a module."""
+    return rebuilt(function, _vector_math(), _njit)
+
+
+def _vector_math() -> Any:
+    # Imported here because Numba is slow to.
+    return importlib.import_module("sysid.engine.vector_math")
+
+
+def _fingerprint(value: Any, key: Any, seen: set[int]) -> None:
+    """Feed all that decides a function's behaviour into a hash."""
+    value = getattr(value, "py_func", value)
+    if isinstance(value, types.FunctionType):
+        if id(value) in seen:
+            return
+        seen.add(id(value))
+        _fingerprint(value.__code__, key, seen)
+        _fingerprint((value.__defaults__, value.__kwdefaults__), key, seen)
+        for cell in value.__closure__ or ():
+            _fingerprint(cell.cell_contents, key, seen)
+        _fingerprint_names(value.__globals__, names_in(value.__code__), key, seen)
+    elif isinstance(value, types.CodeType):
+        key.update(value.co_code + repr((value.co_names, value.co_varnames)).encode())
+        _fingerprint(value.co_consts, key, seen)
+    elif isinstance(value, types.ModuleType):
+        key.update(value.__name__.encode())
+    elif isinstance(value, tuple | list):
+        key.update(f"{type(value).__name__} of {len(value)}:".encode())
+        for item in value:
+            _fingerprint(item, key, seen)
+    elif type(value).__module__ == "numpy" and hasattr(value, "tobytes"):
+        # The text of an array is rounded, and abridged when it is long.
+        key.update(f"{value.dtype}{value.shape}:".encode() + value.tobytes())
+    else:
+        key.update(f"{type(value).__name__}:{value!r};".encode())
+
+
+def _fingerprint_names(scope: dict[str, Any], names: set[str], key: Any, seen: set[int]) -> None:
+    for name in sorted(names & scope.keys()):
+        item = scope[name]
+        key.update(f"{name}=".encode())
+        _fingerprint(item, key, seen)
+        if (
+            isinstance(item, types.ModuleType)
+            and item.__name__.partition(".")[0] not in KNOWN_MODULES
+        ):
+            _fingerprint_names(vars(item), names, key, seen)
+
+
+def _source_file(name: str, text: str) -> Path | None:
+    """Write the kernel's text where Numba can cache beside it; None when nowhere is writable."""
+    folder = cache_folder()
+    path = folder / name
+    try:
+        if path.exists():
+            return path
+        folder.mkdir(parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp(dir=folder, suffix=".tmp")
+        with os.fdopen(handle, "w", encoding="utf-8") as file:
+            file.write(text)
+        # Two processes may race to here; either's file is the right one.
+        Path(temporary).replace(path)
+    except OSError:
+        return None
+    return path
+
+
+def _safe(name: str) -> str:
+    return "".join(c if c.isalnum() else "_" for c in name)[:40]

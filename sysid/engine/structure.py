@@ -1,0 +1,155 @@
+"""A model's equations taken apart: dx/dt = A x + N(x, u), and what depends on parameters alone.
+
+The batch simulator integrates A exactly, so that only N limits its steps. The parts are found
+by running the equations on numbers that write down what is done to them, not from samples of
+their values: a dead zone is never mistaken for a straight line, and the coefficients are exact.
+A value limited from both sides counts with its straight piece in A, which makes its row exact
+while it is not at a limit; N is what is left, zero until then. Where the equations branch on a
+value nothing is claimed to be linear, and N is the user's function itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from sysid.engine.program import Followed, Program, Writer
+from sysid.engine.trace import Clamp, Tape, Trace, traced
+from sysid.problem.model import Function, ProcessModel
+
+Entry = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Guard:
+    """A number within a straight piece of which the equations have limits.
+
+    n_limits: how many of the program's ``margins`` are its own. slopes: its coefficients by
+    state. gains: by row, what the number counts for there. Coefficients are text as in Structure.
+    """
+
+    n_limits: int
+    slopes: Mapping[int, str]
+    gains: Mapping[int, str]
+
+
+@dataclass(frozen=True)
+class Structure:
+    """What is linear in dx/dt = A x + N(x, u).
+
+    coefficients: of the entries (i, j) of A that are not always zero, each as Python text in
+    terms of the constants ``c[..]`` of the program. driven: rows whose N changes within a
+    sample: nonlinear ones, and those with an input that is not held. nonlinear: whether any row
+    of N depends on a state. guards: limits that fast linear parts may run into. shown: states
+    that an output depends on directly, so that it shows when one of them is wrong.
+    """
+
+    coefficients: Mapping[Entry, str]
+    driven: tuple[int, ...]
+    nonlinear: bool
+    guards: tuple[Guard, ...]
+    shown: frozenset[int]
+    program: Program
+
+    @property
+    def constant(self) -> tuple[Entry, ...]:
+        """Entries of A, in order."""
+        return tuple(sorted(self.coefficients))
+
+    def closure(self, n_states: int) -> tuple[Entry, ...]:
+        """Entries of exp(A t) that can differ from zero for this pattern of A."""
+        reach = {(i, i) for i in range(n_states)} | set(self.coefficients)
+        for k in range(n_states):
+            via = [i for i in range(n_states) if (i, k) in reach]
+            to = [j for j in range(n_states) if (k, j) in reach]
+            reach |= {(i, j) for i in via for j in to}
+        return tuple(sorted(reach))
+
+    def products(self, n_states: int) -> tuple[tuple[int, int, int], ...]:
+        """Products in the square of such a matrix: two entries of the closure and their sum's."""
+        entries = self.closure(n_states)
+        place = {entry: k for k, entry in enumerate(entries)}
+        return tuple(
+            (place[i, k], place[k, j], place[i, j])
+            for i, k in entries
+            for row, j in entries
+            if row == k
+        )
+
+
+def analyse(model: ProcessModel, *, exact: bool = True) -> Structure:
+    """Take a model's equations apart; without ``exact`` all of them are left in N."""
+    tape = Tape()
+    rows = _followed(tape, model, model.derivative)
+    clamps = _clamps(tape, rows or ())
+    parts = [_split(row) if exact else ({}, row.total) for row in rows or ()]
+    linear = {(i, j): name for i, (piece, _) in enumerate(parts) for j, name in piece.items()}
+    gains = {
+        k: {i: row.kinks[k] for i, row in enumerate(rows or ()) if k in row.kinks} for k in clamps
+    }
+    functions: dict[str, Followed] = {
+        "remainder": ("derivative", None if rows is None else [rest for _, rest in parts])
+    }
+    shown = frozenset(model.output_states or range(len(model.states)))
+    if model.output is not None:
+        outputs = _followed(tape, model, model.output)
+        totals = None if outputs is None else [value.total for value in outputs]
+        functions["observe"] = ("output", totals)
+        if outputs is not None:
+            shown = frozenset[int]().union(*(value.states for value in outputs))
+    if clamps:
+        functions["margins"] = ("", _margins(tape, clamps.values()))
+    names = {*linear.values()}
+    for k, clamp in clamps.items():
+        names |= {*clamp.base.linear.values(), *gains[k].values()}
+    writer = Writer(tape, len(model.parameters), functions, names)
+    guards = tuple(
+        Guard(len(clamp.limits), writer.placed(clamp.base.linear), writer.placed(gains[k]))
+        for k, clamp in clamps.items()
+    )
+    driven, nonlinear = _driven(model, rows if exact else None, clamps)
+    return Structure(writer.placed(linear), driven, nonlinear, guards, shown, writer.program())
+
+
+def _margins(tape: Tape, clamps: Iterable[Clamp]) -> list[str]:
+    """How far each limited number is above each of its limits."""
+    return [
+        tape.emit("{} - {}", clamp.base.total, limit) for clamp in clamps for limit in clamp.limits
+    ]
+
+
+def _driven(
+    model: ProcessModel, rows: Sequence[Trace] | None, clamps: Mapping[int, Clamp]
+) -> tuple[tuple[int, ...], bool]:
+    """Rows of N that change within a sample, and whether any depends on a state."""
+    if rows is None:
+        return tuple(range(len(model.states))), True
+    moving = {j for j, signal in enumerate(model.inputs) if signal.hold != "zoh"}
+    bent = [bool(row.nonlinear or row.kinks.keys() & clamps.keys()) for row in rows]
+    driven = (i for i, row in enumerate(rows) if bent[i] or row.inputs & moving)
+    return tuple(driven), any(bent)
+
+
+def _clamps(tape: Tape, rows: Sequence[Trace]) -> dict[int, Clamp]:
+    """Limits on straight pieces that the rows are sums of, by their place on the tape."""
+    found = sorted({k for row in rows for k in row.kinks})
+    return {k: tape.clamps[k] for k in found if tape.clamps[k].base.linear}
+
+
+def _followed(tape: Tape, model: ProcessModel, function: Function) -> tuple[Trace, ...] | None:
+    """A function's values on the tape; None where it cannot be followed."""
+    counts = len(model.states), len(model.inputs), len(model.parameters)
+    try:
+        return traced(tape, function, *counts)
+    except Exception:
+        # Whatever it does that a trace cannot follow, the compiler may well be able to.
+        return None
+
+
+def _split(row: Trace) -> tuple[Mapping[int, str], str]:
+    """Straight piece of a row, without the states it depends on in other ways, and the rest."""
+    linear = {j: c for j, c in row.linear.items() if j not in row.nonlinear}
+    if not linear:
+        return {}, row.total
+    other = row.tape.straight({j: c for j, c in row.linear.items() if j in row.nonlinear})
+    return linear, row.tape.join("+", row.rest, other) or "0.0"

@@ -1,0 +1,1 @@
+"""From errors to better parameters: the objective, its quadratic, local refinement."""

@@ -1,0 +1,202 @@
+"""The figure that identification minimises, for whole populations."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from sysid.arrays import FloatArray, IntArray
+from sysid.engine.simulation import BatchResult, BatchSimulator
+from sysid.problem.data import Dataset, output_scale
+from sysid.problem.model import ModelError
+from sysid.problem.space import SearchSpace
+
+# Whether logs count by their samples or each alike.
+Balance = Literal["samples", "logs"]
+
+
+@dataclass(frozen=True)
+class Responses:
+    """Residuals of chromosomes, (n_residuals, n_outputs, n), and their RMS, (n, n_outputs).
+
+    In parts of the outputs' scales, 0 where a sample was lost, not finite where a simulation
+    failed. excess: (n,), the simulations' error estimates in parts of what the accuracy allows.
+    """
+
+    values: FloatArray
+    rms: FloatArray
+    excess: FloatArray
+
+
+class Objective:
+    """Mean over outputs of the RMSE on outputs normalised by max|y|.
+
+    This is (4.22) with the sum inside each root divided by the number of samples, so that it
+    does not grow with the record's length; for one record the two rank chromosomes alike, (4.22)
+    being sqrt(n_samples) times this. Several records count as one long one, or with ``balance``
+    "logs" each alike whatever its length: the mean under the root is then one of the records'
+    means. ``weights``: (n_outputs,), relative importance of the outputs, default equal.
+    ``scales``: what residuals are divided by, per record (n_outputs,): max|y|, times what
+    balances the records.
+    """
+
+    def __init__(
+        self,
+        simulator: BatchSimulator,
+        space: SearchSpace,
+        records: Sequence[Dataset],
+        *,
+        per_log: bool = False,
+        balance: Balance = "samples",
+        weights: FloatArray | None = None,
+    ) -> None:
+        self.simulator = simulator
+        self.space = space
+        self.records = list(records)
+        q = len(simulator.model.outputs)
+        relative = np.ones(q) if weights is None else np.asarray(weights, dtype=np.float64)
+        self.weights = relative / relative.sum()
+        counts = np.array([np.isfinite(record.outputs).sum(axis=0) for record in self.records])
+        self.counts = counts.sum(axis=0)
+        self.scales = _balanced(output_scale(self.records, per_log), counts, balance)
+        unseen = [
+            output.name
+            for output, count, weight in zip(
+                simulator.model.outputs, self.counts, self.weights, strict=True
+            )
+            if weight > 0.0 and not count
+        ]
+        if unseen:
+            raise ModelError(f"no record has a measured sample of output {unseen[0]!r}")
+        self._counter = [0]
+
+    @property
+    def simulations(self) -> int:
+        """Simulations of one chromosome on all records until now."""
+        return self._counter[0]
+
+    def resume_count(self, simulations: int) -> None:
+        """Count on from a number of simulations done before."""
+        self._counter[0] = simulations
+
+    def over(self, space: SearchSpace) -> Objective:
+        """The same objective over another space of the same model; counts go on together."""
+        other = copy.copy(self)
+        other.space = space
+        return other
+
+    def weighed(self, weights: FloatArray) -> Objective:
+        """The same objective with other weights of the outputs, (n_outputs,)."""
+        other = copy.copy(self)
+        other.weights = weights / weights.sum()
+        return other
+
+    def finer(self, accuracy: float) -> Objective:
+        """The same objective by simulations of another accuracy, stiff ones given the steps."""
+        other = copy.copy(self)
+        other.simulator = self.simulator.finer(accuracy)
+        return other
+
+    def evaluate(self, chromosomes: FloatArray) -> tuple[FloatArray, BatchResult]:
+        """Error of each chromosome, (n,), infinite where its simulation failed; and the batch."""
+        result = self.simulator.errors(
+            self.space.full(chromosomes), self.records, self.scales, self._starts(chromosomes)
+        )
+        self._counter[0] += len(chromosomes)
+        return self._mean(self._roots(result.sse.sum(axis=1))), result
+
+    def rms(self, chromosomes: FloatArray) -> FloatArray:
+        """RMSE of each output in parts of its scale, (n, n_outputs), infinite where it failed."""
+        return self._roots(self.evaluate(chromosomes)[1].sse.sum(axis=1))
+
+    def residuals(
+        self, chromosomes: FloatArray, n_steps: Sequence[int] | IntArray, *, keep: bool = True
+    ) -> Responses:
+        """Residuals at given integration steps per sample, records one after another.
+
+        n_steps: (n_records,), or of each chromosome (n, n_records). Without ``keep`` only what
+        they come to, and no values.
+        """
+        steps = np.broadcast_to(n_steps, (len(chromosomes), len(self.records)))
+        found = self.simulator.residuals(
+            self.space.full(chromosomes), self.records, self.scales, steps,
+            self._starts(chromosomes), keep=keep,
+        )  # fmt: skip
+        self._counter[0] += len(chromosomes)
+        rms = self._roots(found.sse.sum(axis=1))
+        return Responses(found.values, rms, found.excess.max(axis=1))
+
+    def steps_needed(self, chromosomes: FloatArray) -> IntArray:
+        """Integration steps per sample that each chromosome needs, (n, n_records)."""
+        vectors = self.space.full(chromosomes)
+        self._counter[0] += len(vectors)
+        return np.stack(
+            [self.simulator.steps_of_each(vectors, record) for record in self.records], axis=1
+        )
+
+    def error_of(self, rms: FloatArray) -> FloatArray:
+        """The error that outputs' root mean squares (n, n_outputs) come to, (n,)."""
+        return self._mean(rms)
+
+    def smoothed_error_of(self, rms: FloatArray, floor: float) -> FloatArray:
+        """The same, but smooth where an output is explained exactly, (n,).
+
+        An RMSE below ``floor`` counts by the parabola that meets the root there with its slope.
+        """
+        with np.errstate(over="ignore", invalid="ignore"):
+            smooth = np.where(rms > floor, rms, 0.5 * (rms**2 / floor + floor))
+        return self._mean(smooth)
+
+    @property
+    def n_residuals(self) -> int:
+        """Residuals of one chromosome, those of all outputs and of lost samples included."""
+        return int(sum(record.outputs.size for record in self.records))
+
+    def least_squares_weights(self, residual: FloatArray) -> FloatArray:
+        """Weights of squared residuals whose sum is least where the error is, (n_outputs,).
+
+        residual: (n_residuals, n_outputs), at that minimum. Half the second derivative of the
+        error is that of the weighted mean square.
+        """
+        counts, rms = np.maximum(self.counts, 1), self._roots(np.sum(residual**2, axis=0))
+        weights: FloatArray = self.weights * len(residual) / counts / np.maximum(rms, 1e-12)
+        return weights
+
+    def _starts(self, chromosomes: FloatArray) -> list[FloatArray]:
+        """Initial states of every chromosome for each record."""
+        model = self.simulator.model
+        return [
+            self.space.starts(chromosomes, k, record.initial_state(model))
+            for k, record in enumerate(self.records)
+        ]
+
+    def _roots(self, sse: FloatArray) -> FloatArray:
+        """Root mean squares of sums of squares, (n, n_outputs)."""
+        roots: FloatArray = np.sqrt(sse / np.maximum(self.counts, 1))
+        return roots
+
+    def _mean(self, rms: FloatArray) -> FloatArray:
+        """The error of the outputs' errors, (n,), infinite where one is not finite."""
+        with np.errstate(over="ignore", invalid="ignore"):  # infinite times a weight of zero
+            errors = rms @ self.weights
+        return np.where(np.isfinite(errors), errors, np.inf)
+
+
+def _balanced(scales: list[FloatArray], counts: IntArray, balance: Balance) -> list[FloatArray]:
+    """Divisors of residuals under which the mean over all samples is the one asked for.
+
+    counts: (n_records, n_outputs), measured samples.
+    """
+    if balance == "samples":
+        return scales
+    if balance != "logs":
+        raise ModelError(f"unknown balance {balance!r}; choose samples or logs")
+    # A log's share of the samples over its share of the logs that saw the output.
+    share = counts * np.sum(counts > 0, axis=0) / np.maximum(counts.sum(axis=0), 1)
+    return [
+        scale * np.sqrt(np.where(n > 0.0, n, 1.0)) for scale, n in zip(scales, share, strict=True)
+    ]

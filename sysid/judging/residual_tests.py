@@ -1,0 +1,101 @@
+"""Do the residuals still hold something that the model should have explained?
+
+Autocorrelation (are they white?) and correlation with past and present inputs (is there
+dynamics left in them?), each with 95 % bands (Ljung, "System Identification", section 16.6).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sysid.arrays import BoolArray, FloatArray, IntArray
+
+_Z95 = 1.959963984540054
+_LEAST_VARIANCE = 0.05  # of a correlation, in parts of 1/n: estimated ones can turn out negative
+
+
+@dataclass(frozen=True)
+class ResidualTest:
+    """Correlations of the residuals of one record.
+
+    lags: (n_lags,), samples, from 0. auto: (n_lags, n_outputs), autocorrelation, 1 at lag 0;
+    auto_band: (n_outputs,), half width of its 95 % band. cross: (n_lags, n_outputs, n_inputs),
+    correlation of the residual with the input so many samples before, in parts of the product of
+    their deviations; cross_band: (n_outputs, n_inputs). tested: (n_inputs,), inputs that say
+    something: they change, and are not themselves measured with noise, which stands in the
+    residuals as well.
+    """
+
+    lags: IntArray
+    auto: FloatArray
+    auto_band: FloatArray
+    cross: FloatArray
+    cross_band: FloatArray
+    tested: BoolArray
+
+    @property
+    def white(self) -> FloatArray:
+        """Share of the lags above 0 inside the band, (n_outputs,); 0.95 is expected."""
+        share: FloatArray = np.mean(np.abs(self.auto[1:]) <= self.auto_band, axis=0)
+        return share
+
+    @property
+    def independent(self) -> FloatArray:
+        """Share of the lags inside the band, (n_outputs, n_inputs); 0.95 is expected.
+
+        NaN for inputs that are not tested.
+        """
+        share = np.mean(np.abs(self.cross) <= self.cross_band, axis=0)
+        return np.where(self.tested, share, np.nan)
+
+
+def residual_test(
+    residual: FloatArray,
+    inputs: FloatArray,
+    input_noise: FloatArray | None = None,
+    n_lags: int = 50,
+) -> ResidualTest:
+    """Correlations of measured minus simulated, (n, n_outputs), NaN where a sample was lost.
+
+    inputs: (n, n_inputs); input_noise: (n_inputs,), standard deviation of what noise they were
+    measured with. n_lags: at most a quarter of the record is used.
+    """
+    n_lags = max(2, min(n_lags, len(residual) // 4))
+    seen = np.isfinite(residual)
+    e, u = _standard(residual), _standard(inputs)
+    counted = np.maximum(seen.sum(axis=0), 1)
+    own = np.stack([np.diagonal(_products(e, e, k)) for k in range(n_lags)]) / counted
+    driving = np.stack([np.diagonal(_products(u, u, k)) for k in range(n_lags)]) / len(u)
+    cross = np.stack([_products(e, u, k) for k in range(n_lags)]) / counted[:, None]
+    # Both being coloured widens the band: sum over k of R_e(k) R_u(k) / n is the variance.
+    both = 1.0 + 2.0 * np.einsum("ko,ki->oi", own[1:], driving[1:])
+    variance = np.maximum(both, _LEAST_VARIANCE) / counted[:, None]
+    noisy = np.zeros(inputs.shape[1]) if input_noise is None else np.asarray(input_noise)
+    return ResidualTest(
+        lags=np.arange(n_lags),
+        auto=own,
+        auto_band=_Z95 / np.sqrt(counted),
+        cross=cross,
+        cross_band=_Z95 * np.sqrt(variance),
+        tested=(noisy == 0.0) & np.any(u != 0.0, axis=0),
+    )
+
+
+def _standard(values: FloatArray) -> FloatArray:
+    """Zero mean and unit variance in each column; 0 where a sample is missing."""
+    seen = np.isfinite(values)
+    count = np.maximum(seen.sum(axis=0), 1)
+    centred = np.where(seen, values - np.where(seen, values, 0.0).sum(axis=0) / count, 0.0)
+    deviation = np.sqrt(np.sum(centred**2, axis=0) / count)
+    # What rounding leaves of a column that never changes is no signal.
+    largest = np.max(np.where(seen, np.abs(values), 0.0), axis=0, initial=0.0)
+    steady = deviation <= 1e-12 * largest
+    return np.where(steady, 0.0, centred / np.where(steady, 1.0, deviation))
+
+
+def _products(a: FloatArray, b: FloatArray, lag: int) -> FloatArray:
+    """Sum of a(t) b(t - lag), (n_a, n_b)."""
+    product: FloatArray = a[lag:].T @ b[: len(b) - lag]
+    return product

@@ -1,0 +1,1 @@
+"""What is to be identified: model, records, search space, figures of merit."""

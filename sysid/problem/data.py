@@ -1,0 +1,130 @@
+"""Uniformly sampled records that a process model is fitted to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from sysid.arrays import FloatArray
+from sysid.problem.model import AROUND_FIRST_SAMPLE, ModelError, ProcessModel
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """One record: row k holds the outputs latched at time k*dt and the inputs from then on.
+
+    inputs: (n_samples, n_inputs); outputs: (n_samples, n_outputs), NaN where a sample was
+    lost, so that a gap keeps its length in time. SI units, columns in the model's order.
+    input_zero, output_zero: (n_inputs,) and (n_outputs,), standard deviation of a constant error
+    that the channel may have had throughout, as an offset calibration leaves it; input_noise:
+    (n_inputs,), standard deviation of the white noise on measured inputs. Default none; they
+    widen the intervals of what is identified.
+
+    Raises ModelError for mismatched shapes, fewer than two rows, or inputs that are not finite.
+    """
+
+    inputs: FloatArray
+    outputs: FloatArray
+    dt: float
+    name: str = "data"
+    input_zero: FloatArray = field(default_factory=lambda: np.zeros(0))
+    output_zero: FloatArray = field(default_factory=lambda: np.zeros(0))
+    input_noise: FloatArray = field(default_factory=lambda: np.zeros(0))
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "inputs", _matrix(self.inputs))
+        object.__setattr__(self, "outputs", _matrix(self.outputs))
+        if len(self.inputs) != len(self.outputs):
+            raise ModelError(
+                f"{self.name}: {len(self.inputs)} rows of inputs, {len(self.outputs)} of outputs"
+            )
+        if len(self.outputs) < 2:
+            raise ModelError(f"{self.name}: it has {len(self.outputs)} row(s); at least 2 needed")
+        if not (np.isfinite(self.dt) and self.dt > 0):
+            raise ModelError(f"{self.name}: sample time {self.dt} s must be positive")
+        if not np.all(np.isfinite(self.inputs)):
+            row = int(np.argmax(~np.all(np.isfinite(self.inputs), axis=1)))
+            raise ModelError(f"{self.name}: an input is not finite in row {row}")
+        for name in ("input_zero", "output_zero", "input_noise"):
+            object.__setattr__(self, name, self._deviations(name))
+
+    def _deviations(self, name: str) -> FloatArray:
+        """One standard deviation for each channel of a side; none given are zeros."""
+        n = (self.inputs if name.startswith("input") else self.outputs).shape[1]
+        given = np.asarray(getattr(self, name), dtype=np.float64)
+        deviations = given if given.size else np.zeros(n)
+        if deviations.shape != (n,) or not np.all(np.isfinite(deviations) & (deviations >= 0.0)):
+            raise ModelError(
+                f"{self.name}: {name} must hold {n} finite numbers, 0 or more: one standard "
+                "deviation for each channel"
+            )
+        return deviations
+
+    @property
+    def n_samples(self) -> int:
+        """Number of rows."""
+        return len(self.outputs)
+
+    @property
+    def time(self) -> FloatArray:
+        """Sample instants [s], shape (n_samples,)."""
+        return self.dt * np.arange(self.n_samples, dtype=np.float64)
+
+    def part(self, begin: int, end: int, name: str) -> Dataset:
+        """The rows from ``begin`` up to ``end`` as a record of their own."""
+        rows = slice(begin, end)
+        return replace(self, inputs=self.inputs[rows], outputs=self.outputs[rows], name=name)
+
+    def check(self, model: ProcessModel) -> None:
+        """Raise ModelError unless the columns match the model's inputs and outputs."""
+        expected = (len(model.inputs), len(model.outputs))
+        found = (self.inputs.shape[1], self.outputs.shape[1])
+        if found != expected:
+            raise ModelError(
+                f"{self.name}: {found[0]} inputs and {found[1]} outputs, but model "
+                f"{model.name} has {expected[0]} and {expected[1]}"
+            )
+
+    def initial_state(self, model: ProcessModel) -> FloatArray:
+        """Start of a free run: states that are outputs from the first row, others as declared.
+
+        Shape (n_states,). A state with ``first_sample`` off starts as declared all the same.
+        """
+        x0 = model.initial_state
+        first = dict(zip(model.output_names, self.outputs[0], strict=True))
+        for i, state in enumerate(model.states):
+            if state.first_sample and np.isfinite(first.get(state.name, np.nan)):
+                x0[i] = first[state.name]
+        return x0
+
+    def initial_range(self, model: ProcessModel, state: int) -> tuple[float, float] | None:
+        """Where the start of a state of the model is to be estimated; None where it is not."""
+        declared = model.states[state].initial_range
+        if declared != AROUND_FIRST_SAMPLE:
+            return declared
+        values = self.outputs[:, model.output_names.index(model.state_names[state])]
+        values = values[np.isfinite(values)]
+        middle = float(self.initial_state(model)[state])
+        span = (float(np.ptp(values)) if len(values) else 0.0) or 1.0
+        return middle - span, middle + span
+
+
+def _matrix(values: FloatArray) -> FloatArray:
+    array: FloatArray = np.ascontiguousarray(values, dtype=np.float64)
+    if array.ndim == 1:
+        array = array.reshape(-1, 1)
+    return array
+
+
+def output_scale(datasets: list[Dataset], per_log: bool = False) -> list[FloatArray]:
+    """max|y| of each output, the unit of (4.22) and of tables 4.2 and 4.3.
+
+    One (n_outputs,) array per dataset: its own maximum with ``per_log``, else the maximum over
+    all of them. An output that never leaves zero gets 1.
+    """
+    measured = [np.where(np.isfinite(d.outputs), np.abs(d.outputs), 0.0) for d in datasets]
+    peaks = np.array([values.max(axis=0) for values in measured])
+    if not per_log:
+        peaks = np.broadcast_to(peaks.max(axis=0), peaks.shape)
+    return [np.where(peak > 0.0, peak, 1.0) for peak in peaks]

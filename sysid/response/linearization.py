@@ -1,0 +1,185 @@
+"""Exact Jacobians of any process model, operating points, and linear models at them."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sysid.arrays import FloatArray
+from sysid.engine.substitution import substituted
+from sysid.problem.model import Function, ModelError, ProcessModel
+from sysid.response.dual import Dual, on_duals
+
+# How far beside the guess an equilibrium is looked for in turn, in the states' own units.
+_NUDGES = (0.0, 0.1, -0.1, 1.0, -1.0)
+
+
+@dataclass(frozen=True)
+class LinearModel:
+    """dx/dt = A x + B u, y = C x + D u for small deviations from an operating point.
+
+    A: (n_states, n_states), B: (n_states, n_inputs), C: (n_outputs, n_states),
+    D: (n_outputs, n_inputs). Unpacks to (A, B, C, D).
+    """
+
+    A: FloatArray
+    B: FloatArray
+    C: FloatArray
+    D: FloatArray
+
+    def __iter__(self) -> Any:
+        return iter((self.A, self.B, self.C, self.D))
+
+
+def linearize(
+    model: ProcessModel, x: FloatArray, u: FloatArray, p: FloatArray | None = None
+) -> LinearModel:
+    """Jacobians of derivative and output at a point, by forward-mode differentiation.
+
+    x: (n_states,), u: (n_inputs,), p: (n_parameters,), default nominal. They are exact to
+    rounding wherever the model is differentiable; at a kink (|x| at zero) the slope of |x| is
+    taken as 0. The result's four matrices are what ``control.ss`` takes. Raises ModelError for
+    wrong shapes or a function that has no known derivative.
+    """
+    x, u, p = _point(model, x, u, p)
+    n, m = len(x), len(u)
+    slopes = _gradient(model, model.derivative, x, u, p)
+    if model.output is not None:
+        outputs = _gradient(model, model.output, x, u, p)
+    else:
+        assert model.output_states is not None
+        outputs = np.eye(n + m)[list(model.output_states)]
+    return LinearModel(slopes[:, :n], slopes[:, n:], outputs[:, :n], outputs[:, n:])
+
+
+def jacobian(
+    model: ProcessModel, x: FloatArray, u: FloatArray, p: FloatArray | None = None
+) -> FloatArray:
+    """df/dx at a point, (n_states, n_states); see ``linearize``."""
+    x, u, p = _point(model, x, u, p)
+    return _gradient(model, model.derivative, x, u, p)[:, : len(x)]
+
+
+def jacobians(model: ProcessModel, x: FloatArray, u: FloatArray, p: FloatArray) -> FloatArray:
+    """df/dx at one point under each of several parameter vectors, (m, n_states, n_states).
+
+    p: (m, n_parameters). All at once, unless the equations branch on what differs between them.
+    NaN where there is no slope, as of a root at zero.
+    """
+    states, n = len(x), len(p)
+    seeds = np.eye(states)[:, :, None]
+    columns = tuple(float(c[0]) if np.all(c == c[0]) else c for c in p.T)
+    try:
+        with np.errstate(all="ignore"):
+            values = _on_duals(model.derivative)(
+                tuple(Dual(float(v), seeds[i]) for i, v in enumerate(x)),
+                tuple(float(v) for v in u),
+                columns,
+            )
+    except ArithmeticError:
+        return np.full((n, states, states), np.nan)
+    except (TypeError, ValueError):
+        return np.stack([jacobian(model, x, u, row) for row in p])
+    slopes = [np.broadcast_to(getattr(v, "slope", np.zeros((1, 1))), (states, n)) for v in values]
+    return np.ascontiguousarray(np.moveaxis(np.array(slopes), 2, 0))
+
+
+def equilibrium(
+    model: ProcessModel,
+    u: FloatArray,
+    p: FloatArray | None = None,
+    *,
+    guess: FloatArray | None = None,
+    hold: dict[str, float] | None = None,
+) -> FloatArray:
+    """A state at which dx/dt is zero under constant inputs, (n_states,).
+
+    hold: {state: value}, states kept at a value instead of solved for: an angle at a speed, or
+    a speed whose driving torque is asked for; the derivative of a held state need not vanish.
+    guess: where to start, default the declared initial state. Raises ModelError when none is
+    found, with the largest remaining derivative.
+    """
+    from scipy.optimize import least_squares
+
+    start = model.initial_state if guess is None else np.array(guess, dtype=np.float64)
+    x, u, p = _point(model, start, u, p)
+    for name, value in (hold or {}).items():
+        if name not in model.state_names:
+            raise ModelError(f"model {model.name} has no state {name!r} to hold")
+        x[model.state_names.index(name)] = value
+    free = [i for i, name in enumerate(model.state_names) if name not in (hold or {})]
+    inputs, parameters = tuple(float(v) for v in u), tuple(float(v) for v in p)
+
+    def complete(values: FloatArray) -> FloatArray:
+        whole = x.copy()
+        whole[free] = values
+        return whole
+
+    def slopes(values: FloatArray) -> FloatArray:
+        at = tuple(float(v) for v in complete(values))
+        return np.array(model.derivative(at, inputs, parameters))[free]
+
+    def slopes_jacobian(values: FloatArray) -> FloatArray:
+        return jacobian(model, complete(values), u, p)[np.ix_(free, free)]
+
+    def solve(nudge: float) -> tuple[FloatArray, FloatArray]:
+        """A stationary point of the search, and its derivatives in parts of their terms."""
+        found = least_squares(
+            slopes, x[free] + nudge, jac=slopes_jacobian,
+            x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-15,
+        )  # fmt: skip
+        size = np.abs(slopes_jacobian(found.x)) @ np.maximum(np.abs(found.x), 1e-6)
+        return found.x, np.abs(found.fun) / np.maximum(size, 1e-12)
+
+    # A start at which an equation has no slope is no help: then from beside it.
+    for nudge in _NUDGES:
+        solution, remaining = solve(nudge)
+        if np.all(remaining < 1e-6):
+            return complete(solution)
+    worst = int(np.argmax(remaining))
+    raise ModelError(
+        f"model {model.name}: no equilibrium found; d{model.state_names[free[worst]]}/dt "
+        f"stays at {slopes(solution)[worst]:.3g}. Give a guess, or hold a state that drifts"
+    )
+
+
+def _gradient(
+    model: ProcessModel, function: Function, x: FloatArray, u: FloatArray, p: FloatArray
+) -> FloatArray:
+    """Derivatives of a function of (x, u, p) with respect to x and u, (m, n_x + n_u)."""
+    n, width = len(x), len(x) + len(u)
+    seeds = np.eye(width)
+    states = tuple(Dual(float(v), seeds[i]) for i, v in enumerate(x))
+    inputs = tuple(Dual(float(v), seeds[n + j]) for j, v in enumerate(u))
+    try:
+        values = _on_duals(function)(states, inputs, tuple(float(v) for v in p))
+    except TypeError as error:
+        raise ModelError(f"model {model.name} cannot be differentiated: {error}") from None
+    return np.array([v.slope if isinstance(v, Dual) else np.zeros(width) for v in values])
+
+
+@functools.lru_cache(maxsize=16)
+def _on_duals(function: Function) -> Function:
+    """A copy of a model's function that takes dual numbers."""
+    copy: Function = substituted(function, on_duals)
+    return copy
+
+
+def _point(
+    model: ProcessModel, x: FloatArray, u: FloatArray, p: FloatArray | None
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    p = model.nominal if p is None else np.asarray(p, dtype=np.float64)
+    x, u = np.array(x, dtype=np.float64), np.asarray(u, dtype=np.float64)
+    for what, values, expected in (
+        ("states", x, len(model.states)),
+        ("inputs", u, len(model.inputs)),
+        ("parameters", p, len(model.parameters)),
+    ):
+        if values.shape != (expected,):
+            raise ModelError(
+                f"model {model.name} has {expected} {what}; shape {values.shape} was given"
+            )
+    return x, u, p
