@@ -22,7 +22,8 @@ import numpy as np
 
 from benchmarks._common import arguments, report, timed
 from daq.identification import records as datasets
-from daq.identification.settings import prepare
+from daq.identification.request import SettingsRequest
+from daq.identification.settings import problem_of
 from sysid import GASSI, BatchSimulator, Dataset, SearchSpace, evaluate, free_run
 from sysid.arrays import FloatArray
 from sysid.fitting.objective import Objective
@@ -57,7 +58,7 @@ def main() -> None:
 
 def load(folder: Path) -> tuple[ProcessModel, list[Dataset]]:
     """The example's model, and a folder's logs read through the example's columns."""
-    prepared = prepare(CONFIG, {})
+    prepared = problem_of(SettingsRequest(str(CONFIG)))
     paths = datasets.expand([folder])
     model = prepared.model
     return model, [datasets.load(path, model, prepared.mapping).dataset for path in paths]

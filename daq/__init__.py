@@ -1,7 +1,9 @@
 """Rigs, runs and their logs; what the commands do, as functions for scripts and notebooks.
 
-``record`` runs an experiment, ``load`` reads a log, ``identify`` and ``replay`` do what the
-commands of these names do. Each is imported when it is first used.
+``check`` previews an experiment, ``record`` runs it, ``analyse`` concludes from a run, ``load``
+reads a log, ``identify``, ``resume``, ``compare``, ``campaign`` and ``replay`` do what the commands
+of these names do. They never print: ``watch`` is called with what they say meanwhile. Each is
+imported when it is first used.
 """
 
 from __future__ import annotations
@@ -10,33 +12,61 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from daq.api import Identification, identify, record, replay
-    from daq.cli.replay import Replay
     from daq.errors import ConfigError, RigError
+    from daq.identification.campaign import CampaignRequest, CampaignResult, campaign
+    from daq.identification.comparison import ComparisonRequest, ComparisonResult, compare
+    from daq.identification.fit import identify, resume
+    from daq.identification.replay import Replay, replay
+    from daq.identification.result import Identification
     from daq.logs.capture import Recording, load
+    from daq.recording.analysis import Analysis, analyse
+    from daq.recording.preview import Preview, check
+    from daq.recording.session import record
 
 _HOMES = {
+    "Analysis": "daq.recording.analysis",
+    "CampaignRequest": "daq.identification.campaign",
+    "CampaignResult": "daq.identification.campaign",
+    "ComparisonRequest": "daq.identification.comparison",
+    "ComparisonResult": "daq.identification.comparison",
     "ConfigError": "daq.errors",
-    "Identification": "daq.api",
+    "Identification": "daq.identification.result",
+    "Preview": "daq.recording.preview",
     "Recording": "daq.logs.capture",
-    "Replay": "daq.cli.replay",
+    "Replay": "daq.identification.replay",
     "RigError": "daq.errors",
-    "identify": "daq.api",
+    "analyse": "daq.recording.analysis",
+    "campaign": "daq.identification.campaign",
+    "check": "daq.recording.preview",
+    "compare": "daq.identification.comparison",
+    "identify": "daq.identification.fit",
     "load": "daq.logs.capture",
-    "record": "daq.api",
-    "replay": "daq.api",
+    "record": "daq.recording.session",
+    "replay": "daq.identification.replay",
+    "resume": "daq.identification.fit",
 }
 
 __all__ = [
+    "Analysis",
+    "CampaignRequest",
+    "CampaignResult",
+    "ComparisonRequest",
+    "ComparisonResult",
     "ConfigError",
     "Identification",
+    "Preview",
     "Recording",
     "Replay",
     "RigError",
+    "analyse",
+    "campaign",
+    "check",
+    "compare",
     "identify",
     "load",
     "record",
     "replay",
+    "resume",
 ]
 
 

@@ -148,6 +148,14 @@ class Reporting(Protocol):
         """Facts about device and connection that JSON can hold; at any time, also when closed."""
 
 
+@runtime_checkable
+class Simulation(Protocol):
+    """A device that is a simulation, and knows what it simulates."""
+
+    def process_model(self) -> Any:
+        """The plant as a ``sysid.ProcessModel`` whose nominal values are the plant's own."""
+
+
 class Device(Protocol):
     """What a backend implements.
 

@@ -30,6 +30,11 @@ _TEX_GREEK = {
     "³": r"\ensuremath{^3}", "ω": r"\ensuremath{\omega}",
 }  # fmt: skip
 
+_PREFIXES = {-9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M"}
+# A power would be of the prefix as well: mm^2 is no thousandth of m^2.
+_PREFIXABLE = re.compile(r"(V|A|ohm|H|F|N|W|J|s|Hz|Pa|T|Wb|m|rad)(?![\w^])")
+_PLAIN = (0.1, 1000.0)
+
 
 @dataclass(frozen=True)
 class _Symbol:
@@ -119,6 +124,19 @@ def digits(value: float, deviation: float | None) -> int:
         return 4
     ratio = abs(value) / deviation
     return max(2, min(7, math.floor(math.log10(max(ratio, 1e-3))) + 2))
+
+
+def engineering(value: float, unit: str) -> tuple[float, str]:
+    """Factor and unit in which a value has one to three digits before the point, as 0.54 mH.
+
+    The factor is 1 from a tenth to a thousand, and for units that take no prefix (kg, 1/s, m^2).
+    """
+    size = abs(value)
+    if not _PREFIXABLE.match(unit) or not math.isfinite(value) or _PLAIN[0] <= size < _PLAIN[1]:
+        return 1.0, unit
+    power = 3 * math.floor(math.log10(size) / 3) if size else 0
+    prefix = _PREFIXES.get(power)
+    return (1.0, unit) if prefix is None else (10.0**-power, f"{prefix}{unit}")
 
 
 def number_html(text: str) -> str:

@@ -5,6 +5,7 @@ Installed with the package. Options: ``--rig-seed N`` seeds ``simulated_rig``.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,11 +13,13 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from daq.progress import Event, Note
+
 if TYPE_CHECKING:
     import pandas as pd
 
-    from daq.cli.replay import Replay
     from daq.findings import Findings
+    from daq.identification.replay import Replay
     from daq.logs.capture import Recording
 
 _RIG = "simulated.yaml"
@@ -60,17 +63,17 @@ class SimulatedRig:
         ``plant={"load": "free"}``. Raises what ``rig run`` reports: ConfigError, InterlockError,
         DeviceError, RunError.
         """
-        from daq.api import record
-        from daq.cli.analyse import analyse, recorded_experiment
+        from daq import record
+        from daq.recording.analysis import conclude_or_warn, recorded_experiment
 
         recording = record(
-            _found(self.tests, experiment),
-            None if rig is None else _found(self.tests, rig),
+            _beside(self.tests, experiment),
+            None if rig is None else _beside(self.tests, rig),
             self.root,
             options={"seed": self.seed, **options},
         )
-        run = recorded_experiment(recording.folder)
-        return Recorded(recording, analyse(run, recording.folder))
+        protocol = recorded_experiment(recording.folder)
+        return Recorded(recording, conclude_or_warn(protocol, recording.folder, _warn))
 
 
 @dataclass(frozen=True)
@@ -96,13 +99,13 @@ class Replayer:
         the simulated rig's own. config: names the columns of a foreign log. The result has
         ``fit`` [%], ``rmse`` and ``msd`` by output, and the arrays. Raises ConfigError.
         """
-        from daq.cli.replay import replay
+        from daq import replay
 
         return replay(
-            Path(_found(self.tests, log)),
-            _found(self.tests, rig),
-            None if parameters is None else Path(_found(self.tests, parameters)),
-            None if config is None else Path(_found(self.tests, config)),
+            _beside(self.tests, log),
+            None if parameters is None else _beside(self.tests, parameters),
+            _beside(self.tests, rig),
+            None if config is None else _beside(self.tests, config),
         )
 
 
@@ -127,7 +130,13 @@ def replay(request: pytest.FixtureRequest) -> Replayer:
     return Replayer(request.path.parent)
 
 
-def _found(folder: Path, name: str | Path) -> str:
+def _beside(folder: Path, name: str | Path) -> str:
     """A file beside the test; otherwise the name as it is, as the command line takes it."""
     beside = folder / name
     return str(beside) if beside.exists() else str(name)
+
+
+def _warn(event: Event) -> None:
+    """Say why nothing follows from a run, as ``rig run`` does."""
+    if isinstance(event, Note):
+        sys.stderr.write(f"rig: {event.level.value}: {event.text}\n")

@@ -29,6 +29,7 @@ from sim_rig.options import (
     Smooth,
 )
 from sim_rig.parts import Layout, known, log_range
+from sim_rig.plots import operating_points, plots
 from sim_rig.wording import equations
 from sysid import Constraint, Input, ModelError, Output, ProcessModel, State
 from sysid.problem.model import picker
@@ -121,6 +122,8 @@ def actuator(
         output=_output(outputs, shaft) if "torque" in outputs else None,
         constraints=_constraints(parts, layout),
         guesses=guesses(driver_motor, driver_brake, load, friction),
+        plots=plots,
+        operating_points=operating_points,
         equations=equations(
             driver_motor, driver_brake, hysteresis, smooth, exponent, friction, load
         ),

@@ -33,7 +33,7 @@ from sim_rig.encoder import EncoderCounter
 from sim_rig.guarding import Watch
 from sim_rig.plant import Plant, state_sizes
 from sim_rig.user import SimulatedUser
-from sysid import Stepper
+from sysid import ProcessModel, Stepper
 
 _BLOCK = 256  # ticks simulated at once in open loop
 _REAL_TIME_BLOCK = 0.02  # s between deliveries of a device in real time
@@ -140,6 +140,10 @@ class SimulatedDevice:
         self._origin = 0.0  # and at tick 0
         self._open = False
         self._running = False
+
+    def process_model(self) -> ProcessModel:
+        """The plant as a process model whose nominal values are the plant's own. ModelError."""
+        return self.options.plant.process_model()
 
     def open(self) -> DeviceInfo:
         """Switch on, the load let down since the last time; sampling starts with ``start``."""

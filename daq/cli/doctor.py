@@ -7,9 +7,12 @@ import sys
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
+
+import typer
 
 from daq.cli import terminal as console
+from daq.cli.options import AsJson
 from daq.errors import RunError
 from daq.logs.capture import make_folder
 from daq.run.realtime import RealTime
@@ -36,6 +39,23 @@ class Check:
     verdict: Verdict
     found: str
     cure: str = ""
+
+
+def doctor(
+    names: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[PORT...]", help="Device names; default all that exist."),
+    ] = None,
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", help="Where capture folders go.")
+    ] = Path("runs"),
+    json: AsJson = False,
+) -> None:
+    """Check whether this computer suits a rig in real time.
+
+    What does not is told with its cure.
+    """
+    doctor_command(names or [], out, json)
 
 
 def doctor_command(names: list[str], out: Path, as_json: bool) -> None:

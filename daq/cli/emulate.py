@@ -8,11 +8,13 @@ import signal
 import sys
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import typer
 
 from daq.cli import terminal as console
+from daq.cli.options import AsJson, RigName
 from daq.errors import ConfigError
 from daq.hal import ANALOG_INPUTS, CHANNELS, Device, Guard, IntArray, Mode, Phase
 from daq.lookup.files import load_rig
@@ -85,6 +87,46 @@ class SimulatedBoard:
     def zero(self) -> None:
         """Outputs to zero until the next start."""
         self._device.safe()
+
+
+def emulate(
+    rig: RigName = "simulated.yaml",
+    link: Annotated[
+        Path | None,
+        typer.Option("--link", metavar="PATH", help="A name for the pty that stays the same."),
+    ] = None,
+    tcp: Annotated[
+        int | None,
+        typer.Option(
+            "--tcp",
+            metavar="NUMBER",
+            help="Serve a loopback TCP port in place of a pty; 0 for any. Default on Windows.",
+        ),
+    ] = None,
+    fault: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--fault",
+            metavar="NAME[=VALUE][@PHASE[+SECONDS]]",
+            help="What goes wrong; may be repeated. 'help' lists the faults.",
+        ),
+    ] = None,
+    drift: Annotated[
+        float, typer.Option("--drift", metavar="PPM", help="Of the device's clock.")
+    ] = 0.0,
+    seed: Annotated[int, typer.Option("--seed", metavar="N", help="Of the faults' chances.")] = 0,
+    journal: Annotated[
+        Path | None,
+        typer.Option("--journal", metavar="FILE", help="Log of what became of the outputs, JSON."),
+    ] = None,
+    json: AsJson = False,
+) -> None:
+    """Put the simulated rig behind the serial protocol.
+
+    It serves in real time until Ctrl-C, and prints the port that rig run --rig serial.yaml --port
+    takes.
+    """
+    emulate_command(rig, link, tcp, fault or [], drift, seed, journal, json)
 
 
 def emulate_command(

@@ -1,255 +1,432 @@
-"""``rig identify``: from logs to parameters, metrics and files."""
+"""``rig identify``: parameters from logs, or several structures compared on them."""
 
 from __future__ import annotations
 
-import datetime
-import os
-from collections.abc import Callable, Sequence
-from collections.abc import Mapping as MappingType
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import yaml
+import typer
 
-from daq.cli import identification as reporting
-from daq.cli import terminal as console
-from daq.errors import ConfigError
-from daq.identification import records as datasets
-from daq.identification import request as resuming
-from daq.identification.records import Loaded
-from daq.identification.result import Identified, document
-from daq.identification.settings import Prepared, gassi_settings, prepare
-from daq.logs import capture
-from sysid import Dataset, ModelError
-from sysid.arrays import FloatArray
-from sysid.gassi import GASSI, PRESETS, Progress
-from sysid.judging.assessment import examine
-from sysid.uncertainty import Profile
+from daq import notation
+from daq.cli import terminal
+from daq.cli.options import (
+    AsJson,
+    ConfigFile,
+    Dask,
+    Generations,
+    HoldBack,
+    Jobs,
+    ModelNames,
+    Population,
+    Preset,
+    Seeds,
+    Settings,
+    Validation,
+    WithReport,
+)
 
-_STAGES = {
-    "search": ("Genetic search", "generation"),
-    "refine": ("Local refinement", "generation"),
-    "weigh": ("Weighing by noise", "iteration"),
-}
+if TYPE_CHECKING:
+    from daq.identification.result import Identification
+    from daq.identification.rows import (
+        AmbiguityRow,
+        LogErrors,
+        OutputErrors,
+        ParameterRow,
+        QuantityRow,
+        Rows,
+    )
+    from sysid.uncertainty import Profile
+
+_STRONG = 0.95  # correlation above which two parameters are named together
+_WITH_RESUME = {"resume", "report", "json", "quiet", "verbose"}
 
 
-def identify_command(
-    logs: list[Path],
-    validate: list[Path],
-    config: Path | None,
-    out: Path | None,
-    options: MappingType[str, Any],
-    settings: list[str],
-    publishing: bool,
-    as_json: bool,
+def identify(
+    context: typer.Context,
+    logs: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="RUN_OR_CSV...", help="Capture folders, CSV logs, or folders of them."
+        ),
+    ] = None,
+    model: ModelNames = None,
+    config: ConfigFile = None,
+    validate: Validation = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="DIR", help="Where results go; default beside the log."),
+    ] = None,
+    preset: Preset = None,
+    population: Population = None,
+    generations: Generations = None,
+    seed: Annotated[
+        int | None, typer.Option("--seed", metavar="N", help="One seed gives one result.")
+    ] = None,
+    hold_back: HoldBack = None,
+    profile: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--profile",
+            metavar="PARAMETER",
+            help="Trace how the fit worsens as this one moves; may be repeated.",
+        ),
+    ] = None,
+    guess: Annotated[
+        bool, typer.Option("--guess", help="Starting ranges from the logs, where none are given.")
+    ] = False,
+    datasheet: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--datasheet", metavar="FILE.yaml", help="Data-sheet values; may be repeated."
+        ),
+    ] = None,
+    settings: Settings = None,
+    arx: Annotated[bool, typer.Option("--arx", help="Compare with an ARX model.")] = False,
+    armax: Annotated[bool, typer.Option("--armax", help="Compare with an ARMAX model.")] = False,
+    seeds: Seeds = None,
+    jobs: Jobs = None,
+    dask: Dask = None,
+    resume: Annotated[
+        Path | None,
+        typer.Option(
+            "--resume", metavar="DIR", help="Go on with what was interrupted, as it was asked."
+        ),
+    ] = None,
+    report: WithReport = True,
+    json: AsJson = False,
 ) -> None:
-    """Identify one parameter set from logs and print it; publishing: write its report as well."""
-    prepared = prepare(config, options, settings)
-    folder = out or default_folder(logs, prepared.model.name)
-    check_writable(folder)
-    report = identify_logs(prepared, logs, validate, folder, as_json, publishing=publishing)
-    if as_json:
-        console.print_json(report)
+    """Identify a model's parameters from one or more logs.
 
-
-def resume_command(folder: Path, publishing: bool, as_json: bool) -> None:
-    """Go on with an identification that was interrupted, and print it."""
-    folder, request = resuming.recall(folder)
-    asked = request.asked
-    config = Path(asked.config) if asked.config is not None else None
-    prepared = prepare(config, asked.options, asked.settings)
-    report = identify_logs(
-        prepared, request.training, request.validation, folder, as_json, resume=True,
-        publishing=publishing,
-    )  # fmt: skip
-    if as_json:
-        console.print_json(report)
-
-
-def identify_logs(
-    prepared: Prepared,
-    training: list[Path],
-    validation: list[Path],
-    folder: Path,
-    as_json: bool,
-    resume: bool = False,
-    publishing: bool = True,
-) -> dict[str, Any]:
-    """Identify, print for people unless ``as_json``, write files; the report for machines.
-
-    resume: go on from the checkpoint in the folder. publishing: write the report's files too,
-    after everything is printed.
+    All logs together have one parameter set. Several models, or linear ones, are ranked: which
+    explains the validation data best, by more than chance, and with how many parameters.
     """
-    train, check = load_logs(prepared, training, validation)
-    for log in (*train, *check):
-        if log.warning is not None:
-            console.report_warning(log.warning)
-    train, ends = datasets.hold_back(train, prepared.settings.hold_back)
-    check = [*ends, *check]
-    if not resume:
-        resuming.remember(folder, prepared.asked, training, validation)
-    estimator = _fit(prepared, train, folder, as_json, resume)
-    result = assemble(prepared, estimator, train, check, as_json)
-    report = document(result)
-    path = write_parameters(folder, report)
-    report["files"] = {"parameters": str(path)}
-    if not as_json:
-        reporting.show(result, path)
-    if estimator.stopped_ != "interrupted":
-        resuming.forget(folder)
-        if publishing:
-            publish_report(prepared, result, report, folder, as_json)
-        if not as_json:
-            reporting.show_next(result, path)
-    elif as_json:
-        report["search"]["resume"] = resuming.command(folder)
-    else:
-        console.print_line(f"Go on with the search: {resuming.command(folder)}")
-    return report
+    from daq.identification import fit
+    from daq.identification.request import SettingsRequest
 
-
-def publish_report(
-    prepared: Prepared,
-    result: Identified,
-    report: dict[str, Any],
-    folder: Path,
-    as_json: bool,
-) -> None:
-    """Write the report's files and name them in ``report``."""
-    from daq.report.publication import (
-        publish,  # matplotlib: the printed result does not wait for it
-    )
-
-    report["files"] |= publish(prepared, result, report, folder, as_json)
-    if not as_json:
-        console.print_line(f"Report: {report['files']['report']}")
-
-
-def load_logs(
-    prepared: Prepared, training: list[Path], validation: list[Path]
-) -> tuple[list[Loaded], list[Loaded]]:
-    """Logs for training and for validation; ConfigError when one is given for both."""
-
-    def loaded(paths: list[Path]) -> list[Loaded]:
-        return [
-            datasets.load(path, prepared.model, prepared.mapping) for path in datasets.expand(paths)
-        ]
-
-    train, check = loaded(training), loaded(validation)
-    refuse_overlap(train, check)
-    return train, check
-
-
-def refuse_overlap(train: list[Loaded], check: list[Loaded]) -> None:
-    """Raise ConfigError when a log is given for training and for validation."""
-    known = {log.path.resolve() for log in train}
-    for log in check:
-        if log.path.resolve() in known:
-            raise ConfigError(
-                f"{log.path}: the same log is given for training and for validation; "
-                "a model proves itself only on data it has not seen"
+    if resume is not None:
+        if any(context.params[name] for name in context.params if name not in _WITH_RESUME):
+            raise typer.BadParameter(
+                "--resume goes on as it was asked; give nothing but --json or --no-report"
             )
-
-
-def default_folder(logs: list[Path], model: str) -> Path:
-    """Beside a single capture's log; otherwise a new folder under runs/."""
-    first = capture.log_path(logs[0])
-    # A folder without a log.csv stands for the CSVs in it, and is no place for results.
-    if len(logs) == 1 and first.name == capture.LOG_NAME and first.exists():
-        return first.parent / "identification"
-    now = datetime.datetime.now(datetime.UTC)
-    return Path("runs") / f"{now:%Y%m%dT%H%M%SZ}-identify-{model}" / "identification"
-
-
-def check_writable(folder: Path) -> None:
-    """Raise ConfigError now, not after a long search, when results could not be written."""
-    there = next((path for path in (folder, *folder.absolute().parents) if path.exists()), folder)
-    if not there.is_dir():
-        reason = f"{there} is not a folder"
-    elif not os.access(there, os.W_OK | os.X_OK):
-        reason = "permission denied"
-    else:
+        with terminal.Watching(quiet=json) as watch:
+            result = fit.resume(resume, watch)
+        _finish(show_identification(result, report, json), json)
         return
-    raise ConfigError(f"{folder}: cannot be created: {reason}; choose a folder with --out")
+    if not logs:
+        raise typer.BadParameter("name the logs to identify from, or a folder with --resume")
+    options = {
+        "preset": preset,
+        "population": population,
+        "generations": generations,
+        "seed": seed,
+        "hold_back": hold_back,
+        "guess": guess or None,
+        "datasheet": datasheet,
+        "profile": profile,
+    }
+    request = SettingsRequest(None if config is None else str(config), options, settings or [])
+    baselines = [name for name, wanted in (("ARX", arx), ("ARMAX", armax)) if wanted]
+    if len(model or []) > 1 or baselines or seeds is not None:
+        from daq.cli.compare import show_comparison
+        from daq.identification.campaign import Workers
+        from daq.identification.comparison import ComparisonRequest, compare
+
+        wanted = ComparisonRequest(
+            logs, validate or [], model or [], baselines, seeds, request, Workers(jobs, dask), out
+        )
+        with terminal.Watching(quiet=json) as watch:
+            compared = compare(wanted, watch)
+        _finish(show_comparison(compared, report, json), json)
+        return
+    request = replace(request, options={**options, "model": model[0] if model else None})
+    with terminal.Watching(quiet=json) as watch:
+        result = fit.identify_request(
+            fit.IdentificationRequest(logs, validate or [], request, out, save=True), watch
+        )
+    _finish(show_identification(result, report, json), json)
 
 
-def _fit(prepared: Prepared, train: list[Loaded], folder: Path, quiet: bool, resume: bool) -> GASSI:
-    checkpoint = resuming.checkpoint(folder)
-    estimator = GASSI(prepared.model, **gassi_settings(prepared.settings))
-    with console.progress(quiet) as bar:
-
-        def watch(step: Progress) -> None:
-            title, unit = _STAGES[step.stage]
-            note = f"{unit} {step.done}/{step.total}, best error {step.error:.3g}"
-            bar.update(title, step.done, step.total, note)
-
-        try:
-            return estimator.fit(
-                [log.dataset for log in train],
-                on_progress=watch,
-                checkpoint=checkpoint,
-                resume=checkpoint if resume else None,
-            )
-        except ModelError as error:
-            if not resume:
-                resuming.forget(folder)
-            raise ConfigError(str(error)) from None
+def _finish(document: dict[str, Any], json: bool) -> None:
+    if json:
+        terminal.print_json(document)
 
 
-def assemble(
-    prepared: Prepared,
-    estimator: GASSI,
-    train: Sequence[Loaded],
-    check: Sequence[Loaded],
-    quiet: bool,
-) -> Identified:
-    """A fitted estimator with its intervals, and how it does on every log."""
-    records, held_back = ([log.dataset for log in logs] for logs in (train, check))
-    runs, unseen_runs = ([estimator.predict(one) for one in some] for some in (records, held_back))
-    refined = PRESETS[estimator.preset].refine and estimator.stopped_ != "interrupted"
-    return Identified(
-        model=prepared.model,
-        model_name=prepared.model_name,
-        settings=prepared.settings,
-        sources={n: g.source for n, g in estimator.guesses_.items()} | dict(prepared.sources),
-        columns_file=Path(prepared.mapping.file.path) if prepared.mapping is not None else None,
-        estimator=estimator,
-        uncertainty=estimator.uncertainty(records) if refined else None,
-        profiles=_profiles(prepared, estimator, records, quiet) if refined else [],
-        training=examine(records, _known(records, runs)),
-        validation=examine(held_back, _known(held_back, unseen_runs)),
-        training_logs=train,
-        validation_logs=check,
-        training_runs=runs,
-        validation_runs=unseen_runs,
+def show_identification(
+    result: Identification, report: bool, json: bool, seeds: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Print a result that was written, and write its report; the document for machines.
+
+    seeds: lines on the other seeds, of which this result is the best.
+    """
+    assert result.folder is not None
+    document = {**result.document, "files": {"parameters": str(result.parameters_file)}}
+    if not json:
+        _show(result)
+        for line in seeds:
+            terminal.print_text(line)
+    if result.interrupted:
+        if json:
+            resumable = {"resume": result.resume_command}
+            return {**document, "search": {**document["search"], **resumable}}
+        terminal.print_line(f"Go on with the search: {result.resume_command}")
+        return document
+    if report:
+        document["files"] |= _publish(result, json)
+    if not json:
+        _show_next(result)
+    return document
+
+
+def _publish(result: Identification, json: bool) -> dict[str, str]:
+    # matplotlib: the printed result does not wait for it
+    from daq.report.publication import publish
+
+    assert result.folder is not None
+    with terminal.Watching(quiet=json) as watch:
+        files = publish(result, result.folder, watch)
+    if not json:
+        terminal.print_line(f"Report: {files['report']}")
+    return files
+
+
+def _show(result: Identification) -> None:
+    """Tables and sentences on standard output."""
+    rows = result.rows
+    terminal.print_line()
+    _show_parameters(result)
+    for name, guess in result.estimator.guesses_.items():
+        terminal.print_text(f"{name} searched as the data suggest: {guess.source}.")
+    if rows.refined:
+        _show_open_questions(rows)
+    _show_profiles(result.profiles)
+    _show_errors(rows)
+    _show_residuals(rows)
+    _show_notes(result)
+    terminal.print_line(f"Parameters: {result.parameters_file}")
+
+
+def _show_next(result: Identification) -> None:
+    mapping = result.problem.mapping
+    columns = f" --config {mapping.file.path}" if mapping is not None else ""
+    log = (*result.validation, *result.training)[0].log.path
+    terminal.print_next(f"rig replay {log} --parameters {result.parameters_file}{columns}")
+
+
+def _show_parameters(result: Identification) -> None:
+    head = ["parameter", "value", "95 % interval", "unit", "searched in", "from", ""]
+    rows = [_parameter_row(result, row) for row in result.rows.parameters]
+    # Ranges that all come from the model need no column that says so.
+    hidden = set()
+    if all(row.source == "model" for row in result.rows.parameters):
+        hidden.add(head.index("from"))
+    if not result.rows.refined:
+        hidden.add(head.index("95 % interval"))
+    kept = [i for i in range(len(head)) if i not in hidden]
+    terminal.print_table(
+        f"Parameters of {result.model.name}",
+        [head[i] for i in kept],
+        [[row[i] for i in kept] for row in rows],
+        text=["unit", "from", ""],
     )
 
 
-def _known(
-    records: Sequence[Dataset], runs: Sequence[FloatArray]
-) -> Callable[[Dataset], FloatArray]:
-    """A function that knows the free run of each record."""
-    known = {id(record): run for record, run in zip(records, runs, strict=True)}
-    return lambda record: known[id(record)]
+def _parameter_row(result: Identification, row: ParameterRow) -> list[str]:
+    # All of a row in the same unit, which is that of its value.
+    scale, unit = notation.engineering(row.value, row.unit)
+    source = "data" if row.name in result.estimator.guesses_ else row.source
+    digits = row.digits if result.rows.refined else 4
+    value = terminal.number(scale * row.value, digits)
+    if row.range is None:
+        how = f"= {row.tied}" if row.tied is not None else "fixed"
+        return [row.name, value, "", unit, how, source, ""]
+    span = _span(row.range, result.problem.settings.ranges.get(row.name), scale)
+    interval = _interval(row, scale) if result.rows.refined else ""
+    return [row.name, value, interval, unit, span, source, row.label]
 
 
-def _profiles(
-    prepared: Prepared, estimator: GASSI, records: Sequence[Dataset], quiet: bool
-) -> list[Profile]:
-    wanted = prepared.settings.profile
-    found = []
-    with console.progress(quiet) as bar:
-        for k, name in enumerate(wanted):
-            bar.update("Profiles", k, len(wanted), f"of {name}")
-            found.append(estimator.profile(name, list(records)))
-            bar.update("Profiles", k + 1, len(wanted), f"of {name}")
-    return found
+def _span(
+    ends: tuple[float, float], configured: tuple[float | None, float | None] | None, scale: float
+) -> str:
+    """A range; in brackets an end that is only where the search starts."""
+    bounds = zip(ends, configured or ends, strict=True)
+    return " .. ".join(
+        f"({scale * end:g})" if bound is None else f"{scale * end:g}" for end, bound in bounds
+    )
 
 
-def write_parameters(folder: Path, report: dict[str, Any]) -> Path:
-    """Write a report as ``parameters.yaml``; ConfigError when the folder cannot be made."""
-    capture.make_folder(folder)
-    path = folder / "parameters.yaml"
-    text = yaml.safe_dump(report, sort_keys=False, allow_unicode=True)
-    capture.write_whole(path, text)
-    return path
+def _interval(row: QuantityRow, scale: float) -> str:
+    if row.interval is None:
+        return "-"
+    return " .. ".join(terminal.number(scale * end, row.digits) for end in row.interval)
+
+
+def _show_open_questions(rows: Rows) -> None:
+    """What the data do not tell, what they tell instead, and what measurement would."""
+    _show_rivals(rows)
+    exact = rows.ambiguities_of("product", "sum")
+    if exact:
+        terminal.print_line("What these data cannot tell apart:")
+    for ambiguity in exact:
+        for line in _exact_lines(ambiguity):
+            terminal.print_text(line)
+    vague = rows.ambiguities_of("vague")
+    if vague:
+        names = "; ".join(" with ".join(a.parameters) for a in vague)
+        terminal.print_text(f"Hardly felt by these data: {names}.")
+    close = [
+        f"{first} and {second}"
+        for (first, second), coefficient in rows.correlations.items()
+        if abs(coefficient) > _STRONG
+    ]
+    if close:
+        pairs = "; ".join(close)
+        terminal.print_text(f"Known mostly together (correlation above {_STRONG:g}): {pairs}.")
+    if exact or vague or close:
+        terminal.print_line()
+
+
+def _show_rivals(rows: Rows) -> None:
+    """Other minima that explain the data as well."""
+    for ambiguity in rows.ambiguities_of("rival"):
+        terminal.print_table(
+            "Sets of parameters that explain these data alike",
+            ["parameter", "this one", *["another"] * len(rows.rivals), "unit"],
+            [_rival_row(rows.parameter(name), rows.rivals) for name in ambiguity.parameters],
+            text=["unit"],
+        )
+        terminal.print_text(
+            f"A measured {ambiguity.measure[0]}, given under 'fixed', would tell which it is."
+        )
+        terminal.print_line()
+
+
+def _rival_row(row: ParameterRow, rivals: Sequence[Mapping[str, float]]) -> list[str]:
+    """One parameter in each of the sets, all in the unit of the first."""
+    scale, unit = notation.engineering(row.value, row.unit)
+    values = (row.value, *(rival[row.name] for rival in rivals))
+    return [row.name, *(terminal.number(scale * value, 3) for value in values), unit]
+
+
+def _exact_lines(ambiguity: AmbiguityRow) -> list[str]:
+    lines = [f"  {', '.join(ambiguity.parameters)} act only together."]
+    for row in ambiguity.determined:
+        scale, unit = notation.engineering(row.value, row.unit)
+        value = terminal.number(scale * row.value, row.digits)
+        quantity = value if unit in {"", "1"} else f"{value} {unit}"
+        lines.append(f"    {row.name} = {quantity}, 95 % interval {_interval(row, scale)}")
+    lines.append(
+        f"    To tell them apart, measure {' and '.join(ambiguity.measure)} by other means (or "
+        "choose a value) and give it under 'fixed'."
+    )
+    return lines
+
+
+def _show_profiles(profiles: Sequence[Profile]) -> None:
+    if not profiles:
+        return
+    terminal.print_table(
+        "Profile likelihood",
+        ["parameter", "value", "95 % interval", "unit"],
+        [
+            [p.name, terminal.number(p.value), " .. ".join(map(_end, (p.low, p.high))), p.unit]
+            for p in profiles
+        ],
+        text=["unit"],
+    )
+
+
+def _end(value: float | None) -> str:
+    """An end of an interval; the data set none where the profile stays low."""
+    return "open" if value is None else terminal.number(value)
+
+
+def _show_errors(rows: Rows) -> None:
+    training, validation = rows.logs["training"], rows.logs["validation"]
+    if len(training) == 1 and len(validation) <= 1:
+        print_errors(training[0].outputs, [log.outputs for log in validation])
+        return
+    _print_logs("Training logs", training, rows.mean_errors("training"))
+    if validation:
+        _print_logs("Validation logs", validation, rows.mean_errors("validation"))
+
+
+def _show_residuals(rows: Rows) -> None:
+    """Residual tests on the validation data, or else on the training data."""
+    table = rows.residuals
+    terminal.print_table(
+        f"Residuals, {table.part}: share of correlations inside their 95 % band",
+        ["residual of", "with itself", *(f"with {name}" for name in table.inputs)],
+        [
+            [output, *(f"{100.0 * share:.0f} %" for share in shares)]
+            for output, shares in table.shares.items()
+        ],
+    )
+
+
+def _show_notes(result: Identification) -> None:
+    rows, verdict = result.rows, result.verdict
+    if result.interrupted:
+        terminal.print_text(
+            f"Stopped by Ctrl-C after {len(result.estimator.history_)} generations: "
+            "these are the best parameters until then."
+        )
+    if any(row.on_bound for row in rows.free):
+        terminal.print_text(
+            "At the end of its range: the data want more room there. Set 'ranges' in a file "
+            "given with --config."
+        )
+    terminal.print_text(f"Trust: {verdict.trust}. {' '.join(verdict.reasons)}")
+    if rows.refined:
+        together = len(rows.combinations)
+        several = "s" if together != 1 else ""
+        also = f", and {together} combination{several} of others" if together else ""
+        terminal.print_text(
+            f"Determined: {len(rows.determined)} of {len(rows.free)} free parameters by "
+            f"themselves{also}."
+        )
+
+
+def print_errors(
+    training: Mapping[str, OutputErrors],
+    validation: Sequence[Mapping[str, OutputErrors]] = (),
+    label: str = "training",
+) -> None:
+    """Table of RMSE, MSD and fit of each output, on one log or on two."""
+    head = ["output", f"RMSE, {label}", "MSD", "fit [%]"]
+    if validation:
+        head += ["RMSE, validation", "MSD", "fit [%]"]
+    rows = [
+        [
+            output,
+            *itertools.chain.from_iterable(
+                _error_cells(log[output]) for log in (training, *validation)
+            ),
+        ]
+        for output in training
+    ]
+    terminal.print_table("Free-run simulation, RMSE and MSD in parts of max|y|", head, rows)
+
+
+def _error_cells(errors: OutputErrors) -> tuple[str, str, str]:
+    number = terminal.number
+    return number(errors.rmse, 3), number(errors.msd, 2), f"{errors.fit_percent:.1f}"
+
+
+def _print_logs(title: str, logs: Sequence[LogErrors], mean: Mapping[str, OutputErrors]) -> None:
+    head = ["log", *(f"fit of {name} [%]" for name in mean), *(f"RMSE of {n}" for n in mean)]
+    rows = [(log.name, log.outputs) for log in logs] + [("mean", mean)]
+    terminal.print_table(
+        title,
+        head,
+        [
+            [
+                name,
+                *(f"{errors.fit_percent:.1f}" for errors in outputs.values()),
+                *(terminal.number(errors.rmse, 3) for errors in outputs.values()),
+            ]
+            for name, outputs in rows
+        ],
+    )

@@ -2,101 +2,66 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
 
-from daq.cli import terminal as console
-from daq.config.schema import Schema
-from daq.config.yaml_file import suggestion
-from daq.errors import ConfigError, RunError
-from daq.logs import capture
-from daq.lookup import schemas
-from daq.lookup.shipped import EXPERIMENTS, RIGS, shipped_files
+import typer
 
-_RIG, _SETTINGS = "rig.yaml", "identification.yaml"
-_SETTINGS_HEAD = """\
-# Settings of an identification, all of which may be left out:
-#   rig identify RUN --config identification.yaml
-# Keys behind a '#' show the default, or an example, of what else can be set.
-"""
-_ACTIVE = {"model": "actuator", "preset": "default"}
+from daq.cli import completion, terminal
+from daq.cli.options import AsJson
 
 
-def init_command(folder: Path, protocol: str, rig: str, as_json: bool) -> None:
-    """Write the files that are not there yet, and say what to do next."""
-    experiment = f"{protocol}.yaml"
-    texts = {
-        experiment: _copy(EXPERIMENTS, protocol, "protocol", "experiment"),
-        _RIG: _copy(RIGS, rig, "rig", "rig"),
-        _SETTINGS: settings_text(),
-        **_companions(protocol),
-    }
-    capture.make_folder(folder)
-    written = [folder / name for name, text in texts.items() if _write_new(folder / name, text)]
-    kept = [folder / name for name in texts if folder / name not in written]
-    schemas.write_schemas(folder / schemas.FOLDER)
-    if as_json:
-        console.print_json({"written": list(map(str, written)), "kept": list(map(str, kept)),
-                            "schemas": str(folder / schemas.FOLDER)})  # fmt: skip
+def init(
+    folder: Annotated[
+        Path, typer.Argument(metavar="[FOLDER]", help="Where the files go; default this folder.")
+    ] = Path(),
+    protocol: Annotated[
+        str,
+        typer.Option(
+            "--protocol",
+            metavar="NAME",
+            help="Shipped experiment to begin with.",
+            autocompletion=completion.protocols,
+        ),
+    ] = "prbs",
+    rig: Annotated[
+        str,
+        typer.Option(
+            "--rig",
+            metavar="NAME",
+            help="Shipped rig to begin with.",
+            autocompletion=completion.rig_names,
+        ),
+    ] = "simulated",
+    json: AsJson = False,
+) -> None:
+    """Write commented YAML files to begin with.
+
+    What is there already stays as it is. Editors complete and check the files by the JSON Schemas
+    written beside them.
+    """
+    from daq.lookup import starter
+
+    files = starter.write_starter(folder, protocol, rig)
+    if json:
+        terminal.print_json(
+            {
+                "written": list(map(str, files.written)),
+                "kept": list(map(str, files.kept)),
+                "schemas": str(files.schemas),
+            }
+        )
         return
-    for path in written:
-        console.print_line(f"Written: {path}")
-    console.print_line(f"Written: {folder / schemas.FOLDER}, by which editors check these files")
-    for path in kept:
-        console.print_line(f"Kept as it was: {path}")
+    for path in files.written:
+        terminal.print_line(f"Written: {path}")
+    terminal.print_line(f"Written: {files.schemas}, by which editors check these files")
+    for path in files.kept:
+        terminal.print_line(f"Kept as it was: {path}")
     there = [] if folder.resolve() == Path.cwd() else [f"cd {folder}"]
     # An experiment without a validation run is mostly not for an identification.
-    identify = f" --identify --config {_SETTINGS}" if "\nvalidation:" in texts[experiment] else ""
-    console.print_next(
+    identify = f" --identify --config {starter.SETTINGS}" if files.validated else ""
+    terminal.print_next(
         *there,
-        f"rig check {experiment} --rig {_RIG}",
-        f"rig run {experiment} --rig {_RIG}{identify}",
+        f"rig check {protocol}.yaml --rig {starter.RIG}",
+        f"rig run {protocol}.yaml --rig {starter.RIG}{identify}",
     )
-
-
-def settings_text() -> str:
-    """A file of an identification's settings in which all but two stand as comments."""
-    schema = schemas.documents({}, {})["identification"]
-    items = sorted(schema["properties"].items(), key=lambda item: item[0] not in _ACTIVE)
-    settings = "\n".join(_setting(name, item) for name, item in items)
-    return f"{schemas.comment('identification')}\n{_SETTINGS_HEAD}\n{settings}"
-
-
-def _setting(name: str, item: Schema) -> str:
-    value = _ACTIVE.get(name, item.get("default"))
-    if "examples" in item:
-        value = item["examples"][0]
-    mark = "" if name in _ACTIVE else "#"
-    return f"# {item['description']}\n{mark}{name}: {schemas.as_yaml(value)}\n"
-
-
-def _copy(packages: Sequence[str], name: str, option: str, kind: str) -> str:
-    """A shipped file's text, for a folder that has its schema in it."""
-    shipped = {path.stem: path for path in shipped_files(packages)}
-    if name not in shipped:
-        raise ConfigError(
-            f"--{option}: no {name!r} to begin with; {suggestion(name, list(shipped))}"
-        )
-    text = shipped[name].read_text(encoding="utf-8")
-    return f"{schemas.comment(kind)}\n{schemas.without_comment(text)}"
-
-
-def _companions(protocol: str) -> dict[str, str]:
-    """Tables that a shipped experiment reads, which lie beside it under its name."""
-    shipped = next(path for path in shipped_files(EXPERIMENTS) if path.stem == protocol)
-    return {
-        path.name: path.read_text(encoding="utf-8")
-        for path in shipped.parent.glob(f"{protocol}.csv")
-    }
-
-
-def _write_new(path: Path, text: str) -> bool:
-    """Whether the file was written; one that is there stays as it is."""
-    try:
-        with path.open("x", encoding="utf-8") as file:
-            file.write(text)
-    except FileExistsError:
-        return False
-    except OSError as error:
-        raise RunError(f"{path}: cannot be written: {error.strerror}") from None
-    return True

@@ -3,10 +3,28 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import Any
+from typing import Annotated, Any
+
+import typer
 
 from daq.cli import terminal as console
+from daq.cli.options import AsJson
 from daq.serial.ports import Answer, ask, list_ports, named
+
+
+def ports(
+    names: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[PORT...]", help="Device names or URLs; default all that exist."),
+    ] = None,
+    unasked: Annotated[
+        bool, typer.Option("--list", help="Send nothing: list the ports without asking.")
+    ] = False,
+    baud: Annotated[int, typer.Option("--baud", help="Of UARTs; USB does not care.")] = 2_000_000,
+    json: AsJson = False,
+) -> None:
+    """List serial ports, and who answers there."""
+    ports_command(names or [], unasked, baud, json)
 
 
 def ports_command(names: list[str], unasked: bool, baud: int, as_json: bool) -> None:

@@ -6,9 +6,36 @@ import importlib.util
 import sys
 import webbrowser
 from pathlib import Path
+from typing import Annotated
+
+import typer
 
 from daq.cli import terminal as console
+from daq.cli.options import AsJson
 from daq.errors import ConfigError
+
+
+def scope(
+    run: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[RUN_OR_CSV]", help="Capture folder or log; default the newest run."
+        ),
+    ] = None,
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", help="Where the runs are that it follows.")
+    ] = Path("runs"),
+    port: Annotated[
+        int | None,
+        typer.Option("--port", min=0, max=65535, help="Of the page; default 5006, 0 for any."),
+    ] = None,
+    browser: Annotated[
+        bool, typer.Option("--browser/--no-browser", help="Open a browser on the page.")
+    ] = True,
+    json: AsJson = False,
+) -> None:
+    """Show a run in the browser, also while it is recorded."""
+    scope_command(run, out, port, browser, json)
 
 
 def scope_command(

@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import functools
 import json
-import math
 import re
 import shutil
 import sys
 import textwrap
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext, redirect_stdout
+from contextlib import ExitStack, contextmanager, nullcontext, redirect_stdout
 from contextvars import ContextVar
 from enum import IntEnum
+from types import TracebackType
 from typing import Any, Protocol, TextIO
 
 from daq import notation
+from daq.documents import plain
+from daq.progress import Event, Level, Progress, Started, Watch
 
-number, digits = notation.number, notation.digits  # pages and tables print numbers alike
+number = notation.number  # pages and tables print numbers alike
 
 
 class Volume(IntEnum):
@@ -35,10 +37,6 @@ class Volume(IntEnum):
 _volume: ContextVar[Volume] = ContextVar("volume", default=Volume.NORMAL)
 _documents: ContextVar[TextIO | None] = ContextVar("documents", default=None)
 _VERBOSE_PERIOD = 1.0  # s between lines of progress
-_PREFIXES = {-9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M"}
-# A power would be of the prefix as well: mm^2 is no thousandth of m^2.
-_PREFIXABLE = re.compile(r"(V|A|ohm|H|F|N|W|J|s|Hz|Pa|T|Wb|m|rad)(?![\w^])")
-_PLAIN = (0.1, 1000.0)
 
 
 @contextmanager
@@ -61,13 +59,6 @@ def documents_alone(asked: bool) -> Iterator[None]:
             yield
     finally:
         _documents.reset(token)
-
-
-class Bar(Protocol):
-    """A progress display: ``update`` as often as one likes."""
-
-    def update(self, title: str, done: float, total: float, note: str) -> None:
-        """Show ``done`` of ``total`` under a title."""
 
 
 def report_error(message: str) -> None:
@@ -200,68 +191,104 @@ def _folded(head: str, width: int) -> str:
     return "\n".join(lines)
 
 
+class Watching:
+    """Shows what a use case says while it works; within it, the function to give as ``watch``.
+
+    Progress is a bar on a terminal, one plain line per finished activity otherwise; quiet: notes
+    and warnings only. Notes end the bars before them.
+    """
+
+    def __init__(self, quiet: bool = False) -> None:
+        self._quiet = quiet
+        self._display: Display | None = None
+        self._open = ExitStack()
+
+    def __enter__(self) -> Watch:
+        return self._show
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        # An activity that an error ended is not shown as finished.
+        self._open.__exit__(kind, error, trace)
+
+    def _show(self, event: Event) -> None:
+        if isinstance(event, Progress):
+            if self._display is None:
+                self._display = self._open.enter_context(_display(self._quiet))
+            self._display.update(event)
+            return
+        self._close()
+        if isinstance(event, Started):
+            if not self._quiet:
+                report_note(event.title)
+        else:
+            _REPORTERS[event.level](event.text)
+
+    def _close(self) -> None:
+        self._display = None
+        self._open.close()
+
+
+class Display(Protocol):
+    """Shows how far activities are: ``update`` as often as one likes."""
+
+    def update(self, step: Progress) -> None:
+        """Show a step."""
+
+
 @contextmanager
-def progress(quiet: bool = False) -> Iterator[Bar]:
-    """A progress bar on a terminal; one plain line per finished step otherwise."""
+def _display(quiet: bool) -> Iterator[Display]:
     if quiet or _volume.get() == Volume.QUIET:
         yield _Silent()
     elif sys.stderr.isatty():
-        with _terminal_bar() as bar:
-            yield bar
+        with _terminal_bars() as bars:
+            yield bars
     else:
-        plain = _Plain(_volume.get() == Volume.VERBOSE)
-        yield plain
-        plain.finish()
-
-
-def engineering(value: float, unit: str) -> tuple[float, str]:
-    """Factor and unit in which a value has one to three digits before the point, as 0.54 mH.
-
-    The factor is 1 from a tenth to a thousand, and for units that take no prefix (kg, 1/s, m^2).
-    """
-    size = abs(value)
-    if not _PREFIXABLE.match(unit) or not math.isfinite(value) or _PLAIN[0] <= size < _PLAIN[1]:
-        return 1.0, unit
-    power = 3 * math.floor(math.log10(size) / 3) if size else 0
-    prefix = _PREFIXES.get(power)
-    return (1.0, unit) if prefix is None else (10.0**-power, f"{prefix}{unit}")
+        lines = _PlainLines(_volume.get() == Volume.VERBOSE)
+        yield lines
+        lines.finish()
 
 
 class _Silent:
-    def update(self, title: str, done: float, total: float, note: str) -> None:
+    def update(self, step: Progress) -> None:
         """Show nothing."""
 
 
-class _Plain:
-    """One line per step, when it is finished."""
+class _PlainLines:
+    """One line per activity, when it is finished."""
 
     def __init__(self, verbose: bool) -> None:
-        self._title = ""
+        self._activity = ""
         self._text = ""
-        self._started = self._told = time.perf_counter()
+        self._started = self._written = time.perf_counter()
         self._verbose = verbose
 
-    def update(self, title: str, done: float, total: float, note: str) -> None:
-        if title != self._title:
+    def update(self, step: Progress) -> None:
+        if step.activity != self._activity:
             self.finish()
-            self._title, self._started = title, time.perf_counter()
-        self._text = f"{title}: {note}"
+            self._activity, self._started = step.activity, time.perf_counter()
+        self._text = f"{step.activity}: {step.status}"
         now = time.perf_counter()
-        if self._verbose and now - self._told > _VERBOSE_PERIOD:
-            self._told = now
+        if self._verbose and now - self._written > _VERBOSE_PERIOD:
+            self._written = now
             sys.stderr.write(f"{self._text} ...\n")
 
     def finish(self) -> None:
-        if self._title:
+        if self._activity:
             seconds = time.perf_counter() - self._started
             sys.stderr.write(f"{self._text} ({seconds:.2f} s)\n")
-        self._title = ""
+        self._activity = ""
 
 
 @contextmanager
-def _terminal_bar() -> Iterator[Bar]:
+def _terminal_bars() -> Iterator[Display]:
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as RichProgress
     from rich.progress import TimeRemainingColumn as Remaining
 
     columns = (
@@ -272,28 +299,24 @@ def _terminal_bar() -> Iterator[Bar]:
         TextColumn("[dim]left"),
         Remaining(),
     )
-    with Progress(*columns, console=Console(file=sys.stderr)) as shown:
+    with RichProgress(*columns, console=Console(file=sys.stderr)) as shown:
         tasks: dict[str, Any] = {}
 
         class Bars:
-            def update(self, title: str, done: float, total: float, note: str) -> None:
-                if title not in tasks:
-                    tasks[title] = shown.add_task(title, total=total, note=note)
-                shown.update(tasks[title], completed=done, total=total, note=note)
+            def update(self, step: Progress) -> None:
+                if step.activity not in tasks:
+                    tasks[step.activity] = shown.add_task(
+                        step.activity, total=step.total, note=step.status
+                    )
+                shown.update(
+                    tasks[step.activity], completed=step.done, total=step.total, note=step.status
+                )
 
         yield Bars()
 
 
-def plain(value: Any) -> Any:
-    """A document as JSON can hold it: numbers that are not finite become null."""
-    if isinstance(value, dict):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    if hasattr(value, "tolist"):
-        return plain(value.tolist())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    if isinstance(value, str | int | float | bool) or value is None:
-        return value
-    return str(value)
+_REPORTERS = {
+    Level.WARNING: report_warning,
+    Level.NOTE: report_note,
+    Level.DETAIL: report_detail,
+}

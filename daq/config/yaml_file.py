@@ -59,6 +59,10 @@ class YamlFile:
         line, column = self.place(key)
         return f"{self.path}:{line}:{column}"
 
+    def line_of(self, key: Key) -> str:
+        """``file:line`` of a key, as a person looks for it."""
+        return f"{self.path}:{self.place(key)[0]}"
+
     def place(self, key: Key) -> tuple[int, int]:
         """Line and column of a key, or of its nearest parent that stands in the file."""
         while key and key not in self.places:
@@ -108,6 +112,10 @@ class CommandLine(YamlFile):
     def where(self, key: Key) -> str:
         """``command line``, or the place in the file."""
         return "command line" if self._is_typed(key) else super().where(key)
+
+    def line_of(self, key: Key) -> str:
+        """``command line``, or the line in the file."""
+        return "command line" if self._is_typed(key) else super().line_of(key)
 
     def place(self, key: Key) -> tuple[int, int]:
         """Before all lines of the file, or the place in it."""

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from daq.identification.records import Loaded
+from daq.identification.records import LoggedRecord
 from sysid import Dataset, ModelError
 from sysid.arrays import FloatArray
 from sysid.linear import ARMAX, tuned
@@ -33,8 +33,8 @@ class Baseline:
     runs: Sequence[FloatArray]
 
 
-def beside(
-    model: ProcessModel, training: Sequence[Loaded], validation: Sequence[Loaded]
+def baseline_of(
+    model: ProcessModel, training: Sequence[LoggedRecord], validation: Sequence[LoggedRecord]
 ) -> Baseline | str:
     """A linear model of the same logs, or why there is none."""
     try:
@@ -62,15 +62,15 @@ def armax(
         )
     # An input held from its sample on acts first on the next row; an interpolated one at once.
     first = [[int(signal.hold == "zoh") for signal in model.inputs]] * q
-    found = tuned(ARMAX(stable=True), list(training), na=_NA, nb=_NB, nc=_NC, nk=[first])
-    runs = {id(record): found.model.predict(record) for record in (*training, *validation)}
+    selection = tuned(ARMAX(stable=True), list(training), na=_NA, nb=_NB, nc=_NC, nk=[first])
+    runs = {id(record): selection.model.predict(record) for record in (*training, *validation)}
 
     def metrics(records: Sequence[Dataset]) -> list[Metrics]:
         return [evaluate(record.outputs, runs[id(record)]) for record in records]
 
     return Baseline(
         "ARMAX",
-        {name: order for name, order in found.best.orders.items() if name != "nk"},
+        {name: order for name, order in selection.best.orders.items() if name != "nk"},
         metrics(training),
         metrics(validation),
         [runs[id(record)] for record in validation],

@@ -25,12 +25,12 @@ class Datasheet:
 def load(path: Path) -> Datasheet:
     """Read a data sheet; ConfigError names line, key and cure."""
     file = yaml_file.load(path)
-    found = [
+    mistakes = [
         mistake
         for name, content in file.content.items()
         for mistake in checking.mistakes(file, DatasheetEntry, content, (str(name),))
     ]
-    checking.refuse([*file.repeated, *found])
+    checking.refuse([*file.repeated, *mistakes])
     entries = {
         str(name): DatasheetEntry.model_validate(content) for name, content in file.content.items()
     }
@@ -39,14 +39,14 @@ def load(path: Path) -> Datasheet:
 
 def check_names(sheets: Sequence[Datasheet], models: Sequence[ProcessModel]) -> None:
     """Raise ConfigError for an entry that no model has a parameter for, or that stands twice."""
-    known = list(dict.fromkeys(name for model in models for name in model.parameter_names))
+    parameters = list(dict.fromkeys(name for model in models for name in model.parameter_names))
     places: dict[str, str] = {}
     for sheet in sheets:
         for name in sheet.entries:
-            if name not in known:
+            if name not in parameters:
                 names = " or ".join(dict.fromkeys(model.name for model in models))
                 raise sheet.file.error(
-                    (name,), f"model {names} has no such parameter; {suggestion(name, known)}"
+                    (name,), f"model {names} has no such parameter; {suggestion(name, parameters)}"
                 )
             if name in places:
                 raise sheet.file.error((name,), f"also in {places[name]}; keep one")
@@ -56,16 +56,16 @@ def check_names(sheets: Sequence[Datasheet], models: Sequence[ProcessModel]) -> 
 def under(
     settings: IdentificationConfig, sheets: Sequence[Datasheet], model: ProcessModel
 ) -> tuple[IdentificationConfig, dict[str, str]]:
-    """Settings completed by data sheets, and where each parameter of theirs stands.
+    """Settings completed by data sheets, and the line that each of their values comes from.
 
     What the settings say of a parameter goes before. Raises ConfigError for a value that is
     physically impossible, or a unit that does not convert.
     """
-    ranges, fixed, places = dict(settings.ranges), dict(settings.fixed), {}
-    said = {*ranges, *fixed, *settings.tied}
+    ranges, fixed, sources = dict(settings.ranges), dict(settings.fixed), {}
+    settled = {*ranges, *fixed, *settings.tied}
     for sheet in sheets:
         for name, entry in sheet.entries.items():
-            if name in said or name not in model.parameter_names:
+            if name in settled or name not in model.parameter_names:
                 continue
             unit = model.parameter(name).unit
             factor = unit_factor(sheet.file, (name, "unit"), entry.unit, unit)
@@ -79,6 +79,6 @@ def under(
                     SearchSpace.of(model, {name: ranges[name]})
             except ModelError as error:
                 raise sheet.file.error((name,), str(error)) from None
-            place = sheet.file.where((name,)).rpartition(":")[0]
-            places[name] = f"{place} ({entry.source})" if entry.source else place
-    return settings.model_copy(update={"ranges": ranges, "fixed": fixed}), places
+            place = sheet.file.line_of((name,))
+            sources[name] = f"{place} ({entry.source})" if entry.source else place
+    return settings.model_copy(update={"ranges": ranges, "fixed": fixed}), sources

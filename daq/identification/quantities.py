@@ -17,18 +17,18 @@ def in_model_units(file: File, models: Sequence[ProcessModel]) -> tuple[File, li
     """The file with plain numbers for what its models declare, and what does not convert."""
     parameters = {p.name: p.unit for model in models for p in model.parameters}
     states = {s.name: s.unit for model in models for s in model.states}
-    content, wrong = dict(file.content), []
+    content, mistakes = dict(file.content), []
     for group, units in (("ranges", parameters), ("fixed", parameters), ("initial", states)):
         if isinstance(content.get(group), Mapping):
-            content[group], found = _converted(file, group, content[group], units)
-            wrong += found
-    return dataclasses.replace(file, content=content), wrong
+            content[group], wrong = _converted(file, group, content[group], units)
+            mistakes += wrong
+    return dataclasses.replace(file, content=content), mistakes
 
 
 def _converted(
     file: YamlFile, group: str, given: Mapping[str, Any], units: Mapping[str, str]
 ) -> tuple[dict[str, Any], list[Mistake]]:
-    numbers, wrong = dict(given), []
+    numbers, mistakes = dict(given), []
     for name, value in given.items():
         if name not in units:
             continue
@@ -39,6 +39,6 @@ def _converted(
                 else converted(value, units[name])
             )
         except ValueError as error:
-            wrong.append(file.mistake((group, name), f"{error}; found {value!r}"))
+            mistakes.append(file.mistake((group, name), f"{error}; found {value!r}"))
             del numbers[name]  # said once
-    return numbers, wrong
+    return numbers, mistakes

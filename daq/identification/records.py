@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Mapping:
+class ColumnMapping:
     """The 'columns' section of a configuration file, checked against a model."""
 
     file: YamlFile
@@ -33,8 +33,8 @@ class Mapping:
 
 
 @dataclass(frozen=True)
-class Loaded:
-    """One log as a record for the model; ``warning`` when its run did not complete."""
+class LoggedRecord:
+    """A log as a record for a model; warning: how a run that did not complete ended."""
 
     dataset: Dataset
     path: Path
@@ -43,7 +43,7 @@ class Loaded:
 
 def expand(paths: list[Path]) -> list[Path]:
     """Logs named on the command line: a folder without a log.csv stands for the CSVs in it."""
-    found: list[Path] = []
+    logs: list[Path] = []
     for path in paths:
         if path.is_dir() and not (path / capture.LOG_NAME).exists():
             inside = sorted(path.glob("*.csv"))
@@ -51,13 +51,13 @@ def expand(paths: list[Path]) -> list[Path]:
                 raise ConfigError(
                     f"{path}: neither a capture folder (with log.csv) nor a folder of CSV files"
                 )
-            found += inside
+            logs += inside
         else:
-            found.append(path)
-    return found
+            logs.append(path)
+    return logs
 
 
-def load(path: Path, model: ProcessModel, mapping: Mapping | None) -> Loaded:
+def load(path: Path, model: ProcessModel, mapping: ColumnMapping | None) -> LoggedRecord:
     """One log as a record; ConfigError names the file, line and column of what is wrong."""
     try:
         if mapping is not None:
@@ -67,13 +67,13 @@ def load(path: Path, model: ProcessModel, mapping: Mapping | None) -> Loaded:
         raise ConfigError(f"{path}: {error}") from None
 
 
-def from_recording(recording: capture.Recording, model: ProcessModel) -> Loaded:
+def from_recording(recording: capture.Recording, model: ProcessModel) -> LoggedRecord:
     """A log that has been read as a record; ConfigError, ModelError."""
     dataset = _with_noise(_from_log(recording.log, model, recording.name), recording, model)
-    return Loaded(dataset, recording.log.path, recording.warning)
+    return LoggedRecord(dataset, recording.log.path, recording.warning)
 
 
-def from_frame(frame: pd.DataFrame, name: str, model: ProcessModel) -> Loaded:
+def from_frame(frame: pd.DataFrame, name: str, model: ProcessModel) -> LoggedRecord:
     """A table with time ``t`` [s] and the model's signals by name; ConfigError, ModelError."""
     path, wanted = Path(name), ("t", *model.input_names, *model.output_names)
     for column in wanted:
@@ -89,10 +89,12 @@ def from_frame(frame: pd.DataFrame, name: str, model: ProcessModel) -> Loaded:
         raise ConfigError(f"{name}: a column is not of numbers: {error}") from None
     tick, dt = time_base(path, numbers["t"].to_numpy(), first_line=0)
     log = Log(path, numbers.assign(tick=tick), dt, torn=False)
-    return Loaded(_from_log(log, model, name), path, None)
+    return LoggedRecord(_from_log(log, model, name), path, None)
 
 
-def hold_back(logs: list[Loaded], part: float) -> tuple[list[Loaded], list[Loaded]]:
+def hold_back(
+    logs: list[LoggedRecord], part: float
+) -> tuple[list[LoggedRecord], list[LoggedRecord]]:
     """The beginnings of logs, to train on, and the last ``part`` of each, to validate by.
 
     An end starts where every output was measured, so that its first sample tells where it
@@ -104,7 +106,7 @@ def hold_back(logs: list[Loaded], part: float) -> tuple[list[Loaded], list[Loade
     return [half[0] for half in halves], [half[1] for half in halves]
 
 
-def _halves(log: Loaded, part: float) -> tuple[Loaded, Loaded]:
+def _halves(log: LoggedRecord, part: float) -> tuple[LoggedRecord, LoggedRecord]:
     whole = log.dataset
     cut = round(whole.n_samples * (1.0 - part))
     complete = np.flatnonzero(np.all(np.isfinite(whole.outputs[cut:]), axis=1))
@@ -124,7 +126,9 @@ def _halves(log: Loaded, part: float) -> tuple[Loaded, Loaded]:
     return halves[0], halves[1]
 
 
-def check_mapping(model: ProcessModel, mapping: Mapping, spare: dict[str, tuple[str, ...]]) -> None:
+def check_mapping(
+    model: ProcessModel, mapping: ColumnMapping, spare: dict[str, tuple[str, ...]]
+) -> None:
     """Raise ConfigError unless every signal of the model, and no other, has its column.
 
     spare: ``inputs`` and ``outputs`` that may have one as well though this model is used without
@@ -183,18 +187,18 @@ def _with_noise(dataset: Dataset, recording: capture.Recording, model: ProcessMo
     )
 
 
-def _load_foreign(path: Path, model: ProcessModel, mapping: Mapping) -> Loaded:
+def _load_foreign(path: Path, model: ProcessModel, mapping: ColumnMapping) -> LoggedRecord:
     columns = mapping.columns
     _check_columns(path, model, mapping)
     inputs_from = {columns.inputs[name].column for name in model.input_names}
     outputs_from = {columns.outputs[name].column for name in model.output_names}
-    known = {columns.time.column, *inputs_from}
-    used = sorted(name for name in known | outputs_from if name is not None)
+    gapless = {columns.time.column, *inputs_from}
+    used = sorted(name for name in gapless | outputs_from if name is not None)
     table = read_table(
         path,
         used,
         "mend these cells or remove their lines (removed lines count as lost samples)",
-        gaps=[name for name in used if name not in known],
+        gaps=[name for name in used if name not in gapless],
     )
     frame = table.frame
     require_rows(path, len(frame))
@@ -223,10 +227,10 @@ def _load_foreign(path: Path, model: ProcessModel, mapping: Mapping) -> Loaded:
         dt,
         path.stem,
     )
-    return Loaded(dataset, path, capture.describe_end(path, table.torn))
+    return LoggedRecord(dataset, path, capture.describe_end(path, table.torn))
 
 
-def _check_columns(path: Path, model: ProcessModel, mapping: Mapping) -> None:
+def _check_columns(path: Path, model: ProcessModel, mapping: ColumnMapping) -> None:
     """Raise ConfigError at each key that names a column which a file does not have."""
     present = column_names(path)
     columns = mapping.columns
@@ -248,7 +252,7 @@ def _check_columns(path: Path, model: ProcessModel, mapping: Mapping) -> None:
     )
 
 
-def _foreign_time(table: Table, mapping: Mapping) -> tuple[IntArray, float]:
+def _foreign_time(table: Table, mapping: ColumnMapping) -> tuple[IntArray, float]:
     """Sequence numbers and sample time [s] of a foreign table's rows."""
     time = mapping.columns.time
     if time.column is None:

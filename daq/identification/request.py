@@ -1,4 +1,4 @@
-"""What an identification was asked for, kept beside its checkpoint until it is done."""
+"""What an identification was asked for, kept beside its checkpoint until it is finished."""
 
 from __future__ import annotations
 
@@ -16,32 +16,43 @@ _CHECKPOINT, _REQUEST = "search.ckpt", "search.json"
 
 
 @dataclass(frozen=True)
-class Asked:
-    """What the settings of an identification were made from, all paths absolute.
+class SettingsRequest:
+    """Where the settings of an identification come from.
 
-    options, settings: those of the command, as ``prepare`` takes them.
+    config: a YAML file. options: settings by name that have an option of their own, None for those
+    not given. settings: any others, as ``key=value``.
     """
 
-    config: str | None
-    options: dict[str, Any]
-    settings: list[str]
+    config: str | None = None
+    options: Mapping[str, Any] | None = None
+    settings: Sequence[str] = ()
 
-    @classmethod
-    def of(
-        cls, config: Path | None, options: Mapping[str, Any], settings: Sequence[str], model: str
-    ) -> Asked:
-        """model: whole name of the one that was found."""
-        kept = {**options, "model": model}
-        if kept.get("datasheet"):
-            kept["datasheet"] = _absolute(kept["datasheet"])
-        return cls(None if config is None else str(config.resolve()), kept, list(settings))
+    @property
+    def config_file(self) -> Path | None:
+        """The YAML file's path."""
+        return None if self.config is None else Path(self.config)
+
+    def option(self, name: str) -> Any:
+        """The value of an option; None where it was not given."""
+        return (self.options or {}).get(name)
+
+    def absolute(self, model: str) -> SettingsRequest:
+        """The same from any folder; model: whole name of the one that was looked up."""
+        options = {**(self.options or {}), "model": model}
+        if options.get("datasheet"):
+            options["datasheet"] = _absolute(options["datasheet"])
+        config = self.config_file
+        return SettingsRequest(
+            None if config is None else str(config.resolve()), options, list(self.settings)
+        )
 
 
 @dataclass(frozen=True)
-class Request:
-    """An identification that may be gone on with: what was asked, on which logs."""
+class InterruptedFit:
+    """An identification that can be continued: where its results go, its settings and logs."""
 
-    asked: Asked
+    folder: Path
+    settings: SettingsRequest
     training: list[Path]
     validation: list[Path]
 
@@ -52,30 +63,31 @@ def checkpoint(folder: Path) -> Path:
 
 
 def remember(
-    folder: Path, asked: Asked, training: Sequence[Path], validation: Sequence[Path]
+    folder: Path, settings: SettingsRequest, training: Sequence[Path], validation: Sequence[Path]
 ) -> None:
-    """Write down what is about to be done, in the folder that the results will go to."""
+    """Write a request into the folder that the results will go to."""
     capture.make_folder(folder)
     content = {
-        "asked": asdict(asked),
+        "asked": asdict(settings),
         "training": _absolute(training),
         "validation": _absolute(validation),
     }
     capture.write_whole(folder / _REQUEST, json.dumps(content, indent=1))
 
 
-def recall(folder: Path) -> tuple[Path, Request]:
-    """The folder with the checkpoint, given or below the given one, and what was asked.
+def recall(folder: Path) -> InterruptedFit:
+    """The request in a folder, or in the folder ``identification`` below it.
 
-    Raises ConfigError when there is nothing to go on with.
+    Raises ConfigError when there is none.
     """
     for place in (folder, folder / "identification"):
         if not (place / _REQUEST).exists():
             continue
         try:
             content = json.loads((place / _REQUEST).read_text(encoding="utf-8"))
-            return place, Request(
-                Asked(**content["asked"]),
+            return InterruptedFit(
+                place,
+                SettingsRequest(**content["asked"]),
                 [Path(path) for path in content["training"]],
                 [Path(path) for path in content["validation"]],
             )
@@ -88,13 +100,13 @@ def recall(folder: Path) -> tuple[Path, Request]:
 
 
 def forget(folder: Path) -> None:
-    """Nothing is left to go on with."""
+    """Remove what is needed only to continue."""
     for name in (_CHECKPOINT, _REQUEST):
         (folder / name).unlink(missing_ok=True)
 
 
-def command(folder: Path) -> str:
-    """What to type to go on."""
+def resume_command(folder: Path) -> str:
+    """What to type to continue."""
     return f"rig identify --resume {shlex.quote(str(folder))}"
 
 

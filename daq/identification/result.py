@@ -1,4 +1,4 @@
-"""A finished identification: what it was made of, and one document of it for machines."""
+"""The result of an identification, and its document: what machines read of it."""
 
 from __future__ import annotations
 
@@ -7,74 +7,164 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import yaml
 
-from daq.config.identification import IdentificationConfig, Signals
-from daq.identification.records import Loaded
+from daq.config.identification import Signals
+from daq.identification.records import LoggedRecord
+from daq.identification.request import resume_command
+from daq.identification.rows import Rows
+from daq.identification.settings import Problem
 from daq.logs import capture
+from sysid import Metrics, ProcessModel
 from sysid.arrays import FloatArray
 from sysid.gassi import GASSI
 from sysid.judging.assessment import RecordResult, Verdict, judge
-from sysid.problem.metrics import Metrics
-from sysid.problem.model import Parameter, ProcessModel
+from sysid.problem.model import Parameter
 from sysid.uncertainty import Estimate, Profile, Uncertainty
 
-# What is said of a parameter without an interval, by why it has none.
-NOTES = {
-    "tied": "only with others",
-    "vague": "hardly felt",
-    "bound": "at its end",
-    "rival": "two answers",
-    "": "",
-}
+if TYPE_CHECKING:
+    import pandas as pd
+
+PARAMETERS = "parameters.yaml"
 
 
 @dataclass(frozen=True)
-class Identified:
-    """A finished identification and what it was made of.
+class FittedLog:
+    """A log with the identified model's free run on it, (n_samples, n_outputs), and its errors."""
 
-    sources: where each parameter's range or value stands that is not the model's own.
-    uncertainty: None where the search was not refined to a minimum. training, validation: one
-    result for each log, in their order. training_runs, validation_runs: the free run on each,
-    (n_samples, n_outputs).
+    log: LoggedRecord
+    run: FloatArray
+    result: RecordResult
+
+
+@dataclass(frozen=True)
+class Identification:
+    """Parameters identified from logs, and how far to trust them.
+
+    uncertainty: None where the search was not refined to a minimum. profiles: those asked for.
+    folder: where ``parameters.yaml`` was written, None where nothing was. seeds: the spread over
+    several seeds, of which this is the best.
     """
 
-    model: ProcessModel
-    model_name: str
-    settings: IdentificationConfig
-    sources: Mapping[str, str]
-    columns_file: Path | None
+    problem: Problem
     estimator: GASSI
     uncertainty: Uncertainty | None
     profiles: Sequence[Profile]
-    training: Sequence[RecordResult]
-    validation: Sequence[RecordResult]
-    training_logs: Sequence[Loaded]
-    validation_logs: Sequence[Loaded]
-    training_runs: Sequence[FloatArray]
-    validation_runs: Sequence[FloatArray]
+    training: Sequence[FittedLog]
+    validation: Sequence[FittedLog]
+    folder: Path | None = None
+    seeds: Mapping[str, Any] | None = None
+
+    @property
+    def model(self) -> ProcessModel:
+        """The process model, as it was used."""
+        return self.problem.model
 
     @cached_property
     def verdict(self) -> Verdict:
         """How far to trust it, and why."""
         return judge(
             self.model,
-            self.training,
-            self.validation,
+            [log.result for log in self.training],
+            [log.result for log in self.validation],
             self.uncertainty,
             self.estimator.feasible_,
         )
 
+    @property
+    def trust(self) -> str:
+        """The verdict in one word."""
+        return self.verdict.trust
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """What the verdict rests on."""
+        return tuple(self.verdict.reasons)
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether Ctrl-C ended the search before its time."""
+        return self.estimator.stopped_ == "interrupted"
+
+    @property
+    def resume_command(self) -> str | None:
+        """What to type to continue an interrupted search; None where there is nothing to."""
+        return resume_command(self.folder) if self.interrupted and self.folder else None
+
+    @property
+    def parameters_file(self) -> Path | None:
+        """Where the parameters were written."""
+        return self.folder / PARAMETERS if self.folder is not None else None
+
+    @cached_property
+    def document(self) -> dict[str, Any]:
+        """What ``parameters.yaml`` holds, and ``rig identify --json`` prints beside the files."""
+        return _document(self)
+
+    @cached_property
+    def rows(self) -> Rows:
+        """The document's tables."""
+        return Rows.of(self.document)
+
+    @property
+    def parameters(self) -> pd.DataFrame:
+        """A row for each parameter: value, low and high end of its 95 % interval, unit.
+
+        NaN where there is no interval, and why as a note: such a parameter is not to be used by
+        itself.
+        """
+        import pandas as pd
+
+        nothing = (float("nan"), float("nan"))
+        rows = {
+            row.name: {
+                "value": row.value,
+                **dict(zip(("low", "high"), row.interval or nothing, strict=True)),
+                "unit": row.unit,
+                "note": row.undetermined_label,
+            }
+            for row in self.rows.parameters
+        }
+        return pd.DataFrame.from_dict(rows, orient="index").rename_axis("parameter")
+
+    @property
+    def metrics(self) -> pd.DataFrame:
+        """Errors of the free runs, a row for each part, log and output.
+
+        rmse and msd in parts of the largest measured value, fit_percent 100 for a perfect one.
+        """
+        import pandas as pd
+
+        rows = [
+            {"part": part, "log": log.name, "output": output, **errors.figures}
+            for part, logs in self.rows.logs.items()
+            for log in logs
+            for output, errors in log.outputs.items()
+        ]
+        return pd.DataFrame(rows).set_index(["part", "log", "output"])
+
+    def save(self, folder: str | Path) -> Path:
+        """Write ``parameters.yaml`` into a folder; its path. Raises ConfigError."""
+        capture.make_folder(Path(folder))
+        path = Path(folder) / PARAMETERS
+        text = yaml.safe_dump(self.document, sort_keys=False, allow_unicode=True)
+        capture.write_whole(path, text)
+        return path
+
     def source(self, name: str) -> str:
         """Where a parameter's range or value comes from."""
-        return self.sources.get(name, "model")
+        if name in self.problem.sources:
+            return self.problem.sources[name]
+        guess = self.estimator.guesses_.get(name)
+        return guess.source if guess is not None else "model"
 
     def estimate(self, name: str) -> Estimate | None:
-        """What is known of a free parameter's uncertainty."""
-        found = self.uncertainty.parameters if self.uncertainty is not None else ()
-        return next((e for e in found if e.name == name), None)
+        """Value and interval of a free parameter; None where there was no refinement."""
+        estimates = self.uncertainty.parameters if self.uncertainty is not None else ()
+        return next((e for e in estimates if e.name == name), None)
 
     def on_bound(self, name: str) -> bool:
         """Whether a free parameter is held by an end of its range."""
@@ -84,22 +174,18 @@ class Identified:
         return bool(space.on_bound(self.estimator.chromosome_)[space.names.index(name)])
 
 
-def document(result: Identified) -> dict[str, Any]:
-    """All of it for machines; what ``parameters.yaml`` holds."""
-    estimator, settings = result.estimator, result.settings
-    verdict = result.verdict
-    parts = (
-        ("training", result.training, result.training_logs),
-        ("validation", result.validation, result.validation_logs),
-    )
+def _document(identification: Identification) -> dict[str, Any]:
+    estimator, problem = identification.estimator, identification.problem
+    settings, verdict = problem.settings, identification.verdict
+    parts = {"training": identification.training, "validation": identification.validation}
     return {
-        "model": result.model_name,
+        "model": problem.model_name,
         **_signals(settings),
         "verdict": {"trust": verdict.trust, "reasons": list(verdict.reasons)},
-        "parameters": {p.name: _parameter(result, p) for p in result.model.parameters},
-        **_initial_states(result),
-        **_uncertainty(result.uncertainty),
-        **_profiles(result.profiles),
+        "parameters": {p.name: _parameter(identification, p) for p in problem.model.parameters},
+        **({"initial_states": starts} if any(starts := estimator.initial_states_) else {}),
+        **_uncertainty(identification.uncertainty),
+        **_profiles(identification.profiles),
         "error": {
             "value": estimator.error_,
             "meaning": "mean over outputs of the RMSE on outputs normalised by max|y|",
@@ -107,10 +193,14 @@ def document(result: Identified) -> dict[str, Any]:
         },
         "metrics": {
             part: [
-                {"log": str(log.path), "name": record.name, **_record(result.model, record)}
-                for record, log in zip(records, logs, strict=True)
+                {
+                    "log": str(log.log.path),
+                    "name": log.result.name,
+                    "outputs": _outputs(problem.model, log.result),
+                }
+                for log in logs
             ]
-            for part, records, logs in parts
+            for part, logs in parts.items()
         },
         "search": {
             "preset": settings.preset,
@@ -123,6 +213,7 @@ def document(result: Identified) -> dict[str, Any]:
             "feasible": estimator.feasible_,
         },
         "software": capture.software_versions(),
+        **({"seeds": dict(identification.seeds)} if identification.seeds is not None else {}),
     }
 
 
@@ -139,22 +230,22 @@ def _signals(signals: Signals) -> dict[str, Any]:
     return {key: value for key, value in chosen.items() if value}
 
 
-def _parameter(result: Identified, parameter: Parameter) -> dict[str, Any]:
-    name = parameter.name
-    entry: dict[str, Any] = {"value": result.estimator.parameters_[name], "unit": parameter.unit}
-    space = result.estimator.space_
+def _parameter(identification: Identification, parameter: Parameter) -> dict[str, Any]:
+    name, estimator = parameter.name, identification.estimator
+    entry: dict[str, Any] = {"value": estimator.parameters_[name], "unit": parameter.unit}
+    space, tied = estimator.space_, identification.problem.settings.tied
     if name in space.names:
         searched = space.parameters[space.names.index(name)]
         entry["range"] = [searched.lower, searched.upper]
         entry["scale"] = searched.scale
-        entry["on_bound"] = result.on_bound(name)
-        if (estimate := result.estimate(name)) is not None:
+        entry["on_bound"] = identification.on_bound(name)
+        if (estimate := identification.estimate(name)) is not None:
             entry |= _interval(estimate)
-    elif name in result.settings.tied:
-        entry["tied"] = result.settings.tied[name]
+    elif name in tied:
+        entry["tied"] = tied[name]
     else:
         entry["fixed"] = True
-    entry["source"] = result.source(name)
+    entry["source"] = identification.source(name)
     return entry
 
 
@@ -165,26 +256,20 @@ def _interval(estimate: Estimate) -> dict[str, Any]:
     return {"std": float(estimate.std), "interval": [float(estimate.low), float(estimate.high)]}
 
 
-def _initial_states(result: Identified) -> dict[str, Any]:
-    """Initial states that were estimated, log by log."""
-    found = result.estimator.initial_states_
-    return {"initial_states": found} if any(found) else {}
-
-
-def _uncertainty(found: Uncertainty | None) -> dict[str, Any]:
-    if found is None:
+def _uncertainty(uncertainty: Uncertainty | None) -> dict[str, Any]:
+    if uncertainty is None:
         return {}
-    names = [parameter.name for parameter in found.parameters]
-    correlation = found.correlation()
+    names = [parameter.name for parameter in uncertainty.parameters]
+    correlation = uncertainty.correlation()
     pairs = [
         {"parameters": [names[i], names[j]], "correlation": round(float(correlation[i, j]), 4)}
         for i, j in itertools.combinations(range(len(names)), 2)
         if np.isfinite(correlation[i, j])
-        and not (found.parameters[i].why or found.parameters[j].why)
+        and not (uncertainty.parameters[i].why or uncertainty.parameters[j].why)
     ]
     return {
-        "determined_directions": found.rank,
-        "singular_values": [float(f"{value:.4g}") for value in found.singular_values],
+        "determined_directions": uncertainty.rank,
+        "singular_values": [float(f"{value:.4g}") for value in uncertainty.singular_values],
         "ambiguities": [
             {
                 "kind": ambiguity.kind,
@@ -195,29 +280,29 @@ def _uncertainty(found: Uncertainty | None) -> dict[str, Any]:
                 ],
                 "measure": list(ambiguity.measure),
             }
-            for ambiguity in found.ambiguities
+            for ambiguity in uncertainty.ambiguities
         ],
-        **({"rivals": [dict(rival) for rival in found.rivals]} if found.rivals else {}),
+        **({"rivals": [dict(rival) for rival in uncertainty.rivals]} if uncertainty.rivals else {}),
         "correlations": pairs,
     }
 
 
-def _profiles(found: Sequence[Profile]) -> dict[str, Any]:
-    if not found:
+def _profiles(profiles: Sequence[Profile]) -> dict[str, Any]:
+    if not profiles:
         return {}
     return {
         "profiles": {
-            one.name: {
-                "interval": [one.low, one.high],
-                "values": one.values.tolist(),
-                "statistic": one.statistic.tolist(),
+            profile.name: {
+                "interval": [profile.low, profile.high],
+                "values": profile.values.tolist(),
+                "statistic": profile.statistic.tolist(),
             }
-            for one in found
+            for profile in profiles
         }
     }
 
 
-def errors_of(model: ProcessModel, metrics: Metrics) -> dict[str, dict[str, float]]:
+def errors_document(model: ProcessModel, metrics: Metrics) -> dict[str, dict[str, float]]:
     """Errors of each output on one log."""
     return {
         name: {
@@ -230,19 +315,17 @@ def errors_of(model: ProcessModel, metrics: Metrics) -> dict[str, dict[str, floa
     }
 
 
-def _record(model: ProcessModel, record: RecordResult) -> dict[str, Any]:
+def _outputs(model: ProcessModel, record: RecordResult) -> dict[str, dict[str, Any]]:
     residuals = record.residuals
     return {
-        "outputs": {
-            name: {
-                **errors,
-                "residual_autocorrelation_in_band": float(residuals.white[j]),
-                "residual_independent_of": {
-                    signal: float(residuals.independent[j, i])
-                    for i, signal in enumerate(model.input_names)
-                    if residuals.tested[i]
-                },
-            }
-            for j, (name, errors) in enumerate(errors_of(model, record.metrics).items())
+        name: {
+            **errors,
+            "residual_autocorrelation_in_band": float(residuals.white[j]),
+            "residual_independent_of": {
+                signal: float(residuals.independent[j, i])
+                for i, signal in enumerate(model.input_names)
+                if residuals.tested[i]
+            },
         }
+        for j, (name, errors) in enumerate(errors_document(model, record.metrics).items())
     }

@@ -2,105 +2,118 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Mapping as MappingType
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from daq.cli import terminal as console
-from daq.cli.models import DEFAULT_MODEL, find_model, whole_name
 from daq.config import checking, yaml_file
 from daq.config.identification import IdentificationConfig, Signals
 from daq.config.yaml_file import CommandLine, Mistake, YamlFile, suggestion
 from daq.errors import ConfigError
-from daq.identification import datasheets
-from daq.identification import records as datasets
+from daq.identification import datasheets, records
 from daq.identification.quantities import in_model_units
-from daq.identification.records import Mapping
-from daq.identification.request import Asked
-from sysid import ModelError, SearchSpace
-from sysid.problem.model import ProcessModel
+from daq.identification.records import ColumnMapping
+from daq.identification.request import SettingsRequest
+from daq.lookup.models import DEFAULT_MODEL, find_model, whole_name
+from daq.progress import Level, Note, Watch, ignore
+from sysid import ModelError, ProcessModel, SearchSpace
 
 
 @dataclass(frozen=True)
-class Prepared:
-    """Settings of an identification, checked before any log is read or rig moved.
+class Problem:
+    """What is to be identified, checked before any log is read or rig moved.
 
-    sources: where each parameter's range or value stands that is not the model's own. asked:
+    sources: where each parameter's range or value stands that is not the model's own. request:
     what all this was made from.
     """
 
     model: ProcessModel
     model_name: str
     settings: IdentificationConfig
-    mapping: Mapping | None
-    sources: MappingType[str, str]
-    asked: Asked
+    mapping: ColumnMapping | None
+    sources: Mapping[str, str]
+    request: SettingsRequest
 
 
-def prepare(
-    config: Path | None, options: MappingType[str, Any], more: Sequence[str] = ()
-) -> Prepared:
-    """Read and check settings and model; ConfigError names file, line, key and cure.
+def problem_of(request: SettingsRequest, watch: Watch = ignore) -> Problem:
+    """Read and check settings and model; ConfigError names file, line, key and cure."""
+    return problems_of(request, [request.option("model")], watch)[0]
 
-    options: by name, None for those not given. more: any setting as ``key=value``.
+
+def problems_of(
+    request: SettingsRequest, names: Sequence[str | None], watch: Watch = ignore
+) -> list[Problem]:
+    """The same settings for each of several models, None for the default one.
+
+    Each takes the ranges, fixed values and the like that it has a name for; names that no model
+    has are mistakes.
     """
-    return prepare_models(config, options, [options.get("model")], more)[0]
-
-
-def prepare_models(
-    config: Path | None,
-    options: MappingType[str, Any],
-    names: Sequence[str | None],
-    more: Sequence[str] = (),
-) -> list[Prepared]:
-    """The same settings for each of several models.
-
-    Each takes the ranges, fixed values and the like that it has a name for; names that none has
-    are mistakes.
-    """
-    given = {key: value for key, value in options.items() if value is not None}
+    config = request.config_file
+    options = {k: value for k, value in (request.options or {}).items() if value is not None}
     written = yaml_file.load(config) if config is not None else None
     if written is not None:
         checking.refuse_other_kind(written, "an identification's settings")
-    file = CommandLine.of(given, more, written)
-    found = _find_all(config, file, names)
-    file, wrong = in_model_units(file, [model for model, _ in found])
-    settings = checking.validate(file, IdentificationConfig, others=wrong)
-    for model, name in found:
-        console.report_detail(f"model {name}: {model.description}")
-    models = [_with_outputs(file, settings, model) for model, _ in found]
+    file = CommandLine.of(options, request.settings, written)
+    declared = _find_models(config, file, names)
+    file, unconverted = in_model_units(file, [model for model, _ in declared])
+    settings = checking.validate(file, IdentificationConfig, others=unconverted)
+    for model, name in declared:
+        watch(Note(Level.DETAIL, f"model {name}: {model.description}"))
+    models = [_with_outputs(file, settings, model) for model, _ in declared]
     _check_names(file, settings, models)
-    mapping = Mapping(file, settings.columns) if settings.columns else None
+    mapping = ColumnMapping(file, settings.columns) if settings.columns else None
     spare = {
         "inputs": _all_names(models, "input_names"),
         "outputs": tuple(
-            n for model, _ in found for n in (*model.output_names, *model.state_names)
+            n for model, _ in declared for n in (*model.output_names, *model.state_names)
         ),
     }
     sheets = [datasheets.load(path) for path in _datasheets(config, file, settings)]
     datasheets.check_names(sheets, models)
-    prepared = []
-    for (_, name), model in zip(found, models, strict=True):
-        own, sources = datasheets.under(_own_settings(settings, model), sheets, model)
-        _check_space(file, own, model)
+    problems = []
+    for (_, name), model in zip(declared, models, strict=True):
+        restricted = _restricted(settings, model)
+        completed, sources = datasheets.under(restricted, sheets, model)
+        _check_space(file, completed, model)
         if mapping is not None:
-            datasets.check_mapping(model, mapping, spare)
-        used = _with_starts(file, own, model)
-        if own.guess and model.guesses is None:
-            raise file.error(("guess",), f"model {model.name} has no 'guesses' function that "
-                             "reads ranges from logs; leave this out")  # fmt: skip
-        asked = Asked.of(config, options, more, name)
-        all_sources = sources | _range_sources(file)
-        prepared.append(Prepared(used, name, own, mapping, all_sources, asked))
-    return prepared
+            records.check_mapping(model, mapping, spare)
+        started = _with_starts(file, completed, model)
+        if completed.guess and model.guesses is None:
+            raise file.error(
+                ("guess",),
+                f"model {model.name} has no 'guesses' function that reads ranges from logs; leave "
+                "this out",
+            )
+        sources |= _range_sources(file)
+        problems.append(Problem(started, name, completed, mapping, sources, request.absolute(name)))
+    return problems
 
 
-def as_told(file: YamlFile, signals: Signals, model: ProcessModel) -> ProcessModel:
+def with_signals(file: YamlFile, signals: Signals, model: ProcessModel) -> ProcessModel:
     """The model with outputs, starts and holds as a file has them; ConfigError names the key."""
     return _with_starts(file, signals, _with_outputs(file, signals, model))
+
+
+def columns_of(config: Path | None, model: ProcessModel) -> ColumnMapping | None:
+    """The columns of a configuration, for the model that parameters are of.
+
+    The file may name another, for which the columns serve as well; ConfigError where they do not.
+    """
+    if config is None:
+        return None
+    file = yaml_file.load(config)
+    file, unconverted = in_model_units(file, [model])
+    settings = checking.validate(file, IdentificationConfig, others=unconverted)
+    if settings.columns is None:
+        return None
+    mapping = ColumnMapping(file, settings.columns)
+    # The file may be of a comparison, in which other models have other signals.
+    columns = settings.columns
+    records.check_mapping(
+        model, mapping, {"inputs": tuple(columns.inputs), "outputs": tuple(columns.outputs)}
+    )
+    return mapping
 
 
 def gassi_settings(settings: IdentificationConfig) -> dict[str, Any]:
@@ -125,12 +138,12 @@ def gassi_settings(settings: IdentificationConfig) -> dict[str, Any]:
     }
 
 
-def _find_all(
+def _find_models(
     config: Path | None, file: CommandLine, names: Sequence[str | None]
 ) -> list[tuple[ProcessModel, str]]:
     """Models and their whole names; when one is not found, the file's other mistakes as well."""
     try:
-        return [_find(config, file, name) for name in names]
+        return [_find_model(config, file, name) for name in names]
     except ConfigError as error:
         if str(error).startswith(file.named(("model",))):
             checking.validate(
@@ -139,20 +152,22 @@ def _find_all(
         raise
 
 
-def _find(config: Path | None, file: CommandLine, typed: str | None) -> tuple[ProcessModel, str]:
+def _find_model(
+    config: Path | None, file: CommandLine, typed: str | None
+) -> tuple[ProcessModel, str]:
     """A model and its whole name, from the command line or else the configuration."""
-    given = file.content.get("model")
-    if given is not None and not isinstance(given, str):
+    configured = file.content.get("model")
+    if configured is not None and not isinstance(configured, str):
         checking.validate(file, IdentificationConfig)
     # A name on the command line is relative to where it is typed, one in a file to that file.
     if typed is None and "model" in file.typed:
-        typed = given
+        typed = configured
     beside = config.parent if config is not None and typed is None else None
-    name = typed or given or DEFAULT_MODEL
+    name = typed or configured or DEFAULT_MODEL
     try:
         return find_model(name, beside), whole_name(name, beside)
     except ConfigError as error:
-        if beside is None or given is None:
+        if beside is None or configured is None:
             raise
         raise file.error(("model",), str(error)) from None
 
@@ -188,12 +203,11 @@ def _datasheets(
 
 def _range_sources(file: CommandLine) -> dict[str, str]:
     """Where the range or value of each parameter was given, for those not left to the model."""
-    found = {}
-    for group in ("ranges", "fixed", "tied"):
-        for name in file.content.get(group) or {}:
-            # Without the column: the line is what one looks for.
-            found[str(name)] = re.sub(r"(:\d+):\d+$", r"\1", file.where((group, str(name))))
-    return found
+    return {
+        str(name): file.line_of((group, str(name)))
+        for group in ("ranges", "fixed", "tied")
+        for name in file.content.get(group) or {}
+    }
 
 
 def _check_names(
@@ -211,10 +225,10 @@ def _check_names(
         ("hold", settings.hold, _all_names(models, "input_names")),
         ("profile", dict.fromkeys(settings.profile), parameters),
     )
-    for group, given, known in groups:
+    for group, given, declared in groups:
         for name in given:
-            if name not in known:
-                hint = f"model {names} has no such name; {suggestion(name, known)}"
+            if name not in declared:
+                hint = f"model {names} has no such name; {suggestion(name, declared)}"
                 if isinstance(file.content.get(group), dict):
                     raise file.error((group, name), hint)
                 raise file.error((group,), f"{name}: {hint}")  # a list has no keys of its own
@@ -224,29 +238,28 @@ def _all_names(models: Sequence[ProcessModel], kind: str) -> tuple[str, ...]:
     return tuple(dict.fromkeys(name for model in models for name in getattr(model, kind)))
 
 
-def _own_settings(settings: IdentificationConfig, model: ProcessModel) -> IdentificationConfig:
+def _restricted(settings: IdentificationConfig, model: ProcessModel) -> IdentificationConfig:
     """The settings without what is meant for other models."""
-    known = dict.fromkeys(("ranges", "fixed", "tied", "scale"), model.parameter_names)
-    known |= {"weights": model.output_names, "initial": model.state_names}
-    known["hold"] = model.input_names
-    own = {
-        group: {name: value for name, value in getattr(settings, group).items() if name in names}
-        for group, names in known.items()
-    }
-    return settings.model_copy(update=own)
+    names = dict.fromkeys(("ranges", "fixed", "tied", "scale"), model.parameter_names)
+    names |= {"weights": model.output_names, "initial": model.state_names}
+    names["hold"] = model.input_names
+    return settings.model_copy(
+        update={
+            group: {name: v for name, v in getattr(settings, group).items() if name in allowed}
+            for group, allowed in names.items()
+        }
+    )
 
 
 def _check_space(file: YamlFile, settings: IdentificationConfig, model: ProcessModel) -> None:
-    ranges, fixed, tied, scale = (
-        settings.ranges, settings.fixed, settings.tied, settings.scale,
-    )  # fmt: skip
+    ranges, fixed, tied, scale = settings.ranges, settings.fixed, settings.tied, settings.scale
     # One parameter at a time first, so that the message can point at it.
     for name in ranges:
         _try_space(file, ("ranges", name), model, {name: ranges[name]})
     for name in scale:
-        own = {name: ranges[name]} if name in ranges else {}
+        single = {name: ranges[name]} if name in ranges else {}
         if name not in fixed and name not in tied:
-            _try_space(file, ("scale", name), model, own, scale={name: scale[name]})
+            _try_space(file, ("scale", name), model, single, scale={name: scale[name]})
     for name in tied:
         _try_space(file, ("tied", name), model, tied={name: tied[name]})
     groups = ("tied", "fixed", "scale", "ranges")

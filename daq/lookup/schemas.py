@@ -1,11 +1,11 @@
-"""JSON Schemas of every kind of file, over the installed protocols and backends; ``rig schema``."""
+"""JSON Schemas of every kind of file, over the installed protocols and backends."""
 
 from __future__ import annotations
 
 import inspect
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,22 +25,6 @@ from daq.plugins import Group, installed, load_plugin
 FOLDER = "schemas"
 
 _OF_ONES_OWN = {"type": "string", "pattern": r"\.py:\w+$", "description": "FILE.py:CLASS"}
-
-
-def schema_command(
-    folder: Path, write_pages: Callable[[], list[Path]] | None, as_json: bool
-) -> None:
-    """Write the schemas, and the reference pages if wanted."""
-    written = {"schemas": write_schemas(folder)}
-    if write_pages is not None:
-        written["reference"] = write_pages()
-    if as_json:
-        console.print_json({key: list(map(str, paths)) for key, paths in written.items()})
-        return
-    for paths in written.values():
-        for path in paths:
-            console.print_line(f"Written: {path}")
-    console.print_next(f"begin an experiment's YAML with the line {comment('experiment', folder)}")
 
 
 def comment(kind: str, folder: Path | str = FOLDER) -> str:

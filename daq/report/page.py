@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,11 +11,20 @@ from pathlib import Path
 from typing import Any
 
 from daq import notation
+from daq.identification.rows import Rows
+from daq.report.explanation import view
+from sysid import ProcessModel
 
 # In the order of the page.
 TOPICS = (
-    "parameters", "responses", "residuals", "frequency", "torque", "excitation", "search",
-)  # fmt: skip
+    "parameters",
+    "responses",
+    "residuals",
+    "frequency",
+    "torque",
+    "excitation",
+    "search",
+)
 _CODE = re.compile("`([^`]+)`")  # what is typed, in sentences
 _TEMPLATES = Path(__file__).parent / "templates"
 
@@ -29,26 +39,30 @@ class Drawing:
     svg: str
 
 
-def page(document: Mapping[str, Any], view: Mapping[str, Any], drawings: Sequence[Drawing]) -> str:
+def page(model: ProcessModel, document: Mapping[str, Any], drawings: Sequence[Drawing]) -> str:
     """The page of a report's document.
 
-    view: what the document does not hold, such as descriptions of the model. Every number shown
-    carries the document's own in ``data-value``.
+    Every number shown carries the document's own in ``data-value``.
     """
     first = next((drawing for drawing in drawings if drawing.topic == "responses"), None)
     ordered = sorted(drawings, key=lambda d: -1 if d is first else TOPICS.index(d.topic))
-    return _rendered("report.html.j2", document, view, ordered)
+    rows = Rows.of(document)
+    variables = {"rows": rows, **view(model, document, rows)}
+    return _rendered("report.html.j2", document, variables, ordered)
 
 
 def comparison_page(
-    document: Mapping[str, Any], view: Mapping[str, Any], drawings: Sequence[Drawing]
+    document: Mapping[str, Any], variables: Mapping[str, Any], drawings: Sequence[Drawing]
 ) -> str:
     """The page of a comparison's document, likewise; figures in their order."""
-    return _rendered("comparison.html.j2", document, view, drawings)
+    return _rendered("comparison.html.j2", document, variables, drawings)
 
 
 def _rendered(
-    name: str, document: Mapping[str, Any], view: Mapping[str, Any], drawings: Sequence[Drawing]
+    name: str,
+    document: Mapping[str, Any],
+    variables: Mapping[str, Any],
+    drawings: Sequence[Drawing],
 ) -> str:
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup, escape
@@ -63,30 +77,28 @@ def _rendered(
     environment.filters["unit"] = notation.unit_text
     environment.filters["number"] = lambda value, digits=3: Markup(_number(value, digits))
     environment.filters["plain"] = lambda value: Markup(notation.number_html(f"{value:g}"))
-    environment.filters["digits"] = _digits
     environment.filters["marked"] = lambda text: Markup(
         _CODE.sub(r"<code>\1</code>", str(escape(text)))
     )
     figures = [
-        {"name": d.name, "topic": d.topic, "caption": d.caption,
-         "svg": Markup(_inlined(d.svg, k)), "number": k}
-        for k, d in enumerate(drawings, 1)
-    ]  # fmt: skip
-    return environment.get_template(name).render(doc=document, figures=figures, **view)
+        {
+            "name": drawing.name,
+            "topic": drawing.topic,
+            "caption": drawing.caption,
+            "svg": Markup(_inlined(drawing.svg, k)),
+            "number": k,
+        }
+        for k, drawing in enumerate(drawings, 1)
+    ]
+    return environment.get_template(name).render(doc=document, figures=figures, **variables)
 
 
 def _number(value: float | None, digits: int) -> str:
     """A number for people, and the whole of it for machines."""
-    if value is None:
+    if value is None or not math.isfinite(value):
         return "–"
     shown = notation.number_html(notation.number(value, digits))
     return f'<span class="n" data-value="{value!r}">{shown}</span>'
-
-
-def _digits(one: Mapping[str, Any]) -> int:
-    if one.get("fixed") or "tied" in one:
-        return 4
-    return notation.digits(one["value"], one.get("std"))
 
 
 def _inlined(svg: str, number: int) -> str:
@@ -96,5 +108,5 @@ def _inlined(svg: str, number: int) -> str:
     return re.sub(r'(\bid="|url\(#|href="#)', partial(_apart, f"f{number}-"), body)
 
 
-def _apart(prefix: str, found: re.Match[str]) -> str:
-    return found[1] + prefix
+def _apart(prefix: str, attribute: re.Match[str]) -> str:
+    return attribute[1] + prefix

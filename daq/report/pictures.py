@@ -1,33 +1,38 @@
-"""From a finished identification to its figures: which are drawn, of which arrays."""
+"""Figures of an identification's report: which are drawn, of which arrays."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from daq.figures import style
 from daq.figures.bode import ComplexArray, Measured, bode
 from daq.figures.convergence import convergence
-from daq.figures.loops import Loop, hysteresis_loops
 from daq.figures.parameters import Determined, Searched, correlation, intervals, ranges
 from daq.figures.picture import Picture
+from daq.figures.plots import plot
 from daq.figures.residuals import Remainder, residual_correlations
 from daq.figures.responses import Response, responses
 from daq.figures.signals import Panel, signals
 from daq.figures.spectra import Spectrum, spectra
-from daq.identification.records import Loaded
-from daq.identification.result import NOTES
+from daq.findings import Axis
+from daq.identification.records import LoggedRecord
+from daq.identification.replay import Replay
+from daq.identification.rows import ParameterRow, Rows
 from daq.logs import capture
 from daq.logs.log import UNITS
-from sim_rig import torque_loops as resisting
 from sysid import Dataset, ModelError, equilibrium, evaluate, linearize
-from sysid.arrays import BoolArray, FloatArray
+from sysid.arrays import FloatArray
 from sysid.judging.residual_tests import residual_test
 from sysid.problem.metrics import mean_known
 from sysid.problem.model import ProcessModel
+from sysid.problem.plots import Evidence
 from sysid.response.frequency import FrequencyResponse, frequency_response, sampled_response
 
 if TYPE_CHECKING:
@@ -52,8 +57,8 @@ class Subject:
 
     model: ProcessModel
     document: Mapping[str, Any]
-    training: Sequence[Loaded]
-    validation: Sequence[Loaded]
+    training: Sequence[LoggedRecord]
+    validation: Sequence[LoggedRecord]
     training_runs: Sequence[Run]
     validation_runs: Sequence[Run]
     foreign: bool
@@ -62,8 +67,13 @@ class Subject:
     @property
     def vector(self) -> FloatArray:
         """All parameters, in the model's order."""
-        found = self.document["parameters"]
-        return np.array([float(found[name]["value"]) for name in self.model.parameter_names])
+        values = {row.name: row.value for row in self.rows.parameters}
+        return np.array([float(values[name]) for name in self.model.parameter_names])
+
+    @cached_property
+    def rows(self) -> Rows:
+        """The document's tables."""
+        return Rows.of(self.document)
 
 
 def pictures(subject: Subject) -> Iterator[Picture]:
@@ -73,9 +83,9 @@ def pictures(subject: Subject) -> Iterator[Picture]:
     yield from _excitation(subject)
     yield from _residuals(subject)
     yield from _search(subject.document)
-    yield from _parameters(subject.document)
+    yield from _parameters(subject.rows)
     yield from _frequency(subject)
-    yield from _torque(subject)
+    yield from _plots_of_model(subject)
 
 
 def _validation(subject: Subject) -> Iterator[Picture]:
@@ -83,7 +93,7 @@ def _validation(subject: Subject) -> Iterator[Picture]:
     against = "".join(f" and {name}" for name in subject.baselines)
     for place, word in _chosen(subject.model, logs, runs):
         simulated = {"identified": runs[place]}
-        simulated |= {name: own[place] for name, own in subject.baselines.items()}
+        simulated |= {name: free_runs[place] for name, free_runs in subject.baselines.items()}
         yield from _responses(
             subject.model, logs[place].dataset, simulated, "validation", word,
             f"Validation: data not used in the fit ({{log}}). Measured outputs, the identified "
@@ -103,18 +113,22 @@ def _training(subject: Subject) -> Iterator[Picture]:
 
 
 def _responses(
-    model: ProcessModel, log: Dataset, simulated: Mapping[str, Run], part: str, word: str,
+    model: ProcessModel,
+    log: Dataset,
+    simulated: Mapping[str, Run],
+    part: str,
+    word: str,
     caption: str,
-) -> Iterator[Picture]:  # fmt: skip
+) -> Iterator[Picture]:
     which = f"{log.name}, {word}" if word else log.name
     for first in range(0, len(model.outputs), _OUTPUTS_A_FIGURE):
-        some = range(first, min(first + _OUTPUTS_A_FIGURE, len(model.outputs)))
+        shown = range(first, min(first + _OUTPUTS_A_FIGURE, len(model.outputs)))
         more = f"from-{model.outputs[first].name}" if first else ""
         yield Picture(
             _stem(part, word, more),
             "responses",
             caption.format(log=which),
-            responses(log.time, [_response(model, log, simulated, j) for j in some]),
+            responses(log.time, [_response(model, log, simulated, j) for j in shown]),
         )
 
 
@@ -152,13 +166,13 @@ def _residuals(subject: Subject) -> Iterator[Picture]:
     data, run = part[0][0].dataset, part[1][0]
     if not np.isfinite(run).all():
         return
-    found = residual_test(data.outputs - run, data.inputs, data.input_noise)
+    test = residual_test(data.outputs - run, data.inputs, data.input_noise)
     names = subject.model.input_names
     remainders = [
         Remainder(
-            output.name, found.auto[:, j], float(found.auto_band[j]),
-            {names[i]: (found.cross[:, j, i], float(found.cross_band[j, i]))
-             for i in range(len(names)) if found.tested[i]},
+            output.name, test.auto[:, j], float(test.auto_band[j]),
+            {names[i]: (test.cross[:, j, i], float(test.cross_band[j, i]))
+             for i in range(len(names)) if test.tested[i]},
         )
         for j, output in enumerate(subject.model.outputs)
     ]  # fmt: skip
@@ -166,7 +180,7 @@ def _residuals(subject: Subject) -> Iterator[Picture]:
         "residuals", "residuals",
         f"Correlation of the residuals ({data.name}) with their own past and with past inputs, in "
         "parts of the 95 % band (grey): a model that explains all but white noise stays inside.",
-        residual_correlations(np.asarray(found.lags * data.dt), remainders),
+        residual_correlations(np.asarray(test.lags * data.dt), remainders),
     )  # fmt: skip
 
 
@@ -175,59 +189,66 @@ def _search(document: Mapping[str, Any]) -> Iterator[Picture]:
     history = np.asarray(search["history"], dtype=np.float64)
     before = float(document["error"]["before_refinement"])
     refined = len(history) and float(history[-1]) < before
+    stages = (
+        ". A genetic search over the whole range comes first, local least squares from its best "
+        "points then."
+    )
     yield Picture(
-        "convergence", "search",
+        "convergence",
+        "search",
         "Convergence of the search: the best error against simulations spent"
-        + (". A genetic search over the whole range comes first, local least squares from its "
-           "best points then." if refined else "."),
+        + (stages if refined else "."),
         convergence(history, int(search["population"]), before if refined else None),
-    )  # fmt: skip
+    )
 
 
-def _parameters(document: Mapping[str, Any]) -> Iterator[Picture]:
-    free = {name: one for name, one in document["parameters"].items() if "range" in one}
-    if free:
+def _parameters(rows: Rows) -> Iterator[Picture]:
+    if rows.free:
         yield Picture(
-            "ranges", "parameters",
+            "ranges",
+            "parameters",
             "Every free parameter in the range that it was searched in. Open circles have no "
             "interval: the data do not determine these by themselves.",
-            ranges([_searched(name, one) for name, one in free.items()]),
-        )  # fmt: skip
-    own = [name for name, one in free.items() if "interval" in one]
-    combined = [one for a in document.get("ambiguities", []) for one in a["determined"]]
-    quantities = [{"name": name, **free[name]} for name in own] + combined
+            ranges([_searched(row) for row in rows.free]),
+        )
+    quantities = [
+        Determined(row.name, row.value, *row.interval)
+        for row in (*rows.determined, *rows.combinations)
+        if row.interval is not None
+    ]
     if quantities:
         yield Picture(
-            "intervals", "parameters",
+            "intervals",
+            "parameters",
             "95 % intervals of all that the data determine: parameters by themselves, and "
             "combinations of those that act only together.",
-            intervals([Determined(q["name"], q["value"], *q["interval"]) for q in quantities]),
-        )  # fmt: skip
-    if len(own) > 1:
+            intervals(quantities),
+        )
+    names = [row.name for row in rows.determined]
+    if len(names) > 1:
         yield Picture(
-            "correlation", "parameters",
+            "correlation",
+            "parameters",
             "Correlation of the estimates that have an interval of their own. ±1 means that one "
             "is known only as well as the other.",
-            correlation(own, _correlations(own, document["correlations"])),
-        )  # fmt: skip
+            correlation(names, _correlations(names, rows)),
+        )
 
 
-def _searched(name: str, one: Mapping[str, Any]) -> Searched:
-    low, high = one["range"]
+def _searched(row: ParameterRow) -> Searched:
+    assert row.range is not None
     return Searched(
-        name, one["unit"], one["value"], low, high, one["scale"] == "log",
-        tuple(one["interval"]) if "interval" in one else None,
-        NOTES[one.get("undetermined", "bound" if one["on_bound"] else "")],
-    )  # fmt: skip
+        row.name, row.unit, row.value, *row.range, row.logarithmic, row.interval, row.label
+    )
 
 
-def _correlations(names: Sequence[str], pairs: Sequence[Mapping[str, Any]]) -> FloatArray:
+def _correlations(names: Sequence[str], rows: Rows) -> FloatArray:
     matrix = np.full((len(names), len(names)), np.nan)
     np.fill_diagonal(matrix, 1.0)
-    for pair in pairs:
-        if all(name in names for name in pair["parameters"]):
-            i, j = (names.index(name) for name in pair["parameters"])
-            matrix[i, j] = matrix[j, i] = pair["correlation"]
+    for pair, coefficient in rows.correlations.items():
+        if all(name in names for name in pair):
+            i, j = (names.index(name) for name in pair)
+            matrix[i, j] = matrix[j, i] = coefficient
     return matrix
 
 
@@ -280,28 +301,28 @@ def _model_responses(
 ) -> dict[str, ComplexArray]:
     """What the identified model does: through the estimate of the logs, and linearised."""
     runs = [*subject.training_runs, *subject.validation_runs]
-    found = {}
+    curves = {}
     if all(np.isfinite(run).all() for run in runs):
         simulated = [
             replace(record, outputs=np.where(np.isfinite(record.outputs), run, np.nan))
             for record, run in zip(records, runs, strict=True)
         ]
-        found["identified"] = frequency_response(simulated).response
+        curves["identified"] = frequency_response(simulated).response
     u = np.concatenate([record.inputs for record in records]).mean(axis=0)
     for name, held in _operating_points(subject.model, records).items():
         response = _linear_response(subject, u, held, frequency, records[0].dt)
         if response is not None:
-            found[name] = response
-    return found
+            curves[name] = response
+    return curves
 
 
 def _linear_response(
-    subject: Subject, u: FloatArray, held: dict[str, float], frequency: FloatArray, dt: float
+    subject: Subject, u: FloatArray, held: Mapping[str, float], frequency: FloatArray, dt: float
 ) -> ComplexArray | None:
     """The model linearised under constant inputs; None where it has no such operating point."""
     model, p = subject.model, subject.vector
     try:
-        linear = linearize(model, equilibrium(model, u, p, hold=held), u, p)
+        linear = linearize(model, equilibrium(model, u, p, hold=dict(held)), u, p)
         response = sampled_response(linear, frequency, dt, [i.hold for i in model.inputs])
     except (ModelError, ArithmeticError, ValueError, np.linalg.LinAlgError):
         return None  # singular there; the other curves say what there is
@@ -310,54 +331,34 @@ def _linear_response(
 
 def _operating_points(
     model: ProcessModel, records: Sequence[Dataset]
-) -> dict[str, dict[str, float]]:
-    """States to hold, by what the operating point is called."""
-    if not ("omega" in model.state_names and "omega" in model.output_names):
-        return {"linear, mean inputs": {}}
-    outputs = np.concatenate([record.outputs for record in records])
-    speeds = outputs[:, model.output_names.index("omega")]
-    speed = float(np.sqrt(np.nanmean(speeds**2)))
-    still = {name: 0.0 for name in ("theta",) if name in model.state_names}
-    return {
-        "linear, ω = 0": {"omega": 0.0, **still},
-        f"linear, ω = {speed:.3g} rad/s": {"omega": speed, **still},
-    }
+) -> Mapping[str, Mapping[str, float]]:
+    """States to hold, by the label of an operating point."""
+    brought = model.operating_points(model, records) if model.operating_points else {}
+    return brought or {"linear, mean inputs": {}}
 
 
-def _torque(subject: Subject) -> Iterator[Picture]:
-    loops = resisting.loops(subject.model, subject.vector, _swing(subject))
-    if loops:
+def _plots_of_model(subject: Subject) -> Iterator[Picture]:
+    """What the model itself brings."""
+    if subject.model.plots is None:
+        return
+    log = {} if subject.foreign else _columns(subject.training[0])
+    records = [logged.dataset for logged in subject.training]
+    for item in subject.model.plots(subject.model, Evidence(subject.vector, records, log)):
         yield Picture(
-            "hysteresis", "torque",
-            "Torque that resists the shaft in the identified model, driven at a sinusoidal speed "
-            "with the brake's current held: over the angle, and over the speed.",
-            hysteresis_loops(loops),
-        )  # fmt: skip
-    measured = [] if subject.foreign else _measured_torque(subject.training[0])
-    if measured:
-        yield Picture(
-            "torque-velocity", "torque",
-            "Torque at the sensor as measured in the training log, over the angle and over the "
-            "speed.",
-            hysteresis_loops(measured, points=True),
-        )  # fmt: skip
-
-
-def _swing(subject: Subject) -> resisting.Swing:
-    """A sinusoidal speed as fast as the logs', and currents within what was measured."""
-    names = subject.model.output_names
-    outputs = np.concatenate([log.dataset.outputs for log in subject.training])
-
-    def largest(name: str) -> float:
-        if name not in names:
-            return 0.0
-        return float(np.nanquantile(np.abs(outputs[:, names.index(name)]), 0.98))
-
-    return resisting.Swing(largest("omega"), largest("current_brake"))
+            item.name,
+            item.topic,
+            item.caption,
+            plot(
+                [Axis(axis.name, axis.unit) for axis in item.over],
+                Axis(item.quantity.name, item.quantity.unit),
+                {curve.label: curve.values for curve in item.curves},
+                item.points,
+            ),
+        )
 
 
 def _chosen(
-    model: ProcessModel, logs: Sequence[Loaded], runs: Sequence[Run]
+    model: ProcessModel, logs: Sequence[LoggedRecord], runs: Sequence[Run]
 ) -> list[tuple[int, str]]:
     """Which logs are shown, and as what: all of a few, else the middle, the worst, the best."""
     n = len(logs)
@@ -377,9 +378,9 @@ def _stem(*words: str) -> str:
     return "-".join(re.sub(r"[^\w.]+", "-", word) for word in words if word)
 
 
-def _pairs(found: FrequencyResponse) -> list[tuple[int, int]]:
+def _pairs(measured: FrequencyResponse) -> list[tuple[int, int]]:
     """For each output the input seen best in it, where one is seen at all."""
-    seen = np.sum(found.coherence > _FELT, axis=0)
+    seen = np.sum(measured.coherence > _FELT, axis=0)
     best = [(j, int(np.argmax(row))) for j, row in enumerate(seen)]
     return [(j, i) for j, i in best if seen[j, i] >= _FEWEST]
 
@@ -397,33 +398,40 @@ def _foreign_signals(model: ProcessModel, data: Dataset) -> Figure:
     return signals(data.time, [*inputs, *outputs])
 
 
-def _capture_signals(log: Loaded) -> Figure:
+def _capture_signals(log: LoggedRecord) -> Figure:
     """All channels: commands with what was applied of them, then the sensors."""
-    frame = capture.load(log.path).log.frame
-    known = {name: frame[name].to_numpy(dtype=np.float64) for name in UNITS if name in frame}
-    time = known.pop("t")
+    columns = _columns(log)
+    time = columns.pop("t")
     panels = []
-    for name in [name for name in known if name.startswith("cmd_")]:
-        applied = known.get(name.replace("cmd_", "applied_"))
-        lines = {"asked": known[name]} | ({} if applied is None else {"applied": applied})
+    for name in [name for name in columns if name.startswith("cmd_")]:
+        applied = columns.get(name.replace("cmd_", "applied_"))
+        lines = {"asked": columns[name]} | ({} if applied is None else {"applied": applied})
         panels.append(Panel(name.removeprefix("cmd_"), UNITS[name], lines, steps=True))
-    sensors = [name for name in known if not name.startswith(("cmd_", "applied_"))]
-    panels += [Panel(name, UNITS[name], {"": known[name]}) for name in sensors]
+    sensors = [name for name in columns if not name.startswith(("cmd_", "applied_"))]
+    panels += [Panel(name, UNITS[name], {"": columns[name]}) for name in sensors]
     return signals(time, panels)
 
 
-def _measured_torque(log: Loaded) -> list[Loop]:
-    """Torque of a capture over angle and speed, apart by whether the brake's current is high."""
+def _columns(log: LoggedRecord) -> dict[str, FloatArray]:
+    """Columns of a capture's log by name."""
     frame = capture.load(log.path).log.frame
-    if not {"theta", "omega", "torque", "current_brake"} <= set(frame):
-        return []
-    current = frame["current_brake"].to_numpy(dtype=np.float64)
-    middle = 0.5 * (float(np.nanmin(current)) + float(np.nanmax(current)))
+    return {name: frame[name].to_numpy(dtype=np.float64) for name in UNITS if name in frame}
 
-    def loop(word: str, rows: BoolArray) -> Loop:
-        angle, speed, torque = (
-            frame[name].to_numpy(dtype=np.float64)[rows] for name in ("theta", "omega", "torque")
+
+def draw_replay(replay: Replay, path: Path) -> None:
+    """Measured and simulated outputs in a figure at a path.
+
+    Raises ConfigError for a format that there is not, RunError where the disk refuses.
+    """
+    outputs = [
+        Response(
+            output.name,
+            output.unit,
+            replay.measured[:, j],
+            {"simulated": replay.simulated[:, j]},
+            f"fit {replay.metrics.fit[j]:.1f} %",
         )
-        return Loop(f"brake {word} {middle:.2g} A", angle, speed, torque)
-
-    return [loop("below", current < middle), loop("above", current >= middle)]
+        for j, output in enumerate(replay.model.outputs)
+    ]
+    kind = style.format_of(path)
+    capture.write_whole(path, style.render(responses(replay.time, outputs), kind))

@@ -10,22 +10,22 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from daq.cli import terminal as console
-from daq.cli.models import DEFAULT_MODEL
+from daq.documents import plain
 from daq.figures import style
 from daq.figures.picture import Picture
 from daq.figures.style import Format
-from daq.identification.baseline import Baseline, beside
-from daq.identification.records import Loaded
-from daq.identification.request import Asked
-from daq.identification.result import NOTES, Identified, errors_of
-from daq.identification.settings import Prepared
+from daq.identification.baseline import Baseline, baseline_of
+from daq.identification.records import LoggedRecord
+from daq.identification.request import SettingsRequest
+from daq.identification.result import Identification, errors_document
+from daq.identification.rows import Rows
 from daq.logs import capture
-from daq.report import latex as table
-from daq.report.explanation import view
+from daq.lookup.models import DEFAULT_MODEL
+from daq.progress import Progress, Watch, ignore
+from daq.report.latex import latex
 from daq.report.page import Drawing, page
 from daq.report.pictures import Subject, pictures
-from sysid.problem.metrics import Metrics
+from sysid import Metrics
 
 DATA, FIGURES = "report.json", "figures"
 _PAGE, _TABLE = "report.html", "parameters.tex"
@@ -33,45 +33,42 @@ _PAGE, _TABLE = "report.html", "parameters.tex"
 _STEPS = 18
 
 
-def publish(
-    prepared: Prepared,
-    result: Identified,
-    document: Mapping[str, Any],
-    folder: Path,
-    quiet: bool,
-) -> dict[str, str]:
+def publish(result: Identification, folder: Path, watch: Watch = ignore) -> dict[str, str]:
     """Write the report into a folder; the files by what they are.
 
-    document: as ``reporting.document`` makes it. Raises RunError where the disk refuses.
+    Raises RunError where the disk refuses.
     """
-    with console.progress(quiet) as bar:
-        bar.update("Report", 0, _STEPS, "linear baseline")
-        linear = beside(result.model, result.training_logs, result.validation_logs)
-        whole = console.plain(_whole(prepared, result, document, linear))
-        subject = Subject(
-            model=result.model,
-            document=whole,
-            training=result.training_logs,
-            validation=result.validation_logs,
-            training_runs=result.training_runs,
-            validation_runs=result.validation_runs,
-            foreign=prepared.mapping is not None,
-            baselines={linear.name: linear.runs} if isinstance(linear, Baseline) else {},
+    watch(Progress("Report", 0, _STEPS, "linear baseline"))
+    training = [fitted.log for fitted in result.training]
+    validation = [fitted.log for fitted in result.validation]
+    linear = baseline_of(result.model, training, validation)
+    document = plain(_document(result, linear))
+    subject = Subject(
+        model=result.model,
+        document=document,
+        training=training,
+        validation=validation,
+        training_runs=[fitted.run for fitted in result.training],
+        validation_runs=[fitted.run for fitted in result.validation],
+        foreign=result.problem.mapping is not None,
+        baselines={linear.name: linear.runs} if isinstance(linear, Baseline) else {},
+    )
+    drawings: list[Drawing] = []
+    for picture, files in draw(subject, folder / FIGURES, ["svg"]):
+        drawings.append(
+            Drawing(picture.name, picture.topic, picture.caption, files["svg"].decode())
         )
-        drawings = []
-        for one, files in draw(subject, folder / FIGURES, ["svg"]):
-            drawings.append(Drawing(one.name, one.topic, one.caption, files["svg"].decode()))
-            count = len(drawings)
-            bar.update("Report", min(count, _STEPS - 1), _STEPS, f"{count} figures")
-        pages = {
-            "report": (_PAGE, page(whole, view(result.model, whole), drawings)),
-            "data": (DATA, json.dumps(whole, indent=1) + "\n"),
-            "latex": (_TABLE, table.latex(whole, NOTES)),
-        }
-        for name, content in pages.values():
-            capture.write_whole(folder / name, content)
-        bar.update("Report", _STEPS, _STEPS, f"{len(drawings)} figures")
-    return {what: str(folder / name) for what, (name, _) in pages.items()}
+        count = len(drawings)
+        watch(Progress("Report", min(count, _STEPS - 1), _STEPS, f"{count} figures"))
+    pages = {
+        "report": (_PAGE, page(result.model, document, drawings)),
+        "data": (DATA, json.dumps(document, indent=1) + "\n"),
+        "latex": (_TABLE, latex(Rows.of(document))),
+    }
+    for name, content in pages.values():
+        capture.write_whole(folder / name, content)
+    watch(Progress("Report", _STEPS, _STEPS, f"{len(drawings)} figures"))
+    return {kind: str(folder / name) for kind, (name, _) in pages.items()}
 
 
 def draw(
@@ -86,35 +83,63 @@ def draw(
         yield picture, contents
 
 
-def _whole(
-    prepared: Prepared,
-    result: Identified,
-    document: Mapping[str, Any],
-    linear: Baseline | str,
-) -> dict[str, Any]:
-    """The document with what only the report tells."""
+def command_of(
+    request: SettingsRequest,
+    training: Sequence[LoggedRecord],
+    validation: Sequence[LoggedRecord],
+    models: Sequence[str],
+    more: Sequence[str],
+) -> str:
+    """What to type to identify the same again; more: words behind the options."""
+    paths = _paths(training)
+    words = ["rig", "identify", *map(str, paths)]
+    for path in _paths(validation):
+        if path not in paths:
+            words += ["--validate", str(path)]
+    if request.config is not None:
+        words += ["--config", request.config]
+    words += _option("model", list(models))
+    for name, value in (request.options or {}).items():
+        if name not in ("seed", "model"):
+            words += _option(name, value)
+    words += more
+    for setting in request.settings:
+        words += ["--set", setting]
+    return shlex.join(words)
+
+
+def fingerprints(
+    training: Sequence[LoggedRecord], validation: Sequence[LoggedRecord]
+) -> list[dict[str, Any]]:
+    """Size and hash of each log, so that it is known again."""
+    uses = (("training", training), ("validation", validation))
+    return [_fingerprint(log, use) for use, logs in uses for log in logs]
+
+
+def _document(result: Identification, linear: Baseline | str) -> dict[str, Any]:
+    """The identification's document with what only the report says."""
     now = datetime.datetime.now(datetime.UTC)
     meanings = {p.name: p.description for p in result.model.parameters}
-    search = {**document["search"], "history": [float(e) for e in result.estimator.history_]}
+    history = [float(error) for error in result.estimator.history_]
     return {
-        **{key: value for key, value in document.items() if key != "files"},
+        **result.document,
         "written": f"{now:%Y-%m-%d %H:%M} UTC",
         "parameters": {
-            name: {**one, "description": meanings[name]}
-            for name, one in document["parameters"].items()
+            name: {**entry, "description": meanings[name]}
+            for name, entry in result.document["parameters"].items()
         },
-        "search": search,
+        "search": {**result.document["search"], "history": history},
         "comparison": _comparison(result, linear),
-        "reproduction": _reproduction(prepared, result),
+        "reproduction": _reproduction(result),
     }
 
 
-def _comparison(result: Identified, linear: Baseline | str) -> dict[str, Any]:
+def _comparison(result: Identification, linear: Baseline | str) -> dict[str, Any]:
     if isinstance(linear, str):
         return {"left_out": linear}
 
     def logs(metrics: Sequence[Metrics]) -> list[dict[str, Any]]:
-        return [{"outputs": errors_of(result.model, one)} for one in metrics]
+        return [{"outputs": errors_document(result.model, errors)} for errors in metrics]
 
     return {
         "name": linear.name,
@@ -123,61 +148,31 @@ def _comparison(result: Identified, linear: Baseline | str) -> dict[str, Any]:
     }
 
 
-def _reproduction(prepared: Prepared, result: Identified) -> dict[str, Any]:
+def _reproduction(result: Identification) -> dict[str, Any]:
     """How to do it again: command, logs with their fingerprints, runs they came from."""
-    asked = prepared.asked
-    model = asked.options.get("model")
+    problem = result.problem
+    model = problem.request.option("model")
     models = [] if model in (None, DEFAULT_MODEL) else [model]
-    seed = ["--seed", str(result.settings.seed)]
-    training, validation = result.training_logs, result.validation_logs
+    seed = ["--seed", str(problem.settings.seed)]
+    training = [fitted.log for fitted in result.training]
+    validation = [fitted.log for fitted in result.validation]
     return {
-        "command": command_of(asked, training, validation, models, seed),
+        "command": command_of(problem.request, training, validation, models, seed),
         "folder": str(Path.cwd()),
-        "columns": asked.config if prepared.mapping is not None else None,
-        "hold_back": prepared.settings.hold_back,
+        "columns": problem.request.config if problem.mapping is not None else None,
+        "hold_back": problem.settings.hold_back,
         "logs": fingerprints(training, validation),
         "runs": [
             _run(record)
-            for path in _paths([*result.training_logs, *result.validation_logs])
+            for path in _paths([*training, *validation])
             if (record := capture.read_record(path)) is not None
         ],
     }
 
 
-def _paths(logs: Sequence[Loaded]) -> list[Path]:
+def _paths(logs: Sequence[LoggedRecord]) -> list[Path]:
     """Their files, each once: a log of which a part is held back stands for two."""
     return list(dict.fromkeys(log.path for log in logs))
-
-
-def command_of(
-    asked: Asked,
-    training: Sequence[Loaded],
-    validation: Sequence[Loaded],
-    models: Sequence[str],
-    more: Sequence[str],
-) -> str:
-    """What to type to identify the same again; more: words behind the options that were asked."""
-    paths = _paths(training)
-    words = ["rig", "identify", *map(str, paths)]
-    for path in _paths(validation):
-        if path not in paths:
-            words += ["--validate", str(path)]
-    if asked.config is not None:
-        words += ["--config", asked.config]
-    words += _option("model", list(models))
-    for name, value in asked.options.items():
-        if name not in ("seed", "model"):
-            words += _option(name, value)
-    words += more
-    for setting in asked.settings:
-        words += ["--set", setting]
-    return shlex.join(words)
-
-
-def fingerprints(training: Sequence[Loaded], validation: Sequence[Loaded]) -> list[dict[str, Any]]:
-    """What is said of each log, so that it is known again."""
-    uses = (("training", training), ("validation", validation))
-    return [_log(log, use) for use, logs in uses for log in logs]
 
 
 def _option(name: str, value: Any) -> list[str]:
@@ -187,10 +182,10 @@ def _option(name: str, value: Any) -> list[str]:
     if value is True:
         return [flag]
     values = value if isinstance(value, list | tuple) else [value]
-    return [word for one in values for word in (flag, str(one))]
+    return [word for item in values for word in (flag, str(item))]
 
 
-def _log(log: Loaded, use: str) -> dict[str, Any]:
+def _fingerprint(log: LoggedRecord, use: str) -> dict[str, Any]:
     return {
         "log": str(log.path),
         "name": log.dataset.name,
@@ -218,5 +213,5 @@ def _run(record: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _section(record: Mapping[str, Any], key: str) -> Mapping[str, Any]:
-    found = record.get(key)
-    return found if isinstance(found, dict) else {}
+    section = record.get(key)
+    return section if isinstance(section, dict) else {}

@@ -7,7 +7,7 @@ simulator compiles it to vector code, SciPy integrates it as the reference.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -140,6 +140,9 @@ class ProcessModel:
     tuple; it may use ``math`` and helper functions of its own. ``output(x, u, p)`` likewise
     returns the outputs; without it each output is the state of the same name.
     ``guesses(records, known)`` reads starting ranges from data, see ``sysid.problem.guesses``.
+    ``plots(model, evidence)`` shows more than the outputs, see ``sysid.problem.plots``, and
+    ``operating_points(model, records)`` says where to linearise: values of states to hold, by a
+    label; without it the mean inputs decide.
     ``equations`` say to people what the functions compute, one text each.
 
     Raises ModelError when names repeat, an output has no state, or a function returns the
@@ -156,6 +159,8 @@ class ProcessModel:
     constraints: tuple[Constraint, ...] = ()
     description: str = ""
     guesses: Callable[[Any, Any], Mapping[str, Any]] | None = None
+    plots: Callable[[Any, Any], Iterable[Any]] | None = None
+    operating_points: Callable[[Any, Any], Mapping[str, Mapping[str, float]]] | None = None
     equations: tuple[str, ...] = ()
     _output_states: tuple[int, ...] | None = field(default=None, init=False, repr=False)
 

@@ -90,8 +90,8 @@ def start_rig(*args, cwd, env=None, **options):
 # Imports what the commands import, then becomes a ``rig`` process per line of standard input.
 _FORKING = """
 import json, os, signal, sys, traceback
-import daq.cli, daq.cli.app, daq.cli.identify, daq.cli.models, daq.cli.replay
-import daq.cli.run, pandas, pint, protocols.prbs, sim_rig.actuator, sim_rig.backend
+import daq.cli, daq.cli.app, daq.identification.comparison, daq.identification.replay
+import daq.recording.preview, pandas, pint, protocols.prbs, sim_rig.actuator, sim_rig.backend
 
 for line in sys.stdin:
     job = json.loads(line)

@@ -8,9 +8,9 @@ import pandas as pd
 import pytest
 import yaml
 
-import daq.cli.campaign
-from daq.cli.campaign import Workers, parse_seeds
 from daq.errors import ConfigError
+from daq.identification import campaign as use_case
+from daq.identification.campaign import Workers, parse_seeds
 from tests.daq.support import rig, start_rig, until
 
 MODELS = """\
@@ -162,7 +162,7 @@ def test_mistakes_are_named_with_their_cure(folder, args, what):
 
 def test_a_scheduler_that_does_not_answer_is_named(monkeypatch):
     pytest.importorskip("distributed", reason="dask.distributed is not installed")
-    monkeypatch.setattr(daq.cli.campaign, "_CONNECT", 0.3)
+    monkeypatch.setattr(use_case, "CONNECT_TIMEOUT", 0.3)
     with (
         pytest.raises(
             ConfigError, match=r"no scheduler answers at tcp://127.0.0.1:9 .*dask worker"

@@ -10,9 +10,9 @@ import pytest
 import yaml
 from scipy.signal import periodogram
 
-from daq.cli.check import spectral_lines
 from daq.config.rig import RigConfig
 from daq.lookup.files import load_experiment
+from daq.recording.preview import spectral_lines
 from tests.daq.support import RIG, environment, forked_rig, write_experiment
 
 LOOP = '''

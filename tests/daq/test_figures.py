@@ -11,8 +11,8 @@ from daq.figures import style
 from daq.figures.bode import Measured, bode
 from daq.figures.convergence import convergence
 from daq.figures.findings import draw
-from daq.figures.loops import Loop, hysteresis_loops
 from daq.figures.parameters import Determined, Searched, correlation, intervals, ranges
+from daq.figures.plots import plot
 from daq.figures.rankings import Ratio, ratios
 from daq.figures.responses import Response, responses
 from daq.figures.signals import Panel, signals
@@ -43,7 +43,8 @@ def charts():
 
 def drawn():
     lost = np.where(TIME > 0.9, np.nan, WAVE)
-    loop = Loop("brake 0.1 A", TIME, WAVE, np.cos(20.0 * TIME))
+    loop = {"angle": TIME, "speed": WAVE, "torque": np.cos(20.0 * TIME)}
+    over, torque = (Axis("angle", "rad"), Axis("speed", "rad/s")), Axis("torque", "N*m")
     searched = [
         Searched("K_m", "N*m/A", 0.1, 0.01, 1.0, True, (0.09, 0.12)),
         Searched(NASTY, "1", 2.0, 1.0, 5.0, False, None, "only with others"),
@@ -66,8 +67,8 @@ def drawn():
         "bode": bode(FREQUENCY, Measured(LAG, np.abs(LAG), 0.1 * np.abs(LAG)),
                      {"identified": LAG, "linear, ω = 0": LAG, "linear, ω = 4.12 rad/s": 1.1 * LAG},
                      ("rad/s", "V")),
-        "loops": hysteresis_loops([loop, loop]),
-        "points": hysteresis_loops([loop], points=True),
+        "loops": plot(over, torque, {"brake 0.1 A": loop, "brake 0.2 A": loop}),
+        "points": plot(over, torque, {"brake 0.1 A": loop}, points=True),
         "ratios": ratios("lag", [Ratio(NASTY * 4, 1.1, 0.9, 1.3), Ratio("ARX", 80, 52, 136)]),
         "chart": draw(chart),
         "plane": draw(plane),

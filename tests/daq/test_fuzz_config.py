@@ -9,7 +9,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from daq.errors import ConfigError
-from daq.identification.settings import prepare
+from daq.identification.request import SettingsRequest
+from daq.identification.settings import problem_of
 from daq.lookup.files import load_experiment, load_rig
 from daq.lookup.shipped import EXPERIMENTS, RIGS, shipped_files
 
@@ -61,7 +62,7 @@ def content_of(path):
 FILES = [
     *((path.name, content_of(path), load_experiment) for path in shipped_files(EXPERIMENTS)),
     *((path.name, content_of(path), load_rig) for path in shipped_files(RIGS)),
-    ("identification.yaml", SETTINGS, lambda path: prepare(path, {})),
+    ("identification.yaml", SETTINGS, lambda path: problem_of(SettingsRequest(str(path)))),
 ]
 
 

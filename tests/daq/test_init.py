@@ -7,12 +7,12 @@ import jsonschema
 import pytest
 import yaml
 
-from daq.cli.init import settings_text
-from daq.cli.models import find_model
 from daq.config.identification import IdentificationConfig
 from daq.config.yaml_file import YamlFile
 from daq.identification.quantities import in_model_units
+from daq.lookup.models import find_model
 from daq.lookup.shipped import EXPERIMENTS, shipped_files
+from daq.lookup.starter import settings_text
 from tests.daq.support import forked_rig, rig
 
 

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from daq.cli.terminal import digits, engineering, number
 from daq.config.units import factor
+from daq.notation import digits, engineering, number
 
 
 @settings(deadline=None)  # the first conversion loads a library

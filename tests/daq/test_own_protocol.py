@@ -4,8 +4,7 @@ import json
 
 import pytest
 
-from daq import record
-from daq.cli.analyse import analyse_command
+from daq import analyse, record
 from daq.errors import ConfigError, RunError
 from tests.daq.support import only_capture, record_of, rig
 
@@ -200,5 +199,5 @@ def test_mistakes_in_findings_leave_the_run_and_name_their_line(written, tmp_pat
         ended["experiment"]["kind"] = kind
         (folder / "run.json").write_text(json.dumps(ended))
         with pytest.raises(RunError) as failed:
-            analyse_command(folder, as_json=False)
+            analyse(folder)
         assert says in str(failed.value)

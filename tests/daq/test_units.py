@@ -11,7 +11,8 @@ from pydantic import Field, ValidationError
 from daq.config.base import Section
 from daq.config.identification import Column
 from daq.config.units import Hertz, Part, RadiansPerSecond, Unit, Volts, factor, unit_of
-from daq.identification.settings import prepare
+from daq.identification.request import SettingsRequest
+from daq.identification.settings import problem_of
 from sim_rig.plant import Plant
 
 
@@ -100,7 +101,7 @@ def test_numbers_of_a_model_are_taken_in_its_units(tmp_path):
         "R_m: {value: 1180 mohm, fixed: true}\nL_b: {range: [100 mH, 0.2 H]}\n"
         "alpha0: {value: 10 mN*m, tolerance: 20 %}\n"
     )
-    prepared = prepare(config, {}, ["fixed.K_dm=0.1 kV/A"])
+    prepared = problem_of(SettingsRequest(str(config), settings=["fixed.K_dm=0.1 kV/A"]))
     settings = prepared.settings
     assert settings.ranges == {
         "L_m": pytest.approx((2e-4, 3e-3)),

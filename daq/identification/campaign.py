@@ -1,0 +1,304 @@
+"""Campaigns: every log with every model and every seed, over cores or a cluster."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from daq.errors import ConfigError
+from daq.identification import records
+from daq.identification.fit import assemble, check_writable, load_logs
+from daq.identification.records import LoggedRecord
+from daq.identification.request import SettingsRequest
+from daq.identification.result import Identification
+from daq.identification.settings import Problem, gassi_settings, problems_of
+from daq.logs import capture
+from daq.progress import Progress, Watch, ignore, warn
+from sysid import Campaign, ModelError, Outcome, Run
+from sysid import campaign as run_campaign
+
+_SEEDS_HELP = "write 0:10 for the seeds 0 to 9, or 3,5,8"
+_WRITE_EVERY = 2.0  # s
+CONNECT_TIMEOUT = 10.0  # s to wait for a scheduler's answer
+
+
+@dataclass(frozen=True)
+class Workers:
+    """Where runs are computed: so many processes here (-1 for all cores), or a dask cluster."""
+
+    jobs: int | None = None
+    dask: str | None = None
+
+    @contextmanager
+    def ready(self) -> Iterator[int | None]:
+        """Set joblib's backend; the number of jobs to ask it for."""
+        if self.jobs == 0:
+            raise ConfigError(
+                "--jobs: 0 runs at a time do nothing; give 1 or more, -1 for all cores"
+            )
+        if self.dask is None:
+            yield -1 if self.jobs is None else self.jobs
+            return
+        import joblib
+
+        with _client(self.dask) as client, joblib.parallel_config(backend="dask", client=client):
+            yield None
+
+
+@dataclass(frozen=True)
+class Group:
+    """Logs that one parameter set is fitted to, and those it is validated on, for one model."""
+
+    problem: Problem
+    name: str
+    training: list[LoggedRecord]
+    validation: list[LoggedRecord]
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """Model and logs, as a campaign's spread is sorted by."""
+        return self.problem.model_name, self.name
+
+    def runs(self, seeds: Sequence[int]) -> list[Run]:
+        """One run for each seed."""
+        settings = gassi_settings(self.problem.settings)
+        return [
+            Run(
+                self.problem.model,
+                [log.dataset for log in self.training],
+                settings,
+                seed,
+                self.problem.model_name,
+                self.name,
+                [log.dataset for log in self.validation],
+            )
+            for seed in seeds
+        ]
+
+    def result(self, outcome: Outcome) -> Identification:
+        """The finished identification of a run that did not fail."""
+        assert outcome.estimator is not None
+        settings = self.problem.settings.model_copy(update={"seed": outcome.run.seed})
+        problem = dataclasses.replace(self.problem, settings=settings)
+        return assemble(problem, outcome.estimator, self.training, self.validation)
+
+
+@dataclass(frozen=True)
+class CampaignRequest:
+    """Every log with every model and seed; together: one parameter set for all logs.
+
+    models: by name, none for the configuration's. seeds: ``0:10`` for 0 to 9, or ``3,5,8``.
+    """
+
+    logs: Sequence[Path]
+    validate: Sequence[Path] = ()
+    models: Sequence[str] = ()
+    seeds: str | None = None
+    settings: SettingsRequest = field(default_factory=SettingsRequest)
+    together: bool = False
+    workers: Workers = field(default_factory=Workers)
+    out: Path | None = None
+
+
+@dataclass(frozen=True)
+class CampaignResult:
+    """All runs of a campaign, and where they were written.
+
+    table: the CSV of all runs. files: parameters of the best run, by model and logs.
+    """
+
+    campaign: Campaign
+    table: Path
+    files: Mapping[tuple[str, str], Path]
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """The same for machines."""
+        return {
+            "runs": [outcome.row() for outcome in self.campaign.outcomes],
+            "spread": [
+                dataclasses.asdict(spread)
+                | (
+                    {"parameters_file": str(self.files[spread.model, spread.data])}
+                    if (spread.model, spread.data) in self.files
+                    else {}
+                )
+                for spread in self.campaign.spread()
+            ],
+            "interrupted": self.campaign.interrupted,
+            "software": capture.software_versions(),
+            "files": {"table": str(self.table)},
+        }
+
+
+def campaign(wanted: CampaignRequest, watch: Watch = ignore) -> CampaignResult:
+    """Identify every log with every model and seed; keep every result. Raises ConfigError."""
+    problems = problems_of(wanted.settings, distinct(wanted.models), watch)
+    seeds = parse_seeds(wanted.seeds) or [problems[0].settings.seed]
+    folder = wanted.out or _default_folder()
+    check_writable(folder)
+    groups = [
+        group
+        for problem in problems
+        for group in groups_of(problem, wanted.logs, wanted.validate, wanted.together)
+    ]
+    warn_of_logs(groups, watch)
+    runs = [run for group in groups for run in group.runs(seeds)]
+    result = run_all(runs, wanted.workers, watch, _TableKeeper(folder))
+    table = _write_table(folder, result)
+    by_key = {group.key: group for group in groups}
+    files = {
+        key: by_key[key].result(outcome).save(folder / f"best-{place}")
+        for place, (key, outcome) in enumerate(result.best().items(), 1)
+    }
+    return CampaignResult(result, table, files)
+
+
+def run_all(
+    runs: Sequence[Run], workers: Workers, watch: Watch, on_outcome: Callable[[Outcome], None]
+) -> Campaign:
+    """All runs with their progress; ConfigError when none of them succeeds."""
+    finished = 0
+
+    def report(outcome: Outcome) -> None:
+        nonlocal finished
+        finished += 1
+        on_outcome(outcome)
+        end = "failed" if outcome.problem else f"error {outcome.error:.3g}"
+        status = f"{finished}/{len(runs)} runs, {outcome.run.name}, seed {outcome.run.seed}: {end}"
+        watch(Progress("Identification", finished, len(runs), status))
+
+    with workers.ready() as jobs:
+        try:
+            result = run_campaign(runs, n_jobs=jobs, on_outcome=report)
+        except ModelError as error:  # a model that cannot travel to another process
+            raise ConfigError(str(error)) from None
+    if result.failed and len(result.failed) == len(result.outcomes):
+        raise ConfigError(result.failed[0].problem)
+    if result.interrupted and not result.outcomes:
+        raise KeyboardInterrupt
+    return result
+
+
+def groups_of(
+    problem: Problem, logs: Sequence[Path], validate: Sequence[Path], together: bool
+) -> list[Group]:
+    """The logs for one model, each by itself or all together, less what is held back of them."""
+    training, validation = load_logs(problem, logs, validate)
+    names = [_joint_name(training)] if together else _log_names(training)
+    sets = [training] if together else [[log] for log in training]
+    groups = []
+    for name, train in zip(names, sets, strict=True):
+        begins, ends = records.hold_back(train, problem.settings.hold_back)
+        groups.append(Group(problem, name, begins, [*ends, *validation]))
+    return groups
+
+
+def warn_of_logs(groups: Sequence[Group], watch: Watch) -> None:
+    """Say once of each log that its run did not complete."""
+    warnings = [log.warning for group in groups for log in (*group.training, *group.validation)]
+    warn(watch, *dict.fromkeys(warnings))
+
+
+def parse_seeds(text: str | None) -> list[int]:
+    """``0:10`` as the seeds 0 to 9, ``3,5,8`` or ``7`` as they stand; nothing for None."""
+    if text is None:
+        return []
+    try:
+        if ":" in text:
+            first, end = text.split(":")
+            seeds = list(range(int(first or 0), int(end)))
+        else:
+            seeds = [int(part) for part in text.split(",")]
+    except ValueError:
+        raise ConfigError(f"--seeds: {text!r} is no list of seeds; {_SEEDS_HELP}") from None
+    if not seeds:
+        raise ConfigError(f"--seeds: {text!r} holds no seed; {_SEEDS_HELP}")
+    for seed in seeds:
+        if not 0 <= seed < 2**32:
+            raise ConfigError(f"--seeds: {seed} is outside 0 .. 4294967295; {_SEEDS_HELP}")
+    return list(dict.fromkeys(seeds))
+
+
+def distinct(models: Sequence[str]) -> list[str | None]:
+    """The models named, None for the default; ConfigError when one is named twice."""
+    for name in models:
+        if models.count(name) > 1:
+            raise ConfigError(f"--model: {name} is given twice; name each model once")
+    return [*models] or [None]
+
+
+class _TableKeeper:
+    """Writes the table as outcomes come, so that little is lost with a campaign that is killed."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._outcomes: list[Outcome] = []
+        self._written = -math.inf
+
+    def __call__(self, outcome: Outcome) -> None:
+        self._outcomes.append(outcome)
+        # Not each of thousands: writing is of all that there is.
+        if time.monotonic() - self._written > _WRITE_EVERY:
+            _write_table(self._folder, Campaign(tuple(self._outcomes)))
+            self._written = time.monotonic()
+
+
+@contextmanager
+def _client(address: str) -> Iterator[Any]:
+    try:
+        import distributed
+    except ImportError:
+        raise ConfigError(
+            "--dask: dask is not installed; install it with: pip install 'hybrid-rig[cluster]'"
+        ) from None
+    connect: Any = distributed.Client
+    try:
+        client = connect(address, timeout=CONNECT_TIMEOUT, set_as_default=False)
+    except (OSError, ValueError, TimeoutError) as error:
+        raise ConfigError(
+            f"--dask: no scheduler answers at {address} ({type(error).__name__}); start one with "
+            "'dask scheduler', workers with 'dask worker ADDRESS', and give the address that it "
+            "prints, as tcp://192.168.0.10:8786"
+        ) from None
+    with client:
+        if not client.ncores():
+            raise ConfigError(
+                f"--dask: the scheduler at {address} has no workers; start some with "
+                f"'dask worker {address}'"
+            )
+        yield client
+
+
+def _default_folder() -> Path:
+    now = datetime.datetime.now(datetime.UTC)
+    return Path("campaigns") / f"{now:%Y%m%dT%H%M%SZ}"
+
+
+def _log_names(logs: Sequence[LoggedRecord]) -> list[str]:
+    """Names that tell logs apart: the capture folder's, or the file's."""
+    names = [
+        log.path.parent.name if log.path.name == capture.LOG_NAME else log.path.stem for log in logs
+    ]
+    return [
+        str(log.path) if names.count(name) > 1 else name
+        for name, log in zip(names, logs, strict=True)
+    ]
+
+
+def _joint_name(logs: Sequence[LoggedRecord]) -> str:
+    return _log_names(logs)[0] if len(logs) == 1 else f"{len(logs)} logs"
+
+
+def _write_table(folder: Path, result: Campaign) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / "campaign.csv"
+    capture.write_whole(path, result.frame().to_csv(index=False, lineterminator="\n"))
+    return path

@@ -1,0 +1,268 @@
+"""Comparison of models, seeds and linear baselines: which structure to believe."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from daq.errors import ConfigError
+from daq.identification.campaign import (
+    Group,
+    Workers,
+    distinct,
+    groups_of,
+    parse_seeds,
+    run_all,
+    warn_of_logs,
+)
+from daq.identification.fit import check_writable, default_folder
+from daq.identification.request import SettingsRequest
+from daq.identification.result import Identification
+from daq.identification.settings import problems_of
+from daq.logs import capture
+from daq.progress import Watch, ignore, warn
+from sysid import Campaign, Candidate, Comparison, ModelError, Outcome, Spread
+from sysid import compare as compare_candidates
+from sysid.judging.comparison import Row
+from sysid.linear import ARMAX, ARX, tuned
+
+_FORMULA = (
+    "AIC = n_e ln det S + 2 k, BIC = n_e ln det S + k ln n_e; S: mean square of the training "
+    "residuals of all outputs, n_e: independent samples they are worth, k: determined parameters"
+)
+
+
+@dataclass(frozen=True)
+class ComparisonRequest:
+    """Structures to be compared on logs: models by name, linear baselines, several seeds.
+
+    baselines: ``ARX``, ``ARMAX``. seeds: ``0:10`` for 0 to 9, or ``3,5,8``.
+    """
+
+    logs: Sequence[Path]
+    validate: Sequence[Path] = ()
+    models: Sequence[str] = ()
+    baselines: Sequence[str] = ()
+    seeds: str | None = None
+    settings: SettingsRequest = field(default_factory=SettingsRequest)
+    workers: Workers = field(default_factory=Workers)
+    out: Path | None = None
+
+
+@dataclass(frozen=True)
+class SeedsResult:
+    """One structure identified with several seeds: the best run, and all of them."""
+
+    best: Identification
+    campaign: Campaign
+
+
+@dataclass(frozen=True)
+class ComparisonResult:
+    """Structures ranked by validation.
+
+    group: the logs, as the first model used them. candidates: with their free runs. files:
+    parameters by model. request_words: what the command line named besides models and logs.
+    """
+
+    comparison: Comparison
+    group: Group
+    candidates: Sequence[Candidate]
+    campaign: Campaign
+    files: Mapping[str, Path]
+    folder: Path
+    request_words: Sequence[str]
+
+    @property
+    def outputs(self) -> Sequence[str]:
+        """Names of the outputs."""
+        return self.group.problem.model.output_names
+
+    @property
+    def file(self) -> Path:
+        """Where the document was written."""
+        return self.folder / "comparison.yaml"
+
+    @cached_property
+    def document(self) -> dict[str, Any]:
+        """What ``comparison.yaml`` holds."""
+        return _document(self)
+
+
+def compare(wanted: ComparisonRequest, watch: Watch = ignore) -> ComparisonResult | SeedsResult:
+    """Identify every structure from the logs and rank them; of one with several seeds the best.
+
+    Raises ConfigError.
+    """
+    if wanted.seeds is not None and wanted.settings.option("seed") is not None:
+        raise ConfigError("--seed and --seeds: give one of them")
+    problems = problems_of(wanted.settings, distinct(wanted.models), watch)
+    seeds = parse_seeds(wanted.seeds) or [problems[0].settings.seed]
+    alone = len(problems) == 1 and not wanted.baselines
+    folder = wanted.out or default_folder(
+        wanted.logs, problems[0].model.name if alone else "comparison"
+    )
+    if wanted.out is None and not alone:
+        folder = folder.with_name("comparison")
+    check_writable(folder)
+    groups = [groups_of(p, wanted.logs, wanted.validate, together=True)[0] for p in problems]
+    _require_same_outputs(groups)
+    warn_of_logs(groups, watch)
+    runs = [run for group in groups for run in group.runs(seeds)]
+    campaign = run_all(runs, wanted.workers, watch, lambda outcome: None)
+    best = {name: outcome for (name, _), outcome in campaign.best().items()}
+    fitted = [g for g in groups if g.problem.model_name in best]
+    if alone:
+        result = fitted[0].result(best[fitted[0].problem.model_name])
+        (spread,) = campaign.spread()
+        result = replace(result, folder=folder, seeds=_spread_document(spread))
+        result.save(folder)
+        return SeedsResult(result, campaign)
+    candidates = _candidates(fitted, best, wanted.baselines, watch)
+    ranking = _rank(fitted[0], candidates)
+    files = {
+        name: group.result(best[name]).save(folder / _folder_name(place, name))
+        for place, group in enumerate(fitted, 1)
+        if (name := group.problem.model_name)
+    }
+    words = [f"--{name.lower()}" for name in wanted.baselines]
+    words += ["--seeds", wanted.seeds] if wanted.seeds is not None else ["--seed", f"{seeds[0]}"]
+    compared = ComparisonResult(ranking, groups[0], candidates, campaign, files, folder, words)
+    text = yaml.safe_dump(dict(compared.document), sort_keys=False, allow_unicode=True)
+    capture.write_whole(compared.file, text)
+    return compared
+
+
+def _require_same_outputs(groups: Sequence[Group]) -> None:
+    first = groups[0].problem
+    for group in groups[1:]:
+        problem = group.problem
+        if problem.model.output_names != first.model.output_names:
+            raise ConfigError(
+                f"--model: {first.model_name} has the outputs "
+                f"{', '.join(first.model.output_names)}, {problem.model_name} "
+                f"{', '.join(problem.model.output_names)}; to be compared they must have the "
+                "same, chosen with 'outputs' in a file given with --config"
+            )
+
+
+def _candidates(
+    groups: Sequence[Group],
+    best: Mapping[str, Outcome],
+    baselines: Sequence[str],
+    watch: Watch,
+) -> list[Candidate]:
+    """Every structure fitted, with its free runs."""
+    candidates = []
+    for group in groups:
+        name = group.problem.model_name
+        estimator = best[name].estimator
+        assert estimator is not None
+        candidates.append(Candidate.of(name, estimator, *_datasets(group)))
+    training, validation = _datasets(groups[0])
+    for kind in baselines:
+        try:
+            selection = tuned({"ARX": ARX, "ARMAX": ARMAX}[kind](stable=True), training)
+        except ModelError as error:
+            warn(watch, f"{kind} is left out: {error}")
+            continue
+        orders = ",".join(f"{name}={order}" for name, order in selection.best.orders.items())
+        candidates.append(Candidate.of(f"{kind}:{orders}", selection.model, training, validation))
+    return candidates
+
+
+def _datasets(group: Group) -> tuple[list[Any], list[Any]]:
+    return [log.dataset for log in group.training], [log.dataset for log in group.validation]
+
+
+def _rank(group: Group, candidates: Sequence[Candidate]) -> Comparison:
+    weights = group.problem.settings.weights
+    names = group.problem.model.output_names
+    try:
+        return compare_candidates(
+            candidates,
+            *_datasets(group),
+            weights=np.array([weights.get(name, 1.0) for name in names]),
+        )
+    except ModelError as error:
+        raise ConfigError(str(error)) from None
+
+
+def _document(result: ComparisonResult) -> dict[str, Any]:
+    comparison, campaign, group = result.comparison, result.campaign, result.group
+    spreads = {spread.model: spread for spread in campaign.spread()}
+    rows = []
+    for row in comparison.rows:
+        entry = _row_document(row, result.outputs)
+        if row.name in spreads:
+            entry["seeds"] = _spread_document(spreads[row.name])
+            entry["parameters_file"] = str(result.files[row.name])
+        rows.append(entry)
+    return {
+        "preferred": comparison.preferred,
+        "verdict": comparison.verdict,
+        "validated": comparison.validated,
+        "training": [str(log.path) for log in group.training],
+        "validation": [str(log.path) for log in group.validation],
+        "structures": rows,
+        "criteria": {
+            "formula": _FORMULA,
+            "samples": comparison.n_samples,
+            "independent_samples": comparison.n_independent,
+        },
+        "failed": [f"{o.run.name}, seed {o.run.seed}: {o.problem}" for o in campaign.failed],
+        "interrupted": campaign.interrupted,
+        "software": capture.software_versions(),
+    }
+
+
+def _row_document(row: Row, outputs: Sequence[str]) -> dict[str, Any]:
+    entry: dict[str, Any] = {
+        "name": row.name,
+        "verdict": row.verdict,
+        "free_parameters": row.n_free,
+        "effective_parameters": row.n_effective,
+        "training_error": row.training_error,
+        "daic": row.daic,
+        "dbic": row.dbic,
+    }
+    if not np.isnan(row.rmse).all():
+        entry["outputs"] = {
+            name: {
+                "rmse": float(row.rmse[j]),
+                "msd": float(row.msd[j]),
+                "fit_percent": float(row.fit[j]),
+            }
+            for j, name in enumerate(outputs)
+        }
+    if row.ratio is not None:
+        entry["squared_errors_relative"] = {
+            "value": row.ratio.value,
+            "interval_95": [row.ratio.low, row.ratio.high],
+            "p_value": row.ratio.p_value,
+        }
+    return entry
+
+
+def _spread_document(spread: Spread) -> dict[str, Any]:
+    return {
+        "runs": spread.runs,
+        "failed": spread.failed,
+        "best": spread.best,
+        "median": spread.median,
+        "worst": spread.worst,
+        "within_1_percent": spread.agreeing,
+    }
+
+
+def _folder_name(place: int, name: str) -> str:
+    """A folder for a model's results: its place, and what of its name a file system takes."""
+    last = name.replace("\\", "/").rpartition("/")[2]
+    return f"{place}-" + re.sub(r"[^A-Za-z0-9.=,-]+", "-", last)[:80]

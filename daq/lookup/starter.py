@@ -1,0 +1,100 @@
+"""Commented files to begin with: an experiment, a rig and settings of an identification."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from daq.config.schema import Schema
+from daq.config.yaml_file import suggestion
+from daq.errors import ConfigError, RunError
+from daq.logs import capture
+from daq.lookup import schemas
+from daq.lookup.shipped import EXPERIMENTS, RIGS, shipped_files
+
+RIG, SETTINGS = "rig.yaml", "identification.yaml"
+_HEAD = """\
+# Settings of an identification, all of which may be left out:
+#   rig identify RUN --config identification.yaml
+# Keys behind a '#' show the default, or an example, of what else can be set.
+"""
+_ACTIVE = {"model": "actuator", "preset": "default"}
+
+
+@dataclass(frozen=True)
+class StarterFiles:
+    """Files that were written, files that were there before, and the folder of schemas.
+
+    validated: whether the experiment has a validation run.
+    """
+
+    written: list[Path]
+    kept: list[Path]
+    schemas: Path
+    validated: bool
+
+
+def write_starter(folder: Path, protocol: str, rig: str) -> StarterFiles:
+    """Write the files that are not there yet. Raises ConfigError for names of nothing shipped."""
+    experiment = f"{protocol}.yaml"
+    texts = {
+        experiment: _copy(EXPERIMENTS, protocol, "protocol", "experiment"),
+        RIG: _copy(RIGS, rig, "rig", "rig"),
+        SETTINGS: settings_text(),
+        **_companions(protocol),
+    }
+    capture.make_folder(folder)
+    written = [folder / name for name, text in texts.items() if _write_new(folder / name, text)]
+    kept = [folder / name for name in texts if folder / name not in written]
+    schemas.write_schemas(folder / schemas.FOLDER)
+    validated = "\nvalidation:" in texts[experiment]
+    return StarterFiles(written, kept, folder / schemas.FOLDER, validated)
+
+
+def settings_text() -> str:
+    """A file of an identification's settings in which all but two stand as comments."""
+    schema = schemas.documents({}, {})["identification"]
+    items = sorted(schema["properties"].items(), key=lambda item: item[0] not in _ACTIVE)
+    settings = "\n".join(_setting(name, item) for name, item in items)
+    return f"{schemas.comment('identification')}\n{_HEAD}\n{settings}"
+
+
+def _setting(name: str, item: Schema) -> str:
+    value = _ACTIVE.get(name, item.get("default"))
+    if "examples" in item:
+        value = item["examples"][0]
+    mark = "" if name in _ACTIVE else "#"
+    return f"# {item['description']}\n{mark}{name}: {schemas.as_yaml(value)}\n"
+
+
+def _copy(packages: Sequence[str], name: str, option: str, kind: str) -> str:
+    """A shipped file's text, for a folder that has its schema in it."""
+    shipped = {path.stem: path for path in shipped_files(packages)}
+    if name not in shipped:
+        raise ConfigError(
+            f"--{option}: no {name!r} to begin with; {suggestion(name, list(shipped))}"
+        )
+    text = shipped[name].read_text(encoding="utf-8")
+    return f"{schemas.comment(kind)}\n{schemas.without_comment(text)}"
+
+
+def _companions(protocol: str) -> dict[str, str]:
+    """Tables that a shipped experiment reads, which lie beside it under its name."""
+    shipped = next(path for path in shipped_files(EXPERIMENTS) if path.stem == protocol)
+    return {
+        path.name: path.read_text(encoding="utf-8")
+        for path in shipped.parent.glob(f"{protocol}.csv")
+    }
+
+
+def _write_new(path: Path, text: str) -> bool:
+    """Whether the file was written; one that is there stays as it is."""
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            file.write(text)
+    except FileExistsError:
+        return False
+    except OSError as error:
+        raise RunError(f"{path}: cannot be written: {error.strerror}") from None
+    return True

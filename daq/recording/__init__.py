@@ -1,0 +1,1 @@
+"""Experiments from file to findings: previewed, recorded, analysed."""

@@ -1,0 +1,151 @@
+"""What a protocol concludes from its run, in numbers, tables and figures."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from daq.documents import plain
+from daq.errors import ConfigError, RigError, RunError
+from daq.experiment import ClosedLoop, Experiment
+from daq.findings import Findings
+from daq.logs import capture
+from daq.logs.log import load_log
+from daq.lookup.files import find_protocol
+from daq.progress import Watch, ignore, warn
+from daq.run.protocol_calls import MISTAKES, mistake, place
+
+RESULTS = "results"
+
+
+@dataclass(frozen=True)
+class Analysis:
+    """Findings from a capture folder; they stand in its ``results``, too."""
+
+    folder: Path
+    findings: Findings
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """The same for machines."""
+        return findings_document(self.findings, self.folder)
+
+
+def analyse(folder: str | Path, *, watch: Watch = ignore) -> Analysis:
+    """Conclude from a capture what its protocol is for, however old it is.
+
+    Raises ConfigError for what is no capture, or one of a protocol that only excites; RunError
+    where nothing follows.
+    """
+    folder = Path(folder)
+    warn(watch, capture.describe_end(capture.log_path(folder), torn=False))
+    experiment = recorded_experiment(folder)
+    findings = conclude(experiment, folder)
+    if findings is None:
+        raise ConfigError(
+            f"{folder}: the protocol {experiment.protocol!r} only excites, and concludes nothing "
+            f"by itself; rig identify {folder} finds parameters"
+        )
+    return Analysis(folder, findings)
+
+
+def recorded_experiment(folder: Path) -> Experiment:
+    """The experiment that a capture folder says was run; ConfigError when it does not."""
+    path = folder / capture.RUN_NAME
+    record = capture.read_record(capture.log_path(folder))
+    if record is None:
+        raise ConfigError(f"{path}: there is no such file; give a capture folder that rig run made")
+    settings = record.get("experiment")
+    if not isinstance(settings, dict) or not isinstance(settings.get("protocol"), str):
+        raise ConfigError(f"{path}: experiment.protocol: the name of a protocol is missing")
+    kind = find_protocol(settings["protocol"], folder)
+    # Beside the settings stands what the protocol made of them.
+    written = {name: value for name, value in settings.items() if name != "excitation"}
+    try:
+        return kind.model_validate(written)
+    except ValueError as error:
+        raise ConfigError(f"{path}: experiment: {error}") from None
+
+
+def conclude_or_warn(
+    experiment: Experiment, folder: Path, watch: Watch = ignore
+) -> Findings | None:
+    """What follows from a run that has just ended; a warning says why nothing does."""
+    try:
+        return conclude(experiment, folder)
+    except RigError as error:
+        warn(watch, str(error))
+        return None
+
+
+def conclude(experiment: Experiment, folder: Path) -> Findings | None:
+    """What an experiment's protocol concludes from a capture, written to its ``results``.
+
+    None of a protocol that only excites. Raises RunError where nothing follows, or the protocol
+    has a mistake.
+    """
+    if type(experiment).findings is Experiment.findings:
+        return None
+    extra = tuple(experiment.columns) if isinstance(experiment, ClosedLoop) else ()
+    log = load_log(folder / capture.LOG_NAME, extra)
+    columns = {name: log.frame[name].to_numpy() for name in extra if name in log.frame}
+    try:
+        findings = experiment.findings(log.samples(), columns)
+        if findings is not None and not isinstance(findings, Findings):
+            raise TypeError(f"it returned {findings!r}; return daq.findings.Findings or None")
+    except ValueError as error:
+        at = place(error, type(experiment))
+        raise RunError(f"{folder}: no result: {error}{at}") from None
+    except MISTAKES as error:
+        raise RunError(
+            f"{folder}: no result: {mistake(experiment, 'in findings()', error)}"
+        ) from error
+    if findings is not None:
+        _write(findings, folder / RESULTS)
+    return findings
+
+
+def findings_document(findings: Findings, folder: Path) -> dict[str, Any]:
+    """Findings for machines, and the files that they were written to."""
+    written = [str(path) for path in sorted((folder / RESULTS).iterdir())]
+    return {**_contents(findings), "files": written}
+
+
+def _contents(findings: Findings) -> dict[str, Any]:
+    return {
+        "numbers": {
+            n.name: {"value": n.value, "unit": n.unit, "low": n.low, "high": n.high}
+            for n in findings.numbers
+        },
+        "tables": {t.name: {k: v.tolist() for k, v in t.columns.items()} for t in findings.tables},
+        "ranges": {name: list(ends) for name, ends in findings.ranges.items()},
+        "remarks": list(findings.remarks),
+    }
+
+
+def _write(findings: Findings, folder: Path) -> None:
+    """Tables as CSV, figures, and all in findings.json."""
+    from daq.figures import style
+    from daq.figures.findings import draw
+
+    capture.make_folder(folder)
+    for table in findings.tables:
+        rows = np.column_stack(list(table.columns.values()))
+        lines = [",".join(table.columns), *(",".join(map(repr, row)) for row in rows.tolist())]
+        capture.write_whole(folder / f"{table.name}.csv", "\n".join(lines) + "\n")
+    for chart in findings.figures:
+        figure = draw(chart)
+        for kind in style.PRINTED:
+            capture.write_whole(folder / f"{chart.name}.{kind}", style.render(figure, kind))
+    text = json.dumps(plain(_contents(findings)), indent=2)
+    capture.write_whole(folder / "findings.json", text + "\n")
+    # Of an earlier analysis with another protocol's text.
+    (folder / "ranges.yaml").unlink(missing_ok=True)
+    if findings.ranges:
+        lines = ["# Starting ranges for rig identify --config", "ranges:"]
+        lines += [f"  {k}: [{low:.6g}, {high:.6g}]" for k, (low, high) in findings.ranges.items()]
+        capture.write_whole(folder / "ranges.yaml", "\n".join(lines) + "\n")

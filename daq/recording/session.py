@@ -1,0 +1,162 @@
+"""An experiment on a rig, from their files to capture folders."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from daq.config.rig import RigConfig
+from daq.diagnose import currents
+from daq.errors import ConfigError
+from daq.experiment import Plan
+from daq.findings import Findings
+from daq.hal import Device, Phase, Reporting
+from daq.logs.capture import LOG_NAME, Recording, load
+from daq.lookup.files import LoadedExperiment, load_experiment, load_rig, rig_for, together
+from daq.progress import Level, Note, Progress, Started, Watch, ignore, warn
+from daq.recording.analysis import conclude_or_warn
+from daq.run.runner import PhaseProgress, RunResult, run_experiment
+
+_ACTIVITIES = {
+    Phase.CALIBRATION: "Offset calibration",
+    Phase.HOMING: "Winding the load",
+    Phase.RUN: "Exciting and logging",
+}
+
+
+@dataclass(frozen=True)
+class Session:
+    """An experiment and the rig it is for, both checked; plan: what the experiment will do.
+
+    validation: the same experiment as its ``validation`` section changes it.
+    """
+
+    loaded: LoadedExperiment
+    validation: LoadedExperiment | None
+    rig: RigConfig
+    device: Device
+    plan: Plan
+
+    def record(
+        self, out: Path, *, validation: bool = False, watch: Watch = ignore
+    ) -> SessionResult:
+        """Run the experiment, and then its validation run where there is one and it is wanted.
+
+        Raises DeviceError, InterlockError, RunError, KeyboardInterrupt or Terminated; outputs are
+        zero then.
+        """
+        run = _run(self.loaded, self.rig, self.device, out, watch)
+        findings = conclude_or_warn(self.loaded.experiment, run.folder, watch)
+        second = None
+        if validation and self.validation is not None:
+            second = _run(self.validation, self.rig, self.device, out, watch)
+        doubts = currents.notes(run.folder / LOG_NAME, self.rig)
+        return SessionResult(run, second, findings, doubts)
+
+
+@dataclass(frozen=True)
+class SessionResult:
+    """Runs that were recorded, and what follows from the first.
+
+    doubts: what is wrong with sensors or amplifiers by its log, with the cure.
+    """
+
+    run: RunResult
+    validation: RunResult | None
+    findings: Findings | None
+    doubts: list[str]
+
+
+def open_session(
+    experiment: str,
+    rig: str | None = None,
+    port: str | None = None,
+    realtime: bool = False,
+    options: Mapping[str, Any] | None = None,
+    watch: Watch = ignore,
+) -> Session:
+    """Read and check an experiment, its validation run and a rig; ConfigError with all mistakes.
+
+    rig: default what the experiment's file says it is for. port, realtime, options: settings of
+    its backend over those of its file.
+    """
+    loaded, (config, device) = together(
+        lambda: load_experiment(experiment),
+        lambda: _rig_on(rig or rig_for(experiment), port, realtime, options or {}, watch),
+    )
+    # Checked even where it will not run: a mistake in the file is best heard of early.
+    validation = loaded.validation()
+    runs = [run for run in (loaded, validation) if run is not None]
+    plans = together(*[partial(run.plan, config) for run in runs])
+    return Session(loaded, validation, config, device, plans[0])
+
+
+def record(
+    experiment: str | Path,
+    rig: str | Path | None = None,
+    out: str | Path = "runs",
+    validation: bool = False,
+    options: Mapping[str, Any] | None = None,
+    *,
+    watch: Watch = ignore,
+) -> Recording:
+    """Run an experiment on a rig; what it logged, ``frame`` as a table.
+
+    Files as for ``rig run``, shipped ones among them. validation: the experiment with what its
+    ``validation`` section changes. options: of the rig's backend, over those of its file. Raises
+    RigError with cause and cure; outputs are zero then.
+
+    >>> from daq import record
+    >>> import tempfile
+    >>> run = record("prbs.yaml", out=tempfile.mkdtemp(), options={"seed": 1})
+    >>> run.record["status"], len(run.frame)
+    ('completed', 8000)
+    """
+    loaded = load_experiment(str(experiment))
+    if validation:
+        changed = loaded.validation()
+        if changed is None:
+            raise ConfigError(f"{loaded.file.path}: it has no 'validation' section; add one")
+        loaded = changed
+    config, device = load_rig(str(rig or rig_for(str(experiment))), options)
+    loaded.plan(config)
+    return load(_run(loaded, config, device, Path(out), watch).folder)
+
+
+def _rig_on(
+    rig: str, port: str | None, realtime: bool, options: Mapping[str, Any], watch: Watch
+) -> tuple[RigConfig, Device]:
+    """A rig on a port in place of its file's, or simulated at the pace of the clock."""
+    config, device = load_rig(rig, options)
+    fields = type(config.options).model_fields
+    if port is not None and "port" not in fields:
+        raise ConfigError(
+            f"--port {port}: the backend {config.backend!r} of {rig} has no port; name the rig "
+            "file of one that has, such as --rig serial.yaml"
+        )
+    if realtime and "time" not in fields:
+        text = f"{rig}: its own clock paces it; --realtime changes nothing"
+        watch(Note(Level.NOTE, text))
+        realtime = False
+    choices = {"port": port, "time": "real" if realtime else None}
+    changes = {key: value for key, value in choices.items() if value is not None}
+    return load_rig(rig, {**options, **changes}) if changes else (config, device)
+
+
+def _run(
+    loaded: LoadedExperiment, rig: RigConfig, device: Device, out: Path, watch: Watch
+) -> RunResult:
+    watch(Started(f"{loaded.name} on {rig.name}"))
+
+    def report(step: PhaseProgress) -> None:
+        done = f"{step.done:.0f}" if step.unit == "samples" else f"{step.done:.1f}"
+        status = f"{done}/{step.total:.10g} {step.unit}"
+        watch(Progress(_ACTIVITIES[step.phase], step.done, step.total, status))
+
+    result = run_experiment(loaded.experiment, loaded.name, rig, device, out, report)
+    if isinstance(device, Reporting):
+        warn(watch, *device.report().get("warnings", []))
+    return result

@@ -1,0 +1,118 @@
+"""The figures of a finished identification's report, in other formats."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, get_args
+
+from daq.errors import ConfigError
+from daq.figures.style import Format
+from daq.identification import records
+from daq.identification.baseline import Baseline, baseline_of
+from daq.identification.parameters import read_parameters
+from daq.identification.records import LoggedRecord
+from daq.identification.settings import columns_of
+from daq.progress import Progress, Watch, ignore
+from daq.report.pictures import Subject
+from daq.report.publication import DATA, FIGURES, draw
+from sysid import BatchSimulator, ProcessModel, free_run
+
+_AGAIN = "identify again to have a report of it"
+
+
+def redraw(
+    folder: Path, kinds: Sequence[str], out: Path | None = None, watch: Watch = ignore
+) -> list[Path]:
+    """Draw the figures of a report again, from its numbers and logs; the files written.
+
+    folder: of an identification, or of the run that it was made from. kinds: formats by name. out:
+    default beside the report. Raises ConfigError.
+    """
+    formats = [_format(kind) for kind in kinds]
+    source = _report_in(folder)
+    subject = _subject(source)
+    target = out or source.parent / FIGURES
+    files: list[Path] = []
+    for picture, _ in draw(subject, target, formats):
+        files += [target / f"{picture.name}.{kind}" for kind in formats]
+        watch(Progress("Figures", len(files), len(files) + 1, f"{len(files)} files"))
+    return files
+
+
+def _format(kind: str) -> Format:
+    for known in get_args(Format):
+        if kind.lower() == known:
+            return known  # type: ignore[no-any-return]
+    raise ConfigError(f"--format {kind}: figures are written as {', '.join(get_args(Format))}")
+
+
+def _report_in(folder: Path) -> Path:
+    """The report's document in a folder, or in the identification below a capture folder."""
+    for place in (folder / DATA, folder / "identification" / DATA):
+        if place.exists():
+            return place
+    raise ConfigError(
+        f"{folder}: no {DATA} there; name the folder of an identification, or of the run that it "
+        "was made from (rig identify writes it unless --no-report is given)"
+    )
+
+
+def _subject(source: Path) -> Subject:
+    try:
+        document = json.loads(source.read_text(encoding="utf-8"))
+        return _restored(document, source)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ConfigError(
+            f"{source}: not a readable report ({type(error).__name__}: {error}); {_AGAIN}"
+        ) from None
+
+
+def _restored(document: Mapping[str, Any], source: Path) -> Subject:
+    """A report's subject, its free runs simulated again."""
+    model, values = read_parameters(source.with_name("parameters.yaml"))
+    training, validation = _logs(document["reproduction"], model)
+    simulator, vector = BatchSimulator(model), model.vector(values)
+    runs = [
+        [free_run(simulator, vector, log.dataset) for log in logs]
+        for logs in (training, validation)
+    ]
+    linear = None
+    if "metrics" in document["comparison"]:
+        linear = baseline_of(model, training, validation)
+    return Subject(
+        model=model,
+        document=document,
+        training=training,
+        validation=validation,
+        training_runs=runs[0],
+        validation_runs=runs[1],
+        foreign=bool(document["reproduction"]["columns"]),
+        baselines={linear.name: linear.runs} if isinstance(linear, Baseline) else {},
+    )
+
+
+def _logs(
+    reproduction: Mapping[str, Any], model: ProcessModel
+) -> tuple[list[LoggedRecord], list[LoggedRecord]]:
+    """The logs as they were used; ConfigError for one that is gone or another now."""
+    columns = columns_of(Path(reproduction["columns"]) if reproduction["columns"] else None, model)
+    root = Path(reproduction["folder"])
+    logs: dict[Path, LoggedRecord] = {}
+    uses: dict[str, list[Path]] = {"training": [], "validation": []}
+    for entry in reproduction["logs"]:
+        path = root / entry["log"]
+        if not path.exists():
+            raise ConfigError(f"{path}: this log of the report is gone; {_AGAIN}")
+        if hashlib.sha256(path.read_bytes()).hexdigest() != entry["sha256"]:
+            raise ConfigError(f"{path}: this log is another than the report's; {_AGAIN}")
+        logs[path] = records.load(path, model, columns)
+        uses[entry["use"]].append(path)
+    training, ends = records.hold_back(
+        [logs[path] for path in uses["training"]], reproduction["hold_back"]
+    )
+    # Of a log that is in both, the end was held back.
+    held_out = [logs[path] for path in uses["validation"] if path not in uses["training"]]
+    return training, [*ends, *held_out]
