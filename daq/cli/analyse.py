@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 
 from daq.cli import terminal as console
-from daq.errors import ConfigError, RigError, RunError
+from daq.errors import USER_CODE_ERRORS, ConfigError, RigError, RunError, raised_in
 from daq.experiment import ClosedLoop, Experiment
 from daq.findings import Findings, Number, Table
 from daq.logs import capture
 from daq.logs.log import load_log
 from daq.lookup.files import find_protocol
-from daq.run.protocol_calls import MISTAKES, mistake, place
+from daq.run.protocol_calls import mistake
 
 RESULTS = "results"
 _WIDTH = 2 * 1.96  # standard deviations in a 95 % interval
@@ -97,9 +97,9 @@ def _conclude(experiment: Experiment, folder: Path) -> Findings | None:
         if found is not None and not isinstance(found, Findings):
             raise TypeError(f"it returned {found!r}; return daq.findings.Findings or None")
     except ValueError as error:
-        at = place(error, type(experiment))
+        at = raised_in(type(experiment), error)
         raise RunError(f"{folder}: no result: {error}{at}") from None
-    except MISTAKES as error:
+    except USER_CODE_ERRORS as error:
         raise RunError(
             f"{folder}: no result: {mistake(experiment, 'in findings()', error)}"
         ) from error

@@ -7,8 +7,7 @@ from pathlib import Path
 
 from daq.cli import terminal as console
 from daq.config.schema import Schema
-from daq.config.yaml_file import suggestion
-from daq.errors import ConfigError, RunError
+from daq.errors import ConfigError, RunError, suggestion
 from daq.logs import capture
 from daq.lookup import schemas
 from daq.lookup.shipped import EXPERIMENTS, RIGS, shipped_files

@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 from daq.cli import terminal as console
-from daq.config.yaml_file import suggestion
-from daq.errors import ConfigError
+from daq.errors import ConfigError, suggestion
 from daq.lookup.user_code import from_file, locate
 from daq.plugins import installed, load_plugin
 from sysid.problem.model import ModelError, ProcessModel, State

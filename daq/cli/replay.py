@@ -14,8 +14,7 @@ from daq.cli.identification import print_metrics
 from daq.cli.models import find_model
 from daq.config import checking, yaml_file
 from daq.config.identification import IdentificationConfig, Signals
-from daq.config.yaml_file import suggestion
-from daq.errors import ConfigError, RunError
+from daq.errors import ConfigError, RunError, suggestion
 from daq.hal import FloatArray
 from daq.identification import records as datasets
 from daq.identification.quantities import in_model_units

@@ -11,8 +11,8 @@ import numpy as np
 from daq.config.checking import refuse
 from daq.config.identification import Column, Columns
 from daq.config.units import factor
-from daq.config.yaml_file import Key, YamlFile, suggestion
-from daq.errors import ConfigError
+from daq.config.yaml_file import Key, YamlFile
+from daq.errors import ConfigError, suggestion
 from daq.hal import FloatArray, IntArray
 from daq.logs import capture
 from daq.logs.log import Log, require_rows, time_base

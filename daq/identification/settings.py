@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping as MappingType
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,8 +12,8 @@ from daq.cli import terminal as console
 from daq.cli.models import DEFAULT_MODEL, find_model, whole_name
 from daq.config import checking, yaml_file
 from daq.config.identification import IdentificationConfig, Signals
-from daq.config.yaml_file import CommandLine, Mistake, YamlFile, suggestion
-from daq.errors import ConfigError
+from daq.config.yaml_file import TypedSettings, YamlFile
+from daq.errors import ConfigError, suggestion
 from daq.identification import datasheets
 from daq.identification import records as datasets
 from daq.identification.quantities import in_model_units
@@ -65,7 +64,7 @@ def prepare_models(
     written = yaml_file.load(config) if config is not None else None
     if written is not None:
         checking.refuse_other_kind(written, "an identification's settings")
-    file = CommandLine.of(given, more, written)
+    file = TypedSettings.of(given, more, written)
     found = _find_all(config, file, names)
     file, wrong = in_model_units(file, [model for model, _ in found])
     settings = checking.validate(file, IdentificationConfig, others=wrong)
@@ -126,20 +125,18 @@ def gassi_settings(settings: IdentificationConfig) -> dict[str, Any]:
 
 
 def _find_all(
-    config: Path | None, file: CommandLine, names: Sequence[str | None]
+    config: Path | None, file: TypedSettings, names: Sequence[str | None]
 ) -> list[tuple[ProcessModel, str]]:
     """Models and their whole names; when one is not found, the file's other mistakes as well."""
     try:
         return [_find(config, file, name) for name in names]
     except ConfigError as error:
-        if str(error).startswith(file.named(("model",))):
-            checking.validate(
-                file, IdentificationConfig, others=[Mistake(file.place(("model",)), str(error))]
-            )
+        if error.key == "model":
+            checking.validate(file, IdentificationConfig, others=error.mistakes)
         raise
 
 
-def _find(config: Path | None, file: CommandLine, typed: str | None) -> tuple[ProcessModel, str]:
+def _find(config: Path | None, file: TypedSettings, typed: str | None) -> tuple[ProcessModel, str]:
     """A model and its whole name, from the command line or else the configuration."""
     given = file.content.get("model")
     if given is not None and not isinstance(given, str):
@@ -154,7 +151,7 @@ def _find(config: Path | None, file: CommandLine, typed: str | None) -> tuple[Pr
     except ConfigError as error:
         if beside is None or given is None:
             raise
-        raise file.error(("model",), str(error)) from None
+        raise ConfigError.of(file.blamed(("model",), error)) from None
 
 
 def _with_outputs(file: YamlFile, signals: Signals, model: ProcessModel) -> ProcessModel:
@@ -179,20 +176,19 @@ def _with_starts(file: YamlFile, signals: Signals, model: ProcessModel) -> Proce
 
 
 def _datasheets(
-    config: Path | None, file: CommandLine, settings: IdentificationConfig
+    config: Path | None, file: TypedSettings, settings: IdentificationConfig
 ) -> list[Path]:
     """Typed names are relative to where they are typed, those in a file to that file."""
     beside = config.parent if config is not None and "datasheet" not in file.typed else Path()
     return [beside / name for name in settings.datasheet]
 
 
-def _range_sources(file: CommandLine) -> dict[str, str]:
+def _range_sources(file: TypedSettings) -> dict[str, str]:
     """Where the range or value of each parameter was given, for those not left to the model."""
     found = {}
     for group in ("ranges", "fixed", "tied"):
         for name in file.content.get(group) or {}:
-            # Without the column: the line is what one looks for.
-            found[str(name)] = re.sub(r"(:\d+):\d+$", r"\1", file.where((group, str(name))))
+            found[str(name)] = file.line((group, str(name)))
     return found
 
 

@@ -74,10 +74,8 @@ class Capture:
         try:
             path.write_bytes(bytes(_RESERVED))
         except OSError as error:
-            raise RunError(
-                f"{path}: cannot be written: {error.strerror}; free space on the disk, or choose "
-                "another with --out"
-            ) from None
+            cure = "free space on the disk, or choose another with --out"
+            raise RunError(f"cannot be written: {error.strerror}", cure=cure, file=path) from None
 
     def finish(self, status: str, reason: str | None, **facts: Any) -> None:
         """Note how the run ended, and the fingerprint of its log.
@@ -135,8 +133,9 @@ class Recording:
                 raise ValueError
         except (AttributeError, OverflowError, TypeError, ValueError):
             raise ConfigError(
-                f"{self.folder / RUN_NAME}: 'calibration' must hold 'samples' and, for "
-                f"{channel}, a 'noise' of 0 or more; delete it to go without"
+                f"'calibration' must hold 'samples' and, for {channel}, a 'noise' of 0 or more",
+                cure="delete it to go without",
+                file=self.folder / RUN_NAME,
             ) from None
         return deviation, deviation / math.sqrt(samples)
 
@@ -164,11 +163,11 @@ def read_record(csv: Path) -> dict[str, Any] | None:
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise ConfigError(
-            f"{path}: not a readable run record ({error}); move it away to use the log alone"
-        ) from None
+        problem = f"not a readable run record ({error})"
+        raise ConfigError(problem, cure="move it away to use the log alone", file=path) from None
     if not isinstance(record, dict):
-        raise ConfigError(f"{path}: not a run record; move it away to use the log alone")
+        cure = "move it away to use the log alone"
+        raise ConfigError("not a run record", cure=cure, file=path)
     return record
 
 
@@ -210,7 +209,7 @@ def write_whole(path: Path, content: str | bytes) -> None:
         reason = (
             error.strerror if folder.is_dir() else f"there is no folder {folder}, make it first"
         )
-        raise RunError(f"{path}: cannot be written: {reason}") from None
+        raise RunError(f"cannot be written: {reason}", file=path) from None
 
 
 def _git_commit() -> str | None:
@@ -243,7 +242,8 @@ def make_folder(folder: Path, exist_ok: bool = True) -> None:
 
 
 def _no_folder(folder: Path, reason: str | None) -> ConfigError:
-    return ConfigError(f"{folder}: cannot be created: {reason}; choose a folder with --out")
+    cure = "choose a folder with --out"
+    return ConfigError(f"cannot be created: {reason}", cure=cure, file=folder)
 
 
 def _new_folder(root: Path, stem: str) -> Path:
@@ -256,7 +256,8 @@ def _new_folder(root: Path, stem: str) -> Path:
                 break
             continue
         return folder
-    raise ConfigError(f"{root}: no capture folder can be made here; choose another with --out")
+    problem = "no capture folder can be made here"
+    raise ConfigError(problem, cure="choose another with --out", file=root)
 
 
 def _file_name(name: str) -> str:

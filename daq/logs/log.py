@@ -98,8 +98,9 @@ class LogWriter:
             there = False
         if not there:
             raise RunError(
-                f"{self.path}: it was deleted, moved or replaced while the run was on; leave the "
-                "folder of a run alone until it has ended"
+                "it was deleted, moved or replaced while the run was on",
+                cure="leave the folder of a run alone until it has ended",
+                file=self.path,
             )
 
     def close(self) -> None:
@@ -126,8 +127,9 @@ class LogWriter:
 
     def _refused(self, error: OSError) -> RunError:
         return RunError(
-            f"{self.path}: cannot be written: {error.strerror}; the first {self.n_samples} "
-            "samples are in it. Free space on the disk, or choose another with --out"
+            f"cannot be written: {error.strerror}; the first {self.n_samples} samples are in it. "
+            "Free space on the disk, or choose another with --out",
+            file=self.path,
         )
 
 
@@ -172,7 +174,7 @@ def load_log(path: Path, extra: Sequence[str] = ()) -> Log:
     if "flags" not in frame:
         frame["flags"] = 0
     uneven = (frame["flags"] % 1.0 != 0.0).to_numpy()
-    _refuse(path, uneven, "flags: it must be a whole number", table.first_line)
+    _refuse(path, uneven, "flags", "it must be a whole number", table.first_line)
     frame = frame.astype({"tick": np.int64, "flags": np.int64})
     return Log(path, frame, dt, table.torn)
 
@@ -195,12 +197,11 @@ def time_base(
     constant rate.
     """
     steps, second = np.diff(time), first_line + 1
-    _refuse(path, ~(steps > 0.0), f"{column}: time does not advance from the line before", second)
+    _refuse(path, ~(steps > 0.0), column, "time does not advance from the line before", second)
     if tick is not None:
-        _refuse(path, tick != np.round(tick), "tick: it must be a whole number", first_line)
-        _refuse(
-            path, ~(np.diff(tick) > 0.0), "tick: it does not advance from the line before", second
-        )
+        _refuse(path, tick != np.round(tick), "tick", "it must be a whole number", first_line)
+        stuck = ~(np.diff(tick) > 0.0)
+        _refuse(path, stuck, "tick", "it does not advance from the line before", second)
         counted = np.diff(tick)
         dt = float(np.median(steps / counted))
     else:
@@ -211,8 +212,12 @@ def time_base(
     if wrong.any():
         row = int(np.argmax(wrong))
         raise ConfigError(
-            f"{path}:{row + second}: {column}: samples are {dt:g} s apart elsewhere but "
-            f"{steps[row]:g} s for {counted[row]:g} of them here; {cure}"
+            f"samples are {dt:g} s apart elsewhere but {steps[row]:g} s for {counted[row]:g} of "
+            "them here",
+            cure=cure,
+            file=path,
+            line=row + second,
+            key=column,
         )
     ticks: IntArray = np.zeros(len(time), dtype=np.int64)
     ticks[1:] = np.cumsum(counted)
@@ -221,16 +226,18 @@ def time_base(
     return ticks + (0 if tick is None else int(tick[0])), dt
 
 
-def _refuse(path: Path, wrong: BoolArray, what: str, first: int) -> None:
+def _refuse(path: Path, wrong: BoolArray, column: str, problem: str, first: int) -> None:
     """Raise ConfigError at the first wrong row; ``first`` is the line of entry 0."""
     if wrong.any():
-        raise ConfigError(f"{path}:{int(np.argmax(wrong)) + first}: {what}")
+        line = int(np.argmax(wrong)) + first
+        raise ConfigError(problem, file=path, line=line, key=column)
 
 
 def require_rows(path: Path, n: int) -> None:
     """Raise ConfigError unless there are samples to work with."""
     if n < 2:
         raise ConfigError(
-            f"{path}: it holds {n} sample{'s' * (n != 1)}; at least 2 are needed. "
-            "Was the run stopped before it began?"
+            f"it holds {n} sample{'s' * (n != 1)}; at least 2 are needed. Was the run stopped "
+            "before it began?",
+            file=path,
         )

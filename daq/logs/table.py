@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.config.yaml_file import suggestion
-from daq.errors import ConfigError
+from daq.errors import ConfigError, suggestion
 from daq.hal import FloatArray
 
 if TYPE_CHECKING:
@@ -102,13 +101,16 @@ def read_table(
         rows = range(layout.line, len(lines))
         line = next((i for i in rows if lines[i].count(separator) >= len(header)), 0)
         raise ConfigError(
-            f"{path}:{line + 1}: {lines[line].count(separator) + 1} cells, but line "
-            f"{layout.line} names {len(header)} columns; separate cells by commas and write "
-            "decimals with a point, or separate them by semicolons"
+            f"{lines[line].count(separator) + 1} cells, but line {layout.line} names "
+            f"{len(header)} columns",
+            cure="separate cells by commas and write decimals with a point, or separate them by "
+            "semicolons",
+            file=path,
+            line=line + 1,
         ) from None
     except pd.errors.ParserError as error:
         reason = str(error).removeprefix("Error tokenizing data. C error: ").strip()
-        raise ConfigError(f"{path}: not a table: {reason}") from None
+        raise ConfigError(f"not a table: {reason}", file=path) from None
     held = [name for name in wanted if name not in gaps]
     if len(frame) and frame[held].iloc[-1].str.strip().str.lower().isin(_NO_NUMBERS).any():
         frame, torn = frame.iloc[:-1], True
@@ -212,13 +214,12 @@ def _complete_lines(path: Path, most: int = -1) -> tuple[str, bool]:
         with path.open("rb") as file:
             data = file.read(most)
     except FileNotFoundError:
-        raise ConfigError(
-            f"{path}: there is no such log; name a capture folder or a CSV file"
-        ) from None
+        cure = "name a capture folder or a CSV file"
+        raise ConfigError("there is no such log", cure=cure, file=path) from None
     except IsADirectoryError:
-        raise ConfigError(f"{path}: this is a folder without a log.csv in it") from None
+        raise ConfigError("this is a folder without a log.csv in it", file=path) from None
     except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+        raise ConfigError(f"cannot be read: {error.strerror}", file=path) from None
     if len(data) == most:
         # Not in the middle of a character.
         data = data[: data.rfind(b"\n") + 1] or data
@@ -226,14 +227,15 @@ def _complete_lines(path: Path, most: int = -1) -> tuple[str, bool]:
     if "\r" in text:
         text = text.replace("\r\n", "\n")
     if not text or text.isspace():
-        raise ConfigError(f"{path}: the log is empty; it must start with a line of column names")
+        cure = "it must start with a line of column names"
+        raise ConfigError("the log is empty", cure=cure, file=path)
     cut = text.rfind("\n") + 1
     tail = text[cut:]
     # A last line without its newline may lack digits even where it has every column.
     complete = text[:cut] if cut else text
     if "\0" in complete:
         line = complete[: complete.index("\0")].count("\n") + 1
-        raise ConfigError(f"{path}:{line}: not a text file: it holds bytes of zero")
+        raise ConfigError("not a text file: it holds bytes of zero", file=path, line=line)
     if complete.endswith("\n\n") or not complete.endswith("\n"):
         complete = complete.rstrip("\n") + "\n"
     return complete, bool(tail.strip())
@@ -247,26 +249,28 @@ def _decoded(path: Path, data: bytes) -> str:
         controls = bytes(byte for byte in range(32) if byte not in _TEXT_CONTROLS)
         if data.translate(None, controls) != data:
             line = data[: error.start].count(b"\n") + 1
-            raise ConfigError(f"{path}:{line}: not a text file (byte {error.start})") from None
+            problem = f"not a text file (byte {error.start})"
+            raise ConfigError(problem, file=path, line=line) from None
         return data.decode("cp1252", errors="replace")
 
 
 def _check_header(path: Path, layout: Layout, columns: Sequence[str]) -> None:
     line, header = layout.line, layout.names
     if all(_is_number(name) for name in header):
-        raise ConfigError(
-            f"{path}:{line}: the first line holds numbers; it must hold the column names"
-        )
+        cure = "it must hold the column names"
+        raise ConfigError("the first line holds numbers", cure=cure, file=path, line=line)
     named = [name for name in header if name]
     twice = sorted({name for name in named if header.count(name) > 1})
     if twice:
-        raise ConfigError(f"{path}:{line}: column {twice[0]!r} stands twice")
+        raise ConfigError(f"column {twice[0]!r} stands twice", file=path, line=line)
     for name in columns:
         if name not in header:
             raise ConfigError(
-                f"{path}:{line}: column {name!r} is missing; {suggestion(name, named)} "
-                f"(the file has {', '.join(named)}). Columns of other programs are named in "
-                "the 'columns' section of a file given with --config"
+                f"column {name!r} is missing",
+                cure=f"{suggestion(name, named)} (the file has {', '.join(named)}). Columns of "
+                "other programs are named in the 'columns' section of a file given with --config",
+                file=path,
+                line=line,
             )
 
 
@@ -293,8 +297,11 @@ def _numbers(
         row = int(bad[0])
         more = f", and in {len(bad) - 1} more lines" if len(bad) > 1 else ""
         raise ConfigError(
-            f"{path}:{row + first_line}: {name}: {column.iloc[row]!r} is not a finite "
-            f"number{more}; {cure}"
+            f"{column.iloc[row]!r} is not a finite number{more}",
+            cure=cure,
+            file=path,
+            line=row + first_line,
+            key=name,
         )
     return values
 
