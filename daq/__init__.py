@@ -13,16 +13,16 @@ if TYPE_CHECKING:
     from daq.api import Identification, identify, record, replay
     from daq.cli.replay import Replay
     from daq.errors import ConfigError, RigError
-    from daq.logs.capture import Recording, load
+    from daq.logs.recording import Recording, load
 
 _HOMES = {
     "ConfigError": "daq.errors",
     "Identification": "daq.api",
-    "Recording": "daq.logs.capture",
+    "Recording": "daq.logs.recording",
     "Replay": "daq.cli.replay",
     "RigError": "daq.errors",
     "identify": "daq.api",
-    "load": "daq.logs.capture",
+    "load": "daq.logs.recording",
     "record": "daq.api",
     "replay": "daq.api",
 }

@@ -17,8 +17,7 @@ from daq.identification import records as datasets
 from daq.identification.records import Loaded, Mapping
 from daq.identification.result import NOTES, Identified, document
 from daq.identification.settings import Prepared, gassi_settings, prepare
-from daq.logs import capture
-from daq.logs.capture import Recording
+from daq.logs.recording import Recording, load
 from daq.lookup.files import DEFAULT_RIG, load_experiment, load_rig, rig_for
 from daq.run.runner import run_experiment
 from sysid import GASSI, ModelError, ProcessModel
@@ -53,7 +52,7 @@ def record(
     config, device = load_rig(str(rig or rig_for(str(experiment))), options)
     loaded.plan(config)
     result = run_experiment(loaded.experiment, loaded.name, config, device, Path(out))
-    return capture.load(result.folder)
+    return load(result.folder)
 
 
 @dataclass(frozen=True)

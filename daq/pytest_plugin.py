@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from daq.cli.replay import Replay
     from daq.findings import Findings
-    from daq.logs.capture import Recording
+    from daq.logs.recording import Recording
 
 _RIG = "simulated.yaml"
 

@@ -12,9 +12,10 @@ import numpy as np
 from daq.cli import terminal as console
 from daq.errors import USER_CODE_ERRORS, ConfigError, RigError, RunError, raised_in
 from daq.experiment import ClosedLoop, Experiment
+from daq.files import make_folder, write_whole
 from daq.findings import Findings, Number, Table
-from daq.logs import capture
-from daq.logs.log import load_log
+from daq.logs.capture import LOG_NAME, RUN_NAME
+from daq.logs.recording import end_of_run, load, log_path, read_record
 from daq.lookup.files import find_protocol
 from daq.run.protocol_calls import mistake
 
@@ -24,7 +25,8 @@ _WIDTH = 2 * 1.96  # standard deviations in a 95 % interval
 
 def analyse_command(folder: Path, as_json: bool) -> None:
     """Conclude from a capture again, and show it."""
-    warning = capture.describe_end(capture.log_path(folder), torn=False)
+    csv = log_path(folder)
+    warning = end_of_run(csv, read_record(csv), torn=False)
     if warning is not None:
         console.report_warning(warning)
     experiment = recorded_experiment(folder)
@@ -55,8 +57,8 @@ def next_commands(folder: Path) -> list[str]:
 
 def recorded_experiment(folder: Path) -> Experiment:
     """The experiment that a capture folder says was run; ConfigError when it does not."""
-    path = folder / capture.RUN_NAME
-    record = capture.read_record(capture.log_path(folder))
+    path = folder / RUN_NAME
+    record = read_record(log_path(folder))
     if record is None:
         raise ConfigError(f"{path}: there is no such file; give a capture folder that rig run made")
     settings = record.get("experiment")
@@ -90,7 +92,7 @@ def _conclude(experiment: Experiment, folder: Path) -> Findings | None:
     if type(experiment).findings is Experiment.findings:
         return None
     extra = tuple(experiment.columns) if isinstance(experiment, ClosedLoop) else ()
-    log = load_log(folder / capture.LOG_NAME, extra)
+    log = load(folder / LOG_NAME, extra)
     columns = {name: log.frame[name].to_numpy() for name in extra if name in log.frame}
     try:
         found = experiment.findings(log.samples(), columns)
@@ -164,20 +166,20 @@ def _write(found: Findings, folder: Path) -> None:
     from daq.figures import style
     from daq.figures.findings import draw
 
-    capture.make_folder(folder)
+    make_folder(folder)
     for table in found.tables:
         rows = np.column_stack(list(table.columns.values()))
         lines = [",".join(table.columns), *(",".join(map(repr, row)) for row in rows.tolist())]
-        capture.write_whole(folder / f"{table.name}.csv", "\n".join(lines) + "\n")
+        write_whole(folder / f"{table.name}.csv", "\n".join(lines) + "\n")
     for figure in found.figures:
         drawn = draw(figure)
         for kind in style.PRINTED:
-            capture.write_whole(folder / f"{figure.name}.{kind}", style.render(drawn, kind))
+            write_whole(folder / f"{figure.name}.{kind}", style.render(drawn, kind))
     text = json.dumps(console.plain(_contents(found)), indent=2)
-    capture.write_whole(folder / "findings.json", text + "\n")
+    write_whole(folder / "findings.json", text + "\n")
     # Of an earlier analysis with another protocol's text.
     (folder / "ranges.yaml").unlink(missing_ok=True)
     if found.ranges:
         lines = ["# Starting ranges for rig identify --config", "ranges:"]
         lines += [f"  {k}: [{low:.6g}, {high:.6g}]" for k, (low, high) in found.ranges.items()]
-        capture.write_whole(folder / "ranges.yaml", "\n".join(lines) + "\n")
+        write_whole(folder / "ranges.yaml", "\n".join(lines) + "\n")

@@ -15,11 +15,13 @@ from typing import Any
 from daq.cli import terminal as console
 from daq.cli.identify import assemble, check_writable, load_logs, write_parameters
 from daq.errors import ConfigError
+from daq.files import write_whole
 from daq.identification import records as datasets
 from daq.identification.records import Loaded
 from daq.identification.result import Identified, document
 from daq.identification.settings import Prepared, gassi_settings, prepare_models
-from daq.logs import capture
+from daq.logs.capture import LOG_NAME
+from daq.provenance import software_versions
 from sysid import Campaign, ModelError, Outcome, Run, Spread, campaign
 
 _SEEDS_HELP = "write 0:10 for the seeds 0 to 9, or 3,5,8"
@@ -248,9 +250,7 @@ def _default_folder() -> Path:
 
 def _log_names(logs: list[Loaded]) -> list[str]:
     """Names that tell logs apart: the capture folder's, or the file's."""
-    names = [
-        log.path.parent.name if log.path.name == capture.LOG_NAME else log.path.stem for log in logs
-    ]
+    names = [log.path.parent.name if log.path.name == LOG_NAME else log.path.stem for log in logs]
     return [
         str(log.path) if names.count(name) > 1 else name
         for name, log in zip(names, logs, strict=True)
@@ -264,7 +264,7 @@ def _together(logs: list[Loaded]) -> str:
 def _write_table(folder: Path, found: Campaign) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "campaign.csv"
-    capture.write_whole(path, found.frame().to_csv(index=False, lineterminator="\n"))
+    write_whole(path, found.frame().to_csv(index=False, lineterminator="\n"))
     return path
 
 
@@ -280,7 +280,7 @@ def _document(
             for spread in found.spread()
         ],
         "interrupted": found.interrupted,
-        "software": capture.software_versions(),
+        "software": software_versions(),
         "files": {"table": str(table)},
     }
 

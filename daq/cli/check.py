@@ -14,10 +14,10 @@ from daq.cli.run import plan_of
 from daq.config.rig import RigConfig
 from daq.errors import ConfigError, RunError
 from daq.experiment import ClosedLoop, Experiment, Plan
+from daq.files import write_whole
 from daq.findings import Chart, Heatmap
 from daq.hal import CHANNELS, FloatArray
-from daq.logs import capture
-from daq.logs.log import UNITS
+from daq.logs.columns import UNITS
 from daq.run.protocol_calls import preview_of
 
 _PART = 0.9  # of the power, that the stated band holds
@@ -261,6 +261,6 @@ def _draw(planned: Plan, settings: Experiment, units: dict[str, str], path: Path
             "'references' or the protocol a method 'preview'"
         )
     try:
-        capture.write_whole(path, style.render(drawn, kind))
+        write_whole(path, style.render(drawn, kind))
     except RunError as error:
         raise ConfigError(f"{error}; or choose another place with --plot FILE.png") from None

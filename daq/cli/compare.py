@@ -24,9 +24,10 @@ from daq.cli.campaign import (
 )
 from daq.cli.identify import check_writable, default_folder, publish_report, write_parameters
 from daq.errors import ConfigError
+from daq.files import write_whole
 from daq.identification.result import document
 from daq.identification.settings import prepare_models
-from daq.logs import capture
+from daq.provenance import software_versions
 from sysid import Campaign, Candidate, Comparison, ModelError, Outcome, Spread, compare
 from sysid.judging.comparison import Row
 from sysid.linear import ARMAX, ARX, tuned
@@ -209,7 +210,7 @@ def _document(
         },
         "failed": [f"{o.run.name}, seed {o.run.seed}: {o.problem}" for o in found.failed],
         "interrupted": found.interrupted,
-        "software": capture.software_versions(),
+        "software": software_versions(),
     }
 
 
@@ -254,7 +255,7 @@ def _spread_document(spread: Spread) -> dict[str, Any]:
 
 def _write(folder: Path, report: Mapping[str, Any]) -> Path:
     path = folder / "comparison.yaml"
-    capture.write_whole(path, yaml.safe_dump(dict(report), sort_keys=False, allow_unicode=True))
+    write_whole(path, yaml.safe_dump(dict(report), sort_keys=False, allow_unicode=True))
     return path
 
 

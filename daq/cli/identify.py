@@ -14,12 +14,14 @@ import yaml
 from daq.cli import identification as reporting
 from daq.cli import terminal as console
 from daq.errors import ConfigError
+from daq.files import make_folder, write_whole
 from daq.identification import records as datasets
 from daq.identification import request as resuming
 from daq.identification.records import Loaded
 from daq.identification.result import Identified, document
 from daq.identification.settings import Prepared, gassi_settings, prepare
-from daq.logs import capture
+from daq.logs.capture import LOG_NAME
+from daq.logs.recording import log_path
 from sysid import Dataset, ModelError
 from sysid.arrays import FloatArray
 from sysid.gassi import GASSI, PRESETS, Progress
@@ -153,9 +155,9 @@ def refuse_overlap(train: list[Loaded], check: list[Loaded]) -> None:
 
 def default_folder(logs: list[Path], model: str) -> Path:
     """Beside a single capture's log; otherwise a new folder under runs/."""
-    first = capture.log_path(logs[0])
+    first = log_path(logs[0])
     # A folder without a log.csv stands for the CSVs in it, and is no place for results.
-    if len(logs) == 1 and first.name == capture.LOG_NAME and first.exists():
+    if len(logs) == 1 and first.name == LOG_NAME and first.exists():
         return first.parent / "identification"
     now = datetime.datetime.now(datetime.UTC)
     return Path("runs") / f"{now:%Y%m%dT%H%M%SZ}-identify-{model}" / "identification"
@@ -248,8 +250,8 @@ def _profiles(
 
 def write_parameters(folder: Path, report: dict[str, Any]) -> Path:
     """Write a report as ``parameters.yaml``; ConfigError when the folder cannot be made."""
-    capture.make_folder(folder)
+    make_folder(folder)
     path = folder / "parameters.yaml"
     text = yaml.safe_dump(report, sort_keys=False, allow_unicode=True)
-    capture.write_whole(path, text)
+    write_whole(path, text)
     return path

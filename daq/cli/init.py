@@ -8,7 +8,7 @@ from pathlib import Path
 from daq.cli import terminal as console
 from daq.config.schema import Schema
 from daq.errors import ConfigError, RunError, suggestion
-from daq.logs import capture
+from daq.files import make_folder
 from daq.lookup import schemas
 from daq.lookup.shipped import EXPERIMENTS, RIGS, shipped_files
 
@@ -30,7 +30,7 @@ def init_command(folder: Path, protocol: str, rig: str, as_json: bool) -> None:
         _SETTINGS: settings_text(),
         **_companions(protocol),
     }
-    capture.make_folder(folder)
+    make_folder(folder)
     written = [folder / name for name, text in texts.items() if _write_new(folder / name, text)]
     kept = [folder / name for name in texts if folder / name not in written]
     schemas.write_schemas(folder / schemas.FOLDER)

@@ -15,12 +15,13 @@ from daq.cli.models import find_model
 from daq.config import checking, yaml_file
 from daq.config.identification import IdentificationConfig, Signals
 from daq.errors import ConfigError, RunError, suggestion
+from daq.files import write_whole
 from daq.hal import FloatArray
 from daq.identification import records as datasets
 from daq.identification.quantities import in_model_units
 from daq.identification.records import Loaded, Mapping
 from daq.identification.settings import as_told
-from daq.logs import capture
+from daq.logs.capture import LOG_NAME
 from daq.lookup.files import DEFAULT_RIG, load_rig
 from sysid import BatchSimulator, Metrics, ModelError, evaluate, free_run
 from sysid.problem.model import ProcessModel
@@ -207,7 +208,7 @@ def _draw(found: Replay, path: Path | None) -> Path | None:
     from daq.figures.responses import Response, responses
 
     chosen = path or found.path.with_name(
-        "replay.png" if found.path.name == capture.LOG_NAME else f"{found.path.stem}-replay.png"
+        "replay.png" if found.path.name == LOG_NAME else f"{found.path.stem}-replay.png"
     )
     kind = style.format_of(chosen)
     outputs = [
@@ -216,7 +217,7 @@ def _draw(found: Replay, path: Path | None) -> Path | None:
         for j, output in enumerate(found.model.outputs)
     ]  # fmt: skip
     try:
-        capture.write_whole(chosen, style.render(responses(found.time, outputs), kind))
+        write_whole(chosen, style.render(responses(found.time, outputs), kind))
     except RunError as error:
         if path is not None:
             raise ConfigError(f"{error}; or choose another with --figure FILE.png") from None

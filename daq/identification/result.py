@@ -13,7 +13,7 @@ import numpy as np
 
 from daq.config.identification import IdentificationConfig, Signals
 from daq.identification.records import Loaded
-from daq.logs import capture
+from daq.provenance import software_versions
 from sysid.arrays import FloatArray
 from sysid.gassi import GASSI
 from sysid.judging.assessment import RecordResult, Verdict, judge
@@ -122,7 +122,7 @@ def document(result: Identified) -> dict[str, Any]:
             "flagged": estimator.flagged_,
             "feasible": estimator.feasible_,
         },
-        "software": capture.software_versions(),
+        "software": software_versions(),
     }
 
 

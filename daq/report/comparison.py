@@ -13,7 +13,7 @@ from daq.figures import style
 from daq.figures.picture import Picture
 from daq.figures.rankings import Ratio, ratios
 from daq.figures.responses import Response, responses
-from daq.logs import capture
+from daq.files import make_folder, write_whole
 from daq.report.page import Drawing, comparison_page
 from daq.report.publication import FIGURES, command_of, fingerprints
 from sysid import Candidate
@@ -35,11 +35,11 @@ def publish_comparison(
     Raises RunError where the disk refuses.
     """
     whole = console.plain(document)
-    capture.make_folder(folder / FIGURES)
+    make_folder(folder / FIGURES)
     drawings = []
     for picture in _pictures(whole, group, candidates):
         content = style.render(picture.figure, "svg")
-        capture.write_whole(folder / FIGURES / f"{picture.name}.svg", content)
+        write_whole(folder / FIGURES / f"{picture.name}.svg", content)
         drawings.append(Drawing(picture.name, picture.topic, picture.caption, content.decode()))
     now = datetime.datetime.now(datetime.UTC)
     preferred = next(row for row in whole["structures"] if row["name"] == whole["preferred"])
@@ -57,7 +57,7 @@ def publish_comparison(
             "logs": fingerprints(group.training, group.validation),
         },
     }
-    capture.write_whole(folder / _PAGE, comparison_page(whole, view, drawings))
+    write_whole(folder / _PAGE, comparison_page(whole, view, drawings))
     return str(folder / _PAGE)
 
 

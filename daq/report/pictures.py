@@ -20,8 +20,8 @@ from daq.figures.signals import Panel, signals
 from daq.figures.spectra import Spectrum, spectra
 from daq.identification.records import Loaded
 from daq.identification.result import NOTES
-from daq.logs import capture
-from daq.logs.log import UNITS
+from daq.logs.columns import UNITS
+from daq.logs.recording import load
 from sim_rig import torque_loops as resisting
 from sysid import Dataset, ModelError, equilibrium, evaluate, linearize
 from sysid.arrays import BoolArray, FloatArray
@@ -399,7 +399,7 @@ def _foreign_signals(model: ProcessModel, data: Dataset) -> Figure:
 
 def _capture_signals(log: Loaded) -> Figure:
     """All channels: commands with what was applied of them, then the sensors."""
-    frame = capture.load(log.path).log.frame
+    frame = load(log.path).frame
     known = {name: frame[name].to_numpy(dtype=np.float64) for name in UNITS if name in frame}
     time = known.pop("t")
     panels = []
@@ -414,7 +414,7 @@ def _capture_signals(log: Loaded) -> Figure:
 
 def _measured_torque(log: Loaded) -> list[Loop]:
     """Torque of a capture over angle and speed, apart by whether the brake's current is high."""
-    frame = capture.load(log.path).log.frame
+    frame = load(log.path).frame
     if not {"theta", "omega", "torque", "current_brake"} <= set(frame):
         return []
     current = frame["current_brake"].to_numpy(dtype=np.float64)

@@ -15,12 +15,13 @@ from daq.cli.models import DEFAULT_MODEL
 from daq.figures import style
 from daq.figures.picture import Picture
 from daq.figures.style import Format
+from daq.files import make_folder, write_whole
 from daq.identification.baseline import Baseline, beside
 from daq.identification.records import Loaded
 from daq.identification.request import Asked
 from daq.identification.result import NOTES, Identified, errors_of
 from daq.identification.settings import Prepared
-from daq.logs import capture
+from daq.logs.recording import read_record
 from daq.report import latex as table
 from daq.report.explanation import view
 from daq.report.page import Drawing, page
@@ -69,7 +70,7 @@ def publish(
             "latex": (_TABLE, table.latex(whole, NOTES)),
         }
         for name, content in pages.values():
-            capture.write_whole(folder / name, content)
+            write_whole(folder / name, content)
         bar.update("Report", _STEPS, _STEPS, f"{len(drawings)} figures")
     return {what: str(folder / name) for what, (name, _) in pages.items()}
 
@@ -78,11 +79,11 @@ def draw(
     subject: Subject, folder: Path, formats: Sequence[Format]
 ) -> Iterator[tuple[Picture, dict[Format, bytes]]]:
     """Every figure, written to files of the formats; with what is in them."""
-    capture.make_folder(folder)
+    make_folder(folder)
     for picture in pictures(subject):
         contents = {kind: style.render(picture.figure, kind) for kind in formats}
         for kind, content in contents.items():
-            capture.write_whole(folder / f"{picture.name}.{kind}", content)
+            write_whole(folder / f"{picture.name}.{kind}", content)
         yield picture, contents
 
 
@@ -139,7 +140,7 @@ def _reproduction(prepared: Prepared, result: Identified) -> dict[str, Any]:
         "runs": [
             _run(record)
             for path in _paths([*result.training_logs, *result.validation_logs])
-            if (record := capture.read_record(path)) is not None
+            if (record := read_record(path)) is not None
         ],
     }
 

@@ -23,7 +23,7 @@ from daq.experiment import (
 from daq.hal import CHANNELS, Device, Flag, FloatArray, Mode, Phase, Samples
 from daq.limits import Limits, mark_interlock
 from daq.logs.capture import COMPLETED, Capture
-from daq.logs.log import LogWriter
+from daq.logs.writer import LogWriter
 from daq.rig import Rig
 from daq.run.interruption import Stopping
 from daq.run.plan import plan
