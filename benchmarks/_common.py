@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from daq.identification import records as datasets
-from daq.logs import capture
 from daq.lookup.files import load_experiment, load_rig
+from daq.provenance import software_versions
 from daq.run.runner import run_experiment
 from sim_rig.backend import SimulatedDevice
 from sysid import Dataset
@@ -35,7 +35,7 @@ def machine() -> dict[str, Any]:
     if info.exists():
         lines = info.read_text(encoding="utf-8").splitlines()
         cpu = next((s.split(":", 1)[1].strip() for s in lines if s.startswith("model name")), cpu)
-    return {"cpu": cpu, "cores": available_cores(), **capture.software_versions()}
+    return {"cpu": cpu, "cores": available_cores(), **software_versions()}
 
 
 def report(figures: dict[str, Any], as_json: bool, show: Callable[[dict[str, Any]], None]) -> None:

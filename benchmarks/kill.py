@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from daq.errors import ConfigError
-from daq.logs import capture
+from daq.logs.recording import load
 
 RATE = 800.0  # Hz
 LONGEST = 2.0  # s into the run phase that a kill may come
@@ -157,10 +157,10 @@ def _waited(pid: int) -> float:
 def _judge(folder: Path, after: float, ran: float, starved: float) -> Kill:
     (run,) = (folder / "runs").iterdir()
     try:
-        recording = capture.load(run)
+        recording = load(run)
     except ConfigError as error:
         return Kill(after, False, False, 0, False, ran, starved, str(error))
-    frame = recording.log.frame
+    frame = recording.frame
     whole = bool(np.array_equal(frame["tick"], np.arange(len(frame))))
     # The oldest missing sample is the one after the last row.
     lost = ran - float(frame["tick"].iloc[-1] + 1) / RATE
@@ -169,7 +169,7 @@ def _judge(folder: Path, after: float, ran: float, starved: float) -> Kill:
         loaded=whole,
         named_interrupted="interrupted" in (recording.warning or ""),
         rows=len(frame),
-        torn=recording.log.torn,
+        torn=recording.torn,
         lost=lost,
         starved=starved,
         error=None if whole else "a tick is missing",

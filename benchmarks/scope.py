@@ -28,7 +28,7 @@ from selenium.webdriver.chrome.service import Service
 
 from benchmarks import _common
 from daq.hal import Samples
-from daq.logs.log import LogWriter
+from daq.logs.writer import LogWriter
 
 RIG = (sys.executable, "-m", "daq.cli")
 RATE = 800.0  # Hz

@@ -27,7 +27,7 @@ import numpy as np
 
 from benchmarks import _common
 from daq.hal import Flag
-from daq.logs import capture
+from daq.logs.recording import load
 from daq.serial import codec, messages
 from daq.serial.codec import Decoder
 from daq.serial.messages import Block, Latch, State, Status, Type
@@ -164,8 +164,8 @@ def over_the_pty(folder: Path, samples: int) -> dict[str, Any]:
     run = next((folder / "runs").iterdir())
     import pandas  # noqa: F401  # what a program that loads logs has imported by then
 
-    took, recording = _common.timed(lambda: capture.load(run))
-    flags = recording.log.frame["flags"].to_numpy()
+    took, recording = _common.timed(lambda: load(run))
+    flags = recording.frame["flags"].to_numpy()
     quarter = memory[len(memory) // 4 : -1] or memory
     return {
         "samples": len(flags),

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from daq.identification.fit import identify, resume
     from daq.identification.replay import Replay, replay
     from daq.identification.result import Identification
-    from daq.logs.capture import Recording, load
+    from daq.logs.recording import Recording, load
     from daq.recording.analysis import Analysis, analyse
     from daq.recording.preview import Preview, check
     from daq.recording.session import record
@@ -32,7 +32,7 @@ _HOMES = {
     "ConfigError": "daq.errors",
     "Identification": "daq.identification.result",
     "Preview": "daq.recording.preview",
-    "Recording": "daq.logs.capture",
+    "Recording": "daq.logs.recording",
     "Replay": "daq.identification.replay",
     "RigError": "daq.errors",
     "analyse": "daq.recording.analysis",
@@ -40,7 +40,7 @@ _HOMES = {
     "check": "daq.recording.preview",
     "compare": "daq.identification.comparison",
     "identify": "daq.identification.fit",
-    "load": "daq.logs.capture",
+    "load": "daq.logs.recording",
     "record": "daq.recording.session",
     "replay": "daq.identification.replay",
     "resume": "daq.identification.fit",

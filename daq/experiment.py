@@ -45,6 +45,22 @@ class Homing(Section):
     timeout: Seconds = Field(60.0, gt=0.0, le=3600.0, description="time allowed for it")
 
 
+class SettingError(ValueError):
+    """A setting that makes no run: its dotted key, and the problem with the cure.
+
+    >>> str(SettingError("motor.hold", "0 s; a level is held for above 0 s"))
+    'motor.hold: 0 s; a level is held for above 0 s'
+    """
+
+    def __init__(self, key: str, problem: str) -> None:
+        super().__init__(key, problem)
+        self.key = key
+        self.problem = problem
+
+    def __str__(self) -> str:
+        return f"{self.key}: {self.problem}"
+
+
 @dataclass(frozen=True)
 class Plan:
     """What a run will do, known before anything is energised.
@@ -122,10 +138,10 @@ class Experiment(Section, abc.ABC):
         """
         n_samples = round(seconds * self.sample_rate)
         if not 2 <= n_samples <= MOST_SAMPLES:
-            raise ValueError(
-                f"{key}: {seconds:g} s at {self.sample_rate:g} Hz makes "
-                f"{n_samples} samples; 2 to {MOST_SAMPLES} are possible: "
-                f"change {key} or sample_rate"
+            raise SettingError(
+                key,
+                f"{seconds:g} s at {self.sample_rate:g} Hz makes {n_samples} samples; 2 to "
+                f"{MOST_SAMPLES} are possible: change {key} or sample_rate",
             )
         return n_samples
 

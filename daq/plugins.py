@@ -5,8 +5,7 @@ from __future__ import annotations
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Literal
 
-from daq.config.yaml_file import suggestion
-from daq.errors import ConfigError
+from daq.errors import ConfigError, suggestion
 
 Group = Literal["rig.backends", "rig.protocols", "rig.models", "rig.limits"]
 
@@ -19,12 +18,12 @@ def installed(group: Group) -> dict[str, EntryPoint]:
 def load_plugin(group: Group, name: str) -> Any:
     """The object registered under a name; ConfigError names those that exist."""
     kind = group.removeprefix("rig.").removesuffix("s")
-    found = installed(group)
-    if name not in found:
-        raise ConfigError(f"unknown {kind} {name!r}; {suggestion(name, list(found))}")
+    points = installed(group)
+    if name not in points:
+        raise ConfigError(f"unknown {kind} {name!r}", cure=suggestion(name, list(points)))
     try:
-        return found[name].load()
+        return points[name].load()
     except Exception as error:
         raise ConfigError(
-            f"{kind} {name!r} ({found[name].value}) does not load: {type(error).__name__}: {error}"
+            f"{kind} {name!r} ({points[name].value}) does not load: {type(error).__name__}: {error}"
         ) from error

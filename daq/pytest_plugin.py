@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from daq.findings import Findings
     from daq.identification.replay import Replay
-    from daq.logs.capture import Recording
+    from daq.logs.recording import Recording
 
 _RIG = "simulated.yaml"
 

@@ -82,7 +82,7 @@ class Rig:
     def info(self) -> DeviceInfo:
         """What the open device says of itself."""
         if self._info is None:
-            raise DeviceError("the rig is not open; call open() first")
+            raise DeviceError("the rig is not open", cure="call open() first")
         return self._info
 
     def open(self) -> DeviceInfo:

@@ -95,16 +95,17 @@ class Play(OpenLoop):
         if names is None:
             wanted = " or ".join(", ".join(names) for names in _COLUMNS)
             raise ConfigError(f"{path}: its columns are {', '.join(present)}; name them {wanted}")
-        table = read_table(path, names, cure="a command must stand in every row; mend them")
-        first, n = table.first_line, len(table.frame)
-        if table.torn:
+        cure = "a command must stand in every row; mend them"
+        frame, first, torn = read_table(path, names, cure)
+        n = len(frame)
+        if torn:
             raise ConfigError(
                 f"{path}:{first + n}: the last line has no end, so it may have been cut; complete "
                 "it and end it with a new line"
             )
         if n < 2:
             raise ConfigError(f"{path}: it holds {n} row{'s' * (n != 1)}; at least 2 are needed")
-        time, *commands = (table.frame[name].to_numpy() for name in names)
+        time, *commands = (frame[name].to_numpy() for name in names)
         stuck = ~(np.diff(time) > 0.0)
         if stuck.any():
             raise ConfigError(

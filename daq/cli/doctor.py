@@ -14,7 +14,7 @@ import typer
 from daq.cli import terminal as console
 from daq.cli.options import AsJson
 from daq.errors import RunError
-from daq.logs.capture import make_folder
+from daq.files import make_folder
 from daq.run.realtime import RealTime
 from daq.serial.link import latency_timer, permission_cure
 from daq.serial.ports import PortFacts, list_ports, named

@@ -13,7 +13,7 @@ import typer
 
 from daq.config.schema import Schema, branches, unit_in
 from daq.experiment import ClosedLoop, Experiment
-from daq.logs import capture
+from daq.files import make_folder, write_whole
 from daq.lookup import schemas
 
 _HEAD = "<!-- Made by `rig schema --reference`; what it says stands in the code. Do not edit. -->\n"
@@ -34,10 +34,10 @@ _KINDS = {
 
 def write_reference(folder: Path, app: typer.Typer) -> list[Path]:
     """Write all pages; the paths written. ConfigError when they cannot be."""
-    capture.make_folder(folder)
+    make_folder(folder)
     found = pages(schemas.protocols(), schemas.backend_options(), app)
     for name, text in found.items():
-        capture.write_whole(folder / name, text)
+        write_whole(folder / name, text)
     return [folder / name for name in found]
 
 

@@ -127,8 +127,7 @@ def _bounds(texts: list[str]) -> dict[str, float]:
 
 
 def _require_outputs(bounds: dict[str, float], result: Replay) -> None:
-    from daq.config.yaml_file import suggestion
-    from daq.errors import ConfigError
+    from daq.errors import ConfigError, suggestion
 
     for name in bounds:
         if name not in result.fit:

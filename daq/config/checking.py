@@ -6,6 +6,7 @@ import difflib
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from types import UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
@@ -13,10 +14,11 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from daq.config.units import unit_of
-from daq.config.yaml_file import Key, Mistake, YamlFile, dotted, suggestion
-from daq.errors import ConfigError
+from daq.config.yaml_file import Key, YamlFile, dotted
+from daq.errors import ConfigError, Mistake, suggestion
 
 Model = TypeVar("Model", bound=BaseModel)
+Complaint = tuple[str, str]  # problem and cure
 _SHOWN = 60  # characters of a value in a message
 _DEEPEST = 6  # levels of sections in which a misplaced key is looked for
 
@@ -52,7 +54,12 @@ def mistakes(
 def refuse(mistakes: Sequence[Mistake]) -> None:
     """Raise a ConfigError of all mistakes, if any, in the order of the file."""
     if mistakes:
-        raise ConfigError("\n".join(mistake.text for mistake in sorted(set(mistakes))))
+        raise ConfigError.of(sorted(set(mistakes), key=_order))
+
+
+def _order(mistake: Mistake) -> tuple[int, int, str]:
+    """By place in the file, what was typed first."""
+    return mistake.line or 0, mistake.column or 0, mistake.text
 
 
 # Keys by which each kind of file is known when it is given in another's place, and the cure.
@@ -72,10 +79,8 @@ def refuse_other_kind(file: YamlFile, wanted: str) -> None:
     for kind, (marks, cure) in _KINDS.items():
         for key in file.content:
             if key in marks:
-                raise ConfigError(
-                    f"{file.where((key,))}: this file holds {kind}, and should hold {wanted}; "
-                    f"{cure}"
-                )
+                problem = f"this file holds {kind}, and should hold {wanted}"
+                raise ConfigError.of([replace(file.mistake((key,), problem, cure), key="")])
 
 
 class _Explainer:
@@ -91,18 +96,18 @@ class _Explainer:
 
     def mistakes(self, errors: Sequence[ErrorDetails]) -> list[Mistake]:
         """One mistake for each key that is wrong."""
-        complaints: dict[Key, list[str]] = {}
+        complaints: dict[Key, list[Complaint]] = {}
         meant = set()
         for item, key in _of_best_branch([(item, self._key(item)) for item in errors]):
             if item["type"] in {"extra_forbidden", "invalid_key"}:
                 near = self._near(key)
                 meant.add((*key[:-1], near))
-                complaints[key] = [f"unknown key; {self._cure(key, near)}"]
+                complaints[key] = [("unknown key", self._cure(key, near))]
             else:
                 complaints.setdefault(key, []).append(self._complaint(item, key))
         return [
-            self._file.mistake((*self._at, *key), " or ".join(dict.fromkeys(said)))
-            for key, said in complaints.items()
+            self._file.mistake((*self._at, *key), *_either(list(dict.fromkeys(alternatives))))
+            for key, alternatives in complaints.items()
             # What is missing because it is misspelt is said once.
             if key not in meant or self._is_there(key)
         ]
@@ -157,14 +162,15 @@ class _Explainer:
             return "between braces a comma begins the next key; write decimals with a point"
         return suggestion(str(key[-1]), self._fields(key[:-1]))
 
-    def _complaint(self, item: ErrorDetails, key: Key) -> str:
+    def _complaint(self, item: ErrorDetails, key: Key) -> Complaint:
         kind = item["type"]
         about = self._about(key)
         if kind == "missing" and isinstance(item["loc"][-1], str):
-            return f"this key is missing; add it{about}"
-        value = self._value(key)
-        # A message of the project's own says what it needs to.
-        return _complaint(kind, item, value, self._types(key)) + about * (kind != "value_error")
+            return "this key is missing", f"add it{about}"
+        problem, cure = _complaint(kind, item, self._value(key), self._types(key))
+        if kind == "value_error":  # a message of the project's own says what it needs to
+            return problem, cure
+        return (problem, f"{cure}{about}") if cure else (f"{problem}{about}", "")
 
     def _about(self, key: Key) -> str:
         """What a key means and its unit, as its field or that of the section it is in says."""
@@ -190,6 +196,13 @@ class _Explainer:
             section = self._value(key[:depth])
             kinds = [inner for kind in _agreeing(kinds, section) for inner in _inside(kind, part)]
         return _agreeing(kinds, self._value(key))
+
+
+def _either(complaints: Sequence[Complaint]) -> Complaint:
+    """What is wrong with a value by each type that it might have."""
+    if len(complaints) == 1:
+        return complaints[0]
+    return " or ".join(Mistake(*complaint).text for complaint in complaints), ""
 
 
 def _of_best_branch(
@@ -289,17 +302,16 @@ _NO_SECTION = {
 }
 
 
-def _complaint(kind: str, item: ErrorDetails, value: object, types: Sequence[Any]) -> str:
+def _complaint(kind: str, item: ErrorDetails, value: object, types: Sequence[Any]) -> Complaint:
     """What is wrong with a value, in plain English, with the value and a cure if it is plain."""
     context = item.get("ctx", {})
     expected = _EXPECTED.get(kind) or _expected_values(kind, context, types)
     if expected is not None:
-        said = f"{expected.format(**context)}, found {_shown(value)}"
-        cure = _cure_of_value(kind, value, context)
-        return f"{said}; {cure}" if cure else said
+        problem = f"{expected.format(**context)}, found {_shown(value)}"
+        return problem, _cure_of_value(kind, value, context)
     message = item["msg"].removeprefix("Value error, ")
-    found = "" if isinstance(value, Mapping) else f"; found {_shown(value)}"
-    return message[0].lower() + message[1:] + found
+    shown = "" if isinstance(value, Mapping) else f"; found {_shown(value)}"
+    return message[0].lower() + message[1:] + shown, ""
 
 
 def _expected_values(kind: str, context: Mapping[str, Any], types: Sequence[Any]) -> str | None:

@@ -153,7 +153,8 @@ class OwnLimit(Section):
     def make(self) -> Any:
         """A new limit for one run."""
         if self._make is None:
-            raise ConfigError(f"limits.own: {self.use} has not been looked up; load the rig's file")
+            problem = f"{self.use} has not been looked up"
+            raise ConfigError(problem, cure="load the rig's file", key="limits.own")
         return self._make()
 
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from daq.errors import ConfigError
+from daq.errors import ConfigError, Mistake, RigError
 
 Key = tuple[str | int, ...]
 _DEEPEST = 20  # levels of nesting
@@ -34,14 +34,6 @@ _Loader.add_implicit_resolver(
 )
 
 
-@dataclass(frozen=True, order=True)
-class Mistake:
-    """Something wrong at a line and column, both (0, 0) outside of a file; text: all of it."""
-
-    place: tuple[int, int]
-    text: str
-
-
 @dataclass(frozen=True)
 class YamlFile:
     """Parsed content of a file and the place of each key in it.
@@ -54,36 +46,35 @@ class YamlFile:
     places: dict[Key, tuple[int, int]]
     repeated: tuple[Mistake, ...] = ()
 
-    def where(self, key: Key) -> str:
-        """``file:line:column`` of a key, or of its nearest parent that stands in the file."""
-        line, column = self.place(key)
-        return f"{self.path}:{line}:{column}"
-
-    def line_of(self, key: Key) -> str:
-        """``file:line`` of a key, as a person looks for it."""
-        return f"{self.path}:{self.place(key)[0]}"
-
     def place(self, key: Key) -> tuple[int, int]:
         """Line and column of a key, or of its nearest parent that stands in the file."""
         while key and key not in self.places:
             key = key[:-1]
         return self.places.get(key, (1, 1))
 
-    def error(self, key: Key, message: str) -> ConfigError:
+    def mistake(self, key: Key, problem: str, cure: str = "") -> Mistake:
+        """What is wrong at a key."""
+        return Mistake(problem, cure, self.path, *self.place(key), dotted(key))
+
+    def error(self, key: Key, problem: str, cure: str = "") -> ConfigError:
         """A ConfigError that points at a key."""
-        return ConfigError(self.mistake(key, message).text)
+        return ConfigError.of([self.mistake(key, problem, cure)])
 
-    def mistake(self, key: Key, message: str) -> Mistake:
-        """The same, to be told with others."""
-        return Mistake(self.place(key), f"{self.named(key)}: {message}")
+    def blamed(self, key: Key, error: RigError) -> list[Mistake]:
+        """The mistakes of an error that the value of a key has led to."""
+        return [mistake.behind(self.mistake(key, "")) for mistake in error.mistakes]
 
-    def named(self, key: Key) -> str:
-        """Place and name of a key, as error messages begin."""
-        return f"{self.where(key)}: {dotted(key)}" if key else self.where(key)
+    def where(self, key: Key) -> str:
+        """``FILE:LINE:COLUMN`` of a key."""
+        return self.mistake(key, "").place
+
+    def line(self, key: Key) -> str:
+        """``FILE:LINE`` of a key."""
+        return replace(self.mistake(key, ""), column=None).place
 
 
 @dataclass(frozen=True)
-class CommandLine(YamlFile):
+class TypedSettings(YamlFile):
     """Settings given as options of a command, over those of a file if there is one.
 
     content: both together. typed: what the command line gave; its keys below ``named_options``
@@ -96,7 +87,7 @@ class CommandLine(YamlFile):
     @classmethod
     def of(
         cls, options: Mapping[str, Any], settings: Sequence[str] = (), file: YamlFile | None = None
-    ) -> CommandLine:
+    ) -> TypedSettings:
         """Options by name without their dashes, and settings as ``key.key=value``.
 
         Raises ConfigError for a setting that is not of that form.
@@ -109,25 +100,21 @@ class CommandLine(YamlFile):
         places, repeated = (file.places, file.repeated) if file else ({}, ())
         return cls(path, content, places, repeated, typed, frozenset(options))
 
+    def mistake(self, key: Key, problem: str, cure: str = "") -> Mistake:
+        """What is wrong with an option as it was typed, or at a key of the file."""
+        if not self._is_typed(key):
+            return super().mistake(key, problem, cure)
+        is_option = key[0] in self.named_options
+        option = f"--{dotted(key).replace('_', '-')}" if is_option else f"--set {dotted(key)}"
+        return Mistake(problem, cure, key=option)
+
     def where(self, key: Key) -> str:
         """``command line``, or the place in the file."""
-        return "command line" if self._is_typed(key) else super().where(key)
+        return super().where(key) or "command line"
 
-    def line_of(self, key: Key) -> str:
+    def line(self, key: Key) -> str:
         """``command line``, or the line in the file."""
-        return "command line" if self._is_typed(key) else super().line_of(key)
-
-    def place(self, key: Key) -> tuple[int, int]:
-        """Before all lines of the file, or the place in it."""
-        return (0, 0) if self._is_typed(key) else super().place(key)
-
-    def named(self, key: Key) -> str:
-        """The option as it is typed, or the key in the file."""
-        if not self._is_typed(key):
-            return super().named(key)
-        if key[0] in self.named_options:
-            return f"--{dotted(key).replace('_', '-')}"
-        return f"--set {dotted(key)}"
+        return super().line(key) or "command line"
 
     def _is_typed(self, key: Key) -> bool:
         """Whether a key, or all there is of the section it belongs in, was typed."""
@@ -146,15 +133,14 @@ def _setting(text: str) -> dict[str, Any]:
     name, equals, value = text.partition("=")
     keys = [part.strip() for part in name.split(".")]
     if not equals or not all(keys):
-        raise ConfigError(f"--set {text}: write KEY=VALUE, for example ranges.K_m=[0.1,0.2]")
+        raise ConfigError("write KEY=VALUE, for example ranges.K_m=[0.1,0.2]", key=f"--set {text}")
     try:
         content: Any = yaml.load(value, Loader=_Loader)
     except yaml.YAMLError:
-        raise ConfigError(f"--set {text}: {value!r} is not valid YAML") from None
-    for key in reversed(keys):
+        raise ConfigError(f"{value!r} is not valid YAML", key=f"--set {text}") from None
+    for key in reversed(keys[1:]):
         content = {key: content}
-    found: dict[str, Any] = content
-    return found
+    return {keys[0]: content}
 
 
 def dotted(key: Key) -> str:
@@ -164,33 +150,36 @@ def dotted(key: Key) -> str:
 
 def load(path: Path) -> YamlFile:
     """Read a YAML mapping; ConfigError when it is missing, unreadable or malformed."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        cure = nearest_file(path) or "check its name"
-        raise ConfigError(f"{path}: there is no such file; {cure}") from None
-    except IsADirectoryError:
-        raise ConfigError(f"{path}: this is a folder; name a YAML file") from None
-    except UnicodeDecodeError as error:
-        line = error.object[: error.start].count(b"\n") + 1
-        raise ConfigError(
-            f"{path}:{line}: not text in UTF-8; save the file with this "
-            "encoding, or name the right one"
-        ) from None
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+    text = _text_of(path)
     try:
         node = yaml.compose(text, Loader=_Loader)
         content = yaml.load(text, Loader=_Loader)
     except yaml.YAMLError as error:
-        raise ConfigError(_syntax_error(path, text, error)) from None
+        raise ConfigError.of([_syntax_mistake(path, text, error)]) from None
     if content is None:
-        raise ConfigError(f"{path}: the file is empty; it must hold 'key: value' lines")
+        raise ConfigError("the file is empty", cure="it must hold 'key: value' lines", file=path)
     if not isinstance(node, yaml.MappingNode) or not isinstance(content, dict):
-        raise ConfigError(f"{path}:1:1: expected 'key: value' lines, found {_kind(content)}")
-    found = _Places(path)
-    found.collect(node, ())
-    return YamlFile(path, content, found.places, tuple(found.repeated))
+        problem = f"expected 'key: value' lines, found {_kind(content)}"
+        raise ConfigError(problem, file=path, line=1, column=1)
+    places = _Places(path)
+    places.collect(node, ())
+    return YamlFile(path, content, places.places, tuple(places.repeated))
+
+
+def _text_of(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        cure = nearest_file(path) or "check its name"
+        raise ConfigError("there is no such file", cure=cure, file=path) from None
+    except IsADirectoryError:
+        raise ConfigError("this is a folder", cure="name a YAML file", file=path) from None
+    except UnicodeDecodeError as error:
+        line = error.object[: error.start].count(b"\n") + 1
+        cure = "save the file with this encoding, or name the right one"
+        raise ConfigError("not text in UTF-8", cure=cure, file=path, line=line) from None
+    except OSError as error:
+        raise ConfigError(f"cannot be read: {error.strerror}", file=path) from None
 
 
 def merge(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
@@ -198,28 +187,22 @@ def merge(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]
     merged = dict(base)
     for key, value in changes.items():
         old = merged.get(key)
-        both = isinstance(old, Mapping) and isinstance(value, Mapping)
-        merged[key] = merge(old, value) if both else value  # type: ignore[arg-type]
+        if isinstance(old, Mapping) and isinstance(value, Mapping):
+            merged[key] = merge(old, value)
+        else:
+            merged[key] = value
     return merged
 
 
-def suggestion(name: str, known: Sequence[str]) -> str:
-    """What a misspelt name may have meant, as the end of an error message."""
-    near = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
-    if near:
-        return f"did you mean {near[0]!r}?"
-    return f"known are {', '.join(sorted(known))}" if known else "none are known"
-
-
-def nearest_file(path: Path, others: Sequence[str] = ()) -> str:
-    """Which file beside a missing one, or which of other names, it may mean; nothing without."""
+def nearest_file(path: Path, shipped: Sequence[str] = ()) -> str:
+    """The cure for a missing file: the nearest name beside it or among the shipped, if any."""
     try:
         beside = {each.stem: each for each in path.parent.iterdir() if each.suffix == path.suffix}
     except OSError:
         beside = {}
-    known = {**{Path(name).stem: Path(name) for name in others}, **beside}
-    near = difflib.get_close_matches(path.stem, known, n=1, cutoff=0.7)
-    return f"did you mean {str(known[near[0]])!r}?" if near else ""
+    candidates = {**{Path(name).stem: Path(name) for name in shipped}, **beside}
+    near = difflib.get_close_matches(path.stem, candidates, n=1, cutoff=0.7)
+    return f"did you mean {str(candidates[near[0]])!r}?" if near else ""
 
 
 class _Places:
@@ -234,18 +217,15 @@ class _Places:
 
     def collect(self, node: yaml.Node, key: Key) -> None:
         """Note the places of all keys below a node; ConfigError where there is no end to them."""
+        line = node.start_mark.line + 1
         if len(key) > _DEEPEST:
-            raise ConfigError(
-                f"{self._path}:{node.start_mark.line + 1}: nested too deeply; does an alias "
-                "(*name) stand inside its own anchor (&name)?"
-            )
+            cure = "does an alias (*name) stand inside its own anchor (&name)?"
+            raise ConfigError("nested too deeply", cure=cure, file=self._path, line=line)
         self._copies += id(node) in self._met
         self._met.add(id(node))
         if self._copies > _MOST_COPIES:
-            raise ConfigError(
-                f"{self._path}:{node.start_mark.line + 1}: aliases (*name) repeat this more than "
-                f"{_MOST_COPIES} times over; write out what is meant"
-            )
+            problem = f"aliases (*name) repeat this more than {_MOST_COPIES} times over"
+            raise ConfigError(problem, cure="write out what is meant", file=self._path, line=line)
         self.places.setdefault(key, _place(node))
         if isinstance(node, yaml.MappingNode):
             self._mapping(node, key)
@@ -258,12 +238,9 @@ class _Places:
         for name, value in node.value:
             child, place = (*key, str(name.value)), _place(name)
             if name.value in seen:
+                problem = f"this key stands twice, first in line {seen[name.value]}"
                 self.repeated.append(
-                    Mistake(
-                        place,
-                        f"{self._path}:{place[0]}:{place[1]}: {dotted(child)}: this key stands "
-                        f"twice, first in line {seen[name.value]}; keep one",
-                    )
+                    Mistake(problem, "keep one", self._path, *place, dotted(child))
                 )
             seen.setdefault(str(name.value), place[0])
             self.places[child] = place
@@ -305,19 +282,21 @@ _CURES = {
 }
 
 
-def _syntax_error(path: Path, text: str, error: yaml.YAMLError) -> str:
+def _syntax_mistake(path: Path, text: str, error: yaml.YAMLError) -> Mistake:
     mark = getattr(error, "problem_mark", None)
     problem = getattr(error, "problem", None) or str(error)
     if mark is None:
-        return f"{path}: not valid YAML: {problem}"
-    where = f"{path}:{mark.line + 1}:{mark.column + 1}: not valid YAML"
+        return Mistake(f"not valid YAML: {problem}", file=path)
     tabs = [i for i, line in enumerate(text.splitlines(), 1) if re.match(r" *\t", line)]
     if mark.line + 1 in tabs:
         lines = "this line begins" if len(tabs) == 1 else f"lines {_listed(tabs)} begin"
-        return f"{where}: {lines} with a tab; indent with spaces"
-    opened = getattr(error, "context_mark", None) or mark
-    cure = next((cure for said, cure in _CURES.items() if problem.startswith(said)), _LOOK)
-    return f"{where}: {cure.format(problem=problem, context=opened.line + 1)}"
+        cause = f"{lines} with a tab; indent with spaces"
+    else:
+        opened = getattr(error, "context_mark", None) or mark
+        cure = next((cure for start, cure in _CURES.items() if problem.startswith(start)), _LOOK)
+        cause = cure.format(problem=problem, context=opened.line + 1)
+    place = (path, mark.line + 1, mark.column + 1)
+    return Mistake(f"not valid YAML: {cause}", "", *place)
 
 
 def _listed(numbers: Sequence[int]) -> str:

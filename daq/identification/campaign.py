@@ -13,14 +13,16 @@ from pathlib import Path
 from typing import Any
 
 from daq.errors import ConfigError
+from daq.files import write_whole
 from daq.identification import records
 from daq.identification.fit import assemble, check_writable, load_logs
 from daq.identification.records import LoggedRecord
 from daq.identification.request import SettingsRequest
 from daq.identification.result import Identification
 from daq.identification.settings import Problem, gassi_settings, problems_of
-from daq.logs import capture
+from daq.logs.capture import LOG_NAME
 from daq.progress import Progress, Watch, ignore, warn
+from daq.provenance import software_versions
 from sysid import Campaign, ModelError, Outcome, Run
 from sysid import campaign as run_campaign
 
@@ -133,7 +135,7 @@ class CampaignResult:
                 for spread in self.campaign.spread()
             ],
             "interrupted": self.campaign.interrupted,
-            "software": capture.software_versions(),
+            "software": software_versions(),
             "files": {"table": str(self.table)},
         }
 
@@ -284,9 +286,7 @@ def _default_folder() -> Path:
 
 def _log_names(logs: Sequence[LoggedRecord]) -> list[str]:
     """Names that tell logs apart: the capture folder's, or the file's."""
-    names = [
-        log.path.parent.name if log.path.name == capture.LOG_NAME else log.path.stem for log in logs
-    ]
+    names = [log.path.parent.name if log.path.name == LOG_NAME else log.path.stem for log in logs]
     return [
         str(log.path) if names.count(name) > 1 else name
         for name, log in zip(names, logs, strict=True)
@@ -300,5 +300,5 @@ def _joint_name(logs: Sequence[LoggedRecord]) -> str:
 def _write_table(folder: Path, result: Campaign) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "campaign.csv"
-    capture.write_whole(path, result.frame().to_csv(index=False, lineterminator="\n"))
+    write_whole(path, result.frame().to_csv(index=False, lineterminator="\n"))
     return path

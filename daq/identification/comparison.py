@@ -13,6 +13,7 @@ import numpy as np
 import yaml
 
 from daq.errors import ConfigError
+from daq.files import write_whole
 from daq.identification.campaign import (
     Group,
     Workers,
@@ -26,8 +27,8 @@ from daq.identification.fit import check_writable, default_folder
 from daq.identification.request import SettingsRequest
 from daq.identification.result import Identification
 from daq.identification.settings import problems_of
-from daq.logs import capture
 from daq.progress import Watch, ignore, warn
+from daq.provenance import software_versions
 from sysid import Campaign, Candidate, Comparison, ModelError, Outcome, Spread
 from sysid import compare as compare_candidates
 from sysid.judging.comparison import Row
@@ -136,7 +137,7 @@ def compare(wanted: ComparisonRequest, watch: Watch = ignore) -> ComparisonResul
     words += ["--seeds", wanted.seeds] if wanted.seeds is not None else ["--seed", f"{seeds[0]}"]
     compared = ComparisonResult(ranking, groups[0], candidates, campaign, files, folder, words)
     text = yaml.safe_dump(dict(compared.document), sort_keys=False, allow_unicode=True)
-    capture.write_whole(compared.file, text)
+    write_whole(compared.file, text)
     return compared
 
 
@@ -219,7 +220,7 @@ def _document(result: ComparisonResult) -> dict[str, Any]:
         },
         "failed": [f"{o.run.name}, seed {o.run.seed}: {o.problem}" for o in campaign.failed],
         "interrupted": campaign.interrupted,
-        "software": capture.software_versions(),
+        "software": software_versions(),
     }
 
 

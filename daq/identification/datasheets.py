@@ -9,7 +9,8 @@ from pathlib import Path
 from daq.config import checking, yaml_file
 from daq.config.datasheet import DatasheetEntry
 from daq.config.identification import IdentificationConfig
-from daq.config.yaml_file import YamlFile, suggestion
+from daq.config.yaml_file import YamlFile
+from daq.errors import suggestion
 from daq.identification.records import unit_factor
 from sysid import ModelError, ProcessModel, SearchSpace
 
@@ -79,6 +80,6 @@ def under(
                     SearchSpace.of(model, {name: ranges[name]})
             except ModelError as error:
                 raise sheet.file.error((name,), str(error)) from None
-            place = sheet.file.line_of((name,))
+            place = sheet.file.line((name,))
             sources[name] = f"{place} ({entry.source})" if entry.source else place
     return settings.model_copy(update={"ranges": ranges, "fixed": fixed}), sources

@@ -17,8 +17,8 @@ from daq.identification.records import ColumnMapping, LoggedRecord
 from daq.identification.request import SettingsRequest
 from daq.identification.result import FittedLog, Identification
 from daq.identification.settings import Problem, gassi_settings, problem_of
-from daq.logs import capture
-from daq.logs.capture import Recording
+from daq.logs.capture import LOG_NAME
+from daq.logs.recording import Recording, log_path
 from daq.progress import Progress, Watch, ignore, warn
 from sysid import Dataset, ModelError, ProcessModel
 from sysid.gassi import GASSI, PRESETS
@@ -160,9 +160,9 @@ def load_logs(
 
 def default_folder(logs: Sequence[Path], model: str) -> Path:
     """Beside a single capture's log; otherwise a new folder under runs/."""
-    first = capture.log_path(logs[0])
+    first = log_path(logs[0])
     # A folder without a log.csv stands for the CSVs in it, and is no place for results.
-    if len(logs) == 1 and first.name == capture.LOG_NAME and first.exists():
+    if len(logs) == 1 and first.name == LOG_NAME and first.exists():
         return first.parent / "identification"
     now = datetime.datetime.now(datetime.UTC)
     return Path("runs") / f"{now:%Y%m%dT%H%M%SZ}-identify-{model}" / "identification"
@@ -287,7 +287,7 @@ def _as_sources(given: Source | Sequence[Source]) -> list[Source]:
 def _paths(sources: Sequence[Source]) -> list[Path]:
     """Files that sources were read from."""
     return [
-        source.log.path if isinstance(source, Recording) else Path(source)
+        source.path if isinstance(source, Recording) else Path(source)
         for source in sources
         if isinstance(source, str | Path | Recording)
     ]

@@ -8,8 +8,8 @@ from typing import Any
 
 from daq.config import checking, yaml_file
 from daq.config.identification import Signals
-from daq.config.yaml_file import YamlFile, suggestion
-from daq.errors import ConfigError
+from daq.config.yaml_file import YamlFile
+from daq.errors import ConfigError, suggestion
 from daq.identification.settings import with_signals
 from daq.lookup.models import find_model
 from sysid import ProcessModel

@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar
 
 from daq.config.units import converted
-from daq.config.yaml_file import Mistake, YamlFile
+from daq.config.yaml_file import YamlFile
+from daq.errors import Mistake
 from sysid.problem.model import ProcessModel
 
 File = TypeVar("File", bound=YamlFile)

@@ -11,12 +11,14 @@ import numpy as np
 from daq.config.checking import refuse
 from daq.config.identification import Column, Columns
 from daq.config.units import factor
-from daq.config.yaml_file import Key, YamlFile, suggestion
-from daq.errors import ConfigError
+from daq.config.yaml_file import Key, YamlFile
+from daq.errors import ConfigError, suggestion
 from daq.hal import FloatArray, IntArray
-from daq.logs import capture
-from daq.logs.log import Log, require_rows, time_base
-from daq.logs.table import Table, column_names, read_table
+from daq.logs.capture import LOG_NAME
+from daq.logs.recording import Recording, end_of_run, log_path, read_record
+from daq.logs.recording import load as load_recording
+from daq.logs.table import column_names, read_table
+from daq.logs.time_base import require_rows, time_base
 from sysid.problem.data import Dataset
 from sysid.problem.model import Input, ModelError, Output, ProcessModel
 
@@ -45,7 +47,7 @@ def expand(paths: list[Path]) -> list[Path]:
     """Logs named on the command line: a folder without a log.csv stands for the CSVs in it."""
     logs: list[Path] = []
     for path in paths:
-        if path.is_dir() and not (path / capture.LOG_NAME).exists():
+        if path.is_dir() and not (path / LOG_NAME).exists():
             inside = sorted(path.glob("*.csv"))
             if not inside:
                 raise ConfigError(
@@ -61,16 +63,16 @@ def load(path: Path, model: ProcessModel, mapping: ColumnMapping | None) -> Logg
     """One log as a record; ConfigError names the file, line and column of what is wrong."""
     try:
         if mapping is not None:
-            return _load_foreign(capture.log_path(path), model, mapping)
-        return from_recording(capture.load(path), model)
+            return _load_foreign(log_path(path), model, mapping)
+        return from_recording(load_recording(path), model)
     except ModelError as error:
         raise ConfigError(f"{path}: {error}") from None
 
 
-def from_recording(recording: capture.Recording, model: ProcessModel) -> LoggedRecord:
+def from_recording(recording: Recording, model: ProcessModel) -> LoggedRecord:
     """A log that has been read as a record; ConfigError, ModelError."""
-    dataset = _with_noise(_from_log(recording.log, model, recording.name), recording, model)
-    return LoggedRecord(dataset, recording.log.path, recording.warning)
+    dataset = _with_noise(_from_log(recording, model, recording.name), recording, model)
+    return LoggedRecord(dataset, recording.path, recording.warning)
 
 
 def from_frame(frame: pd.DataFrame, name: str, model: ProcessModel) -> LoggedRecord:
@@ -88,7 +90,7 @@ def from_frame(frame: pd.DataFrame, name: str, model: ProcessModel) -> LoggedRec
     except (TypeError, ValueError) as error:
         raise ConfigError(f"{name}: a column is not of numbers: {error}") from None
     tick, dt = time_base(path, numbers["t"].to_numpy(), first_line=0)
-    log = Log(path, numbers.assign(tick=tick), dt, torn=False)
+    log = Recording(path, numbers.assign(tick=tick), dt)
     return LoggedRecord(_from_log(log, model, name), path, None)
 
 
@@ -163,7 +165,7 @@ def check_mapping(
             unit_factor(mapping.file, ("columns", group, name, "unit"), given[name].unit, unit)
 
 
-def _from_log(log: Log, model: ProcessModel, title: str) -> Dataset:
+def _from_log(log: Recording, model: ProcessModel, title: str) -> Dataset:
     columns = list(log.frame.columns)
     for name in (*model.input_names, *model.output_names):
         if name not in columns:
@@ -178,7 +180,7 @@ def _from_log(log: Log, model: ProcessModel, title: str) -> Dataset:
     return _dataset(log.path, model, inputs, outputs, tick, log.dt, title)
 
 
-def _with_noise(dataset: Dataset, recording: capture.Recording, model: ProcessModel) -> Dataset:
+def _with_noise(dataset: Dataset, recording: Recording, model: ProcessModel) -> Dataset:
     """The record with what its offset calibration told of noise and zeros."""
     inputs = np.array([recording.noise(name) for name in model.input_names]).reshape(-1, 2)
     outputs = np.array([recording.noise(name) for name in model.output_names]).reshape(-1, 2)
@@ -194,15 +196,14 @@ def _load_foreign(path: Path, model: ProcessModel, mapping: ColumnMapping) -> Lo
     outputs_from = {columns.outputs[name].column for name in model.output_names}
     gapless = {columns.time.column, *inputs_from}
     used = sorted(name for name in gapless | outputs_from if name is not None)
-    table = read_table(
+    frame, first_line, torn = read_table(
         path,
         used,
         "mend these cells or remove their lines (removed lines count as lost samples)",
         gaps=[name for name in used if name not in gapless],
     )
-    frame = table.frame
     require_rows(path, len(frame))
-    tick, dt = _foreign_time(table, mapping)
+    tick, dt = _foreign_time(path, frame, first_line, mapping)
 
     def values(signal: Input | Output, group: str, source: Column) -> FloatArray:
         key = ("columns", group, signal.name, "unit")
@@ -227,7 +228,7 @@ def _load_foreign(path: Path, model: ProcessModel, mapping: ColumnMapping) -> Lo
         dt,
         path.stem,
     )
-    return LoggedRecord(dataset, path, capture.describe_end(path, table.torn))
+    return LoggedRecord(dataset, path, end_of_run(path, read_record(path), torn))
 
 
 def _check_columns(path: Path, model: ProcessModel, mapping: ColumnMapping) -> None:
@@ -252,14 +253,16 @@ def _check_columns(path: Path, model: ProcessModel, mapping: ColumnMapping) -> N
     )
 
 
-def _foreign_time(table: Table, mapping: ColumnMapping) -> tuple[IntArray, float]:
+def _foreign_time(
+    path: Path, frame: pd.DataFrame, first_line: int, mapping: ColumnMapping
+) -> tuple[IntArray, float]:
     """Sequence numbers and sample time [s] of a foreign table's rows."""
     time = mapping.columns.time
     if time.column is None:
         assert time.sample_rate is not None
-        return np.arange(len(table.frame), dtype=np.int64), 1.0 / time.sample_rate
+        return np.arange(len(frame), dtype=np.int64), 1.0 / time.sample_rate
     seconds = unit_factor(mapping.file, ("columns", "time", "unit"), time.unit, "s")
-    values = table.frame[time.column].to_numpy() * seconds
+    values = frame[time.column].to_numpy() * seconds
     cure = (
         "say 'grid: 0.001' (s) in 'columns: time:' to round uneven times to multiples of it, or "
         "resample the log to a constant rate"
@@ -270,13 +273,11 @@ def _foreign_time(table: Table, mapping: ColumnMapping) -> tuple[IntArray, float
         if np.any(np.diff(tick) == 0.0) and np.all(np.diff(values) > 0.0):
             raise mapping.file.error(
                 ("columns", "time", "grid"),
-                f"{time.grid:g} s is too coarse: rows of {table.path} are "
+                f"{time.grid:g} s is too coarse: rows of {path} are "
                 f"{np.diff(values).min():g} s apart; take a tenth of that",
             )
         values = tick * time.grid
-    return time_base(
-        table.path, values, tick, first_line=table.first_line, column=time.column, cure=cure
-    )
+    return time_base(path, values, tick, first_line=first_line, column=time.column, cure=cure)
 
 
 def _dataset(

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from daq.errors import ConfigError
-from daq.logs import capture
+from daq.files import make_folder, write_whole
 
 _CHECKPOINT, _REQUEST = "search.ckpt", "search.json"
 
@@ -66,13 +66,13 @@ def remember(
     folder: Path, settings: SettingsRequest, training: Sequence[Path], validation: Sequence[Path]
 ) -> None:
     """Write a request into the folder that the results will go to."""
-    capture.make_folder(folder)
+    make_folder(folder)
     content = {
         "asked": asdict(settings),
         "training": _absolute(training),
         "validation": _absolute(validation),
     }
-    capture.write_whole(folder / _REQUEST, json.dumps(content, indent=1))
+    write_whole(folder / _REQUEST, json.dumps(content, indent=1))
 
 
 def recall(folder: Path) -> InterruptedFit:

@@ -13,11 +13,12 @@ import numpy as np
 import yaml
 
 from daq.config.identification import Signals
+from daq.files import make_folder, write_whole
 from daq.identification.records import LoggedRecord
 from daq.identification.request import resume_command
 from daq.identification.rows import Rows
 from daq.identification.settings import Problem
-from daq.logs import capture
+from daq.provenance import software_versions
 from sysid import Metrics, ProcessModel
 from sysid.arrays import FloatArray
 from sysid.gassi import GASSI
@@ -148,10 +149,10 @@ class Identification:
 
     def save(self, folder: str | Path) -> Path:
         """Write ``parameters.yaml`` into a folder; its path. Raises ConfigError."""
-        capture.make_folder(Path(folder))
+        make_folder(Path(folder))
         path = Path(folder) / PARAMETERS
         text = yaml.safe_dump(self.document, sort_keys=False, allow_unicode=True)
-        capture.write_whole(path, text)
+        write_whole(path, text)
         return path
 
     def source(self, name: str) -> str:
@@ -212,7 +213,7 @@ def _document(identification: Identification) -> dict[str, Any]:
             "flagged": estimator.flagged_,
             "feasible": estimator.feasible_,
         },
-        "software": capture.software_versions(),
+        "software": software_versions(),
         **({"seeds": dict(identification.seeds)} if identification.seeds is not None else {}),
     }
 

@@ -9,8 +9,8 @@ from typing import Any
 
 from daq.config import checking, yaml_file
 from daq.config.identification import IdentificationConfig, Signals
-from daq.config.yaml_file import CommandLine, Mistake, YamlFile, suggestion
-from daq.errors import ConfigError
+from daq.config.yaml_file import TypedSettings, YamlFile
+from daq.errors import ConfigError, suggestion
 from daq.identification import datasheets, records
 from daq.identification.quantities import in_model_units
 from daq.identification.records import ColumnMapping
@@ -54,7 +54,7 @@ def problems_of(
     written = yaml_file.load(config) if config is not None else None
     if written is not None:
         checking.refuse_other_kind(written, "an identification's settings")
-    file = CommandLine.of(options, request.settings, written)
+    file = TypedSettings.of(options, request.settings, written)
     declared = _find_models(config, file, names)
     file, unconverted = in_model_units(file, [model for model, _ in declared])
     settings = checking.validate(file, IdentificationConfig, others=unconverted)
@@ -139,21 +139,19 @@ def gassi_settings(settings: IdentificationConfig) -> dict[str, Any]:
 
 
 def _find_models(
-    config: Path | None, file: CommandLine, names: Sequence[str | None]
+    config: Path | None, file: TypedSettings, names: Sequence[str | None]
 ) -> list[tuple[ProcessModel, str]]:
     """Models and their whole names; when one is not found, the file's other mistakes as well."""
     try:
         return [_find_model(config, file, name) for name in names]
     except ConfigError as error:
-        if str(error).startswith(file.named(("model",))):
-            checking.validate(
-                file, IdentificationConfig, others=[Mistake(file.place(("model",)), str(error))]
-            )
+        if error.key == "model":
+            checking.validate(file, IdentificationConfig, others=error.mistakes)
         raise
 
 
 def _find_model(
-    config: Path | None, file: CommandLine, typed: str | None
+    config: Path | None, file: TypedSettings, typed: str | None
 ) -> tuple[ProcessModel, str]:
     """A model and its whole name, from the command line or else the configuration."""
     configured = file.content.get("model")
@@ -169,7 +167,7 @@ def _find_model(
     except ConfigError as error:
         if beside is None or configured is None:
             raise
-        raise file.error(("model",), str(error)) from None
+        raise ConfigError.of(file.blamed(("model",), error)) from None
 
 
 def _with_outputs(file: YamlFile, signals: Signals, model: ProcessModel) -> ProcessModel:
@@ -194,17 +192,17 @@ def _with_starts(file: YamlFile, signals: Signals, model: ProcessModel) -> Proce
 
 
 def _datasheets(
-    config: Path | None, file: CommandLine, settings: IdentificationConfig
+    config: Path | None, file: TypedSettings, settings: IdentificationConfig
 ) -> list[Path]:
     """Typed names are relative to where they are typed, those in a file to that file."""
     beside = config.parent if config is not None and "datasheet" not in file.typed else Path()
     return [beside / name for name in settings.datasheet]
 
 
-def _range_sources(file: CommandLine) -> dict[str, str]:
+def _range_sources(file: TypedSettings) -> dict[str, str]:
     """Where the range or value of each parameter was given, for those not left to the model."""
     return {
-        str(name): file.line_of((group, str(name)))
+        str(name): file.line((group, str(name)))
         for group in ("ranges", "fixed", "tied")
         for name in file.content.get(group) or {}
     }

@@ -12,13 +12,12 @@ import dataclasses
 from collections.abc import Iterator
 
 from daq.config.rig import OwnLimit, RigConfig
-from daq.errors import ConfigError, RigError, RunError
+from daq.errors import USER_CODE_ERRORS, ConfigError, RigError, RunError, raised_in
 from daq.hal import Flag, Phase, Samples
 from daq.limits.base import Limit, Trip
 from daq.limits.load import DeviceFound, I2t, Magnitude
 from daq.limits.sensors import Frozen, Jump, Silence, Stalled
 from daq.limits.shaft import Travel, Winding
-from daq.run.protocol_calls import MISTAKES, place
 
 __all__ = ["Limit", "Limits", "Trip", "mark_interlock"]
 
@@ -56,10 +55,9 @@ def _made(item: OwnLimit) -> Limit:
         made: Limit = item.make()
     except RigError:
         raise
-    except MISTAKES as error:
-        raise ConfigError(
-            f"limits.own: {item.use} cannot be made: {type(error).__name__}: {error}"
-        ) from error
+    except USER_CODE_ERRORS as error:
+        problem = f"{item.use} cannot be made: {type(error).__name__}: {error}"
+        raise ConfigError(problem, key="limits.own") from error
     return made
 
 
@@ -129,8 +127,8 @@ class _Named(Limit):
                 raise ValueError
         except (TypeError, ValueError):
             raise RunError(
-                f"the limit {type(self._own).__name__} answered {trip!r} to {len(samples)} "
-                "samples; check must return None or (row, reason); outputs were set to zero"
+                f"the limit {type(self._own).__name__} answered {trip!r} to {len(samples)} samples",
+                cure="check must return None or (row, reason); outputs were set to zero",
             ) from None
         return int(row), str(reason)
 
@@ -140,8 +138,8 @@ class _Named(Limit):
             yield
         except RigError:
             raise
-        except MISTAKES as error:
+        except USER_CODE_ERRORS as error:
             raise RunError(
                 f"the limit {type(self._own).__name__} failed: {type(error).__name__}: {error}"
-                f"{place(error, type(self._own))}; outputs were set to zero"
+                f"{raised_in(type(self._own), error)}; outputs were set to zero"
             ) from error

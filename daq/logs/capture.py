@@ -2,24 +2,17 @@
 
 from __future__ import annotations
 
-import contextlib
 import datetime
 import hashlib
-import importlib.metadata
 import json
-import math
 import platform
-import subprocess
-import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from daq.errors import ConfigError, RunError
-from daq.logs.log import Log, load_log
-
-if TYPE_CHECKING:
-    import pandas as pd
+from daq.files import make_folder, write_whole
+from daq.provenance import software_versions
 
 LOG_NAME = "log.csv"
 RUN_NAME = "run.json"
@@ -74,10 +67,8 @@ class Capture:
         try:
             path.write_bytes(bytes(_RESERVED))
         except OSError as error:
-            raise RunError(
-                f"{path}: cannot be written: {error.strerror}; free space on the disk, or choose "
-                "another with --out"
-            ) from None
+            cure = "free space on the disk, or choose another with --out"
+            raise RunError(f"cannot be written: {error.strerror}", cure=cure, file=path) from None
 
     def finish(self, status: str, reason: str | None, **facts: Any) -> None:
         """Note how the run ended, and the fingerprint of its log.
@@ -95,157 +86,6 @@ class Capture:
             self.save()
 
 
-@dataclass(frozen=True)
-class Recording:
-    """A log with what is known of its run.
-
-    warning: None for a run that completed, else one line that says how it ended.
-    """
-
-    log: Log
-    record: dict[str, Any] | None
-    warning: str | None
-
-    @property
-    def name(self) -> str:
-        """Folder name of a capture, or file name of a lone log."""
-        path = self.log.path
-        return path.parent.name if path.name == LOG_NAME else path.stem
-
-    @property
-    def frame(self) -> pd.DataFrame:
-        """The samples as a table; columns and units are those of ``daq.logs.log``."""
-        return self.log.frame
-
-    @property
-    def folder(self) -> Path:
-        """Where the log stands."""
-        return self.log.path.parent
-
-    def noise(self, channel: str) -> tuple[float, float]:
-        """Standard deviations of a channel's noise and of its zero, as the calibration found them.
-
-        Zeros for a channel that was not calibrated, and without a run record.
-        """
-        found = (self.record or {}).get("calibration", {})
-        try:
-            deviation = float(found.get("noise", {}).get(channel, 0.0))
-            samples = int(found.get("samples", 1))
-            if not (math.isfinite(deviation) and deviation >= 0.0 and samples > 0):
-                raise ValueError
-        except (AttributeError, OverflowError, TypeError, ValueError):
-            raise ConfigError(
-                f"{self.folder / RUN_NAME}: 'calibration' must hold 'samples' and, for "
-                f"{channel}, a 'noise' of 0 or more; delete it to go without"
-            ) from None
-        return deviation, deviation / math.sqrt(samples)
-
-
-def load(path: str | Path) -> Recording:
-    """Read a capture folder, its log.csv, or a lone CSV in either program's format.
-
-    Raises ConfigError when there is no readable log.
-    """
-    csv = log_path(Path(path))
-    log = load_log(csv)
-    return Recording(log, read_record(csv), describe_end(csv, log.torn))
-
-
-def log_path(path: Path) -> Path:
-    """The CSV that a folder or file name given by a user means."""
-    return path / LOG_NAME if path.is_dir() else path
-
-
-def read_record(csv: Path) -> dict[str, Any] | None:
-    """run.json beside a log.csv; None when there is none. ConfigError when it is malformed."""
-    path = csv.parent / RUN_NAME
-    if csv.name != LOG_NAME or not path.exists():
-        return None
-    try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise ConfigError(
-            f"{path}: not a readable run record ({error}); move it away to use the log alone"
-        ) from None
-    if not isinstance(record, dict):
-        raise ConfigError(f"{path}: not a run record; move it away to use the log alone")
-    return record
-
-
-def describe_end(csv: Path, torn: bool) -> str | None:
-    """One line on a run that did not complete, or None."""
-    record = read_record(csv) or {}
-    cut = "; its last line is incomplete and is left out" if torn else ""
-    status = record.get("status", COMPLETED)
-    if status == RUNNING:
-        return f"{csv}: the run was interrupted (killed, or still running){cut}"
-    if status != COMPLETED:
-        return f"{csv}: the run ended early: {status}: {record.get('reason')}{cut}"
-    return f"{csv}: the log was interrupted{cut}" if torn else None
-
-
-def software_versions() -> dict[str, Any]:
-    """Versions of this program, Python and the libraries that shape a result."""
-    names = ("hybrid-rig", "numpy", "scipy", "numba", "pandas")
-    versions: dict[str, Any] = {"python": sys.version.split()[0]}
-    for name in names:
-        try:
-            versions[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            versions[name] = None
-    versions["commit"] = _git_commit()
-    return versions
-
-
-def write_whole(path: Path, content: str | bytes) -> None:
-    """Replace a file's content in one step. Raises RunError when the disk refuses."""
-    temporary = path.with_name(path.name + ".tmp")
-    try:
-        temporary.write_bytes(content.encode() if isinstance(content, str) else content)
-        temporary.replace(path)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
-        folder = path.parent
-        reason = (
-            error.strerror if folder.is_dir() else f"there is no folder {folder}, make it first"
-        )
-        raise RunError(f"{path}: cannot be written: {reason}") from None
-
-
-def _git_commit() -> str | None:
-    """Commit of the checkout this program runs from, marked when files differ from it."""
-    root = Path(__file__).resolve().parents[2]
-    if not (root / ".git").exists():
-        return None
-    try:
-        return subprocess.run(
-            ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=12"],
-            capture_output=True, text=True, timeout=5, check=True,
-        ).stdout.strip()  # fmt: skip
-    except (OSError, subprocess.SubprocessError):
-        return None
-
-
-def make_folder(folder: Path, exist_ok: bool = True) -> None:
-    """Make a folder and what leads to it; ConfigError with the cure when that is impossible.
-
-    Raises FileExistsError where it must be new and is not.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=exist_ok)
-    except FileExistsError:
-        if not exist_ok:
-            raise
-        raise _no_folder(folder, "File exists") from None
-    except OSError as error:
-        raise _no_folder(folder, error.strerror) from None
-
-
-def _no_folder(folder: Path, reason: str | None) -> ConfigError:
-    return ConfigError(f"{folder}: cannot be created: {reason}; choose a folder with --out")
-
-
 def _new_folder(root: Path, stem: str) -> Path:
     for attempt in range(1, 1000):
         folder = root / (stem if attempt == 1 else f"{stem}-{attempt}")
@@ -256,7 +96,8 @@ def _new_folder(root: Path, stem: str) -> Path:
                 break
             continue
         return folder
-    raise ConfigError(f"{root}: no capture folder can be made here; choose another with --out")
+    problem = "no capture folder can be made here"
+    raise ConfigError(problem, cure="choose another with --out", file=root)
 
 
 def _file_name(name: str) -> str:

@@ -7,13 +7,13 @@ import warnings
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
-from daq.config.yaml_file import suggestion
-from daq.errors import ConfigError
+from daq.errors import ConfigError, suggestion
 from daq.hal import FloatArray
+from daq.logs.time_base import refuse_rows
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -25,20 +25,6 @@ _NO_NUMBERS = ("nan", "inf", "-inf")  # what a broken sensor may end a log with
 _HEAD = 1 << 20  # bytes in which a header stands
 _PIECE = 1 << 22  # bytes parsed at a time: what pandas makes of them stays in the processor's cache
 _TEXT_CONTROLS = b"\t\n\r\f"
-
-
-@dataclass(frozen=True)
-class Table:
-    """Columns of a CSV as numbers.
-
-    first_line: the line of the first row. torn: the last line was cut, or broken by a measurement
-    that is no number, and is left out.
-    """
-
-    path: Path
-    frame: pd.DataFrame
-    first_line: int
-    torn: bool
 
 
 @dataclass(frozen=True)
@@ -65,58 +51,89 @@ def read_table(
     columns: Sequence[str] = (),
     cure: str = _CURE,
     gaps: Collection[str] = (),
-) -> Table:
+) -> tuple[pd.DataFrame, int, bool]:
     """Read a CSV of numbers with a header line.
 
-    cure: what to do about cells that hold no number, for the error's end. gaps: columns that may
-    have cells without one, empty or as in ``_NOTHING``; NaN in the table.
+    The columns as numbers, the line of the first row, and whether the last line was cut, or broken
+    by a measurement that is no number, and is left out.
+
+    columns: wanted ones, default all. cure: what to do about cells that hold no number. gaps:
+    columns that may have cells without one, empty or as in ``_NOTHING``; NaN in the table.
 
     Cells are separated by commas, semicolons or tabs (then decimals may have a comma), and
     separators may be followed by blanks. Lines of comments may stand before the header, or the
-    header in the last of them, as NumPy writes it. A cut last line is left out. Raises
-    ConfigError that names file, line and column for anything else that is not a table of finite
-    numbers with the given columns.
+    header in the last of them, as NumPy writes it. Raises ConfigError that names file, line and
+    column for anything else that is not a table of finite numbers with the given columns.
     """
     import pandas as pd
 
     layout = layout_of(_complete_lines(path, _HEAD)[0])
-    header, separator = layout.names, layout.separator
     _check_header(path, layout, columns)
-    wanted = list(columns) or [name for name in header if name]
-    first = layout.line + 1
+    names = list(columns) or [name for name in layout.names if name]
+    first_line = layout.line + 1
     plain = _plain_numbers(path, layout)
     if plain is not None:
         frame, torn = plain
-        return Table(path, frame[wanted], first, torn)
+        return frame[names], first_line, torn
     text, torn = _complete_lines(path)
+    cells = _cells(path, text, layout)
+    without_gaps = [name for name in names if name not in gaps]
+    if len(cells) and cells[without_gaps].iloc[-1].str.strip().str.lower().isin(_NO_NUMBERS).any():
+        cells, torn = cells.iloc[:-1], True
+    decimal_comma = layout.separator != ","
+    numbers = {
+        name: _numbers(path, cells[name], first_line, decimal_comma, cure, name in gaps)
+        for name in names
+    }
+    return pd.DataFrame(numbers), first_line, torn
+
+
+def _cells(path: Path, text: str, layout: Layout) -> pd.DataFrame:
+    """The text of every cell below the header; ConfigError for rows that are too long."""
+    import pandas as pd
+
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", pd.errors.ParserWarning)
-            frame = pd.read_csv(
-                io.StringIO(text), sep=separator, skipinitialspace=True, header=None,
-                skiprows=layout.line, names=_apart(header), index_col=False, dtype=str,
-                keep_default_na=False, skip_blank_lines=False, on_bad_lines="error",
-            )  # fmt: skip
+        return _parsed(
+            io.StringIO(text), layout, dtype=str, sep=layout.separator, skiprows=layout.line
+        )
     except pd.errors.ParserWarning:
         lines = text.splitlines()
-        rows = range(layout.line, len(lines))
-        line = next((i for i in rows if lines[i].count(separator) >= len(header)), 0)
+        n_columns = len(layout.names)
+        counts = [line.count(layout.separator) + 1 for line in lines]
+        row = next((i for i in range(layout.line, len(lines)) if counts[i] > n_columns), 0)
         raise ConfigError(
-            f"{path}:{line + 1}: {lines[line].count(separator) + 1} cells, but line "
-            f"{layout.line} names {len(header)} columns; separate cells by commas and write "
-            "decimals with a point, or separate them by semicolons"
+            f"{counts[row]} cells, but line {layout.line} names {n_columns} columns",
+            cure="separate cells by commas and write decimals with a point, or separate them by "
+            "semicolons",
+            file=path,
+            line=row + 1,
         ) from None
     except pd.errors.ParserError as error:
         reason = str(error).removeprefix("Error tokenizing data. C error: ").strip()
-        raise ConfigError(f"{path}: not a table: {reason}") from None
-    held = [name for name in wanted if name not in gaps]
-    if len(frame) and frame[held].iloc[-1].str.strip().str.lower().isin(_NO_NUMBERS).any():
-        frame, torn = frame.iloc[:-1], True
-    numbers = {
-        name: _numbers(path, name, frame[name], first, separator, cure, name in gaps)
-        for name in wanted
-    }
-    return Table(path, pd.DataFrame(numbers), first, torn)
+        raise ConfigError(f"not a table: {reason}", file=path) from None
+
+
+def _parsed(source: IO[Any], layout: Layout, dtype: type, **options: Any) -> pd.DataFrame:
+    """Rows below a header; a row that is too long raises ParserWarning, other faults ValueError."""
+    import pandas as pd
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", pd.errors.ParserWarning)
+        # A column without a name, as a separator at each line's end makes it, gets its number.
+        names: list[str | int] = [name or place for place, name in enumerate(layout.names)]
+        frame: pd.DataFrame = pd.read_csv(
+            source,
+            names=names,
+            dtype=dtype,
+            skipinitialspace=True,
+            header=None,
+            index_col=False,
+            keep_default_na=False,
+            skip_blank_lines=False,
+            on_bad_lines="error",
+            **options,
+        )
+    return frame
 
 
 def _plain_numbers(path: Path, layout: Layout) -> tuple[pd.DataFrame, bool] | None:
@@ -131,8 +148,7 @@ def _plain_numbers(path: Path, layout: Layout) -> tuple[pd.DataFrame, bool] | No
         return None
     parts, torn = [], False
     try:
-        with path.open("rb") as file, warnings.catch_warnings():
-            warnings.simplefilter("error", pd.errors.ParserWarning)
+        with path.open("rb") as file:
             for _ in range(layout.line):
                 file.readline()
             while piece := file.read(_PIECE) + file.readline():
@@ -149,13 +165,7 @@ def _plain_numbers(path: Path, layout: Layout) -> tuple[pd.DataFrame, bool] | No
 
 def _finite_rows(rows: bytes, layout: Layout) -> pd.DataFrame:
     """Lines of finite numbers, one for each name; raises ValueError or a warning for others."""
-    import pandas as pd
-
-    frame = pd.read_csv(
-        io.BytesIO(rows), skipinitialspace=True, header=None, names=_apart(layout.names),
-        index_col=False, dtype=np.float64, keep_default_na=False, skip_blank_lines=False,
-        on_bad_lines="error", low_memory=False,
-    )  # fmt: skip
+    frame = _parsed(io.BytesIO(rows), layout, dtype=np.float64, low_memory=False)
     if b"\0" in rows or not np.isfinite(frame.to_numpy()).all():
         raise ValueError
     return frame
@@ -172,13 +182,13 @@ def layout_of(text: str) -> Layout:
     at = len(leading)
     if header is None:
         return Layout(1, leading[:1] or [""], ",")
-    numbers = _cells(header, _separator(header))
+    numbers = _names(header, _separator(header))
     if leading and all(map(_is_number, numbers)):
-        named = leading[-1].strip().lstrip("#%/").strip()
-        if len(_cells(named, _separator(header))) == len(numbers):
-            at, header = at - 1, named
+        comment = leading[-1].strip().lstrip("#%/").strip()
+        if len(_names(comment, _separator(header))) == len(numbers):
+            at, header = at - 1, comment
     separator = _separator(header)
-    return Layout(at + 1, _cells(header, separator), separator)
+    return Layout(at + 1, _names(header, separator), separator)
 
 
 def _lines(text: str) -> Iterator[str]:
@@ -194,46 +204,41 @@ def _separator(line: str) -> str:
     return next((s for s in ("\t", ";") if s in line), ",")
 
 
-def _cells(line: str, separator: str) -> list[str]:
+def _names(line: str, separator: str) -> list[str]:
     return [name.strip().strip('"').strip() for name in line.split(separator)]
 
 
-def _apart(header: list[str]) -> list[str | int]:
-    """Columns without a name, as a separator at each line's end makes them, told apart."""
-    return [name or place for place, name in enumerate(header)]
-
-
-def _complete_lines(path: Path, most: int = -1) -> tuple[str, bool]:
+def _complete_lines(path: Path, n_bytes: int = -1) -> tuple[str, bool]:
     """The file's text up to its last complete line, and whether something was cut off.
 
-    most: bytes to read, -1 for all.
+    n_bytes: how much to read, -1 for all.
     """
     try:
         with path.open("rb") as file:
-            data = file.read(most)
+            data = file.read(n_bytes)
     except FileNotFoundError:
-        raise ConfigError(
-            f"{path}: there is no such log; name a capture folder or a CSV file"
-        ) from None
+        cure = "name a capture folder or a CSV file"
+        raise ConfigError("there is no such log", cure=cure, file=path) from None
     except IsADirectoryError:
-        raise ConfigError(f"{path}: this is a folder without a log.csv in it") from None
+        raise ConfigError("this is a folder without a log.csv in it", file=path) from None
     except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
-    if len(data) == most:
+        raise ConfigError(f"cannot be read: {error.strerror}", file=path) from None
+    if len(data) == n_bytes:
         # Not in the middle of a character.
         data = data[: data.rfind(b"\n") + 1] or data
     text = _decoded(path, data)
     if "\r" in text:
         text = text.replace("\r\n", "\n")
     if not text or text.isspace():
-        raise ConfigError(f"{path}: the log is empty; it must start with a line of column names")
+        cure = "it must start with a line of column names"
+        raise ConfigError("the log is empty", cure=cure, file=path)
     cut = text.rfind("\n") + 1
     tail = text[cut:]
     # A last line without its newline may lack digits even where it has every column.
     complete = text[:cut] if cut else text
     if "\0" in complete:
         line = complete[: complete.index("\0")].count("\n") + 1
-        raise ConfigError(f"{path}:{line}: not a text file: it holds bytes of zero")
+        raise ConfigError("not a text file: it holds bytes of zero", file=path, line=line)
     if complete.endswith("\n\n") or not complete.endswith("\n"):
         complete = complete.rstrip("\n") + "\n"
     return complete, bool(tail.strip())
@@ -247,55 +252,54 @@ def _decoded(path: Path, data: bytes) -> str:
         controls = bytes(byte for byte in range(32) if byte not in _TEXT_CONTROLS)
         if data.translate(None, controls) != data:
             line = data[: error.start].count(b"\n") + 1
-            raise ConfigError(f"{path}:{line}: not a text file (byte {error.start})") from None
+            problem = f"not a text file (byte {error.start})"
+            raise ConfigError(problem, file=path, line=line) from None
         return data.decode("cp1252", errors="replace")
 
 
 def _check_header(path: Path, layout: Layout, columns: Sequence[str]) -> None:
     line, header = layout.line, layout.names
     if all(_is_number(name) for name in header):
-        raise ConfigError(
-            f"{path}:{line}: the first line holds numbers; it must hold the column names"
-        )
-    named = [name for name in header if name]
-    twice = sorted({name for name in named if header.count(name) > 1})
-    if twice:
-        raise ConfigError(f"{path}:{line}: column {twice[0]!r} stands twice")
+        cure = "it must hold the column names"
+        raise ConfigError("the first line holds numbers", cure=cure, file=path, line=line)
+    names = [name for name in header if name]
+    repeated = sorted({name for name in names if header.count(name) > 1})
+    if repeated:
+        raise ConfigError(f"column {repeated[0]!r} stands twice", file=path, line=line)
     for name in columns:
         if name not in header:
             raise ConfigError(
-                f"{path}:{line}: column {name!r} is missing; {suggestion(name, named)} "
-                f"(the file has {', '.join(named)}). Columns of other programs are named in "
-                "the 'columns' section of a file given with --config"
+                f"column {name!r} is missing",
+                cure=f"{suggestion(name, names)} (the file has {', '.join(names)}). Columns of "
+                "other programs are named in the 'columns' section of a file given with --config",
+                file=path,
+                line=line,
             )
 
 
 def _numbers(
     path: Path,
-    name: str,
     column: pd.Series,
     first_line: int,
-    separator: str,
+    decimal_comma: bool,
     cure: str,
     with_gaps: bool,
 ) -> FloatArray:
+    """A column's cells as numbers; ConfigError at the first that is none."""
     import pandas as pd
 
     text = column.str.strip()
-    if separator != ",":
+    if decimal_comma:
         text = text.str.replace(",", ".", regex=False)
     values = pd.to_numeric(text, errors="coerce").to_numpy(dtype=np.float64)
     wrong = ~np.isfinite(values)
     if with_gaps:
         wrong &= ~text.str.lower().isin(_NOTHING).to_numpy()
-    bad = np.flatnonzero(wrong)
-    if len(bad):
-        row = int(bad[0])
-        more = f", and in {len(bad) - 1} more lines" if len(bad) > 1 else ""
-        raise ConfigError(
-            f"{path}:{row + first_line}: {name}: {column.iloc[row]!r} is not a finite "
-            f"number{more}; {cure}"
-        )
+    if wrong.any():
+        cell, n_more = column.iloc[int(np.argmax(wrong))], int(wrong.sum()) - 1
+        more = f", and in {n_more} more lines" if n_more else ""
+        problem = f"{cell!r} is not a finite number{more}"
+        refuse_rows(path, wrong, problem, first_line, str(column.name), cure)
     return values
 
 

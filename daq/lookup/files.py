@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import inspect
 import re
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,7 +16,7 @@ from daq.config import checking, yaml_file
 from daq.config.base import Section
 from daq.config.rig import OwnLimit, RigConfig, with_options
 from daq.config.yaml_file import Key, YamlFile
-from daq.errors import ConfigError
+from daq.errors import ConfigError, Mistake
 from daq.experiment import Experiment, Plan
 from daq.hal import Device
 from daq.limits import Limit
@@ -42,8 +41,14 @@ class LoadedExperiment:
         try:
             return plan(self.experiment, rig)
         except ConfigError as error:
-            key = tuple(str(error).split(":", 1)[0].split("."))
-            raise ConfigError(f"{self.file.where(key)}: {error}") from None
+            raise ConfigError.of(map(self._placed, error.mistakes)) from None
+
+    def _placed(self, mistake: Mistake) -> Mistake:
+        """A mistake in a setting, at its line of the file."""
+        if mistake.file is not None:
+            return mistake.behind(self.file.mistake((), ""))
+        line, column = self.file.place(tuple(mistake.key.split(".")))
+        return replace(mistake, file=self.file.path, line=line, column=column)
 
     def validation(self) -> LoadedExperiment | None:
         """The validation run: the same with the keys under ``validation`` changed, if any."""
@@ -60,11 +65,10 @@ class _Validation(YamlFile):
 
     changed: frozenset[Key] = field(default_factory=frozenset)
 
-    def named(self, key: Key) -> str:
-        """Place and name of a key, under the section that it stands in."""
-        if key and key in self.changed:
-            return f"{self.where(key)}: validation.{yaml_file.dotted(key)}"
-        return super().named(key)
+    def mistake(self, key: Key, problem: str, cure: str = "") -> Mistake:
+        """What is wrong at a key, named under the section that it stands in."""
+        mistake = super().mistake(key, problem, cure)
+        return replace(mistake, key=f"validation.{mistake.key}") if key in self.changed else mistake
 
 
 def _validation_file(file: YamlFile) -> YamlFile:
@@ -91,7 +95,7 @@ def find(name: str, packages: Iterable[str]) -> Path:
                 return shipped[candidate]
     cure = yaml_file.nearest_file(path, list(shipped) if path.name == name else [])
     cure = cure or f"check its name, or use a shipped one: {', '.join(shipped)}"
-    raise ConfigError(f"{name}: there is no such file; {cure}")
+    raise ConfigError("there is no such file", cure=cure, file=name)
 
 
 def rig_for(experiment: str) -> str:
@@ -114,8 +118,7 @@ def load_experiment(name: str) -> LoadedExperiment:
     try:
         kind = find_protocol(_protocol_name(file), file.path.parent)
     except ConfigError as error:
-        unknown = file.mistake(("protocol",), str(error))
-        checking.validate(file, _common_settings(), others=[unknown])
+        checking.validate(file, _common_settings(), others=file.blamed(("protocol",), error))
         raise
     own = checking.mistakes(file, kind, file.content)
     if file.content.get("validation") and isinstance(file.content["validation"], dict):
@@ -134,7 +137,8 @@ def _tell(file: YamlFile, what: str, kind: type[Any]) -> None:
 def _protocol_name(file: YamlFile) -> str:
     name = file.content.get("protocol")
     if not isinstance(name, str):
-        raise ConfigError("this key is missing or not a name; for example 'protocol: prbs'")
+        problem = "this key is missing or not a name"
+        raise ConfigError(problem, cure="for example 'protocol: prbs'")
     return name
 
 
@@ -154,14 +158,15 @@ def _common_settings() -> type[Section]:
 
 def together(*steps: Callable[[], Any]) -> list[Any]:
     """What each step gives; one ConfigError with the mistakes of all of them."""
-    results, told = [], []
+    results: list[Any] = []
+    mistakes: dict[str, Mistake] = {}  # by text: each once
     for step in steps:
         try:
             results.append(step())
         except ConfigError as error:
-            told += str(error).splitlines()
-    if told:
-        raise ConfigError("\n".join(dict.fromkeys(told)))
+            mistakes |= {mistake.text: mistake for mistake in error.mistakes}
+    if mistakes:
+        raise ConfigError.of(mistakes.values())
     return results
 
 
@@ -208,7 +213,7 @@ def _find(
     else:
         found = from_file(locate(Path(file[1]), kind, folder), file[2], kind, is_one)
     if not is_one(found):
-        raise ConfigError(f"{name} is no {kind}; {cure}")
+        raise ConfigError(f"{name} is no {kind}", cure=cure)
     return found
 
 
@@ -244,17 +249,14 @@ def load_rig(name: str, options: Mapping[str, Any] | None = None) -> tuple[RigCo
     file = yaml_file.load(find(name, RIGS))
     checking.refuse_other_kind(file, "a rig")
     if options:
-        file = dataclasses.replace(
-            file, content=yaml_file.merge(file.content, {"options": options})
-        )
+        file = replace(file, content=yaml_file.merge(file.content, {"options": options}))
     backend_name = file.content.get("backend", RigConfig.model_fields["backend"].default)
     if not isinstance(backend_name, str):
         checking.validate(file, RigConfig)
     try:
         backend = _find_backend(backend_name, file.path.parent)
     except ConfigError as error:
-        unknown = file.mistake(("backend",), str(error))
-        checking.validate(file, RigConfig, others=[unknown])
+        checking.validate(file, RigConfig, others=file.blamed(("backend",), error))
         raise
     config = checking.validate(file, with_options(backend.Options))
     _tell(file, f"backend {backend_name}", backend)
@@ -282,7 +284,7 @@ def _limit_maker(file: YamlFile, own: OwnLimit, key: Key) -> Callable[[], Limit]
     try:
         kind = _find_limit(own.use, file.path.parent)
     except ConfigError as error:
-        raise file.error((*key, "use"), str(error)) from None
+        raise ConfigError.of(file.blamed((*key, "use"), error)) from None
     options = kind.Options
     if options is None:
         if own.options:

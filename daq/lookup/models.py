@@ -9,8 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
-from daq.config.yaml_file import suggestion
-from daq.errors import ConfigError
+from daq.errors import ConfigError, suggestion
 from daq.lookup.user_code import from_file, locate
 from daq.plugins import load_plugin
 from sysid import ModelError, ProcessModel

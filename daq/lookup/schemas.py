@@ -19,7 +19,7 @@ from daq.config.rig import RigConfig, with_options
 from daq.config.schema import DRAFT, Schema, json_schema, partial
 from daq.errors import ConfigError
 from daq.experiment import Experiment
-from daq.logs import capture
+from daq.files import make_folder, write_whole
 from daq.plugins import Group, installed, load_plugin
 
 FOLDER = "schemas"
@@ -46,11 +46,11 @@ def without_comment(text: str) -> str:
 
 def write_schemas(folder: Path) -> list[Path]:
     """One file for each kind of YAML; the paths written. ConfigError when they cannot be."""
-    capture.make_folder(folder)
+    make_folder(folder)
     paths = []
     for kind, schema in documents(protocols(), backend_options()).items():
         path = folder / f"{kind}.json"
-        capture.write_whole(path, json.dumps(schema, indent=1, ensure_ascii=False) + "\n")
+        write_whole(path, json.dumps(schema, indent=1, ensure_ascii=False) + "\n")
         paths.append(path)
     return paths
 

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from daq.config.schema import Schema
-from daq.config.yaml_file import suggestion
-from daq.errors import ConfigError, RunError
-from daq.logs import capture
+from daq.errors import ConfigError, RunError, suggestion
+from daq.files import make_folder
 from daq.lookup import schemas
 from daq.lookup.shipped import EXPERIMENTS, RIGS, shipped_files
 
@@ -44,7 +43,7 @@ def write_starter(folder: Path, protocol: str, rig: str) -> StarterFiles:
         SETTINGS: settings_text(),
         **_companions(protocol),
     }
-    capture.make_folder(folder)
+    make_folder(folder)
     written = [folder / name for name, text in texts.items() if _write_new(folder / name, text)]
     kept = [folder / name for name in texts if folder / name not in written]
     schemas.write_schemas(folder / schemas.FOLDER)

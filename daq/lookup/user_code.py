@@ -9,8 +9,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Literal
 
-from daq.config.yaml_file import nearest_file, suggestion
-from daq.errors import ConfigError, line_in, same_file
+from daq.config.yaml_file import nearest_file
+from daq.errors import USER_CODE_ERRORS, ConfigError, line_in, same_file, suggestion
 from sysid.problem.model import ModelError
 
 Kind = Literal["backend", "limit", "model", "protocol"]
@@ -22,7 +22,7 @@ def locate(path: Path, kind: Kind, relative_to: Path | None = None) -> Path:
         if candidate.is_file():
             return candidate
     cure = nearest_file(path) or (nearest_file(relative_to / path) if relative_to else "")
-    raise ConfigError(f"{path}: there is no such {kind} file; {cure or 'check its name'}")
+    raise ConfigError(f"there is no such {kind} file", cure=cure or "check its name", file=path)
 
 
 def from_file(path: Path, attribute: str, kind: Kind, is_one: Callable[[Any], bool]) -> Any:
@@ -34,10 +34,8 @@ def from_file(path: Path, attribute: str, kind: Kind, is_one: Callable[[Any], bo
     module = _import(path, kind)
     if not hasattr(module, attribute):
         names = [key for key, value in vars(module).items() if is_one(value)]
-        raise ConfigError(
-            f"{path}: it defines no {attribute!r}; {suggestion(attribute, names)} "
-            f"(FILE.py:NAME names a {kind} in it)"
-        )
+        cure = f"{suggestion(attribute, names)} (FILE.py:NAME names a {kind} in it)"
+        raise ConfigError(f"it defines no {attribute!r}", cure=cure, file=path)
     return getattr(module, attribute)
 
 
@@ -52,24 +50,23 @@ def _import(path: Path, kind: Kind) -> ModuleType:
     sys.modules[spec.name] = module
     try:
         spec.loader.exec_module(module)
-    except (Exception, SystemExit) as error:
+    except USER_CODE_ERRORS as error:
         del sys.modules[spec.name]
-        what = (
+        problem = (
             str(error)
             if isinstance(error, ModelError)
             else f"the {kind} file does not import: {type(error).__name__}: {error}"
         )
-        raise ConfigError(f"{_place(path, error)}: {what}") from None
+        raise ConfigError(problem, file=path, line=_line(path, error)) from None
     finally:
         sys.path.remove(folder)
     return module
 
 
-def _place(path: Path, error: BaseException) -> str:
-    """``file:line`` of the last line of the user's file that the error passed through."""
+def _line(path: Path, error: BaseException) -> int | None:
+    """The last line of the user's file that the error passed through."""
     if isinstance(error, SyntaxError) and same_file(error.filename, path):
-        return f"{path}:{error.lineno}"
+        return error.lineno
     # What a model's function raised is where to look, not where the model is declared.
     raised = error.__context__ if isinstance(error, ModelError) else None
-    line = (line_in(raised, path) if raised is not None else None) or line_in(error, path)
-    return f"{path}:{line}" if line is not None else str(path)
+    return (line_in(raised, path) if raised is not None else None) or line_in(error, path)

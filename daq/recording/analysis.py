@@ -10,14 +10,15 @@ from typing import Any
 import numpy as np
 
 from daq.documents import plain
-from daq.errors import ConfigError, RigError, RunError
+from daq.errors import USER_CODE_ERRORS, ConfigError, RigError, RunError, raised_in
 from daq.experiment import ClosedLoop, Experiment
+from daq.files import make_folder, write_whole
 from daq.findings import Findings
-from daq.logs import capture
-from daq.logs.log import load_log
+from daq.logs.capture import LOG_NAME, RUN_NAME
+from daq.logs.recording import end_of_run, load, log_path, read_record
 from daq.lookup.files import find_protocol
 from daq.progress import Watch, ignore, warn
-from daq.run.protocol_calls import MISTAKES, mistake, place
+from daq.run.protocol_calls import mistake
 
 RESULTS = "results"
 
@@ -42,7 +43,8 @@ def analyse(folder: str | Path, *, watch: Watch = ignore) -> Analysis:
     where nothing follows.
     """
     folder = Path(folder)
-    warn(watch, capture.describe_end(capture.log_path(folder), torn=False))
+    csv = log_path(folder)
+    warn(watch, end_of_run(csv, read_record(csv), torn=False))
     experiment = recorded_experiment(folder)
     findings = conclude(experiment, folder)
     if findings is None:
@@ -55,8 +57,8 @@ def analyse(folder: str | Path, *, watch: Watch = ignore) -> Analysis:
 
 def recorded_experiment(folder: Path) -> Experiment:
     """The experiment that a capture folder says was run; ConfigError when it does not."""
-    path = folder / capture.RUN_NAME
-    record = capture.read_record(capture.log_path(folder))
+    path = folder / RUN_NAME
+    record = read_record(log_path(folder))
     if record is None:
         raise ConfigError(f"{path}: there is no such file; give a capture folder that rig run made")
     settings = record.get("experiment")
@@ -91,16 +93,16 @@ def conclude(experiment: Experiment, folder: Path) -> Findings | None:
     if type(experiment).findings is Experiment.findings:
         return None
     extra = tuple(experiment.columns) if isinstance(experiment, ClosedLoop) else ()
-    log = load_log(folder / capture.LOG_NAME, extra)
+    log = load(folder / LOG_NAME, extra)
     columns = {name: log.frame[name].to_numpy() for name in extra if name in log.frame}
     try:
         findings = experiment.findings(log.samples(), columns)
         if findings is not None and not isinstance(findings, Findings):
             raise TypeError(f"it returned {findings!r}; return daq.findings.Findings or None")
     except ValueError as error:
-        at = place(error, type(experiment))
+        at = raised_in(type(experiment), error)
         raise RunError(f"{folder}: no result: {error}{at}") from None
-    except MISTAKES as error:
+    except USER_CODE_ERRORS as error:
         raise RunError(
             f"{folder}: no result: {mistake(experiment, 'in findings()', error)}"
         ) from error
@@ -132,20 +134,20 @@ def _write(findings: Findings, folder: Path) -> None:
     from daq.figures import style
     from daq.figures.findings import draw
 
-    capture.make_folder(folder)
+    make_folder(folder)
     for table in findings.tables:
         rows = np.column_stack(list(table.columns.values()))
         lines = [",".join(table.columns), *(",".join(map(repr, row)) for row in rows.tolist())]
-        capture.write_whole(folder / f"{table.name}.csv", "\n".join(lines) + "\n")
+        write_whole(folder / f"{table.name}.csv", "\n".join(lines) + "\n")
     for chart in findings.figures:
         figure = draw(chart)
         for kind in style.PRINTED:
-            capture.write_whole(folder / f"{chart.name}.{kind}", style.render(figure, kind))
+            write_whole(folder / f"{chart.name}.{kind}", style.render(figure, kind))
     text = json.dumps(plain(_contents(findings)), indent=2)
-    capture.write_whole(folder / "findings.json", text + "\n")
+    write_whole(folder / "findings.json", text + "\n")
     # Of an earlier analysis with another protocol's text.
     (folder / "ranges.yaml").unlink(missing_ok=True)
     if findings.ranges:
         lines = ["# Starting ranges for rig identify --config", "ranges:"]
         lines += [f"  {k}: [{low:.6g}, {high:.6g}]" for k, (low, high) in findings.ranges.items()]
-        capture.write_whole(folder / "ranges.yaml", "\n".join(lines) + "\n")
+        write_whole(folder / "ranges.yaml", "\n".join(lines) + "\n")

@@ -11,10 +11,10 @@ import numpy as np
 from daq.config.rig import RigConfig
 from daq.errors import ConfigError, RunError
 from daq.experiment import ClosedLoop, Experiment, Plan
+from daq.files import write_whole
 from daq.findings import Chart, Heatmap
 from daq.hal import CHANNELS, FloatArray
-from daq.logs.capture import write_whole
-from daq.logs.log import UNITS
+from daq.logs.columns import UNITS
 from daq.progress import Watch, ignore
 from daq.recording.session import Session, open_session
 from daq.run.protocol_calls import preview_of

@@ -14,7 +14,8 @@ from daq.errors import ConfigError
 from daq.experiment import Plan
 from daq.findings import Findings
 from daq.hal import Device, Phase, Reporting
-from daq.logs.capture import LOG_NAME, Recording, load
+from daq.logs.capture import LOG_NAME
+from daq.logs.recording import Recording, load
 from daq.lookup.files import LoadedExperiment, load_experiment, load_rig, rig_for, together
 from daq.progress import Level, Note, Progress, Started, Watch, ignore, warn
 from daq.recording.analysis import conclude_or_warn

@@ -12,8 +12,8 @@ from daq.figures import style
 from daq.figures.picture import Picture
 from daq.figures.rankings import Ratio, ratios
 from daq.figures.responses import Response, responses
+from daq.files import make_folder, write_whole
 from daq.identification.comparison import ComparisonResult
-from daq.logs import capture
 from daq.report.page import Drawing, comparison_page
 from daq.report.publication import FIGURES, command_of, fingerprints
 
@@ -26,11 +26,11 @@ def publish_comparison(result: ComparisonResult) -> str:
     Raises RunError where the disk refuses.
     """
     document, folder, group = plain(_with_files(result)), result.folder, result.group
-    capture.make_folder(folder / FIGURES)
+    make_folder(folder / FIGURES)
     drawings = []
     for picture in _pictures(document, result):
         content = style.render(picture.figure, "svg")
-        capture.write_whole(folder / FIGURES / f"{picture.name}.svg", content)
+        write_whole(folder / FIGURES / f"{picture.name}.svg", content)
         drawings.append(Drawing(picture.name, picture.topic, picture.caption, content.decode()))
     now = datetime.datetime.now(datetime.UTC)
     preferred = next(row for row in document["structures"] if row["name"] == document["preferred"])
@@ -47,7 +47,7 @@ def publish_comparison(result: ComparisonResult) -> str:
             "logs": fingerprints(*logs),
         },
     }
-    capture.write_whole(folder / _PAGE, comparison_page(document, variables, drawings))
+    write_whole(folder / _PAGE, comparison_page(document, variables, drawings))
     return str(folder / _PAGE)
 
 

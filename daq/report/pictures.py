@@ -21,12 +21,13 @@ from daq.figures.residuals import Remainder, residual_correlations
 from daq.figures.responses import Response, responses
 from daq.figures.signals import Panel, signals
 from daq.figures.spectra import Spectrum, spectra
+from daq.files import write_whole
 from daq.findings import Axis
 from daq.identification.records import LoggedRecord
 from daq.identification.replay import Replay
 from daq.identification.rows import ParameterRow, Rows
-from daq.logs import capture
-from daq.logs.log import UNITS
+from daq.logs.columns import UNITS
+from daq.logs.recording import load
 from sysid import Dataset, ModelError, equilibrium, evaluate, linearize
 from sysid.arrays import FloatArray
 from sysid.judging.residual_tests import residual_test
@@ -414,7 +415,7 @@ def _capture_signals(log: LoggedRecord) -> Figure:
 
 def _columns(log: LoggedRecord) -> dict[str, FloatArray]:
     """Columns of a capture's log by name."""
-    frame = capture.load(log.path).log.frame
+    frame = load(log.path).frame
     return {name: frame[name].to_numpy(dtype=np.float64) for name in UNITS if name in frame}
 
 
@@ -434,4 +435,4 @@ def draw_replay(replay: Replay, path: Path) -> None:
         for j, output in enumerate(replay.model.outputs)
     ]
     kind = style.format_of(path)
-    capture.write_whole(path, style.render(responses(replay.time, outputs), kind))
+    write_whole(path, style.render(responses(replay.time, outputs), kind))

@@ -14,12 +14,13 @@ from daq.documents import plain
 from daq.figures import style
 from daq.figures.picture import Picture
 from daq.figures.style import Format
+from daq.files import make_folder, write_whole
 from daq.identification.baseline import Baseline, baseline_of
 from daq.identification.records import LoggedRecord
 from daq.identification.request import SettingsRequest
 from daq.identification.result import Identification, errors_document
 from daq.identification.rows import Rows
-from daq.logs import capture
+from daq.logs.recording import read_record
 from daq.lookup.models import DEFAULT_MODEL
 from daq.progress import Progress, Watch, ignore
 from daq.report.latex import latex
@@ -66,7 +67,7 @@ def publish(result: Identification, folder: Path, watch: Watch = ignore) -> dict
         "latex": (_TABLE, latex(Rows.of(document))),
     }
     for name, content in pages.values():
-        capture.write_whole(folder / name, content)
+        write_whole(folder / name, content)
     watch(Progress("Report", _STEPS, _STEPS, f"{len(drawings)} figures"))
     return {kind: str(folder / name) for kind, (name, _) in pages.items()}
 
@@ -75,11 +76,11 @@ def draw(
     subject: Subject, folder: Path, formats: Sequence[Format]
 ) -> Iterator[tuple[Picture, dict[Format, bytes]]]:
     """Every figure, written to files of the formats; with what is in them."""
-    capture.make_folder(folder)
+    make_folder(folder)
     for picture in pictures(subject):
         contents = {kind: style.render(picture.figure, kind) for kind in formats}
         for kind, content in contents.items():
-            capture.write_whole(folder / f"{picture.name}.{kind}", content)
+            write_whole(folder / f"{picture.name}.{kind}", content)
         yield picture, contents
 
 
@@ -165,7 +166,7 @@ def _reproduction(result: Identification) -> dict[str, Any]:
         "runs": [
             _run(record)
             for path in _paths([*training, *validation])
-            if (record := capture.read_record(path)) is not None
+            if (record := read_record(path)) is not None
         ],
     }
 

@@ -17,7 +17,7 @@ _ROUNDING = 1.0 + 1e-9
 def plan(experiment: Experiment, rig: RigConfig) -> Plan:
     """What a run will do.
 
-    Raises ConfigError, its text beginning with the key, for settings that make no run, and for a
+    Raises ConfigError, naming the key, for settings that make no run, and for a
     plan that breaks one of the rig's limits: the sample and the value, as far as they are known
     beforehand.
     """
@@ -41,14 +41,16 @@ def plan(experiment: Experiment, rig: RigConfig) -> Plan:
 def _check_homing(turns: float, rig: RigConfig) -> None:
     least, travel = rig.limits.winding, rig.limits.travel
     if turns > 0.0 and least is not None and turns <= least:
-        raise ConfigError(
-            f"homing.turns: {turns:g} turns are wound, and limits.winding of the rig's file wants "
-            f"{least:g} left; wind more"
+        problem = (
+            f"{turns:g} turns are wound, and limits.winding of the rig's file wants {least:g} left"
         )
+        raise ConfigError(problem, cure="wind more", key="homing.turns")
     if travel is not None and turns > max(-travel[0], travel[1]):
         raise ConfigError(
-            f"homing.turns: {turns:g} turns are outside limits.travel of the rig's file, "
-            f"[{travel[0]:g}, {travel[1]:g}] turns; wind less"
+            f"{turns:g} turns are outside limits.travel of the rig's file, "
+            f"[{travel[0]:g}, {travel[1]:g}] turns",
+            cure="wind less",
+            key="homing.turns",
         )
 
 
@@ -62,9 +64,10 @@ def _check_range(planned: Plan, rig: RigConfig, channel: int, name: str) -> None
     if planned.commands is not None:
         asked = f"for {beyond:.6g} V in sample {where(planned.commands[:, channel])}"
     raise ConfigError(
-        f"{name}: the plan asks {asked}, outside the rig's limits "
-        f"[{least:g}, {most:g}] V; change amplitude or offset, or "
-        f"limits.command.{name} in the rig's file if the hardware allows it"
+        f"the plan asks {asked}, outside the rig's limits [{least:g}, {most:g}] V",
+        cure=f"change amplitude or offset, or limits.command.{name} in the rig's file if the "
+        "hardware allows it",
+        key=name,
     )
 
 
@@ -77,10 +80,12 @@ def _check_slew(volts: FloatArray, rate: float, rig: RigConfig, name: str) -> No
         return
     row = int(np.argmax(slopes))
     raise ConfigError(
-        f"{name}: the plan changes the command at {slopes[row]:.6g} V/s in sample {row} (from "
+        f"the plan changes the command at {slopes[row]:.6g} V/s in sample {row} (from "
         f"{volts[row - 1] if row else 0.0:.6g} V to {volts[row]:.6g} V), faster than the rig's "
-        f"limit of {limit:g} V/s; make smaller or slower steps, or change limits.slew.{name} in "
-        "the rig's file if the hardware allows it"
+        f"limit of {limit:g} V/s",
+        cure=f"make smaller or slower steps, or change limits.slew.{name} in the rig's file if "
+        "the hardware allows it",
+        key=name,
     )
 
 
@@ -93,9 +98,10 @@ def _check_current(volts: FloatArray, rate: float, rig: RigConfig, name: str) ->
     row = int(np.argmax(current))
     if current[row] > most * _ROUNDING:
         raise ConfigError(
-            f"{name}: the plan asks for {volts[row]:.6g} V in sample {row}, which is "
-            f"{current[row]:.4g} A by amplifiers.{name}, beyond limits.current.{name} of "
-            f"{most:g} A; change amplitude or offset"
+            f"the plan asks for {volts[row]:.6g} V in sample {row}, which is {current[row]:.4g} A "
+            f"by amplifiers.{name}, beyond limits.current.{name} of {most:g} A",
+            cure="change amplitude or offset",
+            key=name,
         )
     load = getattr(rig.limits.i2t, name)
     if load is None:
@@ -105,10 +111,11 @@ def _check_current(volts: FloatArray, rate: float, rig: RigConfig, name: str) ->
     if beyond.any():
         row = int(np.argmax(beyond))
         raise ConfigError(
-            f"{name}: by sample {row} ({row / rate:.4g} s) the plan has reached "
-            f"{levels[row]:.4g} A^2*s above {load.continuous:g} A, beyond the budget of "
-            f"limits.i2t.{name}, {load.budget:g} A^2*s; make it shorter or smaller, or pause "
-            "for the winding to cool down"
+            f"by sample {row} ({row / rate:.4g} s) the plan has reached {levels[row]:.4g} A^2*s "
+            f"above {load.continuous:g} A, beyond the budget of limits.i2t.{name}, "
+            f"{load.budget:g} A^2*s",
+            cure="make it shorter or smaller, or pause for the winding to cool down",
+            key=name,
         )
 
 
@@ -118,7 +125,8 @@ def _check_speed(name: str, values: FloatArray, experiment: ClosedLoop, limit: f
     row = int(np.argmax(np.abs(values)))
     if not abs(values[row]) <= limit * _ROUNDING:
         raise ConfigError(
-            f"{name}: the plan asks for {values[row]:.4g} rad/s in sample {row}, beyond "
-            f"limits.speed of {limit:g} rad/s; ask for less, or change limits.speed in the "
-            "rig's file if the hardware allows it"
+            f"the plan asks for {values[row]:.4g} rad/s in sample {row}, beyond limits.speed of "
+            f"{limit:g} rad/s",
+            cure="ask for less, or change limits.speed in the rig's file if the hardware allows it",
+            key=name,
         )

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import contextlib
-import inspect
 import json
 import math
+import re
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from daq.errors import ConfigError, RigError, line_in
+from daq.errors import USER_CODE_ERRORS, ConfigError, RigError, raised_in
 from daq.experiment import (
     MOST_SAMPLES,
     Answer,
@@ -21,36 +20,19 @@ from daq.experiment import (
     Experiment,
     Plan,
     Sample,
+    SettingError,
 )
 from daq.findings import Chart, Heatmap
 from daq.hal import CHANNELS
 
-MISTAKES = (Exception, SystemExit)
-"""What code of a user's own may raise without meaning to end the program."""
-
 _ROUNDING = 1e-9  # of a plan's bounds
-
-
-def place(error: BaseException, kind: type) -> str:
-    """`` (FILE:LINE)``, the last line of a class's own file that an error passed through.
-
-    Nothing where it did not, or where the class comes with this program.
-    """
-    try:
-        file = Path(inspect.getfile(kind))
-    except (OSError, TypeError):
-        return ""
-    if file.is_relative_to(Path(__file__).parents[2]):
-        return ""
-    line = line_in(error, file)
-    return f" ({file}:{line})" if line is not None else ""
 
 
 def mistake(experiment: Experiment, doing: str, error: BaseException) -> str:
     """The sentence on an error in a protocol's code: which, where, what."""
     return (
         f"the protocol {experiment.protocol!r} failed {doing}: {type(error).__name__}: {error}"
-        f"{place(error, type(experiment))}"
+        f"{raised_in(type(experiment), error)}"
     )
 
 
@@ -60,9 +42,20 @@ def plan_of(experiment: Experiment) -> Plan:
         try:
             planned = experiment.plan()
         except ValueError as error:
-            raise ConfigError(f"{error}{place(error, type(experiment))}") from None
+            raise _refused(experiment, error) from None
         _check_form(planned, experiment)
     return planned
+
+
+def _refused(experiment: Experiment, error: ValueError) -> ConfigError:
+    """What a protocol says of its settings, by the key that its text begins with."""
+    if isinstance(error, SettingError):
+        key, problem = error.key, error.problem
+    else:
+        # The convention for protocols of users: the one place where a text is taken apart.
+        begin = re.match(r"([\w.]+): ", str(error))
+        key, problem = (begin[1], str(error)[begin.end() :]) if begin else ("", str(error))
+    return ConfigError(f"{problem}{raised_in(type(experiment), error)}", key=key)
 
 
 def description_of(experiment: Experiment) -> dict[str, Any]:
@@ -137,7 +130,7 @@ def _before_the_run(experiment: Experiment, doing: str) -> Iterator[None]:
         yield
     except RigError:
         raise
-    except MISTAKES as error:
+    except USER_CODE_ERRORS as error:
         raise ConfigError(mistake(experiment, doing, error)) from error
 
 

@@ -47,7 +47,8 @@ class RealTime:
             self._lock_memory()
         if asked == "require" and self.refused:
             missing = "; ".join(f"{name}: {reason}" for name, reason in self.refused.items())
-            raise ConfigError(f"realtime: required, but not granted: {missing}. Cure: {_CURE}")
+            problem = f"required, but not granted: {missing}. Cure: {_CURE}"
+            raise ConfigError(problem, key="realtime")
 
     def undo(self) -> None:
         """Back to ordinary scheduling, in reverse order; never raises."""

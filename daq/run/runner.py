@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from daq.config.rig import RigConfig
-from daq.errors import DeviceError, InterlockError, RigError, RunError, Terminated
+from daq.errors import USER_CODE_ERRORS, DeviceError, InterlockError, RigError, RunError, Terminated
 from daq.experiment import (
     Answer,
     ClosedLoop,
@@ -23,11 +23,11 @@ from daq.experiment import (
 from daq.hal import CHANNELS, Device, Flag, FloatArray, Mode, Phase, Samples
 from daq.limits import Limits, mark_interlock
 from daq.logs.capture import COMPLETED, Capture
-from daq.logs.log import LogWriter
+from daq.logs.writer import LogWriter
 from daq.rig import Rig
 from daq.run.interruption import Stopping
 from daq.run.plan import plan
-from daq.run.protocol_calls import MISTAKES, AnswerCheck, controller_of, description_of, mistake
+from daq.run.protocol_calls import AnswerCheck, controller_of, description_of, mistake
 from daq.run.realtime import RealTime
 from daq.run.timing import Timing
 
@@ -130,7 +130,7 @@ class _Run:
             self._finish(*_outcome(error, self.phase))
             error.add_note(self._kept(log))
             raise
-        except MISTAKES as error:
+        except USER_CODE_ERRORS as error:
             reason = (
                 f"the backend failed during {self.phase.value}: {type(error).__name__}: {error}; "
                 "outputs were set to zero. Mend the backend, or report this to who maintains it"
@@ -280,9 +280,11 @@ class _Run:
             if now > homing.timeout:
                 still = "; the shaft did not stand still then" if done >= homing.turns else ""
                 raise RunError(
-                    f"homing: {done:.2f} of {homing.turns:g} turns were wound in "
-                    f"{homing.timeout:g} s{still}; wind the load, hold it until the run goes on "
-                    "and start again, or raise homing.timeout in the experiment"
+                    f"{done:.2f} of {homing.turns:g} turns were wound in "
+                    f"{homing.timeout:g} s{still}",
+                    cure="wind the load, hold it until the run goes on and start again, or raise "
+                    "homing.timeout in the experiment",
+                    key="homing",
                 )
             return False
 
@@ -455,7 +457,7 @@ class _Answering:
                 self._check(answer)
         except RigError:
             raise
-        except MISTAKES as error:
+        except USER_CODE_ERRORS as error:
             raise self._failed(sample.tick, error) from error
         return answer
 
@@ -468,18 +470,20 @@ def _require_rest(calibration: OffsetCalibration, moved: float, means: dict[str,
     """Raise RunError unless what was averaged was a rig at rest."""
     if moved > calibration.motion:
         raise RunError(
-            f"calibration: the shaft moved by {moved:.3g} turns at zero command, more than "
-            f"calibration.motion of {calibration.motion:g} turns; let it come to rest, keep "
-            "hands off and start again"
+            f"the shaft moved by {moved:.3g} turns at zero command, more than calibration.motion "
+            f"of {calibration.motion:g} turns",
+            cure="let it come to rest, keep hands off and start again",
+            key="calibration",
         )
     for name in ("current_motor", "current_brake"):
         most = getattr(calibration, name)
         if not abs(means[name]) <= most:
             raise RunError(
-                f"calibration: {name} reads {means[name]:.4g} A at zero command, more than "
-                f"calibration.{name} of {most:g} A: a current flows, or the sensor is far off. "
-                "Look at the amplifier's input and its zero, and at the sensor's wires; raise "
-                f"calibration.{name} in the experiment if it is the sensor's offset"
+                f"{name} reads {means[name]:.4g} A at zero command, more than calibration.{name} "
+                f"of {most:g} A: a current flows, or the sensor is far off. Look at the "
+                "amplifier's input and its zero, and at the sensor's wires",
+                cure=f"raise calibration.{name} in the experiment if it is the sensor's offset",
+                key="calibration",
             )
 
 

@@ -21,7 +21,7 @@ from bokeh.models.annotations import Span
 from bokeh.plotting import figure
 
 from daq.hal import Flag, FloatArray
-from daq.logs.log import UNITS
+from daq.logs.columns import UNITS
 from daq.scope.history import View
 
 # Okabe & Ito's palette: told apart with any colour vision.

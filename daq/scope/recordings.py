@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from daq.errors import ConfigError
-from daq.logs.capture import LOG_NAME, RUN_NAME, RUNNING, log_path, read_record
+from daq.logs.capture import LOG_NAME, RUN_NAME, RUNNING
+from daq.logs.recording import log_path, read_record
 from daq.scope.history import History
 from daq.scope.tail import LogTail
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from daq.hal import FloatArray, IntArray
-from daq.logs.log import ORIGINAL_COLUMNS
+from daq.logs.columns import ORIGINAL_COLUMNS
 from daq.logs.table import COMMENTS, Layout, layout_of
 
 CHUNK = 2_000_000  # bytes read at a time: some 20 ms of parsing, so that the page stays alive

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from daq.hal import Flag, FloatArray
-from daq.logs.log import UNITS
+from daq.logs.columns import UNITS
 from daq.scope.figures import BLUE, GREEN, GREY, ORANGE, RED, curves_of, flag_name
 from daq.scope.recordings import Recording
 

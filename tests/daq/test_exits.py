@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from daq.logs import capture
+from daq.logs.recording import load
 from tests.daq.support import (
     RIG,
     environment,
@@ -244,7 +244,7 @@ def assert_consistent(folder, status, reason):
     rows = (folder / "log.csv").read_text().splitlines()[1:]
     broken = bool(rows) and "nan" in rows[-1]
     if len(rows) - broken > 1:
-        loaded = capture.load(folder)
+        loaded = load(folder)
         assert f"ended early: {status}" in loaded.warning
         if broken:
             assert "its last line is incomplete and is left out" in loaded.warning
@@ -319,7 +319,7 @@ def test_a_closed_terminal_ends_the_run_and_not_its_record(tmp_path):
     os.close(here)
     process.wait(timeout=60)
     assert_consistent(folder, "stopped", "stopped by SIGHUP during run")
-    assert np.all(np.diff(capture.load(folder).log.frame["tick"]) == 1)
+    assert np.all(np.diff(load(folder).frame["tick"]) == 1)
 
 
 def test_a_log_deleted_during_the_run_is_no_completed_run(run, tmp_path):

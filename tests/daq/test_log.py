@@ -14,9 +14,10 @@ from hypothesis import strategies as st
 from daq.errors import ConfigError, RunError
 from daq.hal import Flag, Samples
 from daq.identification import records as datasets
-from daq.logs import capture
-from daq.logs.log import COLUMNS, ORIGINAL_COLUMNS, LogWriter, load_log
+from daq.logs.columns import COLUMNS, ORIGINAL_COLUMNS
+from daq.logs.recording import load
 from daq.logs.table import read_table
+from daq.logs.writer import LogWriter
 from sim_rig.actuator import actuator
 from tests.daq.support import (
     install_faulty,
@@ -94,7 +95,7 @@ def test_what_is_written_is_read_back_to_the_bit(tmp_path, cells, rate, first, c
             if len(part):
                 log.append(part)
         assert log.n_samples == len(block)
-    loaded = load_log(path)
+    loaded = load(path)
     assert not loaded.torn
     for column in COLUMNS:
         written = getattr(block, "time" if column == "t" else column)
@@ -118,7 +119,7 @@ decimals = st.from_regex(
 def test_any_decimal_is_read_as_python_reads_it(tmp_path, cells):
     path = tmp_path / "table.csv"
     path.write_text("x,y\n" + "".join(f"{cell},1\n" for cell in cells))
-    read = read_table(path).frame["x"].to_numpy()
+    read = read_table(path)[0]["x"].to_numpy()
     assert read.tobytes() == np.array([float(cell) for cell in cells]).tobytes()
 
 
@@ -132,7 +133,7 @@ def test_a_long_log_is_read_whole_and_its_mistakes_found(tmp_path):
     assert len(data) > 4_500_000  # which is more than is read at a time
     for text, torn in ((data, False), (data + b"\n\n", False), (data + b"93.75,0.0,0.", True)):
         path.write_bytes(text)
-        loaded = load_log(path)
+        loaded = load(path)
         assert loaded.torn == torn and len(loaded.frame) == n
         for column in ("tick", "torque", "omega"):
             assert loaded.frame[column].to_numpy().tobytes() == getattr(written, column).tobytes()
@@ -140,7 +141,7 @@ def test_a_long_log_is_read_whole_and_its_mistakes_found(tmp_path):
     for wrong, said in (("", "t: ''"), ("1.0,oops", "cmd_voltage_motor: 'oops'")):
         path.write_text("\n".join([*lines[:70_000], wrong, *lines[70_001:]]) + "\n")
         with pytest.raises(ConfigError, match=f"long.csv:70001: {said} is not a finite number"):
-            load_log(path)
+            load(path)
 
 
 def test_a_log_is_never_overwritten(tmp_path):
@@ -154,13 +155,13 @@ def test_a_log_is_never_overwritten(tmp_path):
 def test_the_original_programs_format_loads(tmp_path):
     path = tmp_path / "old.csv"
     path.write_text(original_text())
-    log = load_log(path)
+    log = load(path)
     assert list(log.frame["current_motor"]) == [0.25 * k for k in range(10)]
     assert log.frame["tick"].tolist() == list(range(10)) and log.dt == pytest.approx(0.001)
     # It applied what it asked for, as far as its log knows.
     assert (log.frame["applied_voltage_motor"] == 0.5).all()
     assert (log.frame["flags"] == 0).all()
-    assert capture.load(path).warning is None
+    assert load(path).warning is None
 
 
 @pytest.mark.parametrize(
@@ -187,9 +188,9 @@ def test_the_original_programs_format_loads(tmp_path):
 def test_harmless_variants_of_a_table_load_alike(tmp_path, change):
     path = tmp_path / "log.csv"
     path.write_text(original_text())
-    plain = load_log(path).frame
+    plain = load(path).frame
     path.write_bytes(change(original_text()).encode())
-    assert load_log(path).frame.equals(plain)
+    assert load(path).frame.equals(plain)
 
 
 # --- truncation ---------------------------------------------------------------------------
@@ -197,7 +198,7 @@ def test_harmless_variants_of_a_table_load_alike(tmp_path, change):
 
 def test_a_log_cut_anywhere_loads_without_a_wrong_number_or_says_why(real_log, tmp_path):
     data = real_log.read_bytes()
-    whole = load_log(real_log).frame
+    whole = load(real_log).frame
     path = tmp_path / "log.csv"
     body = data.index(b"\n") + 1
     third = body + len(b"".join(data[body:].splitlines(keepends=True)[:3]))
@@ -209,10 +210,10 @@ def test_a_log_cut_anywhere_loads_without_a_wrong_number_or_says_why(real_log, t
         rows = data[:cut].count(b"\n") - 1
         if rows < 2:
             with pytest.raises(ConfigError) as refused:
-                load_log(path)
+                load(path)
             assert str(refused.value).startswith(str(path)), cut
             continue
-        log = load_log(path)
+        log = load(path)
         assert len(log.frame) == rows, cut
         assert log.frame.equals(whole.iloc[:rows]), cut
         assert log.torn == (data[:cut][-1:] != b"\n"), cut
@@ -221,14 +222,14 @@ def test_a_log_cut_anywhere_loads_without_a_wrong_number_or_says_why(real_log, t
 def test_a_cut_log_is_named_interrupted(real_log, tmp_path):
     path = tmp_path / "lone.csv"
     path.write_bytes(real_log.read_bytes()[:-5])
-    assert "interrupted; its last line is incomplete and is left out" in capture.load(path).warning
+    assert "interrupted; its last line is incomplete and is left out" in load(path).warning
 
 
 def test_blocks_of_zero_bytes_after_a_power_failure_are_left_out(real_log, tmp_path):
     path = tmp_path / "log.csv"
     path.write_bytes(real_log.read_bytes() + b"\0" * 4096)
-    log = load_log(path)
-    assert log.torn and log.frame.equals(load_log(real_log).frame)
+    log = load(path)
+    assert log.torn and log.frame.equals(load(real_log).frame)
 
 
 # --- lost samples -------------------------------------------------------------------------
@@ -255,7 +256,7 @@ def _log_with_gap(tmp_path, original=False):
 @pytest.mark.parametrize("original", [False, True])
 def test_lost_samples_keep_their_place_in_time(tmp_path, original):
     path, kept = _log_with_gap(tmp_path, original)
-    assert load_log(path).frame["tick"].tolist() == kept.tolist()
+    assert load(path).frame["tick"].tolist() == kept.tolist()
     data = datasets.load(path, actuator(), None).dataset
     assert data.n_samples == 60 and data.dt == pytest.approx(1 / 800)
     assert np.isnan(data.outputs[20:27]).all()
@@ -270,7 +271,7 @@ def test_a_log_that_begins_late_begins_with_its_first_row(tmp_path):
     path = tmp_path / "log.csv"
     with LogWriter(path) as log:
         log.append(samples(10, first=500))
-    assert load_log(path).frame["tick"].tolist() == list(range(500, 510))
+    assert load(path).frame["tick"].tolist() == list(range(500, 510))
     assert datasets.load(path, actuator(), None).dataset.n_samples == 10
 
 
@@ -281,7 +282,7 @@ def test_times_printed_with_few_digits_give_the_true_sample_time(tmp_path):
     for k, line in enumerate(lines[1:]):
         rounded.append(f"{k / 800:.4f}" + line[line.index(",") :])
     path.write_text("\n".join(rounded) + "\n")
-    log = load_log(path)
+    log = load(path)
     assert log.dt == pytest.approx(1 / 800, rel=1e-4)
     assert log.frame["tick"].tolist() == list(range(801))
 
@@ -364,7 +365,7 @@ def test_a_file_that_is_no_log_is_refused_by_file_line_and_column(tmp_path, text
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         with pytest.raises(ConfigError) as refused:
-            load_log(path)
+            load(path)
     assert str(refused.value).startswith(str(path)) and said in str(refused.value)
 
 
@@ -382,14 +383,14 @@ def test_a_binary_file_is_refused_as_such(tmp_path, data, said):
     path = tmp_path / "bad.csv"
     path.write_bytes(data)
     with pytest.raises(ConfigError, match=said):
-        load_log(path)
+        load(path)
 
 
 def test_a_table_keeps_only_the_columns_asked_for(tmp_path):
     path = tmp_path / "foreign.csv"
     path.write_text("time;x\n".replace(";", ",") + "0,1\n1,2\n2,3\n")
-    table = read_table(path, ["x"])
-    assert list(table.frame) == ["x"] and table.frame["x"].tolist() == [1.0, 2.0, 3.0]
+    frame, _, _ = read_table(path, ["x"])
+    assert list(frame) == ["x"] and frame["x"].tolist() == [1.0, 2.0, 3.0]
 
 
 def test_a_table_in_a_german_programs_character_set(tmp_path):
@@ -397,8 +398,8 @@ def test_a_table_in_a_german_programs_character_set(tmp_path):
     path.write_bytes(
         "Zeit [s];Drehzahl [1/min];Übertemperatur [°C]\n0;1,5;2\n1;-3e2;4\n".encode("cp1252")
     )
-    table = read_table(path, ["Drehzahl [1/min]", "Übertemperatur [°C]"])
-    assert table.frame.to_numpy().tolist() == [[1.5, 2.0], [-300.0, 4.0]]
+    frame, _, _ = read_table(path, ["Drehzahl [1/min]", "Übertemperatur [°C]"])
+    assert frame.to_numpy().tolist() == [[1.5, 2.0], [-300.0, 4.0]]
 
 
 def test_lines_are_counted_from_the_files_start(tmp_path):
@@ -408,7 +409,7 @@ def test_lines_are_counted_from_the_files_start(tmp_path):
         read_table(path, ["x"])
     path.write_text("# a\n# b\n" + original_text().replace("0.004,", "0.0001,"))
     with pytest.raises(ConfigError, match=r"noted.csv:8: t: time does not advance"):
-        load_log(path)
+        load(path)
 
 
 def test_columns_that_are_not_asked_for_may_hold_anything(tmp_path):
@@ -416,7 +417,7 @@ def test_columns_that_are_not_asked_for_may_hold_anything(tmp_path):
     lines = original_text().splitlines()
     notes = ["remark", *["see notebook, p. 4" if k == 3 else "" for k in range(10)]]
     path.write_text("\n".join(f'{a}, "{b}"' for a, b in zip(lines, notes, strict=True)) + "\n")
-    assert len(load_log(path).frame) == 10
+    assert len(load(path).frame) == 10
 
 
 # --- the disk is full ---------------------------------------------------------------------
@@ -448,11 +449,11 @@ def test_a_full_disk_ends_the_run_safely_with_a_log_that_loads(tmp_path):
     last = result.stderr.splitlines()[-1]
     assert last.startswith(f"rig: {relative}: cannot be written: File too large;")
     assert "Free space on the disk, or choose another with --out" in last
-    log = capture.load(folder)
-    n = len(log.log.frame)
+    log = load(folder)
+    n = len(log.frame)
     assert f"the first {n} samples are in it" in last
-    assert (folder / "log.csv").stat().st_size == limit and log.log.torn and n > 100
-    assert np.array_equal(log.log.frame["tick"], np.arange(n))
+    assert (folder / "log.csv").stat().st_size == limit and log.torn and n > 100
+    assert np.array_equal(log.frame["tick"], np.arange(n))
     record = record_of(folder)
     assert record["status"] == "failed" and "cannot be written" in record["reason"]
     outputs = [entry for entry in entries if entry["what"] == "outputs"]
@@ -479,5 +480,5 @@ def test_flags_are_the_documented_bits():
 def test_a_last_cell_without_a_number_costs_no_row_in_a_column_that_is_not_read(tmp_path):
     path = tmp_path / "other.csv"
     path.write_text("t,y,remark\n0,1.5,ok\n1,2.5,nan\n")
-    read = read_table(path, ["t", "y"])
-    assert read.frame["y"].tolist() == [1.5, 2.5] and not read.torn
+    frame, _, torn = read_table(path, ["t", "y"])
+    assert frame["y"].tolist() == [1.5, 2.5] and not torn

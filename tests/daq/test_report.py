@@ -11,7 +11,7 @@ from scipy.signal import lfilter
 
 from daq.errors import ConfigError
 from daq.identification import records as datasets
-from daq.logs import capture
+from daq.logs.capture import RUN_NAME
 from sim_rig.actuator import actuator
 from tests.daq.support import forked_rig, only_capture, write_experiment
 
@@ -247,7 +247,7 @@ def loaded(folder):
 @pytest.fixture
 def record(captured):
     """The run record, put back after the test has written another."""
-    path = captured / capture.RUN_NAME
+    path = captured / RUN_NAME
     text = path.read_text()
     yield json.loads(text)
     path.write_text(text)
@@ -274,10 +274,10 @@ def test_noise_and_zeros_of_a_run_reach_the_data(captured, record):
 
 def test_a_run_recorded_without_calibration_still_loads(captured, record):
     del record["calibration"]
-    (captured / capture.RUN_NAME).write_text(json.dumps(record))
+    (captured / RUN_NAME).write_text(json.dumps(record))
     data = loaded(captured)
     assert not any(v.any() for v in (data.input_noise, data.input_zero, data.output_zero))
-    (captured / capture.RUN_NAME).unlink()
+    (captured / RUN_NAME).unlink()
     assert not loaded(captured).input_noise.any()
 
 
@@ -298,7 +298,7 @@ MALFORMED = {
 
 @pytest.mark.parametrize("case", MALFORMED)
 def test_a_calibration_that_makes_no_sense_is_refused(captured, record, case):
-    path = captured / capture.RUN_NAME
+    path = captured / RUN_NAME
     path.write_text(json.dumps({**record, "calibration": MALFORMED[case]}))
     with pytest.raises(ConfigError) as error:
         loaded(captured)
@@ -307,7 +307,7 @@ def test_a_calibration_that_makes_no_sense_is_refused(captured, record, case):
 
 
 def test_the_command_line_refuses_it_too(command, captured, record):
-    path = captured / capture.RUN_NAME
+    path = captured / RUN_NAME
     path.write_text(json.dumps({**record, "calibration": {"noise": {"torque": -1}}}))
     result = command(("identify", captured), captured.parent)
     assert result.returncode == 2 and result.stdout == ""

@@ -10,7 +10,8 @@ import pytest
 
 from daq.errors import ConfigError
 from daq.hal import Flag
-from daq.logs import capture
+from daq.logs.capture import Capture
+from daq.logs.recording import load
 from tests.daq.support import EXPERIMENT as SETTINGS
 from tests.daq.support import (
     install_faulty,
@@ -119,10 +120,10 @@ def test_the_log_is_the_one_the_record_fingerprints(completed):
     folder = only_capture(root)
     digest = hashlib.sha256((folder / "log.csv").read_bytes()).hexdigest()
     assert record_of(folder)["log"] == {"file": "log.csv", "sha256": digest}
-    recording = capture.load(folder)
+    recording = load(folder)
     assert recording.warning is None and recording.name == folder.name
-    assert len(recording.log.frame) == 400 and recording.log.dt == pytest.approx(1 / 800, rel=1e-14)
-    assert np.array_equal(recording.log.frame["tick"], np.arange(400))
+    assert len(recording.frame) == 400 and recording.dt == pytest.approx(1 / 800, rel=1e-14)
+    assert np.array_equal(recording.frame["tick"], np.arange(400))
 
 
 def test_offsets_are_taken_off_the_log(tmp_path):
@@ -136,7 +137,7 @@ def test_offsets_are_taken_off_the_log(tmp_path):
     write_rig(tmp_path / "rig.yaml", **merged(flaws, {"limits": {"current": {"brake": 2.0}}}))
     result = rig("run", "e.yaml", "--rig", "rig.yaml", cwd=tmp_path)
     assert result.returncode == 0, result.stderr
-    frame = capture.load(only_capture(tmp_path)).log.frame
+    frame = load(only_capture(tmp_path)).frame
     volts = record_of(only_capture(tmp_path))["offsets"]["volts"]
     assert np.abs(volts).max() > 0.3
     for name in ("current_motor", "current_brake", "torque"):
@@ -158,7 +159,7 @@ def test_one_seed_gives_a_byte_identical_log_and_another_does_not(tmp_path):
 
 
 def test_two_runs_in_one_second_get_a_folder_each(tmp_path):
-    made = [capture.Capture.create(tmp_path, "same", {}).folder for _ in range(3)]
+    made = [Capture.create(tmp_path, "same", {}).folder for _ in range(3)]
     assert len(set(made)) == 3 and all((folder / "run.json").exists() for folder in made)
 
 
@@ -188,8 +189,8 @@ def test_a_device_that_fails_during_the_run_leaves_zero_outputs_and_says_why(tmp
     assert (record["status"], record["phase"]) == ("failed", "run")
     assert record["reason"] == "the device no longer answers; check its cable"
     assert_left_safe(tmp_path)
-    recording = capture.load(folder)
-    assert 200 < len(recording.log.frame) <= 300
+    recording = load(folder)
+    assert 200 < len(recording.frame) <= 300
     assert "ended early: failed: the device no longer answers" in recording.warning
 
 
@@ -214,7 +215,7 @@ def test_a_current_beyond_its_limit_ends_the_run_with_its_sample_logged(tmp_path
     folder = only_capture(tmp_path)
     record = record_of(folder)
     assert (record["status"], record["phase"]) == ("interlock", "run")
-    frame = capture.load(folder).log.frame
+    frame = load(folder).frame
     flagged = np.flatnonzero(frame["flags"] & int(Flag.INTERLOCK))
     assert flagged.tolist() == [len(frame) - 1], "the tripping sample is the last"
     last = frame.iloc[-1]
@@ -285,7 +286,7 @@ def test_an_interlock_that_only_the_device_saw_ends_the_run(tmp_path, plugin):
     assert result.returncode == 1
     assert "interlock in sample 150" in result.stderr
     assert record_of(only_capture(tmp_path))["status"] == "interlock"
-    frame = capture.load(only_capture(tmp_path)).log.frame
+    frame = load(only_capture(tmp_path)).frame
     assert len(frame) == 151 and frame["flags"].iloc[-1] & int(Flag.INTERLOCK)
 
 
@@ -293,7 +294,7 @@ def test_lost_samples_are_flagged_and_keep_their_place(tmp_path, plugin):
     result = run_with(tmp_path, plugin, "lost", at=100)
     assert result.returncode == 0, result.stderr
     assert "lost" in result.stdout, "the summary says that samples were lost"
-    log = capture.load(only_capture(tmp_path)).log
+    log = load(only_capture(tmp_path))
     ticks = log.frame["tick"].to_numpy()
     flagged = ticks[(log.frame["flags"] & int(Flag.LOST)) != 0]
     assert set(range(400)) - set(ticks) and len(flagged) >= 1
@@ -308,7 +309,7 @@ def test_losing_the_last_samples_of_a_run_is_no_crash(tmp_path, plugin):
     assert "Traceback" not in result.stderr
     record = record_of(only_capture(tmp_path))
     assert record["status"] in {"completed", "failed"}
-    ticks = capture.load(only_capture(tmp_path)).log.frame["tick"]
+    ticks = load(only_capture(tmp_path)).frame["tick"]
     assert ticks.max() < 400
 
 
@@ -324,8 +325,8 @@ def test_a_signal_stops_a_run_in_real_time_with_its_log_whole(tmp_path, plugin, 
     assert f"stopped by {by}" in errors and "Traceback" not in errors
     record = record_of(folder)
     assert (record["status"], record["reason"]) == ("stopped", f"stopped by {by} during run")
-    recording = capture.load(folder)
-    assert 50 <= len(recording.log.frame) < 24_000
+    recording = load(folder)
+    assert 50 <= len(recording.frame) < 24_000
     assert "ended early: stopped" in recording.warning
     assert_left_safe(tmp_path)
 
@@ -353,7 +354,7 @@ def test_a_signal_while_the_load_is_wound_is_recorded_with_its_phase(tmp_path):
     record = record_of(folder)
     assert record["status"] == "stopped" and record["phase"] in {"open", "calibration", "homing"}
     with pytest.raises(ConfigError, match="holds 0 samples"):
-        capture.load(folder)
+        load(folder)
 
 
 def test_rows_reach_the_file_while_the_run_is_going_on(tmp_path):
@@ -366,7 +367,7 @@ def test_rows_reach_the_file_while_the_run_is_going_on(tmp_path):
             until(lambda least=more: rows_in(folder) >= least, f"{more} rows")
             assert process.poll() is None
         assert record_of(folder)["status"] == "running"
-        assert "still running" in capture.load(folder).warning
+        assert "still running" in load(folder).warning
     finally:
         process.kill()
         process.communicate()

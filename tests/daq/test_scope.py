@@ -15,7 +15,9 @@ from hypothesis import strategies as st
 from tornado import httpclient, websocket
 
 from daq.hal import Samples
-from daq.logs.log import COLUMNS, LogWriter, load_log
+from daq.logs.columns import COLUMNS
+from daq.logs.recording import load
+from daq.logs.writer import LogWriter
 from daq.scope.history import History
 from daq.scope.recordings import Recording, Watch
 from daq.scope.tail import LogTail
@@ -65,7 +67,7 @@ def test_a_log_read_as_it_grows_is_the_log_read_at_its_end(tmp_path_factory, cut
         growing.write_bytes(data[:cut])
         rows += tail.poll().values.tolist()
         assert not tail.problems.count and tail.fault is None
-    expected = load_log(folder / "whole" / "log.csv").frame[list(COLUMNS)].to_numpy()
+    expected = load(folder / "whole" / "log.csv").frame[list(COLUMNS)].to_numpy()
     assert tail.columns == COLUMNS
     np.testing.assert_array_equal(rows, expected)
     assert not tail.torn()
@@ -73,7 +75,7 @@ def test_a_log_read_as_it_grows_is_the_log_read_at_its_end(tmp_path_factory, cut
 
 def test_large_and_small_reads_give_the_same_numbers(tmp_path):
     path = write_log(tmp_path, 3000)
-    expected = load_log(path).frame[list(COLUMNS)].to_numpy()
+    expected = load(path).frame[list(COLUMNS)].to_numpy()
     np.testing.assert_allclose(all_rows(LogTail(path)), expected, rtol=1e-14)
 
 

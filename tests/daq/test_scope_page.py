@@ -13,7 +13,8 @@ from selenium.webdriver.common.actions.wheel_input import ScrollOrigin
 
 from daq.hal import Flag
 from daq.logs.capture import Capture
-from daq.logs.log import LogWriter, load_log
+from daq.logs.recording import load
+from daq.logs.writer import LogWriter
 from tests.daq.support import start_rig, until, write_experiment, write_rig
 from tests.daq.test_scope import RATE, samples, start_scope
 
@@ -149,7 +150,7 @@ def test_it_follows_a_run_of_the_rig_from_its_beginning_to_its_end(scope, tmp_pa
     until(lambda: ">stopped<" in tab.head(), "the run's end")
     assert "stopped by Ctrl-C during run" in tab.head()
     (folder,) = (tmp_path / "runs").iterdir()
-    log = load_log(folder / "log.csv").frame
+    log = load(folder / "log.csv").frame
     last = log["t"].iloc[-1]
     until(lambda: tab.time() == (0.0, last) and tab.drawn()[-1] > last - 0.3, "the whole run")
     for column in ("current_motor", "omega", "applied_voltage_brake"):

@@ -6,7 +6,7 @@ import yaml
 
 import protocols
 from daq.config.rig import RigConfig
-from daq.logs.log import load_log
+from daq.logs.recording import load
 from daq.run.runner import run_experiment
 from sim_rig.backend import SimulatedDevice, Simulation
 from tests.daq.support import merged
@@ -28,7 +28,7 @@ def run(experiment, folder, plant, rig=None, **options):
 
 
 def logged(experiment, folder):
-    log = load_log(folder / "log.csv", tuple(experiment.columns))
+    log = load(folder / "log.csv", tuple(experiment.columns))
     return log.samples(), {name: log.frame[name].to_numpy() for name in experiment.columns}
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from daq.errors import ConfigError, DeviceError
 from daq.hal import Flag, Guard, Mode
-from daq.logs import capture
+from daq.logs.recording import load
 from daq.serial.backend import SerialDevice, SerialOptions
 from daq.serial.emulation import faults
 from daq.serial.link import open_link
@@ -80,8 +80,8 @@ def write_run(folder, port, mode="open", seconds=0.5, watchdog=WATCHDOG, homing=
 
 def assert_consistent(folder, total=400):
     """What was logged stands at its tick, and gaps are flagged."""
-    recording = capture.load(folder)
-    frame = recording.log.frame
+    recording = load(folder)
+    frame = recording.frame
     ticks, flags = frame["tick"].to_numpy(), frame["flags"].to_numpy()
     assert (np.diff(ticks) > 0).all() and ticks[-1] < total
     np.testing.assert_allclose(frame["t"], ticks / 800)
@@ -238,7 +238,7 @@ def test_a_killed_host_means_zero_outputs_within_the_watchdogs_time(tmp_path, em
         )
         assert tripped["outputs"] == [0, 0] and tripped["silence_seconds"] < 0.3
         assert not any(any(e["outputs"]) for e in running.journal[running.journal.index(tripped) :])
-        assert "interrupted" in capture.load(only_capture(tmp_path)).warning
+        assert "interrupted" in load(only_capture(tmp_path)).warning
         write_run(tmp_path, running.port, mode)
         again = rig(["run", "e.yaml", "--rig", "rig.yaml", "--out", "again"], tmp_path)
         assert again.returncode == 0, again.stderr

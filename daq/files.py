@@ -1,0 +1,40 @@
+"""Files and folders written for a user: whole or not at all, with the cure where it fails."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+
+from daq.errors import ConfigError, RunError
+
+
+def write_whole(path: Path, content: str | bytes) -> None:
+    """Replace a file's content in one step. Raises RunError when the disk refuses."""
+    temporary = path.with_name(path.name + ".tmp")
+    try:
+        temporary.write_bytes(content.encode() if isinstance(content, str) else content)
+        temporary.replace(path)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        folder = path.parent
+        reason = (
+            error.strerror if folder.is_dir() else f"there is no folder {folder}, make it first"
+        )
+        raise RunError(f"cannot be written: {reason}", file=path) from None
+
+
+def make_folder(folder: Path, exist_ok: bool = True) -> None:
+    """Make a folder and what leads to it; ConfigError with the cure when that is impossible.
+
+    Raises FileExistsError where it must be new and is not.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=exist_ok)
+    except OSError as error:
+        is_file = isinstance(error, FileExistsError)
+        if is_file and not exist_ok:
+            raise
+        reason = "File exists" if is_file else error.strerror
+        cure = "choose a folder with --out"
+        raise ConfigError(f"cannot be created: {reason}", cure=cure, file=folder) from None

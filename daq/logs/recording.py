@@ -1,0 +1,148 @@
+"""Logs as they are read back, however their runs ended."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from daq.errors import ConfigError
+from daq.hal import Samples
+from daq.logs.capture import COMPLETED, LOG_NAME, RUN_NAME, RUNNING
+from daq.logs.columns import ATTRIBUTES, COLUMNS, ORIGINAL_COLUMNS
+from daq.logs.table import column_names, read_table
+from daq.logs.time_base import refuse_rows, require_rows, time_base
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A log in SI units, with what is known of its run.
+
+    frame: one row per sample with at least the columns of the original program and ``tick``,
+    ``applied_voltage_motor``, ``applied_voltage_brake``, ``flags``. dt: sample time [s]. torn: the
+    last line was cut, or broken by a measurement that is no number, and left out. record: what
+    run.json holds, None without one. warning: None for a run that completed, else one line that
+    says how it ended.
+
+    >>> import pandas as pd
+    >>> frame = pd.DataFrame({"t": [0.0, 0.1]})
+    >>> Recording(Path("runs/20260101T120000Z-prbs/log.csv"), frame, dt=0.1).name
+    '20260101T120000Z-prbs'
+    """
+
+    path: Path
+    frame: pd.DataFrame
+    dt: float
+    torn: bool = False
+    record: dict[str, Any] | None = None
+    warning: str | None = None
+
+    @property
+    def name(self) -> str:
+        """Folder name of a capture, or file name of a lone log."""
+        return self.path.parent.name if self.path.name == LOG_NAME else self.path.stem
+
+    @property
+    def folder(self) -> Path:
+        """Where the log stands."""
+        return self.path.parent
+
+    def samples(self) -> Samples:
+        """Its rows as the run had them."""
+        columns = {attribute: self.frame[name].to_numpy() for name, attribute in ATTRIBUTES.items()}
+        return Samples(**columns)
+
+    def noise(self, channel: str) -> tuple[float, float]:
+        """Standard deviations of a channel's noise and of its zero, as the calibration found them.
+
+        Zeros for a channel that was not calibrated, and without a run record. Raises ConfigError
+        for a record that has been tampered with.
+        """
+        calibration = (self.record or {}).get("calibration", {})
+        try:
+            deviation = float(calibration.get("noise", {}).get(channel, 0.0))
+            samples = int(calibration.get("samples", 1))
+            if not (math.isfinite(deviation) and deviation >= 0.0 and samples > 0):
+                raise ValueError
+        except (AttributeError, OverflowError, TypeError, ValueError):
+            raise ConfigError(
+                f"'calibration' must hold 'samples' and, for {channel}, a 'noise' of 0 or more",
+                cure="delete it to go without",
+                file=self.folder / RUN_NAME,
+            ) from None
+        return deviation, deviation / math.sqrt(samples)
+
+
+def load(path: str | Path, extra: Sequence[str] = ()) -> Recording:
+    """Read a capture folder, its log.csv, or a lone CSV in either program's format.
+
+    extra: names of further columns wanted, where it has them. Raises ConfigError naming the file,
+    line and column of what is wrong with the log.
+
+    >>> import tempfile
+    >>> csv = Path(tempfile.mkdtemp()) / "day1.csv"
+    >>> rows = ",".join(ORIGINAL_COLUMNS), "0,1,0,0,0,0,0,0", "0.1,1,0,0.5,0,0,0,0", ""
+    >>> _ = csv.write_text("\\n".join(rows))
+    >>> recording = load(csv)
+    >>> recording.name, recording.dt, recording.frame["current_motor"].tolist()
+    ('day1', 0.1, [0.0, 0.5])
+    """
+    csv = log_path(Path(path))
+    present = column_names(csv)
+    names = [name for name in COLUMNS if name in present or name in ORIGINAL_COLUMNS]
+    names += [name for name in extra if name in present]
+    frame, first_line, torn = read_table(csv, names)
+    require_rows(csv, len(frame))
+    logged_ticks = frame["tick"].to_numpy() if "tick" in frame else None
+    frame["tick"], dt = time_base(csv, frame["t"].to_numpy(), logged_ticks, first_line=first_line)
+    for channel in ("motor", "brake"):
+        # The original program logged only what it asked for.
+        if f"applied_voltage_{channel}" not in frame:
+            frame[f"applied_voltage_{channel}"] = frame[f"cmd_voltage_{channel}"]
+    if "flags" not in frame:
+        frame["flags"] = 0
+    uneven = (frame["flags"] % 1.0 != 0.0).to_numpy()
+    refuse_rows(csv, uneven, "it must be a whole number", first_line, "flags")
+    frame = frame.astype({"tick": np.int64, "flags": np.int64})
+    record = read_record(csv)
+    return Recording(csv, frame, dt, torn, record, end_of_run(csv, record, torn))
+
+
+def log_path(path: Path) -> Path:
+    """The CSV that a folder or file name given by a user means."""
+    return path / LOG_NAME if path.is_dir() else path
+
+
+def read_record(csv: Path) -> dict[str, Any] | None:
+    """run.json beside a log.csv; None when there is none. ConfigError when it is malformed."""
+    path = csv.parent / RUN_NAME
+    if csv.name != LOG_NAME or not path.exists():
+        return None
+    cure = "move it away to use the log alone"
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"not a readable run record ({error})", cure=cure, file=path) from None
+    if not isinstance(record, dict):
+        raise ConfigError("not a run record", cure=cure, file=path)
+    return record
+
+
+def end_of_run(csv: Path, record: dict[str, Any] | None, torn: bool) -> str | None:
+    """One line on how a run ended that did not complete, or None."""
+    record = record or {}
+    cut = "; its last line is incomplete and is left out" if torn else ""
+    status = record.get("status", COMPLETED)
+    if status == RUNNING:
+        return f"{csv}: the run was interrupted (killed, or still running){cut}"
+    if status != COMPLETED:
+        return f"{csv}: the run ended early: {status}: {record.get('reason')}{cut}"
+    return f"{csv}: the log was interrupted{cut}" if torn else None
