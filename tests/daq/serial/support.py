@@ -62,9 +62,10 @@ def emulator(folder, *arguments, plant=None):
 _FORKING = """
 import json, os, signal, sys, traceback
 import daq.cli, daq.cli.app, daq.cli.emulate
+from daq.serial.emulation.board import warm_up
 from sim_rig.backend import SimulatedDevice, Simulation
 
-daq.cli.emulate._warm_up(SimulatedDevice(Simulation()))
+warm_up(SimulatedDevice(Simulation()))
 signal.signal(signal.SIGCHLD, signal.SIG_IGN)
 for line in sys.stdin:
     job = json.loads(line)
