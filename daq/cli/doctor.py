@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
 
 from daq.cli import terminal as console
-from daq.diagnose.computer import Diagnosis, diagnose
+from daq.diagnose.computer import Check, Diagnosis, diagnose
 from daq.errors import RunError
 from daq.serial.ports import ports_of
 
@@ -15,7 +14,7 @@ def doctor_command(names: list[str], out: Path, as_json: bool) -> None:
     """Look at ports, scheduling, memory and disk; exit status 1 when something is bad."""
     diagnosis = diagnose(ports_of(names), out)
     if as_json:
-        checks = [asdict(check) for check in diagnosis.checks]
+        checks = [_document(check) for check in diagnosis.checks]
         console.print_json({"checks": checks, "good": not diagnosis.bad})
     else:
         _show(diagnosis)
@@ -25,13 +24,22 @@ def doctor_command(names: list[str], out: Path, as_json: bool) -> None:
         )
 
 
+def _document(check: Check) -> dict[str, str]:
+    return {
+        "what": check.subject,
+        "verdict": check.verdict,
+        "found": check.observation,
+        "cure": check.cure,
+    }
+
+
 def _show(diagnosis: Diagnosis) -> None:
     console.print_table(
         "This computer",
         ["what", "verdict", "found"],
-        [[check.what, check.verdict, check.found] for check in diagnosis.checks],
+        [[check.subject, check.verdict, check.observation] for check in diagnosis.checks],
         text=["verdict", "found"],
     )
     for check in diagnosis.checks:
         if check.cure:
-            console.print_line(f"{check.what}: {check.cure}")
+            console.print_line(f"{check.subject}: {check.cure}")

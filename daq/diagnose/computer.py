@@ -29,11 +29,11 @@ _TIMER = 2  # ms
 
 @dataclass(frozen=True)
 class Check:
-    """A property of the computer and its verdict; cure: what to do, empty where all is well."""
+    """A verdict on one subject, and what it rests on; cure: what to do, empty where all is well."""
 
-    what: str
+    subject: str
     verdict: Verdict
-    found: str
+    observation: str
     cure: str = ""
 
 
@@ -45,8 +45,8 @@ class Diagnosis:
 
     @property
     def bad(self) -> list[str]:
-        """Properties with which no run is safe."""
-        return [check.what for check in self.checks if check.verdict == "bad"]
+        """Subjects with which no run is safe."""
+        return [check.subject for check in self.checks if check.verdict == "bad"]
 
 
 def diagnose(ports: Sequence[PortFacts], out: Path) -> Diagnosis:
@@ -60,23 +60,26 @@ def diagnose(ports: Sequence[PortFacts], out: Path) -> Diagnosis:
 def _port(port: PortFacts) -> list[Check]:
     if "://" in port.name or os.name == "nt":
         return []
-    what = f"access to {port.name}"
+    access = f"access to {port.name}"
     if not Path(port.name).exists():
-        return [Check(what, "bad", "there is no such port", "'rig ports' lists those there are")]
+        return [Check(access, "bad", "there is no such port", "'rig ports' lists those there are")]
     if not os.access(port.name, os.R_OK | os.W_OK):
-        return [Check(what, "bad", "no permission", permission_cure(port.name))]
-    checks = [Check(what, "good", "may be read and written")]
+        return [Check(access, "bad", "no permission", permission_cure(port.name))]
+    checks = [Check(access, "good", "may be read and written")]
     timer = latency_timer(port.name)
     if timer is not None:
-        found = f"{timer[1]} ms"
-        slow = timer[1] > _TIMER
-        cure = (
-            f"as root: echo 1 > {timer[0]}; for good, a udev rule: "
-            'ACTION=="add", SUBSYSTEM=="usb-serial", ATTR{latency_timer}="1"'
-        )
-        verdict: Verdict = "could be better" if slow else "good"
-        checks.append(Check(f"latency timer of {port.name}", verdict, found, cure if slow else ""))
+        checks.append(_latency(f"latency timer of {port.name}", *timer))
     return checks
+
+
+def _latency(subject: str, file: Path, milliseconds: int) -> Check:
+    if milliseconds <= _TIMER:
+        return Check(subject, "good", f"{milliseconds} ms")
+    cure = (
+        f"as root: echo 1 > {file}; for good, a udev rule: "
+        'ACTION=="add", SUBSYSTEM=="usb-serial", ATTR{latency_timer}="1"'
+    )
+    return Check(subject, "could be better", f"{milliseconds} ms", cure)
 
 
 def _real_time() -> list[Check]:
@@ -96,60 +99,60 @@ def _real_time() -> list[Check]:
     ]
 
 
-def _granted(run: RealTime, name: str, what: str, line: str) -> Check:
+def _granted(run: RealTime, name: str, subject: str, line: str) -> Check:
     if name not in run.refused:
-        return Check(what, "good", str(run.granted.get(name, "left to the system")))
+        return Check(subject, "good", str(run.granted.get(name, "left to the system")))
     cure = (
         f"as root, write the line '{line}' with a group of your user to "
         "/etc/security/limits.d/rig.conf, then log in again"
     )
-    linux = sys.platform.startswith("linux")
-    found = f"not allowed ({run.refused[name]})"
-    return Check(what, "could be better", found, cure if linux else "this system has none")
+    if not sys.platform.startswith("linux"):
+        cure = "this system has none"
+    return Check(subject, "could be better", f"not allowed ({run.refused[name]})", cure)
 
 
 def _wake_ups(worst: float) -> Check:
-    found = f"{1e3 * worst:.1f} ms late at worst, of {_NAPS}"
+    observation = f"{1e3 * worst:.1f} ms late at worst, of {_NAPS}"
     if worst <= _LATE:
-        return Check("wake-ups", "good", found)
-    return Check(
-        "wake-ups",
-        "bad" if worst > _TOO_LATE else "could be better",
-        found,
-        "end other programs; on a laptop, plug in the supply and switch energy saving off",
-    )
+        return Check("wake-ups", "good", observation)
+    verdict: Verdict = "bad" if worst > _TOO_LATE else "could be better"
+    cure = "end other programs; on a laptop, plug in the supply and switch energy saving off"
+    return Check("wake-ups", verdict, observation, cure)
 
 
 def _disk(out: Path) -> Check:
     """Flushes of the size that a fast log makes, where logs go."""
-    made = not out.exists()
+    subject, made = f"disk of {out}", not out.exists()
     make_folder(out)
-    file, longest = out / f".doctor.{os.getpid()}", 0.0
-    block = bytes(_FLUSH_BYTES)
-    begun = time.perf_counter()
+    file = out / f".doctor.{os.getpid()}"
     try:
-        with file.open("wb") as stream:
-            for _ in range(_FLUSHES):
-                before = time.perf_counter()
-                stream.write(block)
-                stream.flush()
-                os.fsync(stream.fileno())
-                longest = max(longest, time.perf_counter() - before)
+        speed, slowest = _flush(file)
     except OSError as error:
         return Check(
-            f"disk of {out}", "bad", f"cannot be written: {error.strerror}", "choose another: --out"
+            subject, "bad", f"cannot be written: {error.strerror}", "choose another: --out"
         )
     finally:
         file.unlink(missing_ok=True)
         if made:
             out.rmdir()
-    speed = _FLUSHES * _FLUSH_BYTES / (time.perf_counter() - begun)
-    found = f"{speed / 1e6:.0f} MB/s, {1e3 * longest:.0f} ms for the slowest flush"
-    if speed >= _SLOW_DISK and longest <= _LONG_FLUSH:
-        return Check(f"disk of {out}", "good", found)
-    return Check(
-        f"disk of {out}",
-        "bad" if speed < _SLOWEST_DISK or longest > _LONGEST_FLUSH else "could be better",
-        found,
-        "write logs to a disk of this computer, not to a stick or the network: rig run --out DIR",
-    )
+    observation = f"{speed / 1e6:.0f} MB/s, {1e3 * slowest:.0f} ms for the slowest flush"
+    if speed >= _SLOW_DISK and slowest <= _LONG_FLUSH:
+        return Check(subject, "good", observation)
+    too_slow = speed < _SLOWEST_DISK or slowest > _LONGEST_FLUSH
+    verdict: Verdict = "bad" if too_slow else "could be better"
+    cure = "write logs to a disk of this computer, not to a stick or the network: rig run --out DIR"
+    return Check(subject, verdict, observation, cure)
+
+
+def _flush(file: Path) -> tuple[float, float]:
+    """Speed of writing a file [bytes/s], and the time of the slowest flush [s]."""
+    block, slowest = bytes(_FLUSH_BYTES), 0.0
+    begun = time.perf_counter()
+    with file.open("wb") as stream:
+        for _ in range(_FLUSHES):
+            before = time.perf_counter()
+            stream.write(block)
+            stream.flush()
+            os.fsync(stream.fileno())
+            slowest = max(slowest, time.perf_counter() - before)
+    return _FLUSHES * _FLUSH_BYTES / (time.perf_counter() - begun), slowest

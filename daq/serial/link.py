@@ -46,9 +46,9 @@ def open_link(port: str, baud: int) -> Link:
 
 
 def _gone(port: str, error: Exception | None = None) -> DeviceError:
-    said = "" if error is None else f" ({error})"
+    reason = "" if error is None else f" ({error})"
     return DeviceError(
-        f"{port}: the port has gone{said}; check the cable and the device's supply. The device "
+        f"{port}: the port has gone{reason}; check the cable and the device's supply. The device "
         "makes itself safe when it hears nothing"
     )
 

@@ -195,13 +195,15 @@ class Welcome:
     @classmethod
     def unpack(cls, payload: bytes) -> Self:
         """The message of this version."""
-        _, version, n, latch, *facts, _, device, firmware, serial = _WELCOME.unpack_from(payload)
+        fields = _WELCOME.unpack_from(payload)
+        _, version, n, latch = fields[:4]
+        facts: tuple[int, float, int, int, int, int] = fields[4:10]
+        device, firmware, serial = map(_text, fields[11:])
         rows = list(_CHANNEL.iter_unpack(payload[_WELCOME.size :]))
         if version_of(payload) != VERSION or len(rows) != n:
             raise ValueError("a WELCOME of another version, or with another number of channels")
         channels = tuple(Channel(_text(name), _text(unit), *row) for name, unit, *row in rows)
-        names = _text(device), _text(firmware), _text(serial)
-        return cls(*names, *facts, channels, Latch(latch), version)
+        return cls(device, firmware, serial, *facts, channels, Latch(latch), version)
 
 
 class Reply(NamedTuple):
