@@ -2,28 +2,18 @@
 
 from __future__ import annotations
 
-import importlib.util
 import sys
 import webbrowser
 from pathlib import Path
 
+from daq import scope
 from daq.cli import terminal as console
-from daq.errors import ConfigError
 
 
 def scope_command(
     run: Path | None, out: Path, port: int | None, browser: bool, as_json: bool
 ) -> None:
     """Serve the page and open a browser on it, until Ctrl-C."""
-    if importlib.util.find_spec("bokeh") is None:
-        raise ConfigError(
-            "rig scope needs Bokeh, which is not installed; install it with: "
-            "pip install 'hybrid-rig[scope]' (in a clone: pip install -e '.[scope]')"
-        )
-    from daq.scope.recordings import Watch
-
-    watch = Watch(out, run)  # a mistake is told before the server is imported, which takes longer
-    from daq.scope.server import serve
 
     def ready(address: str) -> None:
         if as_json:
@@ -35,4 +25,4 @@ def scope_command(
         if browser and not as_json and not webbrowser.open(address):
             console.report_note(f"no browser could be opened; open {address} in one")
 
-    serve(watch, port, ready)
+    scope.show(run, out, port, ready)

@@ -112,11 +112,11 @@ class Emulator:
 
     def run(self, stopped: Callable[[], bool]) -> None:
         """Serve until ``stopped`` says so."""
-        self._awake_by = self._now()
+        self._awake_by = time.perf_counter()
         while not stopped():
             # The machine lives at this instant, before the port is read: a pause of this
             # process after it must not look like silence of the host.
-            now = self._now()
+            now = time.perf_counter()
             self._forgive(now - self._awake_by)
             self._trigger(now)
             self._come_back(now)
@@ -124,7 +124,7 @@ class Emulator:
             self._note()
             self._machine.poll(self._ticks(now))
             self._note()
-            self._transmit(self._now())
+            self._transmit(time.perf_counter())
             self._wait()
         self._port.disconnect()
 
@@ -139,7 +139,7 @@ class Emulator:
         state = (self._board.phase, machine.state, machine.latch, any(self._board.outputs))
         if state != self._noted:
             self._noted = state
-            now = self._now()
+            now = time.perf_counter()
             self._journal(
                 {
                     "seconds": now,
@@ -150,9 +150,6 @@ class Emulator:
                     "silence_seconds": now - machine.heard / self._rate,
                 }
             )
-
-    def _now(self) -> float:
-        return time.perf_counter()
 
     def _ticks(self, now: float) -> int:
         return int(now * self._rate)
@@ -194,7 +191,7 @@ class Emulator:
         return {name: self._active[name] for name in names if name in self._active}
 
     def _wait(self) -> None:
-        now = self._now()
+        now = time.perf_counter()
         until = [now + _LONGEST_WAIT]
         event = self._machine.next_event()
         if event is not None:

@@ -8,32 +8,10 @@ import socket
 import sys
 import time
 from pathlib import Path
-from typing import Protocol
 
 from daq.errors import ConfigError
 
 _COURTESY = 0.3  # s that a host has to go before the next is refused
-
-
-class Port(Protocol):
-    """Where the host connects."""
-
-    name: str
-
-    def files(self) -> list[int]:
-        """What to wait on for bytes or for a host."""
-
-    def read(self) -> bytes:
-        """What has come, without waiting."""
-
-    def write(self, data: bytes) -> int:
-        """How many of the bytes the port took, without waiting."""
-
-    def connect(self) -> None:
-        """Be there; a host may come."""
-
-    def disconnect(self) -> None:
-        """Be gone, as when a cable is pulled."""
 
 
 class PtyPort:
@@ -49,7 +27,7 @@ class PtyPort:
         return [self._master] if self._master >= 0 else []
 
     def read(self) -> bytes:
-        """What has come, without waiting."""
+        """What has come."""
         with contextlib.suppress(BlockingIOError):
             return os.read(self._master, 65_536)
         return b""
@@ -79,7 +57,7 @@ class PtyPort:
             self.name = str(self._link)
 
     def disconnect(self) -> None:
-        """Close both ends; a host reads an error."""
+        """Close both ends, as when a cable is pulled; a host reads an error."""
         for descriptor in (self._master, self._slave):
             if descriptor >= 0:
                 os.close(descriptor)
@@ -104,7 +82,7 @@ class TcpPort:
         return [item.fileno() for item in (self._listener, self._host) if item is not None]
 
     def read(self) -> bytes:
-        """What has come, without waiting; a new host is let in when there is none."""
+        """What has come; a new host is let in when there is none."""
         self._accept()
         if self._host is None:
             return b""
@@ -175,7 +153,11 @@ class TcpPort:
             self._host = None
 
 
-def port_of(link: Path | None, tcp: int | None) -> PtyPort | TcpPort:
+Port = PtyPort | TcpPort
+"""Where a host connects. Reading and writing never wait."""
+
+
+def port_of(link: Path | None, tcp: int | None) -> Port:
     """A pty, named by a link where one is given, or a TCP port; on Windows always the latter."""
     if tcp is not None or sys.platform == "win32":
         if link is not None:
