@@ -55,7 +55,7 @@ class Page:
         self._mark: float | None = None
         self._drawn_step = self._drawn_end = 0
         self._tick = 0
-        self._sources = Sources.empty()
+        self._sources = Sources()
         self._time = Range1d(start=0.0, end=1.0, name="time")
         self._plots: list[figure] = []
         self._head = Div(name="head", sizing_mode="stretch_width")
