@@ -148,14 +148,6 @@ class Reporting(Protocol):
         """Facts about device and connection that JSON can hold; at any time, also when closed."""
 
 
-@runtime_checkable
-class Simulation(Protocol):
-    """A device that is a simulation, and knows what it simulates."""
-
-    def process_model(self) -> Any:
-        """The plant as a ``sysid.ProcessModel`` whose nominal values are the plant's own."""
-
-
 class Device(Protocol):
     """What a backend implements.
 
@@ -194,3 +186,31 @@ class Device(Protocol):
 
     def close(self) -> None:
         """Disconnect; outputs are zero afterwards."""
+
+
+@dataclass(frozen=True)
+class Electronics:
+    """A computed plant, and the converters that a board would have around it.
+
+    device: the plant in virtual time. volts: (low, high), range of inputs and outputs. step_in,
+    step_out: their resolution [V].
+    """
+
+    device: Device
+    volts: tuple[float, float]
+    step_in: float
+    step_out: float
+
+
+@runtime_checkable
+class Simulation(Protocol):
+    """A device whose plant is computed, and therefore known."""
+
+    def process_model(self) -> Any:
+        """The plant as a ``sysid.ProcessModel`` whose nominal values are the plant's.
+
+        Raises ``sysid.ModelError`` for a plant that no process model can be made of.
+        """
+
+    def board(self) -> Electronics:
+        """The same plant anew, without faults of its connection, for a board to serve."""

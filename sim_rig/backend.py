@@ -18,6 +18,7 @@ from daq.hal import (
     ANALOG_INPUTS,
     CHANNELS,
     DeviceInfo,
+    Electronics,
     Flag,
     FloatArray,
     Guard,
@@ -40,6 +41,7 @@ _REAL_TIME_BLOCK = 0.02  # s between deliveries of a device in real time
 _THETA = 6  # the plant's state
 _ACCURACY = 1e-4  # of the plant's states in parts of what matters: a tenth of the noise and below
 _INTERLOCK = int(Flag.INTERLOCK)
+_OUTPUT_BITS, _IDEAL_BITS = 16, 24  # of the converters that a board would have
 
 
 class Imperfections(Section):
@@ -141,10 +143,6 @@ class SimulatedDevice:
         self._open = False
         self._running = False
 
-    def process_model(self) -> ProcessModel:
-        """The plant as a process model whose nominal values are the plant's own. ModelError."""
-        return self.options.plant.process_model()
-
     def open(self) -> DeviceInfo:
         """Switch on, the load let down since the last time; sampling starts with ``start``."""
         self._open = True
@@ -232,6 +230,18 @@ class SimulatedDevice:
         """Switch off."""
         self.safe()
         self._open = self._running = False
+
+    def process_model(self) -> ProcessModel:
+        """The plant's process model, with its values as nominal ones; may raise ModelError."""
+        return self.options.plant.process_model()
+
+    def board(self) -> Electronics:
+        """The same rig anew, in virtual time and without faults of its connection."""
+        options = self.options.model_copy(update={"time": "virtual", "faults": Faults()})
+        bits = _IDEAL_BITS if options.ideal else options.imperfections.bits
+        volts = (-converters.RANGE, converters.RANGE)
+        step_in, step_out = (2.0 * converters.RANGE / 2**n for n in (bits, _OUTPUT_BITS))
+        return Electronics(SimulatedDevice(options), volts, step_in, step_out)
 
     def _require_running(self) -> None:
         if not self._running:

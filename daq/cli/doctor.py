@@ -2,43 +2,16 @@
 
 from __future__ import annotations
 
-import os
-import sys
-import time
-from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from daq.cli import terminal as console
-from daq.cli.options import AsJson
-from daq.errors import RunError
-from daq.files import make_folder
-from daq.run.realtime import RealTime
-from daq.serial.link import latency_timer, permission_cure
-from daq.serial.ports import PortFacts, list_ports, named
+from daq.cli import terminal
+from daq.cli.options import AsJson, RunsFolder
 
-Verdict = Literal["good", "could be better", "bad"]
-
-_NAPS, _NAP = 400, 0.002  # wake-ups timed, and how long each sleeps [s]
-_LATE, _TOO_LATE = 0.005, 0.05  # s; the watchdog's default is 0.1 s
-_FLUSHES, _FLUSH_BYTES = 20, 512 * 1024
-# A log at 4 kHz is half a megabyte a second; a flush that takes longer than the samples that the
-# computer keeps meanwhile loses some.
-_SLOW_DISK, _SLOWEST_DISK = 10e6, 1e6  # bytes/s
-_LONG_FLUSH, _LONGEST_FLUSH = 0.2, 1.0  # s
-_TIMER = 2  # ms
-
-
-@dataclass(frozen=True)
-class Check:
-    """One thing looked at; cure: what to do, empty where all is well."""
-
-    what: str
-    verdict: Verdict
-    found: str
-    cure: str = ""
+if TYPE_CHECKING:
+    from daq.diagnose.computer import Check, Diagnosis
 
 
 def doctor(
@@ -46,142 +19,45 @@ def doctor(
         list[str] | None,
         typer.Argument(metavar="[PORT...]", help="Device names; default all that exist."),
     ] = None,
-    out: Annotated[
-        Path, typer.Option("--out", metavar="DIR", help="Where capture folders go.")
-    ] = Path("runs"),
+    out: RunsFolder = Path("runs"),
     json: AsJson = False,
 ) -> None:
     """Check whether this computer suits a rig in real time.
 
     What does not is told with its cure.
     """
-    doctor_command(names or [], out, json)
+    from daq.diagnose.computer import diagnose
+    from daq.errors import RunError
+    from daq.serial.ports import ports_of
 
-
-def doctor_command(names: list[str], out: Path, as_json: bool) -> None:
-    """Look at ports, scheduling, memory and disk; exit status 1 when something is bad."""
-    ports = named(names) if names else list_ports()
-    checks = [
-        *(check for port in ports for check in _port(port)),
-        *_real_time(),
-        _disk(out),
-    ]
-    if not ports:
-        checks.insert(0, Check("ports", "could be better", "there are none", "plug the device in"))
-    bad = [check.what for check in checks if check.verdict == "bad"]
-    if as_json:
-        console.print_json({"checks": [asdict(check) for check in checks], "good": not bad})
+    diagnosis = diagnose(ports_of(names or []), out)
+    if json:
+        checks = [_document(check) for check in diagnosis.checks]
+        terminal.print_json({"checks": checks, "good": not diagnosis.bad})
     else:
-        _show(checks)
-    if bad:
-        raise RunError(f"not fit for a rig in real time: {', '.join(bad)}; the cures stand above")
+        _show(diagnosis)
+    if diagnosis.bad:
+        raise RunError(
+            f"not fit for a rig in real time: {', '.join(diagnosis.bad)}; the cures stand above"
+        )
 
 
-def _show(checks: list[Check]) -> None:
-    console.print_table(
+def _document(check: Check) -> dict[str, str]:
+    return {
+        "what": check.subject,
+        "verdict": check.verdict,
+        "found": check.observation,
+        "cure": check.cure,
+    }
+
+
+def _show(diagnosis: Diagnosis) -> None:
+    terminal.print_table(
         "This computer",
         ["what", "verdict", "found"],
-        [[check.what, check.verdict, check.found] for check in checks],
+        [[check.subject, check.verdict, check.observation] for check in diagnosis.checks],
         text=["verdict", "found"],
     )
-    for check in checks:
+    for check in diagnosis.checks:
         if check.cure:
-            console.print_line(f"{check.what}: {check.cure}")
-
-
-def _port(port: PortFacts) -> list[Check]:
-    if "://" in port.name or os.name == "nt":
-        return []
-    what = f"access to {port.name}"
-    if not Path(port.name).exists():
-        return [Check(what, "bad", "there is no such port", "'rig ports' lists those there are")]
-    if not os.access(port.name, os.R_OK | os.W_OK):
-        return [Check(what, "bad", "no permission", permission_cure(port.name))]
-    checks = [Check(what, "good", "may be read and written")]
-    timer = latency_timer(port.name)
-    if timer is not None:
-        found = f"{timer[1]} ms"
-        slow = timer[1] > _TIMER
-        cure = (
-            f"as root: echo 1 > {timer[0]}; for good, a udev rule: "
-            'ACTION=="add", SUBSYSTEM=="usb-serial", ATTR{latency_timer}="1"'
-        )
-        verdict: Verdict = "could be better" if slow else "good"
-        checks.append(Check(f"latency timer of {port.name}", verdict, found, cure if slow else ""))
-    return checks
-
-
-def _real_time() -> list[Check]:
-    """What a run is granted, and how late a program so scheduled wakes up that sleeps shortly."""
-    run = RealTime()
-    run.begin("prefer")
-    worst = 0.0
-    for _ in range(_NAPS):
-        begun = time.perf_counter()
-        time.sleep(_NAP)
-        worst = max(worst, time.perf_counter() - begun - _NAP)
-    run.undo()
-    return [
-        _granted(run, "scheduler", "real-time scheduling", "@GROUP - rtprio 50"),
-        _granted(run, "memory", "memory lock", "@GROUP - memlock unlimited"),
-        _wake_ups(worst),
-    ]
-
-
-def _granted(run: RealTime, name: str, what: str, line: str) -> Check:
-    if name not in run.refused:
-        return Check(what, "good", str(run.granted.get(name, "left to the system")))
-    cure = (
-        f"as root, write the line '{line}' with a group of your user to "
-        "/etc/security/limits.d/rig.conf, then log in again"
-    )
-    linux = sys.platform.startswith("linux")
-    found = f"not allowed ({run.refused[name]})"
-    return Check(what, "could be better", found, cure if linux else "this system has none")
-
-
-def _wake_ups(worst: float) -> Check:
-    found = f"{1e3 * worst:.1f} ms late at worst, of {_NAPS}"
-    if worst <= _LATE:
-        return Check("wake-ups", "good", found)
-    return Check(
-        "wake-ups",
-        "bad" if worst > _TOO_LATE else "could be better",
-        found,
-        "end other programs; on a laptop, plug in the supply and switch energy saving off",
-    )
-
-
-def _disk(out: Path) -> Check:
-    """Flushes of the size that a fast log makes, where logs go."""
-    made = not out.exists()
-    make_folder(out)
-    file, longest = out / f".doctor.{os.getpid()}", 0.0
-    block = bytes(_FLUSH_BYTES)
-    begun = time.perf_counter()
-    try:
-        with file.open("wb") as stream:
-            for _ in range(_FLUSHES):
-                before = time.perf_counter()
-                stream.write(block)
-                stream.flush()
-                os.fsync(stream.fileno())
-                longest = max(longest, time.perf_counter() - before)
-    except OSError as error:
-        return Check(
-            f"disk of {out}", "bad", f"cannot be written: {error.strerror}", "choose another: --out"
-        )
-    finally:
-        file.unlink(missing_ok=True)
-        if made:
-            out.rmdir()
-    speed = _FLUSHES * _FLUSH_BYTES / (time.perf_counter() - begun)
-    found = f"{speed / 1e6:.0f} MB/s, {1e3 * longest:.0f} ms for the slowest flush"
-    if speed >= _SLOW_DISK and longest <= _LONG_FLUSH:
-        return Check(f"disk of {out}", "good", found)
-    return Check(
-        f"disk of {out}",
-        "bad" if speed < _SLOWEST_DISK or longest > _LONGEST_FLUSH else "could be better",
-        found,
-        "write logs to a disk of this computer, not to a stick or the network: rig run --out DIR",
-    )
+            terminal.print_line(f"{check.subject}: {check.cure}")

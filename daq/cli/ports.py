@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from daq.cli import terminal as console
+from daq.cli import terminal
 from daq.cli.options import AsJson
-from daq.serial.ports import Answer, ask, list_ports, named
+
+if TYPE_CHECKING:
+    from daq.serial.messages import Welcome
+    from daq.serial.ports import Inquiry, PortFacts
 
 
 def ports(
@@ -24,58 +27,61 @@ def ports(
     json: AsJson = False,
 ) -> None:
     """List serial ports, and who answers there."""
-    ports_command(names or [], unasked, baud, json)
+    from daq.serial.ports import Inquiry, inquire, ports_of
+
+    wanted = ports_of(names or [])
+    inquiries = [Inquiry(port) for port in wanted] if unasked else inquire(wanted, baud)
+    if json:
+        terminal.print_json({"ports": [_document(inquiry, unasked) for inquiry in inquiries]})
+    else:
+        _show(inquiries, unasked)
 
 
-def ports_command(names: list[str], unasked: bool, baud: int, as_json: bool) -> None:
-    """List ports, those named or all, and ask who is there unless ``unasked``."""
-    ports = named(names) if names else list_ports()
-    answers = [Answer(port, None, None) for port in ports] if unasked else ask(ports, baud)
-    if as_json:
-        console.print_json({"ports": [_document(answer, not unasked) for answer in answers]})
-        return
-    if not answers:
-        console.print_line(
+def _show(inquiries: list[Inquiry], unasked: bool) -> None:
+    if not inquiries:
+        terminal.print_line(
             "No serial port has hardware behind it. Plug the device in, or start 'rig emulate' "
             "and name the port that it prints:  rig ports PORT"
         )
         return
-    console.print_table(
+    terminal.print_table(
         "Serial ports",
         ["port", "what it is", "who answers"],
-        [
-            [answer.port.lasting_name or answer.port.name, _kind(answer), _says(answer, unasked)]
-            for answer in answers
-        ],
+        [[_name(i.port), _description(i.port), _answer(i, unasked)] for i in inquiries],
         text=["what it is", "who answers"],
     )
-    there = next((answer.port for answer in answers if answer.welcome is not None), None)
-    if there is not None:
-        port = there.lasting_name or there.name
-        console.print_next(f"rig run prbs.yaml --rig serial.yaml --port {port}")
+    answered = [inquiry.port for inquiry in inquiries if inquiry.welcome is not None]
+    if answered:
+        terminal.print_next(f"rig run prbs.yaml --rig serial.yaml --port {_name(answered[0])}")
 
 
-def _document(answer: Answer, asked: bool) -> dict[str, Any]:
-    document = asdict(answer.port)
-    if asked:
-        welcome = answer.welcome
-        document["answers"] = None if welcome is None else {
-            "device": welcome.device,
-            "firmware": welcome.firmware,
-            "serial_number": welcome.serial,
-            "protocol_version": welcome.version,
-            "clock_hz": welcome.clock,
-            "max_rate_hz": welcome.max_rate,
-            "queue": welcome.queue,
-            "outputs_held_at_zero_by": welcome.latch.name.lower(),
-            "channels": [asdict(channel) for channel in welcome.channels],
-        }  # fmt: skip
-        document["problem"] = answer.problem
+def _document(inquiry: Inquiry, unasked: bool) -> dict[str, Any]:
+    document = asdict(inquiry.port)
+    if not unasked:
+        document["answers"] = None if inquiry.welcome is None else _identity(inquiry.welcome)
+        document["problem"] = inquiry.problem
     return document
 
 
-def _kind(answer: Answer) -> str:
-    port = answer.port
+def _identity(welcome: Welcome) -> dict[str, Any]:
+    return {
+        "device": welcome.device,
+        "firmware": welcome.firmware,
+        "serial_number": welcome.serial,
+        "protocol_version": welcome.version,
+        "clock_hz": welcome.clock,
+        "max_rate_hz": welcome.max_rate,
+        "queue": welcome.queue,
+        "outputs_held_at_zero_by": welcome.latch.name.lower(),
+        "channels": [asdict(channel) for channel in welcome.channels],
+    }
+
+
+def _name(port: PortFacts) -> str:
+    return port.lasting_name or port.name
+
+
+def _description(port: PortFacts) -> str:
     facts = [port.description]
     if port.lasting_name is not None:
         facts.append(f"now {port.name}")
@@ -86,8 +92,8 @@ def _kind(answer: Answer) -> str:
     return ", ".join(fact for fact in facts if fact)
 
 
-def _says(answer: Answer, unasked: bool) -> str:
-    if answer.welcome is not None:
-        welcome = answer.welcome
+def _answer(inquiry: Inquiry, unasked: bool) -> str:
+    if inquiry.welcome is not None:
+        welcome = inquiry.welcome
         return f"{welcome.device}, firmware {welcome.firmware}, up to {welcome.max_rate:g} Hz"
-    return "not asked" if unasked else answer.problem or ""
+    return "not asked" if unasked else inquiry.problem or ""

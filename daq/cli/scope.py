@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import sys
 import webbrowser
 from pathlib import Path
@@ -10,9 +9,8 @@ from typing import Annotated
 
 import typer
 
-from daq.cli import terminal as console
+from daq.cli import terminal
 from daq.cli.options import AsJson
-from daq.errors import ConfigError
 
 
 def scope(
@@ -35,31 +33,16 @@ def scope(
     json: AsJson = False,
 ) -> None:
     """Show a run in the browser, also while it is recorded."""
-    scope_command(run, out, port, browser, json)
-
-
-def scope_command(
-    run: Path | None, out: Path, port: int | None, browser: bool, as_json: bool
-) -> None:
-    """Serve the page and open a browser on it, until Ctrl-C."""
-    if importlib.util.find_spec("bokeh") is None:
-        raise ConfigError(
-            "rig scope needs Bokeh, which is not installed; install it with: "
-            "pip install 'hybrid-rig[scope]' (in a clone: pip install -e '.[scope]')"
-        )
-    from daq.scope.recordings import Watch
-
-    watch = Watch(out, run)  # a mistake is told before the server is imported, which takes longer
-    from daq.scope.server import serve
+    from daq import scope as use_case
 
     def ready(address: str) -> None:
-        if as_json:
-            console.print_json({"address": address, "run": run, "out": out})
+        if json:
+            terminal.print_json({"address": address, "run": run, "out": out})
         else:
             shown = str(run) if run else f"the newest run under {out}"
-            console.print_line(f"{address} shows {shown}; Ctrl-C ends it")
+            terminal.print_line(f"{address} shows {shown}; Ctrl-C ends it")
         sys.stdout.flush()
-        if browser and not as_json and not webbrowser.open(address):
-            console.report_note(f"no browser could be opened; open {address} in one")
+        if browser and not json and not webbrowser.open(address):
+            terminal.report_note(f"no browser could be opened; open {address} in one")
 
-    serve(watch, port, ready)
+    use_case.show(run, out, port, ready)

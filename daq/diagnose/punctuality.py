@@ -1,4 +1,4 @@
-"""How punctual a run was, in words."""
+"""Texts on how punctual a run was."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _IN_LOTS = 3.0  # samples that come at once, on average
 
 
 def summary_line(run: RunResult) -> str | None:
-    """One line on the timing of a run that a clock paced; None of one that waited for the host."""
+    """A line on the timing of a run that a clock paced; None for one that waited for the host."""
     if not run.realtime["needed"]:
         return None
     arrival, answer = run.timing["arrival"], run.timing["answer"]
@@ -29,23 +29,23 @@ def summary_line(run: RunResult) -> str | None:
 
 
 def notes(run: RunResult) -> list[str]:
-    """What went wrong in time: late commands and lost samples, with the cure."""
-    found = []
+    """Notes on late commands and lost samples, each with its cure."""
+    texts = []
     late, lost = run.timing["late"], run.timing["lost"]
     if late["commands"]:
-        found.append(
+        texts.append(
             f"{_many(late['commands'], 'command')} of {run.n_samples} came too late; the device "
             f"held the one before ({_places('sample', late['first_ticks'], late['commands'])})."
             f"{_haste(run)}"
         )
     if lost["samples"]:
         gaps = len(lost["after_ticks"])
-        found.append(
+        texts.append(
             f"{_many(lost['samples'], 'sample')} did not arrive "
             f"({_places('after sample', lost['after_ticks'], gaps)}); the log keeps the gap in "
             "time. Check the connection, or sample more slowly"
         )
-    return found
+    return texts
 
 
 def _haste(run: RunResult) -> str:
@@ -78,7 +78,7 @@ def _short(seconds: float) -> str:
 
 
 def as_document(run: RunResult) -> dict[str, Any]:
-    """For machines."""
+    """The run's timing for machines."""
     return {
         "folder": str(run.folder),
         "samples": run.n_samples,

@@ -10,13 +10,7 @@ from typing import Any
 
 import numpy as np
 from bokeh.layouts import gridplot
-from bokeh.models import (
-    BasicTicker,
-    ColumnDataSource,
-    CrosshairTool,
-    FactorRange,
-    Range1d,
-)
+from bokeh.models import BasicTicker, ColumnDataSource, CrosshairTool, FactorRange, Range1d
 from bokeh.models.annotations import Span
 from bokeh.plotting import figure
 
@@ -53,22 +47,13 @@ class Curve:
     wanted: bool
 
 
-@dataclass(frozen=True)
 class Sources:
     """What the figures draw: samples, where flags stand, and lines across all figures."""
 
-    samples: ColumnDataSource
-    flags: ColumnDataSource
-    lines: ColumnDataSource
-
-    @classmethod
-    def empty(cls) -> Sources:
-        """Nothing to draw yet."""
-        return cls(
-            ColumnDataSource({"t": []}, name="samples"),
-            ColumnDataSource({"time": [], "flag": [], "color": []}, name="flags"),
-            ColumnDataSource({"time": [], "color": [], "dash": []}, name="lines"),
-        )
+    def __init__(self) -> None:
+        self.samples = ColumnDataSource({"t": []}, name="samples")
+        self.flags = ColumnDataSource({"time": [], "flag": [], "color": []}, name="flags")
+        self.lines = ColumnDataSource({"time": [], "color": [], "dash": []}, name="lines")
 
 
 def curves_of(columns: Sequence[str]) -> list[list[Curve]]:
@@ -103,9 +88,11 @@ def make_figures(
             x="time", source=sources.lines, line_color="color", line_dash="dash", line_alpha=0.7
         )
     grid = gridplot(
-        [[plot] for plot in plots], merge_tools=True, toolbar_location="above",
-        sizing_mode="stretch_width", toolbar_options={"logo": None},
-    )  # fmt: skip
+        [[plot] for plot in plots],
+        toolbar_location="above",
+        sizing_mode="stretch_width",
+        toolbar_options={"logo": None},
+    )
     return grid, plots
 
 
@@ -128,22 +115,22 @@ def fit(plot: figure, sources: Sources) -> None:
 
 def make_value_table(values: ColumnDataSource, n_rows: int) -> figure:
     """The values at one time, drawn: new cells in a page's text would have it laid out anew."""
-    table = figure(
-        width=390, height=24 * n_rows, x_range=Range1d(start=0, end=390),
-        y_range=Range1d(start=n_rows - 0.5, end=-0.5), tools="",
-        title=None, toolbar_location=None, outline_line_color=None, min_border=0, name="table",
-    )  # fmt: skip
+    x_range, y_range = Range1d(start=0, end=390), Range1d(start=n_rows - 0.5, end=-0.5)
+    table = figure(width=390, height=24 * n_rows, x_range=x_range, y_range=y_range, tools="")
+    table.update(
+        title=None, toolbar_location=None, outline_line_color=None, min_border=0, name="table"
+    )
     table.axis.visible = False
     table.grid.visible = False
-    look: dict[str, Any] = {
-        "y": "row", "source": values, "text_font_size": "13px", "text_baseline": "middle",
-        "text_font_style": "style",
-    }  # fmt: skip
     table.scatter(x=10, y="row", source=values, marker="square", size=10, color="color")
-    table.text(x=22, text="channel", **look)
-    table.text(x=256, text="value", text_align="right", **look)
-    table.text(x=262, text="unit", **look)
-    table.text(x=388, text="difference", text_align="right", **look)
+    look: dict[str, Any] = {"source": values, "text_font_size": "13px", "text_baseline": "middle"}
+    for column, x, align in (
+        ("channel", 22, "left"),
+        ("value", 256, "right"),
+        ("unit", 262, "left"),
+        ("difference", 388, "right"),
+    ):
+        table.text(x, "row", column, text_align=align, text_font_style="style", **look)
     return table
 
 
@@ -245,10 +232,15 @@ def _flag_strip(sources: Sources, time: Range1d, cursor: Span) -> figure:
 
 def _empty(time: Range1d, cursor: Span, height: int, y_range: Any) -> figure:
     plot = figure(
-        title=None, height=height, x_range=time, y_range=y_range, min_border_left=95,
-        min_border_bottom=6, tools="xbox_zoom,xpan,xwheel_zoom,reset,save",
-        active_scroll="xwheel_zoom", active_drag="xbox_zoom",
-    )  # fmt: skip
+        title=None,
+        height=height,
+        x_range=time,
+        y_range=y_range,
+        tools="xbox_zoom,xpan,xwheel_zoom,reset,save",
+        active_scroll="xwheel_zoom",
+        active_drag="xbox_zoom",
+    )
+    plot.update(min_border_left=95, min_border_bottom=6)
     plot.add_tools(CrosshairTool(overlay=cursor))
     plot.yaxis.axis_label_text_font_style = "normal"
     plot.outline_line_color = "#cccccc"

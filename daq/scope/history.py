@@ -37,7 +37,7 @@ class History:
 
     A stretch is drawn from the newest rows, kept whole; from lows and highs over ``bucket`` rows,
     which double when there are too many; or, magnified further, from the file itself. What is
-    kept does not depend on how long the run is.
+    kept does not depend on how long the run is. The flags in the highs are those of all rows.
 
     columns: names, with ``t`` among them. read: rows of the file between two bytes.
     """
@@ -53,7 +53,6 @@ class History:
         self._recent_end = 0
         self._n_buckets = 0
         self._low, self._high = np.empty((_BUCKETS, n)), np.empty((_BUCKETS, n))
-        self._marks = np.zeros(_BUCKETS, dtype=np.int64)
         self._starts = np.zeros(_BUCKETS, dtype=np.int64)
         self._pending = np.empty((0, n))  # rows of the bucket that is not full yet
         self._pending_starts = np.empty(0, dtype=np.int64)
@@ -93,14 +92,11 @@ class History:
 
     def at(self, time: float) -> FloatArray | None:
         """The row nearest to a time [s], (n_columns,); None without any."""
-        if not self.n_rows:
-            return None
         rows = self._recent_rows()
-        if time < rows[0, self._time]:
-            first, last = self._bucket_range(time, time)
-            rows = self._from_file(first, last)
-            if not len(rows):
-                return None
+        if len(rows) and time < rows[0, self._time]:
+            rows = self._from_file(*self._bucket_range(time, time))
+        if not len(rows):
+            return None
         times = rows[:, self._time]
         right = min(int(np.searchsorted(times, time)), len(times) - 1)
         left = max(right - 1, 0)
@@ -114,26 +110,33 @@ class History:
         go on from where the view ends.
         """
         recent = self._recent_rows()
-        first_kept = self.n_rows - len(recent)
-        if not self.n_rows or first_kept == 0 or start >= recent[0, self._time]:
+        if len(recent) == self.n_rows or start >= recent[0, self._time]:
             times = recent[:, self._time]
-            low = max(int(np.searchsorted(times, start)) - 1, 0)
-            high = min(int(np.searchsorted(times, end, side="right")) + 1, len(times))
-            return self._reduced(recent[low:high], first_kept + low, points, to_the_end)
+            first = max(int(np.searchsorted(times, start)) - 1, 0)
+            rows = recent[first : int(np.searchsorted(times, end, side="right")) + 1]
+            step = step_for(len(rows), points)
+            return self._drawn(rows, rows, step, self.n_rows - len(recent) + first, to_the_end)
         first, last = self._bucket_range(start, end)
-        rows = (last - first) * self.bucket
-        if step_for(rows, points) < self.bucket and rows <= _READ:
-            read = self._from_file(first, last)
-            return self._reduced(read, first * self.bucket, points, to_the_end)
-        return self._from_buckets(first, last, points, to_the_end)
+        n_rows = (last - first) * self.bucket
+        step = step_for(n_rows, points)
+        if step < self.bucket and n_rows <= _READ:
+            rows = self._from_file(first, last)
+            step = step_for(len(rows), points)
+            return self._drawn(rows, rows, step, first * self.bucket, to_the_end)
+        whole = slice(first, min(last, self._n_buckets))
+        low, high = self._low[whole], self._high[whole]
+        if to_the_end and last > self._n_buckets and len(self._pending):
+            rest = self._united(self._pending, self._pending, len(self._pending))
+            low, high = np.concatenate([low, rest[0]]), np.concatenate([high, rest[1]])
+        return self._drawn(low, high, step, first * self.bucket, to_the_end, self.bucket)
 
     def since(self, row: int, step: int) -> View:
         """The full stretches of ``step`` rows from ``row`` on, or from the oldest row kept."""
         recent = self._recent_rows()
         kept = self.n_rows - len(recent)
         first = max(row, kept)
-        n = (self.n_rows - first) // step * step
-        return self._drawn(recent[first - kept : first - kept + n], step, first + n)
+        rows = recent[first - kept :]
+        return self._drawn(rows, rows, step, first, to_the_end=False)
 
     def _recent_rows(self) -> FloatArray:
         first = max(self._recent_end - _RECENT, 0)
@@ -159,9 +162,8 @@ class History:
             n = min(full, _BUCKETS - self._n_buckets)
             rows = slice(done, done + n * self.bucket)
             into = slice(self._n_buckets, self._n_buckets + n)
-            self._low[into] = _lows(values[rows], self.bucket)
-            self._high[into] = _highs(values[rows], self.bucket)
-            self._marks[into] = _united(self._flags_of(values[rows]), self.bucket)
+            low, high = self._united(values[rows], values[rows], self.bucket)
+            self._low[into], self._high[into] = low, high
             self._starts[into] = starts[rows][:: self.bucket]
             self._n_buckets += n
             done = rows.stop
@@ -170,16 +172,9 @@ class History:
     def _merge(self) -> None:
         """Buckets of twice the rows."""
         half = _BUCKETS // 2
-        self._low[:half] = np.fmin(self._low[0::2], self._low[1::2])
-        self._high[:half] = np.fmax(self._high[0::2], self._high[1::2])
-        self._marks[:half] = self._marks[0::2] | self._marks[1::2]
+        self._low[:half], self._high[:half] = self._united(self._low, self._high, 2)
         self._starts[:half] = self._starts[0::2]
         self._n_buckets, self.bucket = half, 2 * self.bucket
-
-    def _flags_of(self, rows: FloatArray) -> IntArray:
-        if self._flags is None:
-            return np.zeros(len(rows), dtype=np.int64)
-        return np.nan_to_num(rows[:, self._flags]).astype(np.int64)
 
     def _bucket_range(self, start: float, end: float) -> tuple[int, int]:
         """Buckets that hold the times, one more on each side; the last may be the pending rows."""
@@ -194,51 +189,44 @@ class History:
             return self._pending
         return self._read(int(self._starts[first]), end)
 
-    def _from_buckets(self, first: int, last: int, points: int, to_the_end: bool) -> View:
-        whole = min(last, self._n_buckets)
-        together = max(1, step_for((last - first) * self.bucket, points) // self.bucket)
-        n = (whole - first) // together * together
-        part, rest = slice(first, first + n), slice(first + n, whole)
-        low = _lows(self._low[part], together)
-        high = _highs(self._high[part], together)
-        marks = _united(self._marks[part], together)
-        view = View(
-            low[:, self._time], low, high, marks, together * self.bucket, (first + n) * self.bucket
-        )
-        pending = self._pending if last > self._n_buckets else self._pending[:0]
-        left = np.concatenate([self._low[rest], self._high[rest], pending])
-        if not to_the_end or not len(left):
-            return view
-        mark = np.bitwise_or.reduce([*self._marks[rest], *self._flags_of(pending)])
-        low, high = _lows(left, len(left)), _highs(left, len(left))
-        end = whole * self.bucket + len(pending)
-        return _joined(view, View(low[:, self._time], low, high, np.array([mark]), 0, end))
+    def _united(
+        self, low: FloatArray, high: FloatArray, together: int
+    ) -> tuple[FloatArray, FloatArray]:
+        """Lows and highs (m, n_columns) of stretches of so many rows or buckets."""
+        shape = -1, together, low.shape[1]
+        low = np.fmin.reduce(low.reshape(shape), axis=1)
+        flags = self._flags_of(high).reshape(-1, together)
+        high = np.fmax.reduce(high.reshape(shape), axis=1)
+        if self._flags is not None:
+            high[:, self._flags] = np.bitwise_or.reduce(flags, axis=1)
+        return low, high
 
-    def _reduced(self, rows: FloatArray, first: int, points: int, to_the_end: bool) -> View:
-        """Rows from number ``first`` on, in stretches of one length."""
-        step = step_for(len(rows), points)
-        n = len(rows) // step * step
-        view = self._drawn(rows[:n], step, first + n)
-        if n == len(rows) or not to_the_end:
-            return view
-        return _joined(view, self._drawn(rows[n:], len(rows) - n, first + len(rows)))
+    def _flags_of(self, rows: FloatArray) -> IntArray:
+        if self._flags is None:
+            return np.zeros(len(rows), dtype=np.int64)
+        return np.nan_to_num(rows[:, self._flags]).astype(np.int64)
 
-    def _drawn(self, rows: FloatArray, step: int, end: int) -> View:
-        low, high = _lows(rows, step), _highs(rows, step)
-        flags = _united(self._flags_of(rows), step)
-        return View(low[:, self._time], low, high, flags, step, end)
-
-
-def _joined(view: View, last: View) -> View:
-    """A view and the rest that filled no stretch of it."""
-    return View(
-        np.concatenate([view.time, last.time]),
-        np.concatenate([view.low, last.low]),
-        np.concatenate([view.high, last.high]),
-        np.concatenate([view.flags, last.flags]),
-        view.step,
-        last.end,
-    )
+    def _drawn(
+        self,
+        low: FloatArray,
+        high: FloatArray,
+        step: int,
+        first: int,
+        to_the_end: bool,
+        bucket: int = 1,
+    ) -> View:
+        """Rows, or buckets of rows, from row ``first`` on, in stretches of ``step`` rows."""
+        together = max(1, step // bucket)
+        n = len(low) // together * together
+        lows, highs = self._united(low[:n], high[:n], together)
+        end = first + n * bucket
+        if to_the_end and n < len(low):
+            rest = self._united(low[n:], high[n:], len(low) - n)
+            lows, highs = np.concatenate([lows, rest[0]]), np.concatenate([highs, rest[1]])
+            end = first + len(low) * bucket
+        flags = self._flags_of(highs)
+        end = min(end, self.n_rows)  # the last bucket may not be full
+        return View(lows[:, self._time], lows, highs, flags, together * bucket, end)
 
 
 def nothing(n_columns: int) -> View:
@@ -252,18 +240,3 @@ def step_for(rows: int, points: int) -> int:
     if rows <= 2 * points:
         return 1
     return 1 << max(1, (rows // (2 * points)).bit_length())
-
-
-def _lows(rows: FloatArray, step: int) -> FloatArray:
-    low: FloatArray = np.fmin.reduce(rows.reshape(-1, step, rows.shape[1]), axis=1)
-    return low
-
-
-def _highs(rows: FloatArray, step: int) -> FloatArray:
-    high: FloatArray = np.fmax.reduce(rows.reshape(-1, step, rows.shape[1]), axis=1)
-    return high
-
-
-def _united(flags: IntArray, step: int) -> IntArray:
-    united: IntArray = np.bitwise_or.reduce(flags.reshape(-1, step), axis=1)
-    return united

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from html import escape
 from typing import Any
 
@@ -28,14 +27,12 @@ from daq.scope.figures import (
     points_of,
 )
 from daq.scope.history import History, View, nothing, step_for
-from daq.scope.recordings import Recording, Watch
-from daq.scope.wording import FAILED, HELP, VALUE_FIELDS, heading, readout
+from daq.scope.texts import FAILED, HELP, VALUE_FIELDS, heading, readout
+from daq.scope.watch import FollowedLog, Watch
 
-PERIOD = 28  # ms between updates: 30 a second and some, for no timer is exact
+_PERIOD = 28  # ms between updates: 30 a second and some, for no timer is exact
 _POINTS = 500  # stretches drawn at least over the width of the page
-_WINDOWS: tuple[tuple[str, float | None], ...] = (
-    ("2 s", 2.0), ("10 s", 10.0), ("60 s", 60.0), ("whole run", None),
-)  # fmt: skip
+_WINDOWS: dict[str, float | None] = {"2 s": 2.0, "10 s": 10.0, "60 s": 60.0, "whole run": None}
 _USUAL, _WHOLE = 1, len(_WINDOWS) - 1
 _VALUES_EVERY = 3  # updates between two of the table: ten a second can be read
 _HEAD_EVERY = 15  # and of the heading, after which a browser lays the whole page out anew
@@ -44,21 +41,12 @@ _LOST = 1.0  # s after which an update that the browser has not echoed counts as
 _MARGIN = 0.5  # of a held view's width that is drawn beyond its edges, to be there when it moves
 
 
-def page_maker(watch: Watch) -> Callable[[Document], None]:
-    """A function that fills a new tab's document."""
-
-    def make(document: Document) -> None:
-        Page(document, watch)
-
-    return make
-
-
 class Page:
     """A tab that follows the watch, or holds a part of the run for a closer look."""
 
     def __init__(self, document: Document, watch: Watch) -> None:
         self._watch = watch
-        self._recording: Recording | None = None
+        self._log: FollowedLog | None = None
         self._columns: tuple[str, ...] = ()
         self._live = True
         self._ended = False
@@ -67,7 +55,7 @@ class Page:
         self._mark: float | None = None
         self._drawn_step = self._drawn_end = 0
         self._tick = 0
-        self._sources = Sources.empty()
+        self._sources = Sources()
         self._time = Range1d(start=0.0, end=1.0, name="time")
         self._plots: list[figure] = []
         self._head = Div(name="head", sizing_mode="stretch_width")
@@ -79,8 +67,7 @@ class Page:
         self._sent_at = 0.0
         self._last_seen = 0
         self._button = Button(label="Pause", width=90, name="pause", button_type="primary")
-        labels = [label for label, _ in _WINDOWS]
-        self._window = RadioButtonGroup(labels=labels, active=_USUAL, name="window")
+        self._window = RadioButtonGroup(labels=list(_WINDOWS), active=_USUAL, name="window")
         self._button.on_click(self._toggle)
         self._window.on_change("active", lambda attr, old, new: self._follow())
         self._figures = column(sizing_mode="stretch_width", name="figures")
@@ -92,7 +79,7 @@ class Page:
         document.add_root(page)
         document.title = "rig scope"
         self._document = document
-        self._timer = document.add_periodic_callback(self._update, PERIOD)
+        self._timer = document.add_periodic_callback(self._update, _PERIOD)
         self._update()
 
     # --- 30 times a second --------------------------------------------------------------------
@@ -108,17 +95,17 @@ class Page:
 
     def _advance(self) -> None:
         self._watch.poll()
-        newest = self._watch.recording
-        if self._live and newest is not self._recording:
+        newest = self._watch.followed
+        if self._live and newest is not self._log:
             self._show(newest)
-        recording = self._recording
-        if recording is not None and recording is not newest:
-            recording.look()
-            recording.read()
+        log = self._log
+        if log is not None and log is not newest:
+            log.look()
+            log.read()
         if self._browser_is_behind():
             return
-        if recording is not None:
-            self._draw(recording)
+        if log is not None:
+            self._draw(log)
         if self._tick % _VALUES_EVERY == 0:
             self._show_values()
         if self._tick % _HEAD_EVERY == 0:
@@ -134,24 +121,24 @@ class Page:
     def _came(self, attribute: str, old: int, new: int) -> None:
         self._last_seen = new
 
-    def _show(self, recording: Recording | None) -> None:
-        self._recording = recording
+    def _show(self, log: FollowedLog | None) -> None:
+        self._log = log
         self._ended = False
         self._set_mark(None)
         self._clear()
-        if recording is not None:
-            self._window.active = _USUAL if recording.state.running else _WHOLE
+        if log is not None:
+            self._window.active = _USUAL if log.state.running else _WHOLE
 
-    def _draw(self, recording: Recording) -> None:
-        history = recording.history
+    def _draw(self, log: FollowedLog) -> None:
+        history = log.history
         if history is None:
             return
-        if recording.tail.columns != self._columns:
-            self._make_figures(recording.tail.columns)
+        if log.tail.columns != self._columns:
+            self._make_figures(log.tail.columns)
         if not history.n_rows:
             return
         if self._live:
-            self._draw_live(recording, history)
+            self._draw_live(log, history)
         elif self._zoomed_to is not None:
             start, end = self._zoomed_to
             self._zoomed_to = None
@@ -159,12 +146,12 @@ class Page:
             points = round(_POINTS * (1.0 + 2.0 * _MARGIN))
             self._replace(history.view(start - margin, end + margin, points), history.spread)
 
-    def _draw_live(self, recording: Recording, history: History) -> None:
+    def _draw_live(self, log: FollowedLog, history: History) -> None:
         """Add what has come since; draw all anew where stretches change their length."""
-        ended = not recording.state.running and recording.loading is None
+        ended = not log.state.running and log.loading is None
         if ended and not self._ended:
             self._window.active = _WHOLE
-        width = _WINDOWS[self._window.active or 0][1]
+        width = list(_WINDOWS.values())[self._window.active or 0]
         first, last = history.span
         start = first if width is None else max(first, last - width)
         rows = history.n_rows if width is None else round(width / (history.dt or 1.0))
@@ -229,13 +216,13 @@ class Page:
         self._side.children = [make_value_table(self._values, len(columns) + 1), words]
 
     def _show_head(self) -> None:
-        newer = self._recording is not self._watch.recording
-        head = heading(self._recording, self._watch.root, newer)
+        newer = self._log is not self._watch.followed
+        head = heading(self._log, self._watch.root, newer)
         if head != self._head.text:
             self._head.text = head
 
     def _show_values(self) -> None:
-        history = self._recording.history if self._recording else None
+        history = self._log.history if self._log else None
         if history is None or not history.n_rows:
             return
         values = history.at(history.span[1] if self._cursor is None else self._cursor)

@@ -13,11 +13,12 @@ from types import FrameType
 
 from bokeh.application import Application
 from bokeh.application.handlers.function import FunctionHandler
+from bokeh.document import Document
 from bokeh.server.server import Server
 
 from daq.errors import ConfigError
-from daq.scope.page import page_maker
-from daq.scope.recordings import Watch
+from daq.scope.page import Page
+from daq.scope.watch import Watch
 
 HOST = "127.0.0.1"
 USUAL_PORT = 5006
@@ -26,8 +27,8 @@ USUAL_PORT = 5006
 def serve(watch: Watch, port: int | None, ready: Callable[[str], None]) -> None:
     """Serve until Ctrl-C or SIGTERM; ``ready`` is told the address.
 
-    port: None for the usual one or, where that is taken, any. Raises ConfigError when the port
-    that was asked for is taken.
+    port: None for the usual one or, where that is taken, any. Raises ConfigError for a port that
+    is taken.
     """
     port = _free(USUAL_PORT, or_any=True) if port is None else _free(port, or_any=False)
     # A tab that is closed while it is written to is no error; what goes wrong in a page it says.
@@ -43,8 +44,11 @@ async def _serve(watch: Watch, port: int, ready: Callable[[str], None]) -> None:
     def end(number: int, frame: FrameType | None) -> None:
         loop.call_soon_threadsafe(ended.set)
 
+    def make_page(document: Document) -> None:
+        Page(document, watch)
+
     server = Server(
-        {"/": Application(FunctionHandler(page_maker(watch)))},
+        {"/": Application(FunctionHandler(make_page))},
         port=port,
         address=HOST,
         allow_websocket_origin=[f"{HOST}:{port}", f"localhost:{port}"],

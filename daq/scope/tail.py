@@ -77,7 +77,7 @@ class LogTail:
         if data and self._layout is None:
             data = self._take_header(data)
         if not data or not self.columns:
-            return _no_rows(len(self.columns), self.offset)
+            return Rows(np.empty((0, len(self.columns))), np.array([self.offset]))
         rows = self._parse(data, self.problems)
         self._line += data.count(b"\n")
         self.offset += len(data)
@@ -195,13 +195,9 @@ class LogTail:
 
 def _forward(time: FloatArray, last: float) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
     """Which times are beyond all before them."""
-    known = np.where(np.isfinite(time), time, -np.inf)
-    before = np.maximum.accumulate(np.concatenate([[last], known]))[:-1]
-    return known > before
-
-
-def _no_rows(n_columns: int, offset: int) -> Rows:
-    return Rows(np.empty((0, n_columns)), np.array([offset], dtype=np.int64))
+    finite = np.where(np.isfinite(time), time, -np.inf)
+    before = np.maximum.accumulate(np.concatenate([[last], finite]))[:-1]
+    return finite > before
 
 
 def _line_starts(data: bytes) -> list[int]:
@@ -238,11 +234,17 @@ def _parse_bulk(data: bytes, layout: Layout, places: list[int]) -> FloatArray | 
         with warnings.catch_warnings():
             warnings.simplefilter("error", pd.errors.ParserWarning)
             frame = pd.read_csv(
-                io.BytesIO(data), sep=layout.separator, header=None, index_col=False,
-                names=list(range(len(layout.names))), usecols=places, dtype=np.float64,
-                skipinitialspace=True, skip_blank_lines=False,
+                io.BytesIO(data),
+                sep=layout.separator,
                 decimal="." if layout.separator == "," else ",",
-            )  # fmt: skip
+                header=None,
+                names=list(range(len(layout.names))),
+                usecols=places,
+                index_col=False,
+                dtype=np.float64,
+                skipinitialspace=True,
+                skip_blank_lines=False,
+            )
     except (ValueError, pd.errors.ParserWarning, pd.errors.ParserError):
         return None
     values: FloatArray = frame.to_numpy(dtype=np.float64)

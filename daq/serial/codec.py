@@ -71,33 +71,22 @@ class Decoder:
     """Frames out of a stream of bytes, however reads cut it.
 
     received: bytes fed. accepted, rejected: frames that passed, and pieces between zeros that
-    did not. discarded: bytes without a zero that grew longer than any frame.
+    did not.
     """
 
     received: int = 0
     accepted: int = 0
     rejected: int = 0
-    discarded: int = 0
     _partial: bytes = b""
 
     def feed(self, data: bytes) -> list[Frame]:
         """The frames that the data complete."""
         self.received += len(data)
         *pieces, rest = (self._partial + data).split(b"\0")
-        if len(rest) > _LONGEST:
-            # The front will not become a frame; what is kept cannot either, and is rejected
-            # at the next zero.
-            self.discarded += len(rest) - _LONGEST - 1
-            rest = rest[: _LONGEST + 1]
-        self._partial = rest
-        frames = []
-        for piece in pieces:
-            if not piece:
-                continue
-            frame = decode(piece)
-            if frame is None:
-                self.rejected += 1
-            else:
-                self.accepted += 1
-                frames.append(frame)
+        # What is longer than any frame stays so, and is rejected at the next zero.
+        self._partial = rest[: _LONGEST + 1]
+        decoded = [decode(piece) for piece in pieces if piece]
+        frames = [frame for frame in decoded if frame is not None]
+        self.accepted += len(frames)
+        self.rejected += len(decoded) - len(frames)
         return frames

@@ -7,6 +7,7 @@ what ``take`` gives. Times are seconds of the host's monotonic clock.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,6 +22,8 @@ from daq.serial.messages import (
     Block,
     Codes,
     Latch,
+    LoopMode,
+    Pong,
     Reply,
     Result,
     Start,
@@ -47,8 +50,8 @@ _REASONS = {
 
 
 @dataclass
-class _Request:
-    """One outstanding request."""
+class PendingRequest:
+    """A request that has not been answered yet: its frame, and when it is sent again."""
 
     type: Type
     seq: int
@@ -76,7 +79,7 @@ class HostMachine:
     """One session with a device.
 
     blocks: samples received, in order, for the program to take. failure: set once, when the
-    session cannot go on. welcome: who answered. status: the newest word of the device.
+    session cannot go on. welcome: who answered. status: the newest state of the device.
     """
 
     def __init__(self, session: int, host: str) -> None:
@@ -92,19 +95,27 @@ class HostMachine:
         self.other_version: int | None = None
         self._host = host
         self._outbox: deque[bytes] = deque()
-        self._request: _Request | None = None
+        self._request: PendingRequest | None = None
         self._request_seq = 0
         self._seq = 0
         self._heard_seq: int | None = None
         self._run = 0
         self._start: Start | None = None
         self._going = False
-        self._expected = 0
+        self._expected = 0  # tick of the next sample
         self._ring = np.zeros((1, len(CHANNELS)), dtype=messages.COMMAND_DTYPE)
-        self._asked = self._sent = self._taken = self._credit = 0
+        # Ticks after the last command: of the program, on the line, at the device, with room there.
+        self._commanded = self._sent = self._taken = self._credit = 0
         self._progress = self._rewound = self._pinged = 0.0
         self._sample_at = self._frame_at = 0.0
-        self._rejected = 0  # damaged frames, by the time of the last good one
+        self._rejected = 0  # damaged frames, by the time of the last good frame
+        self._receivers: dict[int, tuple[Callable[[bytes], Any], Callable[..., None]]] = {
+            Type.SAMPLES: (messages.unpack_samples, self._add_samples),
+            Type.PONG: (messages.unpack_pong, self._add_round_trip),
+            Type.STATUS: (messages.unpack_status, self._update),
+            Type.REPLY: (messages.unpack_reply, self._answer),
+            Type.WELCOME: (_unpack_welcome, self._greet),
+        }
 
     # --- the program around it ----------------------------------------------------------------
 
@@ -121,12 +132,11 @@ class HostMachine:
             return
         if keep_alive and now - self._pinged >= 0.25e-3 * self._start.watchdog:
             self.ping(now)
-        stuck = self._taken < self._sent and now - self._progress > _RESEND
-        if self._start.mode is messages.LoopMode.OPEN and stuck:
+        if self._taken < self._sent and now - self._progress > _RESEND:
             self._rewind(now)
         self._pump(now)
         if self._going and now - self._sample_at > SILENCE:
-            self._fail(self._silence(now))
+            self._fail(self._why_silent(now))
 
     def take(self) -> bytes:
         """All that is to be written now."""
@@ -138,20 +148,21 @@ class HostMachine:
 
     def hello(self, now: float, give_up: float) -> None:
         """Ask who is there; answered when ``welcome`` is set or ``other_version`` is."""
-        payload = messages.Hello(self._host).pack()
-        self._ask(Type.HELLO, payload, now, HELLO_RETRY, give_up)
+        self.ask(Type.HELLO, messages.Hello(self._host).pack(), now, give_up, HELLO_RETRY)
 
-    def ask(self, type_: Type, payload: bytes, now: float, give_up: float = GIVE_UP) -> None:
-        """Send a request, in place of any that is outstanding; answered when ``reply`` is set."""
-        self._ask(type_, payload, now, RETRY, give_up)
-
-    def _ask(
-        self, type_: Type, payload: bytes, now: float, interval: float, give_up: float
+    def ask(
+        self,
+        type_: Type,
+        payload: bytes,
+        now: float,
+        give_up: float = GIVE_UP,
+        interval: float = RETRY,
     ) -> None:
-        self._request_seq = (self._request_seq + 1) & 0xFFFF
-        frame = codec.encode(type_, self.session, self._request_seq, payload)
+        """Send a request, in place of any that is outstanding; answered when ``reply`` is set."""
+        seq = self._request_seq = (self._request_seq + 1) & 0xFFFF
+        frame = codec.encode(type_, self.session, seq, payload)
         self.reply = None
-        self._request = _Request(type_, self._request_seq, frame, interval, now + give_up, now)
+        self._request = PendingRequest(type_, seq, frame, interval, now + give_up, now)
         self._outbox.append(frame)
 
     @property
@@ -165,9 +176,7 @@ class HostMachine:
             pause = now - self._pinged
             self.counters.longest_pause = max(self.counters.longest_pause, pause)
         self._pinged = now
-        self._seq = (self._seq + 1) & 0xFFFF
-        payload = messages.pack_ping(round(now * 1e9))
-        self._outbox.append(codec.encode(Type.PING, self.session, self._seq, payload))
+        self._send(Type.PING, messages.pack_ping(round(now * 1e9)))
 
     # --- the run ------------------------------------------------------------------------------
 
@@ -179,8 +188,8 @@ class HostMachine:
         self.status = None
         self._expected = 0
         self._ring = np.zeros((2 * self.welcome.queue, len(CHANNELS)), messages.COMMAND_DTYPE)
-        self._asked = self._sent = self._taken = 0
-        self._credit = 0  # until the device has answered
+        # No credit until the device has answered.
+        self._commanded = self._sent = self._taken = self._credit = 0
         self._progress = now
         self.ask(Type.START, start.pack(), now)
 
@@ -201,29 +210,28 @@ class HostMachine:
         end = tick + len(codes)
         if end - min(self._taken, tick) > len(self._ring):
             raise DeviceError(
-                f"{end - self._asked} more commands than the device takes now; "
+                f"{end - self._commanded} more commands than the device takes now; "
                 "send no more than room() says"
             )
         self._ring[np.arange(tick, end) % len(self._ring)] = codes
-        if self._sent == self._asked:
+        if self._sent == self._commanded:
             self._sent = max(self._sent, tick)
             self._progress = now
-        self._asked = max(self._asked, end)
+        self._commanded = max(self._commanded, end)
         self._pump(now)
 
     @property
     def room(self) -> int:
         """Commands that may still be sent."""
-        return max(0, self._credit - self._asked)
+        return max(0, self._credit - self._commanded)
 
     @property
     def preloaded(self) -> bool:
         """Whether the device has all that fits it of what was sent."""
-        return self._taken >= min(self._asked, self._credit)
+        return self._taken >= min(self._commanded, self._credit)
 
     def describe(self) -> dict[str, Any]:
         """The line's record: counts of what was noticed, and the clocks' relation."""
-        relation = self.clock.relation()
         status = self.status
         return {
             "line": {
@@ -234,92 +242,77 @@ class HostMachine:
                 "device_overflow_samples": status.overflow if status else 0,
                 "device_late_commands": status.late if status else 0,
             },
-            "clock": relation.describe() if relation else None,
+            "clock": self.clock.describe(),
         }
 
     # --- what comes in ------------------------------------------------------------------------
 
     def _take(self, frame: Frame, now: float) -> None:
         self._frame_at, self._rejected = now, self.decoder.rejected
-        if frame.type == Type.SAMPLES:
-            understood = self._samples(frame, now)
-        elif frame.type == Type.PONG:
-            understood = self._pong(frame, now)
-        elif frame.type == Type.STATUS:
-            self._count(frame.seq)
-            status = messages.unpack_status(frame.payload)
-            understood = status is not None
-            if status is not None:
-                self._asked_again(status, now)
-                self._learn(status, now)
-        elif frame.type == Type.REPLY:
-            understood = self._replied(frame, now)
+        receiver = self._receivers.get(frame.type)
+        if receiver is None:
+            self.counters.malformed += 1
+            return
+        unpack, receive = receiver
+        try:
+            message = unpack(frame.payload)
+        except messages.MALFORMED:
+            self.counters.malformed += 1
         else:
-            understood = frame.type == Type.WELCOME and self._welcomed(frame)
-        self.counters.malformed += not understood
+            receive(message, frame.seq, now)
 
-    def _samples(self, frame: Frame, now: float) -> bool:
-        block = messages.unpack_samples(frame.payload)
-        if block is None:
-            return False
+    def _add_samples(self, block: Block, seq: int, now: float) -> None:
         if block.status.run != self._run or self._start is None:
-            return True  # of a run that was stopped
+            return  # of a run that was stopped
         if block.first < self._expected:
             self.counters.duplicate_blocks += 1
-            return True
-        self._count(frame.seq)
+            return
+        self._count(seq)
         self.counters.lost_samples += block.first - self._expected
         self._expected = block.first + len(block.records)
         self.blocks.append(block)
         self._sample_at = now
         self._learn(block.status, now)
-        return True
 
-    def _pong(self, frame: Frame, now: float) -> bool:
-        unpacked = messages.unpack_pong(frame.payload)
-        if unpacked is None or self.welcome is None:
-            return False
-        pong, status = unpacked
+    def _add_round_trip(self, message: tuple[Pong, Status], seq: int, now: float) -> None:
+        pong, status = message
+        if self.welcome is None:
+            return  # of a ping that nobody has sent
         middle = 0.5 * (pong.received + pong.answered) / self.welcome.clock
         self.clock.add(pong.stamp * 1e-9, middle, now)
         self._learn(status, now)
-        return True
 
-    def _replied(self, frame: Frame, now: float) -> bool:
-        unpacked = messages.unpack_reply(frame.payload)
-        if unpacked is None:
-            return False
-        reply, status = unpacked
+    def _update(self, status: Status, seq: int, now: float) -> None:
+        """Take in a STATUS; without progress it says that commands before the last are missing."""
+        self._count(seq)
+        stands = status.queued_until == self._taken < self._sent
+        if stands and status.run == self._run and now - self._rewound > _REWIND:
+            self._rewind(now)
+        self._learn(status, now)
+
+    def _answer(self, message: tuple[Reply, Status], seq: int, now: float) -> None:
+        reply, status = message
         if reply.result is Result.NO_SESSION:
             if self.welcome is not None:
                 self._fail(
                     "the device has restarted and forgotten the run; its outputs are zero. Look "
                     "for a supply that breaks down, a reset by the port, or firmware that crashed"
                 )
-            return True
+            return
         self._learn(status, now)
-        if self._request is not None and frame.seq == self._request.seq:
+        if self._request is not None and seq == self._request.seq:
             self.reply, self._request = reply, None
-        return True
 
-    def _welcomed(self, frame: Frame) -> bool:
-        version = messages.version_of(frame.payload)
-        if version is None:
-            return False
-        asked = self._request is not None and self._request.type is Type.HELLO
-        if version != messages.VERSION:
-            self.other_version = version
+    def _greet(self, welcome: Welcome | int, seq: int, now: float) -> None:
+        if isinstance(welcome, int):
+            self.other_version = welcome
         else:
-            welcome = Welcome.unpack(frame.payload)
-            if welcome is None:
-                return False
             self.welcome = welcome
-        if asked:
+        if self._request is not None and self._request.type is Type.HELLO:
             self._request = None
-        return True
 
     def _learn(self, status: Status, now: float) -> None:
-        """Take in the device's word about its queue and state, unless it is an old one."""
+        """Take in the state of the device's queue and outputs, unless it is an old one."""
         old = self.status is not None and status.tick < self.status.tick
         if status.run != self._run or self._start is None or old:
             return
@@ -327,7 +320,7 @@ class HostMachine:
         if status.queued_until > self._taken:
             self._taken = status.queued_until
             self._progress = now
-        self._sent = max(self._sent, min(self._taken, self._asked))
+        self._sent = max(self._sent, min(self._taken, self._commanded))
         self._credit = max(self._credit, status.credit_until)
         self._pump(now)
         if self._going and status.latch is Latch.WATCHDOG:
@@ -335,16 +328,16 @@ class HostMachine:
         elif self._going and status.state is State.IDLE and self._request is None:
             self._fail("the device has ended the run by itself; its outputs are zero")
 
-    def _asked_again(self, status: Status, now: float) -> None:
-        """Without progress a STATUS says that commands before those that came are missing."""
-        if self._start is None or status.run != self._run:
-            return
-        stands = status.queued_until == self._taken and self._taken < self._sent
-        opened = self._start.mode is messages.LoopMode.OPEN
-        if stands and opened and now - self._rewound > _REWIND:
-            self._rewind(now)
+    # --- what goes out ------------------------------------------------------------------------
+
+    def _send(self, type_: Type, payload: bytes) -> None:
+        self._seq = (self._seq + 1) & 0xFFFF
+        self._outbox.append(codec.encode(type_, self.session, self._seq, payload))
 
     def _rewind(self, now: float) -> None:
+        """Send again the commands that an open loop's device lacks; a closed loop holds on."""
+        if self._start is None or self._start.mode is not LoopMode.OPEN:
+            return
         self.counters.resent_commands += self._sent - self._taken
         self._sent = self._taken
         self._rewound = self._progress = now
@@ -354,16 +347,13 @@ class HostMachine:
         """Send commands as far as there is credit."""
         if self._start is None or self.welcome is None:
             return
-        fit = (self.welcome.max_payload - messages.COMMANDS_OVERHEAD) // (
-            len(CHANNELS) * messages.COMMAND_DTYPE.itemsize
-        )
-        end = min(self._asked, self._credit)
+        size = len(CHANNELS) * messages.COMMAND_DTYPE.itemsize
+        chunk = min(_CHUNK, (self.welcome.max_payload - messages.COMMANDS_OVERHEAD) // size)
+        end = min(self._commanded, self._credit)
         while self._sent < end:
-            until = min(self._sent + min(_CHUNK, fit), end)
+            until = min(self._sent + chunk, end)
             codes = self._ring[np.arange(self._sent, until) % len(self._ring)]
-            self._seq = (self._seq + 1) & 0xFFFF
-            payload = messages.pack_commands(self._run, self._sent, codes)
-            self._outbox.append(codec.encode(Type.COMMANDS, self.session, self._seq, payload))
+            self._send(Type.COMMANDS, messages.pack_commands(self._run, self._sent, codes))
             self._sent = until
             self._progress = now
 
@@ -384,13 +374,15 @@ class HostMachine:
         if now >= request.give_up:
             self._request = None
             if request.type is not Type.HELLO:
-                self._fail(self._unanswered(request.type.name, now))
+                self._fail(self._why_unanswered(request.type.name, now))
         elif now - request.sent >= request.interval:
             request.sent = now
             self.counters.retries += 1
             self._outbox.append(request.frame)
 
-    def _unanswered(self, name: str, now: float) -> str:
+    # --- failures -----------------------------------------------------------------------------
+
+    def _why_unanswered(self, name: str, now: float) -> str:
         if now - self._frame_at < 0.5 * GIVE_UP:
             return (
                 f"the device goes on sending but does not answer {name}: what it sends waits for a "
@@ -419,7 +411,7 @@ class HostMachine:
             "says what keeps it from doing so; options.watchdog in the rig file allows more"
         )
 
-    def _silence(self, now: float) -> str:
+    def _why_silent(self, now: float) -> str:
         damaged = self.decoder.rejected - self._rejected
         if damaged > 1:
             return (
@@ -440,6 +432,12 @@ class HostMachine:
     def _fail(self, reason: str) -> None:
         if self.failure is None:
             self.failure = DeviceError(reason)
+
+
+def _unpack_welcome(payload: bytes) -> Welcome | int:
+    """Who answers, or the version of the protocol that it speaks where that is another."""
+    version = messages.version_of(payload)
+    return Welcome.unpack(payload) if version == messages.VERSION else version
 
 
 def refusal(reply: Reply) -> str:

@@ -12,43 +12,18 @@ import select
 import socket
 import sys
 from pathlib import Path
-from typing import Protocol
 
 from daq.errors import DeviceError
 
-PATIENCE = 0.01
-"""Longest time that ``read`` waits [s]."""
-
+_PATIENCE = 0.01  # s that a read waits at most
 _WRITE_PATIENCE = 0.5  # s that a port may take to accept a frame
 _SLOW_TIMER = 2  # ms; an adapter's latency timer above it delays every sample
 
 
-class Link(Protocol):
-    """An open connection. Methods raise DeviceError when it is gone."""
-
-    warnings: list[str]
-
-    def read(self) -> bytes:
-        """What has come, or nothing after ``PATIENCE``."""
-
-    def write(self, data: bytes) -> None:
-        """Send all of it."""
-
-    def close(self) -> None:
-        """Disconnect; never raises."""
-
-
-def open_link(port: str, baud: int) -> Link:
-    """Open a port by name or URL, for this program alone. DeviceError names the cure."""
-    if port.startswith("socket://"):
-        return SocketLink(port)
-    return SerialLink(port, baud)
-
-
 def _gone(port: str, error: Exception | None = None) -> DeviceError:
-    said = "" if error is None else f" ({error})"
+    reason = "" if error is None else f" ({error})"
     return DeviceError(
-        f"{port}: the port has gone{said}; check the cable and the device's supply. The device "
+        f"{port}: the port has gone{reason}; check the cable and the device's supply. The device "
         "makes itself safe when it hears nothing"
     )
 
@@ -65,7 +40,7 @@ class SerialLink:
             self._serial = serial.serial_for_url(
                 port,
                 baudrate=baud,
-                timeout=PATIENCE,
+                timeout=_PATIENCE,
                 write_timeout=_WRITE_PATIENCE,
                 exclusive=True if os.name == "posix" else None,
             )
@@ -80,13 +55,13 @@ class SerialLink:
         self._prepare()
 
     def read(self) -> bytes:
-        """What has come, or nothing after ``PATIENCE``."""
+        """What has come, or nothing after 10 ms."""
         try:
             if self._descriptor is None:
                 first: bytes = self._serial.read(1)
                 waiting = self._serial.in_waiting if first else 0
                 return first + self._serial.read(waiting) if waiting else first
-            if not select.select([self._descriptor], [], [], PATIENCE)[0]:
+            if not select.select([self._descriptor], [], [], _PATIENCE)[0]:
                 return b""
             data = os.read(self._descriptor, 65_536)
         except BlockingIOError:
@@ -170,9 +145,9 @@ class SocketLink:
         self._socket.settimeout(_WRITE_PATIENCE)
 
     def read(self) -> bytes:
-        """What has come, or nothing after ``PATIENCE``."""
+        """What has come, or nothing after 10 ms."""
         try:
-            if not select.select([self._socket], [], [], PATIENCE)[0]:
+            if not select.select([self._socket], [], [], _PATIENCE)[0]:
                 return b""
             data = self._socket.recv(65_536)
         except ConnectionError:
@@ -201,6 +176,17 @@ class SocketLink:
             f"{self._port}: the other side has closed the connection. It serves one program "
             "at a time: another may have it, or the emulator or device server has ended"
         )
+
+
+Link = SerialLink | SocketLink
+"""An open connection. Its methods raise DeviceError when it is gone, but for ``close``."""
+
+
+def open_link(port: str, baud: int) -> Link:
+    """Open a port by name or URL, for this program alone. DeviceError names the cure."""
+    if port.startswith("socket://"):
+        return SocketLink(port)
+    return SerialLink(port, baud)
 
 
 def latency_timer(port: str) -> tuple[Path, int] | None:

@@ -1,8 +1,8 @@
 """What the frames say: message types, their layouts, and their numbers.
 
 All layouts are fixed, little-endian and without gaps that are not named; docs/serial-protocol.md
-has them as byte tables. ``unpack`` returns None for a payload of the wrong length, which the
-receiver counts like a frame with a wrong CRC.
+has them as byte tables. Unpacking raises one of ``MALFORMED`` for a payload of the wrong length or
+with a number that means nothing; a receiver counts it like a frame with a wrong CRC.
 """
 
 from __future__ import annotations
@@ -17,6 +17,9 @@ import numpy as np
 import numpy.typing as npt
 
 from daq.hal import ANALOG_INPUTS, CHANNELS
+
+MALFORMED = (struct.error, ValueError, IndexError)
+"""What unpacking raises for a payload that is not of its type."""
 
 VERSION = 1
 MAGIC = b"HRIG"
@@ -116,12 +119,12 @@ COMMANDS_OVERHEAD = _COMMANDS.size
 SAMPLES_OVERHEAD = _SAMPLES_HEAD.size
 
 
-def version_of(payload: bytes) -> int | None:
-    """Protocol version that a HELLO or WELCOME of any version names; None when it is neither."""
-    if len(payload) < _VERSIONED.size:
-        return None
+def version_of(payload: bytes) -> int:
+    """Protocol version that a HELLO or WELCOME of any version names."""
     magic, version = _VERSIONED.unpack_from(payload)
-    return int(version) if magic == MAGIC else None
+    if magic != MAGIC:
+        raise ValueError("neither HELLO nor WELCOME")
+    return int(version)
 
 
 def _text(field: bytes) -> str:
@@ -130,14 +133,13 @@ def _text(field: bytes) -> str:
 
 @dataclass(frozen=True)
 class Hello:
-    """A host opens a session. ``host`` says who it is, for a device's own log."""
+    """A host opens a session. host: who it is, for a device's own log."""
 
     host: str
-    version: int = VERSION
 
     def pack(self) -> bytes:
         """Payload of the frame."""
-        return _HELLO.pack(MAGIC, self.version, 0, self.host.encode()[:31])
+        return _HELLO.pack(MAGIC, VERSION, 0, self.host.encode()[:31])
 
 
 @dataclass(frozen=True)
@@ -156,16 +158,8 @@ class Channel:
 
     def pack(self) -> bytes:
         """The row's 56 bytes."""
-        return _CHANNEL.pack(
-            self.name.encode()[:15], self.unit.encode()[:7],
-            self.scale, self.offset, self.low, self.high,
-        )  # fmt: skip
-
-    @classmethod
-    def unpack(cls, row: bytes) -> Self:
-        """The row of 56 bytes."""
-        name, unit, *numbers = _CHANNEL.unpack(row)
-        return cls(_text(name), _text(unit), *numbers)
+        name, unit = self.name.encode()[:15], self.unit.encode()[:7]
+        return _CHANNEL.pack(name, unit, self.scale, self.offset, self.low, self.high)
 
 
 @dataclass(frozen=True)
@@ -192,34 +186,27 @@ class Welcome:
 
     def pack(self) -> bytes:
         """Payload of the frame."""
-        head = _WELCOME.pack(
-            MAGIC, self.version, len(self.channels), self.latch, self.clock, self.max_rate,
-            self.queue, self.max_payload, self.watchdog_default, self.watchdog_longest, 0,
-            self.device.encode()[:31], self.firmware.encode()[:31], self.serial.encode()[:31],
-        )  # fmt: skip
-        return head + b"".join(channel.pack() for channel in self.channels)
+        head = (MAGIC, self.version, len(self.channels), self.latch, self.clock, self.max_rate)
+        limits = (self.queue, self.max_payload, self.watchdog_default, self.watchdog_longest, 0)
+        names = (name.encode()[:31] for name in (self.device, self.firmware, self.serial))
+        rows = b"".join(channel.pack() for channel in self.channels)
+        return _WELCOME.pack(*head, *limits, *names) + rows
 
     @classmethod
-    def unpack(cls, payload: bytes) -> Self | None:
-        """The message, or None when it is none of this version."""
-        if version_of(payload) != VERSION or len(payload) < _WELCOME.size:
-            return None
-        (
-            _, version, n, latch, clock, max_rate, queue, max_payload, default, longest, _,
-            device, firmware, serial,
-        ) = _WELCOME.unpack_from(payload)  # fmt: skip
-        if len(payload) != _WELCOME.size + n * _CHANNEL.size or latch not in list(Latch):
-            return None
-        rows = range(_WELCOME.size, len(payload), _CHANNEL.size)
-        channels = tuple(Channel.unpack(payload[at : at + _CHANNEL.size]) for at in rows)
-        return cls(
-            _text(device), _text(firmware), _text(serial), clock, max_rate, queue, max_payload,
-            default, longest, channels, Latch(latch), version,
-        )  # fmt: skip
+    def unpack(cls, payload: bytes) -> Self:
+        """The message of this version."""
+        fields = _WELCOME.unpack_from(payload)
+        _, version, n, latch = fields[:4]
+        facts: tuple[int, float, int, int, int, int] = fields[4:10]
+        device, firmware, serial = map(_text, fields[11:])
+        rows = list(_CHANNEL.iter_unpack(payload[_WELCOME.size :]))
+        if version_of(payload) != VERSION or len(rows) != n:
+            raise ValueError("a WELCOME of another version, or with another number of channels")
+        channels = tuple(Channel(_text(name), _text(unit), *row) for name, unit, *row in rows)
+        return cls(device, firmware, serial, *facts, channels, Latch(latch), version)
 
 
-@dataclass(frozen=True)
-class Reply:
+class Reply(NamedTuple):
     """A device's answer to a request, which carries the request's seq in its header."""
 
     request: int
@@ -227,11 +214,11 @@ class Reply:
 
     def pack(self) -> bytes:
         """Payload, without the status that follows it."""
-        return _REPLY.pack(self.request, self.result, 0)
+        return _REPLY.pack(*self, 0)
 
 
 class Status(NamedTuple):
-    """What a device says of itself in every REPLY, SAMPLES, PONG and STATUS.
+    """State of a device, in each REPLY, SAMPLES, PONG and STATUS.
 
     tick: the next to be latched. queued_until: tick after the last command received in order.
     credit_until: first tick for which there is no room yet. late: commands that came after
@@ -249,54 +236,30 @@ class Status(NamedTuple):
 
     def pack(self) -> bytes:
         """The 24 bytes."""
-        return _STATUS.pack(
-            self.run, self.state, self.latch, self.tick, self.queued_until, self.credit_until,
-            self.late, self.overflow,
-        )  # fmt: skip
+        return _STATUS.pack(*self)
 
 
 _STATES, _LATCHES = tuple(State), tuple(Latch)  # by their numbers, quicker than the enums
 
 
-def _status(payload: bytes, at: int = 0) -> Status | None:
-    return _known(*_STATUS.unpack_from(payload, at))
+def _status(run: int, state: int, latch: int, *counts: int) -> Status:
+    return Status(run, _STATES[state], _LATCHES[latch], *counts)
 
 
-def _known(run: int, state: int, latch: int, *numbers: int) -> Status | None:
-    """A status whose state and latch there are."""
-    if state >= len(_STATES) or latch >= len(_LATCHES):
-        return None
-    return Status(run, _STATES[state], _LATCHES[latch], *numbers)
-
-
-def unpack_status(payload: bytes) -> Status | None:
+def unpack_status(payload: bytes) -> Status:
     """A STATUS payload."""
-    return _status(payload) if len(payload) == _STATUS.size else None
+    return _status(*_STATUS.unpack(payload))
 
 
-def unpack_reply(payload: bytes) -> tuple[Reply, Status] | None:
+def unpack_reply(payload: bytes) -> tuple[Reply, Status]:
     """A REPLY payload."""
-    if len(payload) != _REPLY.size + _STATUS.size:
-        return None
     request, result, _ = _REPLY.unpack_from(payload)
-    status = _status(payload, _REPLY.size)
-    if status is None or result not in list(Result):
-        return None
-    return Reply(request, Result(result)), status
+    return Reply(request, Result(result)), unpack_status(payload[_REPLY.size :])
 
 
-@dataclass(frozen=True)
-class Start:
-    """Arm a run. period: clock ticks per sample. watchdog [ms].
+class CodedGuard(NamedTuple):
+    """A ``daq.hal.Guard`` in converter codes and counts; a range's ends: not watched."""
 
-    Clamps and guard as ``daq.hal.Guard``, in converter codes and counts; a device narrows the
-    clamps to its own limits. The ends of a number's range stand for what is not watched.
-    """
-
-    run: int
-    mode: LoopMode
-    period: int
-    watchdog: int
     command_low: tuple[int, ...]
     command_high: tuple[int, ...]
     analog_low: tuple[int, ...]
@@ -306,27 +269,32 @@ class Start:
     count_rate: float
     count_step: int
 
+
+class Start(NamedTuple):
+    """Arm a run. period: clock ticks per sample. watchdog [ms].
+
+    A device narrows the guard's clamps to its own limits.
+    """
+
+    run: int
+    mode: LoopMode
+    period: int
+    watchdog: int
+    guard: CodedGuard
+
     def pack(self) -> bytes:
         """Payload of the frame."""
-        return _START.pack(
-            self.run, self.mode, 0, self.period, self.watchdog, 0,
-            *self.command_low, *self.command_high, *self.analog_low, *self.analog_high,
-            self.counts_low, self.counts_high, self.count_rate, self.count_step,
-        )  # fmt: skip
+        command_low, command_high, analog_low, analog_high, *counts = self.guard
+        codes = (*command_low, *command_high, *analog_low, *analog_high)
+        return _START.pack(self.run, self.mode, 0, self.period, self.watchdog, 0, *codes, *counts)
 
     @classmethod
-    def unpack(cls, payload: bytes) -> Self | None:
-        """The message, or None."""
-        if len(payload) != _START.size:
-            return None
-        run, mode, _, period, watchdog, _, *codes, fewest, most, rate, step = _START.unpack(payload)
-        if mode not in list(LoopMode):
-            return None
-        low, high, under, over = codes[0:2], codes[2:4], codes[4:7], codes[7:10]
-        return cls(
-            run, LoopMode(mode), period, watchdog,
-            tuple(low), tuple(high), tuple(under), tuple(over), fewest, most, rate, step,
-        )  # fmt: skip
+    def unpack(cls, payload: bytes) -> Self:
+        """The message."""
+        run, mode, _, period, watchdog, _, *codes = _START.unpack(payload)
+        low, high, under, over = (codes[a:b] for a, b in ((0, 2), (2, 4), (4, 7), (7, 10)))
+        guard = CodedGuard(tuple(low), tuple(high), tuple(under), tuple(over), *codes[10:])
+        return cls(run, LoopMode(mode), period, watchdog, guard)
 
 
 def pack_run(run: int) -> bytes:
@@ -334,9 +302,9 @@ def pack_run(run: int) -> bytes:
     return _RUN.pack(run)
 
 
-def unpack_run(payload: bytes) -> int | None:
+def unpack_run(payload: bytes) -> int:
     """The run that a GO or STOP names."""
-    return int(_RUN.unpack(payload)[0]) if len(payload) == _RUN.size else None
+    return int(_RUN.unpack(payload)[0])
 
 
 def pack_announce(phase: int, turns: float) -> bytes:
@@ -344,10 +312,8 @@ def pack_announce(phase: int, turns: float) -> bytes:
     return _ANNOUNCE.pack(phase, turns)
 
 
-def unpack_announce(payload: bytes) -> tuple[int, float] | None:
+def unpack_announce(payload: bytes) -> tuple[int, float]:
     """Phase and turns."""
-    if len(payload) != _ANNOUNCE.size:
-        return None
     phase, turns = _ANNOUNCE.unpack(payload)
     return phase, turns
 
@@ -357,13 +323,9 @@ def pack_commands(run: int, first: int, codes: Codes) -> bytes:
     return _COMMANDS.pack(run, len(codes), first) + codes.astype(COMMAND_DTYPE).tobytes()
 
 
-def unpack_commands(payload: bytes) -> tuple[int, int, Codes] | None:
+def unpack_commands(payload: bytes) -> tuple[int, int, Codes]:
     """Run, first tick and codes, (n, 2)."""
-    if len(payload) < _COMMANDS.size:
-        return None
     run, count, first = _COMMANDS.unpack_from(payload)
-    if len(payload) != _COMMANDS.size + count * len(CHANNELS) * COMMAND_DTYPE.itemsize:
-        return None
     codes = np.frombuffer(payload, COMMAND_DTYPE, offset=_COMMANDS.size)
     return run, first, codes.reshape(count, len(CHANNELS))
 
@@ -373,13 +335,12 @@ def pack_ping(stamp: int) -> bytes:
     return _PING.pack(stamp)
 
 
-def unpack_ping(payload: bytes) -> int | None:
+def unpack_ping(payload: bytes) -> int:
     """The host's stamp."""
-    return int(_PING.unpack(payload)[0]) if len(payload) == _PING.size else None
+    return int(_PING.unpack(payload)[0])
 
 
-@dataclass(frozen=True)
-class Pong:
+class Pong(NamedTuple):
     """Answer to PING: its stamp, and the device's clock at its arrival and at the answer."""
 
     stamp: int
@@ -388,15 +349,12 @@ class Pong:
 
     def pack(self, status: Status) -> bytes:
         """Payload of the frame."""
-        return _PONG.pack(self.stamp, self.received, self.answered) + status.pack()
+        return _PONG.pack(*self) + status.pack()
 
 
-def unpack_pong(payload: bytes) -> tuple[Pong, Status] | None:
+def unpack_pong(payload: bytes) -> tuple[Pong, Status]:
     """A PONG payload."""
-    if len(payload) != _PONG.size + _STATUS.size:
-        return None
-    status = _status(payload, _PONG.size)
-    return (Pong(*_PONG.unpack_from(payload)), status) if status is not None else None
+    return Pong(*_PONG.unpack_from(payload)), unpack_status(payload[_PONG.size :])
 
 
 class Block(NamedTuple):
@@ -416,21 +374,17 @@ class Block(NamedTuple):
         return self.status.pack() + head + self.records.tobytes()
 
 
-def unpack_samples(payload: bytes) -> Block | None:
+def unpack_samples(payload: bytes) -> Block:
     """A SAMPLES payload; the records are a view of it."""
-    if len(payload) < SAMPLES_OVERHEAD:
-        return None
-    *numbers, first, count, _, time = _SAMPLES_HEAD.unpack_from(payload)
-    status = _known(*numbers)
-    right = len(payload) == SAMPLES_OVERHEAD + count * SAMPLE_DTYPE.itemsize and count > 0
-    if status is None or not right:
-        return None
+    *status, first, count, _, time = _SAMPLES_HEAD.unpack_from(payload)
     records = np.frombuffer(payload, SAMPLE_DTYPE, offset=SAMPLES_OVERHEAD)
-    return Block(status, first, time, records)
+    if not 0 < len(records) == count:
+        raise ValueError("another number of samples")
+    return Block(_status(*status), first, time, records)
 
 
 def joined(blocks: Sequence[Block]) -> Records:
-    """The records of some blocks, one after the other."""
+    """The records of consecutive blocks, (n,)."""
     if len(blocks) == 1:
         return blocks[0].records
     # numpy would compare the types of all their fields first, which takes longer than the rest.

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from daq.errors import DeviceError
-from daq.serial.backend import SerialDevice, SerialOptions
+from daq.serial.connection import Connection
 from daq.serial.link import latency_timer
 from daq.serial.messages import Welcome
 
@@ -32,57 +32,55 @@ class PortFacts:
 
 
 @dataclass(frozen=True)
-class Answer:
-    """Who answers on a port, or why nobody does."""
+class Inquiry:
+    """Who answers on a port, or why nobody does; neither where nobody was asked."""
 
     port: PortFacts
-    welcome: Welcome | None
-    problem: str | None
+    welcome: Welcome | None = None
+    problem: str | None = None
 
 
-def list_ports() -> list[PortFacts]:
-    """All ports with hardware behind them."""
-    from serial.tools import list_ports as system
-
-    lasting = _lasting_names()
-    found = []
-    for port in sorted(system.comports(), key=lambda item: item.device):
-        # The system names serial ports of mainboards that have none; those say nothing.
-        if port.hwid in {None, "n/a"}:
-            continue
-        usb = f"{port.vid:04x}:{port.pid:04x}" if port.vid is not None else None
-        timer = latency_timer(port.device)
-        found.append(
-            PortFacts(
-                port.device,
-                port.description or "",
-                lasting.get(os.path.realpath(port.device)),
-                usb,
-                timer[1] if timer else None,
-            )
-        )
-    return found
+def ports_of(names: Sequence[str]) -> list[PortFacts]:
+    """Ports of these device names or URLs; without any, all that have hardware behind them."""
+    ports = _system_ports()
+    if not names:
+        return ports
+    by_name = {port.name: port for port in ports}
+    return [by_name.get(name, PortFacts(name, "")) for name in names]
 
 
-def named(names: Sequence[str]) -> list[PortFacts]:
-    """Ports that a user names: device names or URLs."""
-    known = {port.name: port for port in list_ports()}
-    return [known.get(name, PortFacts(name, "")) for name in names]
-
-
-def ask(ports: Sequence[PortFacts], baud: int) -> list[Answer]:
+def inquire(ports: Sequence[PortFacts], baud: int) -> list[Inquiry]:
     """Ask all ports at once who is there; takes as long as the slowest answer."""
     if not ports:
         return []
     with ThreadPoolExecutor(len(ports)) as pool:
-        return list(pool.map(lambda port: _ask(port, baud), ports))
+        return list(pool.map(lambda port: _inquire(port, baud), ports))
 
 
-def _ask(port: PortFacts, baud: int) -> Answer:
+def _inquire(port: PortFacts, baud: int) -> Inquiry:
     try:
-        return Answer(port, SerialDevice(SerialOptions(port=port.name, baud=baud)).who(), None)
+        connection = Connection(port.name, baud)
     except DeviceError as error:
-        return Answer(port, None, str(error).removeprefix(f"{port.name}: "))
+        return Inquiry(port, problem=str(error).removeprefix(f"{port.name}: "))
+    connection.close()
+    return Inquiry(port, connection.welcome)
+
+
+def _system_ports() -> list[PortFacts]:
+    from serial.tools import list_ports
+
+    lasting_names = _lasting_names()
+    # The system names serial ports of mainboards that have none; those say nothing of hardware.
+    ports = [port for port in list_ports.comports() if port.hwid not in {None, "n/a"}]
+    facts = []
+    for port in sorted(ports, key=lambda port: port.device):
+        lasting_name = lasting_names.get(os.path.realpath(port.device))
+        usb = f"{port.vid:04x}:{port.pid:04x}" if port.vid is not None else None
+        timer = latency_timer(port.device)
+        milliseconds = timer[1] if timer else None
+        description = port.description or ""
+        facts.append(PortFacts(port.device, description, lasting_name, usb, milliseconds))
+    return facts
 
 
 def _lasting_names() -> dict[str, str]:

@@ -19,8 +19,8 @@ from daq.logs.columns import COLUMNS
 from daq.logs.recording import load
 from daq.logs.writer import LogWriter
 from daq.scope.history import History
-from daq.scope.recordings import Recording, Watch
 from daq.scope.tail import LogTail
+from daq.scope.watch import FollowedLog, Watch
 from tests.daq.support import environment, rig, start_rig, until
 
 RATE = 800.0
@@ -136,7 +136,7 @@ def test_what_is_broken_is_left_out_and_told(tmp_path, bulk):
 def test_a_file_that_is_no_log_says_so(tmp_path, data, fault):
     path = tmp_path / "log.csv"
     path.write_bytes(data)
-    recording = Recording(path)
+    recording = FollowedLog(path)
     recording.read()
     (told, *_) = recording.complaints()
     assert told.startswith(f"{path}: ") and fault in told
@@ -154,7 +154,7 @@ def test_a_line_without_end_does_not_stop_the_reading(tmp_path):
 
 def test_another_log_under_the_same_name_is_begun_anew(tmp_path):
     path = write_log(tmp_path, 100)
-    recording = Recording(path)
+    recording = FollowedLog(path)
     recording.read()
     path.unlink()
     write_log(tmp_path, 3)
@@ -259,15 +259,15 @@ def record(folder, started, status="completed", **more):
 def watch_until(watch, condition, what):
     def found():
         watch.poll()
-        return watch.recording is not None and condition(watch.recording)
+        return watch.followed is not None and condition(watch.followed)
 
     until(found, what, seconds=10)
-    return watch.recording
+    return watch.followed
 
 
 def test_the_newest_run_is_followed(tmp_path):
     watch = Watch(tmp_path / "runs", None)
-    assert watch.recording is None
+    assert watch.followed is None
     (tmp_path / "runs" / "notes").mkdir(parents=True)
     write_log(tmp_path / "runs" / "b", 10)
     record(tmp_path / "runs" / "b", 2)
@@ -287,7 +287,7 @@ def test_the_newest_run_is_followed(tmp_path):
 def test_a_malformed_record_hides_no_samples(tmp_path):
     path = write_log(tmp_path, 10)
     (tmp_path / "run.json").write_text("{")
-    recording = Recording(path)
+    recording = FollowedLog(path)
     recording.read()
     assert recording.history.n_rows == 10
     (told,) = recording.complaints()

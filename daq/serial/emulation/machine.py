@@ -7,17 +7,21 @@ A program around it feeds bytes as they come (``receive``), calls ``poll`` no la
 
 from __future__ import annotations
 
+import contextlib
 from collections import deque
-from dataclasses import dataclass
-from typing import Protocol
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, Protocol
 
 import numpy as np
 
 from daq.hal import ANALOG_INPUTS, CHANNELS, Flag
 from daq.serial import codec, messages
 from daq.serial.codec import Decoder, Frame
+from daq.serial.emulation.command_ring import CommandRing
 from daq.serial.messages import (
     Block,
+    CodedGuard,
     Codes,
     Latch,
     LoopMode,
@@ -54,7 +58,7 @@ class Board(Protocol):
     def announce(self, phase: int, turns: float) -> None:
         """Which phase of a run begins (order of ``daq.hal.Phase``); may light a lamp."""
 
-    def start(self, rate: float, limits: Start) -> None:
+    def start(self, rate: float, guard: CodedGuard) -> None:
         """Prepare the timer for ``rate`` [Hz], the clamps and the guard; outputs are zero."""
 
     def play(self, commands: Codes) -> Records:
@@ -67,81 +71,6 @@ class Board(Protocol):
 
     def zero(self) -> None:
         """Both outputs to zero now, until the next ``start``."""
-
-
-@dataclass
-class CommandRing:
-    """Commands by tick, in a ring as a microcontroller has it.
-
-    In open loop they arrive in order. In closed loop a tick whose frame was lost is a hole, in
-    which the command before is held. A slot belongs to tick t until t has been played.
-    """
-
-    size: int
-
-    def __post_init__(self) -> None:
-        self._codes = np.zeros((self.size, len(CHANNELS)), dtype=messages.COMMAND_DTYPE)
-        self._owner = np.full(self.size, -1, dtype=np.int64)
-        self.restart(LoopMode.CLOSED)
-
-    def restart(self, mode: LoopMode) -> None:
-        """Forget everything; the next tick is 0."""
-        self._mode = mode
-        self._owner[:] = -1
-        self._last = np.zeros(len(CHANNELS), dtype=messages.COMMAND_DTYPE)
-        self.tick = self.until = self.late = 0
-
-    def forget(self) -> None:
-        """Drop what is queued; what is held from now on is zero."""
-        self._owner[:] = -1
-        self._last[:] = 0
-
-    @property
-    def credit_until(self) -> int:
-        """First tick for which there is no slot yet."""
-        return self.tick + self.size
-
-    def put(self, first: int, codes: Codes) -> bool:
-        """Queue commands for ticks from ``first`` on; whether they followed without a hole.
-
-        Ticks already past are late: counted, and never applied to another tick. In open loop a
-        hole is refused, for the host to send again from ``until``.
-        """
-        if self._mode is LoopMode.OPEN and first > self.until:
-            return False
-        end = min(first + len(codes), self.credit_until)
-        begin = max(first, self.tick)
-        if self._mode is LoopMode.CLOSED:
-            self.late += min(max(self.tick - first, 0), len(codes))
-        if end > begin:
-            ticks = np.arange(begin, end)
-            self._codes[ticks % self.size] = codes[begin - first : end - first]
-            self._owner[ticks % self.size] = ticks
-        self.until = max(self.until, end)
-        return True
-
-    def take(self, n: int) -> tuple[Codes, int]:
-        """Commands (n, 2) of the next n ticks, and how many come before the first that is missing.
-
-        In open loop zero stands from there on; in closed loop the command before is held, and
-        ``held`` marks the rows.
-        """
-        ticks = np.arange(self.tick, self.tick + n)
-        slots = ticks % self.size
-        there = self._owner[slots] == ticks
-        codes = self._codes[slots]
-        self.held = ~there
-        found = n if there.all() else int(np.argmin(there))
-        if found < n and self._mode is LoopMode.OPEN:
-            codes[found:] = 0
-        elif found < n:
-            # Each hole takes the row of the last command before it, or what was held before.
-            rows = np.maximum.accumulate(np.where(there, np.arange(n), -1))
-            codes = np.where(rows[:, None] < 0, self._last, codes[np.maximum(rows, 0)])
-        self._last = codes[-1].copy()
-        self.tick += n
-        self.until = max(self.until, self.tick)
-        return codes, found
 
 
 class DeviceMachine:
@@ -170,6 +99,15 @@ class DeviceMachine:
         self._to_lose = 0
         self._outbox: deque[bytes] = deque()
         self._backlog = 0
+        # How a request's payload is unpacked, and what carries it out.
+        self._requests: dict[int, tuple[Callable[[bytes], Any], Callable[..., Result]]] = {
+            Type.START: (Start.unpack, self._arm),
+            Type.GO: (messages.unpack_run, self._go),
+            Type.STOP: (messages.unpack_run, self._stop),
+            Type.ANNOUNCE: (messages.unpack_announce, self._announce),
+            Type.SAFE: (bytes, self._safe),
+            Type.CLEAR: (bytes, self._clear),
+        }
 
     # --- the program around it ----------------------------------------------------------------
 
@@ -228,15 +166,18 @@ class DeviceMachine:
         if frame.type == Type.COMMANDS:
             self._commands(frame)
         elif frame.type == Type.PING:
-            stamp = messages.unpack_ping(frame.payload)
-            if stamp is not None:
-                self._send(Type.PONG, frame.seq, Pong(stamp, now, now).pack(self._status()))
+            with contextlib.suppress(*messages.MALFORMED):
+                pong = Pong(messages.unpack_ping(frame.payload), now, now)
+                self._send(Type.PONG, frame.seq, pong.pack(self._status()))
         else:
             self._request(frame, now)
 
     def _hello(self, frame: Frame, now: int) -> None:
-        version = messages.version_of(frame.payload)
-        if version is None or frame.session == 0:
+        try:
+            version = messages.version_of(frame.payload)
+        except messages.MALFORMED:
+            return
+        if frame.session == 0:
             return
         # A repeated HELLO of the session that is open changes nothing.
         if version == self.identity.version and frame.session != self._session:
@@ -247,7 +188,7 @@ class DeviceMachine:
             if self.latch is not Latch.WATCHDOG:
                 self.latch = Latch.NONE
             self._board.connect()
-        welcome = Welcome(**{**vars(self.identity), "latch": self.latch})
+        welcome = replace(self.identity, latch=self.latch)
         self._write(codec.encode(Type.WELCOME, frame.session, frame.seq, welcome.pack()))
 
     def _request(self, frame: Frame, now: int) -> None:
@@ -262,47 +203,38 @@ class DeviceMachine:
         self._answered = (frame.seq, self._reply(frame, result))
 
     def _carry_out(self, frame: Frame, now: int) -> Result:
-        if frame.type == Type.START:
-            return self._arm(Start.unpack(frame.payload))
-        if frame.type in (Type.GO, Type.STOP):
-            return self._go_or_stop(frame, now)
-        if frame.type == Type.ANNOUNCE:
-            return self._announce(messages.unpack_announce(frame.payload))
-        if frame.type == Type.SAFE:
-            self._hold_at_zero(Latch.SAFE if self.latch is Latch.NONE else self.latch)
-        elif frame.type == Type.CLEAR:
-            # What clears a latch ends the run as well: nothing plays on from where it stood.
-            self._end()
-            self.latch = Latch.NONE
-        else:
+        if frame.type not in self._requests:
             return Result.UNKNOWN
-        return Result.OK
-
-    def _go_or_stop(self, frame: Frame, now: int) -> Result:
-        run = messages.unpack_run(frame.payload)
-        if run is None:
+        unpack, carry_out = self._requests[frame.type]
+        try:
+            payload = unpack(frame.payload)
+        except messages.MALFORMED:
             return Result.BAD_VALUE
-        if frame.type == Type.GO:
-            return self._go(run, now)
-        if run == self._run:
-            self._end()
-        return Result.OK
+        return carry_out(payload, now)
 
-    def _announce(self, announced: tuple[int, float] | None) -> Result:
-        if announced is None:
-            return Result.BAD_VALUE
+    def _announce(self, announced: tuple[int, float], now: int) -> Result:
         self._board.announce(*announced)
+        return Result.OK
+
+    def _safe(self, payload: bytes, now: int) -> Result:
+        self._hold_at_zero(Latch.SAFE if self.latch is Latch.NONE else self.latch)
+        return Result.OK
+
+    def _clear(self, payload: bytes, now: int) -> Result:
+        # What clears a latch ends the run as well: nothing plays on from where it stood.
+        self._end()
+        self.latch = Latch.NONE
         return Result.OK
 
     # --- the run ------------------------------------------------------------------------------
 
-    def _arm(self, start: Start | None) -> Result:
-        if start is None or not self._possible(start):
+    def _arm(self, start: Start, now: int) -> Result:
+        if not self._possible(start):
             return Result.BAD_VALUE
         if self.latch is Latch.WATCHDOG:
             return Result.LATCHED
         self._end()
-        self._run, self._start = start.run, self._within_limits(start)
+        self._run, self._start = start.run, start._replace(guard=self._narrowed(start.guard))
         self._watchdog = round(
             (start.watchdog or self.identity.watchdog_default) * 1e-3 * self.identity.clock
         )
@@ -310,31 +242,28 @@ class DeviceMachine:
         self._overflow = self._first = self._to_lose = 0
         rate = self.identity.clock / start.period
         self._block = max(1, min(round(BLOCK_SECONDS * rate), _LARGEST_BLOCK))
-        self._board.start(rate, self._start)
+        self._board.start(rate, self._start.guard)
         self.latch = Latch.NONE
         self.state = State.ARMED
         return Result.OK
 
     def _possible(self, start: Start) -> bool:
-        zero_inside = all(
-            low <= 0 <= high
-            for low, high in zip(start.command_low, start.command_high, strict=True)
-        )
+        clamps = zip(start.guard.command_low, start.guard.command_high, strict=True)
         return (
             start.period > 0
             and self.identity.clock / start.period <= self.identity.max_rate
             and start.watchdog <= self.identity.watchdog_longest
-            and zero_inside
+            and all(low <= 0 <= high for low, high in clamps)
         )
 
-    def _within_limits(self, start: Start) -> Start:
-        """The host's clamps, narrowed to what this device ever gives."""
+    def _narrowed(self, guard: CodedGuard) -> CodedGuard:
+        """The host's guard, its clamps narrowed to what this device ever gives."""
         outputs = self.identity.channels[len(ANALOG_INPUTS) : len(ANALOG_INPUTS) + len(CHANNELS)]
-        own_low = [int(np.ceil((item.low - item.offset) / item.scale)) for item in outputs]
-        own_high = [int(np.floor((item.high - item.offset) / item.scale)) for item in outputs]
-        low = tuple(map(max, start.command_low, own_low))
-        high = tuple(map(min, start.command_high, own_high))
-        return Start(**{**vars(start), "command_low": low, "command_high": high})
+        lowest = [int(np.ceil((item.low - item.offset) / item.scale)) for item in outputs]
+        highest = [int(np.floor((item.high - item.offset) / item.scale)) for item in outputs]
+        low = tuple(map(max, guard.command_low, lowest))
+        high = tuple(map(min, guard.command_high, highest))
+        return guard._replace(command_low=low, command_high=high)
 
     def _go(self, run: int, now: int) -> Result:
         if run != self._run or self.state is State.IDLE:
@@ -344,11 +273,18 @@ class DeviceMachine:
             self.state = State.RUNNING
         return Result.OK
 
+    def _stop(self, run: int, now: int) -> Result:
+        if run == self._run:
+            self._end()
+        return Result.OK
+
     def _commands(self, frame: Frame) -> None:
-        unpacked = messages.unpack_commands(frame.payload)
-        if unpacked is None or unpacked[0] != self._run or self.state is State.IDLE:
+        try:
+            run, first, codes = messages.unpack_commands(frame.payload)
+        except messages.MALFORMED:
             return
-        _, first, codes = unpacked
+        if run != self._run or self.state is State.IDLE:
+            return
         in_order = self._ring.put(first, codes)
         if self.latch is not Latch.NONE:
             self._ring.forget()
@@ -369,7 +305,7 @@ class DeviceMachine:
     def _play(self, n: int) -> None:
         """n ticks: what to apply, what the board makes of it, and what follows from that."""
         assert self._start is not None
-        codes, found = self._ring.take(n)
+        codes, unbroken = self._ring.take(n)
         flags = np.zeros(n, dtype=np.uint32)
         if self.latch is not Latch.NONE:
             codes = np.zeros_like(codes)
@@ -377,9 +313,10 @@ class DeviceMachine:
         else:
             if self._start.mode is LoopMode.CLOSED:
                 flags[self._ring.held] = int(Flag.HELD)
-            elif found < n:
-                flags[found:] = int(Flag.UNDERFLOW)
-            clamped = np.clip(codes, self._start.command_low, self._start.command_high)
+            else:
+                flags[unbroken:] = int(Flag.UNDERFLOW)
+            guard = self._start.guard
+            clamped = np.clip(codes, guard.command_low, guard.command_high)
             flags[(clamped != codes).any(axis=1)] |= np.uint32(Flag.CLAMPED)
             codes = clamped.astype(messages.COMMAND_DTYPE)
         records = self._board.play(codes)
@@ -444,16 +381,9 @@ class DeviceMachine:
         self._first += samples
 
     def _status(self) -> Status:
-        return Status(
-            self._run,
-            self.state,
-            self.latch,
-            self._ring.tick,
-            self._ring.until,
-            self._ring.credit_until,
-            self._ring.late,
-            self._overflow,
-        )
+        ring = self._ring
+        queue = ring.tick, ring.until, ring.credit_until, ring.late
+        return Status(self._run, self.state, self.latch, *queue, self._overflow)
 
     def _reply(self, frame: Frame, result: Result) -> bytes:
         payload = Reply(frame.type, result).pack() + self._status().pack()

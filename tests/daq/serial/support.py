@@ -61,10 +61,11 @@ def emulator(folder, *arguments, plant=None):
 # Imports and compiles what an emulator needs, then becomes one per line of standard input.
 _FORKING = """
 import json, os, signal, sys, traceback
-import daq.cli, daq.cli.app, daq.cli.emulate
+import daq.cli, daq.cli.app, daq.serial.emulation.emulator
+from daq.serial.emulation.board import warm_up
 from sim_rig.backend import SimulatedDevice, Simulation
 
-daq.cli.emulate._warm_up(SimulatedDevice(Simulation()))
+warm_up(SimulatedDevice(Simulation()))
 signal.signal(signal.SIGCHLD, signal.SIG_IGN)
 for line in sys.stdin:
     job = json.loads(line)

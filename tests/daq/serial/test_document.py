@@ -13,6 +13,7 @@ from daq.serial.emulation import machine as device
 from daq.serial.messages import (
     Block,
     Channel,
+    CodedGuard,
     Latch,
     LoopMode,
     Pong,
@@ -31,8 +32,10 @@ ARMED = Status(1, State.ARMED, Latch.NONE, 0, 0, 512, 0, 0)
 PRELOADED = Status(1, State.ARMED, Latch.NONE, 0, 3, 512, 0, 0)
 RUNNING = Status(1, State.RUNNING, Latch.NONE, 1, 3, 513, 0, 0)
 START = Start(
-    1, LoopMode.OPEN, 60_000, 100, (-16384, 0), (16384, 1245),
-    (-15729, -1245, -(2**31)), (15729, 1245, 2**31 - 1), -(2**31), 40_960, 260_760.0, 1629,
+    1, LoopMode.OPEN, 60_000, 100, CodedGuard(
+        (-16384, 0), (16384, 1245), (-15729, -1245, -(2**31)), (15729, 1245, 2**31 - 1),
+        -(2**31), 40_960, 260_760.0, 1629,
+    ),
 )  # fmt: skip
 COMMANDS = np.array([[1638, 229], [1638, 229], [-1638, 0]], dtype="<i2")
 

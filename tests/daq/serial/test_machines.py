@@ -8,7 +8,17 @@ from daq.serial import codec, messages
 from daq.serial.emulation.faults import Line
 from daq.serial.emulation.machine import DeviceMachine
 from daq.serial.host import HostMachine
-from daq.serial.messages import Channel, Latch, LoopMode, Result, Start, State, Type, Welcome
+from daq.serial.messages import (
+    Channel,
+    CodedGuard,
+    Latch,
+    LoopMode,
+    Result,
+    Start,
+    State,
+    Type,
+    Welcome,
+)
 
 CLOCK = 1_000_000
 RATE = 1000
@@ -32,7 +42,7 @@ class CountingBoard:
     def announce(self, phase, turns):
         self.announced = (phase, turns)
 
-    def start(self, rate, limits):
+    def start(self, rate, guard):
         self.tick, self.guarded = 0, False
         self.zero()
 
@@ -65,14 +75,14 @@ def identity(**changes):
     return Welcome(**{**facts, **changes})
 
 
-def start_message(mode, run=1, **changes):
+def start_message(mode, run=1, period=PERIOD, watchdog=100, **changes):
     wide = 2**31 - 1
     facts = {
-        "run": run, "mode": mode, "period": PERIOD, "watchdog": 100, "command_low": (-5000, 0),
-        "command_high": (5000, 380), "analog_low": (-wide,) * 3, "analog_high": (wide,) * 3,
-        "counts_low": -wide, "counts_high": wide, "count_rate": np.inf, "count_step": 2 * wide,
+        "command_low": (-5000, 0), "command_high": (5000, 380), "analog_low": (-wide,) * 3,
+        "analog_high": (wide,) * 3, "counts_low": -wide, "counts_high": wide,
+        "count_rate": np.inf, "count_step": 2 * wide,
     }  # fmt: skip
-    return Start(**{**facts, **changes})
+    return Start(run, mode, period, watchdog, CodedGuard(**{**facts, **changes}))
 
 
 class Bench:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from daq.errors import ConfigError
 from daq.logs.capture import LOG_NAME, RUN_NAME, RUNNING
@@ -15,39 +15,68 @@ from daq.scope.tail import LogTail
 
 _LOOK = 0.2  # s between looks for a new run and for changes of run.json
 _QUIET = 3.0  # s without a sample after which a run may have been killed
-_POLL = 0.01  # s in which several pages share what one of them has read
+_POLL = 0.01  # s in which several pages share what the first of them has read
+_MUCH = 1_000_000  # bytes to read that take a while
 
 
 @dataclass(frozen=True)
-class State:
-    """What run.json says of a run.
+class RunState:
+    """State of a run by its run.json.
 
     status: as in the record; "log" for a lone CSV. details: what to show beside it, by name.
+    problem: what is wrong with the record.
     """
 
-    status: str
-    reason: str | None
-    details: dict[str, str]
-    expected_rows: int | None
-    problem: str | None
+    status: str = "log"
+    reason: str | None = None
+    details: dict[str, str] = field(default_factory=dict)
+    expected_rows: int | None = None
+    problem: str | None = None
 
     @property
     def running(self) -> bool:
         """Whether more samples may come."""
         return self.status == RUNNING
 
+    @classmethod
+    def of(cls, log: Path) -> Self:
+        """The state of the run that a log is of."""
+        try:
+            record = read_record(log)
+        except ConfigError as error:
+            return cls(problem=str(error))
+        if record is None:
+            return cls()
+        experiment, rig = _section(record, "experiment"), _section(record, "rig")
+        rate, duration = experiment.get("sample_rate"), experiment.get("duration")
+        details = {
+            "rig": rig.get("name"),
+            "protocol": experiment.get("protocol"),
+            "started": str(record.get("started", ""))[:19].replace("T", " ") + " UTC",
+            "sample rate": f"{rate:g} Hz" if isinstance(rate, int | float) else None,
+        }
+        expected_rows = None
+        if isinstance(rate, int | float) and isinstance(duration, int | float):
+            expected_rows = round(rate * duration)
+        return cls(
+            status=str(record.get("status")),
+            reason=str(record["reason"]) if record.get("reason") else None,
+            details={name: str(value) for name, value in details.items() if value},
+            expected_rows=expected_rows,
+        )
 
-class Recording:
-    """One log as it grows, and what its run says of itself.
+
+class FollowedLog:
+    """A log as it grows, and the state of its run.
 
     Nothing in it raises for what the files hold: what is wrong is told in ``complaints``.
     """
 
-    def __init__(self, log: Path) -> None:
-        self.log = log
-        self.state = State("log", None, {}, None, None)
-        self._state_of: tuple[int, int] | None = None
-        self.tail = LogTail(log)
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.state = RunState()
+        self._record_version: tuple[int, int] | None = None
+        self.tail = LogTail(path)
         self.history: History | None = None
         self._grew = time.monotonic()
         self.look()
@@ -55,14 +84,18 @@ class Recording:
     @property
     def name(self) -> str:
         """Folder of a run, or file of a lone log."""
-        return self.log.resolve().parent.name if self.log.name == LOG_NAME else self.log.name
+        return self.path.resolve().parent.name if self.path.name == LOG_NAME else self.path.name
+
+    @property
+    def n_rows(self) -> int:
+        """Samples read so far."""
+        return self.history.n_rows if self.history else 0
 
     @property
     def loading(self) -> float | None:
         """Part of the file that has been read while there is much to read, else None."""
         size = self.tail.size()
-        behind = size - self.tail.offset
-        return self.tail.offset / size if behind > 1_000_000 else None
+        return self.tail.offset / size if size - self.tail.offset > _MUCH else None
 
     @property
     def quiet_for(self) -> float:
@@ -73,7 +106,7 @@ class Recording:
         """Take what has been written since the last time."""
         if self.tail.size() < self.tail.offset:
             # Another file under the same name.
-            self.tail, self.history = LogTail(self.log), None
+            self.tail, self.history = LogTail(self.path), None
         rows = self.tail.poll()
         if self.history is None and self.tail.columns:
             self.history = History(self.tail.columns, self.tail.read_between)
@@ -83,51 +116,45 @@ class Recording:
 
     def look(self) -> None:
         """Read run.json again where it has changed."""
-        path = self.log.parent / RUN_NAME
         try:
-            now = path.stat()
+            stat = (self.path.parent / RUN_NAME).stat()
         except OSError:
             return
-        changed = (now.st_mtime_ns, now.st_ino)
-        if changed != self._state_of:
-            self._state_of = changed
-            self.state = _read_state(self.log)
+        version = stat.st_mtime_ns, stat.st_ino
+        if version != self._record_version:
+            self._record_version = version
+            self.state = RunState.of(self.path)
 
     def complaints(self) -> list[str]:
         """What is wrong with the log or its record, most serious first."""
-        said = []
-        if self.tail.fault:
-            said.append(f"{self.log}: {self.tail.fault}")
+        file, problems = self.path.name, self.tail.problems
+        texts = [f"{self.path}: {self.tail.fault}"] if self.tail.fault else []
         if self.state.problem:
-            said.append(self.state.problem)
-        problems = self.tail.problems
-        said += [f"{self.log.name}: {text}" for text in problems.first]
+            texts.append(self.state.problem)
+        texts += [f"{file}: {text}" for text in problems.first]
         if problems.count > len(problems.first):
-            said.append(
-                f"{self.log.name}: and {problems.count - len(problems.first)} more like these"
-            )
-        if self.state.running and self.quiet_for > _QUIET and self.history and self.history.n_rows:
-            said.append(
+            texts.append(f"{file}: and {problems.count - len(problems.first)} more like these")
+        if self.state.running and self.quiet_for > _QUIET and self.n_rows:
+            texts.append(
                 f"no new sample for {self.quiet_for:.0f} s although the run has not ended: "
                 "it was killed, or it stalls"
             )
         elif not self.state.running and self.loading is None and self.tail.torn():
-            said.append(f"{self.log.name}: its last line was cut and is left out")
-        return said
+            texts.append(f"{file}: its last line was cut and is left out")
+        return texts
 
 
 class Watch:
     """What the pages show; they share what has been read.
 
-    named: the run to stay with, or None to follow the newest under ``root``.
+    named: the run to stay with, or None to follow the newest under ``root``. Raises ConfigError
+    where there is no such run.
     """
 
     def __init__(self, root: Path, named: Path | None) -> None:
         self.root = root
-        self.named = named
-        self.recording: Recording | None = None
-        if named is not None:
-            self.recording = Recording(_log_of(named))
+        self.followed = FollowedLog(_log_of(named)) if named is not None else None
+        self._stays = named is not None
         self._started: dict[str, str] = {}
         self._looked = self._polled = 0.0
         self.poll()
@@ -140,33 +167,29 @@ class Watch:
         self._polled = now
         if now - self._looked > _LOOK:
             self._looked = now
-            self._follow()
-            if self.recording is not None:
-                self.recording.look()
-        if self.recording is not None:
-            self.recording.read()
+            self._look()
+        if self.followed is not None:
+            self.followed.read()
 
-    def _follow(self) -> None:
-        if self.named is not None:
-            return
-        newest = self._newest()
-        if newest is not None and (self.recording is None or self.recording.log != newest):
-            self.recording = Recording(newest)
+    def _look(self) -> None:
+        newest = None if self._stays else self._newest()
+        if newest is not None and (self.followed is None or self.followed.path != newest):
+            self.followed = FollowedLog(newest)
+        if self.followed is not None:
+            self.followed.look()
 
     def _newest(self) -> Path | None:
         """Log of the run that began last."""
         try:
-            folders = [item for item in self.root.iterdir() if item.is_dir()]
+            folders = {item.name: item for item in self.root.iterdir() if item.is_dir()}
         except OSError:
             return None
-        for folder in folders:
-            if folder.name not in self._started:
-                began = _began(folder)
-                if began is not None:
-                    self._started[folder.name] = began
-        there = {folder.name: folder for folder in folders}
-        runs = [(began, name) for name, began in self._started.items() if name in there]
-        return there[max(runs)[1]] / LOG_NAME if runs else None
+        for name in folders.keys() - self._started.keys():
+            began = _began(folders[name])
+            if began is not None:
+                self._started[name] = began
+        runs = [(began, name) for name, began in self._started.items() if name in folders]
+        return folders[max(runs)[1]] / LOG_NAME if runs else None
 
 
 def _log_of(named: Path) -> Path:
@@ -195,29 +218,6 @@ def _began(folder: Path) -> str | None:
     return started or f"{name[:4]}-{name[4:6]}-{name[6:11]}:{name[11:13]}:{name[13:15]}"
 
 
-def _read_state(log: Path) -> State:
-    try:
-        record = read_record(log)
-    except ConfigError as error:
-        return State("log", None, {}, None, str(error))
-    if record is None:
-        return State("log", None, {}, None, None)
-    experiment = _section(record, "experiment")
-    rate, duration = experiment.get("sample_rate"), experiment.get("duration")
-    expected = None
-    if isinstance(rate, int | float) and isinstance(duration, int | float):
-        expected = round(rate * duration)
-    details = {
-        "rig": _section(record, "rig").get("name"),
-        "protocol": experiment.get("protocol"),
-        "started": str(record.get("started", ""))[:19].replace("T", " ") + " UTC",
-        "sample rate": f"{rate:g} Hz" if isinstance(rate, int | float) else None,
-    }
-    shown = {name: str(value) for name, value in details.items() if value}
-    reason = record.get("reason")
-    return State(str(record.get("status")), str(reason) if reason else None, shown, expected, None)
-
-
 def _section(record: dict[str, Any], name: str) -> dict[str, Any]:
-    found = record.get(name)
-    return found if isinstance(found, dict) else {}
+    section = record.get(name)
+    return section if isinstance(section, dict) else {}

@@ -11,7 +11,7 @@ from typing import Any
 from daq.hal import Flag, FloatArray
 from daq.logs.columns import UNITS
 from daq.scope.figures import BLUE, GREEN, GREY, ORANGE, RED, curves_of, flag_name
-from daq.scope.recordings import Recording
+from daq.scope.watch import FollowedLog
 
 _STATES = {
     "running": (GREEN, "recording"),
@@ -27,27 +27,26 @@ HELP = (
 )
 
 
-def heading(recording: Recording | None, root: Path, newer: bool) -> str:
+def heading(log: FollowedLog | None, root: Path, newer: bool) -> str:
     """Which run, in which state, and what is wrong with it; newer: another one has begun."""
-    if recording is None:
+    if log is None:
         return (
             f"<b>No run under {escape(str(root))} yet.</b> "
             "It is shown as soon as one begins: <code>rig run prbs.yaml</code>"
         )
-    lines = [_title(recording)]
-    if recording.state.reason:
-        lines.append(f"<b>{escape(recording.state.reason)}</b>")
+    lines = [_title(log)]
+    if log.state.reason:
+        lines.append(f"<b>{escape(log.state.reason)}</b>")
     if newer:
         lines.append("<b>A new run has begun: press Live to see it.</b>")
-    if recording.loading is not None:
-        lines.append(f"reading the log: {recording.loading:.0%}")
-    elif recording.state.running and not _rows(recording):
+    if log.loading is not None:
+        lines.append(f"reading the log: {log.loading:.0%}")
+    elif log.state.running and not log.n_rows:
         lines.append("waiting for the first sample: offset calibration, winding of the load")
-    elif not _rows(recording) and not recording.complaints():
+    elif not log.n_rows and not log.complaints():
         lines.append("no sample in this log yet; what is written to it will be shown")
     lines += [
-        f'<span style="color:#a33c00">&#9888; {escape(text)}</span>'
-        for text in recording.complaints()
+        f'<span style="color:#a33c00">&#9888; {escape(text)}</span>' for text in log.complaints()
     ]
     return "<br>".join(lines)
 
@@ -74,23 +73,19 @@ def readout(
     }
 
 
-def _title(recording: Recording) -> str:
-    state, rows = recording.state, _rows(recording)
+def _title(log: FollowedLog) -> str:
+    state, rows = log.state, log.n_rows
     color, word = _STATES.get(state.status, (RED, state.status))
     facts = [f"{name} {value}" for name, value in state.details.items()]
     if state.running and state.expected_rows:
         facts.append(f"{100 * rows // state.expected_rows} % of {state.expected_rows} samples")
-    elif recording.history is not None and rows:
-        facts.append(f"{rows} samples, {recording.history.span[1]:.5g} s")
+    elif log.history is not None and rows:
+        facts.append(f"{rows} samples, {log.history.span[1]:.5g} s")
     return (
-        f'<b style="font-size:1.25em">{escape(recording.name)}</b> '
+        f'<b style="font-size:1.25em">{escape(log.name)}</b> '
         f'<span style="background:{color};color:white;border-radius:3px;padding:1px 8px">'
         f"{escape(word)}</span> {escape(' · '.join(facts))}"
     )
-
-
-def _rows(recording: Recording) -> int:
-    return recording.history.n_rows if recording.history else 0
 
 
 def _figures(name: str, value: float, digits: int, sign: str = "") -> str:

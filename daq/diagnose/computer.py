@@ -1,0 +1,158 @@
+"""Whether a computer suits a rig in real time: its ports, scheduling, memory and disk."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from daq.files import make_folder
+from daq.run.realtime import RealTime
+from daq.serial.link import latency_timer, permission_cure
+from daq.serial.ports import PortFacts
+
+Verdict = Literal["good", "could be better", "bad"]
+
+_NAPS, _NAP = 400, 0.002  # wake-ups timed, and how long each sleeps [s]
+_LATE, _TOO_LATE = 0.005, 0.05  # s; the watchdog's default is 0.1 s
+_FLUSHES, _FLUSH_BYTES = 20, 512 * 1024
+# A log at 4 kHz is half a megabyte a second; a flush that takes longer than the samples that the
+# computer keeps meanwhile loses some.
+_SLOW_DISK, _SLOWEST_DISK = 10e6, 1e6  # bytes/s
+_LONG_FLUSH, _LONGEST_FLUSH = 0.2, 1.0  # s
+_TIMER = 2  # ms
+
+
+@dataclass(frozen=True)
+class Check:
+    """A verdict on one subject, and what it rests on; cure: what to do, empty where all is well."""
+
+    subject: str
+    verdict: Verdict
+    observation: str
+    cure: str = ""
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """Everything that was checked."""
+
+    checks: list[Check]
+
+    @property
+    def bad(self) -> list[str]:
+        """Subjects with which no run is safe."""
+        return [check.subject for check in self.checks if check.verdict == "bad"]
+
+
+def diagnose(ports: Sequence[PortFacts], out: Path) -> Diagnosis:
+    """Check these ports, scheduling and memory, and the disk of the folder for logs."""
+    checks = [check for port in ports for check in _port(port)]
+    if not ports:
+        checks = [Check("ports", "could be better", "there are none", "plug the device in")]
+    return Diagnosis([*checks, *_real_time(), _disk(out)])
+
+
+def _port(port: PortFacts) -> list[Check]:
+    if "://" in port.name or os.name == "nt":
+        return []
+    access = f"access to {port.name}"
+    if not Path(port.name).exists():
+        return [Check(access, "bad", "there is no such port", "'rig ports' lists those there are")]
+    if not os.access(port.name, os.R_OK | os.W_OK):
+        return [Check(access, "bad", "no permission", permission_cure(port.name))]
+    checks = [Check(access, "good", "may be read and written")]
+    timer = latency_timer(port.name)
+    if timer is not None:
+        checks.append(_latency(f"latency timer of {port.name}", *timer))
+    return checks
+
+
+def _latency(subject: str, file: Path, milliseconds: int) -> Check:
+    if milliseconds <= _TIMER:
+        return Check(subject, "good", f"{milliseconds} ms")
+    cure = (
+        f"as root: echo 1 > {file}; for good, a udev rule: "
+        'ACTION=="add", SUBSYSTEM=="usb-serial", ATTR{latency_timer}="1"'
+    )
+    return Check(subject, "could be better", f"{milliseconds} ms", cure)
+
+
+def _real_time() -> list[Check]:
+    """What a run is granted, and how late a program so scheduled wakes up that sleeps shortly."""
+    run = RealTime()
+    run.begin("prefer")
+    worst = 0.0
+    for _ in range(_NAPS):
+        begun = time.perf_counter()
+        time.sleep(_NAP)
+        worst = max(worst, time.perf_counter() - begun - _NAP)
+    run.undo()
+    return [
+        _granted(run, "scheduler", "real-time scheduling", "@GROUP - rtprio 50"),
+        _granted(run, "memory", "memory lock", "@GROUP - memlock unlimited"),
+        _wake_ups(worst),
+    ]
+
+
+def _granted(run: RealTime, name: str, subject: str, line: str) -> Check:
+    if name not in run.refused:
+        return Check(subject, "good", str(run.granted.get(name, "left to the system")))
+    cure = (
+        f"as root, write the line '{line}' with a group of your user to "
+        "/etc/security/limits.d/rig.conf, then log in again"
+    )
+    if not sys.platform.startswith("linux"):
+        cure = "this system has none"
+    return Check(subject, "could be better", f"not allowed ({run.refused[name]})", cure)
+
+
+def _wake_ups(worst: float) -> Check:
+    observation = f"{1e3 * worst:.1f} ms late at worst, of {_NAPS}"
+    if worst <= _LATE:
+        return Check("wake-ups", "good", observation)
+    verdict: Verdict = "bad" if worst > _TOO_LATE else "could be better"
+    cure = "end other programs; on a laptop, plug in the supply and switch energy saving off"
+    return Check("wake-ups", verdict, observation, cure)
+
+
+def _disk(out: Path) -> Check:
+    """Flushes of the size that a fast log makes, where logs go."""
+    subject, made = f"disk of {out}", not out.exists()
+    make_folder(out)
+    file = out / f".doctor.{os.getpid()}"
+    try:
+        speed, slowest = _flush(file)
+    except OSError as error:
+        return Check(
+            subject, "bad", f"cannot be written: {error.strerror}", "choose another: --out"
+        )
+    finally:
+        file.unlink(missing_ok=True)
+        if made:
+            out.rmdir()
+    observation = f"{speed / 1e6:.0f} MB/s, {1e3 * slowest:.0f} ms for the slowest flush"
+    if speed >= _SLOW_DISK and slowest <= _LONG_FLUSH:
+        return Check(subject, "good", observation)
+    too_slow = speed < _SLOWEST_DISK or slowest > _LONGEST_FLUSH
+    verdict: Verdict = "bad" if too_slow else "could be better"
+    cure = "write logs to a disk of this computer, not to a stick or the network: rig run --out DIR"
+    return Check(subject, verdict, observation, cure)
+
+
+def _flush(file: Path) -> tuple[float, float]:
+    """Speed of writing a file [bytes/s], and the time of the slowest flush [s]."""
+    block, slowest = bytes(_FLUSH_BYTES), 0.0
+    begun = time.perf_counter()
+    with file.open("wb") as stream:
+        for _ in range(_FLUSHES):
+            before = time.perf_counter()
+            stream.write(block)
+            stream.flush()
+            os.fsync(stream.fileno())
+            slowest = max(slowest, time.perf_counter() - before)
+    return _FLUSHES * _FLUSH_BYTES / (time.perf_counter() - begun), slowest

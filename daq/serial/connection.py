@@ -1,0 +1,262 @@
+"""A session with the device behind a port: its machine, and the threads that serve it."""
+
+from __future__ import annotations
+
+import contextlib
+import getpass
+import math
+import os
+import platform
+import sys
+import threading
+import time
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+from daq.errors import DeviceError
+from daq.serial import messages
+from daq.serial.host import GIVE_UP, HostMachine, refusal
+from daq.serial.link import open_link
+from daq.serial.messages import Block, Result, Type, Welcome
+
+_HANDSHAKE = 2.0  # s in which a device says who it is: a board resets in less
+_FEED = 0.01  # s between two looks at what is to be sent, or sent again
+_PINGS = 6  # round trips measured before a run
+_PING_PATIENCE = 0.5  # s for all of them
+_PATIENCE = 1.0  # s without a call from the run until the watchdog is no longer fed
+_LOOK = 0.05  # s between two looks at the clock while waiting
+
+T = TypeVar("T")
+
+
+class Connection:
+    """An open port and the device that answers on it.
+
+    One thread reads the port. Another feeds the device's watchdog, because the kernel may keep a
+    reader waiting for its own workers on a busy computer; it does so only while the program calls:
+    one that hangs is no better than one that is dead.
+
+    welcome: who answers. warnings: what is not as it should be about the port. Raises DeviceError,
+    with the cure, where nobody answers or the wrong device does.
+    """
+
+    def __init__(self, port: str, baud: int, watchdog: float = 0.1) -> None:
+        self._port = port
+        self._watchdog = watchdog
+        self._link = open_link(port, baud)
+        session = int.from_bytes(os.urandom(2), "little") or 1
+        self._machine = HostMachine(session, f"{_user()}@{platform.node()}")
+        self._leaving = threading.Event()
+        self._changed = threading.Condition()
+        self._called = 0.0
+        self._threads = [
+            threading.Thread(target=work, name=f"serial rig, {name}", daemon=True)
+            for name, work in (("reading", self._read), ("watchdog", self._feed))
+        ]
+        for thread in self._threads:
+            thread.start()
+        try:
+            self.welcome = self._shake_hands()
+        except BaseException:
+            self.close()
+            raise
+        self.warnings = list(self._link.warnings)
+
+    def close(self) -> None:
+        """Disconnect; the device's watchdog does the rest."""
+        self._leaving.set()
+        for thread in self._threads:
+            thread.join(timeout=2.0)
+        self._link.close()
+
+    def act(self, action: Callable[[HostMachine, float], T]) -> T:
+        """What an action of the machine at this instant [s] gives; what it has to say is sent."""
+        with self._changed:
+            self._called = time.monotonic()
+            result = action(self._machine, self._called)
+            self._write()
+        return result
+
+    def request(self, action: Callable[[HostMachine, float], None]) -> None:
+        """Act, and wait until the device has answered. Raises DeviceError for a refusal."""
+        self.act(action)
+        self._wait(lambda: not self._machine.waiting)
+        reply, failure = self._machine.reply, self._machine.failure
+        # Samples that came before a failure are still to be had from samples().
+        if reply is None and failure is not None:
+            raise failure
+        if reply is not None and reply.result is not Result.OK:
+            raise DeviceError(refusal(reply))
+
+    def ask(self, type_: Type, payload: bytes = b"", give_up: float = GIVE_UP) -> None:
+        """Send a request and wait for its answer."""
+        self.request(lambda machine, now: machine.ask(type_, payload, now, give_up))
+
+    def samples(self) -> list[Block]:
+        """Wait for samples; all that have come."""
+        blocks = self._machine.blocks
+        with self._changed:
+            if not self._wait(lambda: bool(blocks)) and self._machine.failure is not None:
+                raise self._machine.failure
+            self._called = time.monotonic()
+            taken = list(blocks)
+            blocks.clear()
+        return taken
+
+    def wait_for_preload(self, patience: float) -> bool:
+        """Wait until the device has what was sent ahead; whether it has within so long [s]."""
+        preloaded = self._wait(lambda: self._machine.preloaded, time.monotonic() + patience)
+        return preloaded or self._machine.failure is not None
+
+    def describe(self) -> dict[str, Any]:
+        """The line's record."""
+        with self._changed:
+            return self._machine.describe()
+
+    def check_delay(self) -> None:
+        """Measure round trips; raises DeviceError for a line too slow for the watchdog."""
+        clock, decoder = self._machine.clock, self._machine.decoder
+        deadline = time.monotonic() + _PING_PATIENCE
+        for _ in range(_PINGS):
+            # A ping that is lost must not use up the time of the others.
+            self._ping(min(deadline, time.monotonic() + _PING_PATIENCE / _PINGS))
+        if clock.quickest <= 0.5 * self._watchdog:
+            return
+        if not clock.round_trips and decoder.rejected:
+            raise DeviceError(
+                f"{self._port}: {decoder.rejected} damaged frames came, and not one answer in "
+                f"{1e3 * _PING_PATIENCE:.0f} ms; check cable, connectors and baud rate"
+            )
+        slow = (
+            f"took {1e3 * clock.quickest:.0f} ms to answer"
+            if clock.round_trips
+            else f"does not answer within {1e3 * _PING_PATIENCE:.0f} ms"
+        )
+        raise DeviceError(
+            f"{self._port}: the device {slow}, too slow for its watchdog of "
+            f"{1e3 * self._watchdog:.0f} ms. Look at the adapter's latency timer ('rig "
+            "doctor'), at a hub in between, or raise options.watchdog in the rig file"
+        )
+
+    def schedule_as_caller(self) -> None:
+        """The threads go just before the run, where that is scheduled in real time by now."""
+        if not sys.platform.startswith("linux"):
+            return
+        policy, priority = os.sched_getscheduler(0), os.sched_getparam(0).sched_priority
+        for thread in self._threads:
+            # The limit may be the run's own priority.
+            for urgency in (priority + 1, priority) if priority else (0,):
+                with contextlib.suppress(OSError):
+                    os.sched_setscheduler(thread.native_id or 0, policy, os.sched_param(urgency))
+                    break
+
+    def _shake_hands(self) -> Welcome:
+        machine, port = self._machine, self._port
+        self.act(lambda machine, now: machine.hello(now, _HANDSHAKE))
+        self._wait(lambda: not machine.waiting)
+        if machine.failure is not None:
+            raise machine.failure
+        if machine.other_version is not None:
+            raise DeviceError(_version_mismatch(port, machine.other_version))
+        welcome = machine.welcome
+        if welcome is None:
+            raise DeviceError(_no_answer(port, machine))
+        names = tuple(channel.name for channel in welcome.channels)
+        if names != messages.CHANNEL_NAMES:
+            raise DeviceError(
+                f"{port}: {welcome.device} has the channels {', '.join(names) or 'none'}, "
+                f"not {', '.join(messages.CHANNEL_NAMES)}; its firmware is for another rig"
+            )
+        return welcome
+
+    def _ping(self, deadline: float) -> None:
+        clock = self._machine.clock
+        before = clock.round_trips
+        self.act(HostMachine.ping)
+        self._wait(lambda: clock.round_trips > before, deadline)
+
+    def _wait(self, condition: Callable[[], bool], deadline: float = math.inf) -> bool:
+        """Wait for a condition, a failure or a deadline; whether the condition holds."""
+        with self._changed:
+            while not condition():
+                self._called = time.monotonic()
+                if self._machine.failure is not None or self._called >= deadline:
+                    return False
+                self._changed.wait(min(_LOOK, deadline - self._called))
+        return True
+
+    # --- the threads --------------------------------------------------------------------------
+
+    def _read(self) -> None:
+        while not self._leaving.is_set() and self._machine.failure is None:
+            try:
+                data = self._link.read()
+                if data:
+                    with self._changed:
+                        self._machine.feed(data, time.monotonic())
+                        self._write()
+                        self._changed.notify_all()
+            except DeviceError as error:
+                self._fail(error)
+        with self._changed:
+            self._changed.notify_all()
+
+    def _feed(self) -> None:
+        machine, pause = self._machine, min(_FEED, 0.2 * self._watchdog)
+        while not self._leaving.wait(pause) and machine.failure is None:
+            try:
+                with self._changed:
+                    now, waiting = time.monotonic(), machine.waiting
+                    machine.poll(now, keep_alive=now - self._called < _PATIENCE)
+                    self._write()
+                    if machine.failure is not None or machine.waiting != waiting:
+                        self._changed.notify_all()
+            except DeviceError as error:
+                self._fail(error)
+
+    def _fail(self, error: DeviceError) -> None:
+        with self._changed:
+            self._machine.failure = self._machine.failure or error
+            self._changed.notify_all()
+
+    def _write(self) -> None:
+        """Write what the machine has to say; the lock is held, so frames stay whole."""
+        data = self._machine.take()
+        if data:
+            self._link.write(data)
+
+
+def _user() -> str:
+    try:
+        return getpass.getuser()
+    except (OSError, KeyError):
+        return "unknown"
+
+
+def _version_mismatch(port: str, version: int) -> str:
+    mismatch = (
+        f"{port}: the device speaks version {version} of the protocol, this program "
+        f"{messages.VERSION}"
+    )
+    if version > messages.VERSION:
+        return f"{mismatch}. This program is the old one: update hybrid-rig"
+    return f"{mismatch}. The device's firmware is the old one: update that"
+
+
+def _no_answer(port: str, machine: HostMachine) -> str:
+    decoder = machine.decoder
+    if decoder.accepted:
+        return (
+            f"{port}: what answers speaks the protocol but does not say who it is; its firmware is "
+            "incomplete"
+        )
+    if decoder.received:
+        return (
+            f"{port}: {decoder.received} bytes came in {_HANDSHAKE:g} s but no frame of the "
+            "protocol; the baud rate is wrong, or it is another device ('rig ports' shows who "
+            "answers)"
+        )
+    return (
+        f"{port}: no answer in {_HANDSHAKE:g} s; check that the device has power and runs the "
+        "firmware of the protocol, and that this is its port ('rig ports' shows who answers)"
+    )
