@@ -16,9 +16,9 @@ from sysid.fitting.free_run import free_run
 from sysid.fitting.objective import Balance, Objective
 from sysid.fitting.refinement import Refinement
 from sysid.gassi.checkpoint import Checkpoint, load, origin
-from sysid.gassi.running import Best, Run
-from sysid.gassi.search import PRESETS, GeneticSearch, Preset, PresetName
-from sysid.gassi.settling import settle
+from sysid.gassi.genetic_search import PRESETS, GeneticSearch, Preset, PresetName
+from sysid.gassi.likelihood import fit_likelihood
+from sysid.gassi.search_run import Best, SearchRun
 from sysid.problem.data import Dataset
 from sysid.problem.guesses import Guess, guess_ranges
 from sysid.problem.metrics import fit_percent
@@ -223,11 +223,11 @@ class GASSI(RecordEstimator):
             self._end(run, notify)
         return self
 
-    def _end(self, run: Run, notify: Callable[[Progress], None]) -> None:
+    def _end(self, run: SearchRun, notify: Callable[[Progress], None]) -> None:
         """Where a run that came to its own end goes on to."""
         if run.search.converged:
             self.stopped_ = "converged"
-        if not run.preset.refine or self.criterion != "likelihood":
+        if not run.search.preset.refine or self.criterion != "likelihood":
             return
         done = 0
 
@@ -237,7 +237,7 @@ class GASSI(RecordEstimator):
             notify(Progress("weigh", done, done, self.error_))
 
         try:
-            settled = settle(run.objective, run.minima, watch)
+            settled = fit_likelihood(run.objective, run.minima(), watch)
         except KeyboardInterrupt:
             self.stopped_ = "interrupted"
             return
@@ -373,7 +373,7 @@ class GASSI(RecordEstimator):
             raise ModelError("every output has weight 0; at least one must count")
         return weights
 
-    def _run(self, objective: Objective, preset: Preset) -> Run:
+    def _run(self, objective: Objective, preset: Preset) -> SearchRun:
         rng = np.random.default_rng(self.random_state)
         # Of the generations the genetic search has its share, the local refinement the rest.
         own = self.generations
@@ -390,10 +390,10 @@ class GASSI(RecordEstimator):
             self.termination_ratio,
         )
         likelihood = self.criterion == "likelihood"
-        return Run(objective, preset, search, self.generations, rng, likelihood)
+        return SearchRun(objective, search, self.generations, likelihood)
 
     def _keeper(
-        self, data: Sequence[Dataset], run: Run, checkpoint: Path | None, resume: Path | None
+        self, data: Sequence[Dataset], run: SearchRun, checkpoint: Path | None, resume: Path | None
     ) -> Checkpoint | None:
         """What writes the checkpoints, after the run has been set to where it goes on."""
         path = checkpoint if checkpoint is not None else resume
@@ -407,7 +407,7 @@ class GASSI(RecordEstimator):
         keeper.save(run.state())
         return keeper
 
-    def _take(self, run: Run) -> None:
+    def _take(self, run: SearchRun) -> None:
         """The run's best and what it took, as they are known from outside."""
         assert run.best is not None
         self._set(run.best)
