@@ -104,6 +104,10 @@ class Candidates:
     damping: FloatArray
     promise: float
 
+    def worth(self, tolerance: float) -> bool:
+        """Whether they promise more than a share of the error."""
+        return len(self.coordinates) > 0 and not self.promise <= tolerance
+
 
 def candidates(
     space: SearchSpace, at: FloatArray, damping: FloatArray, quadratics: Sequence[Quadratic]

@@ -139,10 +139,9 @@ def curvature(objective: Objective, at: FloatArray) -> FloatArray:
     Coordinates in parts of the ranges.
     """
     (descent,) = _with_steps(objective, [Descent(Point(at))])
-    coordinates, distance = _neighbourhood(objective.space, descent)
-    (around,) = _responses(objective, [descent], [coordinates])
-    error = float(objective.error_of(around.rms[:1])[0])
-    return quadratic_at(objective, around, distance, FLOORS[0] * error).hessian
+    (around,) = _responses(objective, [descent], [_neighbourhood(objective.space, descent)])
+    floor = FLOORS[0] * float(objective.error_of(around.rms[:1])[0])
+    return quadratic_at(objective, around, _distance(objective.space, descent), floor).hessian
 
 
 def advance(
@@ -166,40 +165,36 @@ def _iterated(objective: Objective, descents: list[Descent], tolerance: float) -
     """The descents, whose integration steps are chosen, after one iteration."""
     space = objective.space
     neighbourhoods = [_neighbourhood(space, descent) for descent in descents]
-    responses = _responses(objective, descents, [rows for rows, _ in neighbourhoods])
-    surveys = [
-        _surveyed(objective, descent, around, distance)
-        for descent, around, (_, distance) in zip(descents, responses, neighbourhoods, strict=True)
-    ]
+    around = _responses(objective, descents, neighbourhoods)
+    surveys = [_surveyed(objective, *pair) for pair in zip(descents, around, strict=True)]
     onward = [descent for descent, _ in surveys]
     quadratics = {i: quadratic for i, (_, quadratic) in enumerate(surveys) if quadratic}
-    tried: dict[int, Candidates] = {}
     at = np.array([onward[i].point.at for i in quadratics])
     damping = np.array([onward[i].damping for i in quadratics])
-    offers = candidates(space, at, damping, list(quadratics.values()))
-    for i, offer in zip(quadratics, offers, strict=True):
-        if len(offer.coordinates) == 0 or offer.promise <= tolerance:
-            onward[i] = _helped(objective, onward[i], Stall.ARRIVED)
-        else:
-            tried[i] = offer
-    rows = [offer.coordinates for offer in tried.values()]
-    ends = _responses(objective, [onward[i] for i in tried], rows, keep=False)
-    for (i, offer), end in zip(tried.items(), ends, strict=True):
-        onward[i] = _judged(objective, onward[i], offer, end, tolerance)
+    offers = dict(
+        zip(quadratics, candidates(space, at, damping, list(quadratics.values())), strict=True)
+    )
+    for i in [i for i, offer in offers.items() if not offer.worth(tolerance)]:
+        onward[i] = _resumed(objective, onward[i], Stall.ARRIVED)
+        del offers[i]
+    rows = [offer.coordinates for offer in offers.values()]
+    ends = _responses(objective, [onward[i] for i in offers], rows, keep=False)
+    for (i, offer), responses in zip(offers.items(), ends, strict=True):
+        onward[i] = _judged(objective, onward[i], offer, responses, tolerance)
     return onward
 
 
 def _surveyed(
-    objective: Objective, descent: Descent, around: Responses, distance: FloatArray
+    objective: Objective, descent: Descent, around: Responses
 ) -> tuple[Descent, Quadratic | None]:
     """The descent with its point's error, and the quadratic there unless it stalls or ends.
 
-    around: responses of the point and its neighbours, which are at distances (n_free,) from it.
+    around: responses of the point and its neighbours.
     """
     errors = objective.error_of(around.rms)
     at, error = descent.point.at, float(errors[0])
     if not np.isfinite(error):
-        return _helped(objective, descent, Stall.FAILED), None
+        return _resumed(objective, descent, Stall.FAILED), None
     steps_at = descent.integration.steps_at
     safe = steps_at is not None and np.array_equal(at, steps_at)
     descent = replace(
@@ -216,13 +211,14 @@ def _surveyed(
         braced = recovered(objective, descent, Stall.BURST)
         if braced is not None:
             return braced, None
-        # The other parameters go on alone.
+        # The rest of the parameters go on alone.
         around.values[..., 1:][..., burst] = around.values[..., :1]
     if not np.isfinite(descent.error_of_round):
         descent = replace(descent, error_of_round=error)
+    distance = _distance(objective.space, descent)
     quadratic = quadratic_at(objective, around, distance, descent.floor)
     if not quadratic.leads_somewhere:
-        return _helped(objective, descent, Stall.ARRIVED), None
+        return _resumed(objective, descent, Stall.ARRIVED), None
     return descent, quadratic
 
 
@@ -230,50 +226,33 @@ def _judged(
     objective: Objective, descent: Descent, offer: Candidates, ends: Responses, tolerance: float
 ) -> Descent:
     """The descent after its candidates have been simulated, at the best of them if it gains."""
-    assert descent.point.rms is not None
+    integration = descent.integration
+    assert descent.point.rms is not None and integration.steps_at is not None
     rms = np.stack([descent.point.rms, *ends.rms])
     before, *errors = objective.smoothed_error_of(rms, descent.floor).tolist()
     best = int(np.argmin(errors))
     gain = (before - errors[best]) / before
+    damping = heavier(descent.damping)
+    if gain > 0.0:
+        at, damping = offer.coordinates[best], lighter(float(offer.damping[best]))
+        error = float(objective.error_of(ends.rms[best : best + 1])[0])
+        point = Point(at, error, ends.rms[best], float(ends.excess[best]))
+        if np.any(np.abs(at - integration.steps_at) > _FAR * objective.space.width):
+            integration = replace(integration, steps_at=None)
+        descent = replace(descent, point=point, integration=integration, gain=gain)
     promising = offer.promise > NOTHING
     failed = gain <= 0.0 or (promising and gain < _KEPT * offer.promise)
-    descent = replace(descent, failures=descent.failures + 1 if failed else 0)
-    if gain > 0.0:
-        descent = _moved(objective, descent, offer, ends, best, gain)
-    else:
-        descent = replace(descent, damping=heavier(descent.damping))
-    if descent.failures >= PATIENCE and promising:
-        return _helped(objective, descent, Stall.MISLED)
-    if descent.failures >= PATIENCE or 0.0 < gain <= tolerance:
-        return _helped(objective, descent, Stall.ARRIVED)
+    failures = descent.failures + 1 if failed else 0
+    descent = replace(descent, damping=damping, failures=failures)
+    if failures >= PATIENCE and promising:
+        return _resumed(objective, descent, Stall.MISLED)
+    if failures >= PATIENCE or 0.0 < gain <= tolerance:
+        return _resumed(objective, descent, Stall.ARRIVED)
     return descent
 
 
-def _moved(
-    objective: Objective,
-    descent: Descent,
-    offer: Candidates,
-    ends: Responses,
-    best: int,
-    gain: float,
-) -> Descent:
-    """The descent at one of its candidates."""
-    at, rms, integration = offer.coordinates[best], ends.rms[best], descent.integration
-    error = float(objective.error_of(rms[None])[0])
-    assert integration.steps_at is not None
-    if np.any(np.abs(at - integration.steps_at) > _FAR * objective.space.width):
-        integration = replace(integration, steps_at=None)
-    return replace(
-        descent,
-        point=Point(at, error, rms, float(ends.excess[best])),
-        integration=integration,
-        damping=lighter(float(offer.damping[best])),
-        gain=gain,
-    )
-
-
-def _helped(objective: Objective, descent: Descent, stall: Stall) -> Descent:
-    """A stalled descent as a strategy lets it go on, or finished."""
+def _resumed(objective: Objective, descent: Descent, stall: Stall) -> Descent:
+    """A stalled descent as a strategy lets it go on, or else finished."""
     return recovered(objective, descent, stall) or replace(descent, finished=True)
 
 
@@ -290,12 +269,17 @@ def _with_steps(objective: Objective, descents: list[Descent]) -> list[Descent]:
     return ready
 
 
-def _neighbourhood(space: SearchSpace, descent: Descent) -> tuple[FloatArray, FloatArray]:
-    """A descent's point and its neighbours, (1 + n_free, n_free), and distances, (n_free,)."""
-    at, h = descent.point.at, PERTURBATIONS[descent.level]
+def _distance(space: SearchSpace, descent: Descent) -> FloatArray:
+    """Distances h of the neighbours, in parts of the ranges, (n_free,)."""
+    h = PERTURBATIONS[descent.level]
     # Away from the nearer bound, so that the perturbed chromosome stays in range.
-    distance = np.where(at + h * space.width > space.coded_bounds[1], -h, h)
-    return np.vstack([at, at + np.diag(distance * space.width)]), distance
+    return np.where(descent.point.at + h * space.width > space.coded_bounds[1], -h, h)
+
+
+def _neighbourhood(space: SearchSpace, descent: Descent) -> FloatArray:
+    """A descent's point and its neighbours, (1 + n_free, n_free)."""
+    at, distance = descent.point.at, _distance(space, descent)
+    return np.vstack([at, at + np.diag(distance * space.width)])
 
 
 def _responses(
