@@ -33,7 +33,7 @@ from sysid import BatchSimulator, Dataset, SearchSpace
 from sysid.arrays import FloatArray
 from sysid.fitting.objective import Objective
 from sysid.gassi import PRESETS, GeneticSearch, Preset
-from sysid.gassi.running import Run
+from sysid.gassi.search_run import SearchRun
 from sysid.problem.model import ProcessModel
 
 LOGS = damper.ROOT.parent / "shared" / "data" / "mr_damper"
@@ -132,7 +132,7 @@ def ours(case: Case, seed: int, preset: Preset = PRESETS["default"]) -> float:
     objective, rng = case.objective(preset.log_scale), np.random.default_rng(seed)
     own = max(1, round((1.0 - preset.local_share) * case.generations))
     search = GeneticSearch(objective.space, preset, case.population, own, rng)
-    run = Run(objective, preset, search, case.generations, rng, likelihood=False)
+    run = SearchRun(objective, search, case.generations, likelihood=False)
     while not run.done:
         run.step()
     assert run.best is not None

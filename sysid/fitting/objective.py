@@ -1,11 +1,21 @@
-"""The figure that identification minimises, for whole populations."""
+"""The error that identification minimises, for whole populations.
+
+With e_j the residuals of output j, simulated minus measured in parts of its scale, n_j their
+number and w_j its weight, the weights summing to one:
+
+    E = sum_j w_j r_j        r_j = |e_j| / sqrt(n_j)
+
+This is (4.22) with the sum inside each root divided by the number of samples, so that it does not
+grow with the record's length; for one record the two rank chromosomes alike, (4.22) being
+sqrt(n_samples) times this.
+"""
 
 from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -15,33 +25,45 @@ from sysid.problem.data import Dataset, output_scale
 from sysid.problem.model import ModelError
 from sysid.problem.space import SearchSpace
 
-# Whether logs count by their samples or each alike.
+# Whether records count by their samples or each alike.
 Balance = Literal["samples", "logs"]
 
 
 @dataclass(frozen=True)
 class Responses:
-    """Residuals of chromosomes, (n_residuals, n_outputs, n), and their RMS, (n, n_outputs).
+    """Residuals of n chromosomes in parts of the outputs' scales.
 
-    In parts of the outputs' scales, 0 where a sample was lost, not finite where a simulation
-    failed. excess: (n,), the simulations' error estimates in parts of what the accuracy allows.
+    values: (n_residuals, n_outputs, n), 0 where a sample was lost, not finite where a simulation
+    failed. rms: (n, n_outputs). excess: (n,), the simulations' error estimates in parts of what
+    the accuracy allows.
     """
 
     values: FloatArray
     rms: FloatArray
     excess: FloatArray
 
+    def part(self, rows: slice) -> Responses:
+        """The responses of consecutive chromosomes."""
+        return Responses(self.values[..., rows], self.rms[rows], self.excess[rows])
+
+
+def smoothed(rms: FloatArray, floor: float) -> FloatArray:
+    """Root mean squares, those below the floor f by the parabola (r^2 / f + f) / 2.
+
+    It meets the root at f with its slope, so that no crease is left where an output is explained
+    exactly (Huber, "Robust estimation of a location parameter", Annals of Mathematical
+    Statistics 35, 1964).
+    """
+    return np.where(rms > floor, rms, 0.5 * (rms**2 / floor + floor))
+
 
 class Objective:
-    """Mean over outputs of the RMSE on outputs normalised by max|y|.
+    """Mean over outputs of the RMSE on outputs normalised by max|y|, the E above.
 
-    This is (4.22) with the sum inside each root divided by the number of samples, so that it
-    does not grow with the record's length; for one record the two rank chromosomes alike, (4.22)
-    being sqrt(n_samples) times this. Several records count as one long one, or with ``balance``
-    "logs" each alike whatever its length: the mean under the root is then one of the records'
-    means. ``weights``: (n_outputs,), relative importance of the outputs, default equal.
-    ``scales``: what residuals are divided by, per record (n_outputs,): max|y|, times what
-    balances the records.
+    Several records count as one long one, or with ``balance`` "logs" each alike whatever its
+    length: the mean under the root is then one of the records' means. ``weights``: (n_outputs,),
+    relative importance of the outputs, default equal. ``scales``: divisors of the residuals, per
+    record (n_outputs,): max|y|, times a factor that balances the records.
     """
 
     def __init__(
@@ -63,15 +85,10 @@ class Objective:
         counts = np.array([np.isfinite(record.outputs).sum(axis=0) for record in self.records])
         self.counts = counts.sum(axis=0)
         self.scales = _balanced(output_scale(self.records, per_log), counts, balance)
-        unseen = [
-            output.name
-            for output, count, weight in zip(
-                simulator.model.outputs, self.counts, self.weights, strict=True
-            )
-            if weight > 0.0 and not count
-        ]
-        if unseen:
-            raise ModelError(f"no record has a measured sample of output {unseen[0]!r}")
+        unseen = np.flatnonzero((self.weights > 0.0) & (self.counts == 0))
+        if len(unseen):
+            name = simulator.model.output_names[unseen[0]]
+            raise ModelError(f"no record has a measured sample of output {name!r}")
         self._counter = [0]
 
     @property
@@ -85,21 +102,15 @@ class Objective:
 
     def over(self, space: SearchSpace) -> Objective:
         """The same objective over another space of the same model; counts go on together."""
-        other = copy.copy(self)
-        other.space = space
-        return other
+        return self._with(space=space)
 
     def weighed(self, weights: FloatArray) -> Objective:
         """The same objective with other weights of the outputs, (n_outputs,)."""
-        other = copy.copy(self)
-        other.weights = weights / weights.sum()
-        return other
+        return self._with(weights=weights / weights.sum())
 
     def finer(self, accuracy: float) -> Objective:
         """The same objective by simulations of another accuracy, stiff ones given the steps."""
-        other = copy.copy(self)
-        other.simulator = self.simulator.finer(accuracy)
-        return other
+        return self._with(simulator=self.simulator.finer(accuracy))
 
     def evaluate(self, chromosomes: FloatArray) -> tuple[FloatArray, BatchResult]:
         """Error of each chromosome, (n,), infinite where its simulation failed; and the batch."""
@@ -107,7 +118,7 @@ class Objective:
             self.space.full(chromosomes), self.records, self.scales, self._starts(chromosomes)
         )
         self._counter[0] += len(chromosomes)
-        return self._mean(self._roots(result.sse.sum(axis=1))), result
+        return self.error_of(self._roots(result.sse.sum(axis=1))), result
 
     def rms(self, chromosomes: FloatArray) -> FloatArray:
         """RMSE of each output in parts of its scale, (n, n_outputs), infinite where it failed."""
@@ -118,17 +129,17 @@ class Objective:
     ) -> Responses:
         """Residuals at given integration steps per sample, records one after another.
 
-        n_steps: (n_records,), or of each chromosome (n, n_records). Without ``keep`` only what
-        they come to, and no values.
+        n_steps: (n_records,), or of each chromosome (n, n_records). Without ``keep`` only their
+        root mean squares, and no values.
         """
         steps = np.broadcast_to(n_steps, (len(chromosomes), len(self.records)))
-        found = self.simulator.residuals(
-            self.space.full(chromosomes), self.records, self.scales, steps,
-            self._starts(chromosomes), keep=keep,
-        )  # fmt: skip
+        vectors, starts = self.space.full(chromosomes), self._starts(chromosomes)
+        residuals = self.simulator.residuals(
+            vectors, self.records, self.scales, steps, starts, keep=keep
+        )
         self._counter[0] += len(chromosomes)
-        rms = self._roots(found.sse.sum(axis=1))
-        return Responses(found.values, rms, found.excess.max(axis=1))
+        rms = self._roots(residuals.sse.sum(axis=1))
+        return Responses(residuals.values, rms, residuals.excess.max(axis=1))
 
     def steps_needed(self, chromosomes: FloatArray) -> IntArray:
         """Integration steps per sample that each chromosome needs, (n, n_records)."""
@@ -139,17 +150,15 @@ class Objective:
         )
 
     def error_of(self, rms: FloatArray) -> FloatArray:
-        """The error that outputs' root mean squares (n, n_outputs) come to, (n,)."""
-        return self._mean(rms)
+        """The error E of outputs' errors r (n, n_outputs), (n,), infinite where one failed."""
+        with np.errstate(over="ignore", invalid="ignore"):  # infinite times a weight of zero
+            errors = rms @ self.weights
+        return np.where(np.isfinite(errors), errors, np.inf)
 
     def smoothed_error_of(self, rms: FloatArray, floor: float) -> FloatArray:
-        """The same, but smooth where an output is explained exactly, (n,).
-
-        An RMSE below ``floor`` counts by the parabola that meets the root there with its slope.
-        """
+        """The same of ``smoothed`` outputs' errors, (n,)."""
         with np.errstate(over="ignore", invalid="ignore"):
-            smooth = np.where(rms > floor, rms, 0.5 * (rms**2 / floor + floor))
-        return self._mean(smooth)
+            return self.error_of(smoothed(rms, floor))
 
     @property
     def n_residuals(self) -> int:
@@ -157,7 +166,7 @@ class Objective:
         return int(sum(record.outputs.size for record in self.records))
 
     def least_squares_weights(self, residual: FloatArray) -> FloatArray:
-        """Weights of squared residuals whose sum is least where the error is, (n_outputs,).
+        """Weights of squared residuals whose mean is least where the error is, (n_outputs,).
 
         residual: (n_residuals, n_outputs), at that minimum. Half the second derivative of the
         error is that of the weighted mean square.
@@ -165,6 +174,11 @@ class Objective:
         counts, rms = np.maximum(self.counts, 1), self._roots(np.sum(residual**2, axis=0))
         weights: FloatArray = self.weights * len(residual) / counts / np.maximum(rms, 1e-12)
         return weights
+
+    def _with(self, **changes: Any) -> Objective:
+        variant = copy.copy(self)
+        vars(variant).update(changes)
+        return variant
 
     def _starts(self, chromosomes: FloatArray) -> list[FloatArray]:
         """Initial states of every chromosome for each record."""
@@ -179,15 +193,9 @@ class Objective:
         roots: FloatArray = np.sqrt(sse / np.maximum(self.counts, 1))
         return roots
 
-    def _mean(self, rms: FloatArray) -> FloatArray:
-        """The error of the outputs' errors, (n,), infinite where one is not finite."""
-        with np.errstate(over="ignore", invalid="ignore"):  # infinite times a weight of zero
-            errors = rms @ self.weights
-        return np.where(np.isfinite(errors), errors, np.inf)
-
 
 def _balanced(scales: list[FloatArray], counts: IntArray, balance: Balance) -> list[FloatArray]:
-    """Divisors of residuals under which the mean over all samples is the one asked for.
+    """Divisors of the residuals under which the mean over all samples is the balanced one.
 
     counts: (n_records, n_outputs), measured samples.
     """
@@ -195,7 +203,7 @@ def _balanced(scales: list[FloatArray], counts: IntArray, balance: Balance) -> l
         return scales
     if balance != "logs":
         raise ModelError(f"unknown balance {balance!r}; choose samples or logs")
-    # A log's share of the samples over its share of the logs that saw the output.
+    # A record's share of the samples over its share of the records that saw the output.
     share = counts * np.sum(counts > 0, axis=0) / np.maximum(counts.sum(axis=0), 1)
     return [
         scale * np.sqrt(np.where(n > 0.0, n, 1.0)) for scale, n in zip(scales, share, strict=True)

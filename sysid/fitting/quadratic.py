@@ -1,32 +1,61 @@
-"""The quadratic around a point of a descent, and the damped steps that lead down it."""
+"""The quadratic that bounds the error around a point, and the damped steps down it.
+
+With r_j the outputs' errors at the point, f the floor below which they are smoothed and
+m_j = max(r_j, f), the smoothed error E_f of a step d is bounded from above by a sum of squares
+that touches it at d = 0 (majorisation: Hunter & Lange, "A tutorial on MM algorithms", The American
+Statistician 58, 2004):
+
+    E_f(d) <= sum_j w_j (r_j(d)^2 / m_j + m_j) / 2
+
+Its fixed point is the minimum of the mean RMSE rather than of the plain sum of squares. With
+e_j(d) = e_j + J_j d, the columns of J_j being differences of simulations (Gauss-Newton):
+
+    E_f(d) ~ E_f + g'd + d'H d / 2
+    H = sum_j c_j J_j' J_j        g = sum_j c_j J_j' e_j        c_j = w_j / (n_j m_j)
+
+A step damped by lambda solves (Marquardt, "An algorithm for least-squares estimation of nonlinear
+parameters", Journal of the SIAM 11, 1963)
+
+    (H + lambda D) d = -g        D = diag H
+
+between the bounds of the ranges; one that would cross constraints slides along them. What the
+quadratic promises to gain is the share -(g'd + d'H d / 2) / E_f. Steps and slopes are in parts of
+the ranges.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from sysid.arrays import FloatArray, IntArray
+from sysid.arrays import BoolArray, FloatArray, IntArray
 from sysid.fitting.constraints import Constraints
-from sysid.fitting.objective import Objective, Responses
+from sysid.fitting.objective import Objective, Responses, smoothed
+from sysid.problem.space import SearchSpace
 
-_HOLDING_ROUNDS = 4  # in which what a bound stops is held there and the rest goes on
+# The values of lambda that are tried, in parts of the middle one.
+_FACTORS = 5.0 ** np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
+CANDIDATES = len(_FACTORS)
+FIRST_DAMPING = 1e-2
+_LEAST_DAMPING, _MOST_DAMPING = 1e-14, 1e6
+_HOLDING_ROUNDS = 4  # in which the coordinates that hit a bound are held there
+# A step that ends where a limit is violated is shortened so often, each time to this part.
+_SHORTENINGS, _SHORTER = 6, 0.4
 
 
 @dataclass(frozen=True)
 class Quadratic:
-    """The quadratic around a point: Hessian (n_free, n_free), gradient (n_free,), value.
-
-    Coordinates in units of the ranges.
-    """
+    """H (n_free, n_free), g (n_free,) and the smoothed error E_f at the point."""
 
     hessian: FloatArray
     gradient: FloatArray
-    value: float
+    error: float
 
     @property
     def leads_somewhere(self) -> bool:
-        """Whether it is one, and not flat."""
+        """Whether it is finite and not flat; slopes at the edge of stability may overflow."""
         finite = np.isfinite(self.hessian).all() and np.isfinite(self.gradient).all()
         return bool(finite and np.diag(self.hessian).max() > 0.0)
 
@@ -34,52 +63,129 @@ class Quadratic:
 def quadratic_at(
     objective: Objective, around: Responses, distance: FloatArray, floor: float
 ) -> Quadratic:
-    """The quadratic that bounds the smoothed error from above.
+    """The quadratic around a point, with outputs' errors smoothed below ``floor``.
 
-    around: responses of the point and its neighbours, at distances (n_free,) from it.
+    around: responses of the point and its neighbours, which are at distances (n_free,) from it.
     """
     rms, weights = around.rms[0], objective.weights
-    share = weights / (np.maximum(rms, floor) * np.maximum(objective.counts, 1))
+    c = weights / (np.maximum(rms, floor) * np.maximum(objective.counts, 1))
     counted = np.flatnonzero(weights > 0.0)
     with np.errstate(over="ignore", invalid="ignore"):
         changes = around.values[..., 1:] - around.values[..., :1]
-        hessian, gradient = _summed(changes, around.values[..., 0], share, counted)
+        hessian, gradient = _summed(changes, around.values[..., 0], c, counted)
         if not np.all(np.isfinite(gradient)):
             changes = np.where(np.isfinite(changes), changes, 0.0)
-            hessian, gradient = _summed(changes, around.values[..., 0], share, counted)
+            hessian, gradient = _summed(changes, around.values[..., 0], c, counted)
         hessian, gradient = hessian / np.outer(distance, distance), gradient / distance
-    value = float(np.where(rms > floor, rms, 0.5 * (rms**2 / floor + floor)) @ weights)
-    return Quadratic(hessian, gradient, value)
+    return Quadratic(hessian, gradient, float(smoothed(rms, floor) @ weights))
 
 
 def _summed(
-    changes: FloatArray, residual: FloatArray, share: FloatArray, counted: IntArray
+    changes: FloatArray, residual: FloatArray, c: FloatArray, counted: IntArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Hessian and gradient of the outputs that count, each by its share."""
+    """Sums of c_j J_j' J_j and of c_j J_j' e_j over the outputs that count."""
     n = changes.shape[2]
     hessian, gradient = np.zeros((n, n)), np.zeros(n)
     for j in counted:
         rows = changes[:, j]
-        hessian += share[j] * (rows.T @ rows)
-        gradient += share[j] * (residual[:, j] @ rows)
+        hessian += c[j] * (rows.T @ rows)
+        gradient += c[j] * (residual[:, j] @ rows)
     return hessian, gradient
 
 
-def damped_steps(
-    hessian: FloatArray, gradient: FloatArray, damping: FloatArray, low: FloatArray,
-    high: FloatArray,
-) -> FloatArray:  # fmt: skip
+@dataclass(frozen=True)
+class Candidates:
+    """Coordinates that may follow a point, (n, n_free), and the damping of the steps there, (n,).
+
+    promise: share of the error that the quadratic's own minimum would take away.
+    """
+
+    coordinates: FloatArray
+    damping: FloatArray
+    promise: float
+
+    def worth(self, tolerance: float) -> bool:
+        """Whether they promise more than a share of the error."""
+        return len(self.coordinates) > 0 and not self.promise <= tolerance
+
+
+def candidates(
+    space: SearchSpace, at: FloatArray, damping: FloatArray, quadratics: Sequence[Quadratic]
+) -> list[Candidates]:
+    """Candidates of several points, within the ranges and the constraints.
+
+    at: (m, n_free), search coordinates of the points; damping: (m,), the middle lambda of each.
+    """
+    if not quadratics:
+        return []
+    hessian = np.stack([quadratic.hessian for quadratic in quadratics])
+    gradient = np.stack([quadratic.gradient for quadratic in quadratics])[:, :, None]
+    (lower, upper), width = space.coded_bounds, space.width
+    at = at[:, None]
+    low, high = (lower - at) / width, (upper - at) / width
+    # The last one is for the promise.
+    lambdas = np.clip(damping[:, None] * np.append(_FACTORS, 0.0), _LEAST_DAMPING, _MOST_DAMPING)
+    diagonal = np.diagonal(hessian, axis1=1, axis2=2)
+    scale = np.maximum(diagonal, 1e-12 * diagonal.max(axis=1, keepdims=True))
+    added = lambdas[:, :, None] * scale[:, None]
+    steps = _damped(hessian, gradient, added, low, high)
+    beyond = _infeasible(space, at + steps * width)
+    if beyond.any() and space.model.constraints:
+        for k in np.flatnonzero(beyond.any(axis=1)).tolist():
+            limits = Constraints.at(space, at[k, 0], width)
+            for j in np.flatnonzero(beyond[k]).tolist():
+                curvature = hessian[k] + np.diag(added[k, j])
+                steps[k, j] = _slid(limits, steps[k, j], curvature, low[k, 0], high[k, 0])
+    for _ in range(_SHORTENINGS):
+        if not beyond.any():
+            break
+        beyond[beyond] = _infeasible(space, (at + steps * width)[beyond])
+        steps[beyond] *= _SHORTER
+    coordinates = np.clip(at + steps * width, lower, upper)
+    gained = -(steps @ gradient)[..., 0] - 0.5 * np.sum((steps @ hessian) * steps, axis=2)
+    promises = gained / np.array([quadratic.error for quadratic in quadratics])[:, None]
+    kept = ~beyond & (promises > 0.0)
+    return [
+        Candidates(coordinates[k, :-1][kept[k, :-1]], lambdas[k, :-1][kept[k, :-1]], promise)
+        for k, promise in enumerate(promises.max(axis=1).tolist())
+    ]
+
+
+def lighter(damping: float) -> float:
+    """The next middle lambda after a gain by the given one."""
+    return _limited(damping / np.sqrt(_FACTORS[-1]))
+
+
+def heavier(damping: float) -> float:
+    """The next middle lambda after no gain around the given one."""
+    return _limited(damping * _FACTORS[-1] / _FACTORS[0])
+
+
+def _limited(damping: float) -> float:
+    return float(min(max(damping, _LEAST_DAMPING), _MOST_DAMPING))
+
+
+def _infeasible(space: SearchSpace, coordinates: FloatArray) -> BoolArray:
+    """Which coordinates (..., n_free) violate a constraint or a physical limit, (...)."""
+    violations = space.violations(space.decode(coordinates.reshape(-1, coordinates.shape[-1])))
+    mask: BoolArray = np.any(violations > 0.0, axis=1).reshape(coordinates.shape[:-1])
+    return mask
+
+
+def _damped(
+    hessian: FloatArray, gradient: FloatArray, added: FloatArray, low: FloatArray, high: FloatArray
+) -> FloatArray:
     """Minima of damped quadratics between bounds on the step, by holding what hits them.
 
-    hessian: (m, n_free, n_free), gradient: (m, n_free, 1); damping: (m, n, n_free), so many steps
-    of each; low, high: (m, 1, n_free).
+    hessian: (m, n_free, n_free), gradient: (m, n_free, 1); added: (m, n, n_free), lambda D of n
+    steps of each; low, high: (m, 1, n_free).
     """
     down = -gradient[:, None, :, 0]
     # A direction held by a bound and pushed against it would only shorten the step.
     pushed = ((low >= 0.0) & (down < 0.0)) | ((high <= 0.0) & (down > 0.0))
-    held = np.repeat(pushed, damping.shape[1], axis=1)
-    moves = np.zeros(damping.shape)
-    diagonal = np.arange(damping.shape[2])
+    held = np.repeat(pushed, added.shape[1], axis=1)
+    steps = np.zeros(added.shape)
+    diagonal = np.arange(added.shape[2])
     live = np.arange(len(hessian))
     for _ in range(_HOLDING_ROUNDS):
         if len(live) == 0:
@@ -87,20 +193,20 @@ def damped_steps(
         stay = held[live]
         # A held coordinate's row says that it moves as far as it does.
         systems = np.where(stay[..., None], 0.0, hessian[live, None])
-        systems[..., diagonal, diagonal] += np.where(stay, 1.0, damping[live])
-        found = _solved(systems, np.where(stay, moves[live], down[live]))
-        out = ~stay & ((found < low[live]) | (found > high[live]))
-        moves[live] = np.clip(found, low[live], high[live])
+        systems[..., diagonal, diagonal] += np.where(stay, 1.0, added[live])
+        solutions = _solved(systems, np.where(stay, steps[live], down[live]))
+        out = ~stay & ((solutions < low[live]) | (solutions > high[live]))
+        steps[live] = np.clip(solutions, low[live], high[live])
         held[live] |= out
         live = live[out.any(axis=(1, 2))]
-    return np.where(np.isfinite(moves), moves, 0.0)
+    return np.where(np.isfinite(steps), steps, 0.0)
 
 
 def _solved(systems: FloatArray, right: FloatArray) -> FloatArray:
-    """Solutions (m, n, n_free) of linear systems, NaN for all of one of the m with a singular."""
+    """Solutions (m, n, n_free) of linear systems, NaN for all n where one of them is singular."""
     try:
-        found: FloatArray = np.linalg.solve(systems, right[..., None])[..., 0].astype(np.float64)
-        return found
+        solutions: FloatArray = np.linalg.solve(systems, right[..., None])[..., 0].astype(float)
+        return solutions
     except np.linalg.LinAlgError:
         if len(systems) == 1:
             return np.full(right.shape, np.nan)
@@ -108,15 +214,14 @@ def _solved(systems: FloatArray, right: FloatArray) -> FloatArray:
     return np.concatenate([_solved(system, side) for system, side in pairs])
 
 
-def slid_within(
-    limits: Constraints, move: FloatArray, curvature: FloatArray, low: FloatArray,
-    high: FloatArray,
-) -> FloatArray:  # fmt: skip
-    """A move that slides along the constraints it would cross, bounds kept."""
-    between = (move > low) & (move < high)
+def _slid(
+    limits: Constraints, step: FloatArray, curvature: FloatArray, low: FloatArray, high: FloatArray
+) -> FloatArray:
+    """A step that slides along the constraints it would cross, bounds kept."""
+    between = (step > low) & (step < high)
     free, held = np.flatnonzero(between), ~between
-    rest = Constraints(limits.value + limits.slope[:, held] @ move[held], limits.slope)
+    rest = Constraints(limits.value + limits.slope[:, held] @ step[held], limits.slope)
     inverse: FloatArray = np.linalg.inv(curvature[np.ix_(free, free)]).astype(np.float64)
-    slid = move.copy()
-    slid[free] = rest.among(free).nearest(move[free], inverse)
+    slid = step.copy()
+    slid[free] = rest.among(free).nearest(step[free], inverse)
     return np.clip(slid, low, high)

@@ -1,56 +1,55 @@
 """Local refinement: Levenberg-Marquardt descents, several in one batch of simulations.
 
-Each iteration of all descents under way takes two batches: perturbed chromosomes for the
-sensitivities, then candidates of a few damping values. A descent's course depends on nothing
-but itself. Sensitivities that do not keep what they promise are taken anew from larger
-perturbations: equations that switch, such as dry friction, are steps and plateaus to small ones.
+An iteration of a descent at x, in search coordinates, takes two batches of simulations:
+
+    1. x and its neighbours x + h_k e_k give the quadratic around x (see ``quadratic``): its
+       Hessian H, slope g, and the share of the error that it promises to take away.
+    2. Candidates x + d(lambda), (H + lambda D) d = -g, of five values of lambda around the last
+       one. The best is the next x if it gains anything; lambda falls to a fifth of its own then,
+       and rises 625-fold if none gains.
+
+Integration steps are chosen for x, are the same for all that is simulated around it, so that
+differences are those of the parameters alone, and are chosen anew when x has moved far. A descent
+has arrived when the quadratic promises no more than a tolerance, or no more is gained; what it
+does then, and where it stalls otherwise, are the strategies of ``recovery``.
+
+The method is Levenberg's ("A method for the solution of certain non-linear problems in least
+squares", Quarterly of Applied Mathematics 2, 1944) as scaled by Marquardt (1963). A descent's
+course depends on nothing but itself, whatever others share its batches.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sysid.arrays import BoolArray, FloatArray, IntArray
-from sysid.fitting.constraints import Constraints
+from sysid.arrays import FloatArray
+from sysid.fitting.descent import FLOORS, PERTURBATIONS, Descent, Integration, Point
 from sysid.fitting.objective import Objective, Responses
-from sysid.fitting.quadratic import Quadratic, damped_steps, quadratic_at, slid_within
+from sysid.fitting.quadratic import (
+    CANDIDATES,
+    Candidates,
+    Quadratic,
+    candidates,
+    heavier,
+    lighter,
+    quadratic_at,
+)
+from sysid.fitting.recovery import NOTHING, PATIENCE, Stall, recovered
+from sysid.problem.space import SearchSpace
 
-# Candidates of an iteration: damping values around the last one that served.
-_FACTORS = 5.0 ** np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
-CANDIDATES = len(_FACTORS)
-_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-2, 1e-14, 1e6
-# Parts of the ranges by which coordinates are moved to see what that does. The first is for what
-# is smooth. Where something switches (dry friction, an overflow) the instant of switching moves in
-# steps of the integration, and only a larger move shows what it depends on.
-_PERTURBATIONS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
-_COARSEST = len(_PERTURBATIONS) - 1
-# Sensitivities promise a gain. They are too fine, or too coarse, where less than this share of it
-# comes; a promise of less than _NOTHING of the error says that there is nothing to be gained.
-_KEPT = 0.02
-_NOTHING = 1e-3
-_PATIENCE = 3  # iterations that do not keep their promise, the later ones with more damping
-# An output that is explained better than this share of the error counts by its square, which is
-# smooth: the error itself has a crease where an output is explained exactly, and descents would
-# stop on it. One that has arrived goes on with the next smaller share.
-_SMOOTHING = (1e-1, 1e-2, 1e-3)
 ROUNDING = 1e-12  # errors below it are those of the arithmetic
-# After moves of more than this part of a range the integration steps are chosen anew.
-_FAR = 0.05
-_NEAR = 1e-3  # for the last time
-# A neighbour whose outputs err by so many times their size more than the descent's has left a
-# simulation at the edge of stability: so many times the steps are taken.
-_BURST, _STEADIER, _BRACINGS = 10.0, 1.5, 3
-_RETREAT, _RETREATS = 0.4, 6
+_KEPT = 0.02  # share of the promise below which a gain counts as a failure
+_FAR = 0.05  # parts of the ranges; after longer moves the integration steps are chosen anew
+_BURST = 10.0  # a neighbour's error that is so much larger has left the edge of stability
 _BATCH_BYTES = 2**28  # residuals held at once, unless one descent needs more
 
 
 @dataclass(frozen=True)
 class Refinement:
-    """Refined chromosome (n_free,), its error, each output's, and the iterations it took.
+    """Refined chromosome (n_free,), its error, the outputs' errors, and iterations taken.
 
     rms: (n_outputs,), by a simulation with the steps that the chromosome needs; infinite where
     it needs more than it is allowed.
@@ -62,43 +61,6 @@ class Refinement:
     iterations: int
 
 
-@dataclass(frozen=True)
-class Descent:
-    """One descent between two iterations; ``advance`` returns the next.
-
-    at: search coordinates (n_free,). error: the objective there, infinite before the first
-    iteration; rms: (n_outputs,), the outputs' errors, by a simulation whose error estimate is
-    ``excess`` times what the accuracy allows. gain: part of the error that the last iteration
-    took away. steps: integration steps per sample of each record, chosen at ``steps_at``, None
-    where they are to be chosen; braced: how often they have been raised since, for the sake of
-    the sensitivities. sure, sure_error: where they were last chosen and a simulation succeeded,
-    and the error there; further on they may not do, until the descent has finished.
-    """
-
-    at: FloatArray
-    error: float = np.inf
-    rms: FloatArray | None = None
-    excess: float = np.inf
-    gain: float = 0.0
-    steps: tuple[int, ...] = ()
-    steps_at: FloatArray | None = None
-    damping: float = _FIRST_DAMPING
-    level: int = 0
-    braced: int = 0
-    error_of_round: float = np.inf
-    smoothing: int = 0
-    failures: int = 0
-    iterations: int = 0
-    finished: bool = False
-    sure: FloatArray | None = None
-    sure_error: float = np.inf
-
-    @property
-    def shown(self) -> FloatArray | None:
-        """``rms`` where its simulation had the steps that it needs."""
-        return self.rms if self.excess <= 1.0 else None
-
-
 def refine(
     objective: Objective,
     chromosome: FloatArray,
@@ -107,21 +69,19 @@ def refine(
     tolerance: float = 1e-7,
     on_iteration: Callable[[Refinement], None] | None = None,
 ) -> Refinement:
-    """Minimise the objective from ``chromosome`` within the ranges and constraints.
+    """Minimise the objective from ``chromosome`` (n_free,) within the ranges and constraints.
 
-    Ends when an iteration improves the error by less than ``tolerance`` of it, or could not,
-    and larger perturbations promise no more. The outputs are re-weighted by the inverse root of
-    their current error, whose fixed point is the minimum of the mean RMSE rather than of the
-    plain sum of squares.
+    tolerance: share of the error, of a promise or a gain no larger than which a descent has
+    arrived.
     """
-    space = objective.space
     descent = begin(objective, chromosome)
     while not descent.finished and descent.iterations < max_iterations:
         (descent,) = advance(objective, [descent], tolerance)
-        if on_iteration is not None and descent.rms is not None and np.isfinite(descent.error):
-            at = space.decode(descent.at)
-            on_iteration(Refinement(at, descent.error, descent.rms, descent.iterations))
-    return _refined(objective, [descent])[0]
+        point = descent.point
+        if on_iteration is not None and point.rms is not None and np.isfinite(point.error):
+            at = objective.space.decode(point.at)
+            on_iteration(Refinement(at, point.error, point.rms, descent.iterations))
+    return _refinements(objective, [descent])[0]
 
 
 def refine_each(
@@ -134,7 +94,7 @@ def refine_each(
 ) -> list[Refinement]:
     """The same from each of several chromosomes (n_free,), side by side in the same batches.
 
-    enough: of where a descent has come to, (n_free,), whether it need not go on.
+    enough: whether a descent that has come to a chromosome (n_free,) need not go on.
     """
     descents = [begin(objective, chromosome) for chromosome in chromosomes]
     for _ in range(max_iterations):
@@ -142,32 +102,30 @@ def refine_each(
             break
         descents = advance(objective, descents, tolerance)
         for i, descent in enumerate(descents):
-            if not descent.finished and enough(objective.space.decode(descent.at)):
+            if not descent.finished and enough(objective.space.decode(descent.point.at)):
                 descents[i] = replace(descent, finished=True)
-    return _refined(objective, descents)
+    return _refinements(objective, descents)
 
 
-def _refined(objective: Objective, descents: list[Descent]) -> list[Refinement]:
-    """Where descents have come to, simulated once more where their steps may not have done."""
+def _refinements(objective: Objective, descents: list[Descent]) -> list[Refinement]:
+    """The descents' ends, simulated once more where their integration steps may not have done."""
     if not descents:
         return []
-    chromosomes = objective.space.decode(np.stack([descent.at for descent in descents]))
-    unsure = [i for i, descent in enumerate(descents) if descent.shown is None]
-    anew = iter(objective.rms(chromosomes[unsure])) if unsure else iter(())
+    points = [descent.point for descent in descents]
+    chromosomes = objective.space.decode(np.stack([point.at for point in points]))
+    lacking = [i for i, point in enumerate(points) if point.accurate_rms is None]
+    anew = iter(objective.rms(chromosomes[lacking]) if lacking else ())
+    errors = [next(anew) if p.accurate_rms is None else p.accurate_rms for p in points]
     return [
-        Refinement(
-            chromosome,
-            descent.error,
-            next(anew) if descent.shown is None else descent.shown,
-            descent.iterations,
-        )
-        for chromosome, descent in zip(chromosomes, descents, strict=True)
+        Refinement(chromosome, descent.point.error, rms, descent.iterations)
+        for chromosome, descent, rms in zip(chromosomes, descents, errors, strict=True)
     ]
 
 
 def begin(objective: Objective, chromosome: FloatArray) -> Descent:
     """A descent from a chromosome (n_free,), moved to the nearest point within the ranges."""
-    return Descent(np.clip(objective.space.encode(chromosome), *objective.space.coded_bounds))
+    space = objective.space
+    return Descent(Point(np.clip(space.encode(chromosome), *space.coded_bounds)))
 
 
 def simulations_per_iteration(objective: Objective) -> int:
@@ -178,303 +136,169 @@ def simulations_per_iteration(objective: Objective) -> int:
 def curvature(objective: Objective, at: FloatArray) -> FloatArray:
     """Gauss-Newton Hessian of the error at search coordinates (n_free,), (n_free, n_free).
 
-    Coordinates in units of the ranges.
+    Coordinates in parts of the ranges.
     """
-    frame = _Frame(objective)
-    descents = frame.with_steps([Descent(at)])
-    rows, distance = frame.perturbed(descents[0])
-    (around,) = frame.responses(descents, [rows])
-    error = float(objective.error_of(around.rms[:1])[0])
-    return quadratic_at(objective, around, distance, _SMOOTHING[0] * error).hessian
+    (descent,) = _with_steps(objective, [Descent(Point(at))])
+    (around,) = _responses(objective, [descent], [_neighbourhood(objective.space, descent)])
+    floor = FLOORS[0] * float(objective.error_of(around.rms[:1])[0])
+    return quadratic_at(objective, around, _distance(objective.space, descent), floor).hessian
 
 
 def advance(
     objective: Objective, descents: Sequence[Descent], tolerance: float = 1e-7
 ) -> list[Descent]:
-    """One iteration of each descent that has not finished."""
-    frame = _Frame(objective)
-    result = list(descents)
+    """The descents after one iteration of each that has not finished."""
+    onward = list(descents)
     live = [i for i, descent in enumerate(descents) if not descent.finished]
-    started = dict(zip(live, frame.with_steps([result[i] for i in live]), strict=True))
-    per_batch = max(1, _BATCH_BYTES // (8 * objective.n_residuals * (len(frame.width) + 1)))
+    ready = _with_steps(objective, [descents[i] for i in live])
+    residuals_each = objective.n_residuals * (1 + len(objective.space.parameters))
+    per_batch = max(1, _BATCH_BYTES // (8 * residuals_each))
     for first in range(0, len(live), per_batch):
-        now = live[first : first + per_batch]
-        moved = _iterate(frame, [started[i] for i in now], tolerance)
-        for i, descent in zip(now, moved, strict=True):
-            result[i] = descent
-    return result
+        batch = slice(first, first + per_batch)
+        iterated = _iterated(objective, ready[batch], tolerance)
+        for i, descent in zip(live[batch], iterated, strict=True):
+            onward[i] = descent
+    return onward
 
 
-class _Frame:
-    """The objective in search coordinates, for batches of descents at steps of their own."""
-
-    def __init__(self, objective: Objective) -> None:
-        space = objective.space
-        self.objective = objective
-        self.lower, self.upper = space.coded_bounds
-        self.width = space.width
-
-    def with_steps(self, descents: list[Descent]) -> list[Descent]:
-        """The descents with integration steps chosen where they lack them."""
-        lacking = [i for i, descent in enumerate(descents) if descent.steps_at is None]
-        if lacking:
-            rows = np.stack([descents[i].at for i in lacking])
-            chosen = self.objective.steps_needed(self.objective.space.decode(rows))
-            for i, steps in zip(lacking, chosen, strict=True):
-                own = tuple(int(n) for n in steps)
-                descents[i] = replace(descents[i], steps=own, steps_at=descents[i].at, braced=0)
-        return descents
-
-    def finer_steps(self, descent: Descent) -> tuple[int, ...]:
-        """The descent's steps, or more of them where it has come to need more."""
-        at = descent.steps_at
-        if at is not None and np.all(np.abs(descent.at - at) <= _NEAR * self.width):
-            return descent.steps
-        needed = self.objective.steps_needed(self.objective.space.decode(descent.at[None]))[0]
-        return tuple(max(int(n), have) for n, have in zip(needed, descent.steps, strict=True))
-
-    def responses(
-        self, descents: list[Descent], rows: list[FloatArray], *, keep: bool = True
-    ) -> list[Responses]:
-        """Responses of each descent's rows of coordinates, all in one batch."""
-        if not rows:
-            return []
-        order, chromosomes, steps = self._together(descents, rows)
-        found = self.objective.residuals(chromosomes, steps, keep=keep)
-        parts: dict[int, Responses] = {}
-        first = 0
-        for i in order:
-            own = slice(first, first + len(rows[i]))
-            parts[i] = Responses(found.values[..., own], found.rms[own], found.excess[own])
-            first = own.stop
-        return [parts[i] for i in range(len(rows))]
-
-    def _together(
-        self, descents: list[Descent], rows: list[FloatArray]
-    ) -> tuple[list[int], FloatArray, IntArray]:
-        """An order in which descents of like steps are neighbours, their chromosomes and steps."""
-        order = sorted(range(len(rows)), key=lambda i: descents[i].steps)
-        steps = np.repeat(
-            np.array([descents[i].steps for i in order]), [len(rows[i]) for i in order], axis=0
-        )
-        together = np.concatenate([rows[i] for i in order])
-        return order, self.objective.space.decode(together), steps
-
-    def perturbed(self, descent: Descent) -> tuple[FloatArray, FloatArray]:
-        """The descent's point and its neighbours, (1 + n_free, n_free), and their distances."""
-        h = _PERTURBATIONS[descent.level]
-        # Away from the nearer bound, so that the perturbed chromosome stays in range.
-        distance = np.where(descent.at + h * self.width > self.upper, -h, h)
-        return np.vstack([descent.at, descent.at + np.diag(distance * self.width)]), distance
-
-    def infeasible(self, rows: FloatArray) -> BoolArray:
-        """Which rows (..., n_free) violate a constraint or a physical limit, (...)."""
-        space = self.objective.space
-        violations = space.violations(space.decode(rows.reshape(-1, rows.shape[-1])))
-        mask: BoolArray = np.any(violations > 0.0, axis=1).reshape(rows.shape[:-1])
-        return mask
+def _iterated(objective: Objective, descents: list[Descent], tolerance: float) -> list[Descent]:
+    """The descents, whose integration steps are chosen, after one iteration."""
+    space = objective.space
+    neighbourhoods = [_neighbourhood(space, descent) for descent in descents]
+    around = _responses(objective, descents, neighbourhoods)
+    surveys = [_surveyed(objective, *pair) for pair in zip(descents, around, strict=True)]
+    onward = [descent for descent, _ in surveys]
+    quadratics = {i: quadratic for i, (_, quadratic) in enumerate(surveys) if quadratic}
+    at = np.array([onward[i].point.at for i in quadratics])
+    damping = np.array([onward[i].damping for i in quadratics])
+    offers = dict(
+        zip(quadratics, candidates(space, at, damping, list(quadratics.values())), strict=True)
+    )
+    for i in [i for i, offer in offers.items() if not offer.worth(tolerance)]:
+        onward[i] = _resumed(objective, onward[i], Stall.ARRIVED)
+        del offers[i]
+    rows = [offer.coordinates for offer in offers.values()]
+    ends = _responses(objective, [onward[i] for i in offers], rows, keep=False)
+    for (i, offer), responses in zip(offers.items(), ends, strict=True):
+        onward[i] = _judged(objective, onward[i], offer, responses, tolerance)
+    return onward
 
 
-@dataclass(frozen=True)
-class _Candidates:
-    """Rows (n, n_free) that may follow, with their damping.
+def _surveyed(
+    objective: Objective, descent: Descent, around: Responses
+) -> tuple[Descent, Quadratic | None]:
+    """The descent with its point's error, and the quadratic there unless it stalls or ends.
 
-    promise: part of the error that a step without damping would take away, were all linear.
+    around: responses of the point and its neighbours.
     """
-
-    rows: FloatArray
-    damping: FloatArray
-    promise: float
-
-
-@dataclass(frozen=True)
-class _Sensed:
-    """A descent and the quadratic around it; place: among those that are moved together."""
-
-    place: int
-    descent: Descent
-    equations: Quadratic
-
-
-def _iterate(frame: _Frame, descents: list[Descent], tolerance: float) -> list[Descent]:
-    result: list[Descent | None] = [None] * len(descents)
-    around = [frame.perturbed(descent) for descent in descents]
-    responses = frame.responses(descents, [rows for rows, _ in around])
-    sensed: list[_Sensed] = []
-    for i, descent in enumerate(descents):
-        moved = _sensed(frame, i, descent, responses[i], around[i][1])
-        if isinstance(moved, Descent):
-            result[i] = moved
-        else:
-            sensed.append(moved)
-    tried: list[tuple[_Sensed, _Candidates]] = []
-    for one, candidates in zip(sensed, _candidates(frame, sensed), strict=True):
-        if len(candidates.rows) == 0 or candidates.promise <= tolerance:
-            result[one.place] = _next_round(frame, one.descent)
-        else:
-            tried.append((one, candidates))
-    ends = frame.responses(
-        [one.descent for one, _ in tried], [found.rows for _, found in tried], keep=False
-    )
-    for (one, candidates), found in zip(tried, ends, strict=True):
-        result[one.place] = _judged(frame, one.descent, candidates, found, tolerance)
-    return [descent for descent in result if descent is not None]
-
-
-def _sensed(
-    frame: _Frame, place: int, descent: Descent, around: Responses, distance: FloatArray
-) -> _Sensed | Descent:
-    """What the neighbours of a descent tell; or the descent where they do not help it on."""
-    errors = frame.objective.error_of(around.rms)
-    error = float(errors[0])
+    errors = objective.error_of(around.rms)
+    at, error = descent.point.at, float(errors[0])
     if not np.isfinite(error):
-        # With more steps the simulation fails.
-        return _back(descent)
-    at = replace(
+        return _resumed(objective, descent, Stall.FAILED), None
+    steps_at = descent.integration.steps_at
+    safe = steps_at is not None and np.array_equal(at, steps_at)
+    descent = replace(
         descent,
-        error=error,
-        rms=around.rms[0],
-        excess=float(around.excess[0]),
+        point=Point(at, error, around.rms[0], float(around.excess[0])),
+        safe=Point(at, error) if safe else descent.safe,
         gain=0.0,
         iterations=descent.iterations + 1,
     )
-    if at.steps_at is not None and np.array_equal(at.at, at.steps_at):
-        at = replace(at, sure=at.at, sure_error=error)
     if error <= ROUNDING:
-        return replace(at, finished=True)
+        return replace(descent, finished=True), None
     burst = ~(errors[1:] <= _BURST + error)
-    if burst.any() and at.braced < _BRACINGS:
-        return _steadier(at)
-    # Where more steps do not help it is the model that is unbounded there: not that way.
     if burst.any():
+        braced = recovered(objective, descent, Stall.BURST)
+        if braced is not None:
+            return braced, None
+        # The rest of the parameters go on alone.
         around.values[..., 1:][..., burst] = around.values[..., :1]
-    if not np.isfinite(at.error_of_round):
-        at = replace(at, error_of_round=error)
-    floor = _SMOOTHING[at.smoothing] * error
-    equations = quadratic_at(frame.objective, around, distance, floor)
-    return _Sensed(place, at, equations)
-
-
-def _back(descent: Descent) -> Descent:
-    """Back from where a simulation fails with the steps it needs, to try more damping."""
-    if descent.sure is None:
-        return replace(descent, error=np.inf, rms=None, excess=np.inf, finished=True)
-    return replace(
-        descent,
-        at=descent.sure,
-        error=descent.sure_error,
-        rms=None,
-        excess=np.inf,
-        gain=0.0,
-        steps_at=None,
-        damping=_limited(descent.damping * _FACTORS[-1] / _FACTORS[0]),
-        failures=descent.failures + 1,
-        iterations=descent.iterations + 1,
-        finished=descent.failures + 1 >= _PATIENCE,
-    )
-
-
-def _steadier(descent: Descent) -> Descent:
-    """With more integration steps: those it has serve its simulation, not its neighbours'."""
-    more = tuple(math.ceil(_STEADIER * steps) for steps in descent.steps)
-    return replace(descent, steps=more, braced=descent.braced + 1)
+    if not np.isfinite(descent.error_of_round):
+        descent = replace(descent, error_of_round=error)
+    distance = _distance(objective.space, descent)
+    quadratic = quadratic_at(objective, around, distance, descent.floor)
+    if not quadratic.leads_somewhere:
+        return _resumed(objective, descent, Stall.ARRIVED), None
+    return descent, quadratic
 
 
 def _judged(
-    frame: _Frame, descent: Descent, candidates: _Candidates, found: Responses, tolerance: float
+    objective: Objective, descent: Descent, offer: Candidates, ends: Responses, tolerance: float
 ) -> Descent:
-    """The descent after its candidates have been simulated."""
-    assert descent.rms is not None
-    objective, rms = frame.objective, np.stack([descent.rms, *found.rms])
-    floor = _SMOOTHING[descent.smoothing] * descent.error
-    before, *errors = objective.smoothed_error_of(rms, floor).tolist()
+    """The descent after its candidates have been simulated, at the best of them if it gains."""
+    integration = descent.integration
+    assert descent.point.rms is not None and integration.steps_at is not None
+    rms = np.stack([descent.point.rms, *ends.rms])
+    before, *errors = objective.smoothed_error_of(rms, descent.floor).tolist()
     best = int(np.argmin(errors))
     gain = (before - errors[best]) / before
-    moved, damping = descent, descent.damping
+    damping = heavier(descent.damping)
     if gain > 0.0:
-        at = candidates.rows[best]
-        assert descent.steps_at is not None
-        far = bool(np.any(np.abs(at - descent.steps_at) > _FAR * frame.width))
-        moved = replace(
-            descent,
-            at=at,
-            error=float(objective.error_of(found.rms[best : best + 1])[0]),
-            rms=found.rms[best],
-            excess=float(found.excess[best]),
-            gain=gain,
-            steps_at=None if far else descent.steps_at,
-        )
-        damping = candidates.damping[best] / np.sqrt(_FACTORS[-1])
-    promising = candidates.promise > _NOTHING
-    poor = gain <= 0.0 or (promising and gain < _KEPT * candidates.promise)
-    if gain <= 0.0:
-        damping = descent.damping * _FACTORS[-1] / _FACTORS[0]
-    failures = descent.failures + 1 if poor else 0
-    moved = replace(moved, damping=_limited(damping), failures=failures)
-    if failures >= _PATIENCE and promising and descent.level < _COARSEST:
-        # More damping did not help: it is the sensitivities that are wrong.
-        return replace(moved, level=descent.level + 1, failures=0, damping=_FIRST_DAMPING)
-    if failures >= _PATIENCE or 0.0 < gain <= tolerance:
-        return _next_round(frame, moved)
-    return moved
+        at, damping = offer.coordinates[best], lighter(float(offer.damping[best]))
+        error = float(objective.error_of(ends.rms[best : best + 1])[0])
+        point = Point(at, error, ends.rms[best], float(ends.excess[best]))
+        if np.any(np.abs(at - integration.steps_at) > _FAR * objective.space.width):
+            integration = replace(integration, steps_at=None)
+        descent = replace(descent, point=point, integration=integration, gain=gain)
+    promising = offer.promise > NOTHING
+    failed = gain <= 0.0 or (promising and gain < _KEPT * offer.promise)
+    failures = descent.failures + 1 if failed else 0
+    descent = replace(descent, damping=damping, failures=failures)
+    if failures >= PATIENCE and promising:
+        return _resumed(objective, descent, Stall.MISLED)
+    if failures >= PATIENCE or 0.0 < gain <= tolerance:
+        return _resumed(objective, descent, Stall.ARRIVED)
+    return descent
 
 
-def _next_round(frame: _Frame, descent: Descent) -> Descent:
-    """Finished; unless what was smoothed is not yet the error, or coarse sensitivities have
-    gained, from where fine ones may go on."""
-    assert descent.rms is not None
-    rms = descent.rms[frame.objective.weights > 0.0]
-    smoothing = descent.smoothing
-    if np.any(rms < _SMOOTHING[smoothing] * descent.error) and smoothing + 1 < len(_SMOOTHING):
-        return replace(descent, smoothing=smoothing + 1, failures=0)
-    finer = frame.finer_steps(descent)
-    if finer != descent.steps:
-        return replace(descent, steps=finer, steps_at=descent.at, failures=0)
-    descent = replace(descent, steps_at=descent.at)
-    if descent.level == 0 or descent.error > (1.0 - _NOTHING) * descent.error_of_round:
-        return replace(descent, finished=True)
-    return replace(descent, level=0, failures=0, error_of_round=descent.error)
+def _resumed(objective: Objective, descent: Descent, stall: Stall) -> Descent:
+    """A stalled descent as a strategy lets it go on, or else finished."""
+    return recovered(objective, descent, stall) or replace(descent, finished=True)
 
 
-def _limited(damping: float) -> float:
-    return float(min(max(damping, _LEAST_DAMPING), _MOST_DAMPING))
+def _with_steps(objective: Objective, descents: list[Descent]) -> list[Descent]:
+    """The descents with integration steps chosen where they lack them."""
+    lacking = [i for i, descent in enumerate(descents) if descent.integration.steps_at is None]
+    if not lacking:
+        return descents
+    at = np.stack([descents[i].point.at for i in lacking])
+    ready = list(descents)
+    needed = objective.steps_needed(objective.space.decode(at)).tolist()
+    for i, steps in zip(lacking, needed, strict=True):
+        ready[i] = replace(ready[i], integration=Integration(tuple(steps), ready[i].point.at))
+    return ready
 
 
-def _candidates(frame: _Frame, sensed: list[_Sensed]) -> list[_Candidates]:
-    """Damped Gauss-Newton steps of each that keep to the ranges and constraints."""
-    n = len(frame.width)
-    found = [_Candidates(np.empty((0, n)), np.empty(0), 0.0)] * len(sensed)
-    # Sensitivities may be too large to square at the edge of instability: then stay.
-    usable = [k for k, one in enumerate(sensed) if one.equations.leads_somewhere]
-    if not usable:
-        return found
-    equations = [sensed[k].equations for k in usable]
-    hessian = np.stack([one.hessian for one in equations])
-    gradient = np.stack([one.gradient for one in equations])[:, :, None]
-    at = np.stack([sensed[k].descent.at for k in usable])[:, None]
-    low, high = (frame.lower - at) / frame.width, (frame.upper - at) / frame.width
-    last = np.array([[sensed[k].descent.damping] for k in usable])
-    damping = np.clip(last * np.append(_FACTORS, 0.0), _LEAST_DAMPING, _MOST_DAMPING)
-    diagonal = np.diagonal(hessian, axis1=1, axis2=2)
-    scale = np.maximum(diagonal, 1e-12 * diagonal.max(axis=1, keepdims=True))
-    added = damping[:, :, None] * scale[:, None]
-    moves = damped_steps(hessian, gradient, added, low, high)
-    bad = frame.infeasible(at + moves * frame.width)
-    if bad.any() and frame.objective.space.model.constraints:
-        for k in np.flatnonzero(bad.any(axis=1)).tolist():
-            limits = Constraints.at(frame.objective.space, at[k, 0], frame.width)
-            for j in np.flatnonzero(bad[k]).tolist():
-                curvature = hessian[k] + np.diag(added[k, j])
-                moves[k, j] = slid_within(limits, moves[k, j], curvature, low[k, 0], high[k, 0])
-    for _ in range(_RETREATS):
-        if not bad.any():
-            break
-        bad[bad] = frame.infeasible((at + moves * frame.width)[bad])
-        moves[bad] *= _RETREAT
-    rows = np.clip(at + moves * frame.width, frame.lower, frame.upper)
-    gained = -(moves @ gradient)[..., 0] - 0.5 * np.sum((moves @ hessian) * moves, axis=2)
-    for place, k in enumerate(usable):
-        promise = gained[place] / equations[place].value
-        kept = np.flatnonzero(~bad[place, :-1] & (promise[:-1] > 0.0))
-        found[k] = _Candidates(rows[place, kept], damping[place, kept], float(promise.max()))
-    return found
+def _distance(space: SearchSpace, descent: Descent) -> FloatArray:
+    """Distances h of the neighbours, in parts of the ranges, (n_free,)."""
+    h = PERTURBATIONS[descent.level]
+    # Away from the nearer bound, so that the perturbed chromosome stays in range.
+    return np.where(descent.point.at + h * space.width > space.coded_bounds[1], -h, h)
+
+
+def _neighbourhood(space: SearchSpace, descent: Descent) -> FloatArray:
+    """A descent's point and its neighbours, (1 + n_free, n_free)."""
+    at, distance = descent.point.at, _distance(space, descent)
+    return np.vstack([at, at + np.diag(distance * space.width)])
+
+
+def _responses(
+    objective: Objective,
+    descents: list[Descent],
+    coordinates: list[FloatArray],
+    *,
+    keep: bool = True,
+) -> list[Responses]:
+    """Responses of each descent's rows of coordinates, by its steps, all in one batch."""
+    if not descents:
+        return []
+    # Descents of like steps are neighbours, so that they share blocks of the simulation.
+    order = sorted(range(len(descents)), key=lambda i: descents[i].integration.steps)
+    counts = [len(coordinates[i]) for i in order]
+    steps = np.repeat([descents[i].integration.steps for i in order], counts, axis=0)
+    chromosomes = objective.space.decode(np.concatenate([coordinates[i] for i in order]))
+    together = objective.residuals(chromosomes, steps, keep=keep)
+    parts: dict[int, Responses] = {}
+    for i, count, end in zip(order, counts, np.cumsum(counts).tolist(), strict=True):
+        parts[i] = together.part(slice(end - count, end))
+    return [parts[i] for i in range(len(descents))]

@@ -1,8 +1,8 @@
 """The state of a search in a file, from which it goes on to the bit.
 
 A checkpoint is a NumPy archive: the arrays of the state, and JSON for all else. Beside the state
-it holds what the search was begun with, in words and hashes, so that it is never continued with
-other data, settings or equations.
+it holds the search's origin, in words and hashes, so that it is never continued with other data,
+settings or equations.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import os
 import time
 import warnings
 import zipfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +32,7 @@ State = dict[str, Any]
 def origin(
     model: ProcessModel, records: Sequence[Dataset], settings: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """What a search is begun with: the model, the records and the settings."""
+    """Origin of a search: its model, records and settings."""
     signals = (model.states, model.inputs, model.outputs, model.parameters)
     origin = {
         "model": {
@@ -51,7 +51,7 @@ def origin(
         ],
         "settings": dict(settings),
     }
-    plain: dict[str, Any] = json.loads(json.dumps(origin, default=_number))
+    plain: dict[str, Any] = json.loads(json.dumps(origin, default=float))
     return plain
 
 
@@ -69,13 +69,13 @@ class Checkpoint:
         self._pending: State | None = None
 
     def save(self, state: State) -> None:
-        """Keep a state, in the file at once if the last writing was a while ago."""
+        """Keep a state; write it if the last writing was a while ago."""
         self._pending = state
         if self._written is None or time.monotonic() - self._written >= INTERVAL:
             self.flush()
 
     def flush(self) -> None:
-        """Write the last state if it has not been written."""
+        """Write the last state, unless that has been done."""
         if self._pending is None:
             return
         arrays: dict[str, Any] = {}
@@ -103,7 +103,7 @@ class Checkpoint:
 
 
 def load(path: Path, begun_with: Mapping[str, Any]) -> State:
-    """The state in a checkpoint of a search begun with the same.
+    """The state in a checkpoint of a search of the same origin.
 
     Raises ModelError when there is none, or when it belongs to other data, settings or model.
     """
@@ -114,11 +114,11 @@ def load(path: Path, begun_with: Mapping[str, Any]) -> State:
                 raise ModelError(
                     f"{path}: a checkpoint of another version of this program; start anew"
                 )
-            found = differences(content["begun with"], begun_with)
-            if found:
+            mismatches = differences(content["begun with"], begun_with)
+            if mismatches:
                 raise ModelError(
                     f"{path}: this checkpoint belongs to another identification:\n  "
-                    + "\n  ".join(found)
+                    + "\n  ".join(mismatches)
                     + "\n  Continue it with what it was begun with, or start anew."
                 )
             state: State = _unpacked(content["state"], archive)
@@ -132,29 +132,30 @@ def load(path: Path, begun_with: Mapping[str, Any]) -> State:
 
 
 def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[str]:
-    """What differs between two origins, in words."""
-    found = []
-    if there["model"]["name"] != here["model"]["name"]:
-        return [f"it searches model {there['model']['name']}, this is {here['model']['name']}"]
-    for what in ("equations", "signals and parameters"):
-        if there["model"].get(what) != here["model"].get(what):
-            found.append(f"the {what} of model {here['model']['name']} have changed")
+    """Differences of two origins, in words."""
+    model, name = there["model"], here["model"]["name"]
+    if model["name"] != name:
+        return [f"it searches model {model['name']}, this is {name}"]
+    lines = [
+        f"the {part} of model {name} have changed"
+        for part in ("equations", "signals and parameters")
+        if model.get(part) != here["model"].get(part)
+    ]
     if len(there["records"]) != len(here["records"]):
-        found.append(f"it has {len(there['records'])} record(s), here are {len(here['records'])}")
+        lines.append(f"it has {len(there['records'])} record(s), here are {len(here['records'])}")
     for k, (old, new) in enumerate(zip(there["records"], here["records"], strict=False), 1):
         names = old["name"] if old["name"] == new["name"] else f"{old['name']}, {new['name']} here"
-        for what in ("samples", "sample time"):
-            if old[what] != new[what]:
-                found.append(f"record {k} ({names}): {what} {old[what]:g}, here {new[what]:g}")
-                break
-        else:
-            if old["values"] != new["values"]:
-                found.append(f"record {k} ({names}) has other values")
+        sizes = [key for key in ("samples", "sample time") if old[key] != new[key]]
+        if sizes:
+            key = sizes[0]
+            lines.append(f"record {k} ({names}): {key} {old[key]:g}, here {new[key]:g}")
+        elif old["values"] != new["values"]:
+            lines.append(f"record {k} ({names}) has other values")
     for key in sorted({*there["settings"], *here["settings"]}):
         was, now = there["settings"].get(key), here["settings"].get(key)
         if was != now:
-            found.append(f"{key} is {was}, here {now}")
-    return found
+            lines.append(f"{key} is {was}, here {now}")
+    return lines
 
 
 def _hash(*parts: bytes) -> str:
@@ -164,13 +165,8 @@ def _hash(*parts: bytes) -> str:
     return key.hexdigest()
 
 
-def _number(value: Any) -> float:
-    """Numbers of other libraries as JSON's."""
-    return float(value)
-
-
 def _packed(value: Any, arrays: dict[str, Any]) -> Any:
-    """A value as JSON knows it, its arrays put aside."""
+    """A value in JSON's types, its arrays put aside."""
     if isinstance(value, np.ndarray):
         name = f"array{len(arrays)}"
         arrays[name] = value
@@ -178,12 +174,8 @@ def _packed(value: Any, arrays: dict[str, Any]) -> Any:
     if isinstance(value, dict):
         return {"dict": {key: _packed(item, arrays) for key, item in value.items()}}
     if isinstance(value, list | tuple):
-        kind = type(value).__name__
-        return {kind: [_packed(item, arrays) for item in value]}
+        return {type(value).__name__: [_packed(item, arrays) for item in value]}
     return value.item() if isinstance(value, np.generic) else value
-
-
-_SEQUENCES: dict[str, Callable[[list[Any]], Any]] = {"list": list, "tuple": tuple}
 
 
 def _unpacked(value: Any, archive: Mapping[str, Any]) -> Any:
@@ -194,4 +186,4 @@ def _unpacked(value: Any, archive: Mapping[str, Any]) -> Any:
         return np.array(archive[content])
     if kind == "dict":
         return {key: _unpacked(item, archive) for key, item in content.items()}
-    return _SEQUENCES[kind]([_unpacked(item, archive) for item in content])
+    return {"list": list, "tuple": tuple}[kind](_unpacked(item, archive) for item in content)

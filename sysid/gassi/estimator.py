@@ -1,7 +1,8 @@
-"""GASSI as a scikit-learn style estimator over any process model."""
+"""GASSI as a scikit-learn estimator over any process model."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,9 +17,9 @@ from sysid.fitting.free_run import free_run
 from sysid.fitting.objective import Balance, Objective
 from sysid.fitting.refinement import Refinement
 from sysid.gassi.checkpoint import Checkpoint, load, origin
-from sysid.gassi.running import Best, Run
-from sysid.gassi.search import PRESETS, GeneticSearch, Preset, PresetName
-from sysid.gassi.settling import settle
+from sysid.gassi.genetic_search import PRESETS, GeneticSearch, Preset, PresetName
+from sysid.gassi.likelihood import fit_likelihood
+from sysid.gassi.search_run import Best, SearchRun
 from sysid.problem.data import Dataset
 from sysid.problem.guesses import Guess, guess_ranges
 from sysid.problem.metrics import fit_percent
@@ -31,16 +32,16 @@ from sysid.uncertainty import Profile, Uncertainty, profile, uncertainty
 
 Criterion = Literal["likelihood", "error"]
 
-# Settings that the result does not depend on, or that a checkpoint knows otherwise.
+# Settings that do not decide the result, or that a checkpoint holds in another form.
 _NOT_DECIDING = ("model", "threads", "dt")
 
 
 @dataclass(frozen=True)
 class Progress:
-    """What a watcher of the search is told: generation ``done`` of ``total``, the best error.
+    """Progress of a search: generation ``done`` of ``total``, the best error.
 
     stage: ``search``; ``refine`` while the local refinement spends the rest of them; ``weigh``
-    in the last step by the likelihood, which counts iterations and knows no total.
+    in the last step by the likelihood, where ``done`` and ``total`` are the iterations so far.
     """
 
     stage: str
@@ -64,8 +65,8 @@ class GASSI(RecordEstimator):
         be None: then the other is a bound, and this one only where the search starts.
     fixed : {name: value}, parameters not searched.
     tied : {name: "0.5 * other"}, parameters that are multiples of others.
-    guess : narrow the ranges of parameters of which nothing is said by what the records tell,
-        with the model's ``guesses`` function.
+    guess : narrow the ranges of parameters without a range or value here, by what the model's
+        ``guesses`` function reads from the records.
     scale : {name: "log" or "linear"}, scales to search on in place of the model's.
     elite_percent : share of the population replaced by the elite, r_elite.
     minimum_generations, termination_ratio : i_min and r_termination of (4.11).
@@ -77,20 +78,20 @@ class GASSI(RecordEstimator):
     balance : ``samples``, several records count as one long one; ``logs``, each alike.
     accuracy : normalised RMS error that a simulation aims at.
     max_steps : integration steps a sample may take before a chromosome is flagged.
-    threads : default all cores; the result does not depend on it.
-    random_state : seed; one seed gives one result.
+    threads : default all cores; the result does not depend on their number.
+    random_state : seed; equal seeds give equal results.
     dt : sample time [s] of arrays; Datasets bring their own.
 
     Attributes
     ----------
     parameters_ : dict of all the model's parameters after ``fit``.
     vector_ : (n_parameters,), the same in the model's order.
-    chromosome_ : (n_free,), the free ones in ``space_.names`` order.
+    chromosome_ : (n_free,), the free parameters in ``space_.names`` order.
     initial_states_ : for each record a dict of the initial states that were estimated.
     guesses_ : {name: Guess} of the ranges that were read from the records.
     space_ : SearchSpace that was searched; estimated initial states stand behind the parameters.
-    output_weights_ : (n_outputs,), what the outputs counted in the end.
-    rivals_ : parameters of other minima that the data do not tell from the result.
+    output_weights_ : (n_outputs,), final weights of the outputs.
+    rivals_ : parameters of further minima that the data do not tell from the result.
     error_ : mean over outputs of the RMSE normalised by max|y| (see ``Objective``).
     search_error_ : the lowest error before local refinement.
     feasible_ : whether all constraints hold.
@@ -99,6 +100,24 @@ class GASSI(RecordEstimator):
     stopped_ : ``generations``, ``converged`` or ``interrupted``.
     flagged_ : {status name: count} of simulations that failed during the search.
     n_simulations_ : simulations of one chromosome on all records.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sysid import GASSI, Dataset, Input, Output, Parameter, ProcessModel, State
+    >>> model = ProcessModel(
+    ...     name="lag",
+    ...     states=(State("y", "V"),),
+    ...     inputs=(Input("u", "V"),),
+    ...     outputs=(Output("y", "V"),),
+    ...     parameters=(Parameter("tau", "s", 0.1, 0.01, 1.0, "log"),),
+    ...     derivative=lambda x, u, p: ((u[0] - x[0]) / p[0],),
+    ... )
+    >>> time = np.arange(0.0, 1.0, 0.01)
+    >>> record = Dataset(np.ones(100), 1.0 - np.exp(-time / 0.2), 0.01)
+    >>> estimator = GASSI(model, population=10, generations=2).fit(record)
+    >>> round(estimator.parameters_["tau"], 6)
+    0.2
     """
 
     def __init__(
@@ -174,35 +193,33 @@ class GASSI(RecordEstimator):
         make no sense, or for a checkpoint of other data, settings or model.
         """
         data = self._records(X, y, records, None, reset=True)
-        model = self._model()
-        if self.criterion not in get_args(Criterion):
-            raise ModelError(
-                f"unknown criterion {self.criterion!r}; choose from "
-                + ", ".join(get_args(Criterion))
-            )
-        preset = PRESETS.get(self.preset)
-        if preset is None:
-            raise ModelError(f"unknown preset {self.preset!r}; choose from {', '.join(PRESETS)}")
+        model, preset = self._model(), self._preset()
         self.guesses_: dict[str, Guess] = {}
         if self.guess:
             self.guesses_ = guess_ranges(model, data, self.ranges, self.fixed, self.tied)
-        guessed = {name: (guess.low, guess.high) for name, guess in self.guesses_.items()}
+        ranges = {name: (guess.low, guess.high) for name, guess in self.guesses_.items()}
+        ranges |= self.ranges or {}
         self.space_ = SearchSpace.of(
-            model,
-            {**guessed, **(self.ranges or {})},
-            self.fixed,
-            preset.log_scale,
-            tied=self.tied,
-            scale=self.scale,
+            model, ranges, self.fixed, preset.log_scale, tied=self.tied, scale=self.scale
         )
         objective = self._objective(data)
         self.output_weights_: FloatArray = objective.weights
         self._rivals: tuple[FloatArray, ...] = ()
         self._final_accuracy = self.accuracy
-        run = self._run(objective, preset)
+        run = self._search_run(objective, preset)
         keeper = self._keeper(data, run, checkpoint, resume)
         notify = on_progress or (lambda progress: None)
-        self.stopped_ = "generations"
+        self.stopped_ = self._search(run, keeper, notify)
+        self._take(run)
+        likelihood = preset.refine and self.criterion == "likelihood"
+        if likelihood and self.stopped_ != "interrupted":
+            self._weigh(run, notify)
+        return self
+
+    def _search(
+        self, run: SearchRun, keeper: Checkpoint | None, notify: Callable[[Progress], None]
+    ) -> str:
+        """Why the search ended, after its end."""
         try:
             while not run.done:
                 run.step()
@@ -214,48 +231,32 @@ class GASSI(RecordEstimator):
         except KeyboardInterrupt:
             if run.best is None:
                 raise
-            self.stopped_ = "interrupted"
+            return "interrupted"
         finally:
             if keeper is not None:
                 keeper.flush()
-        self._take(run)
-        if self.stopped_ != "interrupted":
-            self._end(run, notify)
-        return self
+        return "converged" if run.search.converged else "generations"
 
-    def _end(self, run: Run, notify: Callable[[Progress], None]) -> None:
-        """Where a run that came to its own end goes on to."""
-        if run.search.converged:
-            self.stopped_ = "converged"
-        if not run.preset.refine or self.criterion != "likelihood":
-            return
-        done = 0
+    def _weigh(self, run: SearchRun, notify: Callable[[Progress], None]) -> None:
+        """End with the likelihood instead of the mean RMSE."""
+        iterations = itertools.count(1)
 
-        def watch(step: Refinement) -> None:
-            nonlocal done
-            done += 1
+        def watch(_: Refinement) -> None:
+            done = next(iterations)
             notify(Progress("weigh", done, done, self.error_))
 
         try:
-            settled = settle(run.objective, run.minima, watch)
+            likeliest = fit_likelihood(run.objective, run.minima(), watch)
         except KeyboardInterrupt:
             self.stopped_ = "interrupted"
             return
-        self._final_accuracy = settled.objective.simulator.accuracy
-        objective = run.objective
-        if self._final_accuracy < self.accuracy:
-            objective = objective.finer(self._final_accuracy)
-        self._set(
-            Best(
-                objective.space,
-                settled.chromosome,
-                float(objective.evaluate(settled.chromosome[None])[0][0]),
-                run.objective.space.feasible(settled.chromosome),
-            )
-        )
-        self.output_weights_ = settled.objective.weights
-        self._rivals = settled.rivals
-        self.n_simulations_ = run.objective.simulations
+        self._final_accuracy = likeliest.objective.simulator.accuracy
+        objective, chromosome = self._finally_accurate(run.objective), likeliest.chromosome
+        error = float(objective.evaluate(chromosome[None])[0][0])
+        self._set(Best(objective.space, chromosome, error, objective.space.feasible(chromosome)))
+        self.output_weights_ = likeliest.objective.weights
+        self._rivals = likeliest.rivals
+        self.n_simulations_ = objective.simulations
 
     def predict(self, X: Dataset | FloatArray, *, records: Any = None) -> FloatArray:
         """Free-run outputs of the identified model, (n_samples, n_outputs).
@@ -292,30 +293,28 @@ class GASSI(RecordEstimator):
     ) -> Uncertainty:
         """Intervals of the parameters, and what the records cannot tell of them.
 
-        X, y, records: what ``fit`` was given. Raises ModelError where the local refinement did
-        not run to its end: only at a minimum of the error do its sensitivities tell.
+        X, y, records: those of ``fit``. Raises ModelError where the local refinement did not run
+        to its end: only at a minimum of the error do its sensitivities tell.
         """
-        return uncertainty(self._settled(X, y, records), self.chromosome_, self._rivals)
+        return uncertainty(self._final_objective(X, y, records), self.chromosome_, self._rivals)
 
     @one_thread()
     def profile(
         self, name: str, X: Data, y: FloatArray | None = None, *, records: Any = None
     ) -> Profile:
-        """How much worse the best fit becomes as one parameter is moved, others fitted anew.
+        """How much worse the best fit becomes as one parameter is moved, the rest fitted anew.
 
-        X, y, records: what ``fit`` was given. Raises ModelError as ``uncertainty``, and for a
-        parameter that is not free.
+        X, y, records: those of ``fit``. Raises ModelError as ``uncertainty``, and for a parameter
+        that is not free.
         """
-        return profile(self._settled(X, y, records), self.chromosome_, name)
+        return profile(self._final_objective(X, y, records), self.chromosome_, name)
 
     @property
     def rivals_(self) -> list[dict[str, float]]:
-        """All the model's parameters in other minima that the data do not tell from the result."""
-        names = self._model().parameter_names
-        vectors = [self.space_.full(rival) for rival in self._rivals]
-        return [dict(zip(names, vector.tolist(), strict=True)) for vector in vectors]
+        """All the model's parameters in minima that the data do not tell from the result."""
+        return [self._named(self.space_.full(rival)) for rival in self._rivals]
 
-    def _settled(self, X: Data, y: FloatArray | None, records: Any) -> Objective:
+    def _final_objective(self, X: Data, y: FloatArray | None, records: Any) -> Objective:
         """The objective at whose minimum ``fit`` ended."""
         check_is_fitted(self, "vector_")
         if not PRESETS[self.preset].refine:
@@ -323,7 +322,10 @@ class GASSI(RecordEstimator):
         if self.stopped_ == "interrupted":
             raise ModelError("the identification was interrupted, so there are no intervals")
         data = self._records(X, y, records, None, reset=False)
-        objective = self._objective(data).weighed(self.output_weights_)
+        return self._finally_accurate(self._objective(data).weighed(self.output_weights_))
+
+    def _finally_accurate(self, objective: Objective) -> Objective:
+        """The objective by simulations of the accuracy that ``fit`` ended with."""
         if self._final_accuracy < self.accuracy:
             return objective.finer(self._final_accuracy)
         return objective
@@ -337,14 +339,14 @@ class GASSI(RecordEstimator):
         return self.dt
 
     def _objective(self, records: Sequence[Dataset]) -> Objective:
-        """The figure that ``fit`` minimises over ``space_``."""
+        """The error that ``fit`` minimises over ``space_``."""
         return Objective(
             self._simulator(),
             self.space_,
             records,
             per_log=self.per_log,
             balance=self.balance,
-            weights=self._weights(self._model()),
+            weights=self._weights(),
         )
 
     def _model(self) -> ProcessModel:
@@ -357,7 +359,17 @@ class GASSI(RecordEstimator):
             self._model(), accuracy=self.accuracy, threads=self.threads, max_steps=self.max_steps
         )
 
-    def _weights(self, model: ProcessModel) -> FloatArray | None:
+    def _preset(self) -> Preset:
+        for kind, choice, choices in (
+            ("criterion", self.criterion, get_args(Criterion)),
+            ("preset", self.preset, PRESETS),
+        ):
+            if choice not in choices:
+                raise ModelError(f"unknown {kind} {choice!r}; choose from {', '.join(choices)}")
+        return PRESETS[self.preset]
+
+    def _weights(self) -> FloatArray | None:
+        model = self._model()
         if self.weights is None:
             return None
         for name, weight in self.weights.items():
@@ -373,29 +385,27 @@ class GASSI(RecordEstimator):
             raise ModelError("every output has weight 0; at least one must count")
         return weights
 
-    def _run(self, objective: Objective, preset: Preset) -> Run:
-        rng = np.random.default_rng(self.random_state)
+    def _search_run(self, objective: Objective, preset: Preset) -> SearchRun:
         # Of the generations the genetic search has its share, the local refinement the rest.
-        own = self.generations
-        if preset.refine and own > 0:
-            own = max(1, round((1.0 - preset.local_share) * own))
+        generations = self.generations
+        if preset.refine and generations > 0:
+            generations = max(1, round((1.0 - preset.local_share) * generations))
         search = GeneticSearch(
             self.space_,
             preset,
             self.population,
-            own,
-            rng,
+            generations,
+            np.random.default_rng(self.random_state),
             self.elite_percent,
             self.minimum_generations,
             self.termination_ratio,
         )
-        likelihood = self.criterion == "likelihood"
-        return Run(objective, preset, search, self.generations, rng, likelihood)
+        return SearchRun(objective, search, self.generations, self.criterion == "likelihood")
 
     def _keeper(
-        self, data: Sequence[Dataset], run: Run, checkpoint: Path | None, resume: Path | None
+        self, data: Sequence[Dataset], run: SearchRun, checkpoint: Path | None, resume: Path | None
     ) -> Checkpoint | None:
-        """What writes the checkpoints, after the run has been set to where it goes on."""
+        """Writer of the checkpoints, after the run has been restored from one."""
         path = checkpoint if checkpoint is not None else resume
         if path is None:
             return None
@@ -407,8 +417,8 @@ class GASSI(RecordEstimator):
         keeper.save(run.state())
         return keeper
 
-    def _take(self, run: Run) -> None:
-        """The run's best and what it took, as they are known from outside."""
+    def _take(self, run: SearchRun) -> None:
+        """Set the fitted attributes to the state of a run."""
         assert run.best is not None
         self._set(run.best)
         self.search_error_: float = run.search.elite_error
@@ -420,11 +430,13 @@ class GASSI(RecordEstimator):
         self.space_ = best.space
         self.chromosome_: FloatArray = best.chromosome
         self.vector_ = best.space.full(best.chromosome)
-        names = self._model().parameter_names
-        self.parameters_ = {n: float(v) for n, v in zip(names, self.vector_, strict=True)}
+        self.parameters_ = self._named(self.vector_)
         self.initial_states_ = best.space.named_starts(best.chromosome)
         self.error_: float = best.error
         self.feasible_ = best.feasible
+
+    def _named(self, vector: FloatArray) -> dict[str, float]:
+        return dict(zip(self._model().parameter_names, vector.tolist(), strict=True))
 
     def __sklearn_is_fitted__(self) -> bool:
         return hasattr(self, "vector_")

@@ -19,8 +19,8 @@ from sysid.fitting.objective import Objective
 from sysid.response.linearization import jacobians
 
 _FASTEST_SEEN = 0.4  # of the sample rate: slower modes have no alias that could be mistaken
-_REACH = 2.0  # how many times faster or slower than the mode its aliases may be
-_MOST = 6
+_REACH = 2.0  # times that aliases may be faster or slower than the mode
+_MOST_ALIASES = 6
 _STAGES, _ITERATIONS = 3, 2  # on the way to the alias, Newton steps at each
 _HARM = 2.0  # times the error that a swap may cost before its descent
 _TURNED = 3  # parameters that are moved to find twins
@@ -31,10 +31,9 @@ _REACHED = 0.02  # part of the frequency by which the end may miss the alias
 
 
 def lookalikes(objective: Objective, chromosome: FloatArray) -> list[FloatArray]:
-    """Chromosomes (n_free,) whose fastest mode is this one's, or an alias of it.
+    """Chromosomes (n_free,) within the ranges whose fastest mode is this one's or an alias of it.
 
-    The model is linearised where the first record starts. What the ranges do not admit is left
-    out.
+    The model is linearised where the first record starts.
     """
     modes = _Modes(objective, chromosome)
     dt = objective.records[0].dt
@@ -42,7 +41,7 @@ def lookalikes(objective: Objective, chromosome: FloatArray) -> list[FloatArray]
 
 
 def _swaps(objective: Objective, chromosome: FloatArray) -> list[FloatArray]:
-    """With two parameters of a unit changed for each other, where that does little harm."""
+    """Chromosomes with two parameters of a unit swapped, where that does little harm."""
     space = objective.space
     units = [parameter.unit for parameter in space.parameters[: len(space.index)]]
     pairs = [
@@ -61,21 +60,21 @@ def _swaps(objective: Objective, chromosome: FloatArray) -> list[FloatArray]:
 
 
 def _aliases(modes: _Modes, dt: float) -> list[FloatArray]:
-    """With the mode at the frequencies that the sampling does not tell from its own."""
+    """Chromosomes with the mode at the frequencies that sampling does not tell from its own."""
     mode = modes.fastest
-    frequencies = _folded(mode.imag, dt)
+    frequencies = _aliased(mode.imag, dt)
     if mode.imag * dt < 2.0 * np.pi * _FASTEST_SEEN or not len(frequencies):
         return []
     at, values = modes.here(len(frequencies))
     for stage in np.linspace(0.0, 1.0, _STAGES + 1)[1:]:
-        wanted = mode.real + 1j * mode.imag * (frequencies / mode.imag) ** stage
-        at, values = modes.towards(at, values, wanted, np.ones(at.shape, dtype=bool))
+        targets = mode.real + 1j * mode.imag * (frequencies / mode.imag) ** stage
+        at, values = modes.towards(targets, at, values, np.ones(at.shape, dtype=bool))
     reached = np.abs(values.imag - frequencies) < _REACHED * frequencies
     return list(modes.space.decode(at[reached]))
 
 
 def _twins(modes: _Modes) -> list[FloatArray]:
-    """With one of the parameters that the mode hangs on moved, the others keeping the mode."""
+    """Chromosomes with one parameter that acts on the mode moved, the rest keeping the mode."""
     mode = modes.fastest
     places = np.repeat(modes.acting[:_TURNED], len(_TURNS))
     at, _ = modes.here(len(places))
@@ -86,24 +85,23 @@ def _twins(modes: _Modes) -> list[FloatArray]:
     at, places = at[inside], places[inside]
     if not len(at):
         return []
-    others = np.arange(at.shape[1]) != places[:, None]
-    wanted = np.full(len(at), mode)
-    values = modes.nearest(at, wanted)
-    at, values = modes.towards(at, values, wanted, others, _STAGES * _ITERATIONS)
+    rest = np.arange(at.shape[1]) != places[:, None]
+    targets = np.full(len(at), mode)
+    at, values = modes.towards(targets, at, modes.nearest(at, targets), rest, _STAGES * _ITERATIONS)
     return list(modes.space.decode(at[np.abs(values - mode) < _REACHED * abs(mode)]))
 
 
-def _folded(frequency: float, dt: float) -> FloatArray:
-    """Frequencies [rad/s] that look like this one at a sample time, nearest first."""
+def _aliased(frequency: float, dt: float) -> FloatArray:
+    """Aliases of a frequency [rad/s] at a sample time, nearest first."""
     rate = 2.0 * np.pi / dt
     count = int(_REACH * frequency / rate) + 2
-    several = np.arange(-count, count + 1) * rate
-    all_of_them = np.abs(np.concatenate([frequency + several, several - frequency]))
-    apart = np.abs(all_of_them - frequency) > 1e-6 * frequency
-    near = (all_of_them < _REACH * frequency) & (all_of_them > frequency / _REACH)
-    chosen = np.unique(all_of_them[apart & near])
-    order = np.argsort(np.abs(np.log(chosen / frequency)))
-    nearest: FloatArray = chosen[order][:_MOST]
+    multiples = np.arange(-count, count + 1) * rate
+    aliases = np.abs(np.concatenate([frequency + multiples, multiples - frequency]))
+    apart = np.abs(aliases - frequency) > 1e-6 * frequency
+    near = (aliases < _REACH * frequency) & (aliases > frequency / _REACH)
+    aliases = np.unique(aliases[apart & near])
+    order = np.argsort(np.abs(np.log(aliases / frequency)))
+    nearest: FloatArray = aliases[order][:_MOST_ALIASES]
     return nearest
 
 
@@ -111,22 +109,22 @@ class _Modes:
     """Eigenvalues of the linearised model over the search coordinates.
 
     start: search coordinates (n_free,) of the minimum. fastest: the eigenvalue there of largest
-    imaginary part, or where nothing oscillates of largest size. acting: places of the parameters
-    that it hangs on, the strongest first; the others need no differences of their own.
+    imaginary part, or of largest size where nothing oscillates. acting: places of the parameters
+    that act on it, the strongest first; differences of the rest are not taken.
     """
 
     def __init__(self, objective: Objective, chromosome: FloatArray) -> None:
         self.space, self.model = objective.space, objective.simulator.model
         record = objective.records[0]
-        own = record.initial_state(self.model)
-        self.x = self.space.starts(chromosome[None], 0, own)[0]
+        initial_state = record.initial_state(self.model)
+        self.x = self.space.starts(chromosome[None], 0, initial_state)[0]
         self.u = record.inputs[0]
         self.start = self.space.encode(chromosome)
         self.bounds = self.space.coded_bounds
         self.width = self.space.width
         (values,) = self._eigenvalues(self.start[None])
-        oscillates = bool(values.imag.max() > 0.0)
-        self.fastest = complex(values[np.argmax(values.imag if oscillates else np.abs(values))])
+        speeds = values.imag if values.imag.max() > 0.0 else np.abs(values)
+        self.fastest = complex(values[np.argmax(speeds)])
         self.acting = np.arange(len(self.start))
         (slopes,) = self.slopes(*self.here(1))
         size = np.linalg.norm(slopes, axis=0)
@@ -134,20 +132,25 @@ class _Modes:
         self.acting = strongest[size[strongest] > _ACTING * size.max()]
 
     def here(self, count: int) -> tuple[FloatArray, ComplexArray]:
-        """The minimum and its fastest mode, so many times."""
+        """The minimum and its fastest mode, repeated."""
         return np.repeat(self.start[None], count, axis=0), np.full(count, self.fastest)
 
     def towards(
-        self, at: FloatArray, values: ComplexArray, wanted: ComplexArray, moving: BoolArray,
+        self,
+        targets: ComplexArray,
+        at: FloatArray,
+        values: ComplexArray,
+        moving: BoolArray,
         iterations: int = _ITERATIONS,
-    ) -> tuple[FloatArray, ComplexArray]:  # fmt: skip
-        """The least moves, in parts of the ranges, that bring modes where they are wanted.
+    ) -> tuple[FloatArray, ComplexArray]:
+        """Coordinates and modes after Newton steps that bring modes to targets.
 
-        at, moving: (n, n_free); values, wanted: (n,).
+        Of all such steps the least, in parts of the ranges. at, moving: (n, n_free); values,
+        targets: (n,).
         """
         for _ in range(iterations):
             slopes = np.where(moving[:, None], self.slopes(at, values), 0.0)
-            miss = np.stack([(wanted - values).real, (wanted - values).imag], axis=1)
+            miss = np.stack([(targets - values).real, (targets - values).imag], axis=1)
             move = np.linalg.pinv(slopes, rcond=1e-9) @ miss[:, :, None]
             along = (slopes @ move)[:, :, 0]
             at = np.clip(at + move[:, :, 0] * self.width, *self.bounds)
@@ -155,27 +158,27 @@ class _Modes:
         return at, values
 
     def slopes(self, at: FloatArray, values: ComplexArray) -> FloatArray:
-        """How real and imaginary parts move per range of each coordinate, (n, 2, n_free)."""
+        """Slopes of the modes' real and imaginary parts by parts of the ranges, (n, 2, n_free)."""
         n, count = len(at), len(self.acting)
         back = at + _DIFFERENCE * self.width > self.bounds[1]
         shift = np.where(back, -_DIFFERENCE, _DIFFERENCE)
         beside = np.repeat(at[:, None], count, axis=1)
         beside[:, np.arange(count), self.acting] += (shift * self.width)[:, self.acting]
-        found = self.nearest(beside.reshape(n * count, -1), np.repeat(values, count))
-        change = (found.reshape(n, count) - values[:, None]) / shift[:, self.acting]
+        moved = self.nearest(beside.reshape(n * count, -1), np.repeat(values, count))
+        change = (moved.reshape(n, count) - values[:, None]) / shift[:, self.acting]
         slopes = np.zeros((n, 2, at.shape[1]))
         slopes[:, 0, self.acting], slopes[:, 1, self.acting] = change.real, change.imag
         return slopes
 
     def nearest(self, at: FloatArray, values: ComplexArray) -> ComplexArray:
-        """At each row of coordinates the eigenvalue nearest to a value, (n,)."""
-        found = self._eigenvalues(at)
-        chosen = np.argmin(np.abs(found - values[:, None]), axis=1)
-        nearest: ComplexArray = found[np.arange(len(at)), chosen]
+        """The eigenvalue nearest to a value at each row of coordinates, (n,)."""
+        eigenvalues = self._eigenvalues(at)
+        chosen = np.argmin(np.abs(eigenvalues - values[:, None]), axis=1)
+        nearest: ComplexArray = eigenvalues[np.arange(len(at)), chosen]
         return nearest
 
     def _eigenvalues(self, at: FloatArray) -> ComplexArray:
         vectors = self.space.full(self.space.decode(at))
         matrices = jacobians(self.model, self.x, self.u, vectors)
-        found = np.linalg.eigvals(np.where(np.isfinite(matrices), matrices, 0.0))
-        return found.astype(np.complex128)
+        eigenvalues = np.linalg.eigvals(np.where(np.isfinite(matrices), matrices, 0.0))
+        return eigenvalues.astype(np.complex128)

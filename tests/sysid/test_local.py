@@ -21,8 +21,8 @@ from sysid import (
 from sysid.fitting.objective import Objective
 from sysid.fitting.refinement import advance, begin, refine
 from sysid.gassi import PRESETS, GeneticSearch
-from sysid.gassi.local import LocalSearch, Minimum
-from sysid.gassi.running import Run
+from sysid.gassi.local_search import LocalSearch, Minimum
+from sysid.gassi.search_run import SearchRun
 from sysid.problem.space import SearchSpace
 from tests.sysid.support import MOTOR, lag, motor, motor_record
 
@@ -86,7 +86,7 @@ def test_jumps_leave_a_minimum_that_a_descent_cannot(seed):
     start = alias(target)
     before = target.simulations
     local = LocalSearch(target, start[None], before + 6000, 300, np.random.default_rng(seed))
-    while not local.done:
+    while not local.polished:
         local.step()
     assert local.error < 1e-6
     expected = [p.nominal for p in SPRING]
@@ -138,8 +138,8 @@ def test_a_descent_is_the_same_alone_and_among_others():
         alone = [begin(target, start)]
         for _ in range(6):
             alone = advance(target, alone)
-        np.testing.assert_array_equal(alone[0].at, one.at)
-        assert alone[0].error == one.error
+        np.testing.assert_array_equal(alone[0].point.at, one.point.at)
+        assert alone[0].point.error == one.point.error
 
 
 def test_flat_directions_cost_nothing():
@@ -198,16 +198,16 @@ def test_where_only_the_search_found_something_feasible_it_goes_on_from_there():
     model, rng = motor(2.0, (limit,)), np.random.default_rng(2)
     objective = Objective(BatchSimulator(model), SearchSpace.of(model), [motor_record()])
     search = GeneticSearch(objective.space, PRESETS["default"], 40, 1, rng)
-    run = Run(objective, PRESETS["default"], search, 6, rng, likelihood=True)
+    run = SearchRun(objective, search, 6, likelihood=True)
     while run.local is None:
         run.step()
     assert search.elite_feasible
     beyond = objective.space.encode(model.nominal)  # a resistance of 1
     run.local.best, run.local.error, run.local.feasible = beyond, 1e-9, False
     run.local.minima = [Minimum(beyond, 1e-9, np.full(2, 1e-9))]
-    (kept,) = run.minima
+    (kept,) = run.minima()
     np.testing.assert_array_equal(kept, search.elite)
     # Once a descent has found a feasible one, it comes before the likelier infeasible one.
     inside = objective.space.encode(search.elite)
     run.local.best, run.local.error, run.local.feasible = inside, 1e-9, True
-    np.testing.assert_allclose(run.minima[0], search.elite)
+    np.testing.assert_allclose(run.minima()[0], search.elite)

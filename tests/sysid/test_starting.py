@@ -21,7 +21,7 @@ from sysid import (
 from sysid.fitting.free_run import estimate_start, free_run
 from sysid.fitting.objective import Objective
 from sysid.fitting.refinement import refine
-from sysid.gassi.settling import settle
+from sysid.gassi.likelihood import fit_likelihood
 from sysid.uncertainty import uncertainty
 
 
@@ -282,7 +282,7 @@ def test_what_acts_only_together_is_told_where_slopes_are_jagged(swinging):
     model, _, noisy = swinging
     space = SearchSpace.of(model).with_starts([noisy])
     objective = Objective(BatchSimulator(model), space, [noisy])
-    settled = settle(objective, [np.array([*SWING * 1.3, 1.2, 0.0])])
+    settled = fit_likelihood(objective, [np.array([*SWING * 1.3, 1.2, 0.0])])
     found = uncertainty(settled.objective, settled.chromosome, settled.rivals)
     (ambiguity,) = found.ambiguities
     assert ambiguity.kind == "product"

@@ -1,14 +1,13 @@
-"""The genetic search, asked for populations and told their errors.
+"""The genetic search: populations out (``ask``), their errors in (``tell``), no simulation.
 
-``GeneticSearch`` knows no simulation: it proposes chromosomes (``ask``), takes their errors
-(``tell``), and says when it is done. The presets are settings of this one loop.
+The presets are settings of one loop, in which a generation is evaluated, ranked and bred.
 """
 
 from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, fields
 from typing import Any, Literal
 
 import numpy as np
@@ -24,15 +23,15 @@ PresetName = Literal["default", "thesis", "cega", "classic"]
 
 @dataclass(frozen=True)
 class Preset:
-    """What distinguishes the algorithms that share the loop.
+    """Settings of one of the algorithms.
 
     operators: ``adaptive`` (Algorithms 2 to 5) or ``classic`` (Algorithm 1). penalty: whether
     infeasible chromosomes are penalised (4.13)-(4.20). log_scale: search parameters marked
-    ``log`` by their logarithm. keep_in_range: clip to the ranges' bounds; else a range
-    is only where the search starts. spread: mutation noise from the ``initial`` population, as
-    written, or from the ``current`` one. stratified: Latin-hypercube start. collapse: share of
-    the initial spread below which the population starts anew, away from the elite. local_share:
-    share of the simulations left to local refinement.
+    ``log`` by their logarithm. keep_in_range: clip to the ranges' bounds; else the search only
+    starts in the ranges. spread: mutation noise from the ``initial`` population, as written, or
+    from the ``current`` one. stratified: Latin-hypercube start. collapse: share of the initial
+    spread below which the population starts anew, away from the elite. local_share: share of the
+    simulations left to local refinement.
     """
 
     operators: Literal["adaptive", "classic"]
@@ -70,14 +69,10 @@ PRESETS: dict[PresetName, Preset] = {
 # square over the parameters, in parts of their ranges.
 _KEPT, _APART = 8, 0.1
 
-_STATE = (
-    "elite", "elite_error", "elite_feasible", "history", "converged", "_coded", "_initial_spread",
-    "_elite_rank", "_leader", "_leader_rank", "_kept", "_kept_behind", "_kept_errors",
-    "_first_error", "_first_change",
-)  # fmt: skip
-
 # Hyperparameters that Algorithm 1 leaves open and the adaptive algorithms do without.
 _CLASSIC_RATIO, _CLASSIC_CROSSOVER, _CLASSIC_MUTATION = 0.3, 0.8, 0.05
+
+_UNRANKED = (True, np.inf)  # behind every chromosome that was simulated
 
 
 @dataclass
@@ -100,11 +95,6 @@ class GeneticSearch:
     elite_percent: float = 0.5
     minimum_generations: int = 0
     termination_ratio: float = 0.0
-    elite: FloatArray | None = field(default=None, init=False)
-    elite_error: float = field(default=np.inf, init=False)
-    elite_feasible: bool = field(default=False, init=False)
-    history: list[float] = field(default_factory=list, init=False)
-    converged: bool = field(default=False, init=False)
 
     def __post_init__(self) -> None:
         if self.population < 2:
@@ -113,21 +103,32 @@ class GeneticSearch:
             raise ModelError(f"generations is {self.generations}; it must be at least 1")
         if not 0.0 <= self.elite_percent < 100.0:
             raise ModelError(f"elite_percent is {self.elite_percent}; it must be in [0, 100)")
-        self._lower = self.space.coded_lower
-        self._upper = self.space.encode(self.space.upper)
-        self._bounds = self.space.coded_bounds
-        draw = operators.stratified if self.preset.stratified else operators.uniform
-        self._coded = draw(self.population, self._lower, self._upper, self.rng)
-        self._initial_spread = self._coded.std(axis=0)
-        self._elite_rank: tuple[bool, float] = (True, np.inf)
+        self.elite: FloatArray | None = None
+        self.elite_error = np.inf
+        self.elite_feasible = False
+        self.history: list[float] = []
+        self.converged = False
+        self._elite_rank = _UNRANKED
         # The best since the population last started anew, by which it breeds.
         self._leader: FloatArray | None = None
-        self._leader_rank: tuple[bool, float] = (True, np.inf)
-        self._kept = np.empty((0, len(self._lower)))
+        self._start()
+        self._initial_spread = self._coded.std(axis=0)
+        self._kept = np.empty((0, len(self.space.parameters)))
         self._kept_behind: BoolArray = np.empty(0, dtype=bool)
         self._kept_errors = np.empty(0)
         self._first_error = np.inf
         self._first_change: int | None = None
+
+    def _start(self) -> None:
+        """Draw a population that is independent of the elite, which is kept."""
+        draw = operators.stratified if self.preset.stratified else operators.uniform
+        self._coded = draw(self.population, *self._box, self.rng)
+        self._leader, self._leader_rank = None, _UNRANKED
+
+    @property
+    def _box(self) -> tuple[FloatArray, FloatArray]:
+        """Ends of the ranges in search coordinates, (n_free,) each."""
+        return self.space.coded_lower, self.space.encode(self.space.upper)
 
     @property
     def done(self) -> bool:
@@ -135,7 +136,7 @@ class GeneticSearch:
         return self.converged or len(self.history) >= self.generations
 
     def ask(self) -> FloatArray:
-        """The population to evaluate, (population, n_free), in the parameters' own units."""
+        """The population to evaluate, (population, n_free), in the parameters' units."""
         return self.space.decode(self._coded)
 
     def tell(self, errors: FloatArray) -> None:
@@ -158,22 +159,23 @@ class GeneticSearch:
         else:
             self._breed_classic(fitness)
         if self.preset.keep_in_range:
-            np.clip(self._coded, *self._bounds, out=self._coded)
+            np.clip(self._coded, *self.space.coded_bounds, out=self._coded)
 
     def promising(self, count: int) -> FloatArray:
         """The best chromosomes yet that lie apart, best first, (at most ``count``, n_free).
 
-        They are kept for a preset that goes on with local refinement.
+        For a preset that goes on with local refinement.
         """
         return self.space.decode(self._kept[:count])
 
     def state(self) -> dict[str, Any]:
-        """All that the next generations depend on beside the settings and ``rng``."""
-        return {name: copy.copy(getattr(self, name)) for name in _STATE}
+        """The state on which the next generations depend, beside the settings and ``rng``."""
+        arguments = {field.name for field in fields(self)}
+        return {k: copy.copy(v) for k, v in vars(self).items() if k not in arguments}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Go on from a ``state``."""
-        for name in _STATE:
+        for name in self.state():
             setattr(self, name, state[name])
 
     def _save_elite(
@@ -199,12 +201,11 @@ class GeneticSearch:
         rows = np.concatenate([self._kept, self._coded])
         all_behind = np.concatenate([self._kept_behind, behind])
         all_errors = np.concatenate([self._kept_errors, errors])
-        width = self._upper - self._lower
         chosen: list[int] = []
         for j in np.lexsort((all_errors, all_behind)):
             if len(chosen) == _KEPT or not np.isfinite(all_errors[j]):
                 break
-            away = (rows[chosen] - rows[j]) / width
+            away = (rows[chosen] - rows[j]) / self.space.width
             if np.all(np.mean(away**2, axis=1) > _APART**2):
                 chosen.append(int(j))
         self._kept = rows[chosen]
@@ -228,28 +229,18 @@ class GeneticSearch:
         self.converged = mean <= self.termination_ratio * self._first_error
 
     def _breed_adaptive(self, fitness: FloatArray) -> None:
-        sigma = self._initial_spread
-        if self.preset.spread == "current":
-            sigma = self._coded.std(axis=0)
-        spread = np.mean(self._coded.std(axis=0) / self._initial_spread)
-        if spread < self.preset.collapse:
-            self._restart()
+        spread = self._coded.std(axis=0)
+        if np.mean(spread / self._initial_spread) < self.preset.collapse:
+            self._start()
             return
+        sigma = spread if self.preset.spread == "current" else self._initial_spread
         operators.adaptive_crossover(self._coded, fitness, self.rng)
         operators.adaptive_mutation(self._coded, fitness, sigma, self.rng)
         if self._leader is not None:
             leader = self.space.encode(self._leader)
             operators.replace_by_elite(self._coded, leader, self.elite_percent, self.rng)
 
-    def _restart(self) -> None:
-        """A new population that knows nothing of the elite, which is kept."""
-        draw = operators.stratified if self.preset.stratified else operators.uniform
-        self._coded = draw(self.population, self._lower, self._upper, self.rng)
-        self._leader, self._leader_rank = None, (True, np.inf)
-
     def _breed_classic(self, fitness: FloatArray) -> None:
         self._coded = operators.roulette(self._coded, fitness, self.rng)
         operators.arithmetical_crossover(self._coded, _CLASSIC_RATIO, _CLASSIC_CROSSOVER, self.rng)
-        operators.uniform_mutation(
-            self._coded, self._lower, self._upper, _CLASSIC_MUTATION, self.rng
-        )
+        operators.uniform_mutation(self._coded, *self._box, _CLASSIC_MUTATION, self.rng)

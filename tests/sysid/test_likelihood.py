@@ -8,8 +8,8 @@ from scipy.optimize import minimize_scalar
 
 from sysid import GASSI, BatchSimulator, Dataset, Input, Output, Parameter, ProcessModel, State
 from sysid.fitting.objective import Objective
+from sysid.gassi.likelihood import fit_likelihood
 from sysid.gassi.lookalikes import lookalikes
-from sysid.gassi.settling import settle
 from sysid.problem.space import SearchSpace
 from sysid.response.linearization import jacobian
 from tests.sysid.support import prbs
@@ -108,7 +108,7 @@ def test_a_minimum_among_aliases_is_found_from_any_other(seed):
     target = objective_of(model, record)
     start = lookalikes(target, model.nominal)
     wrong = max(start, key=lambda c: float(target.evaluate(c[None])[0][0]))
-    settled = settle(target, [wrong])
+    settled = fit_likelihood(target, [wrong])
     # Under the noise an alias may explain the record as well; the truth is never left out.
     found = [settled.chromosome, *settled.rivals]
     assert any(chromosome == pytest.approx(model.nominal, rel=0.1) for chromosome in found)
@@ -176,6 +176,6 @@ def test_the_likelihood_weighs_each_output_by_its_own_error():
         return float(np.prod(np.sqrt(np.mean((gain * u - outputs) ** 2, axis=0))))
 
     exact = minimize_scalar(product, bounds=(0.5, 2.0), method="bounded", options={"xatol": 1e-9})
-    settled = settle(target, [np.array([1.2])])
+    settled = fit_likelihood(target, [np.array([1.2])])
     assert settled.chromosome[0] == pytest.approx(exact.x, abs=1e-4)
     assert settled.objective.weights[0] > 5.0 * settled.objective.weights[1]

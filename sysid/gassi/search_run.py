@@ -1,4 +1,4 @@
-"""One run of an identification, step by step: genetic search, then local refinement."""
+"""A whole search, step by step: genetic search, then local refinement."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from sysid.arrays import FloatArray
 from sysid.engine.simulation import Status
 from sysid.fitting.objective import Objective
 from sysid.fitting.refinement import simulations_per_iteration
-from sysid.gassi.local import AT_ONCE, LocalSearch
-from sysid.gassi.search import GeneticSearch, Preset
+from sysid.gassi.genetic_search import GeneticSearch
+from sysid.gassi.local_search import AT_ONCE, LocalSearch
 from sysid.problem.model import ModelError
 from sysid.problem.space import SearchSpace
 
@@ -24,7 +24,7 @@ _MOST_RIVALS, _ITERATIONS_EACH = 2, 20
 
 @dataclass(frozen=True)
 class Best:
-    """The best chromosome yet (n_free,) of a space, its error, whether constraints hold."""
+    """The best chromosome (n_free,) of a space, its error, and whether constraints hold."""
 
     space: SearchSpace
     chromosome: FloatArray
@@ -33,20 +33,18 @@ class Best:
 
 
 @dataclass
-class Run:
-    """A search and what follows it, with what they have found and spent.
+class SearchRun:
+    """A genetic search and the local search that follows it.
 
     likelihood: whether simulations are kept for telling minima apart by their likelihood.
     history: the best error after each generation, one being as many simulations as the
     population has chromosomes; the last with what exceeded the budget. flagged: simulations
-    that failed in the search, by status.
+    that failed in the genetic search, by status.
     """
 
     objective: Objective
-    preset: Preset
     search: GeneticSearch
     generations: int
-    rng: np.random.Generator
     likelihood: bool
     local: LocalSearch | None = None
     history: list[float] = field(default_factory=list)
@@ -55,9 +53,9 @@ class Run:
     @property
     def done(self) -> bool:
         """Whether there is nothing left to do."""
-        if not self.preset.refine:
+        if not self.search.preset.refine:
             return self.search.done
-        return self.local is not None and self.local.done
+        return self.local is not None and self.local.polished
 
     @property
     def stage(self) -> str:
@@ -66,39 +64,36 @@ class Run:
 
     @property
     def best(self) -> Best | None:
-        """The best found, None before the first generation; starts are estimated only locally."""
-        search, local = self.search, self.local
+        """The best yet, None before the first generation; starts are estimated only locally."""
+        search, space = self.search, self.objective.space
         if search.elite is None:
             return None
-        found = Best(search.space, search.elite, search.elite_error, search.elite_feasible)
-        if local is None:
-            return found
-        space = self.objective.space
-        if self._gained(local):
-            return Best(space, space.decode(local.best), local.error, local.feasible)
-        whole = space.with_nominal_starts(found.chromosome)
-        return Best(space, whole, found.error, found.feasible)
+        elite = space.with_nominal_starts(search.elite)
+        return self._local_best or Best(space, elite, search.elite_error, search.elite_feasible)
 
     @property
+    def _local_best(self) -> Best | None:
+        """The best of the local search where it is better than that of the genetic search."""
+        search, local, space = self.search, self.local, self.objective.space
+        if local is None:
+            return None
+        elite_rank = not search.elite_feasible, search.elite_error
+        if not (not local.feasible, local.error) < elite_rank:
+            return None
+        return Best(space, space.decode(local.best), local.error, local.feasible)
+
     def minima(self) -> list[FloatArray]:
         """The best chromosome (n_free,) and others far from it that are nearly as good."""
-        best, local = self.best, self.local
+        best = self.best
         assert best is not None
-        if local is None or not self._gained(local):
+        if self.local is None or self._local_best is None:
             return [best.chromosome]
-        space = self.objective.space
-        return [space.decode(at) for at in local.rivals(_MOST_RIVALS)]
-
-    def _gained(self, local: LocalSearch) -> bool:
-        """Whether the local refinement found anything better than the search: feasible first."""
-        search = self.search
-        rank = (not local.feasible, local.error)
-        return rank < (not search.elite_feasible, search.elite_error)
+        return [best.space.decode(at) for at in self.local.rivals(_MOST_RIVALS)]
 
     def step(self) -> None:
-        """The next generation, or the next step of the local refinement."""
+        """The next generation, or the next step of the local search."""
         if not self.search.done:
-            self._generation()
+            self._breed()
             return
         if self.local is None:
             self.local = self._begin_local()
@@ -111,9 +106,9 @@ class Run:
             self.history[-1] = best.error
 
     def state(self) -> dict[str, Any]:
-        """All that the next steps depend on beside what the run was made with."""
+        """The state on which the next steps depend, beside the arguments."""
         return {
-            "rng": self.rng.bit_generator.state,
+            "rng": self.search.rng.bit_generator.state,
             "simulations": self.objective.simulations,
             "search": self.search.state(),
             "local": None if self.local is None else self.local.state(),
@@ -123,7 +118,7 @@ class Run:
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Go on from a ``state``."""
-        self.rng.bit_generator.state = state["rng"]
+        self.search.rng.bit_generator.state = state["rng"]
         self.search.restore(state["search"])
         self.objective.resume_count(state["simulations"])
         if state["local"] is not None:
@@ -131,7 +126,7 @@ class Run:
             self.local.restore(state["local"])
         self.history, self.flagged = state["history"], state["flagged"]
 
-    def _generation(self) -> None:
+    def _breed(self) -> None:
         errors, result = self.objective.evaluate(self.search.ask())
         for status in (Status.UNBOUNDED, Status.OVER_BUDGET):
             count = int(np.sum(result.status == status))
@@ -152,15 +147,10 @@ class Run:
         self.objective = self.objective.over(space)
         generations = self.generations
         if search.converged:
-            generations = round(len(search.history) / (1.0 - self.preset.local_share))
-        most = search.population * generations
+            generations = round(len(search.history) / (1.0 - search.preset.local_share))
+        budget = search.population * generations
         if self.likelihood:
             kept = _MOST_RIVALS * _ITERATIONS_EACH * simulations_per_iteration(self.objective)
-            most -= min(kept, most // 4)
-        return LocalSearch(
-            self.objective,
-            space.with_nominal_starts(search.promising(AT_ONCE)),
-            most,
-            search.population,
-            self.rng,
-        )
+            budget -= min(kept, budget // 4)
+        starts = space.with_nominal_starts(search.promising(AT_ONCE))
+        return LocalSearch(self.objective, starts, budget, search.population, search.rng)

@@ -1,0 +1,152 @@
+"""What a descent does where it stalls.
+
+A strategy takes a descent that has stalled to where it goes on from, or gives up: None. Those for
+a kind of stall are tried in turn; a descent that none of them takes on has finished.
+
+==========  ==============================================  =====================================
+FAILED      the simulation of the point fails               retreat
+BURST       the simulations of neighbours leave its by far  brace
+MISLED      gains stay far behind what is promised          coarsen, then as where it has arrived
+ARRIVED     no gain is promised, or hardly any was made     sharpen, resolve, refocus
+==========  ==============================================  =====================================
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from sysid.fitting.descent import FLOORS, PERTURBATIONS, Descent
+from sysid.fitting.objective import Objective
+from sysid.fitting.quadratic import FIRST_DAMPING, heavier
+
+PATIENCE = 3  # failures in a row, the later ones with more damping
+NOTHING = 1e-3  # share of the error that is not worth a change of perturbations
+_STEADIER, _BRACINGS = 1.5, 3
+_NEAR = 1e-3  # parts of the ranges within which integration steps need not be chosen anew
+
+Strategy = Callable[[Objective, Descent], Descent | None]
+
+
+class Stall(enum.Enum):
+    """How a descent stalls."""
+
+    FAILED = enum.auto()
+    BURST = enum.auto()
+    MISLED = enum.auto()
+    ARRIVED = enum.auto()
+
+
+def retreat(_: Objective, descent: Descent) -> Descent | None:
+    """Back to the safe point, to try more damping.
+
+    Steps chosen anew show that the simulation of the point fails, which those chosen further back
+    did not see. Gives up where there is no safe point; ends on it when patience does.
+    """
+    if descent.safe is None:
+        return None
+    failures = descent.failures + 1
+    return replace(
+        descent,
+        point=descent.safe,
+        integration=replace(descent.integration, steps_at=None),
+        damping=heavier(descent.damping),
+        gain=0.0,
+        failures=failures,
+        iterations=descent.iterations + 1,
+        finished=failures >= PATIENCE,
+    )
+
+
+def brace(_: Objective, descent: Descent) -> Descent | None:
+    """Half as many integration steps more.
+
+    At the edge of stability the steps that the point needs serve its own simulation and not its
+    neighbours'. Gives up after three times: then it is the model that is unbounded there.
+    """
+    integration = descent.integration
+    if integration.braced == _BRACINGS:
+        return None
+    more = tuple(math.ceil(_STEADIER * steps) for steps in integration.steps)
+    braced = replace(integration, steps=more, braced=integration.braced + 1)
+    return replace(descent, integration=braced)
+
+
+def coarsen(_: Objective, descent: Descent) -> Descent | None:
+    """The next larger perturbations.
+
+    More damping has not helped, so it is the slopes that are wrong: to small perturbations
+    equations that switch, as dry friction, are steps and plateaus. Gives up at the largest.
+    """
+    if descent.level + 1 == len(PERTURBATIONS):
+        return None
+    return replace(descent, level=descent.level + 1, failures=0, damping=FIRST_DAMPING)
+
+
+def sharpen(objective: Objective, descent: Descent) -> Descent | None:
+    """The next lower floor, where an output's error is below the present one.
+
+    Descents stop on the crease that the error has where an output is explained exactly, so they
+    approach it smoothed. Gives up where no output is that well explained, and at the lowest floor.
+    """
+    rms = descent.point.rms
+    assert rms is not None
+    below = np.any(rms[objective.weights > 0.0] < descent.floor)
+    if not below or descent.smoothing + 1 == len(FLOORS):
+        return None
+    return replace(descent, smoothing=descent.smoothing + 1, failures=0)
+
+
+def resolve(objective: Objective, descent: Descent) -> Descent | None:
+    """More integration steps, where the point needs more of them than it has.
+
+    They were chosen some way back. Gives up where they do, or were chosen nearby.
+    """
+    at, chosen = descent.point.at, descent.integration
+    space = objective.space
+    if chosen.steps_at is not None and np.all(np.abs(at - chosen.steps_at) <= _NEAR * space.width):
+        return None
+    needed = objective.steps_needed(space.decode(at[None]))[0].tolist()
+    steps = tuple(max(pair) for pair in zip(needed, chosen.steps, strict=True))
+    if steps == chosen.steps:
+        return None
+    return replace(descent, integration=replace(chosen, steps=steps, steps_at=at), failures=0)
+
+
+def refocus(_: Objective, descent: Descent) -> Descent | None:
+    """The smallest perturbations once more, which may go on from where larger ones have led.
+
+    Gives up where there were no larger ones, or where the round of them has gained nothing.
+    """
+    error = descent.point.error
+    if descent.level == 0 or error > (1.0 - NOTHING) * descent.error_of_round:
+        return None
+    return replace(
+        descent,
+        integration=replace(descent.integration, steps_at=descent.point.at),
+        level=0,
+        failures=0,
+        error_of_round=error,
+    )
+
+
+_AT_THE_END = (sharpen, resolve, refocus)
+STRATEGIES: dict[Stall, tuple[Strategy, ...]] = {
+    Stall.FAILED: (retreat,),
+    Stall.BURST: (brace,),
+    Stall.MISLED: (coarsen, *_AT_THE_END),
+    Stall.ARRIVED: _AT_THE_END,
+}
+
+
+def recovered(objective: Objective, descent: Descent, stall: Stall) -> Descent | None:
+    """The descent where the first strategy that does not give up goes on; None without any."""
+    for strategy in STRATEGIES[stall]:
+        onward = strategy(objective, descent)
+        if onward is not None:
+            return onward
+    return None

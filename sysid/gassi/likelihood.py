@@ -1,0 +1,219 @@
+"""The last step of an identification: which minimum, by which weights.
+
+The mean of the outputs' RMSEs serves the search. Statistically it is not the figure to end with:
+it lets an output that is noisy, or whose errors wander slowly, decide what another with small
+white errors could tell better. The likelihood of independent normal errors whose variances are
+unknown has its maximum where the product of the RMSEs is least (Ljung, "System Identification",
+section 7.4, with a diagonal covariance): every output then weighs by the inverse of its own error.
+Among minima the likelihood chooses once more, each output counted by as many independent samples
+as the colour of its errors leaves; those that it cannot tell apart are rivals.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from sysid.arrays import FloatArray
+from sysid.fitting.free_run import FINER, FINEST
+from sysid.fitting.objective import Objective
+from sysid.fitting.refinement import Refinement, refine, refine_each
+from sysid.gassi.lookalikes import lookalikes
+from sysid.uncertainty.colour import colour, longest_memory
+from sysid.uncertainty.sensitivity import (
+    Sensitivity,
+    common_steps,
+    coordinate_units,
+    sensitivity,
+)
+
+_ROUNDS = 6  # of weights and parameters in turn
+_STEADY = 1e-3  # share by which weights may still change
+# An output explained much better than the others keeps this share of the largest error, or the
+# arithmetic of its last digits would decide.
+_LEAST_SHARE = 1e-2
+# Errors below this part of the simulation's accuracy are its own: there is no noise to weigh by.
+_SIMULATION_SHARE = 0.1
+_FINER, _FINEST = 1e-3, 1e-9
+# Colour does not make an output's errors count as fewer independent samples than this.
+_FEWEST = 30.0
+# Deviance above which one minimum is no rival to another: one in a hundred for the four
+# parameters in which such minima typically differ.
+_TOLD_APART = 13.3
+_CONCEIVABLE = 40.0  # the same before a minimum has been refined to its end
+_QUICKLY, _ROUGHLY = 15, 1e-4  # iterations and tolerance until then
+_EXPLORED = 2  # minima whose lookalikes are descended from
+# Minima are one when the way between them, were all linear, changed twice the log-likelihood by
+# less than this.
+_ONE = 16.0
+
+Watch = Callable[[Refinement], None]
+
+
+@dataclass(frozen=True)
+class LikelihoodFit:
+    """Where an identification ends.
+
+    objective: with the weights of the likelihood. chromosome: (n_free,). rivals: chromosomes far
+    from it that the data do not tell from it.
+    """
+
+    objective: Objective
+    chromosome: FloatArray
+    rivals: tuple[FloatArray, ...] = ()
+
+
+def fit_likelihood(
+    objective: Objective, minima: Sequence[FloatArray], watch: Watch | None = None
+) -> LikelihoodFit:
+    """The likeliest of some minima (n_free,) of the mean RMSE and of their lookalikes."""
+    objective = _resolved(objective, minima[0])
+    optima = _Optima(objective)
+    for minimum in minima:
+        optima.add(_weighed(objective, minimum, watch))
+    explored: list[_Optimum] = []
+    while len(explored) < _EXPLORED:
+        best = optima.ranked()[0]
+        if any(best is optimum for optimum in explored):
+            break  # nothing better was found around it
+        explored.append(best)
+        for end in refine_each(
+            best.objective,
+            lookalikes(best.objective, best.chromosome),
+            max_iterations=_QUICKLY,
+            tolerance=_ROUGHLY,
+            enough=lambda chromosome: not optima.new(chromosome),
+        ):
+            # By the best one's weights, until it turns out to matter.
+            rough = _optimum(best.objective, end.chromosome, end.rms)
+            if optima.new(end.chromosome) and optima.deviance(rough, best) < _CONCEIVABLE:
+                optima.add(_weighed(objective, end.chromosome, watch))
+    best, *others = optima.ranked()
+    best = _exact(best)
+    rivals = [optimum for optimum in others if optima.deviance(optimum, best) < _TOLD_APART]
+    return LikelihoodFit(
+        best.objective, best.chromosome, tuple(rival.chromosome for rival in rivals)
+    )
+
+
+@dataclass(frozen=True)
+class _Optimum:
+    """A minimum by its own weights: chromosome (n_free,), the outputs' errors (n_outputs,)."""
+
+    objective: Objective
+    chromosome: FloatArray
+    rms: FloatArray
+    feasible: bool
+
+
+class _Optima:
+    """Minima far from each other, compared by what the data tell at the first."""
+
+    def __init__(self, objective: Objective) -> None:
+        self._objective = objective
+        self._optima: list[_Optimum] = []
+
+    def add(self, optimum: _Optimum) -> None:
+        """Add a minimum if it is a new one."""
+        if self.new(optimum.chromosome):
+            self._optima.append(optimum)
+
+    def new(self, chromosome: FloatArray) -> bool:
+        """Whether a chromosome is far from all minima in directions that the data feel."""
+        coded = self._objective.space.encode
+        for optimum in self._optima:
+            moved = coded(optimum.chromosome) - coded(chromosome)
+            moved /= coordinate_units(self._objective, optimum.chromosome)
+            if moved @ self._information @ moved < _ONE:
+                return False
+        return True
+
+    def ranked(self) -> list[_Optimum]:
+        """The likeliest first, feasible before infeasible."""
+        first = self._optima[0]
+        return sorted(self._optima, key=lambda o: (not o.feasible, self.deviance(o, first)))
+
+    def deviance(self, optimum: _Optimum, reference: _Optimum) -> float:
+        """Twice the logarithm of the likelihood ratio of the reference and the optimum."""
+        floor = _LEAST_SHARE * max(optimum.rms.max(), reference.rms.max(), 1e-300)
+        ratio = np.log(np.maximum(optimum.rms, floor) / np.maximum(reference.rms, floor))
+        return float(2.0 * np.sum(self._independent_samples * ratio))
+
+    @cached_property
+    def _independent_samples(self) -> FloatArray:
+        """Independent samples that each output's errors amount to, (n_outputs,)."""
+        first = self._sensitivity
+        noise = colour(first.residual, first.seen, first.lengths)
+        memory = longest_memory(noise, np.mean(first.residual**2, axis=0))
+        weights = self._objective.weights * len(self._objective.weights)
+        samples: FloatArray = weights * np.maximum(self._objective.counts / memory, _FEWEST)
+        return samples
+
+    @cached_property
+    def _information(self) -> FloatArray:
+        """Fisher information of the coordinates, (n_free, n_free), were errors white."""
+        first = self._sensitivity
+        variance: FloatArray = np.mean(first.residual**2, axis=0)
+        variance = np.maximum(variance, max(_LEAST_SHARE**2 * variance.max(), 1e-300))
+        slopes = (first.slopes / np.sqrt(variance)[:, None]).reshape(-1, first.slopes.shape[2])
+        information: FloatArray = slopes.T @ slopes
+        return information
+
+    @cached_property
+    def _sensitivity(self) -> Sensitivity:
+        first = self._optima[0]
+        steps = common_steps(first.objective, first.chromosome)
+        return sensitivity(first.objective, first.chromosome, steps)
+
+
+def _resolved(objective: Objective, chromosome: FloatArray) -> Objective:
+    """The objective with simulations as accurate as they are meant to be, at a chromosome.
+
+    The steps are chosen by what each of them errs. Where little is damped, as in a pendulum that
+    swings freely, such errors add up along the record; twice the steps show by how much.
+    """
+    accuracy = objective.simulator.accuracy
+    while objective.simulator.accuracy >= FINEST:
+        steps = objective.steps_needed(chromosome[None])[0]
+        coarse = objective.residuals(chromosome[None], steps).values
+        change = coarse - objective.residuals(chromosome[None], 2 * steps).values
+        if not np.max(np.sqrt(np.mean(change**2, axis=0))) > accuracy:
+            break
+        objective = objective.finer(FINER * objective.simulator.accuracy)
+    return objective
+
+
+def _exact(optimum: _Optimum) -> _Optimum:
+    """A minimum whose errors are the simulation's, refined with finer simulations."""
+    accuracy = optimum.objective.simulator.accuracy
+    if optimum.rms.max() > _SIMULATION_SHARE * accuracy:
+        return optimum
+    objective = optimum.objective.finer(max(_FINER * accuracy, _FINEST))
+    end = refine(objective, optimum.chromosome)
+    return _optimum(objective, end.chromosome, end.rms)
+
+
+def _weighed(objective: Objective, chromosome: FloatArray, watch: Watch | None) -> _Optimum:
+    """The minimum by the inverse of its errors: weights and parameters in turn."""
+    given, accuracy = objective.weights, objective.simulator.accuracy
+    rms = objective.rms(chromosome[None])[0]
+    # A refinement may end where a simulation takes more steps than a chromosome is allowed.
+    noisy = np.isfinite(rms).all() and given @ rms > _SIMULATION_SHARE * accuracy
+    for _ in range(_ROUNDS if noisy else 0):
+        weights = given / np.maximum(rms, max(_LEAST_SHARE * rms.max(), 1e-300))
+        weighed = objective.weighed(weights)
+        steady = np.allclose(weighed.weights, objective.weights, rtol=_STEADY)
+        objective = weighed
+        end = refine(objective, chromosome, on_iteration=watch)
+        chromosome, rms = end.chromosome, end.rms
+        if steady:
+            break
+    return _optimum(objective, chromosome, rms)
+
+
+def _optimum(objective: Objective, chromosome: FloatArray, rms: FloatArray) -> _Optimum:
+    finite = np.where(np.isfinite(rms), rms, np.finfo(np.float64).max)
+    return _Optimum(objective, chromosome, finite, objective.space.feasible(chromosome))
