@@ -12,7 +12,7 @@ from sysid.problem.model import AROUND_FIRST_SAMPLE, ModelError, ProcessModel
 
 @dataclass(frozen=True)
 class Dataset:
-    """One record: row k holds the outputs latched at time k*dt and the inputs from then on.
+    """A record: row k holds the outputs latched at time k*dt and the inputs from then on.
 
     inputs: (n_samples, n_inputs); outputs: (n_samples, n_outputs), NaN where a sample was
     lost, so that a gap keeps its length in time. SI units, columns in the model's order.
@@ -22,6 +22,10 @@ class Dataset:
     widen the intervals of what is identified.
 
     Raises ModelError for mismatched shapes, fewer than two rows, or inputs that are not finite.
+
+    >>> record = Dataset(inputs=np.ones(5), outputs=np.arange(5.0), dt=0.01, name="ramp")
+    >>> record.n_samples, record.outputs.shape
+    (5, (5, 1))
     """
 
     inputs: FloatArray
@@ -50,7 +54,7 @@ class Dataset:
             object.__setattr__(self, name, self._deviations(name))
 
     def _deviations(self, name: str) -> FloatArray:
-        """One standard deviation for each channel of a side; none given are zeros."""
+        """Standard deviations of a side's channels; zeros where none are given."""
         n = (self.inputs if name.startswith("input") else self.outputs).shape[1]
         given = np.asarray(getattr(self, name), dtype=np.float64)
         deviations = given if given.size else np.zeros(n)
@@ -72,17 +76,17 @@ class Dataset:
         return self.dt * np.arange(self.n_samples, dtype=np.float64)
 
     def part(self, begin: int, end: int, name: str) -> Dataset:
-        """The rows from ``begin`` up to ``end`` as a record of their own."""
+        """The rows from ``begin`` up to ``end`` as a record."""
         rows = slice(begin, end)
         return replace(self, inputs=self.inputs[rows], outputs=self.outputs[rows], name=name)
 
     def check(self, model: ProcessModel) -> None:
         """Raise ModelError unless the columns match the model's inputs and outputs."""
         expected = (len(model.inputs), len(model.outputs))
-        found = (self.inputs.shape[1], self.outputs.shape[1])
-        if found != expected:
+        columns = (self.inputs.shape[1], self.outputs.shape[1])
+        if columns != expected:
             raise ModelError(
-                f"{self.name}: {found[0]} inputs and {found[1]} outputs, but model "
+                f"{self.name}: {columns[0]} inputs and {columns[1]} outputs, but model "
                 f"{model.name} has {expected[0]} and {expected[1]}"
             )
 
@@ -99,7 +103,7 @@ class Dataset:
         return x0
 
     def initial_range(self, model: ProcessModel, state: int) -> tuple[float, float] | None:
-        """Where the start of a state of the model is to be estimated; None where it is not."""
+        """Range in which a state's initial value is estimated; None where it is not."""
         declared = model.states[state].initial_range
         if declared != AROUND_FIRST_SAMPLE:
             return declared
@@ -112,16 +116,18 @@ class Dataset:
 
 def _matrix(values: FloatArray) -> FloatArray:
     array: FloatArray = np.ascontiguousarray(values, dtype=np.float64)
-    if array.ndim == 1:
-        array = array.reshape(-1, 1)
-    return array
+    return array.reshape(-1, 1) if array.ndim == 1 else array
 
 
 def output_scale(datasets: list[Dataset], per_log: bool = False) -> list[FloatArray]:
     """max|y| of each output, the unit of (4.22) and of tables 4.2 and 4.3.
 
-    One (n_outputs,) array per dataset: its own maximum with ``per_log``, else the maximum over
+    An (n_outputs,) array for each dataset: its maximum with ``per_log``, else the maximum over
     all of them. An output that never leaves zero gets 1.
+
+    >>> runs = [Dataset(np.zeros(2), np.array([0.0, peak]), 0.01) for peak in (-3.0, 2.0)]
+    >>> [scale.tolist() for scale in output_scale(runs)]
+    [[3.0], [3.0]]
     """
     measured = [np.where(np.isfinite(d.outputs), np.abs(d.outputs), 0.0) for d in datasets]
     peaks = np.array([values.max(axis=0) for values in measured])

@@ -1,13 +1,13 @@
-"""Starting ranges from measured data: a model's own rules of thumb, and where each came from.
+"""Starting ranges from measured data: a model's rules of thumb, and where each came from.
 
-A model that can tell something of its parameters from records has a ``guesses`` function:
+A model that can read ranges of its parameters from records has a ``guesses`` function:
 
     def guesses(records, known):
         ...
         return {"R": Guess(0.9, 1.3, "steady current over voltage in bench.csv")}
 
-records: ``Measured``, signals by name. known: {parameter: (low, high)}, what is assumed of every
-parameter so far, low = high for one that is fixed. What it does not return keeps its range.
+records: ``Measured``, signals by name. known: {parameter: (low, high)}, the range assumed of each
+parameter so far, low = high for a fixed one. A parameter that it does not return keeps its range.
 """
 
 from __future__ import annotations
@@ -30,7 +30,11 @@ Known = Mapping[str, tuple[float, float]]
 
 @dataclass(frozen=True)
 class Guess:
-    """A range for a parameter and what it was read from; an end not told is None."""
+    """A range for a parameter and what it was read from; an open end is None.
+
+    >>> Guess(0.9, None, "steady current over voltage in bench.csv").low
+    0.9
+    """
 
     low: float | None
     high: float | None
@@ -62,13 +66,11 @@ class Measured:
         return signal in self.model.input_names or signal in self.model.output_names
 
     def __getitem__(self, signal: str) -> FloatArray:
+        if signal not in self:
+            raise ModelError(f"{self.name}: model {self.model.name} has no signal {signal!r} in it")
         if signal in self.model.input_names:
-            column: FloatArray = self.record.inputs[:, self.model.input_names.index(signal)]
-            return column
-        if signal in self.model.output_names:
-            column = self.record.outputs[:, self.model.output_names.index(signal)]
-            return column
-        raise ModelError(f"{self.name}: model {self.model.name} has no signal {signal!r} in it")
+            return self.record.inputs[:, self.model.input_names.index(signal)]
+        return self.record.outputs[:, self.model.output_names.index(signal)]
 
 
 Guesses = Callable[[Sequence[Measured], Known], Mapping[str, Guess]]
@@ -81,12 +83,20 @@ def guess_ranges(
     fixed: Mapping[str, float] | None = None,
     tied: Mapping[str, str] | None = None,
 ) -> dict[str, Guess]:
-    """Ranges that the records suggest for parameters of which nothing else is said.
+    """Ranges that the records suggest for parameters whose range is not given.
 
-    ranges, fixed and tied as in ``SearchSpace.of``; parameters named there keep what is said.
-    A guess narrows the model's own range; one that lies outside of it takes its place. Both
+    ranges, fixed and tied as in ``SearchSpace.of``; parameters named there keep what is given.
+    A guess narrows the model's declared range, or replaces it where they do not overlap. Both
     ends of what is returned are numbers within the physical limits. Raises ModelError for a
     model without a ``guesses`` function, or one that fails.
+
+    >>> from dataclasses import replace
+    >>> from sysid.examples import lag, lag_record
+    >>> def guesses(records, known):
+    ...     peak = max(abs(record["y"]).max() for record in records)
+    ...     return {"gain": Guess(peak, None, "largest output under 1 V")}
+    >>> guess_ranges(replace(lag(), guesses=guesses), [lag_record()])
+    {'gain': Guess(low=2.62, high=20.0, source='largest output under 1 V')}
     """
     if model.guesses is None:
         raise ModelError(
@@ -94,56 +104,59 @@ def guess_ranges(
             "leave guessing out"
         )
     space = SearchSpace.of(model, ranges, fixed, tied=tied)
-    low, high = space.full(space.lower), space.full(space.upper)
-    known = {
-        name: (float(min(ends)), float(max(ends)))
+    low, high = space.full(space.lower).tolist(), space.full(space.upper).tolist()
+    assumed = {
+        name: (min(ends), max(ends))
         for name, *ends in zip(model.parameter_names, low, high, strict=True)
     }
     for record in records:
         record.check(model)
     with one_thread():
-        told = _called(model, [Measured(record, model) for record in records], known)
-    found = {}
+        guesses = _guesses(model, [Measured(record, model) for record in records], assumed)
+    narrowed = {}
     for parameter in space.parameters:
-        given = told.get(parameter.name)
-        if given is None or parameter.name in (ranges or {}):
+        guess = guesses.get(parameter.name)
+        if guess is None or parameter.name in (ranges or {}):
             continue
-        ends = _rounded(parameter, *_within(parameter, given))
-        if ends != (parameter.lower, parameter.upper):
-            found[parameter.name] = Guess(*ends, given.source)
-    return found
+        range_ = _rounded(parameter, *_within(parameter, guess))
+        if range_ != (parameter.lower, parameter.upper):
+            narrowed[parameter.name] = Guess(*range_, guess.source)
+    return narrowed
 
 
-def _called(model: ProcessModel, records: list[Measured], known: Known) -> Mapping[str, Guess]:
+def _guesses(model: ProcessModel, records: list[Measured], assumed: Known) -> dict[str, Guess]:
+    """What the model's function returns, checked."""
     assert model.guesses is not None
     where = f"model {model.name}: guesses(records, known)"
     try:
-        told = dict(model.guesses(records, known))
+        guesses = dict(model.guesses(records, assumed))
     except ModelError:
         raise
     except Exception as error:
         raise ModelError(f"{where} fails: {type(error).__name__}: {error}") from error
-    for name, guess in told.items():
+    for name, guess in guesses.items():
         model.parameter(name)
         if not isinstance(guess, Guess):
             raise ModelError(f"{where} gives {guess!r} for {name}; return Guess(low, high, source)")
         ends = [end for end in (guess.low, guess.high) if end is not None]
         if not np.all(np.isfinite(ends)) or ends != sorted(ends):
-            raise ModelError(f"{where} gives [{guess.low}, {guess.high}] for {name}; it must be "
-                             "finite, low before high, None for an end not told")  # fmt: skip
-    return told
+            raise ModelError(
+                f"{where} gives [{guess.low}, {guess.high}] for {name}; it must be finite, low "
+                "before high, None for an end not told"
+            )
+    return guesses
 
 
 def _within(parameter: Parameter, guess: Guess) -> tuple[float, float]:
-    """The part of the parameter's range that the guess leaves; the guess, where that is none."""
+    """The part of the declared range that the guess leaves; the guess where that is none."""
     low = parameter.lower if guess.low is None else max(guess.low, parameter.lower)
     high = parameter.upper if guess.high is None else min(guess.high, parameter.upper)
     if low < high:
         return low, high
-    inside = [
+    inside = tuple(
         None if end is None else min(max(end, parameter.minimum), parameter.maximum)
         for end in (guess.low, guess.high)
-    ]
+    )
     try:
         elsewhere = searched(parameter, (inside[0], inside[1]), "linear")
     except ModelError:
@@ -152,15 +165,19 @@ def _within(parameter: Parameter, guess: Guess) -> tuple[float, float]:
 
 
 def _rounded(parameter: Parameter, low: float, high: float) -> tuple[float, float]:
-    """Ends that are no range's own, to three digits outwards; a guess is no better than that."""
-    rounded = []
-    for end, outwards in ((low, math.floor), (high, math.ceil)):
-        if end in (0.0, parameter.lower, parameter.upper, parameter.minimum, parameter.maximum):
-            rounded.append(end)
-            continue
+    """Ends read from data to three digits, outwards: a guess is no better than that."""
+    exact = (0.0, parameter.lower, parameter.upper, parameter.minimum, parameter.maximum)
+
+    def rounded(end: float, outwards: Callable[[float], float]) -> float:
+        if end in exact:
+            return end
         digit = 10.0 ** (math.floor(math.log10(abs(end))) - 2)
-        rounded.append(float(f"{outwards(end / digit) * digit:.3g}"))
-    return max(rounded[0], parameter.minimum), min(rounded[1], parameter.maximum)
+        return float(f"{outwards(end / digit) * digit:.3g}")
+
+    return (
+        max(rounded(low, math.floor), parameter.minimum),
+        min(rounded(high, math.ceil), parameter.maximum),
+    )
 
 
 def regression(
@@ -170,10 +187,15 @@ def regression(
 
     target and each column: (n,); rows with NaN do not count. None where the rows are too few or
     the columns do not tell the coefficients apart.
+
+    >>> t = np.arange(9.0)
+    >>> coefficients, covariance = regression(2.0 * t - 1.0, [t, np.ones(9)])
+    >>> coefficients.round(9).tolist()
+    [2.0, -1.0]
     """
     table = np.column_stack(columns)
     rows = np.isfinite(target) & np.isfinite(table).all(axis=1)
-    table, wanted = table[rows], target[rows]
+    table, target = table[rows], target[rows]
     n, m = table.shape
     if n < 2 * m + 2:
         return None
@@ -184,7 +206,7 @@ def regression(
     if np.abs(np.diag(triangle)).min() < 1e-9 * np.abs(np.diag(triangle)).max():
         return None
     inverse = np.linalg.inv(triangle)
-    coefficients = inverse @ (q.T @ wanted)
-    residual = wanted - (table / size) @ coefficients
+    coefficients = inverse @ (q.T @ target)
+    residual = target - (table / size) @ coefficients
     covariance = inverse @ inverse.T * (residual @ residual / (n - m))
     return coefficients / size, covariance / np.outer(size, size)

@@ -6,31 +6,43 @@ are (n_outputs,).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from sysid.arrays import FloatArray
+from sysid.arrays import BoolArray, FloatArray
 
 
 def rmse(
     measured: FloatArray, simulated: FloatArray, scale: FloatArray | float = 1.0
 ) -> FloatArray:
-    """Root of the mean squared error, divided by ``scale`` (max|y| for tables 4.2 and 4.3)."""
+    """Root of the mean squared error, divided by ``scale`` (max|y| for tables 4.2 and 4.3).
+
+    >>> rmse(np.zeros((2, 1)), np.array([[3.0], [-3.0]]), scale=2.0).tolist()
+    [1.5]
+    """
     result: FloatArray = np.sqrt(_mean((simulated - measured) ** 2, measured)) / scale
     return result
 
 
 def msd(measured: FloatArray, simulated: FloatArray, scale: FloatArray | float = 1.0) -> FloatArray:
-    """Mean signed deviation, simulated minus measured, divided by ``scale``."""
-    result: FloatArray = _mean(simulated - measured, measured) / scale
-    return result
+    """Mean signed deviation, simulated minus measured, divided by ``scale``.
+
+    >>> msd(np.zeros((2, 1)), np.array([[3.0], [-1.0]])).tolist()
+    [1.0]
+    """
+    return _mean(simulated - measured, measured) / scale
 
 
 def fit_percent(measured: FloatArray, simulated: FloatArray) -> FloatArray:
     """100 (1 - ||y - y_sim|| / ||y - mean y||); 100 is perfect, 0 no better than the mean.
 
     An output that never changes has no spread to explain: NaN.
+
+    >>> y = np.array([[1.0], [3.0]])
+    >>> fit_percent(y, y).tolist(), fit_percent(y, 0.0 * y + 2.0).tolist()
+    ([100.0], [0.0])
     """
     residual = np.sqrt(_mean((simulated - measured) ** 2, measured))
     spread = np.sqrt(_mean((measured - _mean(measured, measured)) ** 2, measured))
@@ -38,28 +50,33 @@ def fit_percent(measured: FloatArray, simulated: FloatArray) -> FloatArray:
         return np.where(spread > 0.0, 100.0 * (1.0 - residual / spread), np.nan)
 
 
-def mean_known(values: FloatArray, axis: int | None = None) -> FloatArray:
-    """Mean of the values that are not NaN; NaN where there is none."""
-    known = ~np.isnan(values)
+def mean_known(
+    values: FloatArray | Sequence[FloatArray],
+    axis: int | None = None,
+    counted: BoolArray | None = None,
+) -> FloatArray:
+    """Mean of the values that are ``counted``, by default that are not NaN; NaN of none."""
+    values = np.asarray(values)
+    counted = ~np.isnan(values) if counted is None else counted
     with np.errstate(invalid="ignore"):
-        mean: FloatArray = np.where(known, values, 0.0).sum(axis=axis) / known.sum(axis=axis)
+        mean: FloatArray = np.where(counted, values, 0.0).sum(axis=axis) / counted.sum(axis=axis)
     return mean
 
 
 def _mean(values: FloatArray, measured: FloatArray) -> FloatArray:
-    """Mean over the samples that were measured; NaN for an output without any.
-
-    A simulation that failed is no lost sample: its NaN stays.
-    """
-    counted = ~np.isnan(measured)
-    with np.errstate(invalid="ignore"):
-        total: FloatArray = np.where(counted, values, 0.0).sum(axis=0) / counted.sum(axis=0)
-    return total
+    """Mean over the measured samples; a simulation that failed is no lost sample: its NaN stays."""
+    return mean_known(values, 0, ~np.isnan(measured))
 
 
 @dataclass(frozen=True)
 class Metrics:
-    """RMSE and MSD on outputs normalised by max|y| of the record, fit %, each (n_outputs,)."""
+    """RMSE and MSD on outputs normalised by max|y| of the record, fit %, each (n_outputs,).
+
+    >>> y = np.array([[0.0], [4.0]])
+    >>> metrics = evaluate(y, y + 1.0)
+    >>> metrics.rmse.tolist(), metrics.fit.tolist(), metrics.scale.tolist()
+    ([0.25], [50.0], [4.0])
+    """
 
     rmse: FloatArray
     msd: FloatArray
@@ -68,7 +85,11 @@ class Metrics:
 
 
 def evaluate(measured: FloatArray, simulated: FloatArray) -> Metrics:
-    """All metrics of one record; ``scale`` of the result is max|y| of ``measured``."""
+    """All metrics of a record; ``scale`` of the result is max|y| of ``measured``.
+
+    >>> evaluate(np.array([[0.0], [4.0]]), np.array([[1.0], [3.0]])).fit.tolist()
+    [50.0]
+    """
     peak = np.max(np.where(np.isnan(measured), 0.0, np.abs(measured)), axis=0)
     scale = np.where(peak > 0.0, peak, 1.0)
     return Metrics(

@@ -1,4 +1,4 @@
-"""Description of a grey-box process model: data plus plain-Python functions.
+"""Grey-box process models: data plus plain-Python functions.
 
 A model is written once, as equations over tuples of floats, and serves every engine: the batch
 simulator compiles it to vector code, SciPy integrates it as the reference.
@@ -7,8 +7,9 @@ simulator compiles it to vector code, SciPy integrates it as the reference.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -21,23 +22,33 @@ Function = Callable[..., tuple[Any, ...]]
 Scale = Literal["linear", "log"]
 Hold = Literal["zoh", "foh", "spline"]
 # A value, a range to estimate it in, or a word.
-Start = float | tuple[float, float] | Literal["first", "estimate"]
+InitialValue = float | tuple[float, float] | Literal["first", "estimate"]
 
 AROUND_FIRST_SAMPLE = (-math.inf, math.inf)
 
 
 class ModelError(ValueError):
-    """A process model or its use is wrong; the message says what and how to mend it."""
+    """A process model or its use is wrong; the message says what and how to mend it.
+
+    >>> try:
+    ...     Parameter("R", "ohm", nominal=1.0, lower=0.0, upper=2.0, scale="log")
+    ... except ModelError as error:
+    ...     print(error)
+    parameter R: a log scale needs a positive range, but it starts at 0
+    """
 
 
 @dataclass(frozen=True)
 class State:
-    """One state: name, unit and the value it starts from when no measurement gives it.
+    """A state: name, unit and the value it starts from when no measurement gives it.
 
-    initial_range: (low, high) where that value is unknown and to be estimated from each record;
-    ``AROUND_FIRST_SAMPLE`` for as far from the first sample of the output of the same name as
-    that output spans in the record. first_sample: whether that sample, where there is one, goes
-    before ``initial``.
+    initial_range: (low, high) in which an unknown initial value is estimated from each record;
+    ``AROUND_FIRST_SAMPLE`` reaches as far from the first sample of the output of the same name
+    as that output spans in the record. first_sample: whether that sample, where there is one,
+    takes precedence over ``initial``.
+
+    >>> State("omega", "rad/s", initial_range=(-1.0, 1.0)).initial
+    0.0
     """
 
     name: str
@@ -54,11 +65,14 @@ class State:
 
 @dataclass(frozen=True)
 class Input:
-    """One input and how it runs between samples.
+    """An input and how it runs between samples.
 
     ``zoh`` holds each sample until the next, ``foh`` interpolates linearly, ``spline`` runs a
     cubic spline through all samples of a record (where a model is advanced sample by sample,
     without knowing what comes, linearly).
+
+    >>> Input("load", "N*m", hold="foh").hold
+    'foh'
     """
 
     name: str
@@ -69,7 +83,11 @@ class Input:
 
 @dataclass(frozen=True)
 class Output:
-    """One measured output."""
+    """A measured output.
+
+    >>> Output("omega", "rad/s", "shaft speed").unit
+    'rad/s'
+    """
 
     name: str
     unit: str
@@ -78,12 +96,15 @@ class Output:
 
 @dataclass(frozen=True)
 class Parameter:
-    """One parameter with its search range and its physical limits.
+    """A parameter with its search range and its physical limits.
 
     ``lower``/``upper`` bound where the search starts (outside is improbable);
     ``minimum``/``maximum`` bound what is physically possible (outside is infeasible).
     A ``fixed`` parameter stays at ``nominal``. ``scale`` is how a range spanning decades is
     searched.
+
+    >>> Parameter("L", "H", nominal=2e-3, lower=2e-4, upper=2e-2, scale="log").minimum
+    0.0
     """
 
     name: str
@@ -126,7 +147,11 @@ def check_range(name: str, lower: float, upper: float, scale: Scale = "linear") 
 
 @dataclass(frozen=True)
 class Constraint:
-    """An inequality g(p) <= 0 on the parameters; ``text`` says it in the field's notation."""
+    """An inequality g(p) <= 0 on the parameters; ``text`` says it in the field's notation.
+
+    >>> Constraint("J_m <= J_b", lambda p: p[0] - p[1]).function((1.0, 3.0))
+    -2.0
+    """
 
     text: str
     function: Callable[[tuple[Any, ...]], Any]
@@ -147,6 +172,17 @@ class ProcessModel:
 
     Raises ModelError when names repeat, an output has no state, or a function returns the
     wrong number of values at the nominal parameters.
+
+    >>> lag = ProcessModel(
+    ...     name="lag",
+    ...     states=(State("y", "V"),),
+    ...     inputs=(Input("u", "V"),),
+    ...     outputs=(Output("y", "V"),),
+    ...     parameters=(Parameter("tau", "s", nominal=0.5, lower=0.1, upper=2.0),),
+    ...     derivative=lambda x, u, p: ((u[0] - x[0]) / p[0],),
+    ... )
+    >>> lag.derivative((0.0,), (1.0,), (0.5,))
+    (2.0,)
     """
 
     name: str
@@ -162,15 +198,14 @@ class ProcessModel:
     plots: Callable[[Any, Any], Iterable[Any]] | None = None
     operating_points: Callable[[Any, Any], Mapping[str, Mapping[str, float]]] | None = None
     equations: tuple[str, ...] = ()
-    _output_states: tuple[int, ...] | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
         for kind in ("states", "inputs", "outputs", "parameters", "constraints", "equations"):
-            object.__setattr__(self, kind, _several(self.name, kind, getattr(self, kind)))
+            object.__setattr__(self, kind, _as_tuple(self.name, kind, getattr(self, kind)))
         for kind in ("states", "inputs", "outputs", "parameters"):
             _check_names(self.name, kind, [item.name for item in getattr(self, kind)])
         if self.output is None:
-            object.__setattr__(self, "_output_states", self._match_outputs())
+            self._check_outputs_are_states()
         self._try_functions()
 
     @property
@@ -193,10 +228,12 @@ class ProcessModel:
         """Names of the parameters, in order."""
         return tuple(parameter.name for parameter in self.parameters)
 
-    @property
+    @cached_property
     def output_states(self) -> tuple[int, ...] | None:
         """Index of each output's state, or None when ``output`` computes them."""
-        return self._output_states
+        if self.output is not None:
+            return None
+        return tuple(self.state_names.index(name) for name in self.output_names)
 
     @property
     def nominal(self) -> FloatArray:
@@ -210,24 +247,17 @@ class ProcessModel:
 
     def parameter(self, name: str) -> Parameter:
         """The parameter called ``name``; raises ModelError naming those that exist."""
-        for parameter in self.parameters:
-            if parameter.name == name:
-                return parameter
-        raise ModelError(
-            f"model {self.name} has no parameter {name!r}; it has "
-            + ", ".join(self.parameter_names)
-        )
+        self._check_exists("parameter", [name], self.parameter_names)
+        return self.parameters[self.parameter_names.index(name)]
 
     def vector(self, values: dict[str, float]) -> FloatArray:
         """Parameters as a vector in declared order; those not named stay nominal."""
-        for name in values:
-            self.parameter(name)
+        self._check_exists("parameter", values, self.parameter_names)
         return np.array([values.get(p.name, p.nominal) for p in self.parameters])
 
     def with_parameters(self, **changes: dict[str, Any]) -> ProcessModel:
         """A copy in which parameter ``name`` has the given fields replaced."""
-        for name in changes:
-            self.parameter(name)
+        self._check_exists("parameter", changes, self.parameter_names)
         parameters = tuple(replace(p, **changes.get(p.name, {})) for p in self.parameters)
         return replace(self, parameters=parameters)
 
@@ -236,37 +266,28 @@ class ProcessModel:
 
         Raises ModelError for a name that is neither, one given twice, or none at all.
         """
-        own = {signal.name: signal for signal in self.outputs}
-        states = {s.name: Output(s.name, s.unit, s.description) for s in self.states}
-        known = states | own
-        for name in names:
-            if name not in known:
-                raise ModelError(
-                    f"model {self.name} has no output or state {name!r}; it has {', '.join(known)}"
-                )
-        outputs = tuple(known[name] for name in names)
+        signals = {s.name: Output(s.name, s.unit, s.description) for s in self.states}
+        signals |= {signal.name: signal for signal in self.outputs}
+        self._check_exists("output or state", names, signals)
+        outputs = tuple(signals[name] for name in names)
         if self.output is None:
             return replace(self, outputs=outputs)
-        everything = [*own, *self.state_names]
-        pick = picker([everything.index(name) for name in names]) if names else tuple
+        columns = (*self.output_names, *self.state_names)
+        pick = picker([columns.index(name) for name in names]) if names else tuple
         output = self.output
         return replace(
             self, outputs=outputs, output=lambda x, u, p: pick(output(x, u, p) + tuple(x))
         )
 
-    def with_initial(self, starts: Mapping[str, Start]) -> ProcessModel:
-        """A copy in which the named states start as told, in every record.
+    def with_initial(self, starts: Mapping[str, InitialValue]) -> ProcessModel:
+        """A copy whose named states start as given, in every record.
 
         ``"first"``: at the first sample of the output of the same name. A number: there,
-        whatever was measured. ``"estimate"``: fitted to each record, within the state's own
-        range or around its first sample. ``(low, high)``: the same within this range. Raises
-        ModelError for an unknown state, or a word that its outputs do not allow.
+        whatever was measured. ``"estimate"``: fitted to each record, within the state's
+        declared range or around its first sample. ``(low, high)``: the same within this range.
+        Raises ModelError for an unknown state, or a word that its outputs do not allow.
         """
-        for name in starts:
-            if name not in self.state_names:
-                raise ModelError(
-                    f"model {self.name} has no state {name!r}; it has {', '.join(self.state_names)}"
-                )
+        self._check_exists("state", starts, self.state_names)
         states = tuple(
             self._started(state, starts[state.name]) if state.name in starts else state
             for state in self.states
@@ -278,28 +299,35 @@ class ProcessModel:
 
         Raises ModelError for an unknown input.
         """
-        for name in holds:
-            if name not in self.input_names:
-                raise ModelError(
-                    f"model {self.name} has no input {name!r}; it has {', '.join(self.input_names)}"
-                )
+        self._check_exists("input", holds, self.input_names)
         inputs = tuple(replace(u, hold=holds.get(u.name, u.hold)) for u in self.inputs)
         return replace(self, inputs=inputs)
 
-    def _started(self, state: State, start: Start) -> State:
+    def evaluate_output(
+        self, x: Sequence[Any], u: Sequence[Any], p: Sequence[Any]
+    ) -> tuple[Any, ...]:
+        """Outputs at one point; arrays of equal shape may stand in place of floats."""
+        if self.output is not None:
+            return self.output(tuple(x), tuple(u), tuple(p))
+        assert self.output_states is not None
+        return tuple(x[i] for i in self.output_states)
+
+    def _started(self, state: State, start: InitialValue) -> State:
+        """The state with another start."""
+        where = f"state {state.name} of model {self.name}"
         measured = state.name in self.output_names
         if start == "first":
             if not measured:
                 raise ModelError(
-                    f"state {state.name} of model {self.name} is no output, so no sample tells its "
-                    "start; give a value, 'estimate' or [low, high]"
+                    f"{where} is no output, so no sample tells its start; give a value, "
+                    "'estimate' or [low, high]"
                 )
             return replace(state, initial_range=None, first_sample=True)
         if start == "estimate":
             if state.initial_range is None and not measured:
                 raise ModelError(
-                    f"state {state.name} of model {self.name} is no output and has no range of its "
-                    "own to estimate its start in; give one as [low, high]"
+                    f"{where} is no output and has no range of its own to estimate its start in; "
+                    "give one as [low, high]"
                 )
             return replace(state, initial_range=state.initial_range or AROUND_FIRST_SAMPLE)
         if isinstance(start, tuple):
@@ -311,44 +339,49 @@ class ProcessModel:
             )
         return replace(state, initial=float(start), initial_range=None, first_sample=False)
 
-    def evaluate_output(
-        self, x: Sequence[Any], u: Sequence[Any], p: Sequence[Any]
-    ) -> tuple[Any, ...]:
-        """Outputs at one point; arrays of equal shape may stand in place of floats."""
-        if self.output is not None:
-            return self.output(tuple(x), tuple(u), tuple(p))
-        assert self._output_states is not None
-        return tuple(x[i] for i in self._output_states)
+    def _check_exists(self, kind: str, names: Collection[str], existing: Collection[str]) -> None:
+        for name in names:
+            if name not in existing:
+                raise ModelError(
+                    f"model {self.name} has no {kind} {name!r}; it has {', '.join(existing)}"
+                )
 
-    def _match_outputs(self) -> tuple[int, ...]:
-        missing = [name for name in self.output_names if name not in self.state_names]
-        if missing:
-            raise ModelError(
-                f"model {self.name}: output {missing[0]!r} is not a state; give the model an "
-                f"output function, or name one of its states ({', '.join(self.state_names)})"
-            )
-        return tuple(self.state_names.index(name) for name in self.output_names)
+    def _check_outputs_are_states(self) -> None:
+        for name in self.output_names:
+            if name not in self.state_names:
+                raise ModelError(
+                    f"model {self.name}: output {name!r} is not a state; give the model an "
+                    f"output function, or name one of its states ({', '.join(self.state_names)})"
+                )
 
     def _try_functions(self) -> None:
-        x = tuple(float(v) for v in self.initial_state)
+        """Call every function at the nominal parameters, initial states and inputs of zero."""
+        x, p = tuple(map(float, self.initial_state)), tuple(map(float, self.nominal))
         u = (0.0,) * len(self.inputs)
-        p = tuple(float(v) for v in self.nominal)
-        self._try("derivative", self.derivative, len(self.states), x, u, p)
+        functions = {"derivative": (self.derivative, len(self.states))}
         if self.output is not None:
-            self._try("output", self.output, len(self.outputs), x, u, p)
+            functions["output"] = (self.output, len(self.outputs))
+        for role, (function, expected) in functions.items():
+            where = f"model {self.name}: {role}(x, u, p)"
+            values = _call(where, function, x, u, p)
+            if not isinstance(values, tuple):
+                raise ModelError(f"{where} must return a tuple, not {type(values).__name__}")
+            if len(values) != expected:
+                raise ModelError(f"{where} returns {len(values)} values, expected {expected}")
         for constraint in self.constraints:
             _call(f"model {self.name}: constraint {constraint.text!r}", constraint.function, p)
 
-    def _try(self, role: str, function: Function, expected: int, *args: tuple[float, ...]) -> None:
-        where = f"model {self.name}: {role}(x, u, p)"
-        values = _call(where, function, *args)
-        if not isinstance(values, tuple):
-            raise ModelError(f"{where} must return a tuple, not {type(values).__name__}")
-        if len(values) != expected:
-            raise ModelError(f"{where} returns {len(values)} values, expected {expected}")
+
+def picker(places: Sequence[int]) -> Callable[[Any], tuple[Any, ...]]:
+    """A function of a tuple that returns the values at these places, in a form that compiles."""
+    first = places[0]
+    if len(places) == 1:
+        return lambda values: (values[first],)
+    rest = picker(places[1:])
+    return lambda values: (values[first], *rest(values))
 
 
-def _several(model: str, kind: str, items: Any) -> tuple[Any, ...]:
+def _as_tuple(model: str, kind: str, items: Any) -> tuple[Any, ...]:
     try:
         return tuple(items)
     except TypeError:
@@ -358,13 +391,12 @@ def _several(model: str, kind: str, items: Any) -> tuple[Any, ...]:
         ) from None
 
 
-def picker(places: Sequence[int]) -> Callable[[Any], tuple[Any, ...]]:
-    """A function of a tuple that returns some of its values, in a form that compiles."""
-    first = places[0]
-    if len(places) == 1:
-        return lambda values: (values[first],)
-    rest = picker(places[1:])
-    return lambda values: (values[first], *rest(values))
+def _check_names(model: str, kind: str, names: list[str]) -> None:
+    if not names and kind in ("states", "outputs", "parameters"):
+        raise ModelError(f"model {model}: it has no {kind}")
+    repeated = sorted({name for name in names if names.count(name) > 1})
+    if repeated:
+        raise ModelError(f"model {model}: {kind} repeat the name {repeated[0]!r}")
 
 
 def _call(where: str, function: Callable[..., Any], *args: Any) -> Any:
@@ -380,11 +412,3 @@ def _call(where: str, function: Callable[..., Any], *args: Any) -> Any:
         raise ModelError(
             f"{where} fails at the nominal parameters: {type(error).__name__}: {error}"
         ) from error
-
-
-def _check_names(model: str, kind: str, names: list[str]) -> None:
-    if not names and kind in ("states", "outputs", "parameters"):
-        raise ModelError(f"model {model}: it has no {kind}")
-    repeated = sorted({name for name in names if names.count(name) > 1})
-    if repeated:
-        raise ModelError(f"model {model}: {kind} repeat the name {repeated[0]!r}")

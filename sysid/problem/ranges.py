@@ -31,10 +31,10 @@ class Tie:
 def searched(parameter: Parameter, given: Range | None, scale: Scale | None) -> Parameter:
     """The parameter with the range and scale that it is searched in.
 
-    given: in place of its own range. With one end left out the other is a physical limit, and
-    the search starts between it and the far end of the parameter's own range, or a decade away
-    where that lies on the wrong side. scale: in place of its own. Raises ModelError for a range
-    that is none, that leaves the physical limits, or whose scale it does not suit.
+    given: in place of the declared range. With one end left out the other is a physical limit,
+    and the search starts between it and the far end of the declared range, or a decade away
+    where that lies on the wrong side. scale: in place of the declared one. Raises ModelError for
+    a range that is none, that leaves the physical limits, or whose scale it does not suit.
     """
     low, high = (parameter.lower, parameter.upper) if given is None else given
     minimum, maximum = parameter.minimum, parameter.maximum
@@ -56,14 +56,15 @@ def searched(parameter: Parameter, given: Range | None, scale: Scale | None) -> 
     check_range(parameter.name, low, high, chosen)
     nominal = min(max(parameter.nominal, minimum), maximum)
     return replace(
-        parameter, nominal=nominal, lower=low, upper=high, scale=chosen, fixed=False,
-        minimum=minimum, maximum=maximum,
-    )  # fmt: skip
-
-
-def one_sided(given: Range | None) -> bool:
-    """Whether a range leaves one end open."""
-    return given is not None and None in given
+        parameter,
+        nominal=nominal,
+        lower=low,
+        upper=high,
+        scale=chosen,
+        fixed=False,
+        minimum=minimum,
+        maximum=maximum,
+    )
 
 
 def ties(model: ProcessModel, tied: Mapping[str, str]) -> tuple[Tie, ...]:
@@ -74,20 +75,20 @@ def ties(model: ProcessModel, tied: Mapping[str, str]) -> tuple[Tie, ...]:
     """
     parsed = {name: _parse(model, name, text) for name, text in tied.items()}
     names = model.parameter_names
-    found = []
+    resolved = []
     for name in parsed:
-        factor, source, seen = 1.0, name, [name]
+        factor, source, chain = 1.0, name, [name]
         while source in parsed:
             step, source = parsed[source]
             factor *= step
-            seen.append(source)
-            if seen.count(source) > 1:
+            chain.append(source)
+            if chain.count(source) > 1:
                 raise ModelError(
-                    f"parameter {name}: tied in a circle, {' -> '.join(seen)}; "
+                    f"parameter {name}: tied in a circle, {' -> '.join(chain)}; "
                     "leave one of them out"
                 )
-        found.append(Tie(names.index(name), names.index(source), factor))
-    return tuple(found)
+        resolved.append(Tie(names.index(name), names.index(source), factor))
+    return tuple(resolved)
 
 
 def _parse(model: ProcessModel, name: str, text: str) -> tuple[float, str]:
@@ -102,10 +103,8 @@ def _parse(model: ProcessModel, name: str, text: str) -> tuple[float, str]:
     model.parameter(match["name"])
     factor = float(match["before"] or 1.0) * (-1.0 if match["sign"] == "-" else 1.0)
     behind = float(match["behind"] or 1.0)
-    if match["sign_behind"] == "/" and behind != 0.0:
-        factor /= behind
-    else:
-        factor *= behind
+    divides = match["sign_behind"] == "/" and behind != 0.0
+    factor = factor / behind if divides else factor * behind
     if factor == 0.0:
         raise ModelError(f"parameter {name}: {text!r} multiplies or divides by zero")
     return factor, match["name"]

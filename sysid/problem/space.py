@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -11,15 +11,15 @@ import numpy as np
 from sysid.arrays import BoolArray, FloatArray, IntArray
 from sysid.problem.data import Dataset
 from sysid.problem.model import ModelError, Parameter, ProcessModel, Scale
-from sysid.problem.ranges import Range, Tie, one_sided, searched, ties
+from sysid.problem.ranges import Range, Tie, searched, ties
 
-# A search value this close to an end of its range, in parts of the range, stands on it.
+# A search coordinate this close to an end of its range, in parts of the range, stands on it.
 _ON_BOUND = 1e-3
 
 
 @dataclass(frozen=True)
 class Start:
-    """A state whose initial value is estimated, and the record whose it is."""
+    """An estimated initial state: index of its record and of the state in the model."""
 
     record: int
     state: int
@@ -29,12 +29,19 @@ class Start:
 class SearchSpace:
     """The free parameters of a model between their ranges; the rest stay fixed.
 
-    A chromosome is a row of free parameters in their own units, (n_free,), behind which stand
-    the initial states that are estimated, record by record. ``encode`` maps it to search
-    coordinates (logarithm where the scale is log), ``decode`` back.
+    A chromosome is a row of free parameters in their units, (n_free,), behind which stand the
+    initial states that are estimated, record by record. ``encode`` maps it to search coordinates
+    (logarithm where the scale is log), ``decode`` back.
 
     lower, upper: where the search starts. hard_lower, hard_upper: what it keeps within; for a
     range with one end given these are that end and the physical limit, else lower and upper.
+    one_sided: names of the parameters with such a range. held: a search coordinate and the value
+    that it keeps.
+
+    >>> from sysid.examples import lag
+    >>> space = SearchSpace.of(lag(), ranges={"gain": (1.0, 4.0)}, fixed={"tau": 0.1})
+    >>> space.names, space.full(np.array([2.5])).tolist()
+    (('gain',), [2.5, 0.1])
     """
 
     model: ProcessModel
@@ -44,6 +51,7 @@ class SearchSpace:
     estimated: tuple[Start, ...] = ()
     ties: tuple[Tie, ...] = ()
     one_sided: frozenset[str] = frozenset()
+    held: tuple[int, float] | None = None
 
     @classmethod
     def of(
@@ -56,11 +64,11 @@ class SearchSpace:
         tied: Mapping[str, str] | None = None,
         scale: Mapping[str, Scale] | None = None,
     ) -> SearchSpace:
-        """Space from the model's own ranges and what is said in their place.
+        """Space from the model's declared ranges and what is given in their place.
 
         ranges: {name: (low, high)}, frees a parameter; either end may be None. fixed: {name:
         value}. tied: {name: "0.5 * other"}. scale: {name: "log" or "linear"}; use_log: whether
-        the model's own log scales count. Raises ModelError for an unknown name, a bad range,
+        the model's log scales count. Raises ModelError for an unknown name, a bad range,
         contradictions, or when nothing is left to search.
         """
         ranges, fixed = dict(ranges or {}), dict(fixed or {})
@@ -70,25 +78,30 @@ class SearchSpace:
         _check_conflicts(ranges, fixed, tied, scale)
         for name, value in fixed.items():
             replace(model.parameter(name), nominal=value, fixed=True)  # checks the value
-        followers = ties(model, tied)
-        free, index = [], []
+        resolved = ties(model, tied)
+        free: dict[int, Parameter] = {}
         for i, parameter in enumerate(model.parameters):
             name = parameter.name
             if name in fixed or name in tied or (parameter.fixed and name not in ranges):
                 if name in scale:
-                    raise ModelError(f"parameter {name} has a scale but is not searched; free it "
-                                     "with a range, or leave the scale out")  # fmt: skip
+                    raise ModelError(
+                        f"parameter {name} has a scale but is not searched; free it with a range, "
+                        "or leave the scale out"
+                    )
                 continue
-            own = parameter if use_log else replace(parameter, scale="linear")
-            free.append(searched(own, ranges.get(name), scale.get(name)))
-            index.append(i)
+            declared = parameter if use_log else replace(parameter, scale="linear")
+            free[i] = searched(declared, ranges.get(name), scale.get(name))
         if not free:
             raise ModelError(f"model {model.name}: every parameter is fixed; free at least one")
-        open_ended = frozenset(name for name, given in ranges.items() if one_sided(given))
+        one_sided = frozenset(name for name, ends in ranges.items() if ends and None in ends)
         space = cls(
-            model, tuple(free), model.vector(fixed), tuple(index),
-            ties=followers, one_sided=open_ended,
-        )  # fmt: skip
+            model,
+            tuple(free.values()),
+            model.vector(fixed),
+            tuple(free),
+            ties=resolved,
+            one_sided=one_sided,
+        )
         space._check_ties()
         return space
 
@@ -98,17 +111,17 @@ class SearchSpace:
         return cls(model, (), np.asarray(vector), ()).with_starts([record])
 
     def with_starts(self, records: Sequence[Dataset]) -> SearchSpace:
-        """The same space and the initial states that are to be estimated, record by record."""
+        """The same space with the initial states that are estimated, record by record."""
         parameters, starts = list(self.parameters), list(self.estimated)
         for k, record in enumerate(records):
-            own = record.initial_state(self.model)
+            initial = record.initial_state(self.model)
             for i, state in enumerate(self.model.states):
                 ends = record.initial_range(self.model, i)
                 if ends is None:
                     continue
                 name = f"{state.name}(0)" if len(records) == 1 else f"{state.name}(0) {k + 1}"
                 about = f"initial {state.description or state.name}"
-                begin = min(max(float(own[i]), ends[0]), ends[1])
+                begin = min(max(float(initial[i]), ends[0]), ends[1])
                 parameters.append(
                     Parameter(name, state.unit, begin, *ends, minimum=-np.inf, description=about)
                 )
@@ -122,24 +135,24 @@ class SearchSpace:
             [chromosomes, np.broadcast_to(begin, (*chromosomes.shape[:-1], len(begin)))], axis=-1
         )
 
-    def starts(self, chromosomes: FloatArray, record: int, own: FloatArray) -> FloatArray:
-        """Initial states of one record for each chromosome, (n, n_states).
+    def starts(self, chromosomes: FloatArray, record: int, declared: FloatArray) -> FloatArray:
+        """Initial states of a record for each chromosome, (n, n_states).
 
-        own: (n_states,), those that the record and the model themselves give.
+        declared: (n_states,), initial states of those that are not estimated.
         """
-        states = np.repeat(own[None], len(chromosomes), axis=0)
-        for place, start in enumerate(self.estimated, len(self.index)):
+        states = np.repeat(declared[None], len(chromosomes), axis=0)
+        for start, values in zip(self.estimated, chromosomes.T[len(self.index) :], strict=True):
             if start.record == record:
-                states[:, start.state] = chromosomes[:, place]
+                states[:, start.state] = values
         return states
 
     def named_starts(self, chromosome: FloatArray) -> list[dict[str, float]]:
         """The estimated initial states in a chromosome (n_free,), by state, for each record."""
-        found: list[dict[str, float]] = []
-        for place, start in enumerate(self.estimated, len(self.index)):
-            found += [{} for _ in range(start.record + 1 - len(found))]
-            found[start.record][self.model.states[start.state].name] = float(chromosome[place])
-        return found
+        last = max((start.record for start in self.estimated), default=-1)
+        named: list[dict[str, float]] = [{} for _ in range(last + 1)]
+        for start, value in zip(self.estimated, chromosome[len(self.index) :], strict=True):
+            named[start.record][self.model.states[start.state].name] = float(value)
+        return named
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -155,6 +168,23 @@ class SearchSpace:
     def upper(self) -> FloatArray:
         """High ends of the ranges, (n_free,)."""
         return _constant([parameter.upper for parameter in self.parameters])
+
+    @cached_property
+    def minimum(self) -> FloatArray:
+        """Physical minima, (n_free,)."""
+        return _constant([parameter.minimum for parameter in self.parameters])
+
+    @cached_property
+    def maximum(self) -> FloatArray:
+        """Physical maxima, (n_free,)."""
+        return _constant([parameter.maximum for parameter in self.parameters])
+
+    @cached_property
+    def log(self) -> BoolArray:
+        """Mask of the parameters searched by logarithm, (n_free,)."""
+        mask = np.array([parameter.scale == "log" for parameter in self.parameters], dtype=bool)
+        mask.setflags(write=False)
+        return mask
 
     @cached_property
     def coded_lower(self) -> FloatArray:
@@ -182,8 +212,15 @@ class SearchSpace:
     def coded_bounds(self) -> tuple[FloatArray, FloatArray]:
         """``hard_lower`` and ``hard_upper`` in search coordinates, (n_free,) each."""
         with np.errstate(divide="ignore"):  # the logarithm of zero is the bound -inf
-            ends = self.encode(self.hard_lower), self.encode(self.hard_upper)
-        return _constant(ends[0]), _constant(ends[1])
+            lower, upper = self.encode(self.hard_lower), self.encode(self.hard_upper)
+        if self.held is not None:
+            place, value = self.held
+            lower[place] = upper[place] = value
+        return _constant(lower), _constant(upper)
+
+    def holding(self, place: int, value: float) -> SearchSpace:
+        """The space with a search coordinate held at a value."""
+        return replace(self, held=(place, value))
 
     def on_bound(self, chromosome: FloatArray) -> BoolArray:
         """Which values of a chromosome (n_free,) stand on a bound of their range."""
@@ -191,23 +228,6 @@ class SearchSpace:
         near = _ON_BOUND * self.width
         at = self.encode(chromosome)
         mask: BoolArray = (at < lower + near) | (at > upper - near)
-        return mask
-
-    @cached_property
-    def minimum(self) -> FloatArray:
-        """Physical minima, (n_free,)."""
-        return _constant([parameter.minimum for parameter in self.parameters])
-
-    @cached_property
-    def maximum(self) -> FloatArray:
-        """Physical maxima, (n_free,)."""
-        return _constant([parameter.maximum for parameter in self.parameters])
-
-    @cached_property
-    def log(self) -> BoolArray:
-        """Mask of the parameters searched by logarithm, (n_free,)."""
-        mask = np.array([parameter.scale == "log" for parameter in self.parameters], dtype=bool)
-        mask.setflags(write=False)
         return mask
 
     @cached_property
@@ -288,45 +308,28 @@ class SearchSpace:
         return values
 
 
-@dataclass(frozen=True)
-class HeldSpace(SearchSpace):
-    """A space in which one coordinate keeps its value."""
-
-    place: int = 0
-    value: float = 0.0
-
-    @classmethod
-    def holding(cls, space: SearchSpace, place: int, value: float) -> HeldSpace:
-        """The space with one search coordinate held."""
-        given = {f.name: getattr(space, f.name) for f in fields(SearchSpace)}
-        return cls(**given, place=place, value=value)
-
-    @cached_property
-    def coded_bounds(self) -> tuple[FloatArray, FloatArray]:
-        """As of the whole space, but both at the held value."""
-        lower, upper = (ends.copy() for ends in super().coded_bounds)
-        lower[self.place] = upper[self.place] = self.value
-        return lower, upper
-
-
 def _constant(values: Sequence[float] | FloatArray) -> FloatArray:
-    """An array that several may hold because nobody can change it."""
+    """A read-only array, which caches may share."""
     array = np.array(values, dtype=np.float64)
     array.setflags(write=False)
     return array
 
 
-def _check_conflicts(*groups: Mapping[str, object]) -> None:
-    """Raise ModelError where a parameter has been said to be two things."""
-    ranges, fixed, tied, scale = groups
-    pairs = (
+def _check_conflicts(
+    ranges: Mapping[str, Range],
+    fixed: Mapping[str, float],
+    tied: Mapping[str, str],
+    scale: Mapping[str, Scale],
+) -> None:
+    """Raise ModelError for a parameter with two contradicting settings."""
+    pairs: tuple[tuple[Mapping[str, object], Mapping[str, object], str], ...] = (
         (ranges, fixed, "both a range and a fixed value"),
         (ranges, tied, "a range but is tied to another"),
         (fixed, tied, "a fixed value but is tied to another"),
         (scale, fixed, "a scale but is fixed"),
         (scale, tied, "a scale but is tied to another"),
     )
-    for one, other, what in pairs:
-        both = sorted(set(one) & set(other))
-        if both:
-            raise ModelError(f"parameter {both[0]} has {what}; keep one")
+    for first, second, contradiction in pairs:
+        conflicts = sorted(set(first) & set(second))
+        if conflicts:
+            raise ModelError(f"parameter {conflicts[0]} has {contradiction}; keep one")

@@ -1,6 +1,6 @@
-"""What the data say about identified parameters, how surely, and what they cannot say.
+"""Intervals of identified parameters, and what the data leave undetermined.
 
-The singular values of the scaled output sensitivity tell how far each direction of parameter
+The singular values of the scaled output sensitivity are how far each direction of parameter
 space can move before the outputs show it. Directions that move the outputs less than the noise
 hides are not determined: the parameters in them get no interval, but the combinations that the
 data do determine (products, sums) do.
@@ -9,7 +9,7 @@ data do determine (products, sums) do.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -18,7 +18,6 @@ from scipy.linalg import null_space
 
 from sysid.arrays import FloatArray, IntArray
 from sysid.fitting.objective import Objective
-from sysid.problem.space import SearchSpace
 from sysid.uncertainty.directions import PART, Directions, directions
 from sysid.uncertainty.estimate import Z95, Estimate, Why, product_text, sum_text
 from sysid.uncertainty.relations import (
@@ -30,7 +29,7 @@ from sysid.uncertainty.relations import (
     relations,
     sparse,
 )
-from sysid.uncertainty.sensitivity import common_steps, coordinate_units, sensitivity
+from sysid.uncertainty.sensitivity import Sensitivity, sensitivity
 from sysid.uncertainty.units import product_unit
 
 _ALIKE = 0.05  # rivals closer than this are one
@@ -59,9 +58,9 @@ class Ambiguity:
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """All that the residuals and sensitivities tell about a chromosome.
+    """Intervals of an identified chromosome, and what the data leave undetermined.
 
-    parameters: one estimate for each free parameter (and estimated initial state). covariance:
+    parameters: an estimate for each free parameter (and estimated initial state). covariance:
     (n_free, n_free) of the coordinates (logarithms where searched so, else parts of the value),
     undetermined directions and parameters on a bound left out. singular_values: of the scaled
     sensitivity, falling. rank: how many directions the data determine. rivals: free parameters
@@ -83,7 +82,7 @@ class Uncertainty:
         return correlation
 
     def determined(self) -> tuple[Estimate, ...]:
-        """Every quantity with an interval: parameters of their own, then combinations."""
+        """All quantities with an interval: parameters, then combinations."""
         combined = itertools.chain(*(a.determined for a in self.ambiguities))
         return (*(p for p in self.parameters if not p.why), *combined)
 
@@ -95,51 +94,48 @@ def uncertainty(
 
     The estimate is taken as the minimum of the objective; the colour of its residuals and the
     records' zero errors enter the covariance. rivals: other minima that explain the data as well;
-    what is another there has no interval.
+    a parameter with another value there has no interval.
     """
-    steps = common_steps(objective, chromosome)
-    found = sensitivity(objective, chromosome, steps)
-    ends = objective.space.on_bound(chromosome)
-    told = directions(objective, chromosome, steps, found, ends)
-    units = coordinate_units(objective, chromosome)
-    slope = np.where(objective.space.log, chromosome, units)
-    still = overlooked(objective, chromosome, steps, found, slope, told.lost, rivals)
-    if len(still):
-        found = replace(found, slopes=found.slopes - found.slopes @ still.T @ still)
-        told = directions(objective, chromosome, steps, found, ends)
-    hidden = relations(objective, chromosome, steps, found, slope, told)
-    result = _Teller(objective.space, chromosome, slope, told, hidden).result()
-    names = objective.space.names
-    return _beside(result, [dict(zip(names, rival.tolist(), strict=True)) for rival in rivals])
-
-
-def _beside(result: Uncertainty, rivals: Sequence[Mapping[str, float]]) -> Uncertainty:
-    """Without the intervals of what is another in a rival minimum."""
-
-    def other(estimate: Estimate, rival: Mapping[str, float]) -> bool:
-        if estimate.low is None or estimate.high is None:
-            return False
-        return not estimate.low <= estimate.at(rival) <= estimate.high
-
-    def open_(estimate: Estimate) -> bool:
-        return any(other(estimate, rival) for rival in rivals)
-
-    several = [e for e in result.parameters if open_(e)]
-    names = tuple(e.name for e in sorted(several, key=lambda e: _effort(e.unit)))
-    parameters = tuple(
-        replace(e, std=None, low=None, high=None, why="rival") if open_(e) else e
-        for e in result.parameters
+    local = sensitivity(objective, chromosome)
+    determined = directions(local)
+    inert = overlooked(local, determined.undetermined, rivals)
+    if len(inert):
+        local = replace(local, slopes=local.slopes - local.slopes @ inert.T @ inert)
+        determined = directions(local)
+    analysis = _Analysis(local, determined, relations(local, determined))
+    result = Uncertainty(
+        tuple(analysis.parameter(j) for j in range(len(chromosome))),
+        tuple(analysis.ambiguities()),
+        determined.covariance,
+        determined.singular_values,
+        determined.rank,
     )
+    names = objective.space.names
+    named = [dict(zip(names, rival.tolist(), strict=True)) for rival in rivals]
+    return _among_rivals(result, named)
+
+
+def _among_rivals(result: Uncertainty, rivals: Sequence[Mapping[str, float]]) -> Uncertainty:
+    """Without the intervals that exclude the value in a rival minimum."""
+
+    def disputed(estimate: Estimate) -> bool:
+        return any(estimate.excludes(rival) for rival in rivals)
+
+    several = [e for e in result.parameters if disputed(e)]
+    names = tuple(e.name for e in sorted(several, key=lambda e: _effort(e.unit)))
     ambiguities = [
-        replace(a, determined=tuple(e for e in a.determined if not open_(e)))
+        replace(a, determined=tuple(e for e in a.determined if not disputed(e)))
         for a in result.ambiguities
     ]
     if names:
         ambiguities.insert(0, Ambiguity("rival", names, (), names[:1]))
-    apart = [rival for rival in rivals if any(other(e, rival) for e in several)]
+    apart = [rival for rival in rivals if any(e.excludes(rival) for e in several)]
     return replace(
         result,
-        parameters=parameters,
+        parameters=tuple(
+            replace(e, std=None, low=None, high=None, why="rival") if e in several else e
+            for e in result.parameters
+        ),
         ambiguities=tuple(ambiguities),
         rivals=tuple(_unlike(apart, names)),
     )
@@ -148,133 +144,112 @@ def _beside(result: Uncertainty, rivals: Sequence[Mapping[str, float]]) -> Uncer
 def _unlike(
     rivals: Sequence[Mapping[str, float]], names: Sequence[str]
 ) -> list[Mapping[str, float]]:
-    """Those that differ from each other in some of the named parameters."""
+    """The rivals that differ from each other in one of the named parameters at least."""
     kept: list[Mapping[str, float]] = []
+    values: list[list[float]] = []
     for rival in rivals:
-        values = [rival[name] for name in names]
-        if not any(
-            np.allclose(values, [known[name] for name in names], rtol=_ALIKE) for known in kept
-        ):
+        named = [rival[name] for name in names]
+        if not any(np.allclose(named, before, rtol=_ALIKE) for before in values):
             kept.append(rival)
+            values.append(named)
     return kept
 
 
-@dataclass(frozen=True)
-class _Teller:
-    """Turns directions into statements about parameters.
+class _Analysis:
+    """Estimates and ambiguities from the directions that the data determine."""
 
-    slope: (n_free,), change of each parameter per unit of its coordinate.
-    """
-
-    space: SearchSpace
-    chromosome: FloatArray
-    slope: FloatArray
-    told: Directions
-    hidden: list[Relation]
-
-    def result(self) -> Uncertainty:
-        """Everything together."""
-        n = len(self.chromosome)
-        return Uncertainty(
-            tuple(self._parameter(j) for j in range(n)),
-            tuple(self._ambiguities()),
-            self.told.covariance,
-            self.told.singular_values,
-            self.told.rank,
+    def __init__(
+        self, local: Sensitivity, determined: Directions, relations: list[Relation]
+    ) -> None:
+        self.determined, self.relations = determined, relations
+        self.chromosome, self.increments = local.chromosome, local.increments
+        self.log = local.objective.space.log
+        self.names = local.objective.space.names
+        self.units = [parameter.unit for parameter in local.objective.space.parameters]
+        # Relative change of each parameter per unit of its coordinate; none of what is zero.
+        nonzero = self.chromosome != 0.0
+        self.relative_increments = np.divide(
+            self.increments, self.chromosome, out=np.zeros(len(nonzero)), where=nonzero
         )
 
-    @property
-    def _relative_slope(self) -> FloatArray:
-        """Relative change of each parameter per unit of its coordinate; none of what is zero."""
-        nonzero = self.chromosome != 0.0
-        return np.divide(self.slope, self.chromosome, out=np.zeros(len(nonzero)), where=nonzero)
-
-    def _parameter(self, j: int) -> Estimate:
-        one = np.zeros(len(self.chromosome))
-        one[j] = 1.0
+    def parameter(self, j: int) -> Estimate:
+        """Estimate of a free parameter."""
         why: Why = ""
-        if self.told.held[j]:
+        if self.determined.held[j]:
             why = "bound"
-        elif any(relation.exact and relation.support[j] for relation in self.hidden):
+        elif any(relation.exact and relation.support[j] for relation in self.relations):
             why = "tied"
-        elif np.sum(self.told.lost[:, j] ** 2) > PART:
+        elif self.determined.undetermined_share[j] > PART:
             why = "vague"
         if why:
-            parameter = self.space.parameters[j]
-            value = float(self.chromosome[j])
-            terms = ((parameter.name, 1.0),)
-            return Estimate(parameter.name, parameter.unit, value, terms, "product", why=why)
-        return self._product(one) if self.space.log[j] else self._sum(one)
+            value, terms = float(self.chromosome[j]), ((self.names[j], 1.0),)
+            return Estimate(self.names[j], self.units[j], value, terms, "product", why=why)
+        weights = np.eye(len(self.chromosome))[j]
+        return self._product(weights) if self.log[j] else self._sum(weights)
+
+    def ambiguities(self) -> Iterator[Ambiguity]:
+        """Exact relations that share parameters together, each vague direction by itself."""
+        exact = [relation for relation in self.relations if relation.exact]
+        for members in overlapping([relation.support for relation in exact]):
+            yield self._exact([exact[i] for i in members])
+        for relation in self.relations:
+            if not relation.exact:
+                yield self._ambiguity("vague", named(relation.vector), [relation], [])
 
     def _product(self, exponents: FloatArray) -> Estimate:
         """Estimate of a product of powers of the parameters."""
         used = np.flatnonzero(exponents)
         value = float(np.prod(self.chromosome[used] ** exponents[used]))
-        deviation = self._deviation(exponents * self._relative_slope)
-        terms = self._terms(exponents)
+        deviation = self._deviation(exponents * self.relative_increments)
         ends = value * np.exp(-Z95 * deviation), value * np.exp(Z95 * deviation)
-        units = [self.space.parameters[i].unit for i in used]
-        unit = (
-            units[0] if len(used) == 1 else product_unit(zip(units, exponents[used], strict=True))
-        )
+        unit = self.units[used[0]]
+        if len(used) > 1:
+            unit = product_unit((self.units[i], exponents[i]) for i in used)
+        terms = self._terms(exponents)
+        std = abs(value) * deviation
         return Estimate(
-            product_text(terms), unit, value, terms, "product",
-            abs(value) * deviation, min(ends), max(ends),
-        )  # fmt: skip
+            product_text(terms), unit, value, terms, "product", std, min(ends), max(ends)
+        )
 
     def _sum(self, factors: FloatArray) -> Estimate:
         """Estimate of a weighted sum of the parameters."""
-        used = np.flatnonzero(factors)
         value = float(factors @ self.chromosome)
-        deviation = self._deviation(factors * self.slope)
+        deviation = self._deviation(factors * self.increments)
+        low, high = value - Z95 * deviation, value + Z95 * deviation
+        unit = self.units[np.flatnonzero(factors)[0]]
         terms = self._terms(factors)
-        return Estimate(
-            sum_text(terms), self.space.parameters[used[0]].unit, value, terms, "sum",
-            deviation, value - Z95 * deviation, value + Z95 * deviation,
-        )  # fmt: skip
+        return Estimate(sum_text(terms), unit, value, terms, "sum", deviation, low, high)
 
     def _terms(self, weights: FloatArray) -> tuple[tuple[str, float], ...]:
-        used = np.flatnonzero(weights)
-        return tuple((self.space.parameters[i].name, float(weights[i])) for i in used)
+        return tuple((self.names[i], float(weights[i])) for i in np.flatnonzero(weights))
 
     def _deviation(self, direction: FloatArray) -> float:
-        return float(np.sqrt(max(float(direction @ self.told.covariance @ direction), 0.0)))
-
-    def _ambiguities(self) -> list[Ambiguity]:
-        """Exact relations that share parameters as one, each vague direction by itself."""
-        exact = [relation for relation in self.hidden if relation.exact]
-        groups = overlapping([relation.support for relation in exact])
-        found = [self._exact([exact[i] for i in members]) for members in groups]
-        for relation in self.hidden:
-            if not relation.exact:
-                group = named(relation.vector)
-                found.append(self._ambiguity("vague", group, [relation], []))
-        return found
+        variance = float(direction @ self.determined.covariance @ direction)
+        return float(np.sqrt(max(variance, 0.0)))
 
     def _exact(self, members: list[Relation]) -> Ambiguity:
+        """Exact relations that hang together, and the combinations that they leave determined."""
         group = np.flatnonzero(np.any([relation.support for relation in members], axis=0))
-        sums = all(relation.kind == "sum" for relation in members)
-        if sums:
-            determined = self._sums(group, np.stack([r.vector[group] for r in members]))
-        else:
-            determined = self._products(group, len(group) - len(members))
-        return self._ambiguity("sum" if sums else "product", group, members, determined)
+        if all(relation.kind == "sum" for relation in members):
+            vectors = np.stack([relation.vector[group] for relation in members])
+            return self._ambiguity("sum", group, members, self._sums(group, vectors))
+        products = self._products(group, len(group) - len(members))
+        return self._ambiguity("product", group, members, products)
 
     def _ambiguity(
         self, kind: Kind, group: IntArray, members: list[Relation], determined: list[Estimate]
     ) -> Ambiguity:
-        own = sorted(group, key=lambda i: _effort(self.space.parameters[i].unit))
+        group = np.array(sorted(group, key=lambda i: _effort(self.units[i])))
         vectors = np.stack([relation.vector for relation in members])
         measure: list[int] = []
-        for i in own:
+        for i in group.tolist():
             if np.linalg.matrix_rank(vectors[:, [*measure, i]]) > len(measure):
-                measure.append(int(i))
-        names = self.space.names
+                measure.append(i)
         return Ambiguity(
             kind,
-            tuple(names[i] for i in own),
+            tuple(self.names[i] for i in group),
             tuple(determined),
-            tuple(names[i] for i in measure),
+            tuple(self.names[i] for i in measure),
         )
 
     def _sums(self, group: IntArray, vectors: FloatArray) -> list[Estimate]:
@@ -282,39 +257,37 @@ class _Teller:
 
         vectors: (n_relations, n_group), directions that leave them alone.
         """
-        chosen = []
+        sums = []
         for direction in sparse(null_space(vectors).T):
             factors = np.zeros(len(self.chromosome))
-            factors[group] = direction / self.slope[group]
-            used = np.flatnonzero(factors)
+            factors[group] = direction / self.increments[group]
+            used = factors[np.flatnonzero(factors)]
             # Factors in parts of the smallest, the first of them positive.
-            smallest = np.min(np.abs(factors[used])) * np.sign(factors[used[0]])
-            factors /= smallest
+            factors /= np.min(np.abs(used)) * np.sign(used[0])
             whole = np.round(factors)
             factors = np.where(np.abs(factors - whole) < _WHOLE, whole, factors)
-            if self._determined(factors * self.slope):
-                chosen.append(factors)
-        return [self._sum(factors) for factors in chosen]
-
-    def _determined(self, direction: FloatArray) -> bool:
-        """Whether the data determine what changes so with the coordinates."""
-        outside = np.sum((self.told.lost @ direction) ** 2) / np.sum(direction**2)
-        return bool(outside < PART)
+            if self._is_determined(factors * self.increments):
+                sums.append(self._sum(factors))
+        return sums
 
     def _products(self, group: IntArray, count: int) -> list[Estimate]:
         """Simple products of the group's parameters that the data determine, at most count."""
         chosen: list[FloatArray] = []
-        for exponents in _simple_exponents(len(group)):
+        for powers in _simple_exponents(len(group)):
             if len(chosen) == count:
                 break
-            whole = np.zeros(len(self.chromosome))
-            whole[group] = exponents
-            direction = whole * self._relative_slope
-            if not self._determined(direction):
-                continue
-            if np.linalg.matrix_rank(np.array([*chosen, whole])) > len(chosen):
-                chosen.append(whole)
+            exponents = np.zeros(len(self.chromosome))
+            exponents[group] = powers
+            if self._is_determined(exponents * self.relative_increments) and np.linalg.matrix_rank(
+                np.array([*chosen, exponents])
+            ) > len(chosen):
+                chosen.append(exponents)
         return [self._product(exponents) for exponents in chosen]
+
+    def _is_determined(self, direction: FloatArray) -> bool:
+        """Whether the data determine what changes so with the coordinates."""
+        outside = np.sum((self.determined.undetermined @ direction) ** 2) / np.sum(direction**2)
+        return bool(outside < PART)
 
 
 def _effort(unit: str) -> int:
@@ -322,9 +295,8 @@ def _effort(unit: str) -> int:
     return _MEASURABLE.index(unit) if unit in _MEASURABLE else len(_MEASURABLE)
 
 
-def _simple_exponents(n: int) -> list[FloatArray]:
+def _simple_exponents(n: int) -> Iterator[FloatArray]:
     """Exponents of simple products of n factors, the simplest first: squares after all others."""
-    found = []
     for powers in ((1.0, -1.0), (1.0, -1.0, 2.0, -2.0)):
         for size in (1, 2, 3):
             for places in itertools.combinations(range(n), size):
@@ -332,5 +304,4 @@ def _simple_exponents(n: int) -> list[FloatArray]:
                     if chosen[0] > 0.0 and min(map(abs, chosen)) == 1.0:
                         exponents = np.zeros(n)
                         exponents[list(places)] = chosen
-                        found.append(exponents)
-    return found
+                        yield exponents

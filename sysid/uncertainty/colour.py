@@ -8,7 +8,8 @@ time, so that nothing of the size of the record squared is ever formed.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,6 +54,12 @@ def colour(residual: FloatArray, seen: BoolArray, lengths: Sequence[int]) -> Aut
     return _fit(*_regression(residual, whole, lengths, best), q)
 
 
+def record_rows(lengths: Iterable[int]) -> list[slice]:
+    """Rows of each record, of records of these lengths one after another."""
+    ends = [0, *itertools.accumulate(lengths)]
+    return [slice(begin, end) for begin, end in itertools.pairwise(ends)]
+
+
 def score_covariance(
     slopes: FloatArray, lengths: Sequence[int], model: Autoregression
 ) -> FloatArray:
@@ -62,10 +69,8 @@ def score_covariance(
     """
     p = slopes.shape[2]
     total = np.zeros((p, p))
-    start = 0
-    for length in lengths:
-        part = _response(slopes[start : start + length], model)
-        start += length
+    for rows in record_rows(lengths):
+        part = _response(slopes[rows], model)
         total += np.einsum("tip,ij,tjr->pr", part, model.noise, part, optimize=True)
     return total
 
@@ -99,15 +104,13 @@ def _largest_order(whole: BoolArray, lengths: Sequence[int], q: int) -> int:
 
 
 def _usable(whole: BoolArray, lengths: Sequence[int], order: int) -> BoolArray:
-    """Samples that were measured, as were as many before them in their record, (n,)."""
+    """Samples that were measured, as were ``order`` before them in their record, (n,)."""
     usable = whole.copy()
-    start = 0
-    for length in lengths:
-        part = whole[start : start + length]
+    for rows in record_rows(lengths):
+        measured, counted = whole[rows], usable[rows]
         for k in range(1, order + 1):
-            usable[start + k : start + length] &= part[: max(length - k, 0)]
-        usable[start : start + order] = False
-        start += length
+            counted[k:] &= measured[: max(len(measured) - k, 0)]
+        counted[:order] = False
     return usable
 
 

@@ -11,15 +11,17 @@ from sysid.arrays import FloatArray
 from sysid.fitting.objective import Objective
 from sysid.fitting.refinement import refine
 from sysid.problem.model import ModelError
-from sysid.problem.space import HeldSpace
-from sysid.uncertainty.directions import directions
+from sysid.uncertainty.directions import PART, directions
 from sysid.uncertainty.estimate import Z95
-from sysid.uncertainty.sensitivity import common_steps, coordinate_units, sensitivity
+from sysid.uncertainty.sensitivity import coordinate_units, sensitivity
 
 _STEPS = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 6.0)  # standard deviations, outwards
 _ITERATIONS = 20
 # A parameter without a standard deviation is moved by parts of its range.
 _BLIND_SHARE = 0.05
+
+# A search coordinate and the statistic there.
+_Point = tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -27,9 +29,9 @@ class Profile:
     """The profile of one parameter.
 
     values: (n,), rising, the estimate among them. statistic: (n,), twice the loss of
-    log-likelihood with all the others fitted anew; 3.84 is the 95 % level of chi-squared with one
-    degree of freedom. low, high: where it crosses that level, None where it does not within the
-    range.
+    log-likelihood with all other parameters fitted anew; 3.84 is the 95 % level of chi-squared
+    with one degree of freedom. low, high: where it crosses that level, None where it does not
+    within the range.
     """
 
     name: str
@@ -55,37 +57,47 @@ def profile(objective: Objective, chromosome: FloatArray, name: str) -> Profile:
             f"parameter {name!r} is not free, so it has no profile; free are "
             + ", ".join(space.names)
         )
-    tracer = _Tracer(objective, chromosome, space.names.index(name))
+    place = space.names.index(name)
+    tracer = _Tracer(objective, chromosome, place)
     below, above = tracer.side(-1.0), tracer.side(1.0)
-    points = [*reversed(below), (tracer.centre, 0.0), *above]
-    ends = [tracer.in_units(_crossing([(tracer.centre, 0.0), *side])) for side in (below, above)]
-    parameter = space.parameters[tracer.place]
-    values = [tracer.in_units(coordinate) for coordinate, _ in points]
+    centre = (tracer.centre, 0.0)
+    points = [*reversed(below), centre, *above]
     return Profile(
         name,
-        parameter.unit,
-        float(chromosome[tracer.place]),
-        np.array(values, dtype=np.float64),
+        space.parameters[place].unit,
+        float(chromosome[place]),
+        np.array([tracer.value(coordinate) for coordinate, _ in points]),
         np.array([statistic for _, statistic in points]),
-        ends[0],
-        ends[1],
+        tracer.crossing([centre, *below]),
+        tracer.crossing([centre, *above]),
     )
 
 
 class _Tracer:
-    """Moves one coordinate outwards and fits the others."""
+    """Moves one coordinate outwards and fits the others.
+
+    centre: the coordinate at the estimate. unit: its standard deviation. factor: statistic per
+    loss of error.
+    """
 
     def __init__(self, objective: Objective, chromosome: FloatArray, place: int) -> None:
-        self.objective, self.place = objective, place
-        self.space = objective.space
-        coded = self.space.encode(chromosome)
-        self.start = coded
-        self.centre = float(coded[place])
-        self.unit, self.factor = self._scale(chromosome)
-        self.error = self._error(chromosome)
+        self.objective, self.space, self.place = objective, objective.space, place
+        self.start = self.space.encode(chromosome)
+        self.centre = float(self.start[place])
+        local = sensitivity(objective, chromosome)
+        rms = objective.residuals(chromosome[None], local.steps, keep=False).rms
+        self.error = float(objective.error_of(rms)[0])
+        determined = directions(local)
+        variance = float(determined.covariance[place, place])
+        has_deviation = variance > 0.0 and determined.undetermined_share[place] < PART
+        self.unit = _BLIND_SHARE * float(self.space.width[place])
+        if has_deviation:
+            self.unit = float(np.sqrt(variance) * coordinate_units(objective, chromosome)[place])
+        inflation = determined.inflation(place if has_deviation else None)
+        self.factor = 2.0 * sum(local.lengths) / inflation
 
-    def side(self, sign: float) -> list[tuple[float, float]]:
-        """Coordinates and statistics on one side, until well beyond the 95 % level."""
+    def side(self, sign: float) -> list[_Point]:
+        """Points on one side of the estimate, until well beyond the 95 % level."""
         lower, upper = self.space.coded_bounds
         end = float((lower if sign < 0.0 else upper)[self.place])
         at, points = self.start, []
@@ -101,46 +113,25 @@ class _Tracer:
                 break
         return points
 
-    def in_units(self, coordinate: float | None) -> float | None:
+    def value(self, coordinate: float) -> float:
         """The parameter's value at a coordinate."""
-        if coordinate is None:
-            return None
         coded = self.start.copy()
         coded[self.place] = coordinate
         return float(self.space.decode(coded)[self.place])
 
-    def _scale(self, chromosome: FloatArray) -> tuple[float, float]:
-        """A standard deviation in search coordinates, and the statistic per loss of error."""
-        objective = self.objective
-        steps = common_steps(objective, chromosome)
-        found = sensitivity(objective, chromosome, steps)
-        told = directions(objective, chromosome, steps, found, self.space.on_bound(chromosome))
-        n = sum(found.lengths)
-        blind = _BLIND_SHARE * float(self.space.width[self.place])
-        variance = float(told.covariance[self.place, self.place])
-        own = variance > 0.0 and np.sum(told.lost[:, self.place] ** 2) < 1e-3
-        inflation = told.inflation(self.place if own else None)
-        size = float(coordinate_units(objective, chromosome)[self.place])
-        return (np.sqrt(variance) * size if own else blind), 2.0 * n / inflation
+    def crossing(self, points: list[_Point]) -> float | None:
+        """Value at which the root of the statistic, nearly straight, passes the 95 % level."""
+        for (a, low), (b, high) in itertools.pairwise(points):
+            below, above = np.sqrt(low), np.sqrt(high)
+            if below <= Z95 < above:
+                return self.value(float(a + (b - a) * (Z95 - below) / (above - below)))
+        return None
 
     def _fitted(self, at: FloatArray, coordinate: float) -> tuple[FloatArray, float]:
-        held = HeldSpace.holding(self.space, self.place, coordinate)
+        """Search coordinates of the best fit with the coordinate held, and the statistic there."""
+        held = self.space.holding(self.place, coordinate)
         moved = at.copy()
         moved[self.place] = coordinate
-        result = refine(self.objective.over(held), held.decode(moved), max_iterations=_ITERATIONS)
-        statistic = max(0.0, self.factor * (result.error - self.error))
-        return held.encode(result.chromosome), statistic
-
-    def _error(self, chromosome: FloatArray) -> float:
-        steps = common_steps(self.objective, chromosome)
-        found = self.objective.residuals(chromosome[None], steps, keep=False)
-        return float(self.objective.error_of(found.rms)[0])
-
-
-def _crossing(points: list[tuple[float, float]]) -> float | None:
-    """Where the root of the statistic, nearly straight, passes the 95 % level."""
-    for (a, low), (b, high) in itertools.pairwise(points):
-        below, above = np.sqrt(low), np.sqrt(high)
-        if below <= Z95 < above:
-            return float(a + (b - a) * (Z95 - below) / (above - below))
-    return None
+        best = refine(self.objective.over(held), held.decode(moved), max_iterations=_ITERATIONS)
+        statistic = max(0.0, self.factor * (best.error - self.error))
+        return held.encode(best.chromosome), statistic

@@ -10,21 +10,20 @@ from typing import Literal
 import numpy as np
 
 from sysid.arrays import BoolArray, FloatArray, IntArray
-from sysid.fitting.objective import Objective
 from sysid.uncertainty.directions import Directions
 from sysid.uncertainty.sensitivity import Sensitivity, coordinate_units
 
 Kind = Literal["product", "sum", "vague"]
 
 # How far a relation is followed to prove it exact, and how little the outputs may move beside
-# what moving one of its parameters alone does.
+# moving one of its parameters alone.
 _FOLLOW = 0.2
 _UNMOVED = 1e-3
 _NOTHING = 3e-3  # entries of a direction below this are rounding
 # Shares of a direction's largest entry above which a parameter may be part of what is exact.
 _SHARES = (0.1, 0.03, 0.01, 0.003)
 _NEARLY = 0.02  # of a whole number
-_NEW = 0.1  # part of a direction that others must leave unexplained
+_NEW = 0.1  # part of a direction that the rest must leave unexplained
 # Singular values below this share of the largest may be nothing but errors of the slopes.
 _WEAK = 0.05
 _FIRMLY = 0.25  # share of such a direction's largest entry above which a parameter is part of it
@@ -44,7 +43,7 @@ class Relation:
 
     @property
     def exact(self) -> bool:
-        """Whether no data of this kind could ever tell."""
+        """Whether no data of this kind could ever determine it."""
         return self.kind != "vague"
 
     @property
@@ -54,24 +53,17 @@ class Relation:
         return taking
 
 
-def relations(
-    objective: Objective,
-    chromosome: FloatArray,
-    steps: list[int],
-    found: Sensitivity,
-    slope: FloatArray,
-    told: Directions,
-) -> list[Relation]:
+def relations(sensitivity: Sensitivity, directions: Directions) -> list[Relation]:
     """The undetermined directions as simple ones, each followed to see what it is.
 
-    slope: (n_free,), change of each parameter per unit of its coordinate. Directions that do not
-    move the outputs at all are made simple by themselves, the others up to these.
+    Directions that do not move the outputs at all are made simple by themselves, the others up
+    to these.
     """
-    counted = found.slopes[:, objective.weights > 0.0]
-    follower = _Follower(objective, chromosome, steps, slope, counted.reshape(-1, len(chromosome)))
+    follower = _Follower(sensitivity)
     exact: list[Relation] = []
     vague: list[FloatArray] = []
-    for basis in (told.lost[told.still], told.lost[~told.still]):
+    undetermined, inert = directions.undetermined, directions.inert
+    for basis in (undetermined[inert], undetermined[~inert]):
         for vector in sparse(basis):
             relation = follower.exact(_simplest(vector, exact), exact)
             if relation is None:
@@ -82,35 +74,27 @@ def relations(
 
 
 def overlooked(
-    objective: Objective,
-    chromosome: FloatArray,
-    steps: list[int],
-    found: Sensitivity,
-    slope: FloatArray,
-    lost: FloatArray,
-    rivals: Sequence[FloatArray] = (),
+    sensitivity: Sensitivity, undetermined: FloatArray, rivals: Sequence[FloatArray] = ()
 ) -> FloatArray:
     """Exact directions that errors of the slopes let look determined, (n, n_free), orthonormal.
 
     Dry friction makes the slope of each parameter jagged while all of them together, followed
-    in whole numbers, move nothing. slope: as for ``relations``. lost: (n_lost, n_free), those
-    known not to be determined. rivals: other minima; one that is another point of the same valley
-    lies along such a direction.
+    in whole numbers, move nothing. undetermined: (n, n_free), orthonormal. rivals: other minima;
+    one that is another point of the same valley lies along such a direction.
     """
-    rows = found.slopes[:, objective.weights > 0.0].reshape(-1, len(chromosome))
-    follower = _Follower(objective, chromosome, steps, slope, rows)
-    _, values, vectors = np.linalg.svd(rows, full_matrices=False)
-    at, units = objective.space.encode(chromosome), coordinate_units(objective, chromosome)
-    ways = [(objective.space.encode(rival) - at) / units for rival in rivals]
-    known = [*lost]
+    follower = _Follower(sensitivity)
+    space, chromosome = sensitivity.objective.space, sensitivity.chromosome
+    _, values, vectors = np.linalg.svd(sensitivity.rows, full_matrices=False)
+    units = coordinate_units(sensitivity.objective, chromosome)
+    ways = [(space.encode(rival) - space.encode(chromosome)) / units for rival in rivals]
+    basis = [*undetermined]
     for vector in [*ways, *vectors[values < _WEAK * values[0]]]:
         for candidate in follower.rounded(vector):
-            rest = _beyond(candidate, known)
-            if np.linalg.norm(rest) > _NEW * np.linalg.norm(candidate) and (
-                follower.kind(candidate) != "vague"
-            ):
-                known.append(rest / np.linalg.norm(rest))
-    return np.array(known[len(lost) :]).reshape(-1, len(chromosome))
+            rest = _beyond(candidate, basis)
+            new = np.linalg.norm(rest) > _NEW * np.linalg.norm(candidate)
+            if new and follower.kind(candidate) != "vague":
+                basis.append(rest / np.linalg.norm(rest))
+    return np.array(basis[len(undetermined) :]).reshape(-1, len(chromosome))
 
 
 def overlapping(supports: list[BoolArray]) -> list[list[int]]:
@@ -122,21 +106,17 @@ def overlapping(supports: list[BoolArray]) -> list[list[int]]:
     return groups
 
 
-@dataclass(frozen=True)
 class _Follower:
-    """Follows directions far enough to see what they are.
+    """Follows directions far enough to see what they are."""
 
-    rows: (n_rows, n_free), slopes of the outputs that count.
-    """
+    def __init__(self, sensitivity: Sensitivity) -> None:
+        self.sensitivity = sensitivity
+        self.chromosome, self.increments = sensitivity.chromosome, sensitivity.increments
+        # Whole powers of the parameters move them by their values, whole multiples by one.
+        self.units = (self.chromosome, np.ones_like(self.chromosome))
 
-    objective: Objective
-    chromosome: FloatArray
-    steps: list[int]
-    slope: FloatArray
-    rows: FloatArray
-
-    def exact(self, vector: FloatArray, known: list[Relation]) -> Relation | None:
-        """The exact relation that a direction is but for errors, other than those known."""
+    def exact(self, vector: FloatArray, relations: list[Relation]) -> Relation | None:
+        """The exact relation that a direction is but for errors, unless among ``relations``."""
         tried = []
         size = np.abs(vector)
         for share in _SHARES:
@@ -146,7 +126,7 @@ class _Follower:
             tried.append(members)
             for candidate in self._candidates(vector, members):
                 kind = self.kind(candidate)
-                if kind != "vague" and _is_new(candidate, known):
+                if kind != "vague" and _is_new(candidate, relations):
                     return Relation(candidate, kind)
         return None
 
@@ -157,57 +137,60 @@ class _Follower:
         the direction is sought anew without the others, and with whole numbers for what is near.
         """
         best = np.zeros_like(vector)
-        best[members] = np.linalg.svd(self.rows[:, members], full_matrices=False)[2][-1]
+        rows = self.sensitivity.rows[:, members]
+        best[members] = np.linalg.svd(rows, full_matrices=False)[2][-1]
         yield best
-        for unit in (self.chromosome, np.ones_like(vector)):
+        for unit in self.units:
             if np.all(unit[members] != 0.0):
-                whole = _whole(best[members] * self.slope[members] / unit[members])
+                whole = _whole(best[members] * self.increments[members] / unit[members])
                 if whole is not None:
                     snapped = np.zeros_like(vector)
-                    snapped[members] = whole * unit[members] / self.slope[members]
+                    snapped[members] = whole * unit[members] / self.increments[members]
                     yield snapped / np.max(np.abs(snapped))
 
     def rounded(self, vector: FloatArray) -> Iterator[FloatArray]:
         """Small whole powers, or multiples, of the parameters that a direction comes near."""
         taking = np.abs(vector) > _FIRMLY * np.max(np.abs(vector))
-        for unit in (self.chromosome, np.ones_like(vector)):
+        for unit in self.units:
             usable = taking & (unit != 0.0)
             if not usable.any():
                 continue
             ratios = np.zeros_like(vector)
-            np.divide(vector * self.slope, unit, out=ratios, where=usable)
+            np.divide(vector * self.increments, unit, out=ratios, where=usable)
             for factor in (1.0, 2.0):
                 whole = np.round(factor * ratios / np.max(np.abs(ratios)))
                 if np.count_nonzero(whole) > 1:
-                    yield whole * unit / self.slope
+                    yield whole * unit / self.increments
 
     def kind(self, vector: FloatArray) -> Kind:
-        """Follow a direction as a product and as a sum; what leaves the outputs alone."""
-        step = vector * self.slope
+        """Follow a direction as a product and as a sum; which of them leaves the outputs alone."""
+        step = vector * self.increments
         with np.errstate(divide="ignore", invalid="ignore"):
             relative = np.where(step != 0.0, step / self.chromosome, 0.0)
         if not np.all(np.isfinite(relative)):
             return "vague"
         relative *= _FOLLOW / np.max(np.abs(relative))
         alone = np.zeros_like(relative)
-        one = np.argmax(np.abs(relative))
-        alone[one] = relative[one]
+        largest = np.argmax(np.abs(relative))
+        alone[largest] = relative[largest]
         moved = self.chromosome * np.stack(
             [np.ones_like(relative), np.exp(relative), 1.0 + relative, 1.0 + alone]
         )
-        residuals = self.objective.residuals(moved, self.steps).values
-        counted = residuals[:, self.objective.weights > 0.0]
+        objective = self.sensitivity.objective
+        residuals = objective.residuals(moved, self.sensitivity.steps).values
+        counted = residuals[:, objective.weights > 0.0]
         change = np.sqrt(np.mean((counted[..., 1:] - counted[..., :1]) ** 2, axis=(0, 1)))
-        if change[0] < _UNMOVED * change[2]:
+        product, total, reference = change
+        if product < _UNMOVED * reference:
             return "product"
-        return "sum" if change[1] < _UNMOVED * change[2] else "vague"
+        return "sum" if total < _UNMOVED * reference else "vague"
 
 
-def _is_new(vector: FloatArray, known: list[Relation]) -> bool:
-    """Whether a direction is no mixture of those known."""
-    if not known:
+def _is_new(vector: FloatArray, relations: list[Relation]) -> bool:
+    """Whether a direction is no mixture of those of the relations."""
+    if not relations:
         return True
-    basis = np.linalg.qr(np.stack([relation.vector for relation in known]).T)[0]
+    basis = np.linalg.qr(np.stack([relation.vector for relation in relations]).T)[0]
     rest = _beyond(vector, [*basis.T])
     return bool(np.linalg.norm(rest) > _NEW * np.linalg.norm(vector))
 
@@ -254,7 +237,7 @@ def sparse(basis: FloatArray) -> FloatArray:
         pivot = np.unravel_index(int(np.argmax(np.abs(rows[left]))), (len(left), rows.shape[1]))
         row, column = left.pop(int(pivot[0])), int(pivot[1])
         rows[row] /= rows[row, column]
-        others = [i for i in range(len(rows)) if i != row]
-        rows[others] -= np.outer(rows[others, column], rows[row])
+        rest = [i for i in range(len(rows)) if i != row]
+        rows[rest] -= np.outer(rows[rest, column], rows[row])
     rows[np.abs(rows) < _NOTHING] = 0.0
     return rows

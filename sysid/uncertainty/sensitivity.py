@@ -1,15 +1,17 @@
-"""How the simulated outputs move with the parameters, and with errors of the sensors' zero."""
+"""Slopes of the simulated outputs over the parameters, and what errors of the sensors change."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from sysid.arrays import BoolArray, FloatArray
 from sysid.fitting.objective import Objective
 from sysid.problem.data import Dataset
+from sysid.uncertainty.colour import record_rows
 
 # Central differences in search coordinates: truncation and rounding both near 1e-8.
 _PERTURBATION = 1e-5
@@ -19,19 +21,37 @@ _DRAWS = 128
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """Residuals and their slopes at a chromosome.
+    """Residuals and their slopes at a chromosome, (n_free,), by simulations of so many steps.
 
     residual: (n_residuals, n_outputs), simulated minus measured in parts of the output's scale,
     0 where a sample was lost; seen: of the same shape, where none was. slopes: (n_residuals,
     n_outputs, n_free), with respect to the natural logarithm of a parameter searched by
-    logarithm, else to the parameter in units of ``coordinate_units``. lengths: residuals of each
-    record, one after another.
+    logarithm, else to the parameter in units of ``coordinate_units``.
     """
 
+    objective: Objective
+    chromosome: FloatArray
+    steps: list[int]
     residual: FloatArray
     seen: BoolArray
     slopes: FloatArray
-    lengths: tuple[int, ...]
+
+    @property
+    def lengths(self) -> tuple[int, ...]:
+        """Residuals of each record, which stand one after another."""
+        return tuple(record.n_samples for record in self.objective.records)
+
+    @cached_property
+    def rows(self) -> FloatArray:
+        """Slopes of the outputs that have a weight, (n_rows, n_free)."""
+        weighted = self.slopes[:, self.objective.weights > 0.0]
+        return weighted.reshape(-1, len(self.chromosome))
+
+    @cached_property
+    def increments(self) -> FloatArray:
+        """Change of each parameter per unit of its coordinate, (n_free,)."""
+        units = coordinate_units(self.objective, self.chromosome)
+        return np.where(self.objective.space.log, self.chromosome, units)
 
 
 def common_steps(objective: Objective, chromosome: FloatArray) -> list[int]:
@@ -40,18 +60,21 @@ def common_steps(objective: Objective, chromosome: FloatArray) -> list[int]:
     return [int(steps) for steps in needed.max(axis=0)]
 
 
-def sensitivity(objective: Objective, chromosome: FloatArray, steps: list[int]) -> Sensitivity:
+def sensitivity(
+    objective: Objective, chromosome: FloatArray, steps: list[int] | None = None
+) -> Sensitivity:
     """Residuals and slopes by central differences of simulations with equal steps.
 
-    chromosome: (n_free,). A perturbed simulation that fails has slope zero.
+    chromosome: (n_free,). steps: per sample of each record, default ``common_steps``. A
+    perturbed simulation that fails has slope zero.
     """
+    steps = common_steps(objective, chromosome) if steps is None else steps
     residuals = objective.residuals(_with_neighbours(objective, chromosome), steps).values
     n = len(chromosome)
     slopes = (residuals[..., 1 : n + 1] - residuals[..., n + 1 :]) / (2.0 * _PERTURBATION)
     slopes = np.where(np.isfinite(slopes), slopes, 0.0)
-    lengths = tuple(record.n_samples for record in objective.records)
     seen = np.concatenate([np.isfinite(record.outputs) for record in objective.records])
-    return Sensitivity(residuals[..., 0].copy(), seen, slopes, lengths)
+    return Sensitivity(objective, chromosome, steps, residuals[..., 0].copy(), seen, slopes)
 
 
 def _with_neighbours(objective: Objective, chromosome: FloatArray) -> FloatArray:
@@ -63,79 +86,63 @@ def _with_neighbours(objective: Objective, chromosome: FloatArray) -> FloatArray
 
 
 def coordinate_units(objective: Objective, chromosome: FloatArray) -> FloatArray:
-    """What one unit of each coordinate of the slopes is in search coordinates, (n_free,)."""
+    """Size in search coordinates of a unit of each coordinate of the slopes, (n_free,)."""
     space = objective.space
     size = np.maximum(np.abs(chromosome), 0.05 * (space.upper - space.lower))
     return np.where(space.log, 1.0, size)
 
 
-def zero_errors(
-    objective: Objective, chromosome: FloatArray, steps: list[int], found: Sensitivity
-) -> Iterator[FloatArray]:
+def zero_errors(sensitivity: Sensitivity) -> Iterator[FloatArray]:
     """Change of all residuals by one standard deviation of each sensor's zero error.
 
     Each is (n_residuals, n_outputs): a constant error of one channel of one record.
     """
-    moves = _InputMoves(objective, chromosome, steps, found)
-    for k, record in enumerate(objective.records):
+    objective = sensitivity.objective
+    for k, rows in enumerate(record_rows(sensitivity.lengths)):
+        record = objective.records[k]
         for j in np.flatnonzero(record.output_zero):
-            change = np.zeros_like(found.residual)
-            change[moves.rows(k), j] = record.output_zero[j] / objective.scales[k][j]
+            change = np.zeros_like(sensitivity.residual)
+            change[rows, j] = record.output_zero[j] / objective.scales[k][j]
             yield change
-        for j in np.flatnonzero(record.input_zero):
-            error = np.zeros_like(record.inputs)
-            error[:, j] = record.input_zero[j]
-            yield moves.change(k, error)
+        errors = [error for error in np.diag(record.input_zero) if error.any()]
+        yield from _input_changes(sensitivity, k, errors)
 
 
-def input_noises(
-    objective: Objective, chromosome: FloatArray, steps: list[int], found: Sensitivity
-) -> Iterator[FloatArray]:
-    """Changes of all residuals, (n_residuals, n_outputs), whose outer products sum to what the
-    noise on the measured inputs does: drawn at random, always the same."""
+def input_noises(sensitivity: Sensitivity) -> Iterator[FloatArray]:
+    """Changes of all residuals whose outer products sum to the covariance by input noise.
+
+    Each is (n_residuals, n_outputs), by noise that is drawn at random, always the same.
+    """
     rng = np.random.default_rng(0)
-    moves = _InputMoves(objective, chromosome, steps, found)
-    for k, record in enumerate(objective.records):
-        if not np.any(record.input_noise):
-            continue
-        for _ in range(_DRAWS):
-            error = rng.standard_normal(record.inputs.shape) * record.input_noise
-            yield moves.change(k, error) / np.sqrt(_DRAWS)
+    for k, record in enumerate(sensitivity.objective.records):
+        if np.any(record.input_noise):
+            shape, noise = record.inputs.shape, record.input_noise
+            errors = (rng.standard_normal(shape) * noise for _ in range(_DRAWS))
+            for change in _input_changes(sensitivity, k, errors):
+                yield change / np.sqrt(_DRAWS)
 
 
-class _InputMoves:
-    """Simulations of a chromosome with other inputs."""
+def _input_changes(
+    sensitivity: Sensitivity, k: int, errors: Iterable[FloatArray]
+) -> Iterator[FloatArray]:
+    """Changes of all residuals by errors of record k's inputs, (n_samples, n_inputs) or a row."""
+    objective, record = sensitivity.objective, sensitivity.objective.records[k]
+    rows = record_rows(sensitivity.lengths)[k]
+    chromosomes = sensitivity.chromosome[None]
+    vectors = objective.space.full(chromosomes)
+    initial = record.initial_state(objective.simulator.model)
+    starts = objective.space.starts(chromosomes, k, initial)
 
-    def __init__(
-        self, objective: Objective, chromosome: FloatArray, steps: list[int], found: Sensitivity
-    ) -> None:
-        self._objective, self._steps, self._found = objective, steps, found
-        self._vector = objective.space.full(chromosome[None])
-        model = objective.simulator.model
-        self._starts = [
-            objective.space.starts(chromosome[None], k, record.initial_state(model))
-            for k, record in enumerate(objective.records)
-        ]
-        self._still: dict[int, FloatArray] = {}
+    def outputs(record: Dataset) -> FloatArray:
+        steps = sensitivity.steps[k]
+        simulated: FloatArray = objective.simulator.trajectories(vectors, record, steps, starts)[0]
+        return simulated
 
-    def rows(self, k: int) -> slice:
-        """Where the residuals of record k stand."""
-        end = sum(self._found.lengths[: k + 1])
-        return slice(end - self._found.lengths[k], end)
-
-    def change(self, k: int, error: FloatArray) -> FloatArray:
-        """Change of the residuals by an error (n_samples, n_inputs) of record k's inputs."""
-        record = self._objective.records[k]
-        if k not in self._still:
-            self._still[k] = self._simulated(k, record)
-        moved = self._simulated(k, replace(record, inputs=record.inputs + error))
-        change = np.zeros_like(self._found.residual)
-        difference = (moved - self._still[k]) / self._objective.scales[k]
-        change[self.rows(k)] = np.where(np.isfinite(difference), difference, 0.0)
-        return change
-
-    def _simulated(self, k: int, record: Dataset) -> FloatArray:
-        outputs: FloatArray = self._objective.simulator.trajectories(
-            self._vector, record, self._steps[k], self._starts[k]
-        )[0]
-        return outputs
+    undisturbed = None
+    for error in errors:
+        undisturbed = outputs(record) if undisturbed is None else undisturbed
+        disturbed = outputs(replace(record, inputs=record.inputs + error))
+        difference = (disturbed - undisturbed) / objective.scales[k]
+        change = np.zeros_like(sensitivity.residual)
+        change[rows] = np.where(np.isfinite(difference), difference, 0.0)
+        yield change

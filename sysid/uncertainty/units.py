@@ -6,8 +6,10 @@ import re
 from collections import Counter
 from collections.abc import Iterable
 
+from sysid.uncertainty.estimate import fraction
+
 _FACTOR = re.compile(r"([^\W\d]+|1)(?:\^(-?\d+))?")
-_WRITTEN = re.compile(r"(?P<above>[^/()]+)(?:/(?:\((?P<all>[^/()]+)\)|(?P<one>[^/()*]+)))?")
+_UNIT = re.compile(r"(?P<above>[^/()]+)(?:/(?:\((?P<several>[^/()]+)\)|(?P<single>[^/()*]+)))?")
 # Units made of others, which cancel the one named second.
 _MADE_OF: tuple[tuple[str, str, dict[str, int]], ...] = (
     ("H", "ohm", {"ohm": 1, "s": 1}),
@@ -24,29 +26,25 @@ def product_unit(factors: Iterable[tuple[str, float]]) -> str:
     """
     powers: Counter[str] = Counter()
     for unit, power in factors:
-        own = _powers(unit or "1")
-        if own is None or power != round(power):
+        symbols = _powers(unit or "1")
+        if symbols is None or power != round(power):
             return ""
-        for name, times in own.items():
-            powers[name] += int(power) * times
+        for symbol, times in symbols.items():
+            powers[symbol] += int(power) * times
     for unit, against, parts in _MADE_OF:
         if powers[unit] * powers[against] < 0:
             times = powers.pop(unit)
-            powers.update({name: times * part for name, part in parts.items()})
-    above = [_power(name, times) for name, times in powers.items() if times > 0]
-    below = [_power(name, -times) for name, times in powers.items() if times < 0]
-    bottom = "*".join(below)
-    divided = f"/({bottom})" if len(below) > 1 else f"/{bottom}" if below else ""
-    return ("*".join(above) or "1") + divided
+            powers.update({symbol: times * part for symbol, part in parts.items()})
+    return fraction([(symbol, times) for symbol, times in powers.items() if times], "*", "/")
 
 
 def _powers(unit: str) -> Counter[str] | None:
-    """Symbols of a unit with their powers; None of one that is written otherwise."""
-    found = _WRITTEN.fullmatch(unit)
-    if found is None:
+    """Symbols of a unit with their powers; None of a unit that is written otherwise."""
+    parts = _UNIT.fullmatch(unit)
+    if parts is None:
         return None
     powers: Counter[str] = Counter()
-    for text, sign in ((found["above"], 1), (found["all"] or found["one"] or "1", -1)):
+    for text, sign in ((parts["above"], 1), (parts["several"] or parts["single"] or "1", -1)):
         for factor in text.split("*"):
             symbol = _FACTOR.fullmatch(factor.strip())
             if symbol is None:
@@ -54,7 +52,3 @@ def _powers(unit: str) -> Counter[str] | None:
             if symbol[1] != "1":
                 powers[symbol[1]] += sign * int(symbol[2] or 1)
     return powers
-
-
-def _power(name: str, times: int) -> str:
-    return name if times == 1 else f"{name}^{times}"
