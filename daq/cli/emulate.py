@@ -21,8 +21,8 @@ from daq.serial import messages
 from daq.serial.emulation import faults
 from daq.serial.emulation.emulator import Emulator, PtyPort, TcpPort
 from daq.serial.messages import Channel, Codes, Records, Start, Welcome
-from sim_rig import converters
 from sim_rig.backend import SimulatedDevice
+from sim_rig.device import converters
 
 CLOCK = 48_000_000  # Hz, of a microcontroller with USB
 QUEUE = 16_384  # commands; 64 KiB of its memory
