@@ -27,13 +27,13 @@ from daq.hal import (
     Phase,
     RawSamples,
 )
-from sim_rig import command_queue, converters
-from sim_rig.command_queue import CommandQueue
-from sim_rig.converters import Converters
-from sim_rig.encoder import EncoderCounter
-from sim_rig.guarding import Watch
+from sim_rig.device import command_queue, converters
+from sim_rig.device.command_queue import CommandQueue
+from sim_rig.device.converters import Converters
+from sim_rig.device.encoder import EncoderCounter
+from sim_rig.device.interlock import Interlock
+from sim_rig.device.user import SimulatedUser
 from sim_rig.plant import Plant, state_sizes
-from sim_rig.user import SimulatedUser
 from sysid import ProcessModel, Stepper
 
 _BLOCK = 256  # ticks simulated at once in open loop
@@ -177,7 +177,7 @@ class SimulatedDevice:
                 accuracy=_ACCURACY,
             )
         self._stepper = self._steppers[sample_rate]
-        self._rate, self._guard, self._watch = sample_rate, guard, Watch(guard)
+        self._rate, self._guard, self._interlock = sample_rate, guard, Interlock(guard)
         self._waits_for_commands = mode is Mode.OPEN_LOOP
         self._origin = self._clock
         self._queue.restart(mode)
@@ -284,7 +284,7 @@ class SimulatedDevice:
         n = len(applied)
         noise, encoder = self._unit_noise(n), self._encoder.copy()
         raw, trace = self._simulate(applied, flags, noise)
-        row = self._watch.first_beyond(raw.analog, raw.counts, raw.count_rate) if guarded else n
+        row = self._interlock.first_beyond(raw.analog, raw.counts, raw.count_rate) if guarded else n
         if row < n:
             applied[row:] = 0.0
             flags[row:] = 0

@@ -11,8 +11,8 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 from daq.config.base import Section
 from daq.config.units import Quantity, converted
 from sim_rig.actuator import actuator
-from sim_rig.electrical import MAX_CURRENT, SUPPLY
-from sim_rig.options import (
+from sim_rig.physics.electrical import MAX_CURRENT, SUPPLY
+from sim_rig.physics.options import (
     BrakeDriver,
     Exponent,
     Friction,

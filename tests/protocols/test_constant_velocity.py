@@ -17,7 +17,7 @@ from protocols.staircase import Drive, Plateau, SettlingTest, Staircase, longest
 from protocols.torque_curve import Level, Motor, fit, levels_of, ripple
 from tests.protocols.closed_loop import logged, numbers, run, shipped
 
-C0, C1, K_M, B_M = 1.2e-4, 6e-4, 0.353 / 2.5, 8e-5  # of the simulated rig (sim_rig/values.py)
+C0, C1, K_M, B_M = 1.2e-4, 6e-4, 0.353 / 2.5, 8e-5  # sim_rig/physics/values.py
 K_DB, R_B = 13000.0, 24.0 / 0.19
 RESIDUAL, PER_AMPERE = 0.014, (0.6779 - 0.014) / 0.19
 QUICK = {

@@ -13,8 +13,8 @@ from daq.errors import ConfigError, RunError
 from daq.run.runner import plan
 from protocols.bouc_wen_loop import Cycles, fit, hysteresis
 from protocols.hysteresis_loop import HysteresisLoop
-from sim_rig.hysteresis import hysteresis as brake_model
-from sim_rig.values import named
+from sim_rig.physics.hysteresis import hysteresis as brake_model
+from sim_rig.physics.values import named
 from tests.protocols.closed_loop import numbers, run, shipped
 
 TRUTH = named("rig")

@@ -13,8 +13,8 @@ from protocols.passivity import SampledWall, passive_stiffness
 from protocols.pid import SpeedTracker
 from protocols.virtual_wall import VirtualWall
 from sim_rig.backend import Simulation
-from sim_rig.loads import hand_impedance
-from sim_rig.user import SimulatedUser
+from sim_rig.device.user import SimulatedUser
+from sim_rig.physics.loads import hand_impedance
 from tests.protocols.closed_loop import logged, numbers, run, shipped
 
 PERIOD = 1.0 / 800.0

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import signal
 
-from sim_rig.electrical import (
+from sim_rig.physics.electrical import (
     MAX_CURRENT,
     SUPPLY,
     closed_loop_driver,

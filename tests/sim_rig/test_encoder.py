@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from sim_rig.encoder import EncoderCounter
+from sim_rig.device.encoder import EncoderCounter
 
 PER_TURN = 8192
 RATE = 800.0

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim_rig.friction import friction
+from sim_rig.physics.friction import friction
 from tests.sim_rig.support import Parts
 
 STRIBECK = {"F_c": 0.02, "F_s": 0.03, "omega_s": 2.0, "B_f": 1e-3, "omega_r": 0.01}

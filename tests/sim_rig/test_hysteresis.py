@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from sim_rig.hysteresis import hysteresis
+from sim_rig.physics.hysteresis import hysteresis
 from sysid import ModelError, SearchSpace
 from tests.sim_rig.support import HYSTERESES, Parts
 

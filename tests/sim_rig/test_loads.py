@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 
-from sim_rig.loads import hand_impedance, hand_torque, load, pulley_torque
+from sim_rig.physics.loads import hand_impedance, hand_torque, load, pulley_torque
 from tests.sim_rig.support import Parts, constant, follow
 
 GRAVITY = 9.80665

@@ -8,7 +8,7 @@ from numba import njit
 from daq.hal import FloatArray, Guard
 
 
-class Watch:
+class Interlock:
     """A guard's limits over the samples of a run, in their order."""
 
     def __init__(self, guard: Guard) -> None:

@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from sim_rig.options import DriverKind
-from sim_rig.parts import log_range
+from sim_rig.physics.options import DriverKind
+from sim_rig.physics.parameters import log_range
 from sysid import Parameter
 
 SUPPLY = 24.0  # V, the amplifier's limit
@@ -51,8 +51,8 @@ def open_loop_driver(voltage: Any, current: Any, command: Any, K_v2i: Any, p: An
 
 def limited_closed_loop_driver(voltage: Any, current: Any, command: Any, K_v2i: Any, p: Any) -> Any:
     """``closed_loop_driver`` that asks for no more than its rated current."""
-    asked = saturate(command, MAX_CURRENT / K_v2i)
-    return closed_loop_driver(voltage, current, asked, K_v2i, p)
+    within_rating = saturate(command, MAX_CURRENT / K_v2i)
+    return closed_loop_driver(voltage, current, within_rating, K_v2i, p)
 
 
 def limited_open_loop_driver(voltage: Any, current: Any, command: Any, K_v2i: Any, p: Any) -> Any:
@@ -81,26 +81,34 @@ def driver(kind: DriverKind, limits: bool) -> DriverFunction:
     return limited_open_loop_driver if limits else open_loop_driver
 
 
-def motor_driver_parameters(kind: DriverKind) -> tuple[Parameter, ...]:
-    """Gain and cutoff of the motor's amplifier."""
-    cutoff = log_range("omega_dm", "rad/s", 1000.0, 100.0, 5000.0, "motor driver cutoff")
-    if kind == "closed":
-        return (log_range("K_dm", "V/A", 100.0, 10.0, 500.0, "motor driver gain"), cutoff)
-    return (log_range("G_dm", "V/V", 1.0, 0.1, 10.0, "motor driver gain"), cutoff)
+def driver_equation(kind: DriverKind, index: str) -> str:
+    """The equation of an amplifier without limits as text; index: m (motor) or b (brake)."""
+    drive = (
+        f"K_d{index}*(K_v2i*u_{index} - i_{index})" if kind == "closed" else f"G_d{index}*u_{index}"
+    )
+    return f"dv_{index}/dt = omega_d{index}*({drive} - v_{index})"
 
 
-def brake_driver_parameters(kind: DriverKind) -> tuple[Parameter, ...]:
-    """Gain and cutoff of the brake's amplifier."""
-    if kind == "closed":
-        return (
-            log_range("K_db", "V/A", 10000.0, 1000.0, 40000.0, "brake driver gain"),
-            log_range("omega_db", "rad/s", 20.0, 5.0, 500.0, "brake driver cutoff"),
-        )
-    return (
+_MOTOR_CUTOFF = log_range("omega_dm", "rad/s", 1000.0, 100.0, 5000.0, "motor driver cutoff")
+
+# Gain and cutoff of the amplifiers.
+MOTOR_DRIVERS: dict[DriverKind, tuple[Parameter, ...]] = {
+    "closed": (
+        log_range("K_dm", "V/A", 100.0, 10.0, 500.0, "motor driver gain"),
+        _MOTOR_CUTOFF,
+    ),
+    "open": (log_range("G_dm", "V/V", 1.0, 0.1, 10.0, "motor driver gain"), _MOTOR_CUTOFF),
+}
+BRAKE_DRIVERS: dict[DriverKind, tuple[Parameter, ...]] = {
+    "closed": (
+        log_range("K_db", "V/A", 10000.0, 1000.0, 40000.0, "brake driver gain"),
+        log_range("omega_db", "rad/s", 20.0, 5.0, 500.0, "brake driver cutoff"),
+    ),
+    "open": (
         log_range("G_db", "V/V", 50.0, 10.0, 200.0, "brake driver gain"),
         log_range("omega_db", "rad/s", 500.0, 50.0, 5000.0, "brake driver cutoff"),
-    )
-
+    ),
+}
 
 WINDINGS = (
     log_range("R_m", "ohm", 1.0, 0.5, 8.0, "motor resistance"),
@@ -108,4 +116,8 @@ WINDINGS = (
     log_range("K_m", "N*m/A", 0.14, 0.03, 0.25, "motor constant"),
     log_range("R_b", "ohm", 120.0, 40.0, 200.0, "brake coil resistance"),
     log_range("L_b", "H", 0.15, 0.05, 1.0, "brake coil inductance"),
+)
+WINDING_EQUATIONS = (
+    "L_m di_m/dt = v_m - R_m*i_m + n_c*K_m*omega",
+    "L_b di_b/dt = v_b - R_b*i_b",
 )

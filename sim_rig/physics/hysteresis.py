@@ -15,8 +15,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from sim_rig.options import HysteresisKind
-from sim_rig.parts import known, log_range
+from sim_rig.physics.options import HysteresisKind
+from sim_rig.physics.parameters import PartConstraint, fixed, log_range
 from sysid import ModelError, Parameter
 
 # (omega, z, p) -> dz/dt, p the hysteresis's own parameters
@@ -24,14 +24,16 @@ Rate = Callable[[Any, Any, Any], Any]
 # (current, omega, z, dz/dt, p) -> torque that resists the motion
 Torque = Callable[[Any, Any, Any, Any, Any], Any]
 
+_RATED_CURRENT = 0.19  # A, up to which alpha(i) and c(i) must not be negative
+
 
 @dataclass(frozen=True)
-class Hysteresis:
-    """Equations and parameters of one hysteresis model.
+class HysteresisModel:
+    """Parameters and equations of one hysteresis model.
 
-    constraints: texts and functions g(p) <= 0 of its own parameters (section 3.4.2); that all
-    are positive is in their physical minimum. z_unit: of the hysteresis variable. z_range: where
-    it may stand when a record begins; a load that friction holds leaves it away from zero.
+    constraints: section 3.4.2; that all parameters are positive is in their physical minimum.
+    z_unit: of the hysteresis variable. z_range: where it may stand when a record begins; a load
+    that friction holds leaves it away from zero. equations: rate and torque as text.
     """
 
     parameters: tuple[Parameter, ...]
@@ -39,10 +41,13 @@ class Hysteresis:
     torque: Torque
     z_unit: str
     z_range: tuple[float, float]
-    constraints: tuple[tuple[str, Callable[[Any], Any]], ...] = ()
+    constraints: tuple[PartConstraint, ...]
+    equations: tuple[str, str]
 
 
-def hysteresis(kind: HysteresisKind, smooth: bool = False, exponent: float = 1.0) -> Hysteresis:
+def hysteresis(
+    kind: HysteresisKind, smooth: bool = False, exponent: float = 1.0
+) -> HysteresisModel:
     """A hysteresis model by name; ``exponent`` is n of (3.14), for Bouc-Wen alone.
 
     Raises ModelError for an exponent below 1, at which dz/dt is not defined at z = 0.
@@ -61,18 +66,10 @@ def brake_torque(current: Any, omega: Any, z: Any, coefficients: Any) -> Any:
     return (alpha0 + alpha1 * size) * z + (c0 + c1 * size) * omega
 
 
-def _power(exponent: float) -> Callable[[Any], Any]:
-    """a^n for a >= 0; whole exponents avoid the power function, which is no vector code."""
-    if exponent == 0.0:
-        return lambda a: 1.0
-    if exponent == 1.0:
-        return lambda a: a
-    if exponent == 2.0:
-        return lambda a: a * a
-    return lambda a: a**exponent
+_TORQUE_EQUATION = "tau_b = (alpha0 + alpha1*|i_b|)*z + (c0 + c1*|i_b|)*omega"
 
 
-def _bouc_wen(smooth: bool, exponent: float) -> Hysteresis:
+def _bouc_wen(smooth: bool, exponent: float) -> HysteresisModel:
     if not (math.isfinite(exponent) and exponent >= 1.0):
         raise ModelError(f"the Bouc-Wen exponent must be at least 1, not {exponent:g}")
     power, less = _power(exponent), _power(exponent - 1.0)
@@ -92,13 +89,12 @@ def _bouc_wen(smooth: bool, exponent: float) -> Hysteresis:
     def torque(current: Any, omega: Any, z: Any, z_rate: Any, p: Any) -> Any:
         return brake_torque(current, omega, z, p[3:7])
 
-    return Hysteresis(
+    return HysteresisModel(
         (
             log_range("gamma", "1/rad", 40.0, 5.0, 500.0, "hysteresis shape"),
             log_range("beta", "1/rad", 30.0, 5.0, 500.0, "hysteresis shape"),
             log_range("A", "1/rad", 100.0, 10.0, 1000.0, "hysteresis stiffness"),
-            log_range("alpha0", "N*m", 0.02, 2e-3, 0.5, "hysteretic torque at zero current"),
-            log_range("alpha1", "N*m/A", 4.0, 0.5, 50.0, "hysteretic torque per ampere"),
+            *_ALPHA,
             *_VISCOUS,
             *_sharpness(smooth),
         ),
@@ -111,10 +107,33 @@ def _bouc_wen(smooth: bool, exponent: float) -> Hysteresis:
             ("gamma + beta >= 0 (Bouc-Wen class 1)", lambda p: -p[1] - p[0]),
             *_positive_torque(3),
         ),
+        (_bouc_wen_equation(smooth, exponent), _TORQUE_EQUATION),
     )
 
 
-def _dahl(smooth: bool) -> Hysteresis:
+def _power(exponent: float) -> Callable[[Any], Any]:
+    """a^n for a >= 0; whole exponents avoid the power function, which is no vector code."""
+    if exponent == 0.0:
+        return lambda a: 1.0
+    if exponent == 1.0:
+        return lambda a: a
+    if exponent == 2.0:
+        return lambda a: a * a
+    return lambda a: a**exponent
+
+
+def _bouc_wen_equation(smooth: bool, exponent: float) -> str:
+    if smooth:
+        power = "" if exponent == 1.0 else f"^{exponent:g}"
+        rate = f"omega*(A - (z*tanh(rho*z)){power}*(beta + gamma*tanh(rho*omega*z)))"
+    elif exponent == 1.0:
+        rate = "A*omega - gamma*|omega|*z - beta*omega*|z|"
+    else:
+        rate = f"A*omega - |z|^{exponent - 1.0:g}*(gamma*|omega|*z + beta*omega*|z|)"
+    return f"dz/dt = {rate}"
+
+
+def _dahl(smooth: bool) -> HysteresisModel:
     def exact_rate(omega: Any, z: Any, p: Any) -> Any:
         return p[0] * (omega - abs(omega) * z)  # (3.16)
 
@@ -124,11 +143,11 @@ def _dahl(smooth: bool) -> Hysteresis:
     def torque(current: Any, omega: Any, z: Any, z_rate: Any, p: Any) -> Any:
         return brake_torque(current, omega, z, p[1:5])
 
-    return Hysteresis(
+    smooth_equation = "dz/dt = sigma*omega*(1 - z*tanh(rho*omega))"
+    return HysteresisModel(
         (
             log_range("sigma", "1/rad", 50.0, 5.0, 500.0, "hysteresis shape"),
-            log_range("alpha0", "N*m", 0.02, 2e-3, 0.5, "hysteretic torque at zero current"),
-            log_range("alpha1", "N*m/A", 4.0, 0.5, 50.0, "hysteretic torque per ampere"),
+            *_ALPHA,
             *_VISCOUS,
             *_sharpness(smooth),
         ),
@@ -137,10 +156,11 @@ def _dahl(smooth: bool) -> Hysteresis:
         "1",
         (-1.0, 1.0),
         _positive_torque(1),
+        (smooth_equation if smooth else "dz/dt = sigma*(omega - |omega|*z)", _TORQUE_EQUATION),
     )
 
 
-def _lugre(smooth: bool) -> Hysteresis:
+def _lugre(smooth: bool) -> HysteresisModel:
     def exact_rate(omega: Any, z: Any, p: Any) -> Any:
         return omega - p[0] * abs(omega) * z  # (3.18)
 
@@ -151,7 +171,8 @@ def _lugre(smooth: bool) -> Hysteresis:
         # (3.19)
         return brake_torque(current, omega, z, p[1:5]) + (p[5] + p[6] * abs(current)) * z_rate
 
-    return Hysteresis(
+    sign = "omega*tanh(rho*omega)" if smooth else "|omega|"
+    return HysteresisModel(
         (
             log_range("zeta", "1/rad", 50.0, 5.0, 500.0, "inverse of the largest deflection"),
             log_range("alpha0", "N*m/rad", 1.0, 0.1, 20.0, "stiffness at zero current"),
@@ -169,9 +190,17 @@ def _lugre(smooth: bool) -> Hysteresis:
             *_positive_torque(1),
             ("epsilon(i_b) >= 0 for every current", lambda p: _lowest(p[5], p[6])),
         ),
+        (
+            f"dz/dt = omega - zeta*{sign}*z",
+            f"{_TORQUE_EQUATION} + (epsilon0 + epsilon1*|i_b|)*(dz/dt)",
+        ),
     )
 
 
+_ALPHA = (
+    log_range("alpha0", "N*m", 0.02, 2e-3, 0.5, "hysteretic torque at zero current"),
+    log_range("alpha1", "N*m/A", 4.0, 0.5, 50.0, "hysteretic torque per ampere"),
+)
 _VISCOUS = (
     log_range("c0", "N*m*s/rad", 2e-4, 1e-5, 1e-2, "brake viscous damping at zero current"),
     log_range("c1", "N*m*s/(rad*A)", 2e-3, 1e-4, 5e-2, "brake viscous damping per ampere"),
@@ -181,10 +210,7 @@ _VISCOUS = (
 def _sharpness(smooth: bool) -> tuple[Parameter, ...]:
     if not smooth:
         return ()
-    return (known("rho", "1", 100.0, "sharpness of the smooth sign, tanh(rho x)"),)
-
-
-_RATED_CURRENT = 0.19  # A, up to which alpha(i) and c(i) must not be negative
+    return (fixed("rho", "1", 100.0, "sharpness of the smooth sign, tanh(rho x)"),)
 
 
 def _lowest(constant: Any, per_ampere: Any) -> Any:
@@ -194,7 +220,7 @@ def _lowest(constant: Any, per_ampere: Any) -> Any:
     return 0.5 * (-constant + at_rated + abs(constant + at_rated))
 
 
-def _positive_torque(first: int) -> tuple[tuple[str, Callable[[Any], Any]], ...]:
+def _positive_torque(first: int) -> tuple[PartConstraint, ...]:
     """alpha(i) and c(i) not negative, their coefficients standing from ``first`` on."""
     return (
         ("alpha(i_b) >= 0 for every current", lambda p: _lowest(p[first], p[first + 1])),

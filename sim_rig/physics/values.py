@@ -1,12 +1,12 @@
 """Named sets of parameter values: table 4.1 of the thesis, and the simulated rig's own.
 
 Each value of the rig has the reason for it beside it. "Assumed" ones stand in no data sheet.
-The identification models know nothing of them unless asked.
+Identification models have none of them unless a set is named.
 """
 
 from __future__ import annotations
 
-from sim_rig.options import SetName
+from sim_rig.physics.options import Design, SetName
 
 # Motor and its driver; what a row does not name stays as the rig has it.
 TABLE_4_1 = {
@@ -91,17 +91,19 @@ _BRAKES = {
 }
 
 
-def named(
-    name: SetName,
-    driver_motor: str = "closed",
-    driver_brake: str = "closed",
-    brake: str = "bouc-wen",
-    exponent: float = 1.0,
-) -> dict[str, float]:
-    """Values of a named set for the given parts, by parameter; "nominal" changes none."""
+_DEFAULT = Design()
+
+
+def named(name: SetName, design: Design = _DEFAULT) -> dict[str, float]:
+    """Values of a named set for a design's parts, by parameter; "nominal" changes none."""
     if name == "nominal":
         return {}
-    rig = RIG | _DRIVERS_MOTOR[driver_motor] | _DRIVERS_BRAKE[driver_brake] | _BRAKES[brake]
+    rig = (
+        RIG
+        | _DRIVERS_MOTOR[design.driver_motor]
+        | _DRIVERS_BRAKE[design.driver_brake]
+        | _BRAKES[design.hysteresis]
+    )
     for shape in {"gamma", "beta"} & set(rig):
-        rig[shape] *= _YIELD ** (1.0 - exponent)
+        rig[shape] *= _YIELD ** (1.0 - design.exponent)
     return rig | TABLE_4_1.get(name, {})

@@ -5,6 +5,7 @@ The same types stand in the call ``actuator(...)``, in a rig's YAML and in ``rig
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from pydantic import Field
@@ -49,3 +50,18 @@ ParameterSet = Annotated[
         "thesis's table 4.1"
     ),
 ]
+
+
+@dataclass(frozen=True)
+class Design:
+    """The choices of one actuator, as ``actuator`` takes them."""
+
+    driver_motor: DriverKind = "closed"
+    driver_brake: DriverKind = "closed"
+    hysteresis: HysteresisKind = "bouc-wen"
+    exponent: float = 1.0
+    smooth: bool = False
+    friction: FrictionKind = "none"
+    load: LoadKind = "measured"
+    sensor: SensorPlace = "load"
+    limits: bool = False

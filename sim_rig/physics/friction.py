@@ -14,27 +14,39 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from sim_rig.options import FrictionKind
-from sim_rig.parts import known, log_range
+from sim_rig.physics.options import FrictionKind
+from sim_rig.physics.parameters import PartConstraint, fixed, log_range
 from sysid import Parameter
 
 
 @dataclass(frozen=True)
-class Friction:
-    """Equation and parameters of a friction model; torque (theta, omega, p) resists the motion."""
+class FrictionModel:
+    """Parameters and equation of a friction model.
+
+    torque: (theta, omega, p) -> torque that resists the motion [N*m]. equation: the same as text,
+    empty where there is no friction.
+    """
 
     parameters: tuple[Parameter, ...]
     torque: Callable[[Any, Any, Any], Any]
-    constraints: tuple[tuple[str, Callable[[Any], Any]], ...] = ()
+    constraints: tuple[PartConstraint, ...] = ()
+    equation: str = ""
 
 
-def friction(kind: FrictionKind) -> Friction:
+def friction(kind: FrictionKind) -> FrictionModel:
     """A friction model by name."""
     if kind == "none":
-        return Friction((), lambda theta, omega, p: 0.0)
+        return FrictionModel((), lambda theta, omega, p: 0.0)
     if kind == "stribeck":
-        return Friction(_STRIBECK, stribeck_torque, _CONSTRAINTS)
-    return Friction(_STRIBECK + _CYCLIC, cyclic_torque, (*_CONSTRAINTS, _PRESSED))
+        return FrictionModel(_STRIBECK, stribeck_torque, _CONSTRAINTS, _equation(_LEVEL))
+    around = f"{_LEVEL} + F_cos*cos(cycles*theta) + F_sin*sin(cycles*theta)"
+    return FrictionModel(
+        _STRIBECK + _CYCLIC, cyclic_torque, (*_CONSTRAINTS, _PRESSED), _equation(around)
+    )
+
+
+def _equation(level: str) -> str:
+    return f"tau_f = ({level})*tanh(omega/omega_r) + B_f*omega"
 
 
 def stribeck_torque(theta: Any, omega: Any, p: Any) -> Any:
@@ -56,22 +68,28 @@ def _level(omega: Any, F_c: Any, F_s: Any, omega_s: Any) -> Any:
     return F_c + (F_s - F_c) * math.exp(-share * share)
 
 
+_LEVEL = "F_c + (F_s - F_c)*exp(-(omega/omega_s)^2)"
+
 _STRIBECK = (
     log_range("F_c", "N*m", 0.02, 1e-3, 0.2, "Coulomb friction"),
     log_range("F_s", "N*m", 0.03, 1e-3, 0.3, "friction at the moment of breaking away"),
     log_range("omega_s", "rad/s", 2.0, 0.2, 20.0, "Stribeck speed"),
     # Exactly what c0 does: searched only where somebody frees it.
-    known("B_f", "N*m*s/rad", 0.0, "viscous friction of the brushes"),
-    known("omega_r", "rad/s", 0.1, "speed within which the sign of the speed is smoothed"),
+    fixed("B_f", "N*m*s/rad", 0.0, "viscous friction of the brushes"),
+    fixed("omega_r", "rad/s", 0.1, "speed within which the sign of the speed is smoothed"),
 )
 
+
+def _harmonic(name: str, wave: str) -> Parameter:
+    meaning = f"friction that follows the {wave} of the angle"
+    return Parameter(name, "N*m", 0.0, -0.05, 0.05, minimum=-math.inf, description=meaning)
+
+
 _CYCLIC = (
-    Parameter("F_cos", "N*m", 0.0, -0.05, 0.05, minimum=-math.inf,
-              description="friction that follows the cosine of the angle"),
-    Parameter("F_sin", "N*m", 0.0, -0.05, 0.05, minimum=-math.inf,
-              description="friction that follows the sine of the angle"),
-    known("cycles", "1", 2.0, "periods of the cyclic friction in a turn"),
-)  # fmt: skip
+    _harmonic("F_cos", "cosine"),
+    _harmonic("F_sin", "sine"),
+    fixed("cycles", "1", 2.0, "periods of the cyclic friction in a turn"),
+)
 
 _CONSTRAINTS = (("F_s >= F_c (friction falls with speed)", lambda p: p[0] - p[1]),)
 _PRESSED = (

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from sim_rig.options import LoadKind
-from sim_rig.parts import known
+from sim_rig.physics.options import LoadKind
+from sim_rig.physics.parameters import fixed
 from sysid import Input, Parameter, State
 
 GRAVITY = 9.80665  # m/s^2
@@ -26,7 +26,7 @@ _CABLE = 5000.0  # N/m, assumed: thin braided cable, half a metre
 
 
 @dataclass(frozen=True)
-class Load:
+class LoadModel:
     """A load's states, inputs, parameters and equation.
 
     torque: (theta, omega, x, u, p) -> (torque on the shaft, rates of its own states...), each
@@ -40,7 +40,7 @@ class Load:
     inertia: Callable[[Any], Any] = lambda p: 0.0
 
 
-def load(kind: LoadKind) -> Load:
+def load(kind: LoadKind) -> LoadModel:
     """A load by name; a locked shaft carries nothing but what holds it."""
     return {
         "measured": _MEASURED,
@@ -48,22 +48,22 @@ def load(kind: LoadKind) -> Load:
         "locked": _FREE,
         "pulley": _PULLEY,
         "hand": _HAND,
-        "pulley+hand": both(_PULLEY, _HAND),
+        "pulley+hand": combined(_PULLEY, _HAND),
     }[kind]
 
 
-def both(first: Load, second: Load) -> Load:
+def combined(first: LoadModel, second: LoadModel) -> LoadModel:
     """Two loads on one shaft."""
     n, m, q = len(first.states), len(first.inputs), len(first.parameters)
     first_torque, second_torque = first.torque, second.torque
     first_inertia, second_inertia = first.inertia, second.inertia
 
     def torque(theta: Any, omega: Any, x: Any, u: Any, p: Any) -> tuple[Any, ...]:
-        one = first_torque(theta, omega, x[:n], u[:m], p[:q])
-        other = second_torque(theta, omega, x[n:], u[m:], p[q:])
-        return (one[0] + other[0], *one[1:], *other[1:])
+        from_first = first_torque(theta, omega, x[:n], u[:m], p[:q])
+        from_second = second_torque(theta, omega, x[n:], u[m:], p[q:])
+        return (from_first[0] + from_second[0], *from_first[1:], *from_second[1:])
 
-    return Load(
+    return LoadModel(
         torque,
         first.states + second.states,
         first.inputs + second.inputs,
@@ -110,14 +110,14 @@ def hand_impedance(
     return omega_n**2 * inertia, 2.0 * damping * omega_n * inertia
 
 
-_FREE = Load(lambda theta, omega, x, u, p: (0.0,))
+_FREE = LoadModel(lambda theta, omega, x, u, p: (0.0,))
 
-_MEASURED = Load(
+_MEASURED = LoadModel(
     lambda theta, omega, x, u, p: (u[0],),
     inputs=(Input("torque", "N*m", "foh", "load torque on the shaft, as measured"),),
 )
 
-_PULLEY = Load(
+_PULLEY = LoadModel(
     pulley_torque,
     (
         State("height", "m", -_MASS * GRAVITY / _CABLE, "of the hanging mass, cable stretched"),
@@ -125,17 +125,17 @@ _PULLEY = Load(
     ),
     (),
     (
-        known("mass", "kg", _MASS, "hanging mass"),
-        known("radius", "m", 0.005, "of the pulley; assumed: the brake's residual holds the load"),
-        known("J_p", "kg*m^2", 1e-6, "pulley inertia; assumed: small, of aluminium"),
-        known("k_cable", "N/m", _CABLE, "stiffness; assumed: thin braided cable, half a metre"),
-        known("d_cable", "s/m", 4.0, "loss; assumed: a seventh of critical under the mass"),
-        known("length", "m", 0.5, "of cable that can be wound; assumed: sixteen turns"),
+        fixed("mass", "kg", _MASS, "hanging mass"),
+        fixed("radius", "m", 0.005, "of the pulley; assumed: the brake's residual holds the load"),
+        fixed("J_p", "kg*m^2", 1e-6, "pulley inertia; assumed: small, of aluminium"),
+        fixed("k_cable", "N/m", _CABLE, "stiffness; assumed: thin braided cable, half a metre"),
+        fixed("d_cable", "s/m", 4.0, "loss; assumed: a seventh of critical under the mass"),
+        fixed("length", "m", 0.5, "of cable that can be wound; assumed: sixteen turns"),
     ),
     lambda p: p[2],
 )
 
-_HAND = Load(
+_HAND = LoadModel(
     hand_torque,
     (),
     (
@@ -144,7 +144,7 @@ _HAND = Load(
         Input("hand_omega", "rad/s", "foh", "speed of the wrist"),
     ),
     (
-        known("K_u", "N*m/rad", hand_impedance()[0], "stiffness of the hand (A.2)"),
-        known("B_u", "N*m*s/rad", hand_impedance()[1], "damping of the hand (A.2)"),
+        fixed("K_u", "N*m/rad", hand_impedance()[0], "stiffness of the hand (A.2)"),
+        fixed("B_u", "N*m*s/rad", hand_impedance()[1], "damping of the hand (A.2)"),
     ),
 )

@@ -1,0 +1,1 @@
+"""What stands between the plant and the host: converters, encoder, queue, interlock, user."""

@@ -1,0 +1,32 @@
+"""Starting ranges of the actuator's parameters, read from its logs before any search."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from sim_rig.guesses import damping, electrical
+from sim_rig.guesses.current_response import current_response
+from sim_rig.guesses.ranges import Ranges
+from sim_rig.physics.options import Design
+from sysid import Guess
+from sysid.problem.guesses import Guesses, Known, Measured
+
+
+def guesses(design: Design) -> Guesses:
+    """The function that guesses ranges for an actuator of this design.
+
+    Brush friction or a load that is neither measured nor absent leave the damping unguessed.
+    """
+
+    def guess(records: Sequence[Measured], assumed: Known) -> dict[str, Guess]:
+        ranges = Ranges(assumed)
+        motor, brake = (current_response(records, channel) for channel in ("motor", "brake"))
+        if motor is not None:
+            electrical.narrow(ranges, "motor", design.driver_motor, motor)
+        if brake is not None:
+            electrical.narrow(ranges, "brake", design.driver_brake, brake)
+        if design.friction == "none" and design.load in ("measured", "free"):
+            damping.narrow(ranges, records, brake_delay=brake.delay[1] if brake else 0.0)
+        return ranges.guesses
+
+    return guess
