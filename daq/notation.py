@@ -164,17 +164,17 @@ RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 def _translated(expression: str, atom: Callable[[str], str], rest: Callable[[str], str]) -> str:
     parts, end = [], 0
-    for found in _ATOM.finditer(expression):
-        parts += [rest(expression[end : found.start()]), atom(found[0])]
-        end = found.end()
+    for name in _ATOM.finditer(expression):
+        parts += [rest(expression[end : name.start()]), atom(name[0])]
+        end = name.end()
     return "".join([*parts, rest(expression[end:])])
 
 
 def _symbol(name: str) -> _Symbol | None:
-    found = _SYMBOL.fullmatch(name)
-    if found is None:
+    match = _SYMBOL.fullmatch(name)
+    if match is None:
         return None
-    letter, digits, index, start = found.groups()
+    letter, digits, index, start = match.groups()
     both = ",".join(part for part in (digits, index) if part)
     return _Symbol(letter, both, start is not None)
 

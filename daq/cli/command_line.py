@@ -44,16 +44,17 @@ def _with_volume(function: Callable[..., Any]) -> Callable[..., Any]:
             return function(*args, **options)
 
     # Typer reads the options from the signature and the annotations.
-    own = inspect.signature(function, eval_str=True)
+    signature = inspect.signature(function, eval_str=True)
     kind = inspect.Parameter.KEYWORD_ONLY
     more = [
         inspect.Parameter(name, kind, default=False, annotation=annotation)
         for name, annotation in (("quiet", Quiet), ("verbose", Verbose))
     ]
-    command.__signature__ = own.replace(  # type: ignore[attr-defined]
-        parameters=[*own.parameters.values(), *more]
+    command.__signature__ = signature.replace(  # type: ignore[attr-defined]
+        parameters=[*signature.parameters.values(), *more]
     )
     command.__annotations__ = {
-        parameter.name: parameter.annotation for parameter in [*own.parameters.values(), *more]
+        parameter.name: parameter.annotation
+        for parameter in [*signature.parameters.values(), *more]
     }
     return command

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from daq.cli import terminal
-from daq.cli.identify import show_identification
+from daq.cli.identification import show_identification
 
 if TYPE_CHECKING:
     from daq.identification.comparison import ComparisonResult, SeedsResult

@@ -21,20 +21,18 @@ def experiments(incomplete: str) -> list[Offer]:
 
 def rigs(incomplete: str) -> list[Offer]:
     """Shipped rigs, and YAML files here that name a backend or have its options."""
-    own = _local(incomplete, ".yaml", "backend:", "options:")
-    return _matching(incomplete, [*_shipped(RIGS), *own])
+    local = _local(incomplete, ".yaml", "backend:", "options:")
+    return _matching(incomplete, [*_shipped(RIGS), *local])
 
 
 def rig_names(incomplete: str) -> list[Offer]:
     """Shipped rigs by name."""
-    found = _shipped(RIGS)
-    return _matching(incomplete, [(name.removesuffix(".yaml"), text) for name, text in found])
+    return _matching(incomplete, _stems(RIGS))
 
 
 def protocols(incomplete: str) -> list[Offer]:
     """Shipped experiments by protocol."""
-    found = _shipped(EXPERIMENTS)
-    return _matching(incomplete, [(name.removesuffix(".yaml"), text) for name, text in found])
+    return _matching(incomplete, _stems(EXPERIMENTS))
 
 
 def models(incomplete: str) -> list[Offer]:
@@ -56,8 +54,13 @@ def presets(incomplete: str) -> list[Offer]:
 
 def _matching(incomplete: str, offers: Iterable[Offer]) -> list[Offer]:
     # What stands here goes before what is shipped by the same name.
-    found = {name: text for name, text in offers if name.startswith(incomplete)}
-    return list(found.items())
+    texts = {name: text for name, text in offers if name.startswith(incomplete)}
+    return list(texts.items())
+
+
+def _stems(packages: Iterable[str]) -> Iterator[Offer]:
+    for name, text in _shipped(packages):
+        yield name.removesuffix(".yaml"), text
 
 
 def _shipped(packages: Iterable[str]) -> Iterator[Offer]:
@@ -79,9 +82,10 @@ def _beside(incomplete: str, suffix: str) -> list[Path]:
     if not folder.is_dir():
         return []
     return sorted(
-        path for path in folder.iterdir()
+        path
+        for path in folder.iterdir()
         if not path.name.startswith(".") and (path.suffix == suffix or path.is_dir())
-    )  # fmt: skip
+    )
 
 
 def _about(path: Path) -> str:

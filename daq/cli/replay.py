@@ -72,7 +72,7 @@ def replay(
 
 
 def _show(result: Replay, drawn: Path | None) -> None:
-    from daq.cli.identify import print_errors
+    from daq.cli.identification import print_errors
     from daq.identification.rows import OutputErrors
 
     terminal.print_line(

@@ -75,7 +75,7 @@ def _problem(config: Path | None, model: str | None, watch: Any) -> Problem:
 
 
 def _identify(problem: Problem, result: SessionResult, report: bool, json: bool) -> dict[str, Any]:
-    from daq.cli.identify import show_identification
+    from daq.cli.identification import show_identification
     from daq.identification.fit import fit
 
     validation = [result.validation.folder] if result.validation is not None else []

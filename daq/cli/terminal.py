@@ -50,12 +50,14 @@ def volume(level: Volume) -> Iterator[None]:
 
 
 @contextmanager
-def documents_alone(asked: bool) -> Iterator[None]:
-    """Within it, where asked, standard output is for documents: what else is printed, such as by a
-    user's own protocol, goes to standard error."""
-    token = _documents.set(sys.stdout if asked else None)
+def documents_alone(wanted: bool) -> Iterator[None]:
+    """Within it, where wanted, standard output is for documents only.
+
+    What else is printed, such as by a user's own protocol, goes to standard error.
+    """
+    token = _documents.set(sys.stdout if wanted else None)
     try:
-        with redirect_stdout(sys.stderr) if asked else nullcontext():
+        with redirect_stdout(sys.stderr) if wanted else nullcontext():
             yield
     finally:
         _documents.reset(token)

@@ -84,10 +84,10 @@ def bode(
 def _limits(
     magnitude: FloatArray, good: npt.NDArray[np.bool_], curves: Mapping[str, ComplexArray]
 ) -> tuple[float, float]:
-    """Limits by what is known: neither bars that reach to zero nor a curve's notch."""
-    known = magnitude[good] if good.any() else magnitude
+    """Limits by what is credible: neither bars that reach to zero nor a curve's notch."""
+    credible = magnitude[good] if good.any() else magnitude
     middles = [float(np.median(np.abs(values))) for values in curves.values()]
-    every = np.concatenate([known[known > 0.0], [m for m in middles if m > 0.0]])
+    every = np.concatenate([credible[credible > 0.0], [m for m in middles if m > 0.0]])
     if not len(every):
         return 0.1, 1.0
     return 0.4 * float(every.min()), 2.5 * float(every.max())

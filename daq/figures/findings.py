@@ -22,14 +22,14 @@ _EDGE = 0.16  # in, where the legend's room begins
 def draw(figure: Chart | Heatmap) -> Figure:
     """A figure of a chart or of a value over a plane."""
     title = style.wrapped(figure.title, _LETTERS_A_LINE)
-    said = 0.05 + 0.13 * (title.count("\n") + 1)
+    heading = 0.05 + 0.13 * (title.count("\n") + 1)
     named = [series.label for series in figure.series if series.label]
     shown = named if len(named) > 1 or isinstance(figure, Heatmap) else []
     room = style.legend_room([notation.words(label) for label in shown], _EDGE) if shown else 0.0
     right = 0.72 if isinstance(figure, Heatmap) else 0.1
     left = _LEFT if len(figure.y.label) + len(figure.y.unit) < _SHORT else style.LEFT
     drawn, (panel,) = style.stack(
-        [2.1], left=left, top=said + max(room + 0.03, _SCALE), right=right
+        [2.1], left=left, top=heading + max(room + 0.03, _SCALE), right=right
     )
     if isinstance(figure, Heatmap):
         _plane(drawn, panel, figure)
@@ -40,7 +40,7 @@ def draw(figure: Chart | Heatmap) -> Figure:
     tall = float(drawn.get_size_inches()[1])
     drawn.text(0.08 / style.WIDTH, 1 - 0.03 / tall, title, va="top", linespacing=1.15)
     if shown:
-        style.legend(drawn, panel, _EDGE, above=said - 0.02)
+        style.legend(drawn, panel, _EDGE, above=heading - 0.02)
     return drawn
 
 

@@ -52,20 +52,20 @@ def ranges(parameters: Sequence[Searched]) -> Figure:
     names, left = style.row_names([parameter.name for parameter in parameters])
     figure, (panel,) = style.stack([0.155 * len(parameters) + 0.1], left=left, top=0.24,
                                    right=0.95)  # fmt: skip
-    for row, one in enumerate(parameters):
+    for row, quantity in enumerate(parameters):
         panel.plot([0.0, 1.0], [row, row], color=style.FAINT, lw=3.0, solid_capstyle="butt",
                    zorder=1)  # fmt: skip
-        known = one.interval is not None
-        if one.interval is not None:
-            ends = [_place(one, end) for end in one.interval]
+        determined = quantity.interval is not None
+        if quantity.interval is not None:
+            ends = [_place(quantity, end) for end in quantity.interval]
             panel.plot(ends, [row, row], color=style.BASELINE, lw=3.0, solid_capstyle="butt",
                        zorder=2)  # fmt: skip
         panel.plot(
-            _place(one, one.value), row, "o", ms=3.2, zorder=3,
-            mfc=style.IDENTIFIED if known else "white", mec=style.IDENTIFIED, mew=0.8,
+            _place(quantity, quantity.value), row, "o", ms=3.2, zorder=3,
+            mfc=style.IDENTIFIED if determined else "white", mec=style.IDENTIFIED, mew=0.8,
         )  # fmt: skip
-        if one.note:
-            panel.text(1.07, row, one.note, va="center", fontsize=6.0)
+        if quantity.note:
+            panel.text(1.07, row, quantity.note, va="center", fontsize=6.0)
     _legend_of_ranges(figure, panel)
     panel.set_yticks(range(len(parameters)), names)
     panel.set_ylim(len(parameters) - 0.4, -0.6)
@@ -85,10 +85,10 @@ def _legend_of_ranges(figure: Figure, panel: Axes) -> None:
     style.legend(figure, panel, left=0.2)
 
 
-def _place(one: Searched, value: float) -> float:
+def _place(quantity: Searched, value: float) -> float:
     """From 0 at the low end to 1 at the high end, on the scale of the search."""
-    values = np.array([value, one.lower, one.upper])
-    if one.log:
+    values = np.array([value, quantity.lower, quantity.upper])
+    if quantity.log:
         values = np.log(np.maximum(values, np.finfo(float).tiny))
     place = float((values[0] - values[1]) / (values[2] - values[1]))
     # An interval may be wider than the range.
@@ -100,7 +100,7 @@ def intervals(quantities: Sequence[Determined]) -> Figure:
     """The 95 % interval of every determined quantity, in per cent of its value."""
     names, left = style.row_names([quantity.name for quantity in quantities])
     figure, (panel,) = style.stack([0.17 * len(quantities) + 0.1], left=left, top=0.1)
-    ends = np.array([_relative(one) for one in quantities])
+    ends = np.array([_relative(quantity) for quantity in quantities])
     widths = np.abs(ends).max(axis=1)
     # One that is hardly known must not flatten the others: it leaves the panel, with its width.
     limit = min(float(widths.max()), _WIDEST * float(np.median(widths)))
@@ -122,10 +122,12 @@ def intervals(quantities: Sequence[Determined]) -> Figure:
     return figure
 
 
-def _relative(one: Determined) -> tuple[float, float]:
+def _relative(quantity: Determined) -> tuple[float, float]:
     """Ends of an interval, in per cent of the value away from it."""
-    size = abs(one.value) or 1.0
-    return 100.0 * (one.low - one.value) / size, 100.0 * (one.high - one.value) / size
+    size = abs(quantity.value) or 1.0
+    return 100.0 * (quantity.low - quantity.value) / size, 100.0 * (
+        quantity.high - quantity.value
+    ) / size
 
 
 @style.styled

@@ -33,16 +33,15 @@ def ratios(best: str, others: Sequence[Ratio]) -> Figure:
     rows = [Ratio(best, 1.0, 1.0, 1.0), *others]
     figure, (panel,) = style.stack([0.3 * len(rows)], left=0.15, top=0.1)
     panel.axvline(1.0, color="black", lw=0.4, zorder=1)
-    for place, one in enumerate(rows):
-        panel.errorbar(
-            one.value, place, xerr=[[one.value - one.low], [one.high - one.value]], fmt="o", ms=3.0,
-            capsize=2.0, color=style.IDENTIFIED, ecolor=style.BASELINE, elinewidth=1.2,
-        )  # fmt: skip
-        name = one.name if len(one.name) <= _NAME else f"{one.name[: _NAME - 1]}…"
+    for place, ratio in enumerate(rows):
+        bars = [[ratio.value - ratio.low], [ratio.high - ratio.value]]
+        look = {"color": style.IDENTIFIED, "ecolor": style.BASELINE, "elinewidth": 1.2}
+        panel.errorbar(ratio.value, place, xerr=bars, fmt="o", ms=3.0, capsize=2.0, **look)
+        name = ratio.name if len(ratio.name) <= _NAME else f"{ratio.name[: _NAME - 1]}…"
         panel.text(0.01, place - 0.28, name.replace("$", r"\$"), fontsize=6.0, va="center",
                    bbox={"fc": "white", "ec": "none", "pad": 0.3},
                    transform=panel.get_yaxis_transform())  # fmt: skip
-    ends = np.array([end for one in rows for end in (one.low, one.high)])
+    ends = np.array([end for ratio in rows for end in (ratio.low, ratio.high)])
     panel.set_ylim(len(rows) - 0.5, -0.55)
     panel.set_xlim(0.9 * ends.min(), 1.1 * ends.max())
     style.logarithmic(panel.xaxis, ends)

@@ -177,8 +177,8 @@ def logarithmic(axis: Axis, values: FloatArray) -> None:
     from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
     axis._set_axes_scale("log")  # type: ignore[attr-defined]
-    known = values[np.isfinite(values) & (values > 0.0)]
-    low, high = (float(known.min()), float(known.max())) if len(known) else (1.0, 10.0)
+    positive = values[np.isfinite(values) & (values > 0.0)]
+    low, high = (float(positive.min()), float(positive.max())) if len(positive) else (1.0, 10.0)
     if high < _PLAIN * low:
         axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axis.set_major_formatter(FuncFormatter(_plain if low >= 1e-3 and high < 1e5 else _power))
@@ -303,9 +303,9 @@ def thinned(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
 def format_of(path: Path) -> Format:
     """The format that a file's name asks for; ConfigError for one that there is not."""
     kind = path.suffix.removeprefix(".").lower()
-    for known in get_args(Format):
-        if kind == known:
-            return known  # type: ignore[no-any-return]
+    for written in get_args(Format):
+        if kind == written:
+            return written  # type: ignore[no-any-return]
     raise ConfigError(
         f"{path}: figures are written as {', '.join(get_args(Format))}; "
         f"for example {path.with_suffix('.png')}"

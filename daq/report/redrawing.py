@@ -43,9 +43,9 @@ def redraw(
 
 
 def _format(kind: str) -> Format:
-    for known in get_args(Format):
-        if kind.lower() == known:
-            return known  # type: ignore[no-any-return]
+    for written in get_args(Format):
+        if kind.lower() == written:
+            return written  # type: ignore[no-any-return]
     raise ConfigError(f"--format {kind}: figures are written as {', '.join(get_args(Format))}")
 
 

@@ -1,0 +1,302 @@
+"""What an identification says: tables and sentences on a terminal, a document for machines."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from daq import notation
+from daq.cli import terminal
+
+if TYPE_CHECKING:
+    from daq.identification.result import Identification
+    from daq.identification.rows import (
+        AmbiguityRow,
+        LogErrors,
+        OutputErrors,
+        ParameterRow,
+        QuantityRow,
+        Rows,
+    )
+    from sysid.uncertainty import Profile
+
+_STRONG = 0.95  # correlation above which two parameters are named together
+
+
+def show_identification(
+    result: Identification, report: bool, json: bool, seeds: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Print a result that was written, and write its report; the document for machines.
+
+    seeds: lines on the other seeds, of which this result is the best.
+    """
+    assert result.folder is not None
+    document = {**result.document, "files": {"parameters": str(result.parameters_file)}}
+    if not json:
+        _show(result)
+        for line in seeds:
+            terminal.print_text(line)
+    if result.interrupted:
+        if json:
+            resumable = {"resume": result.resume_command}
+            return {**document, "search": {**document["search"], **resumable}}
+        terminal.print_line(f"Go on with the search: {result.resume_command}")
+        return document
+    if report:
+        document["files"] |= _publish(result, json)
+    if not json:
+        _show_next(result)
+    return document
+
+
+def _publish(result: Identification, json: bool) -> dict[str, str]:
+    # matplotlib: the printed result does not wait for it
+    from daq.report.publication import publish
+
+    assert result.folder is not None
+    with terminal.Watching(quiet=json) as watch:
+        files = publish(result, result.folder, watch)
+    if not json:
+        terminal.print_line(f"Report: {files['report']}")
+    return files
+
+
+def _show(result: Identification) -> None:
+    """Tables and sentences on standard output."""
+    rows = result.rows
+    terminal.print_line()
+    _show_parameters(result)
+    for name, guess in result.estimator.guesses_.items():
+        terminal.print_text(f"{name} searched as the data suggest: {guess.source}.")
+    if rows.refined:
+        _show_open_questions(rows)
+    _show_profiles(result.profiles)
+    _show_errors(rows)
+    _show_residuals(rows)
+    _show_notes(result)
+    terminal.print_line(f"Parameters: {result.parameters_file}")
+
+
+def _show_next(result: Identification) -> None:
+    mapping = result.problem.mapping
+    columns = f" --config {mapping.file.path}" if mapping is not None else ""
+    log = (*result.validation, *result.training)[0].log.path
+    terminal.print_next(f"rig replay {log} --parameters {result.parameters_file}{columns}")
+
+
+def _show_parameters(result: Identification) -> None:
+    head = ["parameter", "value", "95 % interval", "unit", "searched in", "from", ""]
+    rows = [_parameter_row(result, row) for row in result.rows.parameters]
+    # Ranges that all come from the model need no column that says so.
+    hidden = set()
+    if all(row.source == "model" for row in result.rows.parameters):
+        hidden.add(head.index("from"))
+    if not result.rows.refined:
+        hidden.add(head.index("95 % interval"))
+    kept = [i for i in range(len(head)) if i not in hidden]
+    terminal.print_table(
+        f"Parameters of {result.model.name}",
+        [head[i] for i in kept],
+        [[row[i] for i in kept] for row in rows],
+        text=["unit", "from", ""],
+    )
+
+
+def _parameter_row(result: Identification, row: ParameterRow) -> list[str]:
+    # All of a row in the same unit, which is that of its value.
+    scale, unit = notation.engineering(row.value, row.unit)
+    source = "data" if row.name in result.estimator.guesses_ else row.source
+    digits = row.digits if result.rows.refined else 4
+    value = terminal.number(scale * row.value, digits)
+    if row.range is None:
+        how = f"= {row.tied}" if row.tied is not None else "fixed"
+        return [row.name, value, "", unit, how, source, ""]
+    span = _span(row.range, result.problem.settings.ranges.get(row.name), scale)
+    interval = _interval(row, scale) if result.rows.refined else ""
+    return [row.name, value, interval, unit, span, source, row.label]
+
+
+def _span(
+    ends: tuple[float, float], configured: tuple[float | None, float | None] | None, scale: float
+) -> str:
+    """A range; in brackets an end that is only where the search starts."""
+    bounds = zip(ends, configured or ends, strict=True)
+    return " .. ".join(
+        f"({scale * end:g})" if bound is None else f"{scale * end:g}" for end, bound in bounds
+    )
+
+
+def _interval(row: QuantityRow, scale: float) -> str:
+    if row.interval is None:
+        return "-"
+    return " .. ".join(terminal.number(scale * end, row.digits) for end in row.interval)
+
+
+def _show_open_questions(rows: Rows) -> None:
+    """What the data do not tell, what they tell instead, and what measurement would."""
+    _show_rivals(rows)
+    exact = rows.ambiguities_of("product", "sum")
+    if exact:
+        terminal.print_line("What these data cannot tell apart:")
+    for ambiguity in exact:
+        for line in _exact_lines(ambiguity):
+            terminal.print_text(line)
+    vague = rows.ambiguities_of("vague")
+    if vague:
+        names = "; ".join(" with ".join(a.parameters) for a in vague)
+        terminal.print_text(f"Hardly felt by these data: {names}.")
+    close = [
+        f"{first} and {second}"
+        for (first, second), coefficient in rows.correlations.items()
+        if abs(coefficient) > _STRONG
+    ]
+    if close:
+        pairs = "; ".join(close)
+        terminal.print_text(f"Known mostly together (correlation above {_STRONG:g}): {pairs}.")
+    if exact or vague or close:
+        terminal.print_line()
+
+
+def _show_rivals(rows: Rows) -> None:
+    """Other minima that explain the data as well."""
+    for ambiguity in rows.ambiguities_of("rival"):
+        terminal.print_table(
+            "Sets of parameters that explain these data alike",
+            ["parameter", "this one", *["another"] * len(rows.rivals), "unit"],
+            [_rival_row(rows.parameter(name), rows.rivals) for name in ambiguity.parameters],
+            text=["unit"],
+        )
+        terminal.print_text(
+            f"A measured {ambiguity.measure[0]}, given under 'fixed', would tell which it is."
+        )
+        terminal.print_line()
+
+
+def _rival_row(row: ParameterRow, rivals: Sequence[Mapping[str, float]]) -> list[str]:
+    """One parameter in each of the sets, all in the unit of the first."""
+    scale, unit = notation.engineering(row.value, row.unit)
+    values = (row.value, *(rival[row.name] for rival in rivals))
+    return [row.name, *(terminal.number(scale * value, 3) for value in values), unit]
+
+
+def _exact_lines(ambiguity: AmbiguityRow) -> list[str]:
+    lines = [f"  {', '.join(ambiguity.parameters)} act only together."]
+    for row in ambiguity.determined:
+        scale, unit = notation.engineering(row.value, row.unit)
+        value = terminal.number(scale * row.value, row.digits)
+        quantity = value if unit in {"", "1"} else f"{value} {unit}"
+        lines.append(f"    {row.name} = {quantity}, 95 % interval {_interval(row, scale)}")
+    lines.append(
+        f"    To tell them apart, measure {' and '.join(ambiguity.measure)} by other means (or "
+        "choose a value) and give it under 'fixed'."
+    )
+    return lines
+
+
+def _show_profiles(profiles: Sequence[Profile]) -> None:
+    if not profiles:
+        return
+    terminal.print_table(
+        "Profile likelihood",
+        ["parameter", "value", "95 % interval", "unit"],
+        [
+            [p.name, terminal.number(p.value), " .. ".join(map(_end, (p.low, p.high))), p.unit]
+            for p in profiles
+        ],
+        text=["unit"],
+    )
+
+
+def _end(value: float | None) -> str:
+    """An end of an interval; the data set none where the profile stays low."""
+    return "open" if value is None else terminal.number(value)
+
+
+def _show_errors(rows: Rows) -> None:
+    training, validation = rows.logs["training"], rows.logs["validation"]
+    if len(training) == 1 and len(validation) <= 1:
+        print_errors(training[0].outputs, [log.outputs for log in validation])
+        return
+    _print_logs("Training logs", training, rows.mean_errors("training"))
+    if validation:
+        _print_logs("Validation logs", validation, rows.mean_errors("validation"))
+
+
+def _show_residuals(rows: Rows) -> None:
+    """Residual tests on the validation data, or else on the training data."""
+    table = rows.residuals
+    terminal.print_table(
+        f"Residuals, {table.part}: share of correlations inside their 95 % band",
+        ["residual of", "with itself", *(f"with {name}" for name in table.inputs)],
+        [
+            [output, *(f"{100.0 * share:.0f} %" for share in shares)]
+            for output, shares in table.shares.items()
+        ],
+    )
+
+
+def _show_notes(result: Identification) -> None:
+    rows, verdict = result.rows, result.verdict
+    if result.interrupted:
+        terminal.print_text(
+            f"Stopped by Ctrl-C after {len(result.estimator.history_)} generations: "
+            "these are the best parameters until then."
+        )
+    if any(row.on_bound for row in rows.free):
+        terminal.print_text(
+            "At the end of its range: the data want more room there. Set 'ranges' in a file "
+            "given with --config."
+        )
+    terminal.print_text(f"Trust: {verdict.trust}. {' '.join(verdict.reasons)}")
+    if rows.refined:
+        together = len(rows.combinations)
+        several = "s" if together != 1 else ""
+        also = f", and {together} combination{several} of others" if together else ""
+        terminal.print_text(
+            f"Determined: {len(rows.determined)} of {len(rows.free)} free parameters by "
+            f"themselves{also}."
+        )
+
+
+def print_errors(
+    training: Mapping[str, OutputErrors],
+    validation: Sequence[Mapping[str, OutputErrors]] = (),
+    label: str = "training",
+) -> None:
+    """Table of RMSE, MSD and fit of each output, on one log or on two."""
+    head = ["output", f"RMSE, {label}", "MSD", "fit [%]"]
+    if validation:
+        head += ["RMSE, validation", "MSD", "fit [%]"]
+    rows = [
+        [
+            output,
+            *itertools.chain.from_iterable(
+                _error_cells(log[output]) for log in (training, *validation)
+            ),
+        ]
+        for output in training
+    ]
+    terminal.print_table("Free-run simulation, RMSE and MSD in parts of max|y|", head, rows)
+
+
+def _error_cells(errors: OutputErrors) -> tuple[str, str, str]:
+    number = terminal.number
+    return number(errors.rmse, 3), number(errors.msd, 2), f"{errors.fit_percent:.1f}"
+
+
+def _print_logs(title: str, logs: Sequence[LogErrors], mean: Mapping[str, OutputErrors]) -> None:
+    head = ["log", *(f"fit of {name} [%]" for name in mean), *(f"RMSE of {n}" for n in mean)]
+    rows = [(log.name, log.outputs) for log in logs] + [("mean", mean)]
+    terminal.print_table(
+        title,
+        head,
+        [
+            [
+                name,
+                *(f"{errors.fit_percent:.1f}" for errors in outputs.values()),
+                *(terminal.number(errors.rmse, 3) for errors in outputs.values()),
+            ]
+            for name, outputs in rows
+        ],
+    )
