@@ -5,9 +5,9 @@ A use case takes ``watch``, a function of one event, and never prints. ``ignore`
 
 from __future__ import annotations
 
-import enum
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 
 @dataclass(frozen=True)
@@ -27,20 +27,16 @@ class Started:
     title: str
 
 
-class Level(enum.Enum):
-    """How much a note matters."""
-
-    WARNING = "warning"
-    """What a user must know, however quiet."""
-    NOTE = "note"
-    """What a user may want to know."""
-    DETAIL = "detail"
-    """Which files and plugins are used, for those who ask."""
+Level = Literal["warning", "note", "detail"]
 
 
 @dataclass(frozen=True)
 class Note:
-    """One line for the user."""
+    """One line for the user.
+
+    level: ``warning`` is what a user must know however quiet the program is, ``note`` what was
+    decided for the user, ``detail`` which files and plugins are used.
+    """
 
     level: Level
     text: str
@@ -58,4 +54,4 @@ def warn(watch: Watch, *texts: str | None) -> None:
     """Tell warnings, leaving out those that are None."""
     for text in texts:
         if text is not None:
-            watch(Note(Level.WARNING, text))
+            watch(Note("warning", text))

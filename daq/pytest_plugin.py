@@ -139,4 +139,4 @@ def _beside(folder: Path, name: str | Path) -> str:
 def _warn(event: Event) -> None:
     """Say why nothing follows from a run, as ``rig run`` does."""
     if isinstance(event, Note):
-        sys.stderr.write(f"rig: {event.level.value}: {event.text}\n")
+        sys.stderr.write(f"rig: {event.level}: {event.text}\n")

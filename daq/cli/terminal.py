@@ -18,7 +18,7 @@ from typing import Any, Protocol, TextIO
 
 from daq import notation
 from daq.documents import plain
-from daq.progress import Event, Level, Progress, Started, Watch
+from daq.progress import Event, Progress, Started, Watch
 
 number = notation.number  # pages and tables print numbers alike
 
@@ -317,8 +317,4 @@ def _terminal_bars() -> Iterator[Display]:
         yield Bars()
 
 
-_REPORTERS = {
-    Level.WARNING: report_warning,
-    Level.NOTE: report_note,
-    Level.DETAIL: report_detail,
-}
+_REPORTERS = {"warning": report_warning, "note": report_note, "detail": report_detail}

@@ -16,7 +16,7 @@ from daq.identification.quantities import in_model_units
 from daq.identification.records import ColumnMapping
 from daq.identification.request import SettingsRequest
 from daq.lookup.models import DEFAULT_MODEL, find_model, whole_name
-from daq.progress import Level, Note, Watch, ignore
+from daq.progress import Note, Watch, ignore
 from sysid import ModelError, ProcessModel, SearchSpace
 
 
@@ -59,7 +59,7 @@ def problems_of(
     file, unconverted = in_model_units(file, [model for model, _ in declared])
     settings = checking.validate(file, IdentificationConfig, others=unconverted)
     for model, name in declared:
-        watch(Note(Level.DETAIL, f"model {name}: {model.description}"))
+        watch(Note("detail", f"model {name}: {model.description}"))
     models = [_with_outputs(file, settings, model) for model, _ in declared]
     _check_names(file, settings, models)
     mapping = ColumnMapping(file, settings.columns) if settings.columns else None

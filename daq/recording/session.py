@@ -17,7 +17,7 @@ from daq.hal import Device, Phase, Reporting
 from daq.logs.capture import LOG_NAME
 from daq.logs.recording import Recording, load
 from daq.lookup.files import LoadedExperiment, load_experiment, load_rig, rig_for, together
-from daq.progress import Level, Note, Progress, Started, Watch, ignore, warn
+from daq.progress import Note, Progress, Started, Watch, ignore, warn
 from daq.recording.analysis import conclude_or_warn
 from daq.run.runner import PhaseProgress, RunResult, run_experiment
 
@@ -140,7 +140,7 @@ def _rig_on(
         )
     if realtime and "time" not in fields:
         text = f"{rig}: its own clock paces it; --realtime changes nothing"
-        watch(Note(Level.NOTE, text))
+        watch(Note("note", text))
         realtime = False
     choices = {"port": port, "time": "real" if realtime else None}
     changes = {key: value for key, value in choices.items() if value is not None}
