@@ -3,6 +3,7 @@
 import copy
 import importlib
 import os
+import shutil
 import sys
 import threading
 import warnings
@@ -11,6 +12,7 @@ from dataclasses import replace
 import joblib
 import numpy as np
 import pytest
+from joblib.externals.loky import get_reusable_executor
 
 import sysid.campaigns.campaign
 from sysid import GASSI, Constraint, Dataset, ModelError, Run, campaign, combinations, fit_percent
@@ -127,11 +129,17 @@ def test_a_dask_cluster_gives_the_serial_result_to_the_bit(serial):
     assert list(workers.values()) == [True, True]
 
 
-def test_workers_find_the_kernels_that_are_already_compiled(serial, kernel_cache):
+def test_workers_find_the_kernels_that_are_already_compiled(serial, tmp_path, monkeypatch):
     todo, _ = serial
-    before = {path.name for path in kernel_cache.rglob("*") if path.is_file()}
+    cache = shutil.copytree(os.environ["RIG_CACHE_DIR"], tmp_path / "kernels")
+    before = {path.name for path in cache.rglob("*") if path.is_file()}
+    assert before
+    monkeypatch.setenv("RIG_CACHE_DIR", str(cache))
+    # Workers have the environment that they were started with.
+    get_reusable_executor().shutdown(wait=True)
     campaign(todo[-1:] + todo[:1], n_jobs=2)
-    assert {path.name for path in kernel_cache.rglob("*") if path.is_file()} == before
+    get_reusable_executor().shutdown(wait=True)
+    assert {path.name for path in cache.rglob("*") if path.is_file()} == before
 
 
 def test_a_model_of_a_users_file_and_its_neighbour_travel(tmp_path, monkeypatch):
