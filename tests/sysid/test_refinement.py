@@ -271,9 +271,9 @@ def without(monkeypatch):
 
     def refined(strategy, *problem, **settings):
         with monkeypatch.context() as patch:
-            for stall, strategies in recovery.STRATEGIES.items():
-                rest = tuple(other for other in strategies if other is not strategy)
-                patch.setitem(recovery.STRATEGIES, stall, rest)
+            for stall in ("FAILED", "BURST", "ARRIVED", "MISLED"):
+                strategies = getattr(recovery, stall)
+                patch.setattr(recovery, stall, tuple(s for s in strategies if s is not strategy))
             return refine(*problem, **settings)
 
     return refined
