@@ -1,1 +1,1 @@
-"""From errors to better parameters: the objective, its quadratic, local refinement."""
+"""The error of parameters, and its local refinement."""

@@ -1,4 +1,4 @@
-"""Steps that slide along a model's constraints instead of stopping at them."""
+"""A model's constraints near a point, and the least costly moves within them."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from sysid.arrays import FloatArray, IntArray
 from sysid.problem.space import SearchSpace
 
 _PERTURBATION = 1e-6
-# A step ends this far inside, in parts of the constraint's slope: on it rounding would decide.
+# A move ends this far inside, in parts of the constraint's slope: on it rounding would decide.
 _MARGIN = 1e-6
 
 
 @dataclass(frozen=True)
 class Constraints:
-    """The constraints g <= 0 near a point: g there, (n,), and slopes by moves, (n, n_free)."""
+    """Linearised constraints g <= 0: value g at a point, (n,), and slope by moves, (n, n_free)."""
 
     value: FloatArray
     slope: FloatArray
 
     @classmethod
     def at(cls, space: SearchSpace, coded: FloatArray, width: FloatArray) -> Constraints:
-        """Central differences; moves are in units of ``width``."""
+        """At search coordinates (n_free,), by central differences; moves in units of ``width``."""
         shift = _PERTURBATION * np.diag(width)
         points = space.decode(np.concatenate([coded[None], coded + shift, coded - shift]))
         values = space.constraint_values(points)
@@ -32,18 +32,17 @@ class Constraints:
         return cls(values[0], slope)
 
     def among(self, free: IntArray) -> Constraints:
-        """Those that moves of some of the parameters alone can reach, and their slopes."""
+        """Constraints that moves of the free parameters alone can reach."""
         slope = self.slope[:, free]
-        known = np.isfinite(slope).all(axis=1) & np.any(slope != 0.0, axis=1)
-        return Constraints(self.value[known], slope[known])
+        reached = np.isfinite(slope).all(axis=1) & np.any(slope != 0.0, axis=1)
+        return Constraints(self.value[reached], slope[reached])
 
     def nearest(self, move: FloatArray, inverse: FloatArray) -> FloatArray:
-        """The move within the constraints that costs least more than an unconstrained one.
+        """Minimum within the constraints of a quadratic whose free minimum is a move (n_free,).
 
-        move: (n_free,), minimises a quadratic function whose curvature has the given inverse,
-        (n_free, n_free); so does the result, among the moves that keep the linear constraints.
-        Dual active-set method for few constraints (Nocedal & Wright, "Numerical optimization",
-        section 16.5): the most violated one joins, those that would pull leave.
+        inverse: of the quadratic's Hessian, (n_free, n_free). Dual active-set method for few
+        constraints (Nocedal & Wright, "Numerical optimization", section 16.5): the most violated
+        constraint joins, those that would pull leave.
         """
         size = np.linalg.norm(self.slope, axis=1)
         limit = -self.value - _MARGIN * size

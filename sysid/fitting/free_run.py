@@ -1,4 +1,4 @@
-"""Where a free run starts when the record does not say."""
+"""Free runs of a record's inputs, and where they start when the record does not say."""
 
 from __future__ import annotations
 
@@ -11,17 +11,30 @@ from sysid.fitting.refinement import refine
 from sysid.problem.data import Dataset
 from sysid.problem.space import SearchSpace
 
-# How accuracies go on where the errors of single steps add up, and where that ends.
+# Factor to the next accuracy where the errors of single steps add up, and the last accuracy.
 FINER, FINEST = 0.1, 1e-9
 
 
 def free_run(simulator: BatchSimulator, vector: FloatArray, record: Dataset) -> FloatArray:
     """Outputs of a record's inputs, (n_samples, n_outputs), from where the record starts.
 
-    Initial states that the model leaves to be estimated are, from the record's outputs. The
-    simulator's accuracy holds for the whole run, also where the errors of its steps add up.
+    Initial states with a range are estimated from the record's outputs. The simulator's accuracy
+    holds for the whole run, also where the errors of its steps add up.
+
+    >>> from sysid import BatchSimulator, Dataset, Input, Output, Parameter, ProcessModel, State
+    >>> model = ProcessModel(
+    ...     name="lag",
+    ...     states=(State("y", "V"),),
+    ...     inputs=(Input("u", "V"),),
+    ...     outputs=(Output("y", "V"),),
+    ...     parameters=(Parameter("tau", "s", 0.1, 0.01, 1.0, "log"),),
+    ...     derivative=lambda x, u, p: ((u[0] - x[0]) / p[0],),
+    ... )
+    >>> record = Dataset(np.ones(4), np.zeros(4), 0.1)
+    >>> free_run(BatchSimulator(model), model.nominal, record)[:, 0].round(3)
+    array([0.   , 0.632, 0.865, 0.95 ])
     """
-    wanted = simulator.accuracy
+    accuracy = simulator.accuracy
     while True:
         start = estimate_start(simulator, vector, record)
         outputs: FloatArray = simulator.trajectories(vector, record, starts=start[None])[0]
@@ -29,26 +42,24 @@ def free_run(simulator: BatchSimulator, vector: FloatArray, record: Dataset) -> 
         finer = simulator.trajectories(vector, record, twice, start[None])[0]
         error = np.sqrt(np.mean((finer - outputs) ** 2, axis=0))
         size = np.maximum(np.max(np.abs(finer), axis=0), 1e-300)
-        if not np.max(error / size) > wanted or simulator.accuracy < FINEST:
+        if not np.max(error / size) > accuracy or simulator.accuracy < FINEST:
             return outputs
         simulator = simulator.finer(FINER * simulator.accuracy)
 
 
 def estimate_start(simulator: BatchSimulator, vector: FloatArray, record: Dataset) -> FloatArray:
-    """Initial states of one record under known parameters, (n_states,).
+    """Initial states of a record under parameters (n_parameters,), (n_states,).
 
-    States with an ``initial_range`` are fitted to the record's outputs by least squares; the
-    others come from the first sample or as declared. Without a single measured sample nothing
-    is fitted.
+    States with an ``initial_range`` are fitted to the record's measured outputs by least squares;
+    the rest come from the first sample or as declared.
     """
     model = simulator.model
-    own = record.initial_state(model)
+    declared = record.initial_state(model)
     space = SearchSpace.of_starts(model, vector, record)
     weights = np.asarray(np.isfinite(record.outputs).any(axis=0), dtype=np.float64)
     if not (space.estimated and weights.any()):
-        return own
+        return declared
     objective = Objective(simulator, space, [record], weights=weights)
-    begin = space.with_nominal_starts(np.empty(0))
-    found = refine(objective, begin).chromosome
-    start: FloatArray = space.starts(found[None], 0, own)[0]
+    fitted = refine(objective, space.with_nominal_starts(np.empty(0))).chromosome
+    start: FloatArray = space.starts(fitted[None], 0, declared)[0]
     return start

@@ -1,19 +1,11 @@
-"""What a descent does where it stalls.
+"""Strategies of a descent that stalls.
 
-A strategy takes a descent that has stalled to where it goes on from, or gives up: None. Those for
-a kind of stall are tried in turn; a descent that none of them takes on has finished.
-
-==========  ==============================================  =====================================
-FAILED      the simulation of the point fails               retreat
-BURST       the simulations of neighbours leave its by far  brace
-MISLED      gains stay far behind what is promised          coarsen, then as where it has arrived
-ARRIVED     no gain is promised, or hardly any was made     sharpen, resolve, refocus
-==========  ==============================================  =====================================
+A strategy returns a stalled descent as it goes on, or None where it gives up. Those for a kind of
+stall, which stand at the end, are tried in turn; a descent that they all give up has finished.
 """
 
 from __future__ import annotations
 
-import enum
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -29,16 +21,7 @@ NOTHING = 1e-3  # share of the error that is not worth a change of perturbations
 _STEADIER, _BRACINGS = 1.5, 3
 _NEAR = 1e-3  # parts of the ranges within which integration steps need not be chosen anew
 
-Strategy = Callable[[Objective, Descent], Descent | None]
-
-
-class Stall(enum.Enum):
-    """How a descent stalls."""
-
-    FAILED = enum.auto()
-    BURST = enum.auto()
-    MISLED = enum.auto()
-    ARRIVED = enum.auto()
+Strategies = tuple[Callable[[Objective, Descent], Descent | None], ...]
 
 
 def retreat(_: Objective, descent: Descent) -> Descent | None:
@@ -134,19 +117,20 @@ def refocus(_: Objective, descent: Descent) -> Descent | None:
     )
 
 
-_AT_THE_END = (sharpen, resolve, refocus)
-STRATEGIES: dict[Stall, tuple[Strategy, ...]] = {
-    Stall.FAILED: (retreat,),
-    Stall.BURST: (brace,),
-    Stall.MISLED: (coarsen, *_AT_THE_END),
-    Stall.ARRIVED: _AT_THE_END,
-}
+FAILED: Strategies = (retreat,)
+"""The simulation of the point fails."""
+BURST: Strategies = (brace,)
+"""The simulations of neighbours leave that of the point by far."""
+ARRIVED: Strategies = (sharpen, resolve, refocus)
+"""The quadratic promises hardly anything, or hardly anything was gained."""
+MISLED: Strategies = (coarsen, *ARRIVED)
+"""Gains stay far behind what the quadratic promises, whatever the damping."""
 
 
-def recovered(objective: Objective, descent: Descent, stall: Stall) -> Descent | None:
-    """The descent where the first strategy that does not give up goes on; None without any."""
-    for strategy in STRATEGIES[stall]:
+def resumed(objective: Objective, descent: Descent, strategies: Strategies) -> Descent:
+    """The descent as the first strategy that does not give up lets it go on, or else finished."""
+    for strategy in strategies:
         onward = strategy(objective, descent)
         if onward is not None:
             return onward
-    return None
+    return replace(descent, finished=True)

@@ -26,6 +26,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sysid.arrays import FloatArray
+from sysid.fitting import recovery
 from sysid.fitting.descent import FLOORS, PERTURBATIONS, Descent, Integration, Point
 from sysid.fitting.objective import Objective, Responses
 from sysid.fitting.quadratic import (
@@ -37,7 +38,7 @@ from sysid.fitting.quadratic import (
     lighter,
     quadratic_at,
 )
-from sysid.fitting.recovery import NOTHING, PATIENCE, Stall, recovered
+from sysid.fitting.recovery import NOTHING, PATIENCE, resumed
 from sysid.problem.space import SearchSpace
 
 ROUNDING = 1e-12  # errors below it are those of the arithmetic
@@ -175,7 +176,7 @@ def _iterated(objective: Objective, descents: list[Descent], tolerance: float) -
         zip(quadratics, candidates(space, at, damping, list(quadratics.values())), strict=True)
     )
     for i in [i for i, offer in offers.items() if not offer.worth(tolerance)]:
-        onward[i] = _resumed(objective, onward[i], Stall.ARRIVED)
+        onward[i] = resumed(objective, onward[i], recovery.ARRIVED)
         del offers[i]
     rows = [offer.coordinates for offer in offers.values()]
     ends = _responses(objective, [onward[i] for i in offers], rows, keep=False)
@@ -194,7 +195,7 @@ def _surveyed(
     errors = objective.error_of(around.rms)
     at, error = descent.point.at, float(errors[0])
     if not np.isfinite(error):
-        return _resumed(objective, descent, Stall.FAILED), None
+        return resumed(objective, descent, recovery.FAILED), None
     steps_at = descent.integration.steps_at
     safe = steps_at is not None and np.array_equal(at, steps_at)
     descent = replace(
@@ -208,8 +209,8 @@ def _surveyed(
         return replace(descent, finished=True), None
     burst = ~(errors[1:] <= _BURST + error)
     if burst.any():
-        braced = recovered(objective, descent, Stall.BURST)
-        if braced is not None:
+        braced = resumed(objective, descent, recovery.BURST)
+        if not braced.finished:
             return braced, None
         # The rest of the parameters go on alone.
         around.values[..., 1:][..., burst] = around.values[..., :1]
@@ -218,7 +219,7 @@ def _surveyed(
     distance = _distance(objective.space, descent)
     quadratic = quadratic_at(objective, around, distance, descent.floor)
     if not quadratic.leads_somewhere:
-        return _resumed(objective, descent, Stall.ARRIVED), None
+        return resumed(objective, descent, recovery.ARRIVED), None
     return descent, quadratic
 
 
@@ -245,15 +246,10 @@ def _judged(
     failures = descent.failures + 1 if failed else 0
     descent = replace(descent, damping=damping, failures=failures)
     if failures >= PATIENCE and promising:
-        return _resumed(objective, descent, Stall.MISLED)
+        return resumed(objective, descent, recovery.MISLED)
     if failures >= PATIENCE or 0.0 < gain <= tolerance:
-        return _resumed(objective, descent, Stall.ARRIVED)
+        return resumed(objective, descent, recovery.ARRIVED)
     return descent
-
-
-def _resumed(objective: Objective, descent: Descent, stall: Stall) -> Descent:
-    """A stalled descent as a strategy lets it go on, or else finished."""
-    return recovered(objective, descent, stall) or replace(descent, finished=True)
 
 
 def _with_steps(objective: Objective, descents: list[Descent]) -> list[Descent]:

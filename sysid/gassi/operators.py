@@ -1,9 +1,9 @@
-"""Steps of the genetic algorithms: initialisation, fitness, crossover, mutation, elitism.
+"""Operators of the genetic algorithms: initialisation, fitness, crossover, mutation, elitism.
 
-Each takes the random generator it draws from; the adaptive ones change the population in
-place, chromosome after chromosome, as Algorithms 4 and 5 are written. (Their superscripts
-i and i+1 are the population before and after the step: taken literally, the mutation's
-right-hand side would undo the crossover.)
+A population is (n, n_free). The adaptive operators change it in place, chromosome after
+chromosome, as Algorithms 4 and 5 are written. (Their superscripts i and i+1 are the population
+before and after the step: taken literally, the mutation's right-hand side would undo the
+crossover.)
 """
 
 from __future__ import annotations
@@ -14,40 +14,36 @@ from sysid.arrays import BoolArray, FloatArray
 
 
 def uniform(n: int, lower: FloatArray, upper: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Initial population spread evenly at random over the ranges, (n, n_free)."""
+    """Initial population uniformly distributed over the ranges, (n, n_free)."""
     return rng.uniform(lower, upper, size=(n, len(lower)))
 
 
 def stratified(
     n: int, lower: FloatArray, upper: FloatArray, rng: np.random.Generator
 ) -> FloatArray:
-    """Latin hypercube: every n-th part of every range holds exactly one chromosome."""
+    """Initial population by a Latin hypercube: one chromosome in each n-th part of a range."""
     cells = np.stack([rng.permutation(n) for _ in lower], axis=1)
     return lower + (cells + rng.random(cells.shape)) / n * (upper - lower)
 
 
 def normalised_fitness(errors: FloatArray, flagged: BoolArray) -> FloatArray:
-    """Algorithm 3: 1 for the lowest error, 0 for the highest; flagged chromosomes get 0."""
+    """Algorithm 3: 1 for the lowest error, 0 for the highest and for flagged chromosomes."""
     fitness = np.zeros(len(errors))
-    good = ~flagged
-    if not good.any():
-        return fitness
-    highest = errors[good].max()
+    simulated = errors[~flagged]
+    highest = simulated.max(initial=-np.inf)
     if highest <= 0.0:
-        fitness[good] = 1.0
+        fitness[~flagged] = 1.0
         return fitness
-    fitness[good] = 1.0 - errors[good] / highest
-    fitness[good] -= fitness[good].min()
-    top = fitness[good].max()
-    if top > 0.0:
-        fitness[good] /= top
+    gains = 1.0 - simulated / highest
+    gains -= gains.min()
+    fitness[~flagged] = gains / gains.max() if gains.max() > 0.0 else gains
     return fitness
 
 
 def adaptive_crossover(
     population: FloatArray, fitness: FloatArray, rng: np.random.Generator
 ) -> None:
-    """Algorithm 4: of n random pairs, the less fit moves towards the fitter by a common ratio."""
+    """Algorithm 4: the less fit of each of n random pairs moves towards the fitter."""
     n = len(population)
     ratio, fit = rng.random(), fitness.tolist()
     for a, b in rng.integers(n, size=(n, 2)).tolist():
@@ -74,13 +70,13 @@ def adaptive_mutation(
 def replace_by_elite(
     population: FloatArray, elite: FloatArray, percent: float, rng: np.random.Generator
 ) -> None:
-    """Put the elite in place of randomly chosen chromosomes, ``percent`` of them, at least one."""
+    """Replace a percentage of the chromosomes, at random and at least one, by the elite."""
     count = max(1, round(len(population) * percent / 100.0))
     population[rng.choice(len(population), size=count, replace=False)] = elite
 
 
 def roulette(population: FloatArray, fitness: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Proportional selection (4.2): a new population drawn in proportion to fitness."""
+    """Proportional selection (4.2): a population drawn in proportion to fitness."""
     total = fitness.sum()
     share = fitness / total if total > 0.0 else np.full(len(fitness), 1.0 / len(fitness))
     return population[rng.choice(len(population), size=len(population), p=share)]
@@ -89,7 +85,7 @@ def roulette(population: FloatArray, fitness: FloatArray, rng: np.random.Generat
 def arithmetical_crossover(
     population: FloatArray, ratio: float, probability: float, rng: np.random.Generator
 ) -> None:
-    """(4.3), (4.4): random pairs are replaced by their two weighted means."""
+    """Replace random pairs by their two weighted means, (4.3) and (4.4)."""
     order = rng.permutation(len(population))
     for a, b in zip(order[0::2], order[1::2], strict=False):
         if rng.random() < probability:
@@ -105,6 +101,6 @@ def uniform_mutation(
     probability: float,
     rng: np.random.Generator,
 ) -> None:
-    """Each parameter is drawn anew from its range with the given probability."""
+    """Draw each parameter anew from its range with a probability."""
     chosen = rng.random(population.shape) < probability
     population[chosen] = rng.uniform(lower, upper, size=population.shape)[chosen]

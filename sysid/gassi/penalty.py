@@ -36,7 +36,7 @@ def infeasibility(violations: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Indicators:
-    """Rows of the three chromosomes that set the penalty's scale."""
+    """Rows of the chromosomes that set the penalty's scale."""
 
     best: int
     worst_infeasible: int
@@ -44,22 +44,17 @@ class Indicators:
 
 
 def find_indicators(errors: FloatArray, scores: FloatArray) -> Indicators:
-    """Best, worst infeasible and highest-error chromosome among those simulated, section 4.1.3.3.
+    """Best, worst infeasible and highest-error chromosome, section 4.1.3.3.
 
     errors: (n,), finite where simulated; scores: (n,), infeasibility. At least one error must
     be finite and one score positive.
     """
-    usable = np.isfinite(errors)
-    rows = np.flatnonzero(usable)
-    feasible = rows[scores[rows] == 0.0]
+    rows = np.flatnonzero(np.isfinite(errors))
     infeasible = rows[scores[rows] > 0.0]
-    if len(feasible):
-        best = int(feasible[np.argmin(errors[feasible])])
-    else:
-        best = int(min(rows, key=lambda j: (scores[j], errors[j])))
+    best = int(min(rows, key=lambda j: (scores[j], errors[j])))
     below = infeasible[errors[infeasible] < errors[best]]
     if len(below):
-        # Among those that look better than the best, the most infeasible; ties: lowest error.
+        # The most infeasible among those that look better than the best; ties: lowest error.
         worst = min(below, key=lambda j: (-scores[j], errors[j]))
     else:
         worst = min(infeasible, key=lambda j: (-scores[j], -errors[j]))
@@ -67,14 +62,13 @@ def find_indicators(errors: FloatArray, scores: FloatArray) -> Indicators:
 
 
 def penalise(errors: FloatArray, violations: FloatArray) -> FloatArray:
-    """Errors with the two penalties (4.18) and (4.19) added to infeasible chromosomes, (n,).
+    """Errors with the penalties (4.18) and (4.19) added to infeasible chromosomes, (n,).
 
     Errors that are not finite (flagged simulations) pass through and take no part in the
     scale, so that one NaN does not switch the penalty off.
     """
     scores = infeasibility(violations)
-    usable = np.isfinite(errors)
-    infeasible: BoolArray = usable & (scores > 0.0)
+    infeasible: BoolArray = np.isfinite(errors) & (scores > 0.0)
     if not infeasible.any():
         return errors.copy()
     at = find_indicators(errors, scores)
@@ -85,16 +79,11 @@ def penalise(errors: FloatArray, violations: FloatArray) -> FloatArray:
     # the exponential of (4.19) would else grow without bound.
     graded = (scores - scores[at.best]) / span if span > 0.0 else np.zeros_like(scores)
     graded = np.minimum(graded, 1.0)
-
-    first = errors.copy()
-    if worst < best:
-        first[infeasible] += graded[infeasible] * (best - worst)  # (4.18)
-    second = first.copy()
     growth = (np.exp(2.0 * graded) - 1.0) / (np.exp(2.0) - 1.0)
-    second[infeasible] += (
-        _severity(best, worst, highest) * np.abs(first[infeasible]) * growth[infeasible]
-    )  # (4.19)
-    return second
+    penalised, severity = errors.copy(), _severity(best, worst, highest)
+    first = errors[infeasible] + graded[infeasible] * max(best - worst, 0.0)  # (4.18)
+    penalised[infeasible] = first + severity * np.abs(first) * growth[infeasible]  # (4.19)
+    return penalised
 
 
 def _severity(best: float, worst: float, highest: float) -> float:

@@ -17,6 +17,8 @@ from sysid import (
     SearchSpace,
     State,
 )
+from sysid.fitting import recovery
+from sysid.fitting.descent import FLOORS, PERTURBATIONS, Descent, Integration, Point
 from sysid.fitting.objective import Objective
 from sysid.fitting.refinement import refine
 from tests.sysid.support import MOTOR, Formula, draw, lag, motor, motor_record
@@ -260,7 +262,38 @@ def test_it_slides_along_a_constraint_to_the_best_point_on_it(start):
     assert not np.any(target.space.violations(found.chromosome[None]) > 0.0)
 
 
-# --- simulations that fail ------------------------------------------------------------------
+# --- where a descent stalls: each strategy in the situation it is for ------------------------
+
+
+@pytest.fixture
+def without(monkeypatch):
+    """Refinement as it would be if a strategy were not there."""
+
+    def refined(strategy, *problem, **settings):
+        with monkeypatch.context() as patch:
+            for stall in ("FAILED", "BURST", "ARRIVED", "MISLED"):
+                strategies = getattr(recovery, stall)
+                patch.setattr(recovery, stall, tuple(s for s in strategies if s is not strategy))
+            return refine(*problem, **settings)
+
+    return refined
+
+
+def gain_objective(simulator, formula, outputs, **parameter):
+    """Objective of one gain whose outputs are a formula of it, at 100 samples of a sine."""
+    settings = {"nominal": 1.0, "lower": 0.1, "upper": 10.0, "scale": "log"} | parameter
+    model = lag(
+        outputs=tuple(Output(f"y{j}", "1") for j in range(len(outputs.T))),
+        output=lambda x, u, p: (x[0],) * len(outputs.T),
+        parameters=(Parameter("gain", "1", **settings),),
+        derivative=lambda x, u, p: (p[0] * u[0],),
+    )
+    return Objective(
+        simulator(model, formula), SearchSpace.of(model), [Dataset(SINE, outputs, 0.01)]
+    )
+
+
+SINE = np.sin(np.arange(100) / 5.0)
 
 
 class Edge(Formula):
@@ -275,20 +308,16 @@ class Edge(Formula):
         return found
 
 
-def test_it_comes_back_from_where_simulations_fail():
-    model = lag(
-        parameters=(Parameter("gain", "1", 1.0, 0.1, 10.0, "log"),),
-        derivative=lambda x, u, p: (p[0] * u[0],),
-    )
-    u = np.sin(np.arange(100) / 5.0)
-    simulator = Edge(model, lambda p, u: p["gain"] * u)
-    target = Objective(simulator, SearchSpace.of(model), [Dataset(u, 2.0 * u, 0.01)])
+def test_it_retreats_from_where_simulations_fail(without):
+    target = gain_objective(Edge, lambda p, u: p["gain"] * u, 2.0 * SINE[:, None])
     found = refine(target, np.array([0.3]))
     assert np.isfinite(found.error)
     assert 0.3 < found.chromosome[0] <= 1.5
     # The error is that of the chromosome: half the record's peak is explained at a gain of 1.
-    exact = (2.0 - found.chromosome[0]) / 2.0 * np.sqrt(np.mean(u**2)) / np.abs(u).max()
+    exact = (2.0 - found.chromosome[0]) / 2.0 * np.sqrt(np.mean(SINE**2)) / np.abs(SINE).max()
     assert found.error == pytest.approx(exact, rel=1e-6)
+    lost = without(recovery.retreat, target, np.array([0.3]))
+    assert lost.chromosome[0] > 1.5 and not np.isfinite(lost.rms).all()
 
 
 class Brink(Formula):
@@ -321,18 +350,122 @@ def brink(unbounded=False):
         ),
         derivative=lambda x, u, p: (p[0] * u[0] + p[1],),
     )
-    u = np.sin(np.arange(100) / 5.0)
     simulator = Brink(model, lambda p, u: p["gain"] * u + p["offset"])
     simulator.unbounded = unbounded
-    return Objective(simulator, SearchSpace.of(model), [Dataset(u, 2.0 * u, 0.01)])
+    return Objective(simulator, SearchSpace.of(model), [Dataset(SINE, 2.0 * SINE, 0.01)])
 
 
-def test_more_steps_are_taken_where_those_of_the_descent_fail_beside_it():
+def test_it_braces_where_the_steps_of_the_descent_fail_beside_it(without):
     found = refine(brink(), START)
     np.testing.assert_allclose(found.chromosome, [2.0, 0.0], atol=1e-6)
+    np.testing.assert_array_equal(without(recovery.brace, brink(), START).chromosome, START)
 
 
-def test_other_parameters_go_on_where_one_cannot_be_moved():
+def test_the_rest_of_the_parameters_go_on_where_one_cannot_be_moved():
     found = refine(brink(unbounded=True), START)
     assert found.chromosome[0] == START[0]
-    assert found.chromosome[1] == pytest.approx(np.mean(1.7 * np.sin(np.arange(100) / 5.0)))
+    assert found.chromosome[1] == pytest.approx(np.mean(1.7 * SINE))
+
+
+STAIR = 0.02  # a hundredth of the range is more than half of it
+
+
+def staired(gain):
+    """A gain that rises by stairs, each of which falls on its way."""
+    rest = np.mod(gain, STAIR)
+    return gain - 1.5 * rest
+
+
+def test_it_coarsens_where_small_perturbations_see_stairs(without):
+    target = gain_objective(
+        Formula, lambda p, u: staired(p["gain"]) * u, 2.0 * SINE[:, None], lower=1.0, upper=3.0,
+        scale="linear",
+    )  # fmt: skip
+    start = np.array([1.113])
+    assert refine(target, start).chromosome[0] == pytest.approx(2.0, abs=2 * STAIR)
+    assert without(recovery.coarsen, target, start).chromosome[0] < 1.0 + 10 * STAIR
+
+
+def test_it_refocuses_after_larger_perturbations(without):
+    """Stairs far from the minimum; around it all is smooth, and bent to large perturbations."""
+
+    def formula(p, u):
+        far = abs(p["gain"] - 2.0) > 0.5
+        return np.exp((staired(p["gain"]) if far else p["gain"]) * u)
+
+    outputs = np.exp(2.0 * SINE) + 3.0 * SINE**2
+    target = gain_objective(
+        Formula, formula, outputs[:, None], lower=1.0, upper=3.0, scale="linear"
+    )
+
+    def error(gain):
+        return float(target.evaluate(np.array([[gain]]))[0][0])
+
+    exact = minimize_scalar(error, bounds=(1.6, 2.4), method="bounded", options={"xatol": 1e-10})
+    start = np.array([1.113])
+    found = refine(target, start, tolerance=1e-12)
+    assert found.chromosome[0] == pytest.approx(exact.x, abs=1e-6)
+    biased = without(recovery.refocus, target, start, tolerance=1e-12)
+    assert 2e-5 < abs(biased.chromosome[0] - exact.x) < 0.1
+
+
+def test_it_sharpens_the_crease_of_an_output_that_is_explained_exactly(without):
+    """One output wants a gain of 2, and little of it; a noisy one wants 3."""
+    noise = np.random.default_rng(1).normal(0.0, 0.3, 100)
+    outputs = np.column_stack([2.0 * SINE, 3.0 * SINE + noise])
+    target = gain_objective(Formula, lambda p, u: p["gain"] * np.column_stack([u, u]), outputs)
+    start = np.array([1.0])
+    assert refine(target, start).chromosome[0] == pytest.approx(2.0, abs=1e-3)
+    assert without(recovery.sharpen, target, start).chromosome[0] > 2.01
+
+
+class Sluggish(Formula):
+    """From a gain of 1.9 on three steps a sample are needed; fewer are wrong by a hundredth."""
+
+    def steps_of_each(self, vectors, record):
+        return np.where(vectors[:, 0] > 1.9, 3, 1)
+
+    def trajectories(self, vectors, record, n_steps=None, starts=None):
+        found = super().trajectories(vectors, record, n_steps, starts)
+        found[n_steps < 3] *= 1.01
+        return found
+
+
+def test_it_resolves_what_needs_more_steps_than_where_it_came_from(without):
+    outputs = 2.0 * SINE + 0.01 * np.random.default_rng(0).normal(size=100)
+    target = gain_objective(Sluggish, lambda p, u: p["gain"] * u, outputs[:, None])
+    exact, start = SINE @ outputs / (SINE @ SINE), np.array([1.8])
+    assert refine(target, start).chromosome[0] == pytest.approx(exact, rel=1e-6)
+    coarse = without(recovery.resolve, target, start)
+    assert coarse.chromosome[0] == pytest.approx(exact / 1.01, rel=1e-6)
+
+
+HERE = Point(np.array([math.log(1.8)]), 0.1, np.array([0.1]))
+
+
+@pytest.mark.parametrize(
+    ("strategy", "state"),
+    [
+        (recovery.retreat, {}),
+        (recovery.brace, {"integration": Integration((1,), HERE.at, braced=3)}),
+        (recovery.coarsen, {"level": len(PERTURBATIONS) - 1}),
+        (recovery.sharpen, {}),
+        (recovery.sharpen, {"point": Point(HERE.at, 0.1, np.zeros(1)), "smoothing": 2}),
+        (recovery.resolve, {"integration": Integration((1,), HERE.at + 1e-3)}),
+        (recovery.resolve, {"integration": Integration((3,), HERE.at + 1.0)}),
+        (recovery.refocus, {"level": 0, "error_of_round": 1.0}),
+        (recovery.refocus, {"level": 2, "error_of_round": 0.10001}),
+    ],
+)
+def test_every_strategy_gives_up_once(strategy, state):
+    assert len(FLOORS) == 3
+    target = gain_objective(Sluggish, lambda p, u: p["gain"] * u, 2.0 * SINE[:, None])
+    assert strategy(target, Descent(**({"point": HERE} | state))) is None
+
+
+def test_a_descent_ends_on_its_safe_point_when_patience_does():
+    safe = Point(np.zeros(1), 0.2)
+    descent = Descent(HERE, safe, failures=recovery.PATIENCE - 2)
+    once = recovery.retreat(None, descent)
+    assert once.point is safe and not once.finished and once.damping > descent.damping
+    assert recovery.retreat(None, once).finished
