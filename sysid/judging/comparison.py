@@ -65,8 +65,8 @@ class Candidate:
 
     >>> from sysid import ARX
     >>> from sysid.examples import lag_record
-    >>> record = lag_record()
-    >>> Candidate.of("ARX", ARX(na=1, nb=1).fit(record), [record]).n_effective
+    >>> candidate = Candidate.of("first order", ARX(na=1, nb=1).fit(lag_record()), [lag_record()])
+    >>> candidate.n_free
     3
     """
 
@@ -124,6 +124,11 @@ class Row:
     ratio: Ratio | None
     verdict: Standing
 
+    @property
+    def good(self) -> bool:
+        """Whether no structure is better by more than chance."""
+        return self.verdict in ("best", "as good")
+
 
 @dataclass(frozen=True)
 class Comparison:
@@ -132,9 +137,11 @@ class Comparison:
     validated: whether there were validation records; else BIC ranks. n_samples: training rows
     behind the information criteria; n_independent: what they are worth.
 
-    >>> result = Comparison((), preferred="", validated=False, n_samples=0, n_independent=0.0)
-    >>> result.rows
-    ()
+    >>> run = np.array([[0.0], [1.0], [0.0], [-1.0]])
+    >>> record = Dataset(np.zeros(4), run, dt=0.1)
+    >>> close, far = (Candidate(f"{e} off", 1, 1, (run + e,), (run + e,)) for e in (0.1, 0.2))
+    >>> compare([far, close], [record], [record]).rows[0].name
+    '0.1 off'
     """
 
     rows: tuple[Row, ...]
@@ -165,7 +172,7 @@ class Comparison:
     def _preference(self) -> list[str]:
         """Sentences on which of the equally good structures is preferred, and why."""
         chosen = self.row(self.preferred)
-        equals = [row for row in self.rows if row.verdict in ("best", "as good")]
+        equals = [row for row in self.rows if row.good]
         sentences = [
             f"The BIC of {row.name} on the training data, {row.dbic - chosen.dbic:.3g} above that "
             f"of {chosen.name}, is strong evidence against it."
@@ -196,12 +203,13 @@ def compare(
     >>> from sysid import ARX
     >>> from sysid.examples import lag_record
     >>> training, validation = [lag_record()], [lag_record(seed=1)]
+    >>> first, second = (ARX(na=na, nb=1).fit(training) for na in (1, 2))
     >>> candidates = [
-    ...     Candidate.of(f"ARX {na}", ARX(na=na, nb=1).fit(training), training, validation)
-    ...     for na in (1, 2)
+    ...     Candidate.of("first order", first, training, validation),
+    ...     Candidate.of("second order", second, training, validation),
     ... ]
     >>> compare(candidates, training, validation).preferred
-    'ARX 1'
+    'first order'
     """
     names = [candidate.name for candidate in candidates]
     if len(set(names)) < len(names) or not names:
@@ -212,29 +220,18 @@ def compare(
     importance = np.ones(q) if weights is None else np.asarray(weights, dtype=np.float64)
     importance = importance / importance.sum()
     trained = [_FreeRuns.of(training, candidate.training, lag) for candidate in candidates]
-    tested = [
-        _FreeRuns.of(validation, candidate.validation, lag)
-        for candidate in candidates
-        if validation
-    ]
-    criteria = _criteria(trained, [candidate.n_effective for candidate in candidates])
-    score = criteria.bic
+    aic, bic, n, worth = _criteria(trained, [candidate.n_effective for candidate in candidates])
+    score = bic
     ratios: list[Ratio | None] = [None] * len(names)
-    if tested:
+    tested: list[_FreeRuns] = []
+    if validation:
+        tested = [_FreeRuns.of(validation, candidate.validation, lag) for candidate in candidates]
         score = np.array([runs.score(importance) for runs in tested])
         ratios = _ratios(tested, int(np.argmin(score)), importance)
-    order = [int(i) for i in np.argsort(score, kind="stable")]
+    order = np.argsort(score, kind="stable").tolist()
     if np.isposinf(score[order[0]]):
         raise ModelError("no structure has a free run that stays finite")
-    daic, dbic = _above_lowest(criteria.aic), _above_lowest(criteria.bic)
-    standings = [
-        _standing(i == order[0], score[i], ratio, dbic[i]) for i, ratio in enumerate(ratios)
-    ]
-    good = [i for i in order if standings[i] in ("best", "as good")]
-    least = min(dbic[i] for i in good)
-    backed = [i for i in good if not dbic[i] - least > _BIC_STRONG]
-    preferred = min(backed, key=lambda i: (candidates[i].n_effective, order.index(i)))
-    unknown = np.full(q, np.nan)
+    daic, dbic, unknown = _above_lowest(aic), _above_lowest(bic), np.full(q, np.nan)
     rows = [
         Row(
             candidates[i].name,
@@ -244,16 +241,17 @@ def compare(
             tested[i].rmse if tested else unknown,
             tested[i].msd if tested else unknown,
             tested[i].fit if tested else unknown,
-            float(daic[i]),
-            float(dbic[i]),
+            daic[i],
+            dbic[i],
             ratios[i],
-            standings[i],
+            _standing(i == order[0], score[i], ratios[i], dbic[i]),
         )
         for i in order
     ]
-    return Comparison(
-        tuple(rows), names[preferred], bool(validation), criteria.n, criteria.n_independent
-    )
+    least = min(row.dbic for row in rows if row.good)
+    backed = [row for row in rows if row.good and not row.dbic - least > _BIC_STRONG]
+    preferred = min(backed, key=lambda row: row.n_effective)
+    return Comparison(tuple(rows), preferred.name, bool(validation), n, worth)
 
 
 @dataclass(frozen=True)
@@ -271,9 +269,9 @@ class _FreeRuns:
     @classmethod
     def of(cls, records: Sequence[Dataset], runs: Sequence[FloatArray], lag: int) -> _FreeRuns:
         """Without the first ``lag`` rows of each record."""
-        scale = output_scale(list(records))[0]
         simulated = [np.ascontiguousarray(run[lag:]) for run in runs]
-        return cls([record.outputs[lag:] for record in records], simulated, scale)
+        measured = [record.outputs[lag:] for record in records]
+        return cls(measured, simulated, output_scale(list(records))[0])
 
     @cached_property
     def finite(self) -> bool:
@@ -329,17 +327,13 @@ class _FreeRuns:
         return metric(np.concatenate(self.measured), np.concatenate(self.simulated), self.scale)
 
 
-@dataclass(frozen=True)
-class _Criteria:
-    """aic, bic: (n_candidates,), infinite for a free run that failed; n rows are worth so many."""
+def _criteria(
+    trained: Sequence[_FreeRuns], n_effective: Sequence[int]
+) -> tuple[FloatArray, FloatArray, int, float]:
+    """AIC and BIC, the rows behind them and how many independent ones these are worth.
 
-    aic: FloatArray
-    bic: FloatArray
-    n: int
-    n_independent: float
-
-
-def _criteria(trained: Sequence[_FreeRuns], n_effective: Sequence[int]) -> _Criteria:
+    The criteria are (n_candidates,), infinite for a free run that failed.
+    """
     log_det = np.full(len(trained), np.inf)
     residuals: list[list[FloatArray]] = []
     for i, runs in enumerate(trained):
@@ -350,11 +344,11 @@ def _criteria(trained: Sequence[_FreeRuns], n_effective: Sequence[int]) -> _Crit
             joined = np.concatenate(residuals[i])
             log_det[i] = np.linalg.slogdet(joined.T @ joined / len(joined))[1]
     if not any(residuals):
-        return _Criteria(log_det, log_det, 0, 0.0)
+        return log_det, log_det, 0, 0.0
     best = int(np.argmin(log_det))
     n, worth = sum(map(len, residuals[best])), independent_samples(residuals[best])
     k = np.asarray(n_effective, dtype=np.float64)
-    return _Criteria(worth * log_det + 2.0 * k, worth * log_det + np.log(worth) * k, n, worth)
+    return worth * log_det + 2.0 * k, worth * log_det + np.log(worth) * k, n, worth
 
 
 def _ratios(tested: Sequence[_FreeRuns], best: int, importance: FloatArray) -> list[Ratio | None]:
@@ -379,11 +373,10 @@ def _ratios(tested: Sequence[_FreeRuns], best: int, importance: FloatArray) -> l
     ]
 
 
-def _above_lowest(values: FloatArray) -> FloatArray:
+def _above_lowest(values: FloatArray) -> list[float]:
     """Differences from the lowest; NaN when all are infinite."""
     with np.errstate(invalid="ignore"):
-        above: FloatArray = values - values.min()
-    return above
+        return [float(value) for value in values - values.min()]
 
 
 def _standing(best: bool, score: float, ratio: Ratio | None, dbic: float) -> Standing:
