@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from sysid.campaigns.campaign import Campaign, Outcome, Run, Spread, campaign, combinations
@@ -72,14 +73,16 @@ __all__ = [
 ]
 
 
+# scikit-learn takes most of a second to import; only the estimators need it.
+_LAZY = {
+    "ARMAX": "sysid.linear",
+    "ARX": "sysid.linear",
+    "GASSI": "sysid.gassi",
+    "select_orders": "sysid.linear",
+}
+
+
 def __getattr__(name: str) -> Any:
-    # scikit-learn takes most of a second to import; only the estimators need it.
-    if name == "GASSI":
-        from sysid.gassi import GASSI
-
-        return GASSI
-    if name in ("ARMAX", "ARX", "select_orders"):
-        from sysid import linear
-
-        return getattr(linear, name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name not in _LAZY:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_LAZY[name]), name)

@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sysid.campaigns.parcels import pack, unpack
-from sysid.problem.data import Dataset
-from sysid.problem.metrics import Metrics, evaluate
-from sysid.problem.model import ModelError, ProcessModel
 from sysid.engine.simulation import available_cores
+from sysid.problem.data import Dataset
+from sysid.problem.metrics import Metrics, evaluate, mean_known
+from sysid.problem.model import ModelError, ProcessModel
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -33,10 +33,15 @@ _SAME = 0.01
 
 @dataclass(frozen=True)
 class Run:
-    """One identification: a model, the records it is fitted to, settings and seed.
+    """An identification to be done: a model, the records it is fitted to, settings and seed.
 
     settings: arguments of ``GASSI``. name: of the model structure, default the model's. data:
     of the records, default their names. validation: records it is judged by and never fitted to.
+
+    >>> from sysid.examples import lag, lag_record
+    >>> run = Run(lag(), [lag_record(seed=7)], {"population": 20, "generations": 3})
+    >>> run.name, run.data
+    ('lag', 'lag 7')
     """
 
     model: ProcessModel
@@ -60,6 +65,11 @@ class Outcome:
     """What became of a run: a fitted estimator, or the problem that kept it from one.
 
     training, validation: metrics of the free run of each record. seconds: it took.
+
+    >>> from sysid.examples import lag, lag_record
+    >>> run = Run(lag(), [lag_record()])
+    >>> Outcome(run, None, (), (), seconds=0.0, problem="a worker was lost").error
+    inf
     """
 
     run: Run
@@ -75,14 +85,14 @@ class Outcome:
         return np.inf if self.estimator is None else self.estimator.error_
 
     def row(self) -> dict[str, Any]:
-        """Everything as one flat row of a table."""
+        """The outcome as a flat row of a table."""
         row: dict[str, Any] = {
             "model": self.run.name,
             "data": self.run.data,
             "seed": self.run.seed,
             "error": self.error,
-            "fit": _mean_fit(self.training),
-            "validation_fit": _mean_fit(self.validation),
+            "fit": float(mean_known([metrics.fit for metrics in self.training])),
+            "validation_fit": float(mean_known([metrics.fit for metrics in self.validation])),
             "seconds": self.seconds,
             "problem": self.problem,
         }
@@ -96,10 +106,15 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Spread:
-    """One structure on one set of records over its seeds.
+    """A structure on a set of records over the seeds of its runs.
 
     best, median, worst: errors of the runs that did not fail. agreeing: how many of them came
     within 1 % of the best. parameters: {name: (lowest, highest)} among those.
+
+    >>> gain = {"gain": (2.98, 3.01)}
+    >>> spread = Spread("lag", "bench", 5, 0, 0.011, 0.011, 0.2, agreeing=4, parameters=gain)
+    >>> f"{spread.agreeing} of {spread.runs} seeds agree"
+    '4 of 5 seeds agree'
     """
 
     model: str
@@ -115,7 +130,11 @@ class Spread:
 
 @dataclass(frozen=True)
 class Campaign:
-    """Outcomes in the order of the runs; without those that Ctrl-C left undone."""
+    """Outcomes in the order of the runs; without those that Ctrl-C left undone.
+
+    >>> Campaign(outcomes=()).failed
+    ()
+    """
 
     outcomes: tuple[Outcome, ...]
     interrupted: bool = False
@@ -131,9 +150,7 @@ class Campaign:
         What satisfies the model's constraints comes before what does not.
         """
         return {
-            key: min(done, key=_rank)
-            for key, group in self._groups().items()
-            if (done := [o for o in group if o.estimator is not None])
+            key: done[0] for key, group in self._groups().items() if (done := _ranked(group))
         }
 
     def spread(self) -> list[Spread]:
@@ -164,6 +181,10 @@ def combinations(
 
     models: by the names they get in tables. records: by name, what one parameter set is fitted
     to. settings: arguments of ``GASSI`` for all.
+
+    >>> from sysid.examples import lag, lag_record
+    >>> len(combinations({"lag": lag()}, {"bench": [lag_record()]}, seeds=range(3)))
+    3
     """
     seeds = list(seeds)
     return [
@@ -185,8 +206,15 @@ def campaign(
     n_jobs: processes, -1 for all cores; default what ``joblib.parallel_config`` says, else one.
     Each run gets its share of the cores unless its settings name ``threads``; on a cluster,
     where a run has a worker's thread, one. A run that fails is kept with its problem. Ctrl-C
-    ends the campaign and keeps what is finished. on_outcome: told each outcome as it comes.
-    Raises ModelError when there is nothing to do, or a model cannot be sent to another process.
+    ends the campaign and keeps what is finished. on_outcome: called with each outcome as it
+    comes. Raises ModelError when there is nothing to do, or a model cannot be sent to another
+    process.
+
+    >>> from sysid.examples import lag, lag_record
+    >>> runs = [Run(lag(), [lag_record()], {"population": 30, "generations": 4}, seed=1)]
+    >>> (outcome,) = campaign(runs).outcomes
+    >>> round(outcome.estimator.parameters_["gain"], 1)
+    3.0
     """
     import joblib
 
@@ -198,13 +226,13 @@ def campaign(
         joblib.delayed(_identify)(place, *packed.arguments(runs[place]), runs[place].seed, threads)
         for place in _order(runs)
     ]
-    found: dict[int, Outcome] = {}
+    outcomes: dict[int, Outcome] = {}
     interrupted, problem = False, ""
     results = _parallel(n_jobs)(jobs)
     try:
         for parcel in results:
             place, outcome = _outcome(runs, parcel)
-            found[place] = outcome
+            outcomes[place] = outcome
             if on_outcome is not None:
                 on_outcome(outcome)
             if outcome.estimator is not None and outcome.estimator.stopped_ == "interrupted":
@@ -218,9 +246,9 @@ def campaign(
     finally:
         _close(results)
     if not interrupted:
-        for place in set(range(len(runs))) - set(found):
-            found[place] = Outcome(runs[place], None, (), (), 0.0, problem)
-    return Campaign(tuple(found[place] for place in sorted(found)), interrupted)
+        for place in set(range(len(runs))) - set(outcomes):
+            outcomes[place] = Outcome(runs[place], None, (), (), 0.0, problem)
+    return Campaign(tuple(outcomes[place] for place in sorted(outcomes)), interrupted)
 
 
 class _Packed:
@@ -247,7 +275,7 @@ class _Packed:
 def _identify(
     place: int, model: bytes, data: bytes, settings: bytes, seed: int, threads: int
 ) -> bytes:
-    """What a worker does: fit, judge, and send back all but the model, which needs no journey."""
+    """A worker's part: fit, evaluate, and send back all but the model, which is here already."""
     from sysid.gassi import GASSI
 
     started = time.perf_counter()
@@ -256,11 +284,10 @@ def _identify(
     problem = ""
     try:
         groups = unpack(data)
-        given = {"threads": threads, **unpack(settings), "random_state": seed}
-        estimator = GASSI(_model(model), **given)
-        fitted = estimator.fit(groups[0])
+        arguments = {"threads": threads, **unpack(settings), "random_state": seed}
+        fitted = GASSI(_model(model), **arguments).fit(groups[0])
         scores = [
-            tuple(evaluate(record.outputs, estimator.predict(record)) for record in group)
+            tuple(evaluate(record.outputs, fitted.predict(record)) for record in group)
             for group in groups
         ]
         fitted.model = None
@@ -345,24 +372,19 @@ def _described(error: Exception) -> str:
     return f"{type(error).__name__}: {error}"
 
 
-def _mean_fit(metrics: Sequence[Metrics]) -> float:
-    """Mean fit % over outputs and records, NaN without any."""
-    fits = np.array([m.fit for m in metrics]).ravel()
-    known = fits[~np.isnan(fits)]
-    return float(known.mean()) if len(known) else np.nan
-
-
-def _rank(outcome: Outcome) -> tuple[bool, float, int]:
-    assert outcome.estimator is not None
-    return (not outcome.estimator.feasible_, outcome.error, outcome.run.seed)
+def _ranked(group: Sequence[Outcome]) -> list[Outcome]:
+    """The runs that did not fail, the best first, feasible ones before infeasible ones."""
+    fitted = [(o.estimator, o) for o in group if o.estimator is not None]
+    fitted.sort(key=lambda pair: (not pair[0].feasible_, pair[1].error, pair[1].run.seed))
+    return [outcome for _, outcome in fitted]
 
 
 def _spread(model: str, data: str, group: Sequence[Outcome]) -> Spread:
-    done = sorted((o for o in group if o.estimator is not None), key=_rank)
-    errors = np.array([o.error for o in done]) if done else np.array([np.nan])
-    same = [o.estimator for o in done if o.error <= (1.0 + _SAME) * errors.min()]
+    done = _ranked(group)
+    errors = np.array([outcome.error for outcome in done]) if done else np.array([np.nan])
+    agreeing = [o.estimator for o in done if o.error <= (1.0 + _SAME) * errors.min()]
     values = {
-        name: [e.parameters_[name] for e in same if e is not None]
+        name: [e.parameters_[name] for e in agreeing if e is not None]
         for name in (done[0].run.model.parameter_names if done else ())
     }
     return Spread(
@@ -373,6 +395,6 @@ def _spread(model: str, data: str, group: Sequence[Outcome]) -> Spread:
         float(errors.min()),
         float(np.median(errors)),
         float(errors.max()),
-        len(same),
-        {name: (min(found), max(found)) for name, found in values.items()},
+        len(agreeing),
+        {name: (min(numbers), max(numbers)) for name, numbers in values.items()},
     )

@@ -43,24 +43,24 @@ def pack(what: str, value: Any) -> bytes:
 
 
 def unpack(parcel: bytes) -> Any:
-    """What was packed, equal and independent."""
+    """The packed value, equal and independent."""
     return pickle.loads(parcel)
 
 
 def _not_installed() -> list[types.ModuleType]:
     """Loaded modules that another process may not find by their name."""
-    known = sysconfig.get_paths()
-    places = {Path(known[key]) for key in ("stdlib", "platstdlib", "purelib", "platlib")}
-    own = __name__.partition(".")[0]
-    found = []
+    paths = sysconfig.get_paths()
+    places = {Path(paths[key]) for key in ("stdlib", "platstdlib", "purelib", "platlib")}
+    everywhere = (__name__.partition(".")[0], "__main__")
+    modules = []
     for name, module in list(sys.modules.items()):
         file = getattr(module, "__file__", None)
         # Compiled modules have no code that could travel.
-        if file is None or not file.endswith(".py") or name.partition(".")[0] in (own, "__main__"):
+        if file is None or not file.endswith(".py") or name.partition(".")[0] in everywhere:
             continue
         if not _installed(Path(file), places):
-            found.append(module)
-    return found
+            modules.append(module)
+    return modules
 
 
 def _installed(file: Path, places: set[Path]) -> bool:
@@ -74,8 +74,8 @@ def _installed(file: Path, places: set[Path]) -> bool:
 def _by_value(modules: list[types.ModuleType]) -> Iterator[None]:
     import cloudpickle
 
-    known = cloudpickle.list_registry_pickle_by_value()
-    added = [m for m in modules if m.__name__ in sys.modules and m.__name__ not in known]
+    registered = cloudpickle.list_registry_pickle_by_value()
+    added = [m for m in modules if m.__name__ in sys.modules and m.__name__ not in registered]
     for module in added:
         cloudpickle.register_pickle_by_value(module)
     try:

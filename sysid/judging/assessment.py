@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -33,7 +33,7 @@ _MUCH, _WANDERS = 0.05, 0.25
 
 @dataclass(frozen=True)
 class RecordResult:
-    """How a model does on one record; ``simulated``: whether its free run came to the end."""
+    """A model's errors on a record; ``simulated``: whether its free run came to the end."""
 
     name: str
     simulated: bool
@@ -43,7 +43,7 @@ class RecordResult:
 
 @dataclass(frozen=True)
 class Verdict:
-    """How far to trust, and why: one sentence each, the gravest first."""
+    """How far to trust, and why: a sentence for each reason, the gravest first."""
 
     trust: Trust
     reasons: tuple[str, ...]
@@ -56,18 +56,17 @@ def examine(
 
     predict: outputs (n_samples, n_outputs) of a record, as estimators' ``predict``.
     """
-    results = []
-    for record in records:
+
+    def result(record: Dataset) -> RecordResult:
         simulated = predict(record)
-        results.append(
-            RecordResult(
-                record.name,
-                bool(np.all(np.isfinite(simulated))),
-                evaluate(record.outputs, simulated),
-                residual_test(record.outputs - simulated, record.inputs, record.input_noise),
-            )
+        return RecordResult(
+            record.name,
+            bool(np.all(np.isfinite(simulated))),
+            evaluate(record.outputs, simulated),
+            residual_test(record.outputs - simulated, record.inputs, record.input_noise),
         )
-    return results
+
+    return [result(record) for record in records]
 
 
 def judge(
@@ -77,126 +76,108 @@ def judge(
     uncertainty: Uncertainty | None,
     feasible: bool = True,
 ) -> Verdict:
-    """A verdict from all that is known of an identification."""
+    """The verdict on an identification.
+
+    validation: none where no records were held back. uncertainty: None without intervals.
+    feasible: whether the parameters satisfy the constraints.
+    """
     grave = [] if feasible else ["No parameters were found that satisfy all the constraints."]
     light: list[str] = []
-    grave += _failed(model, (*training, *validation))
-    for name, ratio, fit in _progress(model, training, validation):
+    failed = [result.name for result in (*training, *validation) if not result.simulated]
+    if failed:
+        grave.append(
+            f"Model {model.name} cannot be simulated on {', '.join(failed)}: its response grows "
+            "beyond all bounds, or needs too small steps."
+        )
+    for name, ratio, fit in _validation_errors(model, training, validation):
         if fit < _FITTED:
             grave.append(f"{name} is explained poorly on the validation data (fit {fit:.0f} %).")
-        elif ratio > _FAR_WORSE and fit < _EXACT:
-            grave.append(f"{name} errs {ratio:.1f} times as much in validation as in training.")
         elif ratio > _HARDLY_WORSE:
-            light.append(f"{name} errs {ratio:.1f} times as much in validation as in training.")
+            reasons = grave if ratio > _FAR_WORSE and fit < _EXACT else light
+            reasons.append(f"{name} errs {ratio:.1f} times as much in validation as in training.")
     if not validation:
         light.append("No data were held back for validation: the errors are those of the fit.")
-    light += _left_over(model, validation or training)
-    light += _wandering(model, validation or training)
-    if uncertainty is not None:
-        light += _open(uncertainty)
+    light += _input_traces(model, validation or training)
+    light += _wandering_residuals(model, validation or training)
+    on_bound = [p.name for p in uncertainty.parameters if p.why == "bound"] if uncertainty else []
+    if on_bound:
+        verb = "stands" if len(on_bound) == 1 else "stand"
+        light.append(
+            f"{', '.join(on_bound)} {verb} on an end of the range: widen it, or fix the value."
+        )
     if grave:
         return Verdict("poor", (*grave, *light))
     return Verdict("limited", tuple(light)) if light else Verdict("good", _praise(validation))
 
 
-def _failed(model: ProcessModel, results: Sequence[RecordResult]) -> list[str]:
-    """Records that the model cannot follow to the end."""
-    failed = [result.name for result in results if not result.simulated]
-    if not failed:
-        return []
-    return [
-        f"Model {model.name} cannot be simulated on {', '.join(failed)}: its response grows beyond "
-        "all bounds, or needs too small steps."
-    ]
-
-
-def _progress(
+def _validation_errors(
     model: ProcessModel, training: Sequence[RecordResult], validation: Sequence[RecordResult]
 ) -> list[tuple[str, float, float]]:
     """Each output's error in validation in parts of that in training, and its fit [%]."""
     if not validation:
         return []
-    errors = [
-        # Absolute, because each record has its own largest output.
-        np.sqrt(mean_known(np.array([(r.metrics.rmse * r.metrics.scale) ** 2 for r in part]), 0))
-        for part in (training, validation)
-    ]
+    # Absolute, because each record has its own largest output.
+    trained, validated = (
+        np.sqrt(mean_known([(r.metrics.rmse * r.metrics.scale) ** 2 for r in results], 0))
+        for results in (training, validation)
+    )
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratios = errors[1] / errors[0]
-        fits = mean_known(np.array([r.metrics.fit for r in validation]), 0)
+        ratios = validated / trained
+    fits = mean_known([r.metrics.fit for r in validation], 0)
     return list(zip(model.output_names, ratios.tolist(), fits.tolist(), strict=True))
 
 
-def _left_over(model: ProcessModel, results: Sequence[RecordResult]) -> list[str]:
-    """Outputs whose residuals still follow an input."""
-    shares, sizes = _correlations(results)
-    found = []
-    for output, own, size in zip(model.output_names, shares, sizes, strict=True):
-        follows = [
-            signal
-            for signal, share, strength in zip(model.input_names, own, size, strict=True)
-            if share < _INDEPENDENT and strength > _NOTICEABLE
-        ]
-        if follows:
-            found.append(
-                f"Residuals of {output} still follow {' and '.join(follows)}: the model lacks "
+def _input_traces(model: ProcessModel, results: Sequence[RecordResult]) -> Iterator[str]:
+    """Reasons: outputs whose residuals still follow an input."""
+    shares, sizes = _input_correlations(results)
+    follows = (shares < _INDEPENDENT) & (sizes > _NOTICEABLE)
+    for output, following in zip(model.output_names, follows, strict=True):
+        if following.any():
+            inputs = [model.input_names[i] for i in np.flatnonzero(following)]
+            yield (
+                f"Residuals of {output} still follow {' and '.join(inputs)}: the model lacks "
                 "dynamics there."
             )
-    return found
 
 
-def _correlations(results: Sequence[RecordResult]) -> tuple[FloatArray, FloatArray]:
+def _input_correlations(results: Sequence[RecordResult]) -> tuple[FloatArray, FloatArray]:
     """Share of each input's correlations inside their band, and the largest of them.
 
     Both (n_outputs, n_inputs), means over the records: of many, one is outside by chance.
     """
-    shares = mean_known(np.array([result.residuals.independent for result in results]), 0)
+    shares = mean_known([result.residuals.independent for result in results], 0)
     sizes = np.mean([np.abs(result.residuals.cross).max(axis=0) for result in results], axis=0)
     return shares, sizes
 
 
-def _wandering(model: ProcessModel, results: Sequence[RecordResult]) -> list[str]:
-    """Outputs of which much is left that has a memory: it has hidden in the parameters as well."""
-    fits = mean_known(np.array([result.metrics.fit for result in results]), 0)
+def _wandering_residuals(model: ProcessModel, results: Sequence[RecordResult]) -> Iterator[str]:
+    """Reasons: outputs with large coloured residuals, whose cause has moved parameters as well."""
+    fits = mean_known([result.metrics.fit for result in results], 0)
     shares = np.mean([result.residuals.white for result in results], axis=0)
-    found = []
     for output, fit, share in zip(model.output_names, fits, shares, strict=True):
         left = (1.0 - fit / 100.0) ** 2
         if left > _MUCH and share < _WANDERS:
-            found.append(
+            yield (
                 f"{100.0 * left:.0f} % of {output}'s variance is left, and wanders: noise of "
                 "a measured input that came through the plant, or dynamics that the model lacks. "
                 "Parameters that act on it may be off by more than their intervals."
             )
-    return found
 
 
-def _open(uncertainty: Uncertainty) -> list[str]:
-    """What the data leave open, as far as it limits what may be done with the numbers."""
-    held = [p.name for p in uncertainty.parameters if p.why == "bound"]
-    if not held:
-        return []
-    verb = "stands" if len(held) == 1 else "stand"
-    return [f"{', '.join(held)} {verb} on an end of the range: widen it, or fix the value."]
-
-
-def _praise(validation: Sequence[RecordResult]) -> tuple[str, ...]:
-    fit = float(mean_known(np.array([result.metrics.fit for result in validation])))
-    return (
-        f"Data not used in the fit are explained as well as those that were (mean fit {fit:.1f} "
-        f"%){_of_inputs(validation)}.",
-    )
-
-
-def _of_inputs(results: Sequence[RecordResult]) -> str:
-    """What good residuals hold of the inputs; nothing to say of models without."""
-    shares, sizes = _correlations(results)
-    if not np.isfinite(shares).any():
-        return ""
+def _praise(validation: Sequence[RecordResult]) -> tuple[str]:
+    """The reason for a good verdict."""
+    fit = float(mean_known([result.metrics.fit for result in validation]))
+    shares, sizes = _input_correlations(validation)
     traces = sizes[shares < _INDEPENDENT]
+    inputs = ""
     if len(traces):
-        return (
+        inputs = (
             ", and of the inputs no more than a trace is left in the residuals (correlations of "
             f"at most {traces.max():.2f})"
         )
-    return ", and nothing of the inputs is left in the residuals"
+    elif np.isfinite(shares).any():
+        inputs = ", and nothing of the inputs is left in the residuals"
+    return (
+        f"Data not used in the fit are explained as well as those that were (mean fit {fit:.1f} "
+        f"%){inputs}.",
+    )

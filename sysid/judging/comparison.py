@@ -8,8 +8,8 @@ preferred.
 run, each output in units of the best structure's mean squared error: outputs of any unit count
 alike, and a mean loss of 1.2 means squared errors a fifth larger. The best structure is the one
 with the lowest geometric mean of its outputs' errors; by the inequality of arithmetic and
-geometric mean no other has a lower mean loss. How surely the losses of two structures differ over
-the same samples says ``evidence.ratio_of_means``.
+geometric mean no other has a lower mean loss. ``evidence.ratio_of_means`` gives the interval of
+the ratio of two structures' losses over the same samples.
 
 *Information criteria.* Of the free run's residuals e_t on the training records, all outputs
 together:
@@ -27,6 +27,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -34,7 +35,7 @@ import numpy as np
 from sysid.arrays import BoolArray, FloatArray
 from sysid.judging.evidence import Ratio, independent_samples, ratio_of_means
 from sysid.problem.data import Dataset, output_scale
-from sysid.problem.metrics import fit_percent, msd, rmse
+from sysid.problem.metrics import fit_percent, mean_known, msd, rmse
 from sysid.problem.model import ModelError
 
 if TYPE_CHECKING:
@@ -50,7 +51,7 @@ _BIC_MARGIN = 2.0
 _BIC_STRONG = 10.0
 _UNBOUNDED = 1e150  # beyond it squares leave the floating-point range
 
-Verdict = Literal["best", "as good", "worse", "failed"]
+Standing = Literal["best", "as good", "worse", "failed"]
 
 
 @dataclass(frozen=True)
@@ -61,6 +62,12 @@ class Candidate:
     n_effective: how many of them, or of their combinations, the data determine. training,
     validation: per record the simulated outputs, (n_samples, n_outputs). n_lags: rows at a
     record's start that it takes as given.
+
+    >>> from sysid import ARX
+    >>> from sysid.examples import lag_record
+    >>> candidate = Candidate.of("first order", ARX(na=1, nb=1).fit(lag_record()), [lag_record()])
+    >>> candidate.n_free
+    3
     """
 
     name: str
@@ -78,7 +85,7 @@ class Candidate:
         training: Sequence[Dataset],
         validation: Sequence[Dataset] = (),
     ) -> Candidate:
-        """Of an estimator that was fitted to the training records."""
+        """The structure of an estimator that was fitted to the training records."""
         from sysid.gassi import GASSI
 
         trained = tuple(estimator.predict(record) for record in training)
@@ -87,12 +94,16 @@ class Candidate:
             n = len(estimator.theta_)
             return cls(name, n, n, trained, tested, estimator.n_lags_)
         n = len(estimator.space_.names)
-        return cls(name, n, _rank(estimator, training), trained, tested)
+        try:
+            rank = estimator.uncertainty(training).rank
+        except ModelError:  # without intervals all count
+            rank = n
+        return cls(name, n, rank, trained, tested)
 
 
 @dataclass(frozen=True)
 class Row:
-    """One structure in the comparison; arrays are (n_outputs,).
+    """A structure in the comparison; arrays are (n_outputs,).
 
     training_error: mean over outputs of the RMSE in parts of max|y|. rmse, msd, fit: on the
     validation records, rmse and msd in parts of max|y|; NaN without any. daic, dbic: above the
@@ -111,7 +122,12 @@ class Row:
     daic: float
     dbic: float
     ratio: Ratio | None
-    verdict: Verdict
+    verdict: Standing
+
+    @property
+    def good(self) -> bool:
+        """Whether no structure is better by more than chance."""
+        return self.verdict in ("best", "as good")
 
 
 @dataclass(frozen=True)
@@ -120,6 +136,12 @@ class Comparison:
 
     validated: whether there were validation records; else BIC ranks. n_samples: training rows
     behind the information criteria; n_independent: what they are worth.
+
+    >>> run = np.array([[0.0], [1.0], [0.0], [-1.0]])
+    >>> record = Dataset(np.zeros(4), run, dt=0.1)
+    >>> close, far = (Candidate(f"{e} off", 1, 1, (run + e,), (run + e,)) for e in (0.1, 0.2))
+    >>> compare([far, close], [record], [record]).rows[0].name
+    '0.1 off'
     """
 
     rows: tuple[Row, ...]
@@ -134,38 +156,35 @@ class Comparison:
 
     @property
     def verdict(self) -> str:
-        """What the comparison says, in sentences."""
-        best = self.rows[0]
+        """The comparison in sentences."""
+        best, *rest = self.rows
         if self.validated:
-            said = [f"{best.name} explains the validation data best."]
-            said += [_against_validation(row, best.name) for row in self.rows[1:]]
+            sentences = [f"{best.name} explains the validation data best."]
+            sentences += [_against_validation(row, best.name) for row in rest]
         else:
-            said = [
+            sentences = [
                 "Without validation data this ranks by BIC on the training data, which favours "
                 f"{best.name}; validation data would decide better."
             ]
-            said += [_against_training(row) for row in self.rows[1:]]
-        return " ".join([*said, *self._preference()])
+            sentences += [_against_training(row) for row in rest]
+        return " ".join([*sentences, *self._preference()])
 
     def _preference(self) -> list[str]:
-        """Which of those that are as good is preferred, and why."""
+        """Sentences on which of the equally good structures is preferred, and why."""
         chosen = self.row(self.preferred)
-        equals = [row for row in self.rows if row.verdict in ("best", "as good")]
-        said = []
-        for row in equals:
-            if row.dbic - chosen.dbic > _BIC_STRONG and row.n_effective <= chosen.n_effective:
-                said.append(
-                    f"The BIC of {row.name} on the training data, {row.dbic - chosen.dbic:.3g} "
-                    f"above that of {chosen.name}, is strong evidence against it."
-                )
-        if chosen is not self.rows[0] and not said:
-            said.append(
+        equals = [row for row in self.rows if row.good]
+        sentences = [
+            f"The BIC of {row.name} on the training data, {row.dbic - chosen.dbic:.3g} above that "
+            f"of {chosen.name}, is strong evidence against it."
+            for row in equals
+            if row.dbic - chosen.dbic > _BIC_STRONG and row.n_effective <= chosen.n_effective
+        ]
+        if chosen is not self.rows[0] and not sentences:
+            return [
                 f"{chosen.name} is preferred: it has {chosen.n_effective} effective parameters, "
                 f"{self.rows[0].name} has {self.rows[0].n_effective}."
-            )
-        elif len(equals) > 1:
-            said.append(f"{chosen.name} is preferred.")
-        return said
+            ]
+        return [*sentences, f"{chosen.name} is preferred."] if len(equals) > 1 else sentences
 
 
 def compare(
@@ -180,6 +199,17 @@ def compare(
     training, validation: the records of the candidates' free runs, in their order. weights:
     (n_outputs,), relative importance, default equal. Raises ModelError for names that repeat, or
     when no structure has a free run that stays finite.
+
+    >>> from sysid import ARX
+    >>> from sysid.examples import lag_record
+    >>> training, validation = [lag_record()], [lag_record(seed=1)]
+    >>> first, second = (ARX(na=na, nb=1).fit(training) for na in (1, 2))
+    >>> candidates = [
+    ...     Candidate.of("first order", first, training, validation),
+    ...     Candidate.of("second order", second, training, validation),
+    ... ]
+    >>> compare(candidates, training, validation).preferred
+    'first order'
     """
     names = [candidate.name for candidate in candidates]
     if len(set(names)) < len(names) or not names:
@@ -189,195 +219,173 @@ def compare(
     q = training[0].outputs.shape[1]
     importance = np.ones(q) if weights is None else np.asarray(weights, dtype=np.float64)
     importance = importance / importance.sum()
-    trained = _Errors.of(training, [c.training for c in candidates], lag)
-    tested = _Errors.of(validation, [c.validation for c in candidates], lag)
-    criteria = _criteria(trained, [c.n_effective for c in candidates])
+    trained = [_FreeRuns.of(training, candidate.training, lag) for candidate in candidates]
+    aic, bic, n, worth = _criteria(trained, [candidate.n_effective for candidate in candidates])
+    score = bic
+    ratios: list[Ratio | None] = [None] * len(names)
+    tested: list[_FreeRuns] = []
     if validation:
-        score = np.array([tested.score(i, importance) for i in range(len(names))])
+        tested = [_FreeRuns.of(validation, candidate.validation, lag) for candidate in candidates]
+        score = np.array([runs.score(importance) for runs in tested])
         ratios = _ratios(tested, int(np.argmin(score)), importance)
-    else:
-        score, ratios = criteria.bic, [None] * len(names)
-    order = [int(i) for i in np.argsort(score, kind="stable")]
+    order = np.argsort(score, kind="stable").tolist()
     if np.isposinf(score[order[0]]):
         raise ModelError("no structure has a free run that stays finite")
-    daic, dbic = _above_lowest(criteria.aic), _above_lowest(criteria.bic)
-    verdicts = [
-        _verdict(i == order[0], float(score[i]), ratios[i], float(dbic[i]))
-        for i in range(len(names))
-    ]
-    good = [i for i in order if verdicts[i] in ("best", "as good")]
-    least = min(dbic[i] for i in good)
-    backed = [i for i in good if not dbic[i] - least > _BIC_STRONG]
-    preferred = min(backed, key=lambda i: (candidates[i].n_effective, order.index(i)))
+    daic, dbic, unknown = _above_lowest(aic), _above_lowest(bic), np.full(q, np.nan)
     rows = [
         Row(
             candidates[i].name,
             candidates[i].n_free,
             candidates[i].n_effective,
-            trained.mean_rmse(i, importance),
-            tested.rmse(i) if validation else np.full(q, np.nan),
-            tested.msd(i) if validation else np.full(q, np.nan),
-            tested.fit(i) if validation else np.full(q, np.nan),
-            float(daic[i]),
-            float(dbic[i]),
+            trained[i].mean_rmse(importance),
+            tested[i].rmse if tested else unknown,
+            tested[i].msd if tested else unknown,
+            tested[i].fit if tested else unknown,
+            daic[i],
+            dbic[i],
             ratios[i],
-            verdicts[i],
+            _standing(i == order[0], score[i], ratios[i], dbic[i]),
         )
         for i in order
     ]
-    return Comparison(
-        tuple(rows), names[preferred], bool(validation), criteria.n, criteria.n_independent
-    )
+    least = min(row.dbic for row in rows if row.good)
+    backed = [row for row in rows if row.good and not row.dbic - least > _BIC_STRONG]
+    preferred = min(backed, key=lambda row: row.n_effective)
+    return Comparison(tuple(rows), preferred.name, bool(validation), n, worth)
 
 
 @dataclass(frozen=True)
-class _Errors:
-    """Errors of all structures on the same rows of some records.
+class _FreeRuns:
+    """Free runs of a structure on the rows of some records that all structures are judged by.
 
-    measured: per record (n_rows, n_outputs); simulated: per record (n_candidates, n_rows,
-    n_outputs). scale: (n_outputs,), max|y| over all records. finite: per candidate.
+    measured, simulated: per record (n_rows, n_outputs). scale: (n_outputs,), max|y| over all
+    records.
     """
 
     measured: list[FloatArray]
     simulated: list[FloatArray]
     scale: FloatArray
-    finite: list[bool]
 
     @classmethod
-    def of(
-        cls, records: Sequence[Dataset], runs: Sequence[Sequence[FloatArray]], lag: int
-    ) -> _Errors:
+    def of(cls, records: Sequence[Dataset], runs: Sequence[FloatArray], lag: int) -> _FreeRuns:
         """Without the first ``lag`` rows of each record."""
-        scale = output_scale(list(records))[0] if records else np.ones(0)
+        simulated = [np.ascontiguousarray(run[lag:]) for run in runs]
         measured = [record.outputs[lag:] for record in records]
-        simulated = [np.stack([run[k][lag:] for run in runs]) for k in range(len(records))]
-        with np.errstate(invalid="ignore"):
-            finite = [
-                all(bool(np.all(np.abs(run[i]) < _UNBOUNDED)) for run in simulated)
-                for i in range(len(runs))
-            ]
-        return cls(measured, simulated, scale, finite)
+        return cls(measured, simulated, output_scale(list(records))[0])
 
-    @property
+    @cached_property
+    def finite(self) -> bool:
+        """Whether all runs stay within the floating-point range."""
+        with np.errstate(invalid="ignore"):
+            return all(bool(np.all(np.abs(run) < _UNBOUNDED)) for run in self.simulated)
+
+    @cached_property
     def seen(self) -> BoolArray:
         """Outputs that have a measured sample, (n_outputs,)."""
-        found: BoolArray = np.any(np.isfinite(np.concatenate(self.measured)), axis=0)
-        return found
+        seen: BoolArray = np.any(np.isfinite(np.concatenate(self.measured)), axis=0)
+        return seen
 
-    def residuals(self, i: int) -> list[FloatArray]:
+    @property
+    def residuals(self) -> list[FloatArray]:
         """Simulated minus measured in parts of max|y|, per record; NaN where a sample was lost."""
         pairs = zip(self.measured, self.simulated, strict=True)
-        return [(simulated[i] - measured) / self.scale for measured, simulated in pairs]
+        return [(simulated - measured) / self.scale for measured, simulated in pairs]
 
-    def rmse(self, i: int) -> FloatArray:
+    @cached_property
+    def rmse(self) -> FloatArray:
         """Over all records, (n_outputs,); infinite for a free run that failed."""
-        return self._over_all(rmse, i, np.inf)
+        return self._over_all(rmse, np.inf)
 
-    def msd(self, i: int) -> FloatArray:
+    @property
+    def msd(self) -> FloatArray:
         """Over all records, (n_outputs,)."""
-        return self._over_all(msd, i, np.nan)
+        return self._over_all(msd, np.nan)
 
-    def fit(self, i: int) -> FloatArray:
+    @property
+    def fit(self) -> FloatArray:
         """Fit %, mean over the records, (n_outputs,)."""
-        if not self.finite[i]:
+        if not self.finite:
             return np.full(len(self.scale), -np.inf)
         pairs = zip(self.measured, self.simulated, strict=True)
-        fits = np.array([fit_percent(y, simulated[i]) for y, simulated in pairs])
-        known = ~np.isnan(fits)
-        with np.errstate(invalid="ignore"):
-            mean: FloatArray = np.where(known, fits, 0.0).sum(axis=0) / known.sum(axis=0)
-        return mean
+        return mean_known([fit_percent(measured, simulated) for measured, simulated in pairs], 0)
 
-    def mean_rmse(self, i: int, importance: FloatArray) -> float:
+    def mean_rmse(self, importance: FloatArray) -> float:
         """Mean over the outputs that were measured."""
         share = np.where(self.seen, importance, 0.0)
-        return float(np.where(self.seen, self.rmse(i), 0.0) @ share / share.sum())
+        return float(np.where(self.seen, self.rmse, 0.0) @ share / share.sum())
 
-    def score(self, i: int, importance: FloatArray) -> float:
+    def score(self, importance: FloatArray) -> float:
         """Logarithm of the geometric mean of the RMSEs of the outputs that were measured."""
         with np.errstate(divide="ignore"):
-            logs = np.log(self.rmse(i))
+            logs = np.log(self.rmse)
         counted = self.seen & (importance > 0.0)
         return float(logs[counted] @ importance[counted] / importance[counted].sum())
 
-    def _over_all(self, metric: Callable[..., FloatArray], i: int, otherwise: float) -> FloatArray:
-        if not self.finite[i]:
+    def _over_all(self, metric: Callable[..., FloatArray], otherwise: float) -> FloatArray:
+        if not self.finite:
             return np.full(len(self.scale), otherwise)
-        simulated = np.concatenate([run[i] for run in self.simulated])
-        return metric(np.concatenate(self.measured), simulated, self.scale)
+        return metric(np.concatenate(self.measured), np.concatenate(self.simulated), self.scale)
 
 
-@dataclass(frozen=True)
-class _Criteria:
-    """aic, bic: (n_candidates,), infinite for a free run that failed; n rows are worth so many."""
+def _criteria(
+    trained: Sequence[_FreeRuns], n_effective: Sequence[int]
+) -> tuple[FloatArray, FloatArray, int, float]:
+    """AIC and BIC, the rows behind them and how many independent ones these are worth.
 
-    aic: FloatArray
-    bic: FloatArray
-    n: int
-    n_independent: float
-
-
-def _criteria(errors: _Errors, n_effective: Sequence[int]) -> _Criteria:
-    log_det = np.full(len(n_effective), np.inf)
+    The criteria are (n_candidates,), infinite for a free run that failed.
+    """
+    log_det = np.full(len(trained), np.inf)
     residuals: list[list[FloatArray]] = []
-    for i, finite in enumerate(errors.finite):
-        # Rows in which every output was measured.
-        own = [e[np.isfinite(e).all(axis=1)] for e in errors.residuals(i)] if finite else []
-        residuals.append([part for part in own if len(part)])
+    for i, runs in enumerate(trained):
+        # Rows in which all outputs were measured.
+        parts = [e[np.isfinite(e).all(axis=1)] for e in runs.residuals] if runs.finite else []
+        residuals.append([part for part in parts if len(part)])
         if residuals[i]:
-            every = np.concatenate(residuals[i])
-            log_det[i] = np.linalg.slogdet(every.T @ every / len(every))[1]
+            joined = np.concatenate(residuals[i])
+            log_det[i] = np.linalg.slogdet(joined.T @ joined / len(joined))[1]
     if not any(residuals):
-        return _Criteria(log_det, log_det, 0, 0.0)
+        return log_det, log_det, 0, 0.0
     best = int(np.argmin(log_det))
     n, worth = sum(map(len, residuals[best])), independent_samples(residuals[best])
     k = np.asarray(n_effective, dtype=np.float64)
-    return _Criteria(worth * log_det + 2.0 * k, worth * log_det + np.log(worth) * k, n, worth)
+    return worth * log_det + 2.0 * k, worth * log_det + np.log(worth) * k, n, worth
 
 
-def _ratios(errors: _Errors, best: int, importance: FloatArray) -> list[Ratio | None]:
+def _ratios(tested: Sequence[_FreeRuns], best: int, importance: FloatArray) -> list[Ratio | None]:
     """Squared errors of each structure in parts of the best one's."""
-    if not errors.finite[best]:
-        return [None] * len(errors.finite)
-    unit = np.maximum(errors.rmse(best) ** 2, np.finfo(float).tiny)
-    counts = np.isfinite(np.concatenate(errors.measured)).sum(axis=0)
-    rows = sum(map(len, errors.measured))
+    reference = tested[best]
+    if not reference.finite:
+        return [None] * len(tested)
+    unit = np.maximum(reference.rmse**2, np.finfo(float).tiny)
+    counts = np.isfinite(np.concatenate(reference.measured)).sum(axis=0)
+    rows = sum(map(len, reference.measured))
     # An output that was not measured everywhere counts by its mean all the same.
-    share = np.where(errors.seen, importance * rows / np.maximum(counts, 1) / unit, 0.0)
-    share /= importance[errors.seen].sum()
+    share = np.where(reference.seen, importance * rows / np.maximum(counts, 1) / unit, 0.0)
+    share /= importance[reference.seen].sum()
 
-    def losses(i: int) -> list[FloatArray]:
-        return [np.where(np.isfinite(e), e, 0.0) ** 2 @ share for e in errors.residuals(i)]
+    def losses(runs: _FreeRuns) -> list[FloatArray]:
+        return [np.where(np.isfinite(e), e, 0.0) ** 2 @ share for e in runs.residuals]
 
-    reference = losses(best)
+    baseline = losses(reference)
     return [
-        ratio_of_means(losses(i), reference) if finite and i != best else None
-        for i, finite in enumerate(errors.finite)
+        ratio_of_means(losses(runs), baseline) if runs.finite and runs is not reference else None
+        for runs in tested
     ]
 
 
-def _above_lowest(values: FloatArray) -> FloatArray:
+def _above_lowest(values: FloatArray) -> list[float]:
     """Differences from the lowest; NaN when all are infinite."""
     with np.errstate(invalid="ignore"):
-        above: FloatArray = values - values.min()
-    return above
+        return [float(value) for value in values - values.min()]
 
 
-def _verdict(best: bool, score: float, ratio: Ratio | None, dbic: float) -> Verdict:
+def _standing(best: bool, score: float, ratio: Ratio | None, dbic: float) -> Standing:
     if np.isposinf(score):
         return "failed"
     if best:
         return "best"
     good = ratio.low <= 1.0 + _MARGIN if ratio is not None else dbic <= _BIC_MARGIN
     return "as good" if good else "worse"
-
-
-def _rank(estimator: GASSI, training: Sequence[Dataset]) -> int:
-    """Directions of the parameters that the data determine; all where that is not known."""
-    try:
-        return estimator.uncertainty(training).rank
-    except ModelError:
-        return len(estimator.space_.names)
 
 
 def _against_validation(row: Row, best: str) -> str:
@@ -396,8 +404,7 @@ def _against_validation(row: Row, best: str) -> str:
 def _against_training(row: Row) -> str:
     if row.verdict == "failed":
         return f"{row.name} failed: its free run grows out of bounds."
-    meaning = "as good" if row.verdict == "as good" else "worse"
-    return f"{row.name} is {row.dbic:.3g} above it: {meaning}."
+    return f"{row.name} is {row.dbic:.3g} above it: {row.verdict}."
 
 
 def _times(ratio: float) -> str:

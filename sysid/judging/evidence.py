@@ -22,10 +22,10 @@ class Ratio:
     p_value: float
 
 
-def ratio_of_means(losses: Sequence[FloatArray], others: Sequence[FloatArray]) -> Ratio:
-    """Mean of losses in parts of the mean of others, over the same samples in time.
+def ratio_of_means(losses: Sequence[FloatArray], references: Sequence[FloatArray]) -> Ratio:
+    """Mean of losses in parts of the mean of reference losses, over the same samples in time.
 
-    losses, others: not negative, of each record by itself, (n_rows,). Diebold & Mariano
+    losses, references: not negative, of each record by itself, (n_rows,). Diebold & Mariano
     ("Comparing predictive accuracy", J. Business & Economic Statistics 13, 1995), who look at the
     mean difference of the losses, on a logarithmic scale: the interval of a ratio stays positive,
     and a much larger loss is not hidden by its own spread. The standard error allows for
@@ -36,7 +36,7 @@ def ratio_of_means(losses: Sequence[FloatArray], others: Sequence[FloatArray]) -
     """
     from scipy.stats import t as student
 
-    tops, bottoms = np.concatenate(losses), np.concatenate(others)
+    tops, bottoms = np.concatenate(losses), np.concatenate(references)
     top, bottom = float(tops.mean()), float(bottoms.mean())
     if top == bottom == 0.0 or np.array_equal(tops, bottoms):
         return Ratio(1.0, 1.0, 1.0, 1.0)
@@ -44,7 +44,7 @@ def ratio_of_means(losses: Sequence[FloatArray], others: Sequence[FloatArray]) -
         ratio = 0.0 if top == 0.0 else np.inf
         return Ratio(ratio, ratio, ratio, 0.0)
     error, freedom = _standard_error(
-        [a / top - b / bottom for a, b in zip(losses, others, strict=True)]
+        [a / top - b / bottom for a, b in zip(losses, references, strict=True)]
     )
     log = float(np.log(top / bottom))
     half = float(student.ppf(0.5 + _LEVEL / 2.0, freedom)) * error
@@ -54,7 +54,7 @@ def ratio_of_means(losses: Sequence[FloatArray], others: Sequence[FloatArray]) -
 
 
 def _standard_error(series: Sequence[FloatArray]) -> tuple[float, float]:
-    """Of the mean of series around zero, correlated in time; and its degrees of freedom."""
+    """Standard error of the mean of correlated series around zero, and its degrees of freedom."""
     n = sum(map(len, series))
     variance = _covariance(series, 0, n)
     if variance == 0.0:
@@ -75,9 +75,9 @@ def independent_samples(residuals: Sequence[FloatArray]) -> float:
     coloured Gaussian noise (Bartlett, "An introduction to stochastic processes", 1955). The sum
     ends where the correlations cannot be told from those of noise.
     """
-    n, q = sum(map(len, residuals)), residuals[0].shape[1]
-    every = np.concatenate(residuals)
-    values, vectors = np.linalg.eigh(every.T @ every / n)
+    n = sum(map(len, residuals))
+    joined = np.concatenate(residuals)
+    values, vectors = np.linalg.eigh(joined.T @ joined / n)
     kept = values > 1e-12 * values.max(initial=0.0)
     if not kept.any():
         return float(n)

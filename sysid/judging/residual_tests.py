@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from sysid.arrays import BoolArray, FloatArray, IntArray
+from sysid.uncertainty.estimate import Z95
 
-_Z95 = 1.959963984540054
 _LEAST_VARIANCE = 0.05  # of a correlation, in parts of 1/n: estimated ones can turn out negative
 
 
@@ -59,26 +59,26 @@ def residual_test(
 ) -> ResidualTest:
     """Correlations of measured minus simulated, (n, n_outputs), NaN where a sample was lost.
 
-    inputs: (n, n_inputs); input_noise: (n_inputs,), standard deviation of what noise they were
+    inputs: (n, n_inputs); input_noise: (n_inputs,), standard deviation of the noise that they were
     measured with. n_lags: at most a quarter of the record is used.
     """
     n_lags = max(2, min(n_lags, len(residual) // 4))
     seen = np.isfinite(residual)
     e, u = _standard(residual), _standard(inputs)
     counted = np.maximum(seen.sum(axis=0), 1)
-    own = np.stack([np.diagonal(_products(e, e, k)) for k in range(n_lags)]) / counted
+    auto = np.stack([np.diagonal(_products(e, e, k)) for k in range(n_lags)]) / counted
     driving = np.stack([np.diagonal(_products(u, u, k)) for k in range(n_lags)]) / len(u)
     cross = np.stack([_products(e, u, k) for k in range(n_lags)]) / counted[:, None]
     # Both being coloured widens the band: sum over k of R_e(k) R_u(k) / n is the variance.
-    both = 1.0 + 2.0 * np.einsum("ko,ki->oi", own[1:], driving[1:])
-    variance = np.maximum(both, _LEAST_VARIANCE) / counted[:, None]
+    widening = 1.0 + 2.0 * np.einsum("ko,ki->oi", auto[1:], driving[1:])
+    variance = np.maximum(widening, _LEAST_VARIANCE) / counted[:, None]
     noisy = np.zeros(inputs.shape[1]) if input_noise is None else np.asarray(input_noise)
     return ResidualTest(
         lags=np.arange(n_lags),
-        auto=own,
-        auto_band=_Z95 / np.sqrt(counted),
+        auto=auto,
+        auto_band=Z95 / np.sqrt(counted),
         cross=cross,
-        cross_band=_Z95 * np.sqrt(variance),
+        cross_band=Z95 * np.sqrt(variance),
         tested=(noisy == 0.0) & np.any(u != 0.0, axis=0),
     )
 

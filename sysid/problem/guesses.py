@@ -96,7 +96,7 @@ def guess_ranges(
     ...     peak = max(abs(record["y"]).max() for record in records)
     ...     return {"gain": Guess(peak, None, "largest output under 1 V")}
     >>> guess_ranges(replace(lag(), guesses=guesses), [lag_record()])
-    {'gain': Guess(low=2.62, high=20.0, source='largest output under 1 V')}
+    {'gain': Guess(low=2.83, high=20.0, source='largest output under 1 V')}
     """
     if model.guesses is None:
         raise ModelError(

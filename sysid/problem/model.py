@@ -316,19 +316,19 @@ class ProcessModel:
         """The state with another start."""
         where = f"state {state.name} of model {self.name}"
         measured = state.name in self.output_names
+        if start == "first" and not measured:
+            raise ModelError(
+                f"{where} is no output, so no sample tells its start; give a value, 'estimate' or "
+                "[low, high]"
+            )
+        if start == "estimate" and not (measured or state.initial_range):
+            raise ModelError(
+                f"{where} is no output and has no range of its own to estimate its start in; give "
+                "one as [low, high]"
+            )
         if start == "first":
-            if not measured:
-                raise ModelError(
-                    f"{where} is no output, so no sample tells its start; give a value, "
-                    "'estimate' or [low, high]"
-                )
             return replace(state, initial_range=None, first_sample=True)
         if start == "estimate":
-            if state.initial_range is None and not measured:
-                raise ModelError(
-                    f"{where} is no output and has no range of its own to estimate its start in; "
-                    "give one as [low, high]"
-                )
             return replace(state, initial_range=state.initial_range or AROUND_FIRST_SAMPLE)
         if isinstance(start, tuple):
             return replace(state, initial_range=start)

@@ -315,14 +315,10 @@ def _constant(values: Sequence[float] | FloatArray) -> FloatArray:
     return array
 
 
-def _check_conflicts(
-    ranges: Mapping[str, Range],
-    fixed: Mapping[str, float],
-    tied: Mapping[str, str],
-    scale: Mapping[str, Scale],
-) -> None:
-    """Raise ModelError for a parameter with two contradicting settings."""
-    pairs: tuple[tuple[Mapping[str, object], Mapping[str, object], str], ...] = (
+def _check_conflicts(*settings: Mapping[str, object]) -> None:
+    """Raise ModelError for a parameter whose range, fixed value, tie and scale contradict."""
+    ranges, fixed, tied, scale = settings
+    pairs = (
         (ranges, fixed, "both a range and a fixed value"),
         (ranges, tied, "a range but is tied to another"),
         (fixed, tied, "a fixed value but is tied to another"),

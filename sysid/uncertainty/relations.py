@@ -107,7 +107,7 @@ def overlapping(supports: list[BoolArray]) -> list[list[int]]:
 
 
 class _Follower:
-    """Follows directions far enough to see what they are."""
+    """Follows directions by simulations, to see whether they leave the outputs alone."""
 
     def __init__(self, sensitivity: Sensitivity) -> None:
         self.sensitivity = sensitivity
@@ -131,10 +131,11 @@ class _Follower:
         return None
 
     def _candidates(self, vector: FloatArray, members: list[int]) -> Iterator[FloatArray]:
-        """What of a direction could be exact among these members.
+        """Directions of these parameters alone that may be the exact one near ``vector``.
 
-        Slopes at kinks are taken with errors that mix what does nothing with what does little: so
-        the direction is sought anew without the others, and with whole numbers for what is near.
+        Slopes at kinks have errors that mix what does nothing with what does little: so the
+        direction is sought anew without the other parameters, and with whole numbers for what is
+        near them.
         """
         best = np.zeros_like(vector)
         rows = self.sensitivity.rows[:, members]
@@ -149,7 +150,7 @@ class _Follower:
                     yield snapped / np.max(np.abs(snapped))
 
     def rounded(self, vector: FloatArray) -> Iterator[FloatArray]:
-        """Small whole powers, or multiples, of the parameters that a direction comes near."""
+        """Directions of small whole powers, or multiples, of the parameters near ``vector``."""
         taking = np.abs(vector) > _FIRMLY * np.max(np.abs(vector))
         for unit in self.units:
             usable = taking & (unit != 0.0)
@@ -213,13 +214,13 @@ def _whole(ratios: FloatArray) -> FloatArray | None:
 
 
 def named(vector: FloatArray) -> IntArray:
-    """Parameters that a vague direction is about: those of no small share in it."""
+    """Parameters that a vague direction is named after: those with a large share in it."""
     size = np.abs(vector)
     return np.flatnonzero(size > _SHARE * size.max())
 
 
 def _simplest(vector: FloatArray, exact: list[Relation]) -> FloatArray:
-    """A direction about as few parameters as moves along exact ones, which do nothing, allow."""
+    """A direction of the fewest parameters that adding exact ones, which do nothing, allows."""
     for relation in exact:
         ways = [vector]
         for j in np.flatnonzero(relation.support):

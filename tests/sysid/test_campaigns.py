@@ -230,7 +230,7 @@ def test_the_cores_are_shared_among_the_runs(monkeypatch):
         return original(self, *args, **kwargs)
 
     monkeypatch.setattr(GASSI, "fit", fit)
-    monkeypatch.setattr(sysid.campaigns, "available_cores", lambda: 8)
+    monkeypatch.setattr(sysid.campaigns.campaign, "available_cores", lambda: 8)
     todo = runs(seeds=(0,))
     with joblib.parallel_config(backend="threading"):
         campaign(todo, n_jobs=3)
