@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 
-from daq.findings import Axis, Chart, Findings, Number, Series, Table
+from daq.findings import Chart, Findings, Number, Series, Table
 from daq.hal import FloatArray
 from protocols.analysis.bouc_wen_loop import Cycles, fit, motion
-from protocols.analysis.results import table_of_rows
+from protocols.analysis.results import ANGLE, TORQUE, VELOCITY, model_line, table_of_rows
 
 _LITTLE = 0.8  # of the torque's variance explained, below which a loop is no brake's
 _UNLIKE = 1.6  # times a rated value, or a part of it, beyond which something is mixed up
@@ -42,26 +43,22 @@ class LoopFindings:
 
     def findings(self) -> Findings:
         """Parameters, a row for each level, loops over angle and velocity, ranges."""
-        return Findings(
-            self._numbers(), (self._table(),), self._charts(), self._ranges(), self._remarks()
-        )
+        tables, remarks = (self._table(),), tuple(self._remarks())
+        return Findings(self._numbers(), tables, self._charts(), self._ranges(), remarks)
 
     def _numbers(self) -> tuple[Number, ...]:
-        rate, part, kappa0, kappa1 = (
-            getattr(self._fit, name) for name in ("rate", "part", "kappa0", "kappa1")
-        )
-        numbers = [
-            rate.number("rate", "1/rad", "beta + gamma: how fast it turns over"),
-            part.number("part", "1", "gamma / (beta + gamma): shape at the reversal"),
-        ]
-        if kappa0 is not None:
-            meaning = "hysteretic torque at zero current, alpha0 A / (beta + gamma)"
-            numbers += [
-                kappa0.number("kappa0", "N*m", meaning),
-                kappa1.number("kappa1", "N*m/A", "the same per ampere of brake current"),
-            ]
+        loop, numbers = self._fit, []
+        at_zero = "hysteretic torque at zero current"
+        for name, estimate, unit, meaning in (
+            ("rate", loop.rate, "1/rad", "beta + gamma: how fast it turns over"),
+            ("part", loop.part, "1", "gamma / (beta + gamma): shape at the reversal"),
+            ("kappa0", loop.kappa0, "N*m", f"{at_zero}, alpha0 A / (beta + gamma)"),
+            ("kappa1", loop.kappa1, "N*m/A", "the same per ampere of brake current"),
+        ):
+            if estimate is not None:
+                numbers.append(estimate.number(name, unit, meaning))
         meaning = "way from a reversal to zero hysteretic torque"
-        return (*numbers, Number("intercept", self._fit.intercept, "rad", meaning=meaning))
+        return (*numbers, Number("intercept", loop.intercept, "rad", meaning=meaning))
 
     def _table(self) -> Table:
         rows = []
@@ -78,19 +75,17 @@ class LoopFindings:
 
     def _charts(self) -> tuple[Chart, Chart]:
         """Measured means over angle and velocity, and the fitted loops over the angle."""
-        over_angle, over_speed = [], []
-        # The fitted loops are one line with gaps between them.
-        angles, torques = [], []
-        for level, mean, fitted in zip(self._levels, self._motions, self._fit.torque, strict=True):
-            label, torque = f"{level.brake_command:g} V", _closed(level.torque.mean(axis=0))
-            over_angle.append(Series(label, _closed(mean.angle), torque))
-            over_speed.append(Series(label, _closed(mean.speed), torque))
-            angles += [*_closed(mean.angle), math.nan]
-            torques += [*_closed(fitted), math.nan]
-        over_angle.append(Series("fitted", np.array(angles), np.array(torques), style="model"))
+        over_angle, over_speed, fitted = [], [], []
+        for level, mean, torque in zip(self._levels, self._motions, self._fit.torque, strict=True):
+            label, measured = f"{level.brake_command:g} V", _closed(level.torque.mean(axis=0))
+            over_angle.append(Series(label, _closed(mean.angle), measured))
+            over_speed.append(Series(label, _closed(mean.speed), measured))
+            fitted.append((_closed(mean.angle), _closed(torque)))
+        over_angle.append(model_line("fitted", fitted))
+        title = "Torque over the {} at each brake command, mean of cycles"
         return (
-            _chart("torque_angle", "angle", "rad", over_angle),
-            _chart("torque_velocity", "velocity", "rad/s", over_speed),
+            Chart("torque_angle", title.format("angle"), ANGLE, TORQUE, tuple(over_angle)),
+            Chart("torque_velocity", title.format("velocity"), VELOCITY, TORQUE, tuple(over_speed)),
         )
 
     def _ranges(self) -> dict[str, tuple[float, float]]:
@@ -103,44 +98,36 @@ class LoopFindings:
             guesses |= {"alpha0": self._fit.kappa0.value, "alpha1": self._fit.kappa1.value}
         return {name: (x / _GUESS, x * _GUESS) for name, x in guesses.items() if x > 0.0}
 
-    def _remarks(self) -> tuple[str, ...]:
-        fitted, rated = self._fit, self._brake_constant
-        remarks = [
-            f"The Bouc-Wen loop explains {100.0 * fitted.explained:.1f} % of the torque's "
-            "variance. Intervals are by the scatter between cycles alone."
-        ]
-        if fitted.explained < _LITTLE:
+    def _remarks(self) -> Iterator[str]:
+        loop, rated = self._fit, self._brake_constant
+        yield (
+            f"The Bouc-Wen loop explains {100.0 * loop.explained:.1f} % of the torque's variance. "
+            "Intervals are by the scatter between cycles alone."
+        )
+        if loop.explained < _LITTLE:
             elsewhere = "load" if self._torque_sensor == "between" else "between"
-            remarks.append(
+            yield (
                 "That is too little for ranges. Is the torque sensor where 'torque_sensor' says? "
                 f"Else write 'torque_sensor: {elsewhere}'. With the brake off little else than "
                 "noise may be left."
             )
-        if rated and fitted.kappa1 and not rated / _UNLIKE < fitted.kappa1.value < _UNLIKE * rated:
-            remarks.append(
-                f"kappa1 is {fitted.kappa1.value:.3g} N*m/A where ratings.brake_constant says "
+        if rated and loop.kappa1 and not rated / _UNLIKE < loop.kappa1.value < _UNLIKE * rated:
+            yield (
+                f"kappa1 is {loop.kappa1.value:.3g} N*m/A where ratings.brake_constant says "
                 f"{rated:g}: look at 'torque_sensor', ratings.torque_constant and the scales in "
                 "the rig's file."
             )
         if self._n_missing:
-            remarks.append(
-                f"{self._n_missing} brake command(s) without two whole cycles are left out."
-            )
-        if fitted.kappa0 is None:
-            remarks.append("With a second brake command alpha0 and alpha1 could be told apart.")
+            yield f"{self._n_missing} brake command(s) without two whole cycles are left out."
+        if loop.kappa0 is None:
+            yield "With a second brake command alpha0 and alpha1 could be told apart."
         swing = min(float(np.ptp(mean.angle)) for mean in self._motions)
-        if swing < 4.0 * fitted.intercept:
-            remarks.append(
+        if swing < 4.0 * loop.intercept:
+            yield (
                 f"The shaft swung by {swing:.2g} rad only, less than four times the intercept of "
-                f"{fitted.intercept:.2g} rad: the loops do not saturate. Raise the amplitude or "
-                "the period."
+                f"{loop.intercept:.2g} rad: the loops do not saturate. Raise the amplitude or the "
+                "period."
             )
-        return tuple(remarks)
-
-
-def _chart(name: str, label: str, unit: str, series: list[Series]) -> Chart:
-    title = f"Torque over the {label} at each brake command, mean of cycles"
-    return Chart(name, title, Axis(label, unit), Axis("torque", "N*m"), tuple(series))
 
 
 def _closed(values: FloatArray) -> FloatArray:

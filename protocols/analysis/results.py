@@ -1,13 +1,18 @@
-"""Estimates with their intervals, and tables row by row."""
+"""What findings are made of: estimates with their intervals, axes, model lines, tables by rows."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from daq.findings import Number, Table
+from daq.findings import Axis, Number, Series, Table
+from daq.hal import FloatArray
+
+TIME, ANGLE = Axis("time", "s"), Axis("angle", "rad")
+VELOCITY, TORQUE = Axis("velocity", "rad/s"), Axis("torque", "N*m")
 
 
 @dataclass(frozen=True)
@@ -38,6 +43,15 @@ def student(freedom: int) -> float:
     from scipy.stats import t
 
     return float(t.ppf(0.975, freedom))
+
+
+def model_line(label: str, parts: Sequence[tuple[FloatArray, FloatArray]]) -> Series:
+    """One line through the points of each part, (n,) x and y, with gaps between the parts."""
+    x, y = (
+        np.concatenate([np.append(values, math.nan) for values in ends])
+        for ends in zip(*parts, strict=True)
+    )
+    return Series(label, x, y, style="model")
 
 
 def table_of_rows(

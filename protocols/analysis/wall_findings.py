@@ -43,54 +43,49 @@ def visited(
     return visits
 
 
+@dataclass(frozen=True)
 class WallFindings:
     """Which walls are stable; visits: at least one."""
 
-    def __init__(self, settings: WallSettings, theory: WallTheory, visits: list[Visit]) -> None:
-        self._settings, self._theory, self._visits = settings, theory, visits
-        self._limit = settings.ringing.amplitude
+    settings: WallSettings
+    theory: WallTheory
+    visits: list[Visit]
 
     def findings(self) -> Findings:
         """The stiffest walls, tables of them and of all, and a map for each brake command."""
-        maps = tuple(
-            self._map(number, brake)
-            for number, brake in enumerate(self._settings.brake_commands, start=1)
-        )
+        brakes = list(enumerate(self.settings.brake_commands, start=1))
+        numbers = tuple(self._number(place, brake) for place, brake in brakes)
+        maps = tuple(self._map(place, brake) for place, brake in brakes)
         tables = self._boundary_table(), self._wall_table()
-        return Findings(self._numbers(), tables, maps, {}, self._remarks())
+        return Findings(numbers, tables, maps, {}, self._remarks())
 
     def _is_stable(self, visit: Visit) -> bool:
-        return visit.amplitude <= self._limit and visit.contact > _IN_CONTACT
+        return visit.amplitude <= self.settings.ringing.amplitude and visit.contact > _IN_CONTACT
 
     def _stiffest(self, brake: float, damping: float) -> float:
         """The stiffest wall below the first that rang [N*m/rad]; 0 where the softest rang."""
         stiffest = 0.0
-        for visit in self._visits:
+        for visit in self.visits:
             if (visit.cell.brake, visit.cell.damping) == (brake, damping):
                 if not self._is_stable(visit):
                     break
                 stiffest = visit.cell.stiffness
         return stiffest
 
-    def _numbers(self) -> tuple[Number, ...]:
-        return tuple(
-            Number(
-                _numbered("stiffest", number),
-                max(self._stiffest(brake, damping) for damping in self._settings.dampings),
-                "N*m/rad",
-                meaning=f"stiffest wall that was stable, brake at {brake:g} V",
-            )
-            for number, brake in enumerate(self._settings.brake_commands, start=1)
-        )
+    def _number(self, place: int, brake: float) -> Number:
+        """The stiffest wall of all dampings."""
+        stiffest = max(self._stiffest(brake, damping) for damping in self.settings.dampings)
+        meaning = f"stiffest wall that was stable, brake at {brake:g} V"
+        return Number(_numbered("stiffest", place), stiffest, "N*m/rad", meaning=meaning)
 
     def _boundary_table(self) -> Table:
         """By brake command and damping: the stiffest stable wall, and what theory says."""
         rows = []
-        for brake in self._settings.brake_commands:
-            held, free = (self._theory.loop(brake, hand) for hand in (True, False))
-            for damping in self._settings.dampings:
+        for brake in self.settings.brake_commands:
+            held, free = (self.theory.loop(brake, hand) for hand in (True, False))
+            for damping in self.settings.dampings:
                 stable = (held.critical_stiffness(damping), free.critical_stiffness(damping))
-                passive = max(self._theory.passive_stiffness(brake, damping), 0.0)
+                passive = max(self.theory.passive_stiffness(brake, damping), 0.0)
                 rows.append((brake, damping, self._stiffest(brake, damping), *stable, passive))
         heading = (
             "brake_command [V], damping [N*m*s/rad], stiffest [N*m/rad], theory_held [N*m/rad], "
@@ -102,40 +97,40 @@ class WallFindings:
         """Every wall that was visited."""
         rows = [
             (v.cell.brake, v.cell.stiffness, v.cell.damping, v.amplitude, float(self._is_stable(v)))
-            for v in self._visits
+            for v in self.visits
         ]
         heading = (
             "brake_command [V], stiffness [N*m/rad], damping [N*m*s/rad], amplitude [rad], stable"
         )
         return table_of_rows("walls", "Walls", heading, rows, printed=False)
 
-    def _map(self, number: int, brake: float) -> Heatmap:
+    def _map(self, place: int, brake: float) -> Heatmap:
         """Oscillation over damping and stiffness, with the bounds of theory."""
-        stiffnesses, dampings = self._settings.stiffnesses, self._settings.dampings
+        stiffnesses, dampings = self.settings.stiffnesses, self.settings.dampings
         values = np.full((len(stiffnesses), len(dampings)), math.nan)
-        for visit in self._visits:
+        for visit in self.visits:
             if visit.cell.brake == brake:
                 row = stiffnesses.index(visit.cell.stiffness)
-                shown = min(visit.amplitude, 2.0 * self._limit)
+                shown = min(visit.amplitude, 2.0 * self.settings.ringing.amplitude)
                 values[row, dampings.index(visit.cell.damping)] = 1e3 * shown
         return Heatmap(
-            _numbered("z_width", number),
+            _numbered("z_width", place),
             f"Oscillation of the wall, brake at {brake:g} V; it rings above "
-            f"{1e3 * self._limit:.3g} mrad",
+            f"{1e3 * self.settings.ringing.amplitude:.3g} mrad",
             Axis("damping", "N*m*s/rad"),
             Axis("stiffness", "N*m/rad"),
             Axis("amplitude", "mrad"),
             np.array(dampings),
             np.array(stiffnesses),
             values,
-            self._theory.bounds(brake, dampings, stiffnesses[-1]),
+            self.theory.bounds(brake, dampings, stiffnesses[-1]),
         )
 
     def _remarks(self) -> tuple[str, ...]:
-        left = sum(math.isinf(visit.amplitude) for visit in self._visits)
-        skipped = len(self._settings.cells) - len(self._visits)
-        loose = sum(visit.contact <= _IN_CONTACT for visit in self._visits)
-        speed = self._settings.ringing.speed
+        left = sum(math.isinf(visit.amplitude) for visit in self.visits)
+        skipped = len(self.settings.cells) - len(self.visits)
+        loose = sum(visit.contact <= _IN_CONTACT for visit in self.visits)
+        speed = self.settings.ringing.speed
         remarks = (
             (left, f"Walls left at once, at {speed:g} rad/s"),
             (skipped, "Walls not visited, stiffer than one that rang at the same damping"),
@@ -144,6 +139,6 @@ class WallFindings:
         return tuple(f"{walls}: {count}." for count, walls in remarks if count)
 
 
-def _numbered(name: str, number: int) -> str:
-    """The name of the first, and with its number of each further brake command."""
-    return name if number == 1 else f"{name}_{number}"
+def _numbered(name: str, place: int) -> str:
+    """The name of the first, and with its place of each further brake command."""
+    return name if place == 1 else f"{name}_{place}"

@@ -195,6 +195,7 @@ def test_the_plan_is_what_is_asked_of_the_shaft():
     ("changes", "message"),
     [
         ({"period": 0.3333}, "period: 0.3333 s is 266.64 samples"),
+        ({"period": 600, "cycles": 1000}, "cycles: 1.2e+06 s at 800 Hz makes 960001520 samples"),
         ({"ratings": {"torque_constant": None}}, "ratings.torque_constant: with the torque sensor"),
         ({"brake_commands": [0.3]}, "brake_commands: at 0.3 V the brake takes about 7.6 V"),
     ],
