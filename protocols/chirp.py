@@ -10,7 +10,7 @@ from pydantic import Field
 
 from daq.config.units import Hertz, Seconds
 from daq.hal import FloatArray
-from protocols.excitation import Excitation, ExcitedChannel
+from protocols.waveforms.excitation import Excitation, ExcitedChannel
 
 
 class ChirpChannel(ExcitedChannel):
@@ -34,8 +34,7 @@ class Chirp(Excitation[ChirpChannel]):
 
     def deviation(self, name: str, channel: ChirpChannel, time: FloatArray) -> FloatArray:
         """The swept sine, (n,) [V]."""
-        start = self.frequency_of(f"{name}.start_frequency", channel.start_frequency)
-        end = self.frequency_of(f"{name}.end_frequency", channel.end_frequency)
+        start, end = self._band(name, channel)
         duration = self.excited_samples() / self.sample_rate
         swept = _linear if self.sweep == "linear" else _logarithmic
         inside = np.clip(time, 0.0, duration)
@@ -43,19 +42,20 @@ class Chirp(Excitation[ChirpChannel]):
         turns += start * np.minimum(time, 0.0) + end * np.maximum(time - duration, 0.0)
         return channel.amplitude * np.sin(2.0 * np.pi * turns)
 
-    def remarks(self) -> tuple[str, ...]:
-        """How fast each channel sweeps."""
-        lines = []
-        for name, channel in (("motor", self.motor), ("brake", self.brake)):
-            start, end = channel.start_frequency, channel.end_frequency
-            if channel.amplitude > 0.0 and start and end:
-                speed = (
-                    f"{(end - start) / self.duration:.3g} Hz/s"
-                    if self.sweep == "linear"
-                    else f"{math.log2(end / start) / self.duration:.3g} octaves/s"
-                )
-                lines.append(f"{name}: from {start:g} to {end:g} Hz at {speed}")
-        return tuple(lines)
+    def remark(self, name: str, channel: ChirpChannel) -> str:
+        """How fast the channel sweeps."""
+        start, end = self._band(name, channel)
+        if self.sweep == "linear":
+            speed = f"{(end - start) / self.duration:.3g} Hz/s"
+        else:
+            speed = f"{math.log2(end / start) / self.duration:.3g} octaves/s"
+        return f"{name}: from {start:g} to {end:g} Hz at {speed}"
+
+    def _band(self, name: str, channel: ChirpChannel) -> tuple[float, float]:
+        return (
+            self.frequency_of(f"{name}.start_frequency", channel.start_frequency),
+            self.frequency_of(f"{name}.end_frequency", channel.end_frequency),
+        )
 
 
 def _linear(start: float, end: float, duration: float, time: FloatArray) -> FloatArray:
@@ -65,11 +65,6 @@ def _linear(start: float, end: float, duration: float, time: FloatArray) -> Floa
 
 def _logarithmic(start: float, end: float, duration: float, time: FloatArray) -> FloatArray:
     """Turns of a sine whose frequency is multiplied by so much each second, (n,)."""
-    rate = math.log(end / start) / duration
+    x = math.log(end / start) / duration * time
     # expm1(x) / x is 1 where the frequency stays as it is.
-    return start * time * _relative_growth(rate * time)
-
-
-def _relative_growth(x: FloatArray) -> FloatArray:
-    """(exp(x) - 1) / x, (n,)."""
-    return np.divide(np.expm1(x), x, out=np.ones_like(x), where=x != 0.0)
+    return start * time * np.divide(np.expm1(x), x, out=np.ones_like(x), where=x != 0.0)

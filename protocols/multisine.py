@@ -15,8 +15,9 @@ import numpy as np
 from pydantic import Field
 
 from daq.config.units import Hertz, Seconds
-from daq.hal import CHANNELS, FloatArray, IntArray
-from protocols.excitation import Excitation, ExcitedChannel, whole_samples
+from daq.hal import FloatArray, IntArray
+from protocols.waveforms.excitation import Excitation, ExcitedChannel
+from protocols.waveforms.samples import whole_samples
 
 _GROUP = 4  # odd harmonics of which the odd-random grid leaves one out
 
@@ -33,16 +34,16 @@ class MultisineChannel(ExcitedChannel):
     seed: int = Field(1, ge=0, le=2**32 - 1, description="of its phases and left-out harmonics")
 
 
-class Drawn(NamedTuple):
+class Draw(NamedTuple):
     """What chance decided for one channel.
 
     harmonics: (m,), numbers of the lines. phases: (m,) [rad], of cosines at the period's start.
-    draw: which of the draws it was, from 0.
+    number: which of the draws it was, from 0.
     """
 
     harmonics: IntArray
     phases: FloatArray
-    draw: int
+    number: int
 
 
 class Multisine(Excitation[MultisineChannel]):
@@ -77,53 +78,50 @@ class Multisine(Excitation[MultisineChannel]):
 
     def describe(self) -> dict[str, Any]:
         """The experiment as resolved, and the harmonics and phases drawn."""
-        drawn = {}
-        for name, channel in self._excited():
-            found = self._draw(name, channel)
-            drawn[name] = {
+        excitation = {}
+        for name, channel in self.excited.items():
+            draw = self._draw(name, channel)
+            excitation[name] = {
                 "seed": channel.seed,
-                "draw": found.draw,
-                "crest_factor": crest_factor(self._period(found)),
-                "harmonics": found.harmonics.tolist(),
-                "phases": found.phases.tolist(),
+                "draw": draw.number,
+                "crest_factor": crest_factor(self._period(draw)),
+                "harmonics": draw.harmonics.tolist(),
+                "phases": draw.phases.tolist(),
             }
-        return {**super().describe(), "excitation": drawn}
+        return {**super().describe(), "excitation": excitation}
 
     def remarks(self) -> tuple[str, ...]:
-        """Lines and crest factor of each channel."""
-        lines = []
-        for name, channel in self._excited():
-            found = self._draw(name, channel)
-            low, high = found.harmonics[[0, -1]] / self.period
-            best = f", the best of {self.draws} draws" if self.draws > 1 else ""
-            lines.append(
-                f"{name}: {len(found.harmonics)} lines ({channel.harmonics}) from {low:.4g} to "
-                f"{high:.4g} Hz, {1.0 / self.period:.4g} Hz between harmonics; crest factor "
-                f"{crest_factor(self._period(found)):.3f}{best}; seed {channel.seed}"
-            )
-        return (f"{self.periods} periods of {self.period:g} s", *lines)
+        """Periods of all, then lines and crest factor of each channel."""
+        return (f"{self.periods} periods of {self.period:g} s", *super().remarks())
 
-    def _excited(self) -> list[tuple[str, MultisineChannel]]:
-        channels = [(name, getattr(self, name)) for name in CHANNELS]
-        return [(name, channel) for name, channel in channels if channel.amplitude > 0.0]
+    def remark(self, name: str, channel: MultisineChannel) -> str:
+        """Lines and crest factor of the channel."""
+        draw = self._draw(name, channel)
+        low, high = draw.harmonics[[0, -1]] / self.period
+        best = f", the best of {self.draws} draws" if self.draws > 1 else ""
+        return (
+            f"{name}: {len(draw.harmonics)} lines ({channel.harmonics}) from {low:.4g} to "
+            f"{high:.4g} Hz, {1.0 / self.period:.4g} Hz between harmonics; crest factor "
+            f"{crest_factor(self._period(draw)):.3f}{best}; seed {channel.seed}"
+        )
 
-    def _period(self, drawn: Drawn) -> FloatArray:
+    def _period(self, draw: Draw) -> FloatArray:
         """One period with lines of amplitude 1, (samples_per_period,)."""
         n = self.samples_per_period
         lines = np.zeros(n // 2 + 1, dtype=np.complex128)
-        lines[drawn.harmonics] = 0.5 * n * np.exp(1j * drawn.phases)
+        lines[draw.harmonics] = 0.5 * n * np.exp(1j * draw.phases)
         period: FloatArray = np.fft.irfft(lines, n)
         return period
 
-    def _draw(self, name: str, channel: MultisineChannel) -> Drawn:
+    def _draw(self, name: str, channel: MultisineChannel) -> Draw:
         """Harmonics, and of several draws of their phases the one with the lowest crest factor."""
         rng = np.random.default_rng(channel.seed)
         harmonics = self._harmonics(name, channel, rng)
         draws = (
-            Drawn(harmonics, rng.uniform(0.0, 2.0 * np.pi, len(harmonics)), draw)
-            for draw in range(self.draws)
+            Draw(harmonics, rng.uniform(0.0, 2.0 * np.pi, len(harmonics)), number)
+            for number in range(self.draws)
         )
-        return min(draws, key=lambda drawn: crest_factor(self._period(drawn)))
+        return min(draws, key=lambda draw: crest_factor(self._period(draw)))
 
     def _harmonics(
         self, name: str, channel: MultisineChannel, rng: np.random.Generator

@@ -73,8 +73,7 @@ class Play(OpenLoop):
             for where, row in (("begins", rows.commands[0]), ("ends", rows.commands[-1]))
             if row.any()
         ]
-        told = f"plays {len(rows.time)} rows of {rows.path}"
-        return (", ".join([told, *jumps]),)
+        return (", ".join([f"plays {len(rows.time)} rows of {rows.path}", *jumps]),)
 
     def _read(self) -> _Recording:
         """The file's rows. Raises ValueError naming file, line and column of what is wrong."""

@@ -11,7 +11,7 @@ from daq.config.base import Section
 from daq.config.units import Seconds, Volts
 from daq.experiment import Timed
 from daq.hal import CHANNELS, FloatArray, IntArray
-from protocols.excitation import whole_samples
+from protocols.waveforms.samples import whole_samples
 
 REGISTER_BITS = 16
 SEQUENCE_LENGTH = 2**REGISTER_BITS - 1

@@ -7,7 +7,7 @@ from pydantic import Field
 
 from daq.config.units import Hertz, Radians, Seconds
 from daq.hal import FloatArray
-from protocols.excitation import Excitation, ExcitedChannel
+from protocols.waveforms.excitation import Excitation, ExcitedChannel
 
 
 class SineChannel(ExcitedChannel):
@@ -32,11 +32,7 @@ class Sine(Excitation[SineChannel]):
         sine: FloatArray = np.sin(2.0 * np.pi * frequency * time + channel.phase)
         return channel.amplitude * sine
 
-    def remarks(self) -> tuple[str, ...]:
-        """How many periods each channel makes."""
-        lines = []
-        for name, channel in (("motor", self.motor), ("brake", self.brake)):
-            if channel.amplitude > 0.0 and channel.frequency is not None:
-                periods = channel.frequency * self.duration
-                lines.append(f"{name}: {periods:.4g} periods of {channel.frequency:g} Hz")
-        return tuple(lines)
+    def remark(self, name: str, channel: SineChannel) -> str:
+        """How many periods the channel makes."""
+        frequency = self.frequency_of(f"{name}.frequency", channel.frequency)
+        return f"{name}: {frequency * self.duration:.4g} periods of {frequency:g} Hz"

@@ -11,10 +11,11 @@ from daq.config.base import Section
 from daq.config.units import Seconds, Volts
 from daq.experiment import OpenLoop
 from daq.hal import CHANNELS, FloatArray, IntArray
-from protocols.excitation import HeldChannel, smooth_rise, whole_samples
+from protocols.waveforms.excitation import HeldChannel
+from protocols.waveforms.samples import smooth_rise, whole_samples
 
 
-class Staircase(Section):
+class StaircaseLevels(Section):
     """Equal steps up to the top and down again."""
 
     lowest: Volts = Field(0.0, ge=-10.0, le=10.0, description="level at both ends")
@@ -32,13 +33,15 @@ class StepsChannel(HeldChannel):
     """One channel: levels around the offset, or the offset alone."""
 
     levels: list[Volts] | None = Field(None, description="levels in order, around the offset")
-    staircase: Staircase | None = Field(None, description="levels up and down, in their place")
+    staircase: StaircaseLevels | None = Field(
+        None, description="levels up and down, in their place"
+    )
     hold: Seconds | list[Seconds] | None = Field(
         None, description="time at each level, or a list with a time for every level"
     )
 
 
-class _Schedule(NamedTuple):
+class _Sequence(NamedTuple):
     """Levels (m,) [V] and how many samples each is held (m,)."""
 
     levels: FloatArray
@@ -56,19 +59,19 @@ class Steps(OpenLoop):
 
     def waveform(self) -> FloatArray:
         """Both channels' levels, (n_samples, 2) [V]; with a ramp the last change is to zero."""
-        schedules = [self._schedule(name, getattr(self, name)) for name in CHANNELS]
-        n_samples = max(int(schedule.samples.sum()) for schedule in schedules)
+        sequences = self._sequences()
+        n_samples = max(int(sequence.samples.sum()) for sequence in sequences)
         if n_samples == 0:
             raise ValueError(
                 "motor.levels: neither channel has levels; give levels or a staircase to one"
             )
         self.samples_in(n_samples / self.sample_rate, "motor.hold")
         change = round(self.ramp * self.sample_rate)
-        return np.stack([_played(s, n_samples, change) for s in schedules], axis=1)
+        return np.stack([_played(sequence, n_samples, change) for sequence in sequences], axis=1)
 
     def remarks(self) -> tuple[str, ...]:
-        """How many levels each channel visits, and which sequence is cut."""
-        totals = [int(self._schedule(n, getattr(self, n)).samples.sum()) for n in CHANNELS]
+        """Which channel's sequence is cut, and where."""
+        totals = [int(sequence.samples.sum()) for sequence in self._sequences()]
         short, long = sorted(totals)
         if not short or long % short == 0:
             return ()
@@ -78,12 +81,15 @@ class Steps(OpenLoop):
             "and is cut at the end",
         )
 
-    def _schedule(self, name: str, channel: StepsChannel) -> _Schedule:
+    def _sequences(self) -> tuple[_Sequence, _Sequence]:
+        return self._sequence("motor", self.motor), self._sequence("brake", self.brake)
+
+    def _sequence(self, name: str, channel: StepsChannel) -> _Sequence:
         if channel.levels is not None and channel.staircase is not None:
             raise ValueError(f"{name}.staircase: give levels or a staircase, not both")
         levels = channel.staircase.levels if channel.staircase else channel.levels
         if levels is None:
-            return _Schedule(np.array([channel.offset]), np.zeros(1, dtype=np.int64))
+            return _Sequence(np.array([channel.offset]), np.zeros(1, dtype=np.int64))
         if not levels:
             raise ValueError(f"{name}.levels: the list is empty; give at least one level")
         key = f"{name}.hold"
@@ -96,7 +102,7 @@ class Steps(OpenLoop):
                 "number for all"
             )
         samples = [self._held(key, seconds) for seconds in holds]
-        return _Schedule(channel.offset + np.array(levels), np.array(samples))
+        return _Sequence(channel.offset + np.array(levels), np.array(samples))
 
     def _held(self, key: str, seconds: float) -> int:
         """Samples that a level is held."""
@@ -110,12 +116,12 @@ class Steps(OpenLoop):
         return whole_samples(key, seconds, self.sample_rate)
 
 
-def _played(schedule: _Schedule, n_samples: int, change: int) -> FloatArray:
-    """A schedule again and again for n_samples, then ``change`` samples down to zero."""
+def _played(sequence: _Sequence, n_samples: int, change: int) -> FloatArray:
+    """A sequence again and again for n_samples, then ``change`` samples down to zero."""
     # A held channel has one level for the whole run.
-    lengths = schedule.samples if schedule.samples.any() else np.array([n_samples])
+    lengths = sequence.samples if sequence.samples.any() else np.array([n_samples])
     rounds = -(-n_samples // int(lengths.sum()))
-    levels, lengths = np.tile(schedule.levels, rounds), np.tile(lengths, rounds)
+    levels, lengths = np.tile(sequence.levels, rounds), np.tile(lengths, rounds)
     starts = np.cumsum(lengths) - lengths
     rise = smooth_rise(change)
     commands = np.zeros(n_samples + change)

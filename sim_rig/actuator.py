@@ -11,23 +11,11 @@ from collections.abc import Callable
 from typing import Any
 
 from sim_rig.guesses import guesses
-from sim_rig.physics import electrical, values
+from sim_rig.physics import electrical, options, values
 from sim_rig.physics.friction import friction as friction_model
 from sim_rig.physics.hysteresis import hysteresis as hysteresis_model
 from sim_rig.physics.loads import load as load_model
-from sim_rig.physics.options import (
-    BrakeDriver,
-    Design,
-    Exponent,
-    Friction,
-    Hysteresis,
-    Limits,
-    Load,
-    MotorDriver,
-    ParameterSet,
-    Sensor,
-    Smooth,
-)
+from sim_rig.physics.options import Design
 from sim_rig.physics.parameters import Layout, fixed, log_range
 from sim_rig.plots import operating_points, plots
 from sysid import Input, ModelError, Output, ProcessModel, State
@@ -66,16 +54,16 @@ _Shaft = Callable[[Any, Any, Any], tuple[Any, Any, tuple[Any, ...]]]
 
 def actuator(
     *,
-    driver_motor: MotorDriver = "closed",
-    driver_brake: BrakeDriver = "closed",
-    hysteresis: Hysteresis = "bouc-wen",
-    exponent: Exponent = 1.0,
-    smooth: Smooth = False,
-    friction: Friction = "none",
-    load: Load = "measured",
-    sensor: Sensor = "load",
-    limits: Limits = False,
-    parameters: ParameterSet = "nominal",
+    driver_motor: options.MotorDriver = "closed",
+    driver_brake: options.BrakeDriver = "closed",
+    hysteresis: options.Hysteresis = "bouc-wen",
+    exponent: options.Exponent = 1.0,
+    smooth: options.Smooth = False,
+    friction: options.Friction = "none",
+    load: options.Load = "measured",
+    sensor: options.Sensor = "load",
+    limits: options.Limits = False,
+    parameters: options.ParameterSet = "nominal",
     outputs: tuple[str, ...] = (),
 ) -> ProcessModel:
     """The actuator with the given parts, its parameters at a named set.
@@ -151,15 +139,14 @@ class _Assembly:
         )
 
     def _states(self) -> tuple[State, ...]:
-        brake = self._hysteresis
-        z = State("z", brake.z_unit, 0.0, "hysteresis variable", initial_range=brake.z_range)
+        unit, initial = self._hysteresis.z_unit, self._hysteresis.z_range
         return (
             State("voltage_motor", "V", description="amplifier output at the motor"),
             State("voltage_brake", "V", description="amplifier output at the brake coil"),
             State("current_motor", "A"),
             State("current_brake", "A"),
             State("omega", "rad/s", description="shaft speed"),
-            z,
+            State("z", unit, description="hysteresis variable", initial_range=initial),
             State("theta", "rad", description="shaft angle"),
             *self._load.states,
         )
@@ -198,8 +185,8 @@ class _Assembly:
     def _shaft(self) -> _Shaft:
         """Newton's second law for all that turns (3.22), and what the torque sensor sees of it."""
         place, locked, at_load = self._layout.slices, self._locked, self._design.sensor == "load"
-        rate, resisting = self._hysteresis.rate, self._hysteresis.torque
-        rubbing, load_torque = self._friction.torque, self._load.torque
+        rate, brake_torque = self._hysteresis.rate, self._hysteresis.torque
+        brush_torque, load_torque = self._friction.torque, self._load.torque
         load_inertia = self._load.inertia
         of_rotors, of_hysteresis = place["rotors"], place["hysteresis"]
         of_friction, of_load, of_constants = place["friction"], place["load"], place["constants"]
@@ -215,8 +202,8 @@ class _Assembly:
             from_load = load_torque(theta, omega, x[7:], u[2:], p[of_load])
             J_load = load_inertia(p[of_load])
             q = p[of_hysteresis]
-            brake = resisting(i_b, omega, z, rate(omega, z, q), q)
-            brushes = rubbing(theta, omega, p[of_friction])
+            brake = brake_torque(i_b, omega, z, rate(omega, z, q), q)
+            brushes = brush_torque(theta, omega, p[of_friction])
             motor = -n_c * K_m * i_m - n_c * n_c * B_m * omega
             rest = motor - brake - brushes
             if locked:

@@ -58,10 +58,12 @@ class Faults(Section):
     """What goes wrong between host and device; the same seed, the same faults."""
 
     late: Part = Field(
-        0.0, ge=0.0, le=1.0,
+        0.0,
+        ge=0.0,
+        le=1.0,
         description="share of closed-loop commands that take a tick more to arrive: too late "
         "where the experiment answers one tick ahead",
-    )  # fmt: skip
+    )
     lost: Part = Field(0.0, ge=0.0, lt=1.0, description="share of samples that do not arrive")
 
 

@@ -11,19 +11,8 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 from daq.config.base import Section
 from daq.config.units import Quantity, converted
 from sim_rig.actuator import actuator
+from sim_rig.physics import options
 from sim_rig.physics.electrical import MAX_CURRENT, SUPPLY
-from sim_rig.physics.options import (
-    BrakeDriver,
-    Exponent,
-    Friction,
-    Hysteresis,
-    LoadKind,
-    MotorDriver,
-    ParameterSet,
-    PlantLoad,
-    Sensor,
-    Smooth,
-)
 from sysid import ModelError, ProcessModel
 from sysid.arrays import FloatArray
 
@@ -43,15 +32,15 @@ _SIZES = {
 class Plant(Section):
     """The parts of the simulated actuator and what hangs on it."""
 
-    driver_motor: MotorDriver = "closed"
-    driver_brake: BrakeDriver = "closed"
-    hysteresis: Hysteresis = "bouc-wen"
-    exponent: Exponent = 1.0
-    smooth: Smooth = False
-    friction: Friction = "none"
-    load: PlantLoad = "pulley"
-    sensor: Sensor = "load"
-    parameter_set: ParameterSet = "rig"
+    driver_motor: options.MotorDriver = "closed"
+    driver_brake: options.BrakeDriver = "closed"
+    hysteresis: options.Hysteresis = "bouc-wen"
+    exponent: options.Exponent = 1.0
+    smooth: options.Smooth = False
+    friction: options.Friction = "none"
+    load: options.PlantLoad = "pulley"
+    sensor: options.Sensor = "load"
+    parameter_set: options.ParameterSet = "rig"
     parameters: dict[str, Quantity] = Field(
         default_factory=dict, description="values that differ from the set, by name"
     )
@@ -82,11 +71,9 @@ class Plant(Section):
         values that no such plant can have.
         """
         # A handle is always there, whether or not somebody holds it, unless the shaft is locked.
-        loads: dict[str, LoadKind] = {"locked": "locked", "pulley": "pulley+hand"}
-        model = actuator(
-            **self._parts(), load=loads.get(self.load, "hand"), sensor=self.sensor, limits=True
-        )
-        return _with_values(model, self.parameters)
+        loads: dict[str, options.LoadKind] = {"locked": "locked", "pulley": "pulley+hand"}
+        load = loads.get(self.load, "hand")
+        return _with_values(self._actuator(load, self.sensor, limits=True), self.parameters)
 
     def process_model(self) -> ProcessModel:
         """What identification fits to such a plant's logs, at the plant's own values.
@@ -94,45 +81,41 @@ class Plant(Section):
         With the torque sensor between motor and brake the load's torque is not in the log: the
         model then has the load itself. Raises ModelError for a hand, whose motion no log holds.
         """
-        if self.sensor == "load":
-            model = actuator(**self._parts())
-        elif self.load == "hand":
+        if self.sensor == "between" and self.load == "hand":
             raise ModelError(
                 "a hand moves as it will, and with the torque sensor between motor and brake its "
                 "torque is not measured: no model can follow such a log; put the sensor at the load"
             )
-        else:
-            model = actuator(**self._parts(), load=self.load, sensor=self.sensor)
-        own = {k: v for k, v in self.parameters.items() if k in model.parameter_names}
-        return _with_values(model, own)
+        model = self._actuator("measured" if self.sensor == "load" else self.load, self.sensor)
+        names = set(model.parameter_names)
+        return _with_values(model, {k: v for k, v in self.parameters.items() if k in names})
 
-    def _parts(self) -> dict[str, Any]:
-        return {
-            "driver_motor": self.driver_motor,
-            "driver_brake": self.driver_brake,
-            "hysteresis": self.hysteresis,
-            "exponent": self.exponent,
-            "smooth": self.smooth,
-            "friction": self.friction,
-            "parameters": self.parameter_set,
-        }
+    def _actuator(
+        self, load: options.LoadKind, sensor: options.SensorPlace, limits: bool = False
+    ) -> ProcessModel:
+        return actuator(
+            driver_motor=self.driver_motor,
+            driver_brake=self.driver_brake,
+            hysteresis=self.hysteresis,
+            exponent=self.exponent,
+            smooth=self.smooth,
+            friction=self.friction,
+            load=load,
+            sensor=sensor,
+            limits=limits,
+            parameters=self.parameter_set,
+        )
 
 
 def state_sizes(plant: ProcessModel) -> FloatArray:
     """Magnitude that matters of each of the plant's states, (n_states,)."""
     values = dict(zip(plant.parameter_names, plant.nominal, strict=True))
-    # The hysteresis variable at which each of the models slides.
-    sliding = 1.0
+    # The hysteresis variable at which the model slides; 1 of a brake that never does.
+    rise, fall = 1.0, values.get("zeta", 1.0)
     if "A" in values:
-        sliding = _ratio(values["A"], values["beta"] + values["gamma"])
-    elif "zeta" in values:
-        sliding = _ratio(1.0, values["zeta"])
+        rise, fall = values["A"], values["beta"] + values["gamma"]
+    sliding = rise / fall if rise > 0.0 and fall > 0.0 else 1.0
     return np.array([_SIZES.get(name, sliding) for name in plant.state_names])
-
-
-def _ratio(a: float, b: float) -> float:
-    """a / b, or 1 for a brake that never slides."""
-    return a / b if a > 0.0 and b > 0.0 else 1.0
 
 
 def _with_values(model: ProcessModel, values: dict[str, float]) -> ProcessModel:
@@ -143,8 +126,8 @@ def _with_values(model: ProcessModel, values: dict[str, float]) -> ProcessModel:
         try:
             model = model.with_parameters(**{name: {"nominal": value}})
         except ModelError as error:
-            text, named = str(error), f"parameter {name}:"
-            raise ModelError(text if text.startswith(named) else f"{named} {text}") from None
+            text, key = str(error), f"parameter {name}:"
+            raise ModelError(text if text.startswith(key) else f"{key} {text}") from None
     for constraint in model.constraints:
         if constraint.function(tuple(model.nominal)) > 0.0:
             raise ModelError(f"the plant's parameters violate {constraint.text}")

@@ -1,4 +1,4 @@
-"""What the simulated rig watches itself, as a board does in its timer's interrupt."""
+"""The device's own interlock, checked every tick as a board does in its timer's interrupt."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from daq.hal import FloatArray, Guard
 
 
 class Interlock:
-    """A guard's limits over the samples of a run, in their order."""
+    """Limits of a guard, checked over the samples of a run in their order."""
 
     def __init__(self, guard: Guard) -> None:
         self._analog = np.array([guard.analog_low, guard.analog_high], dtype=np.float64)

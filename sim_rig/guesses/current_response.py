@@ -76,7 +76,7 @@ def _of_record(record: Measured, channel: str) -> CurrentResponse | None:
     rows = slice(_MOST_ROWS)
     current, signals = record[f"current_{channel}"][rows], [signal[rows] for signal in signals]
     octaves = _memory(current, signals)
-    start = _first_row(octaves)
+    start = _oldest(octaves)
     solved = regression(current[start:], _regressors(signals, octaves, start)) if octaves else None
     return None if solved is None else _response(*solved, octaves, record)
 
@@ -85,11 +85,11 @@ def _response(
     weights: FloatArray, covariance: FloatArray, octaves: int, record: Measured
 ) -> CurrentResponse | None:
     """The response by the weights of the regressors and their covariance."""
-    dt, delays = record.dt, _delays(octaves)
-    width = np.array([len(group) for group in delays], dtype=np.float64)
-    behind = len(weights) - len(delays)
+    dt, (newest, oldest) = record.dt, _delays(octaves)
+    width = oldest - newest + 1.0
+    behind = len(weights) - len(width)
     steps = np.pad(width, (0, behind))
-    times = np.pad(dt * np.array([group.mean() for group in delays]) * width, (0, behind))
+    times = np.pad(dt * (0.5 * (newest + oldest)) * width, (0, behind))
     gain, spread = float(steps @ weights), SIGMAS * _deviation(steps, covariance)
     if gain <= spread:
         return None
@@ -98,7 +98,7 @@ def _response(
     late = SIGMAS * _deviation(times - delay * steps, covariance) / gain
     per_speed = None
     if behind > 1:
-        felt = np.concatenate([np.zeros(len(delays)), [1.0], width, [0.0]])
+        felt = np.concatenate([np.zeros(len(width)), [1.0], width, [0.0]])
         size = abs(float(felt @ weights))
         reach = SIGMAS * _deviation(felt, covariance) + _MARGIN * size
         per_speed = (max(size - reach, 0.0), size + reach)
@@ -116,10 +116,10 @@ def _memory(current: FloatArray, signals: list[FloatArray]) -> int:
     0 where no regression is possible.
     """
     best, lowest = 0, math.inf
-    start = min(_first_row(_OCTAVES), len(current) // 2)
+    start = min(_oldest(_OCTAVES), len(current) // 2)
     target = current[start:]
     for octaves in range(1, _OCTAVES + 1):
-        if _first_row(octaves) > start:
+        if _oldest(octaves) > start:
             break
         columns = _regressors(signals, octaves, start)
         solved = regression(target, columns)
@@ -135,19 +135,16 @@ def _memory(current: FloatArray, signals: list[FloatArray]) -> int:
     return min(best + 1, _OCTAVES) if best > 0 else 0
 
 
-def _delays(octaves: int) -> list[IntArray]:
-    """Groups of delays in samples, from 1 on."""
-    groups, first = [], 1
-    for octave in range(octaves):
-        for _ in range(_PER_OCTAVE):
-            groups.append(np.arange(first, first + 2**octave))
-            first += 2**octave
-    return groups
-
-
-def _first_row(octaves: int) -> int:
-    """The first row that has all the past behind it."""
+def _oldest(octaves: int) -> int:
+    """The longest delay [samples], before which no row has all the past behind it."""
     return _PER_OCTAVE * ((1 << octaves) - 1)
+
+
+def _delays(octaves: int) -> tuple[IntArray, IntArray]:
+    """Newest and oldest delay of each group, from 1 on [samples]."""
+    width = np.repeat(2 ** np.arange(octaves), _PER_OCTAVE)
+    oldest = np.cumsum(width)
+    return oldest - width + 1, oldest
 
 
 def _regressors(signals: list[FloatArray], octaves: int, start: int) -> list[FloatArray]:
@@ -161,22 +158,17 @@ def _regressors(signals: list[FloatArray], octaves: int, start: int) -> list[Flo
     for place, signal in enumerate(signals):
         if place > 0:
             columns.append(signal[start:])
-        total = _running(np.nan_to_num(signal))
-        lost = _running(np.isnan(signal).astype(np.float64))
-        for group in _delays(octaves):
-            # Rows start - oldest .. start - newest of the signal, summed, for each row from start.
-            newest, oldest = int(group[0]), int(group[-1])
-            upper = slice(start - newest + 1, n - newest + 1)
-            lower = slice(start - oldest, n - oldest)
-            sums = total[upper] - total[lower]
-            columns.append(np.where(lost[upper] > lost[lower], np.nan, sums))
-    columns.append(np.ones(n - start))
-    return columns
-
-
-def _running(values: FloatArray) -> FloatArray:
-    """Sums of all values before each row, and of all."""
-    return np.concatenate([[0.0], np.cumsum(values)])
+        # Sums of all values before each row, and of all.
+        total, lost = (
+            np.concatenate([[0.0], np.cumsum(values)])
+            for values in (np.nan_to_num(signal), np.isnan(signal))
+        )
+        for newest, oldest in zip(*_delays(octaves), strict=True):
+            ends = slice(start - newest + 1, n - newest + 1)
+            begins = slice(start - oldest, n - oldest)
+            sums = total[ends] - total[begins]
+            columns.append(np.where(lost[ends] > lost[begins], np.nan, sums))
+    return [*columns, np.ones(n - start)]
 
 
 def _deviation(direction: FloatArray, covariance: FloatArray) -> float:

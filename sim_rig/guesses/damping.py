@@ -69,8 +69,8 @@ def _slopes(record: Measured, K_m: Interval, n_c: float, settling: float) -> lis
     if speed is None or "current_motor" not in record:
         return []
     load = record["torque"] if "torque" in record else np.zeros(len(speed))
-    resisting = [_smooth(load - n_c * constant * record["current_motor"]) for constant in K_m]
-    carried = _smooth(record["current_brake"]) if "current_brake" in record else None
+    torques = [_smooth(load - n_c * constant * record["current_motor"]) for constant in K_m]
+    current = _smooth(record["current_brake"]) if "current_brake" in record else None
     omega, command = _smooth(speed), record["applied_voltage_brake"]
     moments = _steady(omega, command, record.dt, settling)
     levels = command[_HALF : len(command) - _HALF]
@@ -80,14 +80,14 @@ def _slopes(record: Measured, K_m: Interval, n_c: float, settling: float) -> lis
         count = int(rows.sum())
         if count < _FEWEST:
             continue
-        fits = [regression(torque[rows], [omega[rows], np.ones(count)]) for torque in resisting]
+        fits = [regression(torque[rows], [omega[rows], np.ones(count)]) for torque in torques]
         limits = [
             weights[0] + SIGMAS * math.sqrt(covariance[0, 0])
             for weights, covariance in filter(None, fits)
         ]
         if len(limits) == 2 and max(limits) > 0.0:
-            current = 0.0 if carried is None else _at_least(np.abs(carried[rows]))
-            slopes.append(_Slope(max(limits), current, count, record.name))
+            carried = 0.0 if current is None else _at_least(np.abs(current[rows]))
+            slopes.append(_Slope(max(limits), carried, count, record.name))
     return slopes
 
 

@@ -61,35 +61,32 @@ _RESIDUAL = 0.014  # N*m, assumed: residual torque 2 % of the rated one
 _RATED = 0.6779  # N*m at 0.19 A: rating
 _YIELD = 60.0 / 48.0  # z at which the Bouc-Wen brake slides, whatever its exponent
 
+_PER_AMPERE = (_RATED - _RESIDUAL) / 0.19
+
 # The same brake in each of the models: rated and residual torque, stiffness at rest, damping.
+_VISCOUS = {
+    "c0": 1.2e-4,  # assumed: viscous part small against the hysteretic
+    "c1": 6e-4,  # assumed: see c0
+}
 _BRAKES = {
-    "bouc-wen": {
+    "bouc-wen": _VISCOUS
+    | {
         "gamma": 28.0,  # assumed: with beta, class 1 and rate-independent
         "beta": 20.0,  # assumed: see gamma
         "A": 60.0,  # assumed: yields after about 20 mrad
         "alpha0": _RESIDUAL / _YIELD,
-        "alpha1": (_RATED - _RESIDUAL) / 0.19 / _YIELD,
-        "c0": 1.2e-4,  # assumed: viscous part small against the hysteretic
-        "c1": 6e-4,  # assumed: see c0
+        "alpha1": _PER_AMPERE / _YIELD,
     },
-    "dahl": {
-        "sigma": 48.0,
-        "alpha0": _RESIDUAL,
-        "alpha1": (_RATED - _RESIDUAL) / 0.19,
-        "c0": 1.2e-4,
-        "c1": 6e-4,
-    },
-    "lugre": {
+    "dahl": _VISCOUS | {"sigma": 48.0, "alpha0": _RESIDUAL, "alpha1": _PER_AMPERE},
+    "lugre": _VISCOUS
+    | {
         "zeta": 48.0,
         "alpha0": _RESIDUAL * 48.0,
-        "alpha1": (_RATED - _RESIDUAL) / 0.19 * 48.0,
-        "c0": 1.2e-4,
-        "c1": 6e-4,
+        "alpha1": _PER_AMPERE * 48.0,
         "epsilon0": 1e-4,  # assumed: as small as the viscous part
         "epsilon1": 6e-4,  # assumed: see epsilon0
     },
 }
-
 
 _DEFAULT = Design()
 

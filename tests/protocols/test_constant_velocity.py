@@ -11,10 +11,11 @@ from daq.errors import ConfigError, RunError
 from daq.experiment import Sample
 from daq.hal import Samples
 from daq.run.runner import plan
+from protocols.analysis.ripple import ripple
+from protocols.analysis.torque_curve import Level, Motor, fit, levels_of
 from protocols.constant_velocity import ConstantVelocity
-from protocols.pid import VelocityGains
-from protocols.staircase import Drive, Plateau, SettlingTest, Staircase, longest
-from protocols.torque_curve import Level, Motor, fit, levels_of, ripple
+from protocols.control.pid import VelocityGains
+from protocols.control.staircase import Drive, Plateau, SettlingTest, Staircase, longest
 from tests.protocols.closed_loop import logged, numbers, run, shipped
 
 C0, C1, K_M, B_M = 1.2e-4, 6e-4, 0.353 / 2.5, 8e-5  # sim_rig/physics/values.py

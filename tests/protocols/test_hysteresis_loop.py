@@ -11,7 +11,7 @@ from scipy.integrate import quad, solve_ivp
 from daq.config.rig import RigConfig
 from daq.errors import ConfigError, RunError
 from daq.run.runner import plan
-from protocols.bouc_wen_loop import Cycles, fit, hysteresis
+from protocols.analysis.bouc_wen_loop import Cycles, fit, hysteresis
 from protocols.hysteresis_loop import HysteresisLoop
 from sim_rig.physics.hysteresis import hysteresis as brake_model
 from sim_rig.physics.values import named
@@ -195,6 +195,7 @@ def test_the_plan_is_what_is_asked_of_the_shaft():
     ("changes", "message"),
     [
         ({"period": 0.3333}, "period: 0.3333 s is 266.64 samples"),
+        ({"period": 600, "cycles": 1000}, "cycles: 1.2e+06 s at 800 Hz makes 960001520 samples"),
         ({"ratings": {"torque_constant": None}}, "ratings.torque_constant: with the torque sensor"),
         ({"brake_commands": [0.3]}, "brake_commands: at 0.3 V the brake takes about 7.6 V"),
     ],

@@ -6,7 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
-from protocols.pid import Pid, PidGains, Ramp, SpeedTracker
+from protocols.control.pid import Pid, PidGains, Ramp
+from protocols.control.speed_tracker import SpeedTracker
 
 STEP = 1.0 / 800.0  # s
 numbers = st.floats(-100.0, 100.0)

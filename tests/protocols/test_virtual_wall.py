@@ -9,8 +9,8 @@ from daq.config.rig import RigConfig
 from daq.errors import ConfigError, RunError
 from daq.experiment import Sample
 from daq.run.runner import plan
-from protocols.passivity import SampledWall, passive_stiffness
-from protocols.pid import SpeedTracker
+from protocols.analysis.passivity import SampledWall, passive_stiffness
+from protocols.control.speed_tracker import SpeedTracker
 from protocols.virtual_wall import VirtualWall
 from sim_rig.backend import Simulation
 from sim_rig.device.user import SimulatedUser
@@ -76,7 +76,7 @@ def test_a_wall_that_rings_at_any_stiffness_has_no_critical_one():
 
 @pytest.mark.parametrize("damping", [0.0, 0.02])
 def test_on_the_simulated_rig_walls_ring_on_the_side_that_theory_says(tmp_path, damping):
-    critical = wall().loop(0.0, hand=True).critical_stiffness(damping)
+    critical = wall().theory.loop(0.0, hand=True).critical_stiffness(damping)
     walls = [0.6 * critical, 0.85 * critical, 1.2 * critical, 1.4 * critical]
     settings = wall(stiffnesses=walls, dampings=[damping], brake_commands=[0])
     samples, extra = run(settings, tmp_path, HELD, hand=LEANS)

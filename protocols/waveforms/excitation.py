@@ -1,9 +1,8 @@
-"""What excitations have in common: a channel around its offset, smooth ends, whole samples."""
+"""Excitations: both channels moved around their offsets, brought in from zero and out to it."""
 
 from __future__ import annotations
 
 import abc
-import math
 from dataclasses import replace
 from typing import Generic, TypeVar
 
@@ -14,6 +13,7 @@ from daq.config.base import Section
 from daq.config.units import Seconds, Volts
 from daq.experiment import OpenLoop, Plan
 from daq.hal import CHANNELS, FloatArray
+from protocols.waveforms.samples import smooth_rise
 
 
 class HeldChannel(Section):
@@ -57,6 +57,20 @@ class Excitation(OpenLoop, Generic[Channel]):
         that nothing jumps where they meet. Raises ValueError, naming the key.
         """
 
+    @abc.abstractmethod
+    def remark(self, name: str, channel: Channel) -> str:
+        """What a user should know of an excited channel beforehand."""
+
+    @property
+    def excited(self) -> dict[str, Channel]:
+        """The channels that are excited, by name."""
+        channels: dict[str, Channel] = {name: getattr(self, name) for name in CHANNELS}
+        return {name: channel for name, channel in channels.items() if channel.amplitude > 0.0}
+
+    def remarks(self) -> tuple[str, ...]:
+        """A line for each excited channel."""
+        return tuple(self.remark(name, channel) for name, channel in self.excited.items())
+
     def plan(self) -> Plan:
         """The commands, their peaks, and where the ramps end."""
         lead = self._ramp_samples
@@ -69,14 +83,11 @@ class Excitation(OpenLoop, Generic[Channel]):
         time = np.arange(-lead, excited + lead) / self.sample_rate
         rise = smooth_rise(lead)
         window = np.concatenate([rise, np.ones(excited), rise[::-1]])
-        columns = []
-        for name in CHANNELS:
-            channel: Channel = getattr(self, name)
-            commands = np.full(len(time), channel.offset)
-            if channel.amplitude > 0.0:
-                commands += self.deviation(name, channel, time)
-            columns.append(window * commands)
-        return np.stack(columns, axis=1)
+        commands: FloatArray = np.tile([self.motor.offset, self.brake.offset], (len(time), 1))
+        for name, channel in self.excited.items():
+            commands[:, CHANNELS.index(name)] += self.deviation(name, channel, time)
+        commands *= window[:, None]
+        return commands
 
     @property
     def _ramp_samples(self) -> int:
@@ -95,25 +106,3 @@ class Excitation(OpenLoop, Generic[Channel]):
                 f"{0.5 * self.sample_rate:g} Hz; lower it or raise sample_rate"
             )
         return frequency
-
-
-def smooth_rise(n: int) -> FloatArray:
-    """Raised cosine from 0 to 1 in n samples, both ends left out, (n,)."""
-    return 0.5 - 0.5 * np.cos(np.pi * np.arange(1, n + 1) / (n + 1))
-
-
-def whole_samples(key: str, seconds: float, sample_rate: float) -> int:
-    """Samples in a time [s] that must be a whole number of them, one or more.
-
-    Raises ValueError that names the key and the nearest times that are.
-    """
-    samples = seconds * sample_rate
-    nearest = max(1, round(samples))
-    if math.isclose(samples, nearest, rel_tol=1e-9):
-        return nearest
-    below, above = max(1, math.floor(samples)), max(1, math.ceil(samples))
-    near = " or ".join(f"{n / sample_rate:.10g}" for n in sorted({below, above}))
-    raise ValueError(
-        f"{key}: {seconds:g} s is {samples:.6g} samples at {sample_rate:g} Hz, not a whole "
-        f"number; the nearest that are: {near} s"
-    )

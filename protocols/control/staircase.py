@@ -4,21 +4,29 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from daq.config.base import Section
-from daq.config.units import Hertz, Percent, RadiansPerSecond, Seconds
+from daq.config.units import Percent, RadiansPerSecond, Seconds
 from daq.errors import RunError
 from daq.experiment import Answer, Sample
 from daq.hal import FloatArray
-from protocols.pid import Pid, Ramp, SpeedTracker, VelocityGains
+from protocols.control.pid import Ramp, VelocityGains
+from protocols.control.velocity_loop import VelocityServo
 
 COLUMNS = {"omega_ref": "rad/s", "omega_tracked": "rad/s", "plateau": "1", "settled": "1"}
 """What ``Staircase`` logs: reference, speed from the angle, number of the plateau from 0 (-1
 behind the last), and 1 while the settled velocity is being measured."""
+
+# How much faster a shaft may turn that the motor brakes with all its might.
+_RUNAWAY = 10.0  # rad/s
+
+# A brake let go at once would let the shaft leap.
+_BRAKE_SLOPE = 0.5  # V/s
 
 
 class SettlingTest(Section):
@@ -28,9 +36,11 @@ class SettlingTest(Section):
     least: RadiansPerSecond = Field(0.3, gt=0.0, le=100.0, description="half the band at least")
     time: Seconds = Field(0.5, ge=0.0, le=60.0, description="time within the band before it counts")
     timeout: Seconds = Field(
-        4.0, gt=0.0, le=600.0,
+        4.0,
+        gt=0.0,
+        le=600.0,
         description="time at a velocity beyond what is measured, after which it is given up",
-    )  # fmt: skip
+    )
 
     @model_validator(mode="after")
     def _possible(self) -> SettlingTest:
@@ -44,13 +54,6 @@ class SettlingTest(Section):
     def band(self, velocity: float) -> float:
         """How far from its reference a settled velocity may be [rad/s]."""
         return max(self.least, self.tolerance / 100.0 * abs(velocity))
-
-
-# How much faster a shaft may turn that the motor brakes with all its might.
-_RUNAWAY = 10.0  # rad/s
-
-# A brake let go at once would let the shaft leap.
-_BRAKE_SLOPE = 0.5  # V/s
 
 
 @dataclass(frozen=True)
@@ -67,14 +70,14 @@ class Drive:
     """How the velocities are reached: the loop and what bounds it.
 
     slope: of the reference [rad/s^2]. limit: largest motor command, either way [V]. fastest:
-    speed beyond which the run is ended [rad/s]. bandwidth: of the speed that the loop sees.
+    speed beyond which the run is ended [rad/s]. bandwidth: of the speed that the loop sees [Hz].
     """
 
     gains: VelocityGains
     slope: float
     limit: float
     fastest: float
-    bandwidth: Hertz
+    bandwidth: float
 
 
 class Staircase:
@@ -86,42 +89,32 @@ class Staircase:
     """
 
     def __init__(self, plateaus: tuple[Plateau, ...], drive: Drive, settling: SettlingTest) -> None:
-        self._plateaus, self._settling = plateaus, settling
-        self._fastest, self._limit = drive.fastest, drive.limit
-        self._tracker = SpeedTracker(drive.bandwidth)
-        self._ramp = Ramp(drive.slope)
-        self._brake_ramp = Ramp(_BRAKE_SLOPE)
-        self._pid = Pid(drive.gains, -drive.limit, drive.limit)
+        self._plateaus, self._settling, self._limit = plateaus, settling, drive.limit
+        cure = ", and look what drives the shaft if not"
+        self._servo = VelocityServo(drive.gains, drive.limit, drive.fastest, drive.bandwidth, cure)
+        self._velocity_ramp, self._brake_ramp = Ramp(drive.slope), Ramp(_BRAKE_SLOPE)
         self._time = 0.0
         self._braked_from = math.inf
-        self._velocity = self._brake = self._measure = self._band = 0.0
-        self._inside, self._arrived = math.inf, 0.0
-        self._index = -1
+        self._plateau, self._index = Plateau(0.0, 0.0, 0.0), -1
         self._next(0.0)
 
     def answer(self, sample: Sample) -> Answer | None:
         """Commands that drive the shaft to the plateau's velocity."""
         now = sample.time
-        speed = self._tracker.update(now, sample.theta)
-        reference = self._ramp.towards(self._velocity, now - self._time)
-        brake = self._brake_ramp.towards(self._brake, now - self._time)
+        speed = self._servo.track(sample)
+        reference = self._velocity_ramp.towards(self._plateau.velocity, now - self._time)
+        brake = self._brake_ramp.towards(self._plateau.brake, now - self._time)
         self._time = now
         settled = self._is_settled(now, reference, speed)
         logged = (reference, speed, float(self._index), float(settled))
-        volts = self._pid.output(now, reference, speed)
-        self._check(volts, speed)
-        if self._over(now, reference, speed):
+        volts = self._servo.volts(now, reference, speed)
+        self._check_sign(volts, speed)
+        if self._is_over(now):
             return None
         return Answer(volts, brake, logged)
 
-    def _check(self, volts: float, speed: float) -> None:
-        """RunError for a shaft that is too fast, or gains speed against the motor."""
-        if abs(speed) > self._fastest:
-            raise RunError(
-                f"the shaft turns at {speed:.4g} rad/s, beyond {self._fastest:.4g} rad/s, while "
-                f"{self._ramp.value:.4g} rad/s were asked for; lower the gains under 'loop' if it "
-                "rings, and look what drives the shaft if not"
-            )
+    def _check_sign(self, volts: float, speed: float) -> None:
+        """RunError for a shaft that gains speed against the motor."""
         if volts * speed >= 0.0 or abs(volts) < self._limit:
             self._braked_from = math.inf
             return
@@ -135,7 +128,8 @@ class Staircase:
 
     def _is_settled(self, now: float, reference: float, speed: float) -> bool:
         """Whether the sample is one of those that count."""
-        underway = reference != self._velocity or self._brake_ramp.value != self._brake
+        plateau = self._plateau
+        underway = reference != plateau.velocity or self._brake_ramp.value != plateau.brake
         if underway:
             self._arrived = now
         if underway or abs(speed - reference) > self._band:
@@ -144,55 +138,52 @@ class Staircase:
         self._inside = min(self._inside, now)
         return self._index >= 0 and now - self._inside >= self._settling.time
 
-    def _over(self, now: float, reference: float, speed: float) -> bool:
+    def _is_over(self, now: float) -> bool:
         """Whether the run is over; goes on to the next plateau once this one is done with."""
+        measure = self._plateau.measure
+        measured = now - self._inside >= self._settling.time + measure
+        given_up = now - self._arrived > self._settling.timeout + measure
         if self._index < 0:
-            stopped = now - self._inside >= self._settling.time
-            return stopped or now - self._arrived > self._settling.timeout
-        measured = now - self._inside >= self._settling.time + self._measure
-        if measured or now - self._arrived > self._settling.timeout + self._measure:
+            return measured or given_up
+        if measured or given_up:
             self._next(now)
         return False
 
     def _next(self, now: float) -> None:
         """To the next plateau; behind the last to rest."""
         self._index += 1
-        if self._index == len(self._plateaus):
-            self._index = -1
-            step = Plateau(0.0, self._brake, 0.0)
+        if self._index < len(self._plateaus):
+            self._plateau = self._plateaus[self._index]
         else:
-            step = self._plateaus[self._index]
-        self._velocity, self._brake, self._measure = step.velocity, step.brake, step.measure
-        self._band = self._settling.band(step.velocity)
+            self._index, self._plateau = -1, Plateau(0.0, self._plateau.brake, 0.0)
+        self._band = self._settling.band(self._plateau.velocity)
         self._inside, self._arrived = math.inf, now
 
 
-def longest(plateaus: tuple[Plateau, ...], drive: Drive, settling: SettlingTest) -> float:
+def longest(plateaus: Sequence[Plateau], drive: Drive, settling: SettlingTest) -> float:
     """The longest that a staircase can take [s]."""
-    velocities = [0.0, *(step.velocity for step in plateaus), 0.0]
+    velocities = [0.0, *(plateau.velocity for plateau in plateaus), 0.0]
     ramps = sum(abs(b - a) for a, b in itertools.pairwise(velocities)) / drive.slope
     brakes = sum(abs(b.brake - a.brake) for a, b in itertools.pairwise(plateaus)) / _BRAKE_SLOPE
-    return (
-        ramps
-        + brakes
-        + sum(step.measure + settling.timeout for step in plateaus)
-        + settling.timeout
-    )
+    held = sum(plateau.measure + settling.timeout for plateau in plateaus)
+    return ramps + brakes + held + settling.timeout
 
 
 def quickest(
-    plateaus: tuple[Plateau, ...], drive: Drive, settling: SettlingTest, rate: float
+    plateaus: Sequence[Plateau], drive: Drive, settling: SettlingTest, rate: float
 ) -> tuple[FloatArray, FloatArray]:
     """Reference [rad/s] and brake command [V], (m,) each, where every velocity settles at once."""
-    rest = Plateau(0.0, plateaus[-1].brake, 0.0)
-    velocity, brake, at = [], [], Plateau(0.0, 0.0, 0.0)
-    for step in (*plateaus, rest):
-        turn, pull = step.velocity - at.velocity, step.brake - at.brake
+    velocities, brakes, before = [], [], Plateau(0.0, 0.0, 0.0)
+    for plateau in (*plateaus, Plateau(0.0, plateaus[-1].brake, 0.0)):
+        turn, pull = plateau.velocity - before.velocity, plateau.brake - before.brake
         ramps = max(abs(turn) / drive.slope, abs(pull) / _BRAKE_SLOPE)
-        time = np.arange(1, round((ramps + settling.time + step.measure) * rate) + 1) / rate
-        velocity.append(at.velocity + np.clip(math.copysign(drive.slope, turn) * time,
-                                              min(turn, 0.0), max(turn, 0.0)))  # fmt: skip
-        brake.append(at.brake + np.clip(math.copysign(_BRAKE_SLOPE, pull) * time,
-                                        min(pull, 0.0), max(pull, 0.0)))  # fmt: skip
-        at = step
-    return np.concatenate(velocity), np.concatenate(brake)
+        time = np.arange(1, round((ramps + settling.time + plateau.measure) * rate) + 1) / rate
+        velocities.append(before.velocity + _ramp(turn, drive.slope, time))
+        brakes.append(before.brake + _ramp(pull, _BRAKE_SLOPE, time))
+        before = plateau
+    return np.concatenate(velocities), np.concatenate(brakes)
+
+
+def _ramp(way: float, slope: float, time: FloatArray) -> FloatArray:
+    """Changes by ``way`` no faster than by ``slope`` per second, (n,)."""
+    return np.clip(math.copysign(slope, way) * time, min(way, 0.0), max(way, 0.0))

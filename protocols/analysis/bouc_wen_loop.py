@@ -14,12 +14,14 @@ with kappa = alpha A / (beta + gamma), so that of z and alpha only their product
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from daq.hal import FloatArray
+from protocols.analysis.results import Estimate, student
 
 _POINTS = 400  # of a cycle that are fitted
 _RATES = (2.0, 2000.0)  # 1/rad, of all brakes that there may be
@@ -44,8 +46,8 @@ class Cycles:
     def energy(self) -> FloatArray:
         """Area of the torque-angle loop of each cycle, (n_cycles,) [J]."""
         torque = 0.5 * (self.torque + np.roll(self.torque, -1, axis=1))[:, :-1]
-        found: FloatArray = np.sum(torque * np.diff(self.angle, axis=1), axis=1)
-        return found
+        energy: FloatArray = np.sum(torque * np.diff(self.angle, axis=1), axis=1)
+        return energy
 
 
 class Motion(NamedTuple):
@@ -57,16 +59,8 @@ class Motion(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Estimate:
-    """A value and its standard error, by the scatter between cycles."""
-
-    value: float
-    error: float
-
-
-@dataclass(frozen=True)
 class LoopFit:
-    """Parameters of the steady loops.
+    """Parameters of the steady loops; errors by the scatter between cycles.
 
     kappa: half the height of the loop at each level [N*m]. kappa0, kappa1: their line over the
     current, None with a single level. explained: part of the torque's variance. torque: fitted,
@@ -105,8 +99,8 @@ def motion(cycles: Cycles) -> Motion:
     window = min(max(5, 2 * round(0.008 / cycles.dt) + 1), n - 1 + n % 2)
 
     def smooth(order: int) -> FloatArray:
-        found: FloatArray = savgol_filter(angle, window, 3, order, cycles.dt, mode="wrap")
-        return found
+        smoothed: FloatArray = savgol_filter(angle, window, 3, order, cycles.dt, mode="wrap")
+        return smoothed
 
     return Motion(smooth(0), smooth(1) + drift / cycles.dt, smooth(2))
 
@@ -117,13 +111,12 @@ def hysteresis(angle: FloatArray, rate: float, part: float) -> FloatArray:
     sign = np.sign(steps).T
     way = rate * np.abs(steps).T
     w = np.zeros(len(angle))
-    found = np.empty(angle.shape)
-    for cycle in range(2):  # the first one forgets where it began
+    settled = np.empty(angle.shape)
+    for _cycle in range(2):  # the first one forgets where it began, and is written over
         for k in range(angle.shape[1]):
-            if cycle:
-                found[:, k] = w
+            settled[:, k] = w
             w = np.where(sign[k] == 0.0, w, sign[k] * _along(sign[k] * w, way[k], part))
-    return found
+    return settled
 
 
 def _along(u: FloatArray, way: FloatArray, part: float) -> FloatArray:
@@ -139,102 +132,98 @@ def _along(u: FloatArray, way: FloatArray, part: float) -> FloatArray:
 def fit(levels: list[Cycles]) -> LoopFit:
     """Loop parameters by least squares over the mean cycles of all levels together.
 
-    rate and part are searched, everything else enters linearly (variable projection, Golub and
-    Pereyra 1973). Raises ValueError where the shaft has hardly moved.
+    levels: as many cycles of each. rate and part are searched, everything else enters linearly
+    (variable projection, Golub and Pereyra 1973). Raises ValueError where the shaft has hardly
+    moved.
     """
     from scipy.optimize import least_squares
 
-    problem = _Problem.of(levels)
+    problem = _Problem(levels)
 
     def residual(x: FloatArray) -> FloatArray:
-        return problem.residual(math.exp(x[0]), float(x[1]))
+        columns = problem.columns(math.exp(x[0]), float(x[1]))
+        misfit: FloatArray = columns @ problem.weights(columns) - problem.torque
+        return misfit
 
     starts = [np.array([math.log(rate), 0.7]) for rate in np.geomspace(8.0, 500.0, 7)]
     best = min(starts, key=lambda x: float(np.sum(residual(x) ** 2)))
     low, high = (np.array([math.log(_RATES[k]), _PARTS[k]]) for k in range(2))
-    found = least_squares(residual, best, bounds=(low, high), diff_step=[_STEP, _STEP])
-    return problem.concluded(math.exp(found.x[0]), float(found.x[1]))
+    solution = least_squares(residual, best, bounds=(low, high), diff_step=[_STEP, _STEP])
+    return problem.result(math.exp(solution.x[0]), float(solution.x[1]))
 
 
-@dataclass(frozen=True)
 class _Problem:
-    """Torque and motion at the fitted points: (n_levels, n) each."""
+    """Mean torque and motion of all levels at the points that are fitted.
 
-    levels: list[Cycles]
-    motions: list[Motion]
-    every: int
+    torque: (n_levels * points,) [N*m].
+    """
 
-    @classmethod
-    def of(cls, levels: list[Cycles]) -> _Problem:
-        motions = [motion(level) for level in levels]
-        if any(np.ptp(m.angle) < 0.02 for m in motions):
+    def __init__(self, levels: list[Cycles]) -> None:
+        self._motions = [motion(level) for level in levels]
+        if any(np.ptp(m.angle) < 0.02 for m in self._motions):
             raise ValueError(
                 "the shaft has hardly moved: raise the amplitude or lower brake_commands; a brake "
                 "stronger than the motor holds it"
             )
-        return cls(levels, motions, max(1, levels[0].angle.shape[1] // _POINTS))
+        self._levels, self._stride = levels, max(1, levels[0].angle.shape[1] // _POINTS)
+        self._currents = np.array([level.current for level in levels])
+        self.torque = np.stack([x.torque.mean(axis=0)[:: self._stride] for x in levels]).ravel()
 
-    def _stacked(self, name: str, every: int) -> FloatArray:
-        return np.stack([getattr(m, name)[::every] for m in self.motions])
+    def columns(self, rate: float, part: float, stride: int | None = None) -> FloatArray:
+        """What enters linearly, (n_levels * points, n_columns); stride: from point to point."""
+        from scipy.linalg import block_diag
 
-    def _columns(self, rate: float, part: float, every: int) -> FloatArray:
-        """Of what enters linearly, (n_levels * points, n_columns)."""
-        n_levels = len(self.levels)
-        w = hysteresis(self._stacked("angle", every), rate, part)
-        speed = self._stacked("speed", every)
-        own = np.eye(n_levels)[:, :, None]
-        currents = np.array([level.current for level in self.levels])[:, None]
-        columns = [*(own * w[:, None, :]).swapaxes(0, 1), speed,
-                   self._stacked("acceleration", every)]  # fmt: skip
-        if n_levels > 1:
-            columns.append(currents * speed)
-        columns += list(np.broadcast_to(own, (n_levels, n_levels, w.shape[1])).swapaxes(0, 1))
-        return np.stack([column.ravel() for column in columns], axis=1)
+        angle, speed, acceleration = (
+            np.stack(column)[:, :: stride or self._stride]
+            for column in zip(*self._motions, strict=True)
+        )
+        w = hysteresis(angle, rate, part)[:, :, None]
+        of_all = [speed, acceleration]
+        if len(self._levels) > 1:
+            of_all.append(self._currents[:, None] * speed)
+        of_all = [values.ravel() for values in of_all]
+        return np.column_stack([block_diag(*w), *of_all, block_diag(*np.ones_like(w))])
 
-    def _mean_torque(self, every: int) -> FloatArray:
-        return np.stack([x.torque.mean(axis=0)[::every] for x in self.levels]).ravel()
+    def weights(self, columns: FloatArray) -> FloatArray:
+        """Least-squares weights of the columns."""
+        weights: FloatArray = np.linalg.lstsq(columns, self.torque, rcond=None)[0]
+        return weights
 
-    def residual(self, rate: float, part: float) -> FloatArray:
-        columns, torque = self._columns(rate, part, self.every), self._mean_torque(self.every)
-        weights, *_ = np.linalg.lstsq(columns, torque, rcond=None)
-        left: FloatArray = columns @ weights - torque
-        return left
-
-    def concluded(self, rate: float, part: float) -> LoopFit:
+    def result(self, rate: float, part: float) -> LoopFit:
         """All parameters, with errors by what each cycle alone would have changed."""
-        n, every = len(self.levels), self.every
-        columns, torque = self._columns(rate, part, every), self._mean_torque(every)
-        weights, *_ = np.linalg.lstsq(columns, torque, rcond=None)
-        by_rate = (self._columns(rate * (1.0 + _STEP), part, every) - columns) @ weights / _STEP
-        by_part = (self._columns(rate, part - _STEP, every) - columns) @ weights / -_STEP
+        n, torque = len(self._levels), self.torque
+        columns = self.columns(rate, part)
+        weights = self.weights(columns)
+        by_rate = (self.columns(rate * (1.0 + _STEP), part) - columns) @ weights / _STEP
+        by_part = (self.columns(rate, part - _STEP) - columns) @ weights / -_STEP
         jacobian = np.column_stack([by_rate / rate, by_part, columns])
         changes = self._cycle_deviations() @ np.linalg.pinv(jacobian).T
-        errors = np.sqrt(np.sum(changes**2, axis=0) / (len(changes) * (len(changes) - 1)))
-        kappa = tuple(Estimate(float(weights[k]), float(errors[2 + k])) for k in range(n))
-        own = np.asarray(weights[:n]), np.asarray(changes[:, 2 : 2 + n])
-        line = self._line(*own) if n > 1 else (None, None)
-        left = columns @ weights - torque
-        whole = self._columns(rate, part, 1) @ weights
+        of_rate, of_part, *kappa = _estimates([rate, part, *weights[:n]], changes[:, : 2 + n])
+        # kappa0 + kappa1 |i| through the levels.
+        sizes = np.abs(self._currents)
+        inverse = np.linalg.pinv(np.column_stack([np.ones_like(sizes), sizes]))
+        line = _estimates(inverse @ np.asarray(weights[:n]), changes[:, 2 : 2 + n] @ inverse.T)
+        misfit = np.sum((columns @ weights - torque) ** 2)
         return LoopFit(
-            rate=Estimate(rate, float(errors[0])),
-            part=Estimate(part, float(errors[1])),
-            kappa=kappa,
-            kappa0=line[0],
-            kappa1=line[1],
-            explained=float(1.0 - np.sum(left**2) / np.sum((torque - torque.mean()) ** 2)),
-            torque=whole.reshape(n, -1),
+            rate=of_rate,
+            part=of_part,
+            kappa=tuple(kappa),
+            kappa0=line[0] if n > 1 else None,
+            kappa1=line[1] if n > 1 else None,
+            explained=float(1.0 - misfit / np.sum((torque - torque.mean()) ** 2)),
+            torque=(self.columns(rate, part, stride=1) @ weights).reshape(n, -1),
         )
 
     def _cycle_deviations(self) -> FloatArray:
         """Torque of each cycle less the mean one, (n_cycles, n_levels * points)."""
-        each = [x.torque[:, :: self.every] for x in self.levels]
-        return np.concatenate([x - x.mean(axis=0) for x in each], axis=1)
+        cycles = [level.torque[:, :: self._stride] for level in self._levels]
+        return np.concatenate([x - x.mean(axis=0) for x in cycles], axis=1)
 
-    def _line(self, kappa: FloatArray, changes: FloatArray) -> tuple[Estimate, Estimate]:
-        """kappa0 + kappa1 |i| through the levels; errors as of ``concluded``."""
-        currents = np.abs([level.current for level in self.levels])
-        inverse = np.linalg.pinv(np.column_stack([np.ones_like(currents), currents]))
-        values, moved = inverse @ kappa, changes @ inverse.T
-        errors = np.sqrt(np.sum(moved**2, axis=0) / (len(moved) * (len(moved) - 1)))
-        first, second = (Estimate(float(v), float(e)) for v, e in zip(values, errors, strict=True))
-        return first, second
+
+def _estimates(values: Sequence[float] | FloatArray, changes: FloatArray) -> list[Estimate]:
+    """Estimates of m values by what each cycle alone changes in them, (n_cycles, m)."""
+    n = len(changes)
+    errors = np.sqrt(np.sum(changes**2, axis=0) / (n * (n - 1)))
+    return [
+        Estimate(float(v), float(e), student(n - 1)) for v, e in zip(values, errors, strict=True)
+    ]

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import functools
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from daq.findings import Series
 from daq.hal import FloatArray
-from protocols.pid import tracker_gains
+from protocols.control.speed_tracker import tracker_gains
+from protocols.control.wall import Body
 
 _STIFFEST = 1e4  # N*m/rad, beyond what any motor renders
 _HALVINGS = 32
+_DRAWN = 60  # dampings of a bound in a figure
 
 
 def passive_stiffness(physical: float, damping: float, period: float) -> float:
@@ -48,8 +53,9 @@ class SampledWall:
         plant, push = self._shaft
         alpha, beta = tracker_gains(self.bandwidth, self.period)
         # The tracker as it stands after the sample k, from its state after k - 1 and theta_k.
-        track = np.array([[1.0 - alpha, (1.0 - alpha) * self.period],
-                          [-beta / self.period, 1.0 - beta]])  # fmt: skip
+        track = np.array(
+            [[1.0 - alpha, (1.0 - alpha) * self.period], [-beta / self.period, 1.0 - beta]]
+        )
         gain = np.array([alpha, beta / self.period])
         loop = np.zeros((n, n))
         loop[:2, :2] = plant
@@ -85,3 +91,57 @@ class SampledWall:
         whole[1] = np.array([-self.stiffness, -self.damping, 1.0]) / self.inertia
         step = expm(whole * self.period)
         return step[:2, :2], step[:2, 2]
+
+
+@dataclass(frozen=True)
+class WallTheory:
+    """Stability and passivity of walls rendered to a body, by the brake's command [V].
+
+    period [s], ahead and bandwidth [Hz] as of ``SampledWall``.
+    """
+
+    body: Body
+    period: float
+    ahead: int
+    bandwidth: float
+
+    def damping(self, brake: float) -> float:
+        """b + b_passive of (1.2) [N*m*s/rad]."""
+        return self.body.damping + self.body.brake_damping * abs(brake)
+
+    def loop(self, brake: float, hand: bool) -> SampledWall:
+        """The sampled loop around the shaft, with the hand or without."""
+        body = self.body
+        return SampledWall(
+            body.inertia,
+            self.damping(brake) + (body.hand_damping if hand else 0.0),
+            body.hand_stiffness if hand else 0.0,
+            self.period,
+            self.ahead,
+            self.bandwidth,
+        )
+
+    def passive_stiffness(self, brake: float, damping: float) -> float:
+        """Largest passive stiffness of a wall of this damping [N*m/rad]."""
+        return passive_stiffness(self.damping(brake), damping, self.period)
+
+    def bounds(
+        self, brake: float, dampings: Sequence[float], stiffest: float
+    ) -> tuple[Series, Series, Series]:
+        """Bounds of stability, handle held and free, and of passivity over the damping."""
+        drawn = np.linspace(min(dampings), max(dampings), _DRAWN)
+
+        def stable(label: str, hand: bool) -> Series:
+            loop = self.loop(brake, hand)
+            bound = np.array([loop.critical_stiffness(damping) for damping in drawn])
+            return Series(label, drawn, np.where(bound <= stiffest, bound, math.nan))
+
+        return (
+            stable("stable, handle held", hand=True),
+            stable("stable, handle free", hand=False),
+            Series(
+                "passive by (1.1)" if brake == 0.0 else "passive by (1.2)",
+                np.array([0.0, self.damping(brake)]),
+                np.array([self.passive_stiffness(brake, 0.0), 0.0]),
+            ),
+        )

@@ -21,12 +21,13 @@ import numpy as np
 import numpy.typing as npt
 
 from daq.hal import FloatArray, Samples
-from protocols.staircase import Plateau
+from protocols.analysis.results import Estimate, student
+from protocols.control.staircase import Plateau
 
 _BATCHES = 16  # of a plateau, whose means tell how far its mean may be trusted
 _LEAST_ERROR = 1e-9  # of a mean, in its unit, where nothing is noisy
 
-BoolArray = npt.NDArray[np.bool_]
+Rows = npt.NDArray[np.intp]
 
 
 @dataclass(frozen=True)
@@ -61,28 +62,20 @@ def levels_of(
     settled = extra["settled"] == 1.0
     levels = []
     for index, plateau in enumerate(plateaus):
-        counted = _last_stretch(settled & (extra["plateau"] == index))
-        rows = np.flatnonzero(counted)
-        # A sample short of the time is whole: times are a row's, not a row's end.
-        short = 1.5 * float(np.median(np.diff(samples.time[rows]))) if len(rows) > 1 else 0.0
-        if (
-            len(rows) < 2
-            or samples.time[rows[-1]] - samples.time[rows[0]] < plateau.measure - short
-        ):
+        rows = _last_stretch(np.flatnonzero(settled & (extra["plateau"] == index)))
+        if len(rows) < 2:
             continue
-        levels.append(_level(samples, extra, index, rows[_whole_turns(samples.theta[rows])]))
+        time = samples.time[rows]
+        # A sample short of the time is whole: times are a row's, not a row's end.
+        if time[-1] - time[0] >= plateau.measure - 1.5 * float(np.median(np.diff(time))):
+            levels.append(_level(samples, extra, index, rows[_whole_turns(samples.theta[rows])]))
     return levels
 
 
-def _last_stretch(counted: BoolArray) -> BoolArray:
-    """Only the last of the stretches of true: a departure from the band began the plateau anew."""
-    rows = np.flatnonzero(counted)
-    if len(rows) == 0:
-        return counted
+def _last_stretch(rows: Rows) -> Rows:
+    """The last rows without a gap: a departure from the band began the plateau anew."""
     breaks = np.flatnonzero(np.diff(rows) > 1)
-    first = rows[breaks[-1] + 1] if len(breaks) else rows[0]
-    last: BoolArray = counted & (np.arange(len(counted)) >= first)
-    return last
+    return rows[breaks[-1] + 1 :] if len(breaks) else rows
 
 
 def _whole_turns(theta: FloatArray) -> slice:
@@ -92,9 +85,7 @@ def _whole_turns(theta: FloatArray) -> slice:
     return slice(int(np.searchsorted(travel, 2.0 * math.pi * turns)) if turns else len(theta))
 
 
-def _level(
-    samples: Samples, extra: Mapping[str, FloatArray], index: int, rows: npt.NDArray[np.intp]
-) -> Level:
+def _level(samples: Samples, extra: Mapping[str, FloatArray], index: int, rows: Rows) -> Level:
     time, theta = samples.time[rows], samples.theta[rows]
     torque, current = samples.torque[rows], samples.current_motor[rows]
     return Level(
@@ -120,22 +111,13 @@ def _error_of_mean(values: FloatArray) -> float:
 
 @dataclass(frozen=True)
 class Motor:
-    """What is known of the motor: constant [N*m/A] and viscous damping [N*m*s/rad].
+    """Constant [N*m/A] and viscous damping [N*m*s/rad] of the motor, by its ratings.
 
     Needed where the torque sensor is at the load; elsewhere the run tells both.
     """
 
     constant: float
     damping: float
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """A value with the ends of its 95 % interval."""
-
-    value: float
-    low: float
-    high: float
 
 
 @dataclass(frozen=True)
@@ -158,10 +140,14 @@ class Line:
     constant: Estimate | None
     damping: Estimate | None
 
-    def torque(self, level: int, omega: FloatArray) -> FloatArray:
+    @property
+    def slopes(self) -> FloatArray:
+        """Torque over velocity while sliding, at each brake command, (m,) [N*m*s/rad]."""
+        return self.c0.value + (self.c1.value if self.c1 else 0.0) * self.currents
+
+    def torque(self, place: int, omega: FloatArray) -> FloatArray:
         """The brake's torque at a brake command, by its place, and velocities [N*m]."""
-        slope = self.c0.value + (self.c1.value * float(self.currents[level]) if self.c1 else 0.0)
-        return float(self.kappa[level]) * np.sign(omega) + slope * omega
+        return float(self.kappa[place]) * np.sign(omega) + float(self.slopes[place]) * omega
 
 
 def fit(levels: Sequence[Level], plateaus: Sequence[Plateau], motor: Motor | None) -> Line:
@@ -169,48 +155,45 @@ def fit(levels: Sequence[Level], plateaus: Sequence[Plateau], motor: Motor | Non
 
     Raises ValueError where no brake command has two of them in a direction.
     """
-    own = np.array([plateaus[level.index].brake for level in levels])
+    command = np.array([plateaus[level.index].brake for level in levels])
     omega = np.array([level.omega for level in levels])
-    if not _has_slope(own, omega):
+    if not _has_slope(command, omega):
         raise ValueError(
             "no brake command has two settled velocities in the same direction, which a slope takes"
         )
-    commands, place = np.unique(own, return_inverse=True)
+    commands, place = np.unique(command, return_inverse=True)
+    m = len(commands)
     measured = np.array([level.brake_current for level in levels])
-    currents = np.array([measured[place == i].mean() for i in range(len(commands))])
+    currents = np.array([measured[place == i].mean() for i in range(m)])
     currents *= -1.0 if currents.sum() < 0.0 else 1.0  # the brake cares for its size alone
-    brake = np.column_stack([
-        np.sign(omega)[:, None] * (place[:, None] == np.arange(len(commands))),
-        omega,
-        currents[place] * omega,
-    ])  # fmt: skip
+    sign = np.sign(omega)
+    kappa = sign[:, None] * (place[:, None] == np.arange(m))
+    brake = np.column_stack([kappa, omega, currents[place] * omega])
     torque = np.array([level.torque.mean() for level in levels])
     current = np.array([level.current_motor.mean() for level in levels])
     errors = _pooled(levels, [level.torque_error for level in levels])
     current_errors = _pooled(levels, [level.current_error for level in levels])
     # What the zero of a sensor may still be off is told by the other direction alone.
-    ones = np.full((len(levels), 1), float(np.ptp(np.sign(omega)) > 0.0))
+    offset = np.full((len(levels), 1), float(np.ptp(sign) > 0.0))
     if motor is not None:
         sides = motor.constant * current - motor.damping * omega
-        solved = _solve(np.hstack([brake, ones]), sides, motor.constant * current_errors)
+        solution = _solve(np.hstack([brake, offset]), sides, motor.constant * current_errors)
     else:
         constant = _constant(torque, current)
-        none = np.zeros((len(levels), 4))
-        losses = np.column_stack([ones, -current, omega, np.sign(omega)])
-        matrix = np.block([[brake, ones, none], [brake, 0.0 * ones, losses]])
+        losses = np.column_stack([offset, -current, omega, sign])
+        matrix = np.block([[brake, offset, np.zeros_like(losses)], [brake, 0.0 * offset, losses]])
         sides = np.concatenate([torque, 0.0 * torque])
-        solved = _solve(matrix, sides, np.concatenate([errors, constant * current_errors]))
-    m = len(commands)
+        solution = _solve(matrix, sides, np.concatenate([errors, constant * current_errors]))
     return Line(
-        c0=solved.estimate(m),
-        c1=solved.estimate(m + 1) if m > 1 else None,
+        c0=solution.estimate(m),
+        c1=solution.estimate(m + 1) if m > 1 else None,
         commands=commands,
         currents=currents,
-        kappa=solved.values[:m],
-        kappa_errors=solved.errors[:m],
-        misfit=solved.misfit,
-        constant=None if motor else solved.told(m + 4),
-        damping=None if motor else solved.told(m + 5),
+        kappa=solution.values[:m],
+        kappa_errors=solution.errors[:m],
+        misfit=solution.misfit,
+        constant=None if motor else solution.determined(m + 4),
+        damping=None if motor else solution.determined(m + 5),
     )
 
 
@@ -244,26 +227,25 @@ def _constant(torque: FloatArray, current: FloatArray) -> float:
 
 
 @dataclass(frozen=True)
-class _Solved:
+class _Solution:
+    """Values and their standard errors, (n,); misfit as of ``Line``; degrees of freedom."""
+
     values: FloatArray
     errors: FloatArray
     misfit: float
     freedom: int
 
     def estimate(self, place: int) -> Estimate:
-        from scipy.stats import t
+        value, error = float(self.values[place]), float(self.errors[place])
+        return Estimate(value, error, student(self.freedom))
 
-        reach = float(t.ppf(0.975, self.freedom)) * float(self.errors[place])
-        value = float(self.values[place])
-        return Estimate(value, value - reach, value + reach)
-
-    def told(self, place: int) -> Estimate | None:
-        """The estimate where the rows tell it to a half, None elsewhere."""
-        found = self.estimate(place)
-        return found if found.high - found.value < 0.5 * found.value else None
+    def determined(self, place: int) -> Estimate | None:
+        """The estimate where the rows determine it to a half, None elsewhere."""
+        estimate = self.estimate(place)
+        return estimate if estimate.high - estimate.value < 0.5 * estimate.value else None
 
 
-def _solve(matrix: FloatArray, sides: FloatArray, errors: FloatArray) -> _Solved:
+def _solve(matrix: FloatArray, sides: FloatArray, errors: FloatArray) -> _Solution:
     """Weighted least squares; what the rows cannot tell apart does not spoil what they can."""
     weighted, target = matrix / errors[:, None], sides / errors
     inverse = np.linalg.pinv(weighted, rcond=1e-10)
@@ -271,47 +253,4 @@ def _solve(matrix: FloatArray, sides: FloatArray, errors: FloatArray) -> _Solved
     freedom = max(len(sides) - int(np.linalg.matrix_rank(weighted)), 1)
     misfit = float(np.linalg.norm(weighted @ values - target) / math.sqrt(freedom))
     spread = np.sqrt(np.sum(inverse**2, axis=1)) * max(misfit, 1.0)
-    return _Solved(values, spread, misfit, freedom)
-
-
-@dataclass(frozen=True)
-class Ripple:
-    """The strongest part of a torque that recurs with every turn.
-
-    amplitude and its standard error [N*m], periods in a turn; angle, torque, errors: means over
-    parts of a turn and their standard errors, (n,).
-    """
-
-    amplitude: float
-    error: float
-    periods: int
-    angle: FloatArray
-    torque: FloatArray
-    errors: FloatArray
-
-
-_HARMONICS = 12  # in a turn
-_PARTS = 72  # of a turn
-
-
-def ripple(theta: FloatArray, torque: FloatArray) -> Ripple:
-    """How a torque (n,) [N*m] goes with the angle (n,) [rad] over whole turns."""
-    n = np.arange(1, _HARMONICS + 1)
-    waves = np.exp(-1j * np.outer(theta, n))
-    matrix = np.column_stack([np.ones(len(theta)), waves.real, waves.imag])
-    values, *_ = np.linalg.lstsq(matrix, torque, rcond=None)
-    sizes = np.hypot(values[1 : _HARMONICS + 1], values[_HARMONICS + 1 :])
-    residuals = torque - matrix @ values
-    strongest = int(np.argmax(sizes))
-    part = np.floor(theta % (2.0 * math.pi) / (2.0 * math.pi) * _PARTS).astype(int) % _PARTS
-    counts = np.bincount(part, minlength=_PARTS)
-    sums = np.bincount(part, torque, minlength=_PARTS)
-    seen = counts > 0
-    return Ripple(
-        amplitude=float(sizes[strongest]),
-        error=float(residuals.std() * math.sqrt(2.0 / len(theta))),
-        periods=strongest + 1,
-        angle=(np.flatnonzero(seen) + 0.5) * 2.0 * math.pi / _PARTS,
-        torque=sums[seen] / counts[seen],
-        errors=residuals.std() / np.sqrt(counts[seen]),
-    )
+    return _Solution(values, spread, misfit, freedom)

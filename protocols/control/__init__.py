@@ -1,0 +1,1 @@
+"""Controllers that answer every sample, and the settings of their loops."""

@@ -1,0 +1,1 @@
+"""Commands known beforehand: channels around an offset, smooth ends, whole samples."""
