@@ -11,13 +11,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from daq.errors import DeviceError
 from daq.hal import CHANNELS
 from daq.serial import codec, messages
 from daq.serial.clock import ClockEstimator
 from daq.serial.codec import Decoder, Frame
+from daq.serial.command_stream import CommandStream
 from daq.serial.messages import (
     Block,
     Codes,
@@ -37,8 +36,6 @@ RETRY = 0.1  # s until a request is sent again
 HELLO_RETRY = 0.2
 GIVE_UP = 1.0  # s until a request that nobody answers fails
 SILENCE = 1.0  # s without a sample until a run fails
-_RESEND = 0.15  # s without progress until commands are sent again
-_REWIND = 0.05  # s between two repetitions that a device asked for
 _CHUNK = 256  # ticks in a frame of commands at most
 
 _REASONS = {
@@ -103,11 +100,8 @@ class HostMachine:
         self._start: Start | None = None
         self._going = False
         self._expected = 0  # tick of the next sample
-        self._ring = np.zeros((1, len(CHANNELS)), dtype=messages.COMMAND_DTYPE)
-        # Ticks after the last command: of the program, on the line, at the device, with room there.
-        self._commanded = self._sent = self._taken = self._credit = 0
-        self._progress = self._rewound = self._pinged = 0.0
-        self._sample_at = self._frame_at = 0.0
+        self._commands = CommandStream(queue=1)
+        self._sample_at = self._frame_at = self._pinged = 0.0
         self._rejected = 0  # damaged frames, by the time of the last good frame
         self._receivers: dict[int, tuple[Callable[[bytes], Any], Callable[..., None]]] = {
             Type.SAMPLES: (messages.unpack_samples, self._add_samples),
@@ -132,7 +126,7 @@ class HostMachine:
             return
         if keep_alive and now - self._pinged >= 0.25e-3 * self._start.watchdog:
             self.ping(now)
-        if self._taken < self._sent and now - self._progress > _RESEND:
+        if self._commands.lags(now):
             self._rewind(now)
         self._pump(now)
         if self._going and now - self._sample_at > SILENCE:
@@ -187,10 +181,7 @@ class HostMachine:
         self.blocks.clear()
         self.status = None
         self._expected = 0
-        self._ring = np.zeros((2 * self.welcome.queue, len(CHANNELS)), messages.COMMAND_DTYPE)
-        # No credit until the device has answered.
-        self._commanded = self._sent = self._taken = self._credit = 0
-        self._progress = now
+        self._commands = CommandStream(self.welcome.queue, now)
         self.ask(Type.START, start.pack(), now)
 
     def go(self, now: float) -> None:
@@ -207,28 +198,18 @@ class HostMachine:
 
     def send(self, tick: int, codes: Codes, now: float) -> None:
         """Queue commands (n, 2) from ``tick`` on; they go out as the device has room."""
-        end = tick + len(codes)
-        if end - min(self._taken, tick) > len(self._ring):
-            raise DeviceError(
-                f"{end - self._commanded} more commands than the device takes now; "
-                "send no more than room() says"
-            )
-        self._ring[np.arange(tick, end) % len(self._ring)] = codes
-        if self._sent == self._commanded:
-            self._sent = max(self._sent, tick)
-            self._progress = now
-        self._commanded = max(self._commanded, end)
+        self._commands.give(tick, codes, now)
         self._pump(now)
 
     @property
     def room(self) -> int:
         """Commands that may still be sent."""
-        return max(0, self._credit - self._commanded)
+        return self._commands.room
 
     @property
     def preloaded(self) -> bool:
         """Whether the device has all that fits it of what was sent."""
-        return self._taken >= min(self._commanded, self._credit)
+        return self._commands.preloaded
 
     def describe(self) -> dict[str, Any]:
         """The line's record: counts of what was noticed, and the clocks' relation."""
@@ -285,8 +266,7 @@ class HostMachine:
     def _update(self, status: Status, seq: int, now: float) -> None:
         """Take in a STATUS; without progress it says that commands before the last are missing."""
         self._count(seq)
-        stands = status.queued_until == self._taken < self._sent
-        if stands and status.run == self._run and now - self._rewound > _REWIND:
+        if status.run == self._run and self._commands.lacks(status.queued_until, now):
             self._rewind(now)
         self._learn(status, now)
 
@@ -317,11 +297,7 @@ class HostMachine:
         if status.run != self._run or self._start is None or old:
             return
         self.status = status
-        if status.queued_until > self._taken:
-            self._taken = status.queued_until
-            self._progress = now
-        self._sent = max(self._sent, min(self._taken, self._commanded))
-        self._credit = max(self._credit, status.credit_until)
+        self._commands.acknowledge(status.queued_until, status.credit_until, now)
         self._pump(now)
         if self._going and status.latch is Latch.WATCHDOG:
             self._fail(self._why_tripped(now, self._start.watchdog))
@@ -338,9 +314,7 @@ class HostMachine:
         """Send again the commands that an open loop's device lacks; a closed loop holds on."""
         if self._start is None or self._start.mode is not LoopMode.OPEN:
             return
-        self.counters.resent_commands += self._sent - self._taken
-        self._sent = self._taken
-        self._rewound = self._progress = now
+        self.counters.resent_commands += self._commands.rewind(now)
         self._pump(now)
 
     def _pump(self, now: float) -> None:
@@ -349,13 +323,8 @@ class HostMachine:
             return
         size = len(CHANNELS) * messages.COMMAND_DTYPE.itemsize
         chunk = min(_CHUNK, (self.welcome.max_payload - messages.COMMANDS_OVERHEAD) // size)
-        end = min(self._commanded, self._credit)
-        while self._sent < end:
-            until = min(self._sent + chunk, end)
-            codes = self._ring[np.arange(self._sent, until) % len(self._ring)]
-            self._send(Type.COMMANDS, messages.pack_commands(self._run, self._sent, codes))
-            self._sent = until
-            self._progress = now
+        for first, codes in self._commands.chunks(chunk, now):
+            self._send(Type.COMMANDS, messages.pack_commands(self._run, first, codes))
 
     def _count(self, seq: int) -> None:
         """Notice frames that never came by the device's running number."""

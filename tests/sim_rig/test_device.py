@@ -5,11 +5,13 @@ import math
 import numpy as np
 import pytest
 
+from daq import hal
 from daq.errors import DeviceError
 from daq.hal import Flag, Guard, Mode, Phase, RawSamples
+from daq.serial.backend import SerialDevice, SerialOptions
 from sim_rig.backend import Imperfections, SimulatedDevice, Simulation
 from sim_rig.plant import Plant
-from sysid import Dataset
+from sysid import Dataset, ModelError
 from tests.sim_rig.support import PLANTS
 from tests.sysid.reference import simulate as reference
 
@@ -305,3 +307,28 @@ def test_a_hand_that_is_the_load_stays_where_it_has_wound_to():
     found.announce(Phase.RUN)
     turns = play(found, np.zeros((400, 2))).counts / 8192
     np.testing.assert_allclose(turns, 1.1, atol=0.02)
+
+
+@pytest.mark.parametrize(("ideal", "bits"), [(False, 12), (True, 24)])
+def test_a_board_has_the_same_plant_in_virtual_time_and_without_faults(ideal, bits):
+    options = Simulation(
+        seed=7, ideal=ideal, time="real", faults={"lost": 0.5}, imperfections={"bits": 12}
+    )
+    served = SimulatedDevice(options)
+    assert isinstance(served, hal.Simulation)
+    electronics = served.board()
+    assert (electronics.step_in, electronics.step_out) == (20.0 / 2**bits, 20.0 / 2**16)
+    info = electronics.device.open()
+    assert info.virtual_time and info.volts_in == electronics.volts == (-10.0, 10.0)
+    plain = device(seed=7, ideal=ideal, imperfections={"bits": 12})
+    there, here = (play(item, waveform(200)) for item in (electronics.device, plain))
+    assert np.array_equal(there.analog, here.analog) and np.array_equal(there.counts, here.counts)
+
+
+def test_a_simulation_knows_its_plants_values_and_hardware_does_not():
+    plant = Plant(parameters={"K_m": 0.123})
+    model = SimulatedDevice(Simulation(plant=plant)).process_model()
+    assert dict(zip(model.parameter_names, model.nominal, strict=True))["K_m"] == 0.123
+    with pytest.raises(ModelError, match="put the sensor at the load"):
+        SimulatedDevice(Simulation(plant=Plant(load="hand", sensor="between"))).process_model()
+    assert not isinstance(SerialDevice(SerialOptions()), hal.Simulation)
