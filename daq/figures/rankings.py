@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -35,7 +35,11 @@ def ratios(best: str, others: Sequence[Ratio]) -> Figure:
     panel.axvline(1.0, color="black", lw=0.4, zorder=1)
     for place, ratio in enumerate(rows):
         bars = [[ratio.value - ratio.low], [ratio.high - ratio.value]]
-        look = {"color": style.IDENTIFIED, "ecolor": style.BASELINE, "elinewidth": 1.2}
+        look: dict[str, Any] = {
+            "color": style.IDENTIFIED,
+            "ecolor": style.BASELINE,
+            "elinewidth": 1.2,
+        }
         panel.errorbar(ratio.value, place, xerr=bars, fmt="o", ms=3.0, capsize=2.0, **look)
         name = ratio.name if len(ratio.name) <= _NAME else f"{ratio.name[: _NAME - 1]}…"
         panel.text(0.01, place - 0.28, name.replace("$", r"\$"), fontsize=6.0, va="center",

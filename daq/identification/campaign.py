@@ -97,6 +97,9 @@ class CampaignRequest:
     """Every log with every model and seed; together: one parameter set for all logs.
 
     models: by name, none for the configuration's. seeds: ``0:10`` for 0 to 9, or ``3,5,8``.
+
+    >>> CampaignRequest([Path("runs/a"), Path("runs/b")], seeds="0:5").together
+    False
     """
 
     logs: Sequence[Path]
@@ -114,6 +117,10 @@ class CampaignResult:
     """All runs of a campaign, and where they were written.
 
     table: the CSV of all runs. files: parameters of the best run, by model and logs.
+
+    >>> from sysid import Campaign
+    >>> sorted(CampaignResult(Campaign(()), Path("campaign.csv"), {}).document)
+    ['files', 'interrupted', 'runs', 'software', 'spread']
     """
 
     campaign: Campaign
@@ -141,7 +148,16 @@ class CampaignResult:
 
 
 def campaign(wanted: CampaignRequest, watch: Watch = ignore) -> CampaignResult:
-    """Identify every log with every model and seed; keep every result. Raises ConfigError."""
+    """Identify every log with every model and seed; keep every result. Raises ConfigError.
+
+    >>> from daq import CampaignRequest, campaign, record
+    >>> from daq.identification.request import SettingsRequest
+    >>> quick = SettingsRequest(options={"population": 16, "generations": 2})
+    >>> run = record("prbs.yaml")
+    >>> result = campaign(CampaignRequest([run.folder], seeds="0:2", settings=quick))
+    >>> len(result.campaign.outcomes), result.table.name
+    (2, 'campaign.csv')
+    """
     problems = problems_of(wanted.settings, distinct(wanted.models), watch)
     seeds = parse_seeds(wanted.seeds) or [problems[0].settings.seed]
     folder = wanted.out or _default_folder()

@@ -45,6 +45,9 @@ class ComparisonRequest:
     """Structures to be compared on logs: models by name, linear baselines, several seeds.
 
     baselines: ``ARX``, ``ARMAX``. seeds: ``0:10`` for 0 to 9, or ``3,5,8``.
+
+    >>> ComparisonRequest([Path("runs/a")], models=["actuator"], baselines=["ARX"]).seeds is None
+    True
     """
 
     logs: Sequence[Path]
@@ -71,6 +74,13 @@ class ComparisonResult:
 
     group: the logs, as the first model used them. candidates: with their free runs. files:
     parameters by model. request_words: what the command line named besides models and logs.
+
+    >>> from daq import ComparisonRequest, compare, record
+    >>> quick = SettingsRequest(options={"population": 16, "generations": 2})
+    >>> logs = [record("prbs.yaml").folder], [record("prbs.yaml", validation=True).folder]
+    >>> result = compare(ComparisonRequest(*logs, baselines=["ARX"], settings=quick))
+    >>> result.comparison.preferred, result.file.name
+    ('actuator', 'comparison.yaml')
     """
 
     comparison: Comparison
@@ -101,6 +111,11 @@ def compare(wanted: ComparisonRequest, watch: Watch = ignore) -> ComparisonResul
     """Identify every structure from the logs and rank them; of one with several seeds the best.
 
     Raises ConfigError.
+
+    >>> both = SettingsRequest(options={"seed": 1})
+    >>> compare(ComparisonRequest([Path("runs/today")], seeds="0:3", settings=both))
+    Traceback (most recent call last):
+    daq.errors.ConfigError: --seed and --seeds: give one of them
     """
     if wanted.seeds is not None and wanted.settings.option("seed") is not None:
         raise ConfigError("--seed and --seeds: give one of them")

@@ -70,8 +70,7 @@ def identify(
     of settings; settings: keys of such a file. Raises ConfigError with cause and cure.
 
     >>> from daq import identify, record
-    >>> import tempfile
-    >>> run = record("prbs.yaml", out=tempfile.mkdtemp())
+    >>> run = record("prbs.yaml")
     >>> result = identify(run, population=16, generations=2, fixed={"R_m": 1.2})
     >>> result.parameters.loc["R_m", "value"]
     np.float64(1.2)
@@ -106,6 +105,10 @@ def resume(folder: str | Path, watch: Watch = ignore) -> Identification:
     """Continue an identification that was interrupted, as it was requested.
 
     folder: of its results, or the capture folder above. Raises ConfigError without such a one.
+
+    >>> resume("runs")
+    Traceback (most recent call last):
+    daq.errors.ConfigError: runs: no identification was interrupted there; name the folder ...
     """
     interrupted = request.recall(Path(folder))
     problem = problem_of(interrupted.settings, watch)

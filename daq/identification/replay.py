@@ -30,6 +30,11 @@ class Replay:
 
     time: (n,) [s]. measured, simulated: (n, n_outputs) in the outputs' units. source: whose
     parameters. warning: how a run that did not complete ended.
+
+    >>> from daq import record, replay
+    >>> result = replay(record("prbs.yaml"))
+    >>> result.below({"omega": 100.1})
+    {'omega': 100.1}
     """
 
     path: Path
@@ -90,9 +95,7 @@ def replay(
     those of the simulated rig. config: names the columns of a foreign log. Raises ConfigError.
 
     >>> from daq import record, replay
-    >>> import tempfile
-    >>> run = record("prbs.yaml", out=tempfile.mkdtemp())
-    >>> result = replay(run)  # through the simulated rig's own model
+    >>> result = replay(record("prbs.yaml"))  # through the simulated rig's own model
     >>> result.fit["current_motor"] > 95.0
     True
     """

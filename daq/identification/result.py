@@ -48,6 +48,11 @@ class Identification:
     uncertainty: None where the search was not refined to a minimum. profiles: those asked for.
     folder: where ``parameters.yaml`` was written, None where nothing was. seeds: the spread over
     several seeds, of which this is the best.
+
+    >>> from daq import identify, record
+    >>> result = identify(record("prbs.yaml"), population=16, generations=2)
+    >>> result.save("results").name, list(result.metrics.columns)
+    ('parameters.yaml', ['rmse', 'msd', 'fit_percent'])
     """
 
     problem: Problem

@@ -25,7 +25,11 @@ RESULTS = "results"
 
 @dataclass(frozen=True)
 class Analysis:
-    """Findings from a capture folder; they stand in its ``results``, too."""
+    """Findings from a capture folder; they stand in its ``results``, too.
+
+    >>> Analysis(Path("runs/today"), Findings(remarks=("all quiet",))).findings.remarks
+    ('all quiet',)
+    """
 
     folder: Path
     findings: Findings
@@ -41,6 +45,11 @@ def analyse(folder: str | Path, *, watch: Watch = ignore) -> Analysis:
 
     Raises ConfigError for what is no capture, or one of a protocol that only excites; RunError
     where nothing follows.
+
+    >>> from daq import analyse, record
+    >>> analyse(record("prbs.yaml").folder)
+    Traceback (most recent call last):
+    daq.errors.ConfigError: runs/...-prbs: the protocol 'prbs' only excites, and concludes nothing ...
     """
     folder = Path(folder)
     csv = log_path(folder)

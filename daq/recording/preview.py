@@ -44,7 +44,13 @@ class ChannelFacts:
 
 @dataclass(frozen=True)
 class Preview:
-    """A session that has been checked, and what its plan does to each channel."""
+    """A session that has been checked, and what its plan does to each channel.
+
+    >>> from daq import check
+    >>> preview = check("prbs.yaml")
+    >>> preview.channels["motor"].limits_volts, preview.concludes
+    ((-5.0, 5.0), False)
+    """
 
     session: Session
     channels: dict[str, ChannelFacts]

@@ -111,8 +111,7 @@ def record(
     RigError with cause and cure; outputs are zero then.
 
     >>> from daq import record
-    >>> import tempfile
-    >>> run = record("prbs.yaml", out=tempfile.mkdtemp(), options={"seed": 1})
+    >>> run = record("prbs.yaml", options={"seed": 1})
     >>> run.record["status"], len(run.frame)
     ('completed', 8000)
     """

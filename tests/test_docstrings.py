@@ -1,0 +1,66 @@
+"""Examples in docstrings run, and everything that daq and sysid export has one."""
+
+from __future__ import annotations
+
+import doctest
+import importlib
+import pkgutil
+
+import pytest
+
+import daq
+import protocols
+import sim_rig
+import sysid
+
+# Exported objects whose docstring has no example yet; empties as they get theirs.
+MISSING = {
+    "ARMAX",
+    "ARX",
+    "BatchResult",
+    "BatchSimulator",
+    "GASSI",
+    "LinearModel",
+    "Status",
+    "Stepper",
+    "equilibrium",
+    "free_run",
+    "jacobian",
+    "linearize",
+    "select_orders",
+}
+
+
+def modules_of(package):
+    yield package.__name__
+    for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
+        if not module.name.endswith("__main__"):
+            yield module.name
+
+
+def examples():
+    """The docstrings that have examples, by the objects' names."""
+    finder = doctest.DocTestFinder(exclude_empty=True)
+    for package in (daq, protocols, sim_rig, sysid):
+        for name in modules_of(package):
+            for test in finder.find(importlib.import_module(name)):
+                if test.examples:
+                    yield pytest.param(test, id=test.name)
+
+
+@pytest.mark.parametrize("example", examples())
+def test_an_example_prints_what_it_says(example, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    report: list[str] = []
+    flags = doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS
+    results = doctest.DocTestRunner(optionflags=flags).run(example, out=report.append)
+    assert not results.failed, "".join(report)
+
+
+@pytest.mark.parametrize(
+    "exported", [(package, name) for package in (daq, sysid) for name in package.__all__], ids=str
+)
+def test_what_is_exported_has_an_example(exported):
+    package, name = exported
+    has_example = bool(doctest.DocTestParser().get_examples(getattr(package, name).__doc__))
+    assert has_example != (name in MISSING)
