@@ -114,8 +114,8 @@ class RigError(Exception):
 class ConfigError(RigError):
     """Wrong usage, configuration or input file: nothing was energised (exit status 2).
 
-    >>> str(ConfigError("it must be above 0", cure="write 0.5", file="rig.yaml", line=3, key="rate"))
-    'rig.yaml:3: rate: it must be above 0; write 0.5'
+    >>> str(ConfigError("it must be above 0", cure="write 0.5", file="rig.yaml", line=3))
+    'rig.yaml:3: it must be above 0; write 0.5'
     """
 
     exit_status = 2

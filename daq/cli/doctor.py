@@ -38,7 +38,8 @@ def doctor(
         _show(diagnosis)
     if diagnosis.bad:
         raise RunError(
-            f"not fit for a rig in real time: {', '.join(diagnosis.bad)}; the cures stand above"
+            f"not fit for a rig in real time: {', '.join(diagnosis.bad)}",
+            cure="the cures stand above",
         )
 
 

@@ -65,8 +65,11 @@ def emulate(
     config, device = load_rig(rig)
     if not isinstance(device, Simulation):
         raise ConfigError(
-            f"{rig}: its backend is {config.backend!r}; only the simulated one can be emulated. "
-            "Name a rig file with 'backend: simulated'"
+            f"its backend is {config.backend!r}",
+            cure=(
+                "only the simulated one can be emulated. Name a rig file with 'backend: simulated'"
+            ),
+            file=rig,
         )
 
     def ready(port: str) -> None:

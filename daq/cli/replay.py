@@ -132,8 +132,8 @@ def _require_outputs(bounds: dict[str, float], result: Replay) -> None:
     for name in bounds:
         if name not in result.fit:
             raise ConfigError(
-                f"--fail-under {name}: model {result.model.name} has no such output; "
-                f"{suggestion(name, result.model.output_names)}"
+                f"--fail-under {name}: model {result.model.name} has no such output",
+                cure=suggestion(name, result.model.output_names),
             )
 
 
@@ -149,7 +149,7 @@ def _draw(result: Replay, path: Path | None) -> Path | None:
         draw_replay(result, chosen)
     except RunError as error:
         if path is not None:
-            raise ConfigError(f"{error}; or choose another with --figure FILE.png") from None
+            raise ConfigError(str(error), cure="or choose another with --figure FILE.png") from None
         terminal.report_warning(str(error))
         return None
     return chosen

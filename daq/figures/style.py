@@ -307,8 +307,9 @@ def format_of(path: Path) -> Format:
         if kind == written:
             return written  # type: ignore[no-any-return]
     raise ConfigError(
-        f"{path}: figures are written as {', '.join(get_args(Format))}; "
-        f"for example {path.with_suffix('.png')}"
+        f"figures are written as {', '.join(get_args(Format))}",
+        cure=f"for example {path.with_suffix('.png')}",
+        file=path,
     )
 
 

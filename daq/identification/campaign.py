@@ -43,7 +43,7 @@ class Workers:
         """Set joblib's backend; the number of jobs to ask it for."""
         if self.jobs == 0:
             raise ConfigError(
-                "--jobs: 0 runs at a time do nothing; give 1 or more, -1 for all cores"
+                "0 runs at a time do nothing", cure="give 1 or more, -1 for all cores", key="--jobs"
             )
         if self.dask is None:
             yield -1 if self.jobs is None else self.jobs
@@ -236,12 +236,14 @@ def parse_seeds(text: str | None) -> list[int]:
         else:
             seeds = [int(part) for part in text.split(",")]
     except ValueError:
-        raise ConfigError(f"--seeds: {text!r} is no list of seeds; {_SEEDS_HELP}") from None
+        raise ConfigError(
+            f"{text!r} is no list of seeds", cure=_SEEDS_HELP, key="--seeds"
+        ) from None
     if not seeds:
-        raise ConfigError(f"--seeds: {text!r} holds no seed; {_SEEDS_HELP}")
+        raise ConfigError(f"{text!r} holds no seed", cure=_SEEDS_HELP, key="--seeds")
     for seed in seeds:
         if not 0 <= seed < 2**32:
-            raise ConfigError(f"--seeds: {seed} is outside 0 .. 4294967295; {_SEEDS_HELP}")
+            raise ConfigError(f"{seed} is outside 0 .. 4294967295", cure=_SEEDS_HELP, key="--seeds")
     return list(dict.fromkeys(seeds))
 
 
@@ -249,7 +251,7 @@ def distinct(models: Sequence[str]) -> list[str | None]:
     """The models named, None for the default; ConfigError when one is named twice."""
     for name in models:
         if models.count(name) > 1:
-            raise ConfigError(f"--model: {name} is given twice; name each model once")
+            raise ConfigError(f"{name} is given twice", cure="name each model once", key="--model")
     return [*models] or [None]
 
 
@@ -275,22 +277,29 @@ def _client(address: str) -> Iterator[Any]:
         import distributed
     except ImportError:
         raise ConfigError(
-            "--dask: dask is not installed; install it with: pip install 'hybrid-rig[cluster]'"
+            "dask is not installed",
+            cure="install it with: pip install 'hybrid-rig[cluster]'",
+            key="--dask",
         ) from None
     connect: Any = distributed.Client
     try:
         client = connect(address, timeout=CONNECT_TIMEOUT, set_as_default=False)
     except (OSError, ValueError, TimeoutError) as error:
         raise ConfigError(
-            f"--dask: no scheduler answers at {address} ({type(error).__name__}); start one with "
-            "'dask scheduler', workers with 'dask worker ADDRESS', and give the address that it "
-            "prints, as tcp://192.168.0.10:8786"
+            f"no scheduler answers at {address} ({type(error).__name__})",
+            cure=(
+                "start one with 'dask scheduler', workers with 'dask worker "
+                "ADDRESS', and give the address that it prints, as "
+                "tcp://192.168.0.10:8786"
+            ),
+            key="--dask",
         ) from None
     with client:
         if not client.ncores():
             raise ConfigError(
-                f"--dask: the scheduler at {address} has no workers; start some with "
-                f"'dask worker {address}'"
+                f"the scheduler at {address} has no workers",
+                cure=f"start some with 'dask worker {address}'",
+                key="--dask",
             )
         yield client
 

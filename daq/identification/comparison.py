@@ -162,10 +162,15 @@ def _require_same_outputs(groups: Sequence[Group]) -> None:
         problem = group.problem
         if problem.model.output_names != first.model.output_names:
             raise ConfigError(
-                f"--model: {first.model_name} has the outputs "
-                f"{', '.join(first.model.output_names)}, {problem.model_name} "
-                f"{', '.join(problem.model.output_names)}; to be compared they must have the "
-                "same, chosen with 'outputs' in a file given with --config"
+                f"{first.model_name} has the outputs "
+                f"{', '.join(first.model.output_names)}, "
+                f"{problem.model_name} "
+                f"{', '.join(problem.model.output_names)}",
+                cure=(
+                    "to be compared they must have the same, chosen with "
+                    "'outputs' in a file given with --config"
+                ),
+                key="--model",
             )
 
 

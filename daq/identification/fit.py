@@ -155,8 +155,9 @@ def load_logs(
     for log in check:
         if log.path.resolve() in paths:
             raise ConfigError(
-                f"{log.path}: the same log is given for training and for validation; "
-                "a model proves itself only on data it has not seen"
+                "the same log is given for training and for validation",
+                cure="a model proves itself only on data it has not seen",
+                file=log.path,
             )
     return train, check
 
@@ -180,7 +181,9 @@ def check_writable(folder: Path) -> None:
         reason = "permission denied"
     else:
         return
-    raise ConfigError(f"{folder}: cannot be created: {reason}; choose a folder with --out")
+    raise ConfigError(
+        f"cannot be created: {reason}", cure="choose a folder with --out", file=folder
+    )
 
 
 def assemble(
@@ -211,15 +214,16 @@ def take(
         return records.load(Path(source), model, mapping)
     if mapping is not None:
         raise ConfigError(
-            f"{mapping.file.path}: its 'columns' are those of files; rename a table's columns "
-            "to the model's signals instead, and leave them out"
+            "its 'columns' are those of files",
+            cure="rename a table's columns to the model's signals instead, and leave them out",
+            file=mapping.file.path,
         )
     try:
         if isinstance(source, Recording):
             return records.from_recording(source, model)
         return records.from_frame(source, name, model)
     except ModelError as error:
-        raise ConfigError(f"{name}: {error}") from None
+        raise ConfigError(str(error), file=name) from None
 
 
 def _fitted(log: LoggedRecord, estimator: GASSI) -> FittedLog:

@@ -51,7 +51,7 @@ def expand(paths: list[Path]) -> list[Path]:
             inside = sorted(path.glob("*.csv"))
             if not inside:
                 raise ConfigError(
-                    f"{path}: neither a capture folder (with log.csv) nor a folder of CSV files"
+                    "neither a capture folder (with log.csv) nor a folder of CSV files", file=path
                 )
             logs += inside
         else:
@@ -66,7 +66,7 @@ def load(path: Path, model: ProcessModel, mapping: ColumnMapping | None) -> Logg
             return _load_foreign(log_path(path), model, mapping)
         return from_recording(load_recording(path), model)
     except ModelError as error:
-        raise ConfigError(f"{path}: {error}") from None
+        raise ConfigError(str(error), file=path) from None
 
 
 def from_recording(recording: Recording, model: ProcessModel) -> LoggedRecord:
@@ -81,14 +81,15 @@ def from_frame(frame: pd.DataFrame, name: str, model: ProcessModel) -> LoggedRec
     for column in wanted:
         if column not in frame:
             raise ConfigError(
-                f"{name}: model {model.name} needs the column {column!r}; the table has "
-                f"{', '.join(map(str, frame.columns))}. Rename or add it"
+                f"model {model.name} needs the column {column!r}",
+                cure=f"the table has {', '.join(map(str, frame.columns))}. Rename or add it",
+                file=name,
             )
     require_rows(path, len(frame))
     try:
         numbers = frame.loc[:, list(wanted)].astype(np.float64)
     except (TypeError, ValueError) as error:
-        raise ConfigError(f"{name}: a column is not of numbers: {error}") from None
+        raise ConfigError(f"a column is not of numbers: {error}", file=name) from None
     tick, dt = time_base(path, numbers["t"].to_numpy(), first_line=0)
     log = Recording(path, numbers.assign(tick=tick), dt)
     return LoggedRecord(_from_log(log, model, name), path, None)
@@ -119,9 +120,11 @@ def _halves(log: LoggedRecord, part: float) -> tuple[LoggedRecord, LoggedRecord]
         measured = np.isfinite(whole.outputs[first:last]).any(axis=0)
         if last - first < 2 or not measured.all():
             raise ConfigError(
-                f"{log.path}: with hold_back {part:g} the {share} of it hold {last - first} "
-                f"samples{'' if measured.all() else ' and miss an output'}; hold back another "
-                "part, or validate with another log"
+                f"with hold_back {part:g} the {share} of it hold "
+                f"{last - first} "
+                f"samples{'' if measured.all() else ' and miss an output'}",
+                cure="hold back another part, or validate with another log",
+                file=log.path,
             )
         dataset = whole.part(first, last, f"{whole.name} ({share})")
         halves.append(replace(log, dataset=dataset))
@@ -170,9 +173,12 @@ def _from_log(log: Recording, model: ProcessModel, title: str) -> Dataset:
     for name in (*model.input_names, *model.output_names):
         if name not in columns:
             raise ConfigError(
-                f"{log.path}: model {model.name} needs {name!r}, which is no column of "
-                f"this log; {suggestion(name, columns)} Name the column in the 'columns' "
-                "section of a file given with --config"
+                f"model {model.name} needs {name!r}, which is no column of this log",
+                cure=(
+                    f"{suggestion(name, columns)} Name the column in the "
+                    "'columns' section of a file given with --config"
+                ),
+                file=log.path,
             )
     inputs = log.frame[list(model.input_names)].to_numpy(dtype=np.float64)
     outputs = log.frame[list(model.output_names)].to_numpy(dtype=np.float64)
@@ -294,8 +300,9 @@ def _dataset(
     length = int(rows[-1]) + 1
     if length > 50 * len(rows) + 1000:
         raise ConfigError(
-            f"{path}: the log covers {length} sample times but holds {len(rows)} samples; "
-            "too much is missing to identify anything from it"
+            f"the log covers {length} sample times but holds {len(rows)} samples",
+            cure="too much is missing to identify anything from it",
+            file=path,
         )
     whole = np.full((length, len(model.outputs)), np.nan)
     whole[rows] = outputs

@@ -134,11 +134,12 @@ def _parameters_of_rig(rig: str) -> tuple[ProcessModel, dict[str, float]]:
     _, device = load_rig(rig)
     if not isinstance(device, Simulation):
         raise ConfigError(
-            f"{rig}: only a simulated rig knows its own parameters; "
-            "give those of an identification with --parameters"
+            "only a simulated rig knows its own parameters",
+            cure="give those of an identification with --parameters",
+            file=rig,
         )
     try:
         model = device.process_model()
     except ModelError as error:
-        raise ConfigError(f"{rig}: {error}") from None
+        raise ConfigError(str(error), file=rig) from None
     return model, dict(zip(model.parameter_names, model.nominal, strict=True))

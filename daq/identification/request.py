@@ -92,10 +92,11 @@ def recall(folder: Path) -> InterruptedFit:
                 [Path(path) for path in content["validation"]],
             )
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise ConfigError(f"{place / _REQUEST}: cannot be read: {error}") from None
+            raise ConfigError(f"cannot be read: {error}", file=place / _REQUEST) from None
     raise ConfigError(
-        f"{folder}: no identification was interrupted there; name the folder that its results "
-        "were to go to"
+        "no identification was interrupted there",
+        cure="name the folder that its results were to go to",
+        file=folder,
     )
 
 

@@ -116,7 +116,7 @@ def _as_model(source: Any, where: str, options: str) -> ProcessModel:
     if callable(source) and not isinstance(source, ProcessModel):
         source = _made(source, where, _split(options, where, _lists(source)))
     elif options:
-        raise ConfigError(f"{where} is a finished model; it takes no options ({options!r})")
+        raise ConfigError(f"{where} is a finished model", cure=f"it takes no options ({options!r})")
     if not isinstance(source, ProcessModel):
         raise ConfigError(
             f"{where} is of type {type(source).__name__}, not a sysid.ProcessModel or a function "
@@ -136,7 +136,7 @@ def _split(options: str, where: str, lists: frozenset[str]) -> dict[str, Any]:
             continue
         if not (key and equals and value):
             raise ConfigError(
-                f"{where}: {item!r} is no option; write NAME:option=value,option=value"
+                f"{item!r} is no option", cure="write NAME:option=value,option=value", file=where
             )
         chosen[key] = (value,) if key in lists else value
         last = key
@@ -156,18 +156,20 @@ def _made(factory: Callable[..., Any], where: str, options: dict[str, Any]) -> A
     names = list(inspect.signature(factory).parameters)
     for key in options:
         if key not in names:
-            raise ConfigError(f"{where} has no option {key!r}; {suggestion(key, names)}")
+            raise ConfigError(f"{where} has no option {key!r}", cure=suggestion(key, names))
     try:
         # Turns text into what the function's annotations ask for.
         return validate_call(factory)(**options) if options else factory()
     except ValidationError as error:
         first = error.errors()[0]
         key = str(first["loc"][0]) if first["loc"] else "its options"
-        raise ConfigError(f"{where}: {key}={options.get(key, '')}: {first['msg']}") from None
+        raise ConfigError(f"{key}={options.get(key, '')}: {first['msg']}", file=where) from None
     except ModelError as error:
-        raise ConfigError(f"{where}: {error}") from None
+        raise ConfigError(str(error), file=where) from None
     except Exception as error:
-        raise ConfigError(f"{where}: calling it fails: {type(error).__name__}: {error}") from None
+        raise ConfigError(
+            f"calling it fails: {type(error).__name__}: {error}", file=where
+        ) from None
 
 
 def model_options(name: str) -> list[ModelOption]:

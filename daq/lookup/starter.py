@@ -72,7 +72,7 @@ def _copy(packages: Sequence[str], name: str, option: str, kind: str) -> str:
     shipped = {path.stem: path for path in shipped_files(packages)}
     if name not in shipped:
         raise ConfigError(
-            f"--{option}: no {name!r} to begin with; {suggestion(name, list(shipped))}"
+            f"--{option}: no {name!r} to begin with", cure=suggestion(name, list(shipped))
         )
     text = shipped[name].read_text(encoding="utf-8")
     return f"{schemas.comment(kind)}\n{schemas.without_comment(text)}"
@@ -95,5 +95,5 @@ def _write_new(path: Path, text: str) -> bool:
     except FileExistsError:
         return False
     except OSError as error:
-        raise RunError(f"{path}: cannot be written: {error.strerror}") from None
+        raise RunError(f"cannot be written: {error.strerror}", file=path) from None
     return True

@@ -49,7 +49,7 @@ def analyse(folder: str | Path, *, watch: Watch = ignore) -> Analysis:
     >>> from daq import analyse, record
     >>> analyse(record("prbs.yaml").folder)
     Traceback (most recent call last):
-    daq.errors.ConfigError: runs/...-prbs: the protocol 'prbs' only excites, and concludes nothing ...
+    daq.errors.ConfigError: runs/...: the protocol 'prbs' only excites, and concludes ...
     """
     folder = Path(folder)
     csv = log_path(folder)
@@ -58,8 +58,9 @@ def analyse(folder: str | Path, *, watch: Watch = ignore) -> Analysis:
     findings = conclude(experiment, folder)
     if findings is None:
         raise ConfigError(
-            f"{folder}: the protocol {experiment.protocol!r} only excites, and concludes nothing "
-            f"by itself; rig identify {folder} finds parameters"
+            f"the protocol {experiment.protocol!r} only excites, and concludes nothing by itself",
+            cure=f"rig identify {folder} finds parameters",
+            file=folder,
         )
     return Analysis(folder, findings)
 
@@ -69,17 +70,19 @@ def recorded_experiment(folder: Path) -> Experiment:
     path = folder / RUN_NAME
     record = read_record(log_path(folder))
     if record is None:
-        raise ConfigError(f"{path}: there is no such file; give a capture folder that rig run made")
+        raise ConfigError(
+            "there is no such file", cure="give a capture folder that rig run made", file=path
+        )
     settings = record.get("experiment")
     if not isinstance(settings, dict) or not isinstance(settings.get("protocol"), str):
-        raise ConfigError(f"{path}: experiment.protocol: the name of a protocol is missing")
+        raise ConfigError("experiment.protocol: the name of a protocol is missing", file=path)
     kind = find_protocol(settings["protocol"], folder)
     # Beside the settings stands what the protocol made of them.
     written = {name: value for name, value in settings.items() if name != "excitation"}
     try:
         return kind.model_validate(written)
     except ValueError as error:
-        raise ConfigError(f"{path}: experiment: {error}") from None
+        raise ConfigError(f"experiment: {error}", file=path) from None
 
 
 def conclude_or_warn(
@@ -110,10 +113,10 @@ def conclude(experiment: Experiment, folder: Path) -> Findings | None:
             raise TypeError(f"it returned {findings!r}; return daq.findings.Findings or None")
     except ValueError as error:
         at = raised_in(type(experiment), error)
-        raise RunError(f"{folder}: no result: {error}{at}") from None
+        raise RunError(f"no result: {error}{at}", file=folder) from None
     except USER_CODE_ERRORS as error:
         raise RunError(
-            f"{folder}: no result: {mistake(experiment, 'in findings()', error)}"
+            f"no result: {mistake(experiment, 'in findings()', error)}", file=folder
         ) from error
     if findings is not None:
         _write(findings, folder / RESULTS)

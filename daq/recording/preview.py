@@ -188,14 +188,16 @@ def draw_preview(preview: Preview, path: Path) -> None:
         figure = draw(chart)
     else:
         raise ConfigError(
-            f"--plot {path}: {experiment.protocol} says nothing beforehand of what its controller "
-            "will ask for, so there is nothing to draw; leave --plot out, or give the plan "
-            "'references' or the protocol a method 'preview'"
+            f"--plot {path}: {experiment.protocol} says nothing beforehand "
+            "of what its controller will ask for, so there is nothing to draw",
+            cure=(
+                "leave --plot out, or give the plan 'references' or the protocol a method 'preview'"
+            ),
         )
     try:
         write_whole(path, style.render(figure, kind))
     except RunError as error:
-        raise ConfigError(f"{error}; or choose another place with --plot FILE.png") from None
+        raise ConfigError(str(error), cure="or choose another place with --plot FILE.png") from None
 
 
 def _chart(experiment: Experiment) -> Chart | Heatmap | None:

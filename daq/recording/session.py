@@ -119,7 +119,9 @@ def record(
     if validation:
         changed = loaded.validation()
         if changed is None:
-            raise ConfigError(f"{loaded.file.path}: it has no 'validation' section; add one")
+            raise ConfigError(
+                "it has no 'validation' section", cure="add one", file=loaded.file.path
+            )
         loaded = changed
     config, device = load_rig(str(rig or rig_for(str(experiment))), options)
     loaded.plan(config)
@@ -134,8 +136,8 @@ def _rig_on(
     fields = type(config.options).model_fields
     if port is not None and "port" not in fields:
         raise ConfigError(
-            f"--port {port}: the backend {config.backend!r} of {rig} has no port; name the rig "
-            "file of one that has, such as --rig serial.yaml"
+            f"--port {port}: the backend {config.backend!r} of {rig} has no port",
+            cure="name the rig file of one that has, such as --rig serial.yaml",
         )
     if realtime and "time" not in fields:
         text = f"{rig}: its own clock paces it; --realtime changes nothing"

@@ -55,8 +55,12 @@ def _report_in(folder: Path) -> Path:
         if place.exists():
             return place
     raise ConfigError(
-        f"{folder}: no {DATA} there; name the folder of an identification, or of the run that it "
-        "was made from (rig identify writes it unless --no-report is given)"
+        f"no {DATA} there",
+        cure=(
+            "name the folder of an identification, or of the run that it was "
+            "made from (rig identify writes it unless --no-report is given)"
+        ),
+        file=folder,
     )
 
 
@@ -66,7 +70,7 @@ def _subject(source: Path) -> Subject:
         return _restored(document, source)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ConfigError(
-            f"{source}: not a readable report ({type(error).__name__}: {error}); {_AGAIN}"
+            f"not a readable report ({type(error).__name__}: {error})", cure=_AGAIN, file=source
         ) from None
 
 
@@ -105,9 +109,9 @@ def _logs(
     for entry in reproduction["logs"]:
         path = root / entry["log"]
         if not path.exists():
-            raise ConfigError(f"{path}: this log of the report is gone; {_AGAIN}")
+            raise ConfigError("this log of the report is gone", cure=_AGAIN, file=path)
         if hashlib.sha256(path.read_bytes()).hexdigest() != entry["sha256"]:
-            raise ConfigError(f"{path}: this log is another than the report's; {_AGAIN}")
+            raise ConfigError("this log is another than the report's", cure=_AGAIN, file=path)
         logs[path] = records.load(path, model, columns)
         uses[entry["use"]].append(path)
     training, ends = records.hold_back(
