@@ -75,15 +75,15 @@ def test_aliases_have_the_same_multiplier_over_a_sample():
     model = oscillator(frequency, 100.0, 5000.0)
     target = objective_of(model, record_of(model, dt))
     here = np.array([frequency, 60.0, 1.0])
-    found = lookalikes(target, here)
-    own = np.exp(np.linalg.eigvals(jacobian(model, np.zeros(2), np.zeros(1), here)) * dt)
+    chromosomes = lookalikes(target, here)
+    expected = np.exp(np.linalg.eigvals(jacobian(model, np.zeros(2), np.zeros(1), here)) * dt)
     frequencies = []
-    for chromosome in found:
+    for chromosome in chromosomes:
         values = np.linalg.eigvals(jacobian(model, np.zeros(2), np.zeros(1), chromosome))
         frequencies.append(round(float(np.abs(values.imag).max())))
         multipliers = np.exp(values * dt)
         np.testing.assert_allclose(
-            np.sort_complex(multipliers), np.sort_complex(own), atol=0.1 * abs(own[0])
+            np.sort_complex(multipliers), np.sort_complex(expected), atol=0.1 * abs(expected[0])
         )
     folded = 2.0 * np.pi / dt - np.sqrt(frequency**2 - 60.0**2)
     assert min(abs(np.array(frequencies) - abs(folded))) < 0.03 * frequency or folded < 450.0
@@ -93,9 +93,9 @@ def test_aliases_have_the_same_multiplier_over_a_sample():
 def test_slow_models_have_no_aliases():
     model = oscillator(50.0, 5.0, 500.0)
     here = np.array([50.0, 20.0, 1.0])
-    found = lookalikes(objective_of(model, record_of(model, 0.01)), here)
+    chromosomes = lookalikes(objective_of(model, record_of(model, 0.01)), here)
     mode = np.sqrt(50.0**2 - 20.0**2)
-    for chromosome in found:
+    for chromosome in chromosomes:
         values = np.linalg.eigvals(jacobian(model, np.zeros(2), np.zeros(1), chromosome))
         assert np.abs(values.imag).max() == pytest.approx(mode, rel=0.03)
 
@@ -108,10 +108,10 @@ def test_a_minimum_among_aliases_is_found_from_any_other(seed):
     target = objective_of(model, record)
     start = lookalikes(target, model.nominal)
     wrong = max(start, key=lambda c: float(target.evaluate(c[None])[0][0]))
-    settled = fit_likelihood(target, [wrong])
+    likeliest = fit_likelihood(target, [wrong])
     # Under the noise an alias may explain the record as well; the truth is never left out.
-    found = [settled.chromosome, *settled.rivals]
-    assert any(chromosome == pytest.approx(model.nominal, rel=0.1) for chromosome in found)
+    ends = [likeliest.chromosome, *likeliest.rivals]
+    assert any(chromosome == pytest.approx(model.nominal, rel=0.1) for chromosome in ends)
 
 
 # --- rivals ---------------------------------------------------------------------------------
@@ -119,32 +119,32 @@ def test_a_minimum_among_aliases_is_found_from_any_other(seed):
 
 def test_lags_that_may_change_places_have_no_intervals_of_their_own():
     record = record_of(lags(), 0.01, noise=0.02)
-    found = GASSI(lags(), population=40, generations=8).fit(record)
-    here = sorted(found.parameters_[name] for name in ("first", "second"))
+    fitted = GASSI(lags(), population=40, generations=8).fit(record)
+    here = sorted(fitted.parameters_[name] for name in ("first", "second"))
     assert here == pytest.approx([0.03, 0.12], rel=0.1)
-    (rival,) = found.rivals_
-    assert rival["first"] == pytest.approx(found.parameters_["second"], rel=1e-2)
-    assert rival["second"] == pytest.approx(found.parameters_["first"], rel=1e-2)
-    told = found.uncertainty(record)
-    assert [estimate.why for estimate in told.parameters] == ["rival", "rival"]
-    assert told.determined() == ()
-    (ambiguity,) = told.ambiguities
+    (rival,) = fitted.rivals_
+    assert rival["first"] == pytest.approx(fitted.parameters_["second"], rel=1e-2)
+    assert rival["second"] == pytest.approx(fitted.parameters_["first"], rel=1e-2)
+    intervals = fitted.uncertainty(record)
+    assert [estimate.why for estimate in intervals.parameters] == ["rival", "rival"]
+    assert intervals.determined() == ()
+    (ambiguity,) = intervals.ambiguities
     assert ambiguity.kind == "rival" and set(ambiguity.parameters) == {"first", "second"}
 
 
 def test_a_measured_one_tells_them_apart():
     record = record_of(lags(), 0.01, noise=0.02)
-    found = GASSI(lags(), population=40, generations=8, fixed={"first": 0.03}).fit(record)
-    (second,) = found.uncertainty(record).parameters
-    assert found.rivals_ == [] and second.why == ""
+    fitted = GASSI(lags(), population=40, generations=8, fixed={"first": 0.03}).fit(record)
+    (second,) = fitted.uncertainty(record).parameters
+    assert fitted.rivals_ == [] and second.why == ""
     assert second.low < 0.12 < second.high
 
 
 def test_what_the_data_tell_apart_is_no_rival():
     model = oscillator(900.0, 300.0, 2000.0)
-    found = GASSI(model, population=40, generations=10).fit(record_of(model, 0.01, noise=0.001))
-    assert found.rivals_ == []
-    assert found.parameters_["frequency"] == pytest.approx(900.0, rel=0.01)
+    fitted = GASSI(model, population=40, generations=10).fit(record_of(model, 0.01, noise=0.001))
+    assert fitted.rivals_ == []
+    assert fitted.parameters_["frequency"] == pytest.approx(900.0, rel=0.01)
 
 
 # --- weights --------------------------------------------------------------------------------
@@ -176,6 +176,6 @@ def test_the_likelihood_weighs_each_output_by_its_own_error():
         return float(np.prod(np.sqrt(np.mean((gain * u - outputs) ** 2, axis=0))))
 
     exact = minimize_scalar(product, bounds=(0.5, 2.0), method="bounded", options={"xatol": 1e-9})
-    settled = fit_likelihood(target, [np.array([1.2])])
-    assert settled.chromosome[0] == pytest.approx(exact.x, abs=1e-4)
-    assert settled.objective.weights[0] > 5.0 * settled.objective.weights[1]
+    likeliest = fit_likelihood(target, [np.array([1.2])])
+    assert likeliest.chromosome[0] == pytest.approx(exact.x, abs=1e-4)
+    assert likeliest.objective.weights[0] > 5.0 * likeliest.objective.weights[1]

@@ -100,27 +100,27 @@ def test_the_budget_is_kept_and_the_end_is_a_minimum():
     record = Dataset(
         clean.inputs, clean.outputs + noise * np.abs(clean.outputs).max(axis=0), clean.dt
     )
-    found = GASSI(motor(), population=100, generations=20, criterion="error").fit(record)
-    assert 0.9 * 2000 < found.n_simulations_ <= 2000
-    assert len(found.history_) in (19, 20)
-    assert np.all(np.diff(found.history_) <= 1e-12)
-    assert found.history_[-1] == found.error_
-    again = refine(objective(motor(), record), found.chromosome_)
-    assert found.error_ == pytest.approx(again.error, rel=1e-6)
+    fitted = GASSI(motor(), population=100, generations=20, criterion="error").fit(record)
+    assert 0.9 * 2000 < fitted.n_simulations_ <= 2000
+    assert len(fitted.history_) in (19, 20)
+    assert np.all(np.diff(fitted.history_) <= 1e-12)
+    assert fitted.history_[-1] == fitted.error_
+    again = refine(objective(motor(), record), fitted.chromosome_)
+    assert fitted.error_ == pytest.approx(again.error, rel=1e-6)
 
 
 def test_a_budget_too_small_is_exceeded_by_one_descent_to_the_minimum():
-    found = GASSI(motor(), population=10, generations=2, criterion="error").fit(motor_record())
-    again = refine(objective(motor(), motor_record()), found.chromosome_)
-    assert found.error_ <= 1.001 * again.error
-    assert found.n_simulations_ <= 20 + 50 * 14
-    assert len(found.history_) == 2
+    fitted = GASSI(motor(), population=10, generations=2, criterion="error").fit(motor_record())
+    again = refine(objective(motor(), motor_record()), fitted.chromosome_)
+    assert fitted.error_ <= 1.001 * again.error
+    assert fitted.n_simulations_ <= 20 + 50 * 14
+    assert len(fitted.history_) == 2
 
 
 def test_rounding_ends_it_early():
-    found = GASSI(motor(), population=100, generations=100, criterion="error").fit(motor_record())
-    np.testing.assert_allclose(found.vector_, list(MOTOR.values()), rtol=1e-6)
-    assert found.n_simulations_ < 0.3 * 100 * 100
+    fitted = GASSI(motor(), population=100, generations=100, criterion="error").fit(motor_record())
+    np.testing.assert_allclose(fitted.vector_, list(MOTOR.values()), rtol=1e-6)
+    assert fitted.n_simulations_ < 0.3 * 100 * 100
 
 
 # --- descents in one batch ------------------------------------------------------------------
@@ -134,12 +134,12 @@ def test_a_descent_is_the_same_alone_and_among_others():
     together = [begin(target, start) for start in starts]
     for _ in range(6):
         together = advance(target, together)
-    for start, one in zip(starts, together, strict=True):
+    for start, descent in zip(starts, together, strict=True):
         alone = [begin(target, start)]
         for _ in range(6):
             alone = advance(target, alone)
-        np.testing.assert_array_equal(alone[0].point.at, one.point.at)
-        assert alone[0].point.error == one.point.error
+        np.testing.assert_array_equal(alone[0].point.at, descent.point.at)
+        assert alone[0].point.error == descent.point.error
 
 
 def test_flat_directions_cost_nothing():
@@ -157,15 +157,15 @@ def test_flat_directions_cost_nothing():
         derivative=derivative,
     )
     inputs = np.sign(np.sin(np.arange(120) / 7.0))
-    one = lag()
+    lumped = lag()
     blank = Dataset(inputs, np.full(120, np.nan), 0.01)
-    outputs = BatchSimulator(one).trajectories(one.nominal, blank)[0]
+    outputs = BatchSimulator(lumped).trajectories(lumped.nominal, blank)[0]
     record = Dataset(inputs, outputs, 0.01)
-    both = refine(objective(model, record), np.array([1.0, 0.7, 0.1]))
-    single = refine(objective(one, record), np.array([0.7, 0.1]))
-    assert both.error < 1e-10
-    assert both.iterations <= single.iterations + 2
-    assert both.chromosome[0] * both.chromosome[1] == pytest.approx(2.0, rel=1e-8)
+    product = refine(objective(model, record), np.array([1.0, 0.7, 0.1]))
+    single = refine(objective(lumped, record), np.array([0.7, 0.1]))
+    assert product.error < 1e-10
+    assert product.iterations <= single.iterations + 2
+    assert product.chromosome[0] * product.chromosome[1] == pytest.approx(2.0, rel=1e-8)
 
 
 def test_it_slides_along_a_constraint():
@@ -174,9 +174,9 @@ def test_it_slides_along_a_constraint():
     record = motor_record()
     target = objective(motor(3.0, (limit,)), record, 1e-6)
     start = np.array([1.5, 9e-4, 1.1e-6, 2e-5, 2.2e-2])
-    found = refine(target, start, max_iterations=200)
-    assert found.chromosome[0] >= 50.0 * found.chromosome[4]
-    assert found.chromosome[0] == pytest.approx(50.0 * found.chromosome[4], rel=1e-4)
+    refined = refine(target, start, max_iterations=200)
+    assert refined.chromosome[0] >= 50.0 * refined.chromosome[4]
+    assert refined.chromosome[0] == pytest.approx(50.0 * refined.chromosome[4], rel=1e-4)
 
     def tied(x, u, p):
         current, omega = x
@@ -190,7 +190,7 @@ def test_it_slides_along_a_constraint():
         "line", motor().states, motor().inputs, motor().outputs, motor(3.0).parameters[1:], tied
     )
     expected = refine(objective(line, record, 1e-6), start[1:], max_iterations=200)
-    assert found.error == pytest.approx(expected.error, rel=1e-3)
+    assert refined.error == pytest.approx(expected.error, rel=1e-3)
 
 
 def test_where_only_the_search_found_something_feasible_it_goes_on_from_there():

@@ -218,7 +218,7 @@ def test_an_output_that_lost_most_of_its_samples_counts_as_the_error_counts_it()
         name="gains",
         states=(State("x", "1"),),
         inputs=(Input("u", "1"),),
-        outputs=(Output("one", "1"), Output("other", "1")),
+        outputs=(Output("good", "1"), Output("patchy", "1")),
         parameters=(Parameter("gain", "1", 1.0, 0.1, 10.0, "log"),),
         derivative=lambda x, u, p: (-x[0],),
         output=lambda x, u, p: (x[0], x[0]),
@@ -230,8 +230,8 @@ def test_an_output_that_lost_most_of_its_samples_counts_as_the_error_counts_it()
         return float(target.error_of(target.residuals(np.array([[gain]]), [1]).rms)[0])
 
     exact = minimize_scalar(error, bounds=(0.5, 2.0), method="bounded", options={"xatol": 1e-9})
-    found = refine(target, np.array([2.0]), tolerance=1e-12).chromosome[0]
-    assert found == pytest.approx(exact.x, abs=1e-5)
+    gain = refine(target, np.array([2.0]), tolerance=1e-12).chromosome[0]
+    assert gain == pytest.approx(exact.x, abs=1e-5)
 
 
 # --- constraints ----------------------------------------------------------------------------
@@ -256,10 +256,10 @@ def test_it_slides_along_a_constraint_to_the_best_point_on_it(start):
         lambda gain: float(target.evaluate(np.array([[gain, 0.03 * gain]]))[0][0]),
         bounds=(1.0, 3.0), method="bounded", options={"xatol": 1e-9},
     )  # fmt: skip
-    found = refine(target, np.array(start))
-    assert found.error == pytest.approx(best.fun, rel=1e-4)
-    assert found.chromosome == pytest.approx([best.x, 0.03 * best.x], rel=1e-3)
-    assert not np.any(target.space.violations(found.chromosome[None]) > 0.0)
+    refined = refine(target, np.array(start))
+    assert refined.error == pytest.approx(best.fun, rel=1e-4)
+    assert refined.chromosome == pytest.approx([best.x, 0.03 * best.x], rel=1e-3)
+    assert not np.any(target.space.violations(refined.chromosome[None]) > 0.0)
 
 
 # --- where a descent stalls: each strategy in the situation it is for ------------------------
@@ -269,14 +269,14 @@ def test_it_slides_along_a_constraint_to_the_best_point_on_it(start):
 def without(monkeypatch):
     """Refinement as it would be if a strategy were not there."""
 
-    def refined(strategy, *problem, **settings):
+    def refine_without(strategy, *problem, **settings):
         with monkeypatch.context() as patch:
             for stall in ("FAILED", "BURST", "ARRIVED", "MISLED"):
                 strategies = getattr(recovery, stall)
                 patch.setattr(recovery, stall, tuple(s for s in strategies if s is not strategy))
             return refine(*problem, **settings)
 
-    return refined
+    return refine_without
 
 
 def gain_objective(simulator, formula, outputs, **parameter):
@@ -303,19 +303,19 @@ class Edge(Formula):
         return np.where(vectors[:, 0] > 1.5, 2, 1)
 
     def trajectories(self, vectors, record, n_steps=None, starts=None):
-        found = super().trajectories(vectors, record, n_steps, starts)
-        found[(vectors[:, 0] > 1.5) & (n_steps == 2)] = np.nan
-        return found
+        outputs = super().trajectories(vectors, record, n_steps, starts)
+        outputs[(vectors[:, 0] > 1.5) & (n_steps == 2)] = np.nan
+        return outputs
 
 
 def test_it_retreats_from_where_simulations_fail(without):
     target = gain_objective(Edge, lambda p, u: p["gain"] * u, 2.0 * SINE[:, None])
-    found = refine(target, np.array([0.3]))
-    assert np.isfinite(found.error)
-    assert 0.3 < found.chromosome[0] <= 1.5
+    refined = refine(target, np.array([0.3]))
+    assert np.isfinite(refined.error)
+    assert 0.3 < refined.chromosome[0] <= 1.5
     # The error is that of the chromosome: half the record's peak is explained at a gain of 1.
-    exact = (2.0 - found.chromosome[0]) / 2.0 * np.sqrt(np.mean(SINE**2)) / np.abs(SINE).max()
-    assert found.error == pytest.approx(exact, rel=1e-6)
+    exact = (2.0 - refined.chromosome[0]) / 2.0 * np.sqrt(np.mean(SINE**2)) / np.abs(SINE).max()
+    assert refined.error == pytest.approx(exact, rel=1e-6)
     lost = without(recovery.retreat, target, np.array([0.3]))
     assert lost.chromosome[0] > 1.5 and not np.isfinite(lost.rms).all()
 
@@ -332,11 +332,11 @@ class Brink(Formula):
         return np.where(np.all(vectors == START, axis=1), 1, 3)
 
     def trajectories(self, vectors, record, n_steps=None, starts=None):
-        found = super().trajectories(vectors, record, n_steps, starts)
-        found[np.any(vectors != START, axis=1) & (n_steps < 3)] = np.inf
+        outputs = super().trajectories(vectors, record, n_steps, starts)
+        outputs[np.any(vectors != START, axis=1) & (n_steps < 3)] = np.inf
         if self.unbounded:
-            found[vectors[:, 0] != START[0]] = np.inf
-        return found
+            outputs[vectors[:, 0] != START[0]] = np.inf
+        return outputs
 
 
 START = np.array([0.3, 2.0])
@@ -356,15 +356,15 @@ def brink(unbounded=False):
 
 
 def test_it_braces_where_the_steps_of_the_descent_fail_beside_it(without):
-    found = refine(brink(), START)
-    np.testing.assert_allclose(found.chromosome, [2.0, 0.0], atol=1e-6)
+    refined = refine(brink(), START)
+    np.testing.assert_allclose(refined.chromosome, [2.0, 0.0], atol=1e-6)
     np.testing.assert_array_equal(without(recovery.brace, brink(), START).chromosome, START)
 
 
 def test_the_rest_of_the_parameters_go_on_where_one_cannot_be_moved():
-    found = refine(brink(unbounded=True), START)
-    assert found.chromosome[0] == START[0]
-    assert found.chromosome[1] == pytest.approx(np.mean(1.7 * SINE))
+    refined = refine(brink(unbounded=True), START)
+    assert refined.chromosome[0] == START[0]
+    assert refined.chromosome[1] == pytest.approx(np.mean(1.7 * SINE))
 
 
 STAIR = 0.02  # a hundredth of the range is more than half of it
@@ -403,8 +403,8 @@ def test_it_refocuses_after_larger_perturbations(without):
 
     exact = minimize_scalar(error, bounds=(1.6, 2.4), method="bounded", options={"xatol": 1e-10})
     start = np.array([1.113])
-    found = refine(target, start, tolerance=1e-12)
-    assert found.chromosome[0] == pytest.approx(exact.x, abs=1e-6)
+    refined = refine(target, start, tolerance=1e-12)
+    assert refined.chromosome[0] == pytest.approx(exact.x, abs=1e-6)
     biased = without(recovery.refocus, target, start, tolerance=1e-12)
     assert 2e-5 < abs(biased.chromosome[0] - exact.x) < 0.1
 
@@ -426,9 +426,9 @@ class Sluggish(Formula):
         return np.where(vectors[:, 0] > 1.9, 3, 1)
 
     def trajectories(self, vectors, record, n_steps=None, starts=None):
-        found = super().trajectories(vectors, record, n_steps, starts)
-        found[n_steps < 3] *= 1.01
-        return found
+        outputs = super().trajectories(vectors, record, n_steps, starts)
+        outputs[n_steps < 3] *= 1.01
+        return outputs
 
 
 def test_it_resolves_what_needs_more_steps_than_where_it_came_from(without):
