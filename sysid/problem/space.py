@@ -11,7 +11,7 @@ import numpy as np
 from sysid.arrays import BoolArray, FloatArray, IntArray
 from sysid.problem.data import Dataset
 from sysid.problem.model import ModelError, Parameter, ProcessModel, Scale
-from sysid.problem.ranges import Range, Tie, searched, ties
+from sysid.problem.ranges import Range, Tie, ties, with_search_range
 
 # A search coordinate this close to an end of its range, in parts of the range, stands on it.
 _ON_BOUND = 1e-3
@@ -90,7 +90,7 @@ class SearchSpace:
                     )
                 continue
             declared = parameter if use_log else replace(parameter, scale="linear")
-            free[i] = searched(declared, ranges.get(name), scale.get(name))
+            free[i] = with_search_range(declared, ranges.get(name), scale.get(name))
         if not free:
             raise ModelError(f"model {model.name}: every parameter is fixed; free at least one")
         one_sided = frozenset(name for name, ends in ranges.items() if ends and None in ends)
