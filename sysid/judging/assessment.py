@@ -83,12 +83,7 @@ def judge(
     """
     grave = [] if feasible else ["No parameters were found that satisfy all the constraints."]
     light: list[str] = []
-    failed = [result.name for result in (*training, *validation) if not result.simulated]
-    if failed:
-        grave.append(
-            f"Model {model.name} cannot be simulated on {', '.join(failed)}: its response grows "
-            "beyond all bounds, or needs too small steps."
-        )
+    grave += _failed_runs(model, (*training, *validation))
     for name, ratio, fit in _validation_errors(model, training, validation):
         if fit < _FITTED:
             grave.append(f"{name} is explained poorly on the validation data (fit {fit:.0f} %).")
@@ -99,15 +94,21 @@ def judge(
         light.append("No data were held back for validation: the errors are those of the fit.")
     light += _input_traces(model, validation or training)
     light += _wandering_residuals(model, validation or training)
-    on_bound = [p.name for p in uncertainty.parameters if p.why == "bound"] if uncertainty else []
-    if on_bound:
-        verb = "stands" if len(on_bound) == 1 else "stand"
-        light.append(
-            f"{', '.join(on_bound)} {verb} on an end of the range: widen it, or fix the value."
-        )
+    if uncertainty is not None:
+        light += _parameters_on_bounds(uncertainty)
     if grave:
         return Verdict("poor", (*grave, *light))
     return Verdict("limited", tuple(light)) if light else Verdict("good", _praise(validation))
+
+
+def _failed_runs(model: ProcessModel, results: Sequence[RecordResult]) -> Iterator[str]:
+    """Reason: records that the model cannot follow to the end."""
+    failed = [result.name for result in results if not result.simulated]
+    if failed:
+        yield (
+            f"Model {model.name} cannot be simulated on {', '.join(failed)}: its response grows "
+            "beyond all bounds, or needs too small steps."
+        )
 
 
 def _validation_errors(
@@ -162,6 +163,14 @@ def _wandering_residuals(model: ProcessModel, results: Sequence[RecordResult]) -
                 "a measured input that came through the plant, or dynamics that the model lacks. "
                 "Parameters that act on it may be off by more than their intervals."
             )
+
+
+def _parameters_on_bounds(uncertainty: Uncertainty) -> Iterator[str]:
+    """Reason: parameters that stand on an end of their range."""
+    names = [p.name for p in uncertainty.parameters if p.why == "bound"]
+    if names:
+        verb = "stands" if len(names) == 1 else "stand"
+        yield f"{', '.join(names)} {verb} on an end of the range: widen it, or fix the value."
 
 
 def _praise(validation: Sequence[RecordResult]) -> tuple[str]:

@@ -221,15 +221,12 @@ def compare(
     importance = importance / importance.sum()
     trained = [_FreeRuns.of(training, candidate.training, lag) for candidate in candidates]
     aic, bic, n, worth = _criteria(trained, [candidate.n_effective for candidate in candidates])
-    score = bic
-    ratios: list[Ratio | None] = [None] * len(names)
-    tested: list[_FreeRuns] = []
-    if validation:
-        tested = [_FreeRuns.of(validation, candidate.validation, lag) for candidate in candidates]
-        score = np.array([runs.score(importance) for runs in tested])
-        ratios = _ratios(tested, int(np.argmin(score)), importance)
+    tested = [_FreeRuns.of(validation, c.validation, lag) for c in candidates if validation]
+    score = np.array([runs.score(importance) for runs in tested]) if tested else bic
+    best = int(np.argmin(score))
+    ratios = _ratios(tested, best, importance) if tested else [None] * len(names)
     order = np.argsort(score, kind="stable").tolist()
-    if np.isposinf(score[order[0]]):
+    if np.isposinf(score[best]):
         raise ModelError("no structure has a free run that stays finite")
     daic, dbic, unknown = _above_lowest(aic), _above_lowest(bic), np.full(q, np.nan)
     rows = [
@@ -244,7 +241,7 @@ def compare(
             daic[i],
             dbic[i],
             ratios[i],
-            _standing(i == order[0], score[i], ratios[i], dbic[i]),
+            _standing(i == best, score[i], ratios[i], dbic[i]),
         )
         for i in order
     ]

@@ -21,7 +21,7 @@ import numpy as np
 from sysid.arrays import FloatArray
 from sysid.problem.data import Dataset
 from sysid.problem.model import ModelError, Parameter, ProcessModel
-from sysid.problem.ranges import Range, searched
+from sysid.problem.ranges import Range, with_search_range
 from sysid.problem.space import SearchSpace
 from sysid.threads import one_thread
 
@@ -158,7 +158,7 @@ def _within(parameter: Parameter, guess: Guess) -> tuple[float, float]:
         for end in (guess.low, guess.high)
     )
     try:
-        elsewhere = searched(parameter, (inside[0], inside[1]), "linear")
+        elsewhere = with_search_range(parameter, (inside[0], inside[1]), "linear")
     except ModelError:
         return parameter.lower, parameter.upper  # nothing that is physically possible
     return elsewhere.lower, elsewhere.upper

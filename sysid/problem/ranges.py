@@ -28,7 +28,7 @@ class Tie:
     factor: float
 
 
-def searched(parameter: Parameter, given: Range | None, scale: Scale | None) -> Parameter:
+def with_search_range(parameter: Parameter, given: Range | None, scale: Scale | None) -> Parameter:
     """The parameter with the range and scale that it is searched in.
 
     given: in place of the declared range. With one end left out the other is a physical limit,

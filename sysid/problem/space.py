@@ -11,7 +11,7 @@ import numpy as np
 from sysid.arrays import BoolArray, FloatArray, IntArray
 from sysid.problem.data import Dataset
 from sysid.problem.model import ModelError, Parameter, ProcessModel, Scale
-from sysid.problem.ranges import Range, Tie, searched, ties
+from sysid.problem.ranges import Range, Tie, ties, with_search_range
 
 # A search coordinate this close to an end of its range, in parts of the range, stands on it.
 _ON_BOUND = 1e-3
@@ -82,26 +82,19 @@ class SearchSpace:
         free: dict[int, Parameter] = {}
         for i, parameter in enumerate(model.parameters):
             name = parameter.name
-            if name in fixed or name in tied or (parameter.fixed and name not in ranges):
-                if name in scale:
-                    raise ModelError(
-                        f"parameter {name} has a scale but is not searched; free it with a range, "
-                        "or leave the scale out"
-                    )
-                continue
-            declared = parameter if use_log else replace(parameter, scale="linear")
-            free[i] = searched(declared, ranges.get(name), scale.get(name))
+            if name not in fixed and name not in tied and (name in ranges or not parameter.fixed):
+                declared = parameter if use_log else replace(parameter, scale="linear")
+                free[i] = with_search_range(declared, ranges.get(name), scale.get(name))
+            elif name in scale:
+                raise ModelError(
+                    f"parameter {name} has a scale but is not searched; free it with a range, or "
+                    "leave the scale out"
+                )
         if not free:
             raise ModelError(f"model {model.name}: every parameter is fixed; free at least one")
+        parameters, base = tuple(free.values()), model.vector(fixed)
         one_sided = frozenset(name for name, ends in ranges.items() if ends and None in ends)
-        space = cls(
-            model,
-            tuple(free.values()),
-            model.vector(fixed),
-            tuple(free),
-            ties=resolved,
-            one_sided=one_sided,
-        )
+        space = cls(model, parameters, base, tuple(free), ties=resolved, one_sided=one_sided)
         space._check_ties()
         return space
 

@@ -23,9 +23,9 @@ from sysid.uncertainty.estimate import Z95, Estimate, Why, product_text, sum_tex
 from sysid.uncertainty.relations import (
     Kind,
     Relation,
-    named,
+    main_parameters,
     overlapping,
-    overlooked,
+    overlooked_directions,
     relations,
     sparse,
 )
@@ -98,7 +98,7 @@ def uncertainty(
     """
     local = sensitivity(objective, chromosome)
     determined = directions(local)
-    inert = overlooked(local, determined.undetermined, rivals)
+    inert = overlooked_directions(local, determined.undetermined, rivals)
     if len(inert):
         local = replace(local, slopes=local.slopes - local.slopes @ inert.T @ inert)
         determined = directions(local)
@@ -194,7 +194,7 @@ class _Analysis:
             yield self._exact([exact[i] for i in members])
         for relation in self.relations:
             if not relation.exact:
-                yield self._ambiguity("vague", named(relation.vector), [relation], [])
+                yield self._ambiguity("vague", main_parameters(relation.vector), [relation], [])
 
     def _product(self, exponents: FloatArray) -> Estimate:
         """Estimate of a product of powers of the parameters."""

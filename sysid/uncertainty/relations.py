@@ -73,7 +73,7 @@ def relations(sensitivity: Sensitivity, directions: Directions) -> list[Relation
     return exact + [Relation(_simplest(vector, exact), "vague") for vector in vague]
 
 
-def overlooked(
+def overlooked_directions(
     sensitivity: Sensitivity, undetermined: FloatArray, rivals: Sequence[FloatArray] = ()
 ) -> FloatArray:
     """Exact directions that errors of the slopes let look determined, (n, n_free), orthonormal.
@@ -213,7 +213,7 @@ def _whole(ratios: FloatArray) -> FloatArray | None:
     return None
 
 
-def named(vector: FloatArray) -> IntArray:
+def main_parameters(vector: FloatArray) -> IntArray:
     """Parameters that a vague direction is named after: those with a large share in it."""
     size = np.abs(vector)
     return np.flatnonzero(size > _SHARE * size.max())
@@ -226,7 +226,7 @@ def _simplest(vector: FloatArray, exact: list[Relation]) -> FloatArray:
         for j in np.flatnonzero(relation.support):
             way = vector - vector[j] / relation.vector[j] * relation.vector
             ways.append(np.where(np.abs(way) < _NOTHING * np.max(np.abs(way)), 0.0, way))
-        vector = min(ways, key=lambda way: len(named(way)))
+        vector = min(ways, key=lambda way: len(main_parameters(way)))
     return vector
 
 
