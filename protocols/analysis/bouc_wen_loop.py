@@ -171,18 +171,18 @@ class _Problem:
 
     def columns(self, rate: float, part: float, stride: int | None = None) -> FloatArray:
         """What enters linearly, (n_levels * points, n_columns); stride: from point to point."""
-        from scipy.linalg import block_diag
-
+        n = len(self._levels)
         angle, speed, acceleration = (
             np.stack(column)[:, :: stride or self._stride]
             for column in zip(*self._motions, strict=True)
         )
-        w = hysteresis(angle, rate, part)[:, :, None]
-        of_all = [speed, acceleration]
-        if len(self._levels) > 1:
-            of_all.append(self._currents[:, None] * speed)
-        of_all = [values.ravel() for values in of_all]
-        return np.column_stack([block_diag(*w), *of_all, block_diag(*np.ones_like(w))])
+        w = hysteresis(angle, rate, part)
+        of_level = np.eye(n)[:, :, None]
+        columns = [*(of_level * w[:, None, :]).swapaxes(0, 1), speed, acceleration]
+        if n > 1:
+            columns.append(self._currents[:, None] * speed)
+        columns += list(np.broadcast_to(of_level, (n, n, w.shape[1])).swapaxes(0, 1))
+        return np.stack([column.ravel() for column in columns], axis=1)
 
     def weights(self, columns: FloatArray) -> FloatArray:
         """Least-squares weights of the columns."""

@@ -40,8 +40,7 @@ class CurrentResponse:
 
 def current_response(records: Sequence[Measured], channel: str) -> CurrentResponse | None:
     """The response of motor or brake that all records have in common, None where none shows it."""
-    each = [_of_record(record, channel) for record in records]
-    responses = [response for response in each if response is not None]
+    responses = list(filter(None, [_of_record(record, channel) for record in records]))
     if not responses:
         return None
     per_speeds = [response.per_speed for response in responses if response.per_speed is not None]
