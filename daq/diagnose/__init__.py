@@ -1,1 +1,1 @@
-"""What may be wrong with a computer, a rig or a run, each with its cure."""
+"""Faults of a computer, a rig or a run, each with its cure."""

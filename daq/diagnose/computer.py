@@ -83,7 +83,7 @@ def _latency(subject: str, file: Path, milliseconds: int) -> Check:
 
 
 def _real_time() -> list[Check]:
-    """What a run is granted, and how late a program so scheduled wakes up that sleeps shortly."""
+    """Scheduling and memory that a run is granted, and how late it wakes from short sleeps."""
     run = RealTime()
     run.begin("prefer")
     worst = 0.0
@@ -121,7 +121,7 @@ def _wake_ups(worst: float) -> Check:
 
 
 def _disk(out: Path) -> Check:
-    """Flushes of the size that a fast log makes, where logs go."""
+    """Time of flushes as a fast log makes them, in the folder for logs."""
     subject, made = f"disk of {out}", not out.exists()
     make_folder(out)
     file = out / f".doctor.{os.getpid()}"

@@ -48,7 +48,7 @@ class Curve:
 
 
 class Sources:
-    """What the figures draw: samples, where flags stand, and lines across all figures."""
+    """Data of the figures: samples, flags, and lines across all figures."""
 
     def __init__(self) -> None:
         self.samples = ColumnDataSource({"t": []}, name="samples")
@@ -135,7 +135,7 @@ def make_value_table(values: ColumnDataSource, n_rows: int) -> figure:
 
 
 def broad_name(column: str) -> str:
-    """What a column is called where it is drawn broad in the source of samples."""
+    """Name of a column that is drawn broad, in the source of samples."""
     return f"{column} broad"
 
 
@@ -145,7 +145,7 @@ def points_of(view: View) -> int:
 
 
 def as_data(columns: Sequence[str], view: View, span: FloatArray) -> dict[str, Any]:
-    """What the source of samples holds of a view.
+    """Columns of the source of samples for a view.
 
     A line goes from the lowest to the highest value of each stretch. span: (n_columns,), from the
     lowest to the highest value of all there is.
@@ -166,12 +166,12 @@ def as_data(columns: Sequence[str], view: View, span: FloatArray) -> dict[str, A
 
 
 def flag_name(flag: Flag) -> str:
-    """A flag as people read it."""
+    """A flag's name for people."""
     return str(flag.name).lower()
 
 
 def flag_marks(view: View) -> dict[str, list[Any]]:
-    """Where which flag stands."""
+    """Times, names and colors of a view's flags."""
     marks: dict[str, list[Any]] = {"time": [], "flag": [], "color": []}
     if not view.flags.any():
         return marks

@@ -18,7 +18,7 @@ Reader = Callable[[int, int], FloatArray]
 
 @dataclass(frozen=True)
 class View:
-    """What is drawn of a stretch of a run: the lowest and the highest of every ``step`` rows.
+    """A stretch of a run to be drawn: the lowest and the highest of every ``step`` rows.
 
     time: (m,), of the first of them [s]. low, high: (m, n_columns), one and the same where
     ``step`` is 1; no spike is lost. flags: (m,), those of all of them. end: row after the last.
@@ -104,7 +104,7 @@ class History:
         return nearest
 
     def view(self, start: float, end: float, points: int, to_the_end: bool = True) -> View:
-        """What there is between two times [s], in ``points`` to twice as many stretches.
+        """Rows between two times [s], in ``points`` to twice as many stretches.
 
         to_the_end: draw the last rows too, where they fill no stretch; without it ``since`` can
         go on from where the view ends.

@@ -114,7 +114,7 @@ class Page:
         self._sent.start, self._sent_at = self._tick, time.monotonic()
 
     def _browser_is_behind(self) -> bool:
-        """Whether it has not come to the last updates yet: more of them would only queue up."""
+        """Whether the last updates have not been drawn yet: more of them would only queue up."""
         waiting = time.monotonic() - self._sent_at < _LOST
         return waiting and self._tick - self._last_seen > _AHEAD
 
@@ -147,7 +147,7 @@ class Page:
             self._replace(history.view(start - margin, end + margin, points), history.spread)
 
     def _draw_live(self, log: FollowedLog, history: History) -> None:
-        """Add what has come since; draw all anew where stretches change their length."""
+        """Draw the newest rows; all anew where stretches change their length."""
         ended = not log.state.running and log.loading is None
         if ended and not self._ended:
             self._window.active = _WHOLE

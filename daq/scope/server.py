@@ -25,7 +25,7 @@ USUAL_PORT = 5006
 
 
 def serve(watch: Watch, port: int | None, ready: Callable[[str], None]) -> None:
-    """Serve until Ctrl-C or SIGTERM; ``ready`` is told the address.
+    """Serve until Ctrl-C or SIGTERM; ``ready`` is called with the address.
 
     port: None for the usual one or, where that is taken, any. Raises ConfigError for a port that
     is taken.

@@ -34,13 +34,13 @@ class Rows:
 
 @dataclass
 class Problems:
-    """What is wrong with a log: the first few described, all counted."""
+    """Problems of a log: the first few described, all counted."""
 
     first: list[str] = field(default_factory=list)
     count: int = 0
 
     def note(self, text: str) -> None:
-        """One problem more."""
+        """Add a problem."""
         self.count += 1
         if len(self.first) < _KEPT:
             self.first.append(text)
@@ -72,7 +72,7 @@ class LogTail:
             return 0
 
     def poll(self) -> Rows:
-        """What has been written since the last time, up to ``CHUNK`` bytes of it."""
+        """Rows written since the last call, in up to ``CHUNK`` bytes."""
         data = self._whole_lines()
         if data and self._layout is None:
             data = self._take_header(data)
@@ -153,7 +153,7 @@ class LogTail:
         return self._parse_lines(data, starts, problems)
 
     def _parse_lines(self, data: bytes, starts: IntArray, problems: Problems) -> Rows:
-        """By line: what is not a row is left out, what is not a number becomes NaN."""
+        """Rows by line; other lines are left out, other cells become NaN."""
         assert self._layout is not None
         names, separator = self._layout.names, self._layout.separator
         kept: list[int] = []
@@ -227,7 +227,7 @@ def _number(cell: str, separator: str) -> float:
 
 
 def _parse_bulk(data: bytes, layout: Layout, places: list[int]) -> FloatArray | None:
-    """All rows at once; None where a row is not what the header says."""
+    """All rows at once; None where a row does not fit the header."""
     import pandas as pd
 
     try:

@@ -1,4 +1,4 @@
-"""What is shown: the newest run under a folder, or one that was named, as it grows."""
+"""The run that is shown: the newest under a folder, or a named one, as it grows."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class RunState:
 class FollowedLog:
     """A log as it grows, and the state of its run.
 
-    Nothing in it raises for what the files hold: what is wrong is told in ``complaints``.
+    Nothing in it raises for what the files hold: problems stand in ``complaints``.
     """
 
     def __init__(self, path: Path) -> None:
@@ -103,7 +103,7 @@ class FollowedLog:
         return time.monotonic() - self._grew
 
     def read(self) -> None:
-        """Take what has been written since the last time."""
+        """Read the rows written since the last call."""
         if self.tail.size() < self.tail.offset:
             # Another file under the same name.
             self.tail, self.history = LogTail(self.path), None
@@ -126,7 +126,7 @@ class FollowedLog:
             self.state = RunState.of(self.path)
 
     def complaints(self) -> list[str]:
-        """What is wrong with the log or its record, most serious first."""
+        """Problems of the log and its record, most serious first."""
         file, problems = self.path.name, self.tail.problems
         texts = [f"{self.path}: {self.tail.fault}"] if self.tail.fault else []
         if self.state.problem:
@@ -145,7 +145,7 @@ class FollowedLog:
 
 
 class Watch:
-    """What the pages show; they share what has been read.
+    """The log that all pages show; it is read once for all of them.
 
     named: the run to stay with, or None to follow the newest under ``root``. Raises ConfigError
     where there is no such run.

@@ -112,7 +112,7 @@ class SerialDevice:
         return self._sampling().act(lambda machine, now: machine.room)
 
     def receive(self) -> RawSamples:
-        """Wait for samples; all that have come."""
+        """Samples received so far; waits for the first."""
         connection = self._sampling()
         if not self._going:
             self._go(connection)

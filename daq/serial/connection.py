@@ -70,7 +70,7 @@ class Connection:
         self._link.close()
 
     def act(self, action: Callable[[HostMachine, float], T]) -> T:
-        """What an action of the machine at this instant [s] gives; what it has to say is sent."""
+        """Result of an action of the machine at this instant [s]; the frames it makes are sent."""
         with self._changed:
             self._called = time.monotonic()
             result = action(self._machine, self._called)
@@ -93,7 +93,7 @@ class Connection:
         self.request(lambda machine, now: machine.ask(type_, payload, now, give_up))
 
     def samples(self) -> list[Block]:
-        """Wait for samples; all that have come."""
+        """Blocks received so far; waits for the first."""
         blocks = self._machine.blocks
         with self._changed:
             if not self._wait(lambda: bool(blocks)) and self._machine.failure is not None:
@@ -139,7 +139,7 @@ class Connection:
         )
 
     def schedule_as_caller(self) -> None:
-        """The threads go just before the run, where that is scheduled in real time by now."""
+        """Schedule the threads just ahead of the caller, where that is in real time."""
         if not sys.platform.startswith("linux"):
             return
         policy, priority = os.sched_getscheduler(0), os.sched_getparam(0).sched_priority
@@ -220,7 +220,7 @@ class Connection:
             self._changed.notify_all()
 
     def _write(self) -> None:
-        """Write what the machine has to say; the lock is held, so frames stay whole."""
+        """Write the machine's frames; the lock is held, so they stay whole."""
         data = self._machine.take()
         if data:
             self._link.write(data)

@@ -60,7 +60,7 @@ class PendingRequest:
 
 @dataclass
 class Counters:
-    """What went wrong on the line and was noticed, for the record of the run."""
+    """Counts of errors on the line, for the record of the run."""
 
     lost_samples: int = 0
     duplicate_blocks: int = 0
@@ -133,7 +133,7 @@ class HostMachine:
             self._fail(self._why_silent(now))
 
     def take(self) -> bytes:
-        """All that is to be written now."""
+        """Frames to be written now, and no more later."""
         data = b"".join(self._outbox)
         self._outbox.clear()
         return data
@@ -212,7 +212,7 @@ class HostMachine:
         return self._commands.preloaded
 
     def describe(self) -> dict[str, Any]:
-        """The line's record: counts of what was noticed, and the clocks' relation."""
+        """The line's record: counts of bytes, frames and errors, and the clocks' relation."""
         status = self.status
         return {
             "line": {
@@ -410,6 +410,6 @@ def _unpack_welcome(payload: bytes) -> Welcome | int:
 
 
 def refusal(reply: Reply) -> str:
-    """What a device's refusal of a request means."""
+    """Text of a device's refusal of a request."""
     name = Type(reply.request).name if reply.request in list(Type) else f"{reply.request:#x}"
     return f"the device refuses {name}: it {_REASONS.get(reply.result, 'gives no reason')}"

@@ -55,7 +55,7 @@ class SerialLink:
         self._prepare()
 
     def read(self) -> bytes:
-        """What has come, or nothing after 10 ms."""
+        """Bytes received, or none after 10 ms."""
         try:
             if self._descriptor is None:
                 first: bytes = self._serial.read(1)
@@ -88,7 +88,7 @@ class SerialLink:
             self._serial.close()
 
     def _write_now(self, data: bytes) -> int:
-        """What the port takes without waiting."""
+        """Write without waiting; the number of bytes that the port took."""
         if self._descriptor is None:
             return 0
         try:
@@ -97,7 +97,7 @@ class SerialLink:
             return 0
 
     def _prepare(self) -> None:
-        """What was said before is not for us; no delay in the adapter; no reset on closing."""
+        """Drop old input, ask the adapter for low latency, and keep DTR up on closing."""
         with contextlib.suppress(*self._failures):
             self._serial.reset_input_buffer()
         if not sys.platform.startswith("linux") or "://" in self._port:
@@ -145,7 +145,7 @@ class SocketLink:
         self._socket.settimeout(_WRITE_PATIENCE)
 
     def read(self) -> bytes:
-        """What has come, or nothing after 10 ms."""
+        """Bytes received, or none after 10 ms."""
         try:
             if not select.select([self._socket], [], [], _PATIENCE)[0]:
                 return b""
@@ -218,7 +218,7 @@ def _not_opened(port: str, error: Exception) -> DeviceError:
 
 
 def permission_cure(port: str) -> str:
-    """What gives a user access to a port on this system."""
+    """Command that gives a user access to a port on this system."""
     group = "dialout"
     if sys.platform != "win32":
         import grp
@@ -229,7 +229,7 @@ def permission_cure(port: str) -> str:
 
 
 def _holder(port: str) -> str:
-    """Who has the port open, where the system tells."""
+    """Process that has the port open, in brackets, where the system tells."""
     try:
         device = Path(port).resolve()
         for process in Path("/proc").iterdir():

@@ -1,4 +1,4 @@
-"""What the frames say: message types, their layouts, and their numbers.
+"""Messages in the frames: types, layouts and numbers.
 
 All layouts are fixed, little-endian and without gaps that are not named; docs/serial-protocol.md
 has them as byte tables. Unpacking raises one of ``MALFORMED`` for a payload of the wrong length or
@@ -65,7 +65,7 @@ class Type(enum.IntEnum):
 
 
 class State(enum.IntEnum):
-    """What a device is doing."""
+    """State of a device."""
 
     IDLE = 0
     ARMED = 1

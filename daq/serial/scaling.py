@@ -18,7 +18,7 @@ _LARGEST_RATE = float(np.finfo(np.float32).max)  # 1/s
 
 
 class Scaling:
-    """What the codes of a device mean. input_range: volts that every analog input can measure."""
+    """Scales of a device's codes. input_range: volts that every analog input can measure."""
 
     def __init__(self, channels: Sequence[Channel]) -> None:
         inputs, outputs = channels[:_N_IN], channels[_N_IN : _N_IN + _N_OUT]

@@ -1,1 +1,1 @@
-"""The device's side of the serial protocol, with whatever may go wrong on it."""
+"""The device's side of the serial protocol, with faults on request."""

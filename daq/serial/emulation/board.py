@@ -86,7 +86,7 @@ class SimulatedBoard:
 
 
 def identity(name: str, electronics: Electronics, max_rate: float) -> Welcome:
-    """What a microcontroller with such converters would say of itself."""
+    """WELCOME of a microcontroller with such converters."""
     low, high = electronics.volts
     inputs = [Channel(item, "V", electronics.step_in, 0.0, low, high) for item in ANALOG_INPUTS]
     outputs = [Channel(item, "V", electronics.step_out, 0.0, low, high) for item in CHANNELS]

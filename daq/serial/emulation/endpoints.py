@@ -23,17 +23,17 @@ class PtyPort:
         self._master = self._slave = -1
 
     def files(self) -> list[int]:
-        """The master's end."""
+        """Descriptors to wait on: the master's."""
         return [self._master] if self._master >= 0 else []
 
     def read(self) -> bytes:
-        """What has come."""
+        """Bytes received."""
         with contextlib.suppress(BlockingIOError):
             return os.read(self._master, 65_536)
         return b""
 
     def write(self, data: bytes) -> int:
-        """How many of the bytes the pty took."""
+        """Number of bytes that the pty took."""
         if self._master < 0:
             return len(data)
         with contextlib.suppress(BlockingIOError):
@@ -78,11 +78,11 @@ class TcpPort:
         self.name = ""
 
     def files(self) -> list[int]:
-        """Listener and host."""
+        """Descriptors to wait on: the listener's and the host's."""
         return [item.fileno() for item in (self._listener, self._host) if item is not None]
 
     def read(self) -> bytes:
-        """What has come; a new host is let in when there is none."""
+        """Bytes received; a new host is let in when there is none."""
         self._accept()
         if self._host is None:
             return b""
@@ -97,7 +97,7 @@ class TcpPort:
         return data
 
     def write(self, data: bytes) -> int:
-        """How many of the bytes were taken; without a host, all of them, for nobody."""
+        """Number of bytes taken; without a host, all of them, for nobody."""
         if self._host is None:
             return len(data)
         try:

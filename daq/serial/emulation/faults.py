@@ -106,7 +106,7 @@ class Line:
                     self._schedule(self._damaged(b"\0" + piece + b"\0", faults), now, faults)
 
     def ready(self, now: float) -> bytes:
-        """All that has arrived by ``now``."""
+        """Bytes that have arrived by ``now`` [s]."""
         arrived = []
         while self._due and self._due[0][0] <= now:
             arrived.append(self._due.popleft()[1])

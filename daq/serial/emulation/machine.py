@@ -303,7 +303,7 @@ class DeviceMachine:
                 self._flush()
 
     def _play(self, n: int) -> None:
-        """n ticks: what to apply, what the board makes of it, and what follows from that."""
+        """Play n ticks: commands and flags, the board's samples, and the latches that they set."""
         assert self._start is not None
         codes, unbroken = self._ring.take(n)
         flags = np.zeros(n, dtype=np.uint32)
@@ -338,7 +338,7 @@ class DeviceMachine:
             self._flush()
 
     def _end(self) -> None:
-        """No run any more; outputs zero."""
+        """End the run; outputs are zero."""
         self._board.zero()
         self._ring.forget()
         self._samples = []
