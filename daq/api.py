@@ -18,7 +18,8 @@ from daq.identification.records import Loaded, Mapping
 from daq.identification.result import NOTES, Identified, document
 from daq.identification.settings import Prepared, gassi_settings, prepare
 from daq.logs.recording import Recording, load
-from daq.lookup.files import DEFAULT_RIG, load_experiment, load_rig, rig_for
+from daq.lookup.experiments import load_experiment
+from daq.lookup.rigs import DEFAULT_RIG, load_rig, rig_for
 from daq.run.runner import run_experiment
 from sysid import GASSI, ModelError, ProcessModel
 

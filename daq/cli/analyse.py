@@ -16,8 +16,8 @@ from daq.files import make_folder, write_whole
 from daq.findings import Findings, Number, Table
 from daq.logs.capture import LOG_NAME, RUN_NAME
 from daq.logs.recording import end_of_run, load, log_path, read_record
-from daq.lookup.files import find_protocol
-from daq.run.protocol_calls import mistake
+from daq.lookup.classes import find_protocol
+from daq.run.protocol import failure
 
 RESULTS = "results"
 _WIDTH = 2 * 1.96  # standard deviations in a 95 % interval
@@ -103,7 +103,7 @@ def _conclude(experiment: Experiment, folder: Path) -> Findings | None:
         raise RunError(f"{folder}: no result: {error}{at}") from None
     except USER_CODE_ERRORS as error:
         raise RunError(
-            f"{folder}: no result: {mistake(experiment, 'in findings()', error)}"
+            f"{folder}: no result: {failure(experiment, 'in findings()', error)}"
         ) from error
     if found is not None:
         _write(found, folder / RESULTS)

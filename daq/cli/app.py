@@ -471,11 +471,9 @@ def schema(
 
     They know the installed protocols and backends.
     """
-    from daq.cli.reference import write_reference
-    from daq.lookup.schemas import schema_command
+    from daq.cli.schema import schema_command
 
-    pages = None if reference is None else lambda: write_reference(reference, app)
-    schema_command(folder, pages, json)
+    schema_command(folder, reference, app, json)
 
 
 @app.command(epilog="Example:  rig models actuator --json")

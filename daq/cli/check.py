@@ -18,7 +18,7 @@ from daq.files import write_whole
 from daq.findings import Chart, Heatmap
 from daq.hal import CHANNELS, FloatArray
 from daq.logs.columns import UNITS
-from daq.run.protocol_calls import preview_of
+from daq.run.protocol import preview_of
 
 _PART = 0.9  # of the power, that the stated band holds
 _BARS = " ▁▂▃▄▅▆▇█"

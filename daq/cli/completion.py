@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-
-from daq.lookup.shipped import EXPERIMENTS, RIGS, shipped_files
+from typing import Literal
 
 Offer = tuple[str, str]  # a value and what it is
 
@@ -15,25 +14,25 @@ _FIRST = 4096  # characters of a file that say what kind it is
 def experiments(incomplete: str) -> list[Offer]:
     """Shipped experiments, and YAML files here that name a protocol."""
     return _matching(
-        incomplete, [*_shipped(EXPERIMENTS), *_local(incomplete, ".yaml", "protocol:")]
+        incomplete, [*_shipped("experiments"), *_local(incomplete, ".yaml", "protocol:")]
     )
 
 
 def rigs(incomplete: str) -> list[Offer]:
     """Shipped rigs, and YAML files here that name a backend or have its options."""
     own = _local(incomplete, ".yaml", "backend:", "options:")
-    return _matching(incomplete, [*_shipped(RIGS), *own])
+    return _matching(incomplete, [*_shipped("rigs"), *own])
 
 
 def rig_names(incomplete: str) -> list[Offer]:
     """Shipped rigs by name."""
-    found = _shipped(RIGS)
+    found = _shipped("rigs")
     return _matching(incomplete, [(name.removesuffix(".yaml"), text) for name, text in found])
 
 
 def protocols(incomplete: str) -> list[Offer]:
     """Shipped experiments by protocol."""
-    found = _shipped(EXPERIMENTS)
+    found = _shipped("experiments")
     return _matching(incomplete, [(name.removesuffix(".yaml"), text) for name, text in found])
 
 
@@ -60,9 +59,12 @@ def _matching(incomplete: str, offers: Iterable[Offer]) -> list[Offer]:
     return list(found.items())
 
 
-def _shipped(packages: Iterable[str]) -> Iterator[Offer]:
-    for path in shipped_files(packages):
-        yield path.name, _about(path)
+def _shipped(kind: Literal["experiments", "rigs"]) -> Iterator[Offer]:
+    from daq.lookup.shipped import shipped_experiments, shipped_rigs
+
+    files = shipped_experiments() if kind == "experiments" else shipped_rigs()
+    for name, path in files.items():
+        yield name, _about(path)
 
 
 def _local(incomplete: str, suffix: str, *keys: str) -> Iterator[Offer]:

@@ -15,7 +15,7 @@ import numpy as np
 from daq.cli import terminal as console
 from daq.errors import ConfigError
 from daq.hal import ANALOG_INPUTS, CHANNELS, Device, Guard, IntArray, Mode, Phase
-from daq.lookup.files import load_rig
+from daq.lookup.rigs import load_rig
 from daq.run.realtime import RealTime
 from daq.serial import messages
 from daq.serial.emulation import faults
@@ -102,7 +102,7 @@ def emulate_command(
         _list_faults(as_json)
         return
     chosen = [faults.parse(text) for text in fault]
-    config, device = load_rig(rig)
+    config, device = load_rig(rig, notify=console.report)
     if not isinstance(device, SimulatedDevice):
         raise ConfigError(
             f"{rig}: its backend is {config.backend!r}; only the simulated one can be emulated. "

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 from daq.cli import terminal as console
@@ -10,7 +10,7 @@ from daq.config.schema import Schema
 from daq.errors import ConfigError, RunError, suggestion
 from daq.files import make_folder
 from daq.lookup import schemas
-from daq.lookup.shipped import EXPERIMENTS, RIGS, shipped_files
+from daq.lookup.shipped import shipped_experiments, shipped_rigs
 
 _RIG, _SETTINGS = "rig.yaml", "identification.yaml"
 _SETTINGS_HEAD = """\
@@ -25,15 +25,15 @@ def init_command(folder: Path, protocol: str, rig: str, as_json: bool) -> None:
     """Write the files that are not there yet, and say what to do next."""
     experiment = f"{protocol}.yaml"
     texts = {
-        experiment: _copy(EXPERIMENTS, protocol, "protocol", "experiment"),
-        _RIG: _copy(RIGS, rig, "rig", "rig"),
+        experiment: _copy(shipped_experiments(), protocol, "protocol", "experiment"),
+        _RIG: _copy(shipped_rigs(), rig, "rig", "rig"),
         _SETTINGS: settings_text(),
         **_companions(protocol),
     }
     make_folder(folder)
     written = [folder / name for name, text in texts.items() if _write_new(folder / name, text)]
     kept = [folder / name for name in texts if folder / name not in written]
-    schemas.write_schemas(folder / schemas.FOLDER)
+    schemas.write_schemas(folder / schemas.FOLDER, console.report)
     if as_json:
         console.print_json({"written": list(map(str, written)), "kept": list(map(str, kept)),
                             "schemas": str(folder / schemas.FOLDER)})  # fmt: skip
@@ -58,7 +58,7 @@ def settings_text() -> str:
     schema = schemas.documents({}, {})["identification"]
     items = sorted(schema["properties"].items(), key=lambda item: item[0] not in _ACTIVE)
     settings = "\n".join(_setting(name, item) for name, item in items)
-    return f"{schemas.comment('identification')}\n{_SETTINGS_HEAD}\n{settings}"
+    return f"{schemas.schema_comment('identification')}\n{_SETTINGS_HEAD}\n{settings}"
 
 
 def _setting(name: str, item: Schema) -> str:
@@ -69,20 +69,19 @@ def _setting(name: str, item: Schema) -> str:
     return f"# {item['description']}\n{mark}{name}: {schemas.as_yaml(value)}\n"
 
 
-def _copy(packages: Sequence[str], name: str, option: str, kind: str) -> str:
+def _copy(files: Mapping[str, Path], name: str, option: str, kind: str) -> str:
     """A shipped file's text, for a folder that has its schema in it."""
-    shipped = {path.stem: path for path in shipped_files(packages)}
+    shipped = {path.stem: path for path in files.values()}
     if name not in shipped:
-        raise ConfigError(
-            f"--{option}: no {name!r} to begin with; {suggestion(name, list(shipped))}"
-        )
+        cure = suggestion(name, list(shipped))
+        raise ConfigError(f"no {name!r} to begin with", cure=cure, key=f"--{option}")
     text = shipped[name].read_text(encoding="utf-8")
-    return f"{schemas.comment(kind)}\n{schemas.without_comment(text)}"
+    return f"{schemas.schema_comment(kind)}\n{schemas.without_schema_comment(text)}"
 
 
 def _companions(protocol: str) -> dict[str, str]:
     """Tables that a shipped experiment reads, which lie beside it under its name."""
-    shipped = next(path for path in shipped_files(EXPERIMENTS) if path.stem == protocol)
+    shipped = shipped_experiments()[f"{protocol}.yaml"]
     return {
         path.name: path.read_text(encoding="utf-8")
         for path in shipped.parent.glob(f"{protocol}.csv")

@@ -22,7 +22,7 @@ from daq.identification.quantities import in_model_units
 from daq.identification.records import Loaded, Mapping
 from daq.identification.settings import as_told
 from daq.logs.capture import LOG_NAME
-from daq.lookup.files import DEFAULT_RIG, load_rig
+from daq.lookup.rigs import DEFAULT_RIG, load_rig
 from sysid import BatchSimulator, Metrics, ModelError, evaluate, free_run
 from sysid.problem.model import ProcessModel
 
@@ -265,7 +265,7 @@ def _value(file: yaml_file.YamlFile, key: tuple[str, ...], entry: Any) -> float:
 
 
 def _rig_truth(rig: str) -> tuple[ProcessModel, dict[str, float]]:
-    config, device = load_rig(rig)
+    config, device = load_rig(rig, notify=console.report)
     if config.backend != "simulated":
         raise ConfigError(
             f"{rig}: only a simulated rig knows its own parameters; "

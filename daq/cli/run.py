@@ -11,12 +11,14 @@ from daq.cli.analyse import analyse, as_document, next_commands, show_findings
 from daq.config.rig import RigConfig
 from daq.diagnose import currents as plausible
 from daq.diagnose import punctuality
-from daq.errors import ConfigError
+from daq.errors import ConfigError, together
 from daq.experiment import Plan
 from daq.hal import Device, Phase, Reporting
 from daq.logs.capture import LOG_NAME
-from daq.lookup.files import LoadedExperiment, load_experiment, load_rig, rig_for, together
-from daq.run.runner import PhaseProgress, RunResult, run_experiment
+from daq.lookup.experiments import LoadedExperiment, load_experiment
+from daq.lookup.rigs import load_rig, rig_for
+from daq.run.runner import RunResult, run_experiment
+from daq.run.sampling import PhaseProgress
 
 _TITLES = {
     Phase.CALIBRATION: "Offset calibration",
@@ -99,8 +101,8 @@ def plan_of(experiment: str, rig: str | None, port: str | None, realtime: bool =
     rig: default what the experiment's file says it is for.
     """
     loaded, (config, device) = together(
-        lambda: load_experiment(experiment),
-        lambda: rig_on(rig or rig_for(experiment), port, realtime),
+        lambda: load_experiment(experiment, console.report),
+        lambda: rig_on(rig or rig_for(experiment, console.report), port, realtime),
     )
     # Checked even where it will not run: a mistake in the file is best heard of early.
     validation = loaded.validation()
@@ -111,7 +113,7 @@ def plan_of(experiment: str, rig: str | None, port: str | None, realtime: bool =
 
 def rig_on(rig: str, port: str | None, realtime: bool = False) -> tuple[RigConfig, Device]:
     """A rig on a port in place of its file's, or simulated at the pace of the clock."""
-    config, device = load_rig(rig)
+    config, device = load_rig(rig, notify=console.report)
     options = type(config.options).model_fields
     if port is not None and "port" not in options:
         raise ConfigError(
@@ -123,7 +125,7 @@ def rig_on(rig: str, port: str | None, realtime: bool = False) -> tuple[RigConfi
         realtime = False
     asked = {"port": port, "time": "real" if realtime else None}
     changes = {key: value for key, value in asked.items() if value is not None}
-    return load_rig(rig, changes) if changes else (config, device)
+    return load_rig(rig, changes, console.report) if changes else (config, device)
 
 
 def _run(

@@ -17,6 +17,7 @@ from enum import IntEnum
 from typing import Any, Protocol, TextIO
 
 from daq import notation
+from daq.notes import Note
 
 number, digits = notation.number, notation.digits  # pages and tables print numbers alike
 
@@ -81,6 +82,11 @@ def report_warning(message: str) -> None:
     sys.stderr.write(f"rig: warning: {message}\n")
 
 
+def report(note: Note) -> None:
+    """What a use case tells meanwhile, as loud as it is meant."""
+    _REPORTS[note.level](note.text)
+
+
 def report_note(message: str) -> None:
     """One line of notice on standard error."""
     if _volume.get() >= Volume.NORMAL:
@@ -91,6 +97,9 @@ def report_detail(message: str) -> None:
     """One line on standard error for those who want to know more."""
     if _volume.get() >= Volume.VERBOSE:
         sys.stderr.write(f"rig: {message}\n")
+
+
+_REPORTS = {"detail": report_detail, "note": report_note, "warning": report_warning}
 
 
 def print_next(*commands: str) -> None:

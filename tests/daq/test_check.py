@@ -12,7 +12,7 @@ from scipy.signal import periodogram
 
 from daq.cli.check import spectral_lines
 from daq.config.rig import RigConfig
-from daq.lookup.files import load_experiment
+from daq.lookup.experiments import load_experiment
 from tests.daq.support import RIG, environment, forked_rig, write_experiment
 
 LOOP = '''

@@ -10,7 +10,7 @@ from daq.config.rig import RigConfig
 from daq.errors import ConfigError, RunError
 from daq.experiment import Sample
 from daq.hal import Samples
-from daq.run.runner import plan
+from daq.run.plan import plan
 from protocols.constant_velocity import ConstantVelocity
 from protocols.pid import VelocityGains
 from protocols.staircase import Drive, Plateau, SettlingTest, Staircase, longest
