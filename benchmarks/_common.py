@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from daq.identification import records as datasets
-from daq.lookup.files import load_experiment, load_rig
+from daq.lookup.experiments import load_experiment
+from daq.lookup.rigs import load_rig
 from daq.provenance import software_versions
 from daq.run.runner import run_experiment
 from sim_rig.backend import SimulatedDevice

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import difflib
 import inspect
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 USER_CODE_ERRORS = (Exception, SystemExit)
 """What code of a user's own may raise without meaning to end the program."""
@@ -138,6 +138,20 @@ class Terminated(BaseException):
 
     ``str`` of it is the signal's name, for example SIGTERM.
     """
+
+
+def together(*steps: Callable[[], Any]) -> list[Any]:
+    """What each step returns; one ConfigError with the mistakes of all of them."""
+    results: list[Any] = []
+    mistakes: dict[str, Mistake] = {}  # by text: each once
+    for step in steps:
+        try:
+            results.append(step())
+        except ConfigError as error:
+            mistakes |= {mistake.text: mistake for mistake in error.mistakes}
+    if mistakes:
+        raise ConfigError.of(mistakes.values())
+    return results
 
 
 def suggestion(name: str, candidates: Sequence[str]) -> str:

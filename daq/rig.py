@@ -53,18 +53,22 @@ class Rig:
         self.config = config
         self.offsets = Offsets.zero()
         self._device = device
-        # Commands asked for, and whether they were clamped, by tick modulo the length.
-        self._asked = np.zeros((1, len(CHANNELS)))
-        self._clamped = np.zeros(1, dtype=bool)
-        self._asked_until = 0
-        self._last_tick = -1
-        self._rate = 1.0
-        self._low, self._high = self._command_limits()
-        self._step: FloatArray | None = None  # V, largest from tick to tick
-        self._last = np.zeros(len(CHANNELS))  # V, the command before
-        self._scale = self._scales()
-        self._radians = 0.0
         self._info: DeviceInfo | None = None
+        self._radians = 0.0  # per count
+        self._reset(1.0, 1)
+
+    def _reset(self, sample_rate: float, n_commands: int) -> None:
+        """Forget all ticks; n_commands: how many commands may be on their way."""
+        self._rate = sample_rate
+        # Commands before clamping, and whether they were clamped, by tick modulo the length.
+        self._commands = np.zeros((n_commands, len(CHANNELS)))
+        self._clamped = np.zeros(n_commands, dtype=bool)
+        self._next_command = 0  # tick
+        self._last_tick = -1
+        self._low, self._high = self._command_limits()
+        self._step = self._largest_step()  # V from tick to tick
+        self._last_command = np.zeros(len(CHANNELS))  # V
+        self._scale = self._scales()
 
     def __enter__(self) -> Rig:
         self.open()
@@ -111,15 +115,7 @@ class Rig:
                 f"sample_rate {sample_rate:g} Hz is too fast for it"
             )
         # Twice what the device can hold ahead: as much may be on its way back.
-        self._asked = np.zeros((2 * self.info.queue, len(CHANNELS)))
-        self._clamped = np.zeros(len(self._asked), dtype=bool)
-        self._asked_until = 0
-        self._last_tick = -1
-        self._rate = sample_rate
-        self._low, self._high = self._command_limits()
-        self._step = self._largest_step(sample_rate)
-        self._last = np.zeros(len(CHANNELS))
-        self._scale = self._scales()
+        self._reset(sample_rate, 2 * self.info.queue)
         encoder = self.config.sensors.encoder
         self._radians = encoder.sign * 2.0 * np.pi / (4.0 * encoder.cycles)
         self._device.start(sample_rate, mode, self._guard(window))
@@ -130,8 +126,8 @@ class Rig:
         Ticks must follow one another without a gap. Where the limits have a slew, a command
         follows the one before no faster than that.
         """
-        if tick != self._asked_until:
-            raise DeviceError(f"commands for tick {tick} follow those until {self._asked_until}")
+        if tick != self._next_command:
+            raise DeviceError(f"commands for tick {tick} follow those until {self._next_command}")
         commands = np.asarray(commands, dtype=np.float64)
         limited = np.minimum(np.maximum(commands, self._low), self._high)
         if self._step is not None:
@@ -141,9 +137,9 @@ class Rig:
         if changed.any() and not np.isfinite(commands).all():
             raise DeviceError(f"a command from tick {tick} on is not a finite number of volts")
         places = self._places(tick, len(commands))
-        self._asked[places] = commands
+        self._commands[places] = commands
         self._clamped[places] = changed.any(axis=1) if changed.any() else False
-        self._asked_until += len(commands)
+        self._next_command += len(commands)
         self._device.send(tick, limited)
 
     def take_offsets(self, means: Mapping[str, float]) -> None:
@@ -182,27 +178,26 @@ class Rig:
         limits = [getattr(self.config.limits.command, name) for name in CHANNELS]
         return np.array([low for low, _ in limits]), np.array([high for _, high in limits])
 
-    def _largest_step(self, rate: float) -> FloatArray | None:
+    def _largest_step(self) -> FloatArray | None:
+        """Largest change of each command from tick to tick, (2,) [V]; None without a slew limit."""
         slew = [getattr(self.config.limits.slew, name) for name in CHANNELS]
         if all(limit is None for limit in slew):
             return None
         return np.array(
-            [math.inf if limit is None else limit / rate * (1 + 1e-9) for limit in slew]
+            [math.inf if limit is None else limit / self._rate * (1 + 1e-9) for limit in slew]
         )
 
     def _slewed(self, commands: FloatArray, step: FloatArray) -> FloatArray:
         """The commands (n, 2) [V], each no further than ``step`` from the one applied before."""
-        if (
-            len(commands)
-            and not (np.abs(np.diff(commands, axis=0, prepend=[self._last])) <= step).all()
-        ):
+        changes = np.abs(np.diff(commands, axis=0, prepend=[self._last_command]))
+        if not (changes <= step).all():
             commands = commands.copy()
-            last = self._last
+            last = self._last_command
             for row in range(len(commands)):
                 last = np.minimum(np.maximum(commands[row], last - step), last + step)
                 commands[row] = last
         if len(commands):
-            self._last = commands[-1]
+            self._last_command = commands[-1]
         return commands
 
     def _guard(self, window: tuple[float, float]) -> Guard:
@@ -231,20 +226,20 @@ class Rig:
 
     def _places(self, tick: int, n: int) -> slice | IntArray:
         """Where the commands of n ticks are kept."""
-        start = tick % len(self._asked)
-        if start + n <= len(self._asked):
+        start = tick % len(self._commands)
+        if start + n <= len(self._commands):
             return slice(start, start + n)
-        return np.arange(tick, tick + n) % len(self._asked)
+        return np.arange(tick, tick + n) % len(self._commands)
 
     def _to_si(self, raw: RawSamples) -> Samples:
         analog = (raw.analog - self.offsets.volts) * self._scale
         first, last, n = int(raw.tick[0]), int(raw.tick[-1]), len(raw.tick)
-        if last - first == n - 1 and last < self._asked_until:
+        if last - first == n - 1 and last < self._next_command:
             places = self._places(first, n)
         else:
-            # A tick never asked for counts as the one before.
-            places = np.minimum(raw.tick, max(self._asked_until - 1, 0)) % len(self._asked)
-        asked, flags = self._asked[places].copy(), raw.flags.copy()
+            # A tick without a command counts as the one before.
+            places = np.minimum(raw.tick, max(self._next_command - 1, 0)) % len(self._commands)
+        commands, flags = self._commands[places].copy(), raw.flags.copy()
         if self._clamped[places].any():
             flags |= self._clamped[places] * int(Flag.CLAMPED)
         if first != self._last_tick + 1:
@@ -255,8 +250,8 @@ class Rig:
         return Samples(
             tick=raw.tick,
             time=raw.tick / self._rate,
-            cmd_voltage_motor=asked[:, 0],
-            cmd_voltage_brake=asked[:, 1],
+            cmd_voltage_motor=commands[:, 0],
+            cmd_voltage_brake=commands[:, 1],
             applied_voltage_motor=raw.applied[:, 0],
             applied_voltage_brake=raw.applied[:, 1],
             current_motor=analog[:, 0],

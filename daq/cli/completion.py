@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-
-from daq.lookup.shipped import EXPERIMENTS, RIGS, shipped_files
+from typing import Literal
 
 Offer = tuple[str, str]  # a value and what it is
+Kind = Literal["experiments", "rigs"]
 
 _FIRST = 4096  # characters of a file that say what kind it is
 
@@ -15,24 +15,24 @@ _FIRST = 4096  # characters of a file that say what kind it is
 def experiments(incomplete: str) -> list[Offer]:
     """Shipped experiments, and YAML files here that name a protocol."""
     return _matching(
-        incomplete, [*_shipped(EXPERIMENTS), *_local(incomplete, ".yaml", "protocol:")]
+        incomplete, [*_shipped("experiments"), *_local(incomplete, ".yaml", "protocol:")]
     )
 
 
 def rigs(incomplete: str) -> list[Offer]:
     """Shipped rigs, and YAML files here that name a backend or have its options."""
     local = _local(incomplete, ".yaml", "backend:", "options:")
-    return _matching(incomplete, [*_shipped(RIGS), *local])
+    return _matching(incomplete, [*_shipped("rigs"), *local])
 
 
 def rig_names(incomplete: str) -> list[Offer]:
     """Shipped rigs by name."""
-    return _matching(incomplete, _stems(RIGS))
+    return _matching(incomplete, _stems("rigs"))
 
 
 def protocols(incomplete: str) -> list[Offer]:
     """Shipped experiments by protocol."""
-    return _matching(incomplete, _stems(EXPERIMENTS))
+    return _matching(incomplete, _stems("experiments"))
 
 
 def models(incomplete: str) -> list[Offer]:
@@ -58,14 +58,17 @@ def _matching(incomplete: str, offers: Iterable[Offer]) -> list[Offer]:
     return list(texts.items())
 
 
-def _stems(packages: Iterable[str]) -> Iterator[Offer]:
-    for name, text in _shipped(packages):
+def _stems(kind: Kind) -> Iterator[Offer]:
+    for name, text in _shipped(kind):
         yield name.removesuffix(".yaml"), text
 
 
-def _shipped(packages: Iterable[str]) -> Iterator[Offer]:
-    for path in shipped_files(packages):
-        yield path.name, _about(path)
+def _shipped(kind: Kind) -> Iterator[Offer]:
+    from daq.lookup.shipped import shipped_experiments, shipped_rigs
+
+    files = shipped_experiments() if kind == "experiments" else shipped_rigs()
+    for name, path in files.items():
+        yield name, _about(path)
 
 
 def _local(incomplete: str, suffix: str, *keys: str) -> Iterator[Offer]:

@@ -52,7 +52,7 @@ def emulate(
     """
     from daq.errors import ConfigError
     from daq.hal import Simulation
-    from daq.lookup.files import load_rig
+    from daq.lookup.rigs import load_rig
     from daq.run.realtime import RealTime
     from daq.serial.emulation import faults
     from daq.serial.emulation.emulator import emulate as serve
@@ -62,7 +62,7 @@ def emulate(
         _list_faults(json)
         return
     chosen = [faults.parse(text) for text in fault or []]
-    config, device = load_rig(rig)
+    config, device = load_rig(rig, watch=terminal.report_event)
     if not isinstance(device, Simulation):
         raise ConfigError(
             f"its backend is {config.backend!r}",

@@ -42,7 +42,7 @@ def init(
     """
     from daq.lookup import starter
 
-    files = starter.write_starter(folder, protocol, rig)
+    files = starter.write_starter(folder, protocol, rig, terminal.report_event)
     if json:
         terminal.print_json(
             {

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-import importlib.resources
 import inspect
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import typer
+from typer.cli import get_docs_for_click
 
+from daq.cli import terminal
 from daq.config.schema import Schema, branches, unit_in
 from daq.experiment import ClosedLoop, Experiment
 from daq.files import make_folder, write_whole
 from daq.lookup import schemas
+from daq.lookup.shipped import shipped_experiments
 
 _HEAD = "<!-- Made by `rig schema --reference`; what it says stands in the code. Do not edit. -->\n"
 _TABLE = "| key | value | unit | default | allowed | meaning |\n|---|---|---|---|---|---|\n"
@@ -22,6 +24,16 @@ _UNITS = """\
 A number with a unit may be written with one: `0.005`, `5 ms` and `0.005 s` are the same. Keys that
 are not in the table are mistakes.
 """
+_STATUS = (
+    "`rig COMMAND --help` says the same. Exit status: 0 done, 1 the run failed or an interlock "
+    "tripped, 2 wrong usage or configuration."
+)
+_BOUNDS = {
+    "minimum": "at least",
+    "exclusiveMinimum": "above",
+    "maximum": "at most",
+    "exclusiveMaximum": "below",
+}
 _KINDS = {
     "number": "number",
     "integer": "whole number",
@@ -35,10 +47,14 @@ _KINDS = {
 def write_reference(folder: Path, app: typer.Typer) -> list[Path]:
     """Write all pages; the paths written. ConfigError when they cannot be."""
     make_folder(folder)
-    found = pages(schemas.protocols(), schemas.backend_options(), app)
-    for name, text in found.items():
+    protocols, backends = (
+        schemas.protocols(terminal.report_event),
+        schemas.backend_options(terminal.report_event),
+    )
+    texts = pages(protocols, backends, app)
+    for name, text in texts.items():
         write_whole(folder / name, text)
-    return [folder / name for name in found]
+    return [folder / name for name in texts]
 
 
 def pages(
@@ -51,21 +67,21 @@ def pages(
     made["identification.md"] = _page(
         "Identification: keys of the YAML",
         "What `rig identify --config FILE.yaml` and `--set KEY=VALUE` take.",
-        _rows_of(documents["identification"]),
+        _rows(documents["identification"]),
     )
     made["datasheet.md"] = _page(
         "Data sheet: keys of the YAML",
         "What `rig identify --datasheet FILE.yaml` takes: for each parameter, by its name:",
-        _rows_of(documents["datasheet"]["additionalProperties"], "PARAMETER."),
+        _rows(documents["datasheet"]["additionalProperties"], "PARAMETER."),
     )
     made["command-line.md"] = _command_line(app)
     return {"README.md": _index(protocols), **made}
 
 
 def _index(protocols: Mapping[str, type[Experiment]]) -> str:
+    first_lines = {k: (inspect.getdoc(p) or "").partition("\n")[0] for k, p in protocols.items()}
     experiments = "".join(
-        f"- [`{name}`](protocol-{name}.md): {_first_line(kind)}\n"
-        for name, kind in protocols.items()
+        f"- [`{name}`](protocol-{name}.md): {line}\n" for name, line in first_lines.items()
     )
     return (
         f"{_HEAD}\n# Reference\n\nExperiments, by protocol:\n\n{experiments}\n"
@@ -77,14 +93,14 @@ def _index(protocols: Mapping[str, type[Experiment]]) -> str:
 
 def _protocol(name: str, kind: type[Experiment]) -> str:
     text = _page(
-        f"Protocol `{name}`", inspect.getdoc(kind) or "", _rows_of(schemas.protocol_schema(kind))
+        f"Protocol `{name}`", inspect.getdoc(kind) or "", _rows(schemas.protocol_schema(kind))
     )
     if issubclass(kind, ClosedLoop) and kind.columns:
         text += "\nBeside every sample it logs:\n\n| column | unit |\n|---|---|\n"
         text += "".join(f"| `{column}` | {unit} |\n" for column, unit in kind.columns.items())
-    shipped = importlib.resources.files("protocols") / f"{name}.yaml"
-    if shipped.is_file():
-        content = schemas.without_comment(shipped.read_text(encoding="utf-8"))
+    shipped = shipped_experiments().get(f"{name}.yaml")
+    if shipped is not None:
+        content = schemas.without_schema_comment(shipped.read_text(encoding="utf-8"))
         text += f"\nThe shipped `{name}.yaml`:\n\n```yaml\n{content}```\n"
     return text
 
@@ -93,31 +109,28 @@ def _rig(document: Schema, backends: Mapping[str, Any]) -> str:
     text = _page(
         "Rig: keys of the YAML",
         "What `--rig FILE.yaml` takes: the backend that talks to the rig, calibration and limits.",
-        _rows_of(document),
+        _rows(document),
     )
     for name, options in backends.items():
-        rows = _rows_of(schemas.rig_options(options), "options.")
-        text += f"\n## Options of the backend `{name}`\n\n{_TABLE}{''.join(rows)}"
+        rows = _rows(schemas.rig_options(options), "options.")
+        text += f"\n## Options of the backend `{name}`\n\n{_TABLE}{rows}"
     return text
 
 
-def _page(title: str, intro: str, rows: Sequence[str]) -> str:
-    return f"{_HEAD}\n# {title}\n\n{intro}\n\n{_UNITS}\n{_TABLE}{''.join(rows)}"
+def _page(title: str, intro: str, rows: str) -> str:
+    return f"{_HEAD}\n# {title}\n\n{intro}\n\n{_UNITS}\n{_TABLE}{rows}"
 
 
-def _rows_of(schema: Schema, prefix: str = "") -> list[str]:
-    return list(_rows(schema, prefix))
-
-
-def _rows(schema: Schema, prefix: str) -> Iterator[str]:
-    required = schema.get("required", [])
+def _rows(schema: Schema, prefix: str = "") -> str:
+    """A line of the table for each key of a schema, those of sections below their own."""
+    lines = []
     for name, item in schema.get("properties", {}).items():
-        key = f"{prefix}{name}"
-        inner = [(f"{key}{step}", part) for step, part in _sections(item)]
-        yield _row(key, item, name in required, bool(inner))
+        sections = list(_sections(item))
+        is_required = name in schema.get("required", [])
+        lines.append(_row(f"{prefix}{name}", item, is_required, bool(sections)))
         if name != "validation":
-            for below, part in inner:
-                yield from _rows(part, f"{below}.")
+            lines += [_rows(section, f"{prefix}{name}{step}.") for step, section in sections]
+    return "".join(lines)
 
 
 def _sections(item: Schema) -> Iterator[tuple[str, Schema]]:
@@ -132,31 +145,21 @@ def _sections(item: Schema) -> Iterator[tuple[str, Schema]]:
             yield ".NAME", named
 
 
-def _row(key: str, item: Schema, required: bool, section: bool) -> str:
-    unit = unit_in(item) or ""
-    text = item.get("description", "")
-    if unit:
-        text = text.removesuffix(f" [{unit}]")
+def _row(key: str, item: Schema, is_required: bool, is_section: bool) -> str:
+    unit, default = unit_in(item), item.get("default")
+    meaning = item.get("description", "").removesuffix(f" [{unit}]")
     if "examples" in item:
-        text += f", for example `{schemas.as_yaml(item['examples'][0])}`"
-    default = "required" if required else _default(item, section)
+        meaning += f", for example `{schemas.as_yaml(item['examples'][0])}`"
+    has_default = not is_section and default not in (None, "", [], {})
     cells = (
-        f"`{key}`", _value(item), "" if section or unit == "1" else unit, default, _allowed(item),
-        text,
-    )  # fmt: skip
-    return _line(cells)
-
-
-def _line(cells: Sequence[str]) -> str:
-    """One line of a Markdown table."""
+        f"`{key}`",
+        _value(item),
+        "" if is_section or unit in (None, "1") else unit,
+        "required" if is_required else f"`{_number(default)}`" if has_default else "",
+        _allowed(item),
+        meaning,
+    )
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |\n"
-
-
-def _default(item: Schema, section: bool) -> str:
-    value = item.get("default")
-    if section or value in (None, "", [], {}):
-        return ""
-    return f"`{_number(value)}`"
 
 
 def _number(value: Any) -> str:
@@ -200,56 +203,21 @@ def _bounds(schema: Schema) -> str:
     """Words or bounds of a value, or of those inside it."""
     if "enum" in schema:
         return ", ".join(f"`{value}`" for value in schema["enum"])
-    low = _bound(schema, "at least", "minimum", "above", "exclusiveMinimum")
-    high = _bound(schema, "at most", "maximum", "below", "exclusiveMaximum")
     inner = schema.get("items") or schema.get("additionalProperties")
     if isinstance(inner, list):
         return _allowed(inner[0])
-    if not isinstance(inner, dict) or "properties" in inner:
-        return ", ".join(filter(None, [low, high, _length(schema)]))
-    return ", ".join(filter(None, [_length(schema), _allowed(inner)]))
-
-
-def _length(schema: Schema) -> str:
-    """How many values, where that is not one number."""
-    if "items" not in schema or schema.get("minItems", 0) == schema.get("maxItems"):
-        return ""
-    least = _bound(schema, "at least", "minItems")
-    return f"{least} of them" if least else ""
-
-
-def _bound(schema: Schema, word: str, key: str, other: str = "", strict: str = "") -> str:
-    if key in schema:
-        return f"{word} {_number(schema[key])}"
-    return f"{other} {_number(schema[strict])}" if strict in schema else ""
-
-
-def _first_line(kind: type[Any]) -> str:
-    return (inspect.getdoc(kind) or "").partition("\n")[0]
+    bounds = [f"{words} {_number(schema[key])}" for key, words in _BOUNDS.items() if key in schema]
+    if "items" in schema and schema.get("minItems", 0) not in (0, schema.get("maxItems")):
+        bounds.append(f"at least {schema['minItems']} of them")
+    if isinstance(inner, dict) and "properties" not in inner:
+        bounds.append(_allowed(inner))
+    return ", ".join(filter(None, bounds))
 
 
 def _command_line(app: typer.Typer) -> str:
-    command: Any = typer.main.get_command(app)
-    text = (
-        f"{_HEAD}\n# Command line\n\n`rig COMMAND --help` says the same. Exit status: 0 done, 1 "
-        "the run failed or an interlock tripped, 2 wrong usage or configuration.\n"
+    group: Any = typer.main.get_command(app)
+    context = typer.Context(group, info_name="rig")
+    return f"{_HEAD}\n# Command line\n\n{_STATUS}\n\n" + "".join(
+        get_docs_for_click(obj=command, ctx=context, indent=1, call_prefix="rig")
+        for command in group.commands.values()
     )
-    for name, sub in command.commands.items():
-        text += f"\n## rig {name}\n\n{inspect.cleandoc(sub.help or '')}\n\n"
-        if sub.epilog:
-            text += f"    {sub.epilog.removeprefix('Example:').strip()}\n\n"
-        text += "| argument or option | value | default | meaning |\n|---|---|---|---|\n"
-        text += "".join(_option(param) for param in sub.params)
-    return text
-
-
-def _option(param: Any) -> str:
-    names = ", ".join(f"`{name}`" for name in param.opts)
-    if param.param_type_name == "argument":
-        names = f"`{param.metavar or param.name.upper()}`"
-    flag = getattr(param, "is_flag", False)
-    value = "" if flag or param.param_type_name == "argument" else param.metavar or "VALUE"
-    default = "required" if param.required else "" if flag else param.default
-    shown = "" if default in (None, "", ()) else str(default)
-    cells = (names, value, shown, param.help or "")
-    return _line(cells)

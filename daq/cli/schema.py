@@ -29,7 +29,8 @@ def schema(
     """
     from daq.lookup import schemas
 
-    written = {"schemas": schemas.write_schemas(folder)}
+    watch = terminal.report_event
+    written = {"schemas": schemas.write_schemas(folder, watch)}
     if reference is not None:
         from daq.cli.app import app
         from daq.cli.reference import write_reference
@@ -41,5 +42,5 @@ def schema(
     for paths in written.values():
         for path in paths:
             terminal.print_line(f"Written: {path}")
-    first = schemas.comment("experiment", folder)
+    first = schemas.schema_comment("experiment", folder)
     terminal.print_next(f"begin an experiment's YAML with the line {first}")

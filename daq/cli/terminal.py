@@ -18,7 +18,7 @@ from typing import Any, Protocol, TextIO
 
 from daq import notation
 from daq.documents import plain
-from daq.progress import Event, Progress, Started, Watch
+from daq.progress import Event, Note, Progress, Started, Watch
 
 number = notation.number  # pages and tables print numbers alike
 
@@ -72,6 +72,12 @@ def report_error(message: str) -> None:
 def report_warning(message: str) -> None:
     """One line on standard error of what a user must know, however quiet."""
     sys.stderr.write(f"rig: warning: {message}\n")
+
+
+def report_event(event: Event) -> None:
+    """A note as loud as it is meant, without showing progress: a ``watch`` for what is quick."""
+    if isinstance(event, Note):
+        _REPORTERS[event.level](event.text)
 
 
 def report_note(message: str) -> None:
@@ -228,7 +234,7 @@ class Watching:
             if not self._quiet:
                 report_note(event.title)
         else:
-            _REPORTERS[event.level](event.text)
+            report_event(event)
 
     def _close(self) -> None:
         self._display = None

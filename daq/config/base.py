@@ -23,9 +23,9 @@ class Section(BaseModel):
         for name, part in _parts(value, kind):
             if isinstance(part, bool):
                 # Of ``parameters``: parameter R_m.
-                one = f"{(info.field_name or '').removesuffix('s')} {name}: " if name else ""
+                entry = f"{(info.field_name or '').removesuffix('s')} {name}: " if name else ""
                 raise ValueError(
-                    f"{one}{_expected(kind)}; YAML reads yes, no, on and off as true and false"
+                    f"{entry}{_expected(kind)}; YAML reads yes, no, on and off as true and false"
                 )
         return value
 

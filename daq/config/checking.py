@@ -6,7 +6,7 @@ import difflib
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
@@ -63,13 +63,12 @@ def _order(mistake: Mistake) -> tuple[int, int, str]:
 
 
 # Keys by which each kind of file is known when it is given in another's place, and the cure.
+_SEARCH_KEYS = {"model", "columns", "ranges", "fixed", "population", "preset"}
 _KINDS = {
     "an experiment": ({"protocol"}, "name it behind rig run or rig check"),
     "a rig": ({"backend", "limits", "sensors"}, "give it with --rig"),
-    "an identification's settings": (
-        {"model", "columns", "ranges", "fixed", "population", "preset"}, "give it with --config"
-    ),
-}  # fmt: skip
+    "an identification's settings": (_SEARCH_KEYS, "give it with --config"),
+}
 
 
 def refuse_other_kind(file: YamlFile, wanted: str) -> None:
@@ -83,16 +82,14 @@ def refuse_other_kind(file: YamlFile, wanted: str) -> None:
                 raise ConfigError.of([replace(file.mistake((key,), problem, cure), key="")])
 
 
+@dataclass(frozen=True)
 class _Explainer:
-    """What pydantic found wrong with data, told by file, key, value and cure."""
+    """Mistakes of the part of a file at a key, from pydantic's errors."""
 
-    def __init__(
-        self, file: YamlFile, model: type[BaseModel], data: Mapping[str, Any], at: Key
-    ) -> None:
-        self._file = file
-        self._model = model
-        self._data = data
-        self._at = at
+    file: YamlFile
+    model: type[BaseModel]
+    content: Mapping[str, Any]
+    at: Key
 
     def mistakes(self, errors: Sequence[ErrorDetails]) -> list[Mistake]:
         """One mistake for each key that is wrong."""
@@ -106,7 +103,7 @@ class _Explainer:
             else:
                 complaints.setdefault(key, []).append(self._complaint(item, key))
         return [
-            self._file.mistake((*self._at, *key), *_either(list(dict.fromkeys(alternatives))))
+            self.file.mistake((*self.at, *key), *_either(list(dict.fromkeys(alternatives))))
             for key, alternatives in complaints.items()
             # What is missing because it is misspelt is said once.
             if key not in meant or self._is_there(key)
@@ -114,7 +111,7 @@ class _Explainer:
 
     def _key(self, item: ErrorDetails) -> Key:
         """The key an error is about, without what pydantic adds for branches of a union."""
-        value: Any = self._data
+        value: Any = self.content
         key: list[str | int] = []
         for part in item["loc"]:
             if isinstance(value, Mapping) and (part in value or str(part) in map(str, value)):
@@ -130,10 +127,10 @@ class _Explainer:
         return tuple(key)
 
     def _is_there(self, key: Key) -> bool:
-        return (*self._at, *key) in self._file.places
+        return (*self.at, *key) in self.file.places
 
     def _value(self, key: Key) -> Any:
-        value: Any = self._data
+        value: Any = self.content
         for part in key:
             try:
                 value = value[part]
@@ -142,20 +139,17 @@ class _Explainer:
         return value
 
     def _near(self, key: Key) -> str | None:
-        known = self._fields(key[:-1])
-        return next(iter(difflib.get_close_matches(str(key[-1]), known, n=1, cutoff=0.6)), None)
+        names = self._fields(key[:-1])
+        return next(iter(difflib.get_close_matches(str(key[-1]), names, n=1, cutoff=0.6)), None)
 
     def _cure(self, key: Key, near: str | None) -> str:
         """Where an unknown key belongs, or what it may have meant."""
-        parents = [
-            parent for parent in _sections_with(self._model, str(key[-1])) if parent != key[:-1]
-        ]
-        if parents:
-            under = " or ".join(dotted(parent) for parent in parents if parent)
-            top = "at the left margin, under no other key" if () in parents else ""
-            return "it belongs " + " or ".join(
-                filter(None, [top, f"under {under}" if under else ""])
-            )
+        sections = [at for at in _sections_with(self.model, str(key[-1])) if at != key[:-1]]
+        if sections:
+            places = ["at the left margin, under no other key"] if () in sections else []
+            if under := " or ".join(dotted(section) for section in sections if section):
+                places.append(f"under {under}")
+            return f"it belongs {' or '.join(places)}"
         if near is not None:
             return f"did you mean {near!r}?"
         if str(key[-1]).isdigit():
@@ -191,7 +185,7 @@ class _Explainer:
 
     def _types(self, key: Key) -> list[Any]:
         """What may stand at a key: the alternatives that agree with what stands there."""
-        kinds: list[Any] = [self._model]
+        kinds: list[Any] = [self.model]
         for depth, part in enumerate(key):
             section = self._value(key[:depth])
             kinds = [inner for kind in _agreeing(kinds, section) for inner in _inside(kind, part)]
@@ -212,19 +206,19 @@ def _of_best_branch(
     for item, key in errors:
         branched = len(item["loc"]) > len(key)
         deeper = any(
-            other[: len(key)] == key and len(other) > len(key) and len(its["loc"]) > len(other)
-            for its, other in errors
+            below[: len(key)] == key and len(below) > len(key) and len(inner["loc"]) > len(below)
+            for inner, below in errors
         )
         if not (branched and deeper):
             yield item, key
 
 
-def alternatives(kind: Any) -> list[Any]:
+def _alternatives(kind: Any) -> list[Any]:
     """The branches of a type, each without its marks."""
     if get_origin(kind) is Annotated:
-        return alternatives(get_args(kind)[0])
+        return _alternatives(get_args(kind)[0])
     if get_origin(kind) in {Union, UnionType}:
-        return [branch for part in get_args(kind) for branch in alternatives(part)]
+        return [branch for part in get_args(kind) for branch in _alternatives(part)]
     return [kind]
 
 
@@ -232,14 +226,14 @@ def _inside(kind: Any, part: str | int) -> list[Any]:
     """What may stand at a key or index of a value of a type."""
     if hasattr(kind, "model_fields"):
         field = kind.model_fields.get(part)
-        return alternatives(field.annotation) if field is not None else []
+        return _alternatives(field.annotation) if field is not None else []
     inner = get_args(kind)
     if get_origin(kind) is dict:
-        return alternatives(inner[1])
+        return _alternatives(inner[1])
     if get_origin(kind) is list:
-        return alternatives(inner[0])
+        return _alternatives(inner[0])
     if get_origin(kind) is tuple and isinstance(part, int):
-        return alternatives(inner[min(part, len(inner) - 1)])
+        return _alternatives(inner[min(part, len(inner) - 1)])
     return []
 
 
@@ -260,11 +254,11 @@ def _sections_with(model: Any, name: str, at: Key = ()) -> list[Key]:
     """Sections below a model that have a key of that name."""
     if len(at) > _DEEPEST or not hasattr(model, "model_fields"):
         return []
-    found = [at] if name in model.model_fields else []
-    for own, field in model.model_fields.items():
-        for kind in alternatives(field.annotation):
-            found += _sections_with(kind, name, (*at, own))
-    return list(dict.fromkeys(found))
+    sections = [at] if name in model.model_fields else []
+    for key, field in model.model_fields.items():
+        for kind in _alternatives(field.annotation):
+            sections += _sections_with(kind, name, (*at, key))
+    return list(dict.fromkeys(sections))
 
 
 _NUMBER, _WHOLE, _TRUTH = "expected a number", "expected a whole number", "expected true or false"
@@ -339,8 +333,8 @@ def _cure_of_value(kind: str, value: object, context: Mapping[str, Any]) -> str:
         return f"write [{value}]"
     if kind == "string_type" and isinstance(value, int | float):
         return "put it in quotes"
-    known = re.findall(r"'([^']+)'", context.get("expected", context.get("expected_tags", "")))
-    near = difflib.get_close_matches(str(value), known, n=1, cutoff=0.5)
+    words = re.findall(r"'([^']+)'", context.get("expected", context.get("expected_tags", "")))
+    near = difflib.get_close_matches(str(value), words, n=1, cutoff=0.5)
     return f"did you mean {near[0]!r}?" if near else ""
 
 

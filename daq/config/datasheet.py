@@ -32,15 +32,15 @@ class DatasheetEntry(Section):
             return {**given, "value": value[0], "unit": value[1]}
         if not isinstance(ends, list):
             return given
-        found = [split(end) for end in ends]
-        unit = next((end[1] for end in found if end is not None), None)
+        quantities = [split(end) for end in ends]
+        unit = next((quantity[1] for quantity in quantities if quantity is not None), None)
         if unit is None:
             return given
-        same = [
-            plain if end is None else end[0] * factor(end[1], unit)
-            for plain, end in zip(ends, found, strict=True)
+        numbers = [
+            end if quantity is None else quantity[0] * factor(quantity[1], unit)
+            for end, quantity in zip(ends, quantities, strict=True)
         ]
-        return {**given, "range": same, "unit": unit}
+        return {**given, "range": numbers, "unit": unit}
 
     @model_validator(mode="after")
     def _complete(self) -> DatasheetEntry:

@@ -142,7 +142,7 @@ class EncoderLimits(Section):
     stall: Stall | None = Field(None, description="current that must move it; left out: none")
 
 
-class OwnLimit(Section):
+class UserLimit(Section):
     """A limit of a user's own."""
 
     use: str = Field(min_length=1, description="name of an installed limit, or FILE.py:CLASS")
@@ -158,7 +158,7 @@ class OwnLimit(Section):
         return self._make()
 
 
-class Limits(Section):
+class LimitSettings(Section):
     """What keeps the rig and the hand on it whole; docs/safety.md tells each."""
 
     command: CommandLimits = Field(CommandLimits(), description="clamps of the commands")
@@ -182,7 +182,7 @@ class Limits(Section):
         description="for which an input with noise, or one that must follow its command, may "
         "read the same to the bit; null: not watched",
     )
-    own: list[OwnLimit] = Field(default_factory=list, description="limits from your own code")
+    own: list[UserLimit] = Field(default_factory=list, description="limits from your own code")
 
     @field_validator("travel")
     @classmethod
@@ -212,7 +212,7 @@ class RigConfig(Section):
     options: Any = Field(default_factory=dict, description="the backend's own settings")
     sensors: Sensors = Field(Sensors(), description="calibration of the measured channels")
     amplifiers: Amplifiers = Field(Amplifiers(), description="gain of current-controlled ones")
-    limits: Limits = Field(Limits(), description="clamps and interlocks")
+    limits: LimitSettings = Field(LimitSettings(), description="clamps and interlocks")
     realtime: Realtime = Field(
         "prefer",
         description="real-time scheduling during a run: off, prefer (as far as it is granted), "

@@ -34,8 +34,8 @@ def partial(schema: Schema) -> Schema:
 
 def unit_in(schema: Schema) -> str | None:
     """The unit of the numbers at a key, wherever in its schema it stands."""
-    own: str | None = schema.get("unit")
-    return own or next((unit for inner in _inner(schema) if (unit := unit_in(inner))), None)
+    declared: str | None = schema.get("unit")
+    return declared or next((unit for inner in _inner(schema) if (unit := unit_in(inner))), None)
 
 
 def branches(schema: Schema) -> list[Schema]:

@@ -91,14 +91,14 @@ def converted(value: Any, unit: str) -> Any:
 
     Raises ValueError for a unit that does not convert.
     """
-    found = split(value)
-    return value if found is None else found[0] * factor(found[1], unit)
+    quantity = split(value)
+    return value if quantity is None else quantity[0] * factor(quantity[1], unit)
 
 
 def split(value: Any) -> tuple[float, str] | None:
     """Number and unit of a text such as ``5 ms``; None for anything else."""
-    found = _QUANTITY.fullmatch(value) if isinstance(value, str) else None
-    return None if found is None else (float(found[1]), found[2])
+    parts = _QUANTITY.fullmatch(value) if isinstance(value, str) else None
+    return None if parts is None else (float(parts[1]), parts[2])
 
 
 def factor(given: str, wanted: str) -> float:
@@ -113,7 +113,7 @@ def factor(given: str, wanted: str) -> float:
     registry = _registry()
     try:
         have, want = (registry.Quantity(1.0, _spelt(unit)) for unit in (given, wanted))
-        found = float(have.to(want.units).magnitude)
+        result = float(have.to(want.units).magnitude)
     except pint.DimensionalityError:
         raise ValueError(f"{given!r} does not convert to {wanted!r}") from None
     except Exception:
@@ -126,7 +126,7 @@ def factor(given: str, wanted: str) -> float:
             f"{given!r} does not say whether it counts turns or radians, as {wanted!r} does, or "
             "the other way round; write 'rpm', 'turn/s', 'deg' or 'rad/s'"
         )
-    return found
+    return result
 
 
 @functools.cache
@@ -151,7 +151,7 @@ def _unit_in(metadata: typing.Iterable[Any]) -> str | None:
 
 
 def _unit_of_type(kind: Any) -> str | None:
-    own = _unit_in(getattr(kind, "__metadata__", ()))
-    if own is not None:
-        return own
+    marked = _unit_in(getattr(kind, "__metadata__", ()))
+    if marked is not None:
+        return marked
     return next((unit for part in typing.get_args(kind) if (unit := _unit_of_type(part))), None)

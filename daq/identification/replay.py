@@ -15,7 +15,7 @@ from daq.identification.fit import take
 from daq.identification.parameters import read_parameters
 from daq.identification.result import Identification
 from daq.identification.settings import columns_of
-from daq.lookup.files import DEFAULT_RIG, load_rig
+from daq.lookup.rigs import DEFAULT_RIG, load_rig
 from sysid import BatchSimulator, Metrics, ModelError, ProcessModel, evaluate, free_run
 
 if TYPE_CHECKING:

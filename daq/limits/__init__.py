@@ -11,9 +11,9 @@ import contextlib
 import dataclasses
 from collections.abc import Iterator
 
-from daq.config.rig import OwnLimit, RigConfig
+from daq.config.rig import RigConfig, UserLimit
 from daq.errors import USER_CODE_ERRORS, ConfigError, RigError, RunError, raised_in
-from daq.hal import Flag, Phase, Samples
+from daq.hal import CHANNELS, Flag, Phase, Samples
 from daq.limits.base import Limit, Trip
 from daq.limits.load import DeviceFound, I2t, Magnitude
 from daq.limits.sensors import Frozen, Jump, Silence, Stalled
@@ -26,8 +26,8 @@ class Limits:
     """All limits of a rig, asked together."""
 
     def __init__(self, config: RigConfig) -> None:
-        own = [_Named(_made(item)) for item in config.limits.own]
-        self._limits: list[Limit] = [*_built_in(config), *own]
+        users = [_UserCode(_made(settings)) for settings in config.limits.own]
+        self._limits: list[Limit] = [*_built_in(config), *users]
 
     def begin(self, phase: Phase, sample_rate: float) -> None:
         """Tell every limit that a phase begins."""
@@ -49,44 +49,45 @@ class Limits:
         return first
 
 
-def _made(item: OwnLimit) -> Limit:
-    """A user's own limit. Raises ConfigError for a mistake in its constructor."""
+def _made(settings: UserLimit) -> Limit:
+    """A limit of a user's own. Raises ConfigError for a mistake in its constructor."""
     try:
-        made: Limit = item.make()
+        limit: Limit = settings.make()
     except RigError:
         raise
     except USER_CODE_ERRORS as error:
-        problem = f"{item.use} cannot be made: {type(error).__name__}: {error}"
+        problem = f"{settings.use} cannot be made: {type(error).__name__}: {error}"
         raise ConfigError(problem, key="limits.own") from error
-    return made
+    return limit
 
 
 def _built_in(config: RigConfig) -> list[Limit]:
     """The limits that a rig's file asks for; a value that is not finite passes none of them."""
-    limits, encoder = config.limits, config.limits.encoder
-    found: list[Limit] = [
-        Magnitude("current_motor", limits.current.motor, "A"),
-        Magnitude("current_brake", limits.current.brake, "A"),
-        Magnitude("torque", limits.torque, "N*m"),
-        Magnitude("omega", limits.speed, "rad/s"),
+    settings, encoder = config.limits, config.limits.encoder
+    limits: list[Limit] = [
+        Magnitude("current_motor", settings.current.motor, "A"),
+        Magnitude("current_brake", settings.current.brake, "A"),
+        Magnitude("torque", settings.torque, "N*m"),
+        Magnitude("omega", settings.speed, "rad/s"),
         Magnitude("theta", None, "rad"),
         Jump(encoder.fastest),
         Silence(encoder.silent),
     ]
-    overloads = {"current_motor": limits.i2t.motor, "current_brake": limits.i2t.brake}
-    found += [I2t(name, load) for name, load in overloads.items() if load is not None]
-    if limits.travel is not None:
-        found.append(Travel(*limits.travel))
-    if limits.winding is not None:
-        found.append(Winding(limits.winding))
+    for channel in CHANNELS:
+        overload = getattr(settings.i2t, channel)
+        if overload is not None:
+            limits.append(I2t(f"current_{channel}", overload))
+    if settings.travel is not None:
+        limits.append(Travel(*settings.travel))
+    if settings.winding is not None:
+        limits.append(Winding(settings.winding))
     if encoder.stall is not None:
-        found.append(Stalled(encoder.stall))
-    if limits.frozen is not None:
-        follows = {"motor": "current_motor", "brake": "current_brake"}
-        found += [Frozen(name, limits.frozen, channel) for channel, name in follows.items()]
-        found.append(Frozen("torque", limits.frozen, None))
-    found.append(DeviceFound())  # last, for the others know more of what it found
-    return found
+        limits.append(Stalled(encoder.stall))
+    if settings.frozen is not None:
+        limits += [Frozen(f"current_{name}", settings.frozen, name) for name in CHANNELS]
+        limits.append(Frozen("torque", settings.frozen, None))
+    limits.append(DeviceFound())  # last, for the others know more of what it found
+    return limits
 
 
 def mark_interlock(samples: Samples, row: int) -> Samples:
@@ -96,21 +97,22 @@ def mark_interlock(samples: Samples, row: int) -> Samples:
     return dataclasses.replace(samples, flags=flags)
 
 
-class _Named(Limit):
+class _UserCode(Limit):
     """A limit of a user's own: what is wrong with it names its class."""
 
-    def __init__(self, own: Limit) -> None:
-        self._own = own
+    def __init__(self, limit: Limit) -> None:
+        self._limit = limit
+        self._name = f"the limit {type(limit).__name__}"
 
     def begin(self, phase: Phase, sample_rate: float) -> None:
         """Pass it on."""
         with self._blamed():
-            self._own.begin(phase, sample_rate)
+            self._limit.begin(phase, sample_rate)
 
     def window(self) -> tuple[float, float]:
-        """Pass it on."""
+        """Pass it on, and see that it is one."""
         with self._blamed():
-            low, high = self._own.window()
+            low, high = self._limit.window()
             if not low <= high:
                 raise ValueError(f"its window ({low!r}, {high!r}) is none")
             return float(low), float(high)
@@ -118,7 +120,7 @@ class _Named(Limit):
     def check(self, samples: Samples) -> Trip | None:
         """Pass it on, and see that the answer is one."""
         with self._blamed():
-            trip = self._own.check(samples)
+            trip = self._limit.check(samples)
         if trip is None:
             return None
         try:
@@ -127,7 +129,7 @@ class _Named(Limit):
                 raise ValueError
         except (TypeError, ValueError):
             raise RunError(
-                f"the limit {type(self._own).__name__} answered {trip!r} to {len(samples)} samples",
+                f"{self._name} answered {trip!r} to {len(samples)} samples",
                 cure="check must return None or (row, reason); outputs were set to zero",
             ) from None
         return int(row), str(reason)
@@ -139,7 +141,6 @@ class _Named(Limit):
         except RigError:
             raise
         except USER_CODE_ERRORS as error:
-            raise RunError(
-                f"the limit {type(self._own).__name__} failed: {type(error).__name__}: {error}"
-                f"{raised_in(type(self._own), error)}; outputs were set to zero"
-            ) from error
+            place = raised_in(type(self._limit), error)
+            problem = f"{self._name} failed: {type(error).__name__}: {error}{place}"
+            raise RunError(f"{problem}; outputs were set to zero") from error

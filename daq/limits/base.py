@@ -6,6 +6,7 @@ import abc
 import math
 
 import numpy as np
+import numpy.typing as npt
 
 from daq.config.base import Section
 from daq.hal import FloatArray, Phase, Samples
@@ -42,6 +43,11 @@ class Limit(abc.ABC):
         Every sample that arrives is shown once and in order. The reason completes the sentence
         "interlock in sample k: ...".
         """
+
+
+def first_row(beyond: npt.NDArray[np.bool_]) -> int | None:
+    """The first row of those that are beyond a limit; None without any."""
+    return int(np.argmax(beyond)) if beyond.any() else None
 
 
 def within(values: FloatArray, limit: float) -> bool:

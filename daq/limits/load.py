@@ -6,9 +6,9 @@ import numpy as np
 
 from daq.config.rig import Overload
 from daq.hal import Flag, FloatArray, Phase, Samples
-from daq.limits.base import Limit, Trip, within
+from daq.limits.base import Limit, Trip, first_row, within
 
-_MOST = float(np.finfo(np.float64).max)  # any finite number is within it
+_LARGEST = float(np.finfo(np.float64).max)  # any finite number is within it
 _INTERLOCK = int(Flag.INTERLOCK)
 
 
@@ -17,7 +17,7 @@ class Magnitude(Limit):
 
     def __init__(self, name: str, limit: float | None, unit: str) -> None:
         self._name, self._unit = name, unit
-        self._limit = _MOST if limit is None else limit
+        self._limit = _LARGEST if limit is None else limit
 
     def check(self, samples: Samples) -> Trip | None:
         """Compare every sample; what is no number compares as beyond."""
@@ -42,10 +42,8 @@ class DeviceFound(Limit):
         flags = samples.flags
         if len(flags) == 1 and not flags.item() & _INTERLOCK:
             return None
-        flagged = (flags & _INTERLOCK) != 0
-        if not flagged.any():
-            return None
-        return int(np.argmax(flagged)), "the device found an input beyond its limit"
+        row = first_row((flags & _INTERLOCK) != 0)
+        return None if row is None else (row, "the device found an input beyond its limit")
 
 
 def i2t_levels(
@@ -88,11 +86,8 @@ class I2t(Limit):
         steps = np.diff(samples.tick, prepend=self._tick) * self._dt
         levels = i2t_levels(self._level, current, steps, self._continuous)
         self._tick, self._level = int(samples.tick[-1]), float(levels[-1])
-        beyond = levels > self._budget
-        if not beyond.any():
-            return None
-        row = int(np.argmax(beyond))
-        return row, self._reason(levels[row])
+        row = first_row(levels > self._budget)
+        return None if row is None else (row, self._reason(levels[row]))
 
     def _reason(self, level: float) -> str:
         return (

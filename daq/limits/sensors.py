@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import abc
 import math
 
 import numpy as np
 
 from daq.config.rig import Stall
 from daq.hal import FloatArray, Phase, Samples
-from daq.limits.base import TURN, Limit, Trip, changes, within
+from daq.limits.base import TURN, Limit, Trip, changes, first_row
 
 _FOLLOWS = 0.1  # V of change of a command that must show in its current
 _RARER = 10  # times the longest standstill of the calibration that an input may stand still
@@ -39,11 +40,8 @@ class Jump(Limit):
             return 0, self._reason(step, self._tick - before)
         steps = np.abs(np.diff(theta, prepend=last))
         ticks = np.diff(samples.tick, prepend=before)
-        beyond = steps > self._most * ticks
-        if not beyond.any():
-            return None
-        row = int(np.argmax(beyond))
-        return row, self._reason(steps[row], int(ticks[row]))
+        row = first_row(steps > self._most * ticks)
+        return None if row is None else (row, self._reason(steps[row], int(ticks[row])))
 
     def _reason(self, step: float, ticks: int) -> str:
         speed = step / ticks * self._fastest / self._most
@@ -53,78 +51,100 @@ class Jump(Limit):
         )
 
 
-class Silence(Limit):
+class _Standstill(Limit):
+    """A quantity that reads the same to the bit from sample to sample, judged while it does."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._value = math.nan
+
+    def begin(self, phase: Phase, sample_rate: float) -> None:
+        """Start anew."""
+        self._value = math.nan
+        self._changed(0)
+
+    def check(self, samples: Samples) -> Trip | None:
+        """Judge every sample that reads what the one before did."""
+        values: FloatArray = getattr(samples, self._name)
+        if changes(values, self._value):
+            self._value = values.item(-1)
+            self._changed(len(values))
+            return None
+        for row, value in enumerate(values.tolist()):
+            if value != self._value:
+                self._value = value
+                self._changed(1)
+                continue
+            reason = self._stood(samples, row)
+            if reason is not None:
+                return row, reason
+        return None
+
+    @abc.abstractmethod
+    def _changed(self, n_samples: int) -> None:
+        """So many samples, none of which reads what the one before did."""
+
+    @abc.abstractmethod
+    def _stood(self, samples: Samples, row: int) -> str | None:
+        """One more sample that reads the same; why that cannot be."""
+
+
+class Silence(_Standstill):
     """The speed estimate and the count of the encoder must agree on whether the shaft turns."""
 
     def __init__(self, turns: float) -> None:
+        super().__init__("theta")
         self._most = turns * TURN
         self._dt = 1.0
-        self._theta, self._turned = math.nan, 0.0
+        self._turned = 0.0  # rad, by the speed estimate
 
     def begin(self, phase: Phase, sample_rate: float) -> None:
         """Start anew."""
+        super().begin(phase, sample_rate)
         self._dt = 1.0 / sample_rate
-        self._theta, self._turned = math.nan, 0.0
 
-    def check(self, samples: Samples) -> Trip | None:
-        """Sum up the speed while the count stands still."""
-        theta = samples.theta
-        if changes(theta, self._theta):
-            self._theta, self._turned = theta.item(-1), 0.0
+    def _changed(self, n_samples: int) -> None:
+        self._turned = 0.0
+
+    def _stood(self, samples: Samples, row: int) -> str | None:
+        self._turned += abs(samples.omega.item(row)) * self._dt
+        if not self._turned > self._most:
             return None
-        for row, angle in enumerate(theta.tolist()):
-            if angle != self._theta:
-                self._theta, self._turned = angle, 0.0
-                continue
-            self._turned += abs(samples.omega.item(row)) * self._dt
-            if self._turned > self._most:
-                return row, (
-                    f"the speed estimate says that the shaft turned by {self._turned / TURN:.3g} "
-                    f"turns, and the encoder's count stands still; check the encoder"
-                )
-        return None
-
-
-class Stalled(Limit):
-    """A current that must turn the shaft while the encoder shows not one count."""
-
-    def __init__(self, stall: Stall) -> None:
-        self._stall = stall
-        self._most = 0
-        self._theta, self._still = math.nan, 0
-
-    def begin(self, phase: Phase, sample_rate: float) -> None:
-        """Start anew."""
-        self._most = max(1, round(self._stall.time * sample_rate))
-        self._theta, self._still = math.nan, 0
-
-    def check(self, samples: Samples) -> Trip | None:
-        """Count the samples in which it stands still and must not."""
-        theta, motor = samples.theta, samples.current_motor
-        if changes(theta, self._theta) or within(motor, self._stall.motor):
-            self._theta, self._still = theta.item(-1), 0
-            return None
-        for row, angle in enumerate(theta.tolist()):
-            if angle != self._theta or not self._pulls(samples, row):
-                self._theta, self._still = angle, 0
-                continue
-            self._still += 1
-            if self._still >= self._most:
-                return row, (
-                    f"the encoder has stood still for {self._stall.time:g} s at a motor current "
-                    f"of {motor[row]:.3g} A with the brake off: the shaft is blocked, or the "
-                    "encoder dead"
-                )
-        return None
-
-    def _pulls(self, samples: Samples, row: int) -> bool:
         return (
-            abs(samples.current_motor.item(row)) >= self._stall.motor
-            and abs(samples.current_brake.item(row)) <= self._stall.brake
+            f"the speed estimate says that the shaft turned by {self._turned / TURN:.3g} "
+            "turns, and the encoder's count stands still; check the encoder"
         )
 
 
-class Frozen(Limit):
+class Stalled(_Standstill):
+    """A current that must turn the shaft while the encoder shows not one count."""
+
+    def __init__(self, stall: Stall) -> None:
+        super().__init__("theta")
+        self._stall = stall
+        self._most = self._standing = 0  # samples
+
+    def begin(self, phase: Phase, sample_rate: float) -> None:
+        """Start anew."""
+        super().begin(phase, sample_rate)
+        self._most = max(1, round(self._stall.time * sample_rate))
+
+    def _changed(self, n_samples: int) -> None:
+        self._standing = 0
+
+    def _stood(self, samples: Samples, row: int) -> str | None:
+        motor, brake = samples.current_motor.item(row), samples.current_brake.item(row)
+        pulls = abs(motor) >= self._stall.motor and abs(brake) <= self._stall.brake
+        self._standing = self._standing + 1 if pulls else 0
+        if not pulls or self._standing < self._most:
+            return None
+        return (
+            f"the encoder has stood still for {self._stall.time:g} s at a motor current of "
+            f"{motor:.3g} A with the brake off: the shaft is blocked, or the encoder dead"
+        )
+
+
+class Frozen(_Standstill):
     """An input that reads the same to the bit for longer than its noise, or its command, allows.
 
     Noise is what the calibration shows: an input that then changes all the time may not stand
@@ -133,67 +153,49 @@ class Frozen(Limit):
     """
 
     def __init__(self, name: str, seconds: float, command: str | None) -> None:
-        self._name, self._seconds = name, seconds
+        super().__init__(name)
+        self._seconds = seconds
         self._command = f"applied_voltage_{command}" if command else None
         self._rate = 1.0
         self._longest = self._seen = 0  # samples of the calibration
         self._learning = False
         self._most = math.inf  # samples it may stand still
         self._least = 1  # samples that any verdict takes
-        self._value, self._still, self._away, self._asked = math.nan, 0, 0, math.nan
+        self._unchanged = self._disobeyed = 0  # samples, those under another command than at first
+        self._first_command = math.nan  # V, since it stands still
 
     def begin(self, phase: Phase, sample_rate: float) -> None:
         """Learn from the calibration, watch from then on."""
         self._learning = phase is Phase.CALIBRATION
         self._rate = sample_rate
         self._least = max(2, round(self._seconds * sample_rate))
-        self._value, self._still, self._away = math.nan, 0, 0
-        known = self._seen > 0 and _RARER * self._longest <= self._seen
-        self._most = max(self._least, _RARER * self._longest) if known else math.inf
+        has_noise = self._seen > 0 and _RARER * self._longest <= self._seen
+        self._most = max(self._least, _RARER * self._longest) if has_noise else math.inf
+        super().begin(phase, sample_rate)
 
-    def check(self, samples: Samples) -> Trip | None:
-        """Count how long it has read the same."""
-        values: FloatArray = getattr(samples, self._name)
-        if changes(values, self._value):
-            self._changed(values.item(-1), len(values))
-            return None
-        asked: FloatArray | None = getattr(samples, self._command) if self._command else None
-        for row, value in enumerate(values.tolist()):
-            if value != self._value:
-                self._changed(value, 1)
-                continue
-            reason = self._stood(0.0 if asked is None else asked.item(row))
-            if reason is not None:
-                return row, reason
-        return None
-
-    def _changed(self, value: float, seen: int) -> None:
-        self._value, self._still, self._away, self._asked = value, 0, 0, math.nan
-        if self._learning:
-            self._seen += seen
+    def _changed(self, n_samples: int) -> None:
+        self._unchanged, self._disobeyed, self._first_command = 0, 0, math.nan
+        if self._learning and n_samples:
+            self._seen += n_samples
             self._longest = max(self._longest, 1)
 
-    def _stood(self, asked: float) -> str | None:
-        """One more sample of the same value under a command [V]; why that cannot be."""
-        self._still += 1
-        if self._asked != self._asked:  # not yet known
-            self._asked = asked
-        if abs(asked - self._asked) >= _FOLLOWS:
-            self._away += 1
+    def _stood(self, samples: Samples, row: int) -> str | None:
+        command = getattr(samples, self._command).item(row) if self._command else 0.0
+        self._unchanged += 1
+        if math.isnan(self._first_command):
+            self._first_command = command
+        if abs(command - self._first_command) >= _FOLLOWS:
+            self._disobeyed += 1
         if self._learning:
             self._seen += 1
-            self._longest = max(self._longest, self._still + 1)
+            self._longest = max(self._longest, self._unchanged + 1)
             return None
-        if self._still >= self._most:
-            return (
-                f"{self._name} has read {self._value:.6g} to the bit for "
-                f"{self._still / self._rate:.3g} s, and its noise never let it before; "
-                "check its sensor and converter"
-            )
-        if self._away >= self._least:
-            return (
-                f"{self._name} has read {self._value:.6g} to the bit for "
-                f"{self._away / self._rate:.3g} s under a changed command; check the amplifier "
-                "and its current sensor"
-            )
-        return None
+        if self._unchanged >= self._most:
+            seconds = self._unchanged / self._rate
+            cause = ", and its noise never let it before; check its sensor and converter"
+        elif self._disobeyed >= self._least:
+            seconds = self._disobeyed / self._rate
+            cause = " under a changed command; check the amplifier and its current sensor"
+        else:
+            return None
+        return f"{self._name} has read {self._value:.6g} to the bit for {seconds:.3g} s{cause}"

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from daq.hal import FloatArray, Phase, Samples
-from daq.limits.base import TURN, Limit, Trip
+from daq.limits.base import TURN, Limit, Trip, first_row
 
 
 class _Position:
@@ -40,7 +38,7 @@ class _Position:
         return self._first + self.ahead(turns)
 
     def turns(self, angle: float) -> float:
-        """The other way round."""
+        """How many turns the shaft has at an angle [rad] of this phase."""
         return self.before + (angle - self._first) / TURN
 
 
@@ -67,12 +65,12 @@ class Travel(Limit):
             self._least, self._most = map(self._position.angle, (self._low, self._high))
         if len(theta) == 1 and self._least <= theta.item() <= self._most:
             return None
-        beyond = (theta < self._least) | (theta > self._most)
-        if not beyond.any():
-            return None
-        row = int(np.argmax(beyond))
-        return row, (
-            f"the shaft is {self._position.turns(theta[row]):.4g} turns from where it began, "
+        row = first_row((theta < self._least) | (theta > self._most))
+        return None if row is None else (row, self._reason(theta.item(row)))
+
+    def _reason(self, angle: float) -> str:
+        return (
+            f"the shaft is {self._position.turns(angle):.4g} turns from where it began, "
             f"outside its travel of [{self._low:g}, {self._high:g}] turns"
         )
 
@@ -110,11 +108,10 @@ class Winding(Limit):
             self._least = self._sign * position.angle(self._sign * self._least_turns)
         if self._sign == 0.0 or (len(theta) == 1 and self._sign * theta.item() >= self._least):
             return None
-        beyond = self._sign * theta < self._least
-        if not beyond.any():
+        row = first_row(self._sign * theta < self._least)
+        if row is None:
             return None
-        row = int(np.argmax(beyond))
-        left = self._sign * position.turns(theta[row])
+        left = self._sign * position.turns(theta.item(row))
         return row, (
             f"the cable is nearly unwound: {left:.3g} of {abs(position.before):.3g} turns are "
             f"left, and limits.winding is {self._least_turns:g}. Wind further (homing.turns), "

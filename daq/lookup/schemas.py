@@ -11,7 +11,6 @@ from typing import Any
 
 import yaml
 
-from daq.cli import terminal as console
 from daq.config.base import Section
 from daq.config.datasheet import DatasheetEntry
 from daq.config.identification import IdentificationConfig
@@ -21,13 +20,14 @@ from daq.errors import ConfigError
 from daq.experiment import Experiment
 from daq.files import make_folder, write_whole
 from daq.plugins import Group, installed, load_plugin
+from daq.progress import Note, Watch, ignore
 
 FOLDER = "schemas"
 
-_OF_ONES_OWN = {"type": "string", "pattern": r"\.py:\w+$", "description": "FILE.py:CLASS"}
+_FILE_AND_CLASS = {"type": "string", "pattern": r"\.py:\w+$", "description": "FILE.py:CLASS"}
 
 
-def comment(kind: str, folder: Path | str = FOLDER) -> str:
+def schema_comment(kind: str, folder: Path | str = FOLDER) -> str:
     """The line by which an editor finds the schema of a file, relative to the file."""
     return f"# yaml-language-server: $schema={Path(folder).as_posix()}/{kind}.json"
 
@@ -38,31 +38,31 @@ def as_yaml(value: Any) -> str:
     return text.removesuffix("\n...\n").strip()
 
 
-def without_comment(text: str) -> str:
+def without_schema_comment(text: str) -> str:
     """A file's text without that line."""
     first, _, rest = text.partition("\n")
     return rest if first.startswith("# yaml-language-server") else text
 
 
-def write_schemas(folder: Path) -> list[Path]:
+def write_schemas(folder: Path, watch: Watch = ignore) -> list[Path]:
     """One file for each kind of YAML; the paths written. ConfigError when they cannot be."""
     make_folder(folder)
     paths = []
-    for kind, schema in documents(protocols(), backend_options()).items():
+    for kind, schema in documents(protocols(watch), backend_options(watch)).items():
         path = folder / f"{kind}.json"
         write_whole(path, json.dumps(schema, indent=1, ensure_ascii=False) + "\n")
         paths.append(path)
     return paths
 
 
-def protocols() -> dict[str, type[Experiment]]:
+def protocols(watch: Watch = ignore) -> dict[str, type[Experiment]]:
     """The installed protocols that load, by name."""
-    return _loaded("rig.protocols")
+    return _loaded("rig.protocols", watch)
 
 
-def backend_options() -> dict[str, type[Section]]:
+def backend_options(watch: Watch = ignore) -> dict[str, type[Section]]:
     """What the installed backends that load take as options, by name."""
-    return {name: backend.Options for name, backend in _loaded("rig.backends").items()}
+    return {name: backend.Options for name, backend in _loaded("rig.backends", watch).items()}
 
 
 def documents(
@@ -92,7 +92,7 @@ def experiment_schema(protocols: Mapping[str, type[Experiment]]) -> Schema:
         for name, kind in protocols.items()
     ]
     common = json_schema(Experiment)["properties"]
-    common["protocol"] = {**common["protocol"], "oneOf": [*named, _OF_ONES_OWN]}
+    common["protocol"] = {**common["protocol"], "oneOf": [*named, _FILE_AND_CLASS]}
     return {
         "type": "object",
         "properties": common,
@@ -119,7 +119,7 @@ def rig_schema(backends: Mapping[str, type[Section]]) -> Schema:
     for name in ("backend", "options"):
         common["properties"][name].pop("default", None)
     named = [{"const": name} for name in backends]
-    common["properties"]["backend"] |= {"oneOf": [*named, _OF_ONES_OWN], "default": default}
+    common["properties"]["backend"] |= {"oneOf": [*named, _FILE_AND_CLASS], "default": default}
     common["allOf"] = [
         _when(
             "backend",
@@ -134,8 +134,8 @@ def rig_schema(backends: Mapping[str, type[Section]]) -> Schema:
 
 def rig_options(options: type[Section]) -> Schema:
     """The options of one backend."""
-    found: Schema = json_schema(with_options(options))["properties"]["options"]
-    return found
+    schema: Schema = json_schema(with_options(options))["properties"]["options"]
+    return schema
 
 
 def _when(key: str, value: str, then: Schema, or_absent: bool = False) -> Schema:
@@ -150,11 +150,11 @@ def _document(title: str, schema: Schema) -> Schema:
     return {"$schema": DRAFT, "title": title, **schema}
 
 
-def _loaded(group: Group) -> dict[str, Any]:
-    found = {}
+def _loaded(group: Group, watch: Watch) -> dict[str, Any]:
+    plugins = {}
     for name in sorted(installed(group)):
         try:
-            found[name] = load_plugin(group, name)
+            plugins[name] = load_plugin(group, name)
         except ConfigError as error:
-            console.report_warning(f"left out: {error}")
-    return found
+            watch(Note("warning", f"left out: {error}"))
+    return plugins

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,7 +10,8 @@ from daq.config.schema import Schema
 from daq.errors import ConfigError, RunError, suggestion
 from daq.files import make_folder
 from daq.lookup import schemas
-from daq.lookup.shipped import EXPERIMENTS, RIGS, shipped_files
+from daq.lookup.shipped import shipped_experiments, shipped_rigs
+from daq.progress import Watch, ignore
 
 RIG, SETTINGS = "rig.yaml", "identification.yaml"
 _HEAD = """\
@@ -34,19 +35,19 @@ class StarterFiles:
     validated: bool
 
 
-def write_starter(folder: Path, protocol: str, rig: str) -> StarterFiles:
+def write_starter(folder: Path, protocol: str, rig: str, watch: Watch = ignore) -> StarterFiles:
     """Write the files that are not there yet. Raises ConfigError for names of nothing shipped."""
     experiment = f"{protocol}.yaml"
     texts = {
-        experiment: _copy(EXPERIMENTS, protocol, "protocol", "experiment"),
-        RIG: _copy(RIGS, rig, "rig", "rig"),
+        experiment: _copy(shipped_experiments(), protocol, "protocol", "experiment"),
+        RIG: _copy(shipped_rigs(), rig, "rig", "rig"),
         SETTINGS: settings_text(),
         **_companions(protocol),
     }
     make_folder(folder)
     written = [folder / name for name, text in texts.items() if _write_new(folder / name, text)]
     kept = [folder / name for name in texts if folder / name not in written]
-    schemas.write_schemas(folder / schemas.FOLDER)
+    schemas.write_schemas(folder / schemas.FOLDER, watch)
     validated = "\nvalidation:" in texts[experiment]
     return StarterFiles(written, kept, folder / schemas.FOLDER, validated)
 
@@ -56,7 +57,7 @@ def settings_text() -> str:
     schema = schemas.documents({}, {})["identification"]
     items = sorted(schema["properties"].items(), key=lambda item: item[0] not in _ACTIVE)
     settings = "\n".join(_setting(name, item) for name, item in items)
-    return f"{schemas.comment('identification')}\n{_HEAD}\n{settings}"
+    return f"{schemas.schema_comment('identification')}\n{_HEAD}\n{settings}"
 
 
 def _setting(name: str, item: Schema) -> str:
@@ -67,20 +68,20 @@ def _setting(name: str, item: Schema) -> str:
     return f"# {item['description']}\n{mark}{name}: {schemas.as_yaml(value)}\n"
 
 
-def _copy(packages: Sequence[str], name: str, option: str, kind: str) -> str:
+def _copy(files: Mapping[str, Path], name: str, option: str, kind: str) -> str:
     """A shipped file's text, for a folder that has its schema in it."""
-    shipped = {path.stem: path for path in shipped_files(packages)}
+    shipped = {path.stem: path for path in files.values()}
     if name not in shipped:
         raise ConfigError(
             f"--{option}: no {name!r} to begin with", cure=suggestion(name, list(shipped))
         )
     text = shipped[name].read_text(encoding="utf-8")
-    return f"{schemas.comment(kind)}\n{schemas.without_comment(text)}"
+    return f"{schemas.schema_comment(kind)}\n{schemas.without_schema_comment(text)}"
 
 
 def _companions(protocol: str) -> dict[str, str]:
     """Tables that a shipped experiment reads, which lie beside it under its name."""
-    shipped = next(path for path in shipped_files(EXPERIMENTS) if path.stem == protocol)
+    shipped = shipped_experiments()[f"{protocol}.yaml"]
     return {
         path.name: path.read_text(encoding="utf-8")
         for path in shipped.parent.glob(f"{protocol}.csv")

@@ -25,15 +25,15 @@ def locate(path: Path, kind: Kind, relative_to: Path | None = None) -> Path:
     raise ConfigError(f"there is no such {kind} file", cure=cure or "check its name", file=path)
 
 
-def from_file(path: Path, attribute: str, kind: Kind, is_one: Callable[[Any], bool]) -> Any:
+def from_file(path: Path, attribute: str, kind: Kind, is_valid: Callable[[Any], bool]) -> Any:
     """An object of a Python file.
 
-    is_one: whether an object is of the kind, for suggestions. Raises ConfigError naming file,
+    is_valid: whether an object is of the kind, for suggestions. Raises ConfigError naming file,
     line and cause.
     """
     module = _import(path, kind)
     if not hasattr(module, attribute):
-        names = [key for key, value in vars(module).items() if is_one(value)]
+        names = [key for key, value in vars(module).items() if is_valid(value)]
         cure = f"{suggestion(attribute, names)} (FILE.py:NAME names a {kind} in it)"
         raise ConfigError(f"it defines no {attribute!r}", cure=cure, file=path)
     return getattr(module, attribute)

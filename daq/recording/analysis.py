@@ -16,9 +16,9 @@ from daq.files import make_folder, write_whole
 from daq.findings import Findings
 from daq.logs.capture import LOG_NAME, RUN_NAME
 from daq.logs.recording import end_of_run, load, log_path, read_record
-from daq.lookup.files import find_protocol
+from daq.lookup.classes import find_protocol
 from daq.progress import Watch, ignore, warn
-from daq.run.protocol_calls import mistake
+from daq.run.protocol import failure
 
 RESULTS = "results"
 
@@ -116,7 +116,7 @@ def conclude(experiment: Experiment, folder: Path) -> Findings | None:
         raise RunError(f"no result: {error}{at}", file=folder) from None
     except USER_CODE_ERRORS as error:
         raise RunError(
-            f"no result: {mistake(experiment, 'in findings()', error)}", file=folder
+            f"no result: {failure(experiment, 'in findings()', error)}", file=folder
         ) from error
     if findings is not None:
         _write(findings, folder / RESULTS)

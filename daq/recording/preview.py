@@ -17,7 +17,7 @@ from daq.hal import CHANNELS, FloatArray
 from daq.logs.columns import UNITS
 from daq.progress import Watch, ignore
 from daq.recording.session import Session, open_session
-from daq.run.protocol_calls import preview_of
+from daq.run.protocol import preview_of
 
 _PART = 0.9  # of the power, that the stated band holds
 
@@ -123,7 +123,7 @@ def check(
 
     >>> from daq import check
     >>> check("prbs.yaml").seconds
-    10.0
+    1.25
     """
     session = open_session(str(experiment), None if rig is None else str(rig), port, watch=watch)
     settings = session.loaded.experiment

@@ -10,16 +10,18 @@ from typing import Any
 
 from daq.config.rig import RigConfig
 from daq.diagnose import currents
-from daq.errors import ConfigError
+from daq.errors import ConfigError, together
 from daq.experiment import Plan
 from daq.findings import Findings
 from daq.hal import Device, Phase, Reporting
 from daq.logs.capture import LOG_NAME
 from daq.logs.recording import Recording, load
-from daq.lookup.files import LoadedExperiment, load_experiment, load_rig, rig_for, together
+from daq.lookup.experiments import LoadedExperiment, load_experiment
+from daq.lookup.rigs import load_rig, rig_for
 from daq.progress import Note, Progress, Started, Watch, ignore, warn
 from daq.recording.analysis import conclude_or_warn
-from daq.run.runner import PhaseProgress, RunResult, run_experiment
+from daq.run.runner import RunResult, run_experiment
+from daq.run.sampling import PhaseProgress
 
 _ACTIVITIES = {
     Phase.CALIBRATION: "Offset calibration",
@@ -85,8 +87,8 @@ def open_session(
     its backend over those of its file.
     """
     loaded, (config, device) = together(
-        lambda: load_experiment(experiment),
-        lambda: _rig_on(rig or rig_for(experiment), port, realtime, options or {}, watch),
+        lambda: load_experiment(experiment, watch),
+        lambda: _rig_on(rig or rig_for(experiment, watch), port, realtime, options or {}, watch),
     )
     # Checked even where it will not run: a mistake in the file is best heard of early.
     validation = loaded.validation()
@@ -113,9 +115,9 @@ def record(
     >>> from daq import record
     >>> run = record("prbs.yaml", options={"seed": 1})
     >>> run.record["status"], len(run.frame)
-    ('completed', 8000)
+    ('completed', 1000)
     """
-    loaded = load_experiment(str(experiment))
+    loaded = load_experiment(str(experiment), watch)
     if validation:
         changed = loaded.validation()
         if changed is None:
@@ -123,7 +125,7 @@ def record(
                 "it has no 'validation' section", cure="add one", file=loaded.file.path
             )
         loaded = changed
-    config, device = load_rig(str(rig or rig_for(str(experiment))), options)
+    config, device = load_rig(str(rig or rig_for(str(experiment), watch)), options, watch)
     loaded.plan(config)
     return load(_run(loaded, config, device, Path(out), watch).folder)
 
@@ -132,7 +134,7 @@ def _rig_on(
     rig: str, port: str | None, realtime: bool, options: Mapping[str, Any], watch: Watch
 ) -> tuple[RigConfig, Device]:
     """A rig on a port in place of its file's, or simulated at the pace of the clock."""
-    config, device = load_rig(rig, options)
+    config, device = load_rig(rig, options, watch)
     fields = type(config.options).model_fields
     if port is not None and "port" not in fields:
         raise ConfigError(
@@ -145,7 +147,7 @@ def _rig_on(
         realtime = False
     choices = {"port": port, "time": "real" if realtime else None}
     changes = {key: value for key, value in choices.items() if value is not None}
-    return load_rig(rig, {**options, **changes}) if changes else (config, device)
+    return load_rig(rig, {**options, **changes}, watch) if changes else (config, device)
 
 
 def _run(

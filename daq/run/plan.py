@@ -9,7 +9,7 @@ from daq.errors import ConfigError
 from daq.experiment import ClosedLoop, Experiment, Plan
 from daq.hal import CHANNELS, FloatArray
 from daq.limits.load import i2t_levels
-from daq.run.protocol_calls import description_of, plan_of, rehearse
+from daq.run.protocol import description_of, plan_of, rehearse
 
 _ROUNDING = 1.0 + 1e-9
 
@@ -60,11 +60,11 @@ def _check_range(planned: Plan, rig: RigConfig, channel: int, name: str) -> None
     if low >= least and high <= most:
         return
     beyond, where = (high, np.argmax) if high > most else (low, np.argmin)
-    asked = f"up to {beyond:.6g} V"
+    request = f"up to {beyond:.6g} V"
     if planned.commands is not None:
-        asked = f"for {beyond:.6g} V in sample {where(planned.commands[:, channel])}"
+        request = f"for {beyond:.6g} V in sample {where(planned.commands[:, channel])}"
     raise ConfigError(
-        f"the plan asks {asked}, outside the rig's limits [{least:g}, {most:g}] V",
+        f"the plan asks {request}, outside the rig's limits [{least:g}, {most:g}] V",
         cure=f"change amplitude or offset, or limits.command.{name} in the rig's file if the "
         "hardware allows it",
         key=name,

@@ -35,9 +35,9 @@ class RealTime:
         self.refused: dict[str, str] = {}
         self._undo: list[Callable[[], object]] = []
 
-    def begin(self, asked: Realtime) -> None:
+    def begin(self, wanted: Realtime) -> None:
         """Obtain what there is. Raises ConfigError, with the cure, when it is required."""
-        if asked == "off":
+        if wanted == "off":
             return
         self._quiet_collector()
         if sys.platform == "win32":
@@ -45,7 +45,7 @@ class RealTime:
         else:
             self._raise_scheduler()
             self._lock_memory()
-        if asked == "require" and self.refused:
+        if wanted == "require" and self.refused:
             missing = "; ".join(f"{name}: {reason}" for name, reason in self.refused.items())
             problem = f"required, but not granted: {missing}. Cure: {_CURE}"
             raise ConfigError(problem, key="realtime")
@@ -94,11 +94,11 @@ class RealTime:
     def _raise_class(self) -> None:
         if sys.platform == "win32":
             kernel = ctypes.windll.kernel32
-            own = kernel.GetCurrentProcess()
-            if not kernel.SetPriorityClass(own, _HIGH_PRIORITY_CLASS):
+            process = kernel.GetCurrentProcess()
+            if not kernel.SetPriorityClass(process, _HIGH_PRIORITY_CLASS):
                 self.refused["scheduler"] = "SetPriorityClass: refused"
                 return
-            self._undo.append(lambda: kernel.SetPriorityClass(own, _NORMAL_PRIORITY_CLASS))
+            self._undo.append(lambda: kernel.SetPriorityClass(process, _NORMAL_PRIORITY_CLASS))
             self.granted["scheduler"] = "HIGH_PRIORITY_CLASS"
 
 

@@ -11,7 +11,7 @@ import yaml
 from scipy.signal import periodogram
 
 from daq.config.rig import RigConfig
-from daq.lookup.files import load_experiment
+from daq.lookup.experiments import load_experiment
 from daq.recording.preview import spectral_lines
 from tests.daq.support import RIG, environment, forked_rig, write_experiment
 

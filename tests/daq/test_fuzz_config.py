@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from daq.errors import ConfigError
 from daq.identification.request import SettingsRequest
 from daq.identification.settings import problem_of
-from daq.lookup.files import load_experiment, load_rig
-from daq.lookup.shipped import EXPERIMENTS, RIGS, shipped_files
+from daq.lookup.experiments import load_experiment
+from daq.lookup.rigs import load_rig
+from daq.lookup.shipped import shipped_experiments, shipped_rigs
 
 WORDS = st.sampled_from(
     [
@@ -60,8 +61,8 @@ def content_of(path):
 
 
 FILES = [
-    *((path.name, content_of(path), load_experiment) for path in shipped_files(EXPERIMENTS)),
-    *((path.name, content_of(path), load_rig) for path in shipped_files(RIGS)),
+    *((path.name, content_of(path), load_experiment) for path in shipped_experiments().values()),
+    *((path.name, content_of(path), load_rig) for path in shipped_rigs().values()),
     ("identification.yaml", SETTINGS, lambda path: problem_of(SettingsRequest(str(path)))),
 ]
 

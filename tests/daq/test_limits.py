@@ -8,12 +8,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from daq.cli.terminal import report
 from daq.config.rig import RigConfig
 from daq.errors import ConfigError
 from daq.hal import Flag, Mode, Phase, Samples
 from daq.limits import Limits
 from daq.limits.load import i2t_levels
-from daq.lookup.files import load_rig
+from daq.lookup.rigs import load_rig
 from daq.rig import Rig
 from sim_rig.backend import SimulatedDevice, Simulation
 
@@ -262,10 +263,10 @@ def test_commands_follow_no_faster_than_the_slew():
 
 
 def test_a_cables_limit_is_left_out_where_the_plant_has_no_cable(capsys):
-    config, _ = load_rig("simulated.yaml", {"plant": {"load": "free"}})
+    config, _ = load_rig("simulated.yaml", {"plant": {"load": "free"}}, report)
     assert config.limits.winding is None
     assert "limits.winding of 0.25 turns is left out" in capsys.readouterr().err
-    config, _ = load_rig("simulated.yaml")
+    config, _ = load_rig("simulated.yaml", watch=report)
     assert config.limits.winding == 0.25 and not capsys.readouterr().err
 
 

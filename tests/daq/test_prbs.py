@@ -9,7 +9,7 @@ from scipy.signal import max_len_seq
 import protocols
 from daq.config.rig import RigConfig
 from daq.errors import ConfigError
-from daq.lookup.files import load_experiment
+from daq.lookup.experiments import load_experiment
 from daq.run.plan import plan
 from protocols.prbs import SEQUENCE_LENGTH, Prbs, lfsr_bits
 from tests.daq.support import EXPERIMENT, merged

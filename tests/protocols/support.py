@@ -3,7 +3,7 @@
 import yaml
 
 from daq.config.rig import RigConfig
-from daq.lookup.files import load_experiment
+from daq.lookup.experiments import load_experiment
 
 SHORT = {"calibration": {"samples": 16}}
 

@@ -10,7 +10,7 @@ from daq.config.rig import RigConfig
 from daq.errors import ConfigError, RunError
 from daq.experiment import Sample
 from daq.hal import Samples
-from daq.run.runner import plan
+from daq.run.plan import plan
 from protocols.analysis.ripple import ripple
 from protocols.analysis.torque_curve import Level, Motor, fit, levels_of
 from protocols.constant_velocity import ConstantVelocity

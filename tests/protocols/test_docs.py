@@ -9,7 +9,7 @@ import yaml
 
 import protocols
 from daq.config.rig import RigConfig
-from daq.lookup.files import load_experiment
+from daq.lookup.experiments import load_experiment
 from daq.plugins import installed
 
 DOCS = Path(protocols.__file__).parents[1] / "docs" / "protocols"

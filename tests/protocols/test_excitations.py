@@ -12,7 +12,7 @@ from scipy.signal import chirp as scipy_chirp
 
 from daq.config.rig import RigConfig
 from daq.errors import ConfigError
-from daq.lookup.files import load_experiment
+from daq.lookup.experiments import load_experiment
 from daq.plugins import load_plugin
 from tests.daq.support import only_capture, record_of
 from tests.protocols.support import loaded, planned

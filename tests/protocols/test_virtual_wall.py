@@ -8,7 +8,7 @@ from scipy.signal import cont2discrete
 from daq.config.rig import RigConfig
 from daq.errors import ConfigError, RunError
 from daq.experiment import Sample
-from daq.run.runner import plan
+from daq.run.plan import plan
 from protocols.analysis.passivity import SampledWall, passive_stiffness
 from protocols.control.speed_tracker import SpeedTracker
 from protocols.virtual_wall import VirtualWall

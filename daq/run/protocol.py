@@ -28,7 +28,7 @@ from daq.hal import CHANNELS
 _ROUNDING = 1e-9  # of a plan's bounds
 
 
-def mistake(experiment: Experiment, doing: str, error: BaseException) -> str:
+def failure(experiment: Experiment, doing: str, error: BaseException) -> str:
     """The sentence on an error in a protocol's code: which, where, what."""
     return (
         f"the protocol {experiment.protocol!r} failed {doing}: {type(error).__name__}: {error}"
@@ -131,7 +131,7 @@ def _before_the_run(experiment: Experiment, doing: str) -> Iterator[None]:
     except RigError:
         raise
     except USER_CODE_ERRORS as error:
-        raise ConfigError(mistake(experiment, doing, error)) from error
+        raise ConfigError(failure(experiment, doing, error)) from error
 
 
 def _plain(value: Any) -> Any:

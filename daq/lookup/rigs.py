@@ -1,0 +1,93 @@
+"""Rigs by the names that users write: configuration and device."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+from daq.config import checking, yaml_file
+from daq.config.rig import RigConfig, UserLimit, with_options
+from daq.config.yaml_file import Key, YamlFile
+from daq.errors import ConfigError
+from daq.hal import Device
+from daq.limits import Limit
+from daq.lookup.classes import find_backend, find_limit
+from daq.lookup.shipped import find_file, shipped_experiments, shipped_rigs
+from daq.progress import Note, Watch, ignore
+
+DEFAULT_RIG = "simulated.yaml"
+
+
+def rig_for(experiment: str, watch: Watch = ignore) -> str:
+    """The rig file that an experiment's file says it is for; the simulated rig's without."""
+    try:
+        file = yaml_file.load(find_file(experiment, shipped_experiments, watch))
+    except ConfigError:
+        return DEFAULT_RIG  # what is wrong with the experiment is told when it is loaded
+    name = file.content.get("rig")
+    if not isinstance(name, str) or not name:
+        return DEFAULT_RIG
+    beside = file.path.parent / name
+    return str(beside) if beside.exists() else name
+
+
+def load_rig(
+    name: str, options: Mapping[str, Any] | None = None, watch: Watch = ignore
+) -> tuple[RigConfig, Device]:
+    """Read and check a rig file; its configuration and the backend's device, not yet open.
+
+    options: the backend's own settings that take precedence over the file's.
+    """
+    file = yaml_file.load(find_file(name, shipped_rigs, watch))
+    checking.refuse_other_kind(file, "a rig")
+    if options:
+        content = yaml_file.merge(file.content, {"options": options})
+        file = replace(file, content=content)
+    backend_name, backend = _backend(file)
+    config = checking.validate(file, with_options(backend.Options))
+    class_name = f"{backend.__module__}.{backend.__qualname__}"
+    watch(Note("detail", f"{file.path}: backend {backend_name} is {class_name}"))
+    for index, limit in enumerate(config.limits.own):
+        limit._make = _limit_maker(file, limit, ("limits", "own", index))
+    config = _with_fitting_limits(config, watch)
+    device: Device = backend(config.options)
+    return config, device
+
+
+def _backend(file: YamlFile) -> tuple[str, Any]:
+    """Name and class of a rig's backend; ConfigError with all mistakes of its file."""
+    name = file.content.get("backend", RigConfig.model_fields["backend"].default)
+    if not isinstance(name, str):
+        checking.validate(file, RigConfig)
+    try:
+        return name, find_backend(name, file.path.parent)
+    except ConfigError as error:
+        checking.validate(file, RigConfig, others=file.blamed(("backend",), error))
+        raise
+
+
+def _with_fitting_limits(config: RigConfig, watch: Watch) -> RigConfig:
+    """Without the limit of a cable where the simulated plant has none."""
+    least = config.limits.winding
+    if least is None or getattr(config.options, "cable", True):
+        return config
+    text = f"limits.winding of {least:g} turns is left out: options.plant.load is without a cable"
+    watch(Note("note", text))
+    limits = config.limits.model_copy(update={"winding": None})
+    return config.model_copy(update={"limits": limits})
+
+
+def _limit_maker(file: YamlFile, limit: UserLimit, key: Key) -> Callable[[], Limit]:
+    """What makes the limit that an entry of ``limits.own`` names, its settings checked."""
+    try:
+        kind = find_limit(limit.use, file.path.parent)
+    except ConfigError as error:
+        raise ConfigError.of(file.blamed((*key, "use"), error)) from None
+    if kind.Options is None:
+        if limit.options:
+            raise file.error((*key, "options"), f"the limit {limit.use} has no settings")
+        return kind
+    settings = checking.validate(file, kind.Options, limit.options, (*key, "options"))
+    make: Callable[..., Limit] = kind
+    return lambda: make(settings)

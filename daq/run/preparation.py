@@ -1,0 +1,97 @@
+"""Phases at zero command before a run: offsets of the inputs, winding of the load."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from daq.errors import RunError
+from daq.experiment import Homing, OffsetCalibration
+from daq.hal import ANALOG_INPUTS, Samples
+from daq.run.sampling import Sampling
+
+_REST_TIME = 1.0  # s that the shaft must stand still to end homing
+_REST_TURNS = 0.01  # turns it may creep meanwhile
+_TURN = 2.0 * np.pi
+
+
+def calibrate(sampling: Sampling, calibration: OffsetCalibration, record: dict[str, Any]) -> None:
+    """Make the mean of the inputs at zero command their offset.
+
+    record: what run.json holds; the noise and the offsets are added. Raises RunError for a rig
+    that is not at rest.
+    """
+    blocks: list[Samples] = []
+    n_samples = 0
+    for samples in sampling.at_zero():
+        blocks.append(samples)
+        n_samples += len(samples)
+        sampling.tell(min(n_samples, calibration.samples), calibration.samples, "samples")
+        if n_samples >= calibration.samples:
+            break
+    sampling.rig.stop()
+    turns = float(np.ptp(np.concatenate([block.theta for block in blocks]))) / _TURN
+    inputs = {
+        name: np.concatenate([getattr(block, name) for block in blocks]) for name in ANALOG_INPUTS
+    }
+    means = {name: float(values.mean()) for name, values in inputs.items()}
+    # How far the offsets, and every later sample, may be trusted.
+    record["calibration"] = {
+        "samples": n_samples,
+        "noise": {name: float(values.std()) for name, values in inputs.items()},
+        "turns": turns,
+    }
+    _require_rest(calibration, turns, means)
+    sampling.rig.take_offsets(means)
+    record["offsets"] = {**means, "volts": sampling.rig.offsets.volts.tolist()}
+
+
+def _require_rest(calibration: OffsetCalibration, turns: float, means: dict[str, float]) -> None:
+    """Raise RunError unless what was averaged was a rig at rest."""
+    if turns > calibration.motion:
+        raise RunError(
+            f"the shaft moved by {turns:.3g} turns at zero command, more than calibration.motion "
+            f"of {calibration.motion:g} turns",
+            cure="let it come to rest, keep hands off and start again",
+            key="calibration",
+        )
+    for name in ("current_motor", "current_brake"):
+        largest = getattr(calibration, name)
+        if not abs(means[name]) <= largest:
+            raise RunError(
+                f"{name} reads {means[name]:.4g} A at zero command, more than calibration.{name} "
+                f"of {largest:g} A: a current flows, or the sensor is far off. Look at the "
+                "amplifier's input and its zero, and at the sensor's wires",
+                cure=f"raise calibration.{name} in the experiment if it is the sensor's offset",
+                key="calibration",
+            )
+
+
+def home(sampling: Sampling, homing: Homing, record: dict[str, Any]) -> None:
+    """Wait until the load is wound and the shaft has come to rest.
+
+    record: what run.json holds; the turns are added. Raises RunError after the time allowed.
+    """
+    start: float | None = None
+    rest_since, rest_turns = 0.0, 0.0
+    for samples in sampling.at_zero():
+        now, turns = samples.time.item(-1), samples.theta.item(-1) / _TURN
+        start = turns if start is None else start
+        wound = abs(turns - start)
+        sampling.tell(min(wound, homing.turns), homing.turns, "turns")
+        if abs(turns - rest_turns) > _REST_TURNS:
+            rest_since, rest_turns = now, turns
+        if wound >= homing.turns and now - rest_since >= _REST_TIME:
+            break
+        if now > homing.timeout:
+            restless = "; the shaft did not stand still then" if wound >= homing.turns else ""
+            raise RunError(
+                f"{wound:.2f} of {homing.turns:g} turns were wound in "
+                f"{homing.timeout:g} s{restless}",
+                cure="wind the load, hold it until the run goes on and start again, or raise "
+                "homing.timeout in the experiment",
+                key="homing",
+            )
+    sampling.rig.stop()
+    record["homing"] = {"turns": rest_turns - (start or 0.0), "rate": sampling.sample_rate}

@@ -1,0 +1,134 @@
+"""Samples of a run, each shown to the limits before anything else is done with it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from daq.errors import InterlockError
+from daq.hal import CHANNELS, FloatArray, Mode, Phase, Samples
+from daq.limits import Limits, mark_interlock
+from daq.logs.writer import LogWriter
+from daq.rig import Rig
+from daq.run.timing import Timing
+
+_ZEROS_AHEAD = 0.05  # s of zero commands queued while waiting
+
+
+@dataclass(frozen=True)
+class PhaseProgress:
+    """What a watcher of a run is told: ``done`` of ``total`` in ``unit`` of a phase."""
+
+    phase: Phase
+    done: float
+    total: float
+    unit: str
+
+
+Watcher = Callable[[PhaseProgress], None]
+
+
+def nobody(progress: PhaseProgress) -> None:
+    """Who watches when nobody does."""
+
+
+class Sampling:
+    """An open rig that is sampled phase by phase under its limits.
+
+    phase: the one that is on. timing: how punctual the samples since ``begin`` were.
+    """
+
+    def __init__(self, rig: Rig, limits: Limits, sample_rate: float, watch: Watcher) -> None:
+        self.rig = rig
+        self.sample_rate = sample_rate
+        self.phase = Phase.OPEN
+        self.timing = Timing()
+        self._limits = limits
+        self._watch = watch
+
+    def enter(self, phase: Phase, turns: float = 0.0) -> None:
+        """A phase begins, homing with the ``turns`` to wind."""
+        self.phase = phase
+        if phase is not Phase.OPEN:
+            self.rig.announce(phase, turns)
+
+    def begin(self, mode: Mode) -> None:
+        """Sample from tick 0 on, outputs at zero."""
+        self._limits.begin(self.phase, self.sample_rate)
+        self.rig.start(self.sample_rate, mode, self._limits.window())
+        self.timing = Timing()
+
+    def at_zero(self) -> Iterator[Samples]:
+        """Blocks of samples at zero command without end. Raises InterlockError."""
+        # Sent a little ahead: zeros are safe to hold, and the host need not hurry every tick.
+        ahead = max(1, round(_ZEROS_AHEAD * self.sample_rate))
+        self.begin(Mode.CLOSED_LOOP)
+        self.rig.send(0, np.zeros((ahead, len(CHANNELS))))
+        sent = ahead
+        while True:
+            samples = self.rig.receive()
+            trip = self._limits.check(samples)
+            if trip is not None:
+                self.rig.safe()
+                raise InterlockError(
+                    f"interlock during {self.phase.value}: {trip[1]}; outputs are zero"
+                )
+            yield samples
+            missing = int(samples.tick[-1]) + 1 + ahead - sent
+            if missing > 0:
+                self.rig.send(sent, np.zeros((missing, len(CHANNELS))))
+                sent += missing
+
+    def receive(self, end: int) -> tuple[Samples, str | None]:
+        """Samples before the tick ``end``, up to the first beyond a limit, and why it is.
+
+        The outputs are zero by then. Without samples the last ones before ``end`` were lost.
+        """
+        arrived = self.rig.receive()
+        self.timing.received(arrived)
+        samples = before(arrived, end)
+        trip = self._limits.check(samples) if len(samples) else None
+        if trip is None:
+            return samples, None
+        self.rig.safe()
+        row, reason = trip
+        return mark_interlock(before(samples, samples.tick.item(row) + 1), row), reason
+
+    def keep(
+        self,
+        log: LogWriter,
+        samples: Samples,
+        extra: Sequence[FloatArray],
+        trip: str | None,
+        total: int,
+    ) -> int:
+        """Log samples of ``total``; the tick after them.
+
+        extra: further columns, (n,) each. Raises InterlockError where there is a ``trip``.
+        """
+        log.append(samples, extra)
+        self.timing.logged(samples)
+        end = samples.tick.item(-1) + 1
+        self.tell(end, total, "samples")
+        if trip is not None:
+            raise InterlockError(f"interlock in sample {end - 1}: {trip}; outputs are zero")
+        return end
+
+    def tell(self, done: float, total: float, unit: str) -> None:
+        """Tell the watcher how far the phase is."""
+        try:
+            self._watch(PhaseProgress(self.phase, done, total, unit))
+        except OSError:
+            # Its terminal or pipe is gone. That is no reason to lose a run: whoever closed it
+            # ends the run by a signal, if that was meant.
+            self._watch = nobody
+
+
+def before(samples: Samples, end: int) -> Samples:
+    """The samples with ticks before ``end``."""
+    if samples.tick.item(-1) < end:
+        return samples
+    kept = samples.tick < end
+    return Samples(**{field.name: getattr(samples, field.name)[kept] for field in fields(samples)})
