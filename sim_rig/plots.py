@@ -60,10 +60,10 @@ def operating_points(
     outputs = np.concatenate([record.outputs for record in records])
     omega = outputs[:, model.output_names.index("omega")]
     speed = float(np.sqrt(np.nanmean(omega**2)))
-    still = {name: 0.0 for name in ("theta",) if name in model.state_names}
+    at_rest = {name: 0.0 for name in ("theta",) if name in model.state_names}
     return {
-        "linear, ω = 0": {"omega": 0.0, **still},
-        f"linear, ω = {speed:.3g} rad/s": {"omega": speed, **still},
+        "linear, ω = 0": {"omega": 0.0, **at_rest},
+        f"linear, ω = {speed:.3g} rad/s": {"omega": speed, **at_rest},
     }
 
 

@@ -26,7 +26,7 @@ def figures(
     json: AsJson = False,
 ) -> None:
     """Draw an identification's figures for papers and slides."""
-    from daq.report.redrawing import redraw
+    from daq.report.reprint import redraw
 
     with terminal.Watching(quiet=json) as watch:
         files = redraw(run, kinds or ["pdf", "png"], out, watch)

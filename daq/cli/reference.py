@@ -44,21 +44,21 @@ _KINDS = {
 }
 
 
-def write_reference(folder: Path, app: typer.Typer) -> list[Path]:
+def write_reference(folder: Path, command: Any) -> list[Path]:
     """Write all pages; the paths written. ConfigError when they cannot be."""
     make_folder(folder)
     protocols, backends = (
         schemas.protocols(terminal.report_event),
         schemas.backend_options(terminal.report_event),
     )
-    texts = pages(protocols, backends, app)
+    texts = pages(protocols, backends, command)
     for name, text in texts.items():
         write_whole(folder / name, text)
     return [folder / name for name in texts]
 
 
 def pages(
-    protocols: Mapping[str, type[Experiment]], backends: Mapping[str, Any], app: typer.Typer
+    protocols: Mapping[str, type[Experiment]], backends: Mapping[str, Any], command: Any
 ) -> dict[str, str]:
     """The text of each page by the name of its file; app: the command line."""
     documents = schemas.documents(protocols, backends)
@@ -74,7 +74,7 @@ def pages(
         "What `rig identify --datasheet FILE.yaml` takes: for each parameter, by its name:",
         _rows(documents["datasheet"]["additionalProperties"], "PARAMETER."),
     )
-    made["command-line.md"] = _command_line(app)
+    made["command-line.md"] = _command_line(command)
     return {"README.md": _index(protocols), **made}
 
 
@@ -214,10 +214,9 @@ def _bounds(schema: Schema) -> str:
     return ", ".join(filter(None, bounds))
 
 
-def _command_line(app: typer.Typer) -> str:
-    group: Any = typer.main.get_command(app)
-    context = typer.Context(group, info_name="rig")
+def _command_line(command: Any) -> str:
+    context = typer.Context(command, info_name="rig")
     return f"{_HEAD}\n# Command line\n\n{_STATUS}\n\n" + "".join(
-        get_docs_for_click(obj=command, ctx=context, indent=1, call_prefix="rig")
-        for command in group.commands.values()
+        get_docs_for_click(obj=subcommand, ctx=context, indent=1, call_prefix="rig")
+        for subcommand in command.commands.values()
     )

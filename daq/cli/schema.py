@@ -12,6 +12,7 @@ from daq.cli.options import AsJson
 
 
 def schema(
+    context: typer.Context,
     folder: Annotated[
         Path, typer.Argument(metavar="[FOLDER]", help="Where the schemas go; default schemas.")
     ] = Path("schemas"),
@@ -32,10 +33,9 @@ def schema(
     watch = terminal.report_event
     written = {"schemas": schemas.write_schemas(folder, watch)}
     if reference is not None:
-        from daq.cli.app import app
         from daq.cli.reference import write_reference
 
-        written["reference"] = write_reference(reference, app)
+        written["reference"] = write_reference(reference, context.find_root().command)
     if json:
         terminal.print_json({key: list(map(str, paths)) for key, paths in written.items()})
         return

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from daq.config import checking, yaml_file
+from daq.config import check, yaml_file
 from daq.config.datasheet import DatasheetEntry
 from daq.config.identification import IdentificationConfig
 from daq.config.yaml_file import YamlFile
@@ -29,9 +29,9 @@ def load(path: Path) -> Datasheet:
     mistakes = [
         mistake
         for name, content in file.content.items()
-        for mistake in checking.mistakes(file, DatasheetEntry, content, (str(name),))
+        for mistake in check.mistakes(file, DatasheetEntry, content, (str(name),))
     ]
-    checking.refuse([*file.repeated, *mistakes])
+    check.refuse([*file.repeated, *mistakes])
     entries = {
         str(name): DatasheetEntry.model_validate(content) for name, content in file.content.items()
     }

@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from daq.config import checking, yaml_file
+from daq.config import check, yaml_file
 from daq.config.identification import Signals
 from daq.config.yaml_file import YamlFile
 from daq.errors import ConfigError, suggestion
@@ -29,7 +29,7 @@ def read_parameters(path: Path) -> tuple[ProcessModel, dict[str, float]]:
     except ConfigError as error:
         raise file.error(("model",), str(error)) from None
     signals = {key: file.content[key] for key in Signals.model_fields if key in file.content}
-    model = with_signals(file, checking.validate(file, Signals, signals), model)
+    model = with_signals(file, check.validate(file, Signals, signals), model)
     entries = file.content.get("parameters")
     if not isinstance(entries, dict):
         raise file.error(("parameters",), "this key is missing; it holds 'name: value' lines")

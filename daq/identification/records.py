@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.config.checking import refuse
+from daq.config.check import refuse
 from daq.config.identification import Column, Columns
 from daq.config.units import factor
 from daq.config.yaml_file import Key, YamlFile

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from daq.config import checking, yaml_file
+from daq.config import check, yaml_file
 from daq.config.identification import IdentificationConfig, Signals
 from daq.config.yaml_file import TypedSettings, YamlFile
 from daq.errors import ConfigError, suggestion
@@ -53,11 +53,11 @@ def problems_of(
     options = {k: value for k, value in (request.options or {}).items() if value is not None}
     written = yaml_file.load(config) if config is not None else None
     if written is not None:
-        checking.refuse_other_kind(written, "an identification's settings")
+        check.refuse_other_kind(written, "an identification's settings")
     file = TypedSettings.of(options, request.settings, written)
     declared = _find_models(config, file, names)
     file, unconverted = in_model_units(file, [model for model, _ in declared])
-    settings = checking.validate(file, IdentificationConfig, others=unconverted)
+    settings = check.validate(file, IdentificationConfig, others=unconverted)
     for model, name in declared:
         watch(Note("detail", f"model {name}: {model.description}"))
     models = [_with_outputs(file, settings, model) for model, _ in declared]
@@ -104,7 +104,7 @@ def columns_of(config: Path | None, model: ProcessModel) -> ColumnMapping | None
         return None
     file = yaml_file.load(config)
     file, unconverted = in_model_units(file, [model])
-    settings = checking.validate(file, IdentificationConfig, others=unconverted)
+    settings = check.validate(file, IdentificationConfig, others=unconverted)
     if settings.columns is None:
         return None
     mapping = ColumnMapping(file, settings.columns)
@@ -146,7 +146,7 @@ def _find_models(
         return [_find_model(config, file, name) for name in names]
     except ConfigError as error:
         if error.key == "model":
-            checking.validate(file, IdentificationConfig, others=error.mistakes)
+            check.validate(file, IdentificationConfig, others=error.mistakes)
         raise
 
 
@@ -156,7 +156,7 @@ def _find_model(
     """A model and its whole name, from the command line or else the configuration."""
     configured = file.content.get("model")
     if configured is not None and not isinstance(configured, str):
-        checking.validate(file, IdentificationConfig)
+        check.validate(file, IdentificationConfig)
     # A name on the command line is relative to where it is typed, one in a file to that file.
     if typed is None and "model" in file.typed:
         typed = configured

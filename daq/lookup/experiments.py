@@ -7,7 +7,7 @@ from typing import Any
 
 from pydantic import ConfigDict, create_model
 
-from daq.config import checking, yaml_file
+from daq.config import check, yaml_file
 from daq.config.base import Section
 from daq.config.rig import RigConfig
 from daq.config.yaml_file import Key, YamlFile
@@ -54,17 +54,17 @@ class LoadedExperiment:
 def load_experiment(name: str, watch: Watch = ignore) -> LoadedExperiment:
     """Read and check an experiment; ConfigError names file, line, key and cure."""
     file = yaml_file.load(find_file(name, shipped_experiments, watch))
-    checking.refuse_other_kind(file, "an experiment")
+    check.refuse_other_kind(file, "an experiment")
     try:
         protocol = find_protocol(_protocol_name(file), file.path.parent)
     except ConfigError as error:
-        checking.validate(file, _common_settings(), others=file.blamed(("protocol",), error))
+        check.validate(file, _common_settings(), others=file.blamed(("protocol",), error))
         raise
-    mistakes = checking.mistakes(file, protocol, file.content)
+    mistakes = check.mistakes(file, protocol, file.content)
     if isinstance(file.content.get("validation"), dict) and file.content["validation"]:
         validation = _validation_file(file)
-        mistakes += checking.mistakes(validation, protocol, validation.content)
-    checking.refuse([*file.repeated, *mistakes])
+        mistakes += check.mistakes(validation, protocol, validation.content)
+    check.refuse([*file.repeated, *mistakes])
     experiment = _experiment(file, protocol)
     class_name = f"{protocol.__module__}.{protocol.__qualname__}"
     watch(Note("detail", f"{file.path}: protocol {experiment.protocol} is {class_name}"))
@@ -100,7 +100,7 @@ def _experiment(file: YamlFile, protocol: type[Experiment]) -> Experiment:
         # The capture must find it from any folder.
         path = locate(parts[0], "protocol", file.path.parent).resolve()
         content["protocol"] = f"{path}:{parts[1]}"
-    experiment = checking.validate(file, protocol, content)
+    experiment = check.validate(file, protocol, content)
     experiment._folder = file.path.parent
     return experiment
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
-from daq.config import checking, yaml_file
+from daq.config import check, yaml_file
 from daq.config.rig import RigConfig, UserLimit, with_options
 from daq.config.yaml_file import Key, YamlFile
 from daq.errors import ConfigError
@@ -40,12 +40,12 @@ def load_rig(
     options: the backend's own settings that take precedence over the file's.
     """
     file = yaml_file.load(find_file(name, shipped_rigs, watch))
-    checking.refuse_other_kind(file, "a rig")
+    check.refuse_other_kind(file, "a rig")
     if options:
         content = yaml_file.merge(file.content, {"options": options})
         file = replace(file, content=content)
     backend_name, backend = _backend(file)
-    config = checking.validate(file, with_options(backend.Options))
+    config = check.validate(file, with_options(backend.Options))
     class_name = f"{backend.__module__}.{backend.__qualname__}"
     watch(Note("detail", f"{file.path}: backend {backend_name} is {class_name}"))
     for index, limit in enumerate(config.limits.own):
@@ -59,11 +59,11 @@ def _backend(file: YamlFile) -> tuple[str, Any]:
     """Name and class of a rig's backend; ConfigError with all mistakes of its file."""
     name = file.content.get("backend", RigConfig.model_fields["backend"].default)
     if not isinstance(name, str):
-        checking.validate(file, RigConfig)
+        check.validate(file, RigConfig)
     try:
         return name, find_backend(name, file.path.parent)
     except ConfigError as error:
-        checking.validate(file, RigConfig, others=file.blamed(("backend",), error))
+        check.validate(file, RigConfig, others=file.blamed(("backend",), error))
         raise
 
 
@@ -88,6 +88,6 @@ def _limit_maker(file: YamlFile, limit: UserLimit, key: Key) -> Callable[[], Lim
         if limit.options:
             raise file.error((*key, "options"), f"the limit {limit.use} has no settings")
         return kind
-    settings = checking.validate(file, kind.Options, limit.options, (*key, "options"))
+    settings = check.validate(file, kind.Options, limit.options, (*key, "options"))
     make: Callable[..., Limit] = kind
     return lambda: make(settings)

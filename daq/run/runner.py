@@ -22,7 +22,7 @@ from daq.run.preparation import calibrate, home
 from daq.run.protocol import description_of
 from daq.run.realtime import RealTime
 from daq.run.sampling import Sampling, Watcher, nobody
-from daq.run.signals import Signals
+from daq.run.signals import SignalHandling
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def run_experiment(
     limits = Limits(rig_config)
     record = {"experiment": description, "rig": rig_config.model_dump(mode="json")}
     capture = Capture.create(root, name, record)
-    with Signals() as signals:
+    with SignalHandling() as signals:
         sampling = Sampling(Rig(device, rig_config), limits, experiment.sample_rate, watch)
         run = _Run(experiment, planned.n_samples, excitation, sampling, capture, signals)
         return run.execute()
@@ -77,7 +77,7 @@ class _Run:
         excitation: FloatArray | Dialogue,
         sampling: Sampling,
         capture: Capture,
-        signals: Signals,
+        signals: SignalHandling,
     ) -> None:
         self.experiment = experiment
         self.n_samples = n_samples

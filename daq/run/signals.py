@@ -19,7 +19,7 @@ _NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK", "SIGQUIT", "SIGTSTP")
 _PATIENCE = 2.0  # s after the first signal in which the outputs must have been zeroed
 
 
-class Signals:
+class SignalHandling:
     """Turns signals into exceptions while a run is on. Use as a context manager.
 
     The first signal raises KeyboardInterrupt or ``Terminated``. From then on, and from ``shield``
@@ -35,7 +35,7 @@ class Signals:
         self._pending: BaseException | None = None
         self._shielded = self._breakable = False
 
-    def __enter__(self) -> Signals:
+    def __enter__(self) -> SignalHandling:
         if threading.current_thread() is threading.main_thread():
             numbers = [getattr(signal, name) for name in _NAMES if hasattr(signal, name)]
             heard = [n for n in numbers if signal.getsignal(n) is not signal.SIG_IGN]

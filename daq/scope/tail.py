@@ -21,7 +21,7 @@ _KEPT = 5  # problems described; further ones are counted
 
 
 @dataclass(frozen=True)
-class Rows:
+class TailRows:
     """Samples in the order of the file.
 
     values: (n, n_columns), NaN where a cell holds no finite number. starts: (n + 1,), byte at
@@ -71,13 +71,13 @@ class LogTail:
         except OSError:
             return 0
 
-    def poll(self) -> Rows:
+    def poll(self) -> TailRows:
         """Rows written since the last call, in up to ``CHUNK`` bytes."""
         data = self._whole_lines()
         if data and self._layout is None:
             data = self._take_header(data)
         if not data or not self.columns:
-            return Rows(np.empty((0, len(self.columns))), np.array([self.offset]))
+            return TailRows(np.empty((0, len(self.columns))), np.array([self.offset]))
         rows = self._parse(data, self.problems)
         self._line += data.count(b"\n")
         self.offset += len(data)
@@ -143,16 +143,16 @@ class LogTail:
         self.offset = _line_starts(data)[layout.line]
         return data[self.offset :]
 
-    def _parse(self, data: bytes, problems: Problems) -> Rows:
+    def _parse(self, data: bytes, problems: Problems) -> TailRows:
         assert self._layout is not None
         starts = self.offset + np.array(_line_starts(data), dtype=np.int64)
         if len(data) > _BULK:
             values = _parse_bulk(data, self._layout, self._places)
             if values is not None and len(values) == len(starts) - 1:
-                return Rows(values, starts)
+                return TailRows(values, starts)
         return self._parse_lines(data, starts, problems)
 
-    def _parse_lines(self, data: bytes, starts: IntArray, problems: Problems) -> Rows:
+    def _parse_lines(self, data: bytes, starts: IntArray, problems: Problems) -> TailRows:
         """Rows by line; other lines are left out, other cells become NaN."""
         assert self._layout is not None
         names, separator = self._layout.names, self._layout.separator
@@ -176,9 +176,9 @@ class LogTail:
             kept.append(index)
             values.append(row)
         table = np.array(values, dtype=np.float64).reshape(len(values), len(self.columns))
-        return Rows(table, np.append(starts[kept], starts[-1]))
+        return TailRows(table, np.append(starts[kept], starts[-1]))
 
-    def _advancing(self, rows: Rows) -> Rows:
+    def _advancing(self, rows: TailRows) -> TailRows:
         """The rows in which time advances."""
         time = rows.values[:, self.columns.index("t")]
         good = _forward(time, self._last_time)
@@ -190,7 +190,7 @@ class LogTail:
             )
         if good.any():
             self._last_time = float(time[good][-1])
-        return Rows(rows.values[good], np.append(rows.starts[:-1][good], rows.starts[-1]))
+        return TailRows(rows.values[good], np.append(rows.starts[:-1][good], rows.starts[-1]))
 
 
 def _forward(time: FloatArray, last: float) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:

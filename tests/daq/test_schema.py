@@ -7,6 +7,7 @@ from pathlib import Path
 
 import jsonschema
 import pytest
+import typer
 import yaml
 
 from daq.cli import reference
@@ -72,7 +73,7 @@ def test_the_shipped_schema_is_up_to_date_and_a_schema(kind):
 
 def test_the_reference_pages_are_up_to_date():
     folder = ROOT / "docs" / "reference"
-    pages = reference.pages(PROTOCOLS, BACKENDS, app)
+    pages = reference.pages(PROTOCOLS, BACKENDS, typer.main.get_command(app))
     # Pages of protocols that are gone would stay.
     made = {path.name for path in folder.glob("protocol-*.md")}
     assert made == {name for name in pages if name.startswith("protocol-")}, REGENERATE
