@@ -1,21 +1,77 @@
-"""ARMAX models by prediction-error minimisation."""
+"""ARX and ARMAX models as scikit-learn regressors."""
 
 from __future__ import annotations
 
-from sysid.linear.base import PolynomialModel
-from sysid.linear.orders import Order, Orders
-from sysid.problem.model import ModelError
+from dataclasses import KW_ONLY, dataclass
+
+from sysid.linear.estimator import PolynomialModel
+from sysid.linear.polynomials import Order
 
 
+@dataclass(repr=False, eq=False)
+class ARX(PolynomialModel):
+    """Identify A(q) y = B(q) u + offset + e by linear least squares.
+
+    y(t) + A_1 y(t-1) + ... = B_nk u(t-nk) + ... + offset + e(t), with full matrices. Ljung,
+    System Identification, sections 4.2 and 10.1. Biased when the noise is not white; ``ARMAX``
+    models its colour.
+
+    Parameters
+    ----------
+    na : lags of the outputs: one number, or (n_outputs, n_outputs), a row for each equation.
+    nb : coefficients of the inputs: one number, or (n_outputs, n_inputs).
+    nk : samples before an input first acts, as nb. 1 where a row's outputs are latched before
+        its inputs are applied (see ``Dataset``); 0 lets an input act on its own row.
+    offset : estimate a constant for each equation. It carries the operating point: the model
+        is linear about it, and no mean is subtracted.
+    stable : mirror unstable poles in the unit circle and estimate B and offset again.
+
+    Attributes
+    ----------
+    A_ : (n_lags + 1, n_outputs, n_outputs), by lag; A_[0] is the identity.
+    B_ : (n_lags + 1, n_outputs, n_inputs), by lag; zero where nk delays.
+    C_ : (nc + 1, n_outputs), the diagonal of C by lag; C_[0] is 1.
+    offset_ : (n_outputs,), zero with offset=False.
+    A_std_, B_std_, C_std_, offset_std_ : standard errors, of the same shapes; infinite where
+        the data do not determine a coefficient, NaN where ``stable`` moved it.
+    theta_, names_, covariance_ : all coefficients (n,), their names (``a2[0,1]`` weighs
+        y_1(t-2) in the equation of y_0) and covariance (n, n).
+    noise_covariance_ : (n_outputs, n_outputs) of e.
+    residuals_ : per output (n_rows,), the estimate of e in each equation that was fitted.
+    loss_ : (n_outputs,) mean square of e, that before each record included.
+    log_likelihood_, aic_, bic_ : Gaussian, over the n_rows_ instants known for every output.
+    n_lags_ : rows of a record that have no complete past.
+    poles_, radius_, stable_ : roots of det A, the largest one's size, whether that is below 1.
+    reflected_ : whether ``stable`` had to move poles.
+    input_mean_, output_mean_ : operating point that simulations start from; zero with
+        offset=False.
+    dt_ : sample time [s], None if arrays came without.
+
+    >>> import numpy as np
+    >>> from scipy.signal import lfilter
+    >>> u = np.tile([1.0, 1.0, -1.0], 20)
+    >>> y = lfilter([0.0, 0.2], [1.0, -0.9], u)  # y(t) = 0.9 y(t-1) + 0.2 u(t-1)
+    >>> model = ARX(na=1, nb=1, offset=False).fit(u[:, None], y)
+    >>> dict(zip(model.names_, model.theta_.round(6).tolist()))
+    {'a1[0,0]': -0.9, 'b1[0,0]': 0.2}
+    """
+
+    na: Order = 2
+    nb: Order = 2
+    nk: Order = 1
+    _: KW_ONLY
+    offset: bool = True
+    stable: bool = False
+
+
+@dataclass(repr=False, eq=False)
 class ARMAX(PolynomialModel):
     """Identify A(q) y = B(q) u + offset + C(q) e by minimising one-step prediction errors.
 
     A and B are full, C is diagonal, so that each output's equation is a problem of its own: to
     maximise the Gaussian likelihood of its one-step prediction errors. Each C has its roots
     inside the unit circle. The noise before the first complete row of a record, and before the
-    first one after a gap, is unknown and counts as such: taken for zero, as is common, it
-    biases a C that forgets slowly. Ljung, System Identification, sections 4.2, 7.2 to 7.4
-    and 10.2.
+    first one after a gap, is unknown and counts as such (``prediction_error``).
 
     Parameters
     ----------
@@ -27,39 +83,22 @@ class ARMAX(PolynomialModel):
     ----------
     iterations_, converged_ : iterations for each output, and whether all were enough.
     Others : those of ``ARX``.
+
+    >>> import numpy as np
+    >>> from scipy.signal import lfilter
+    >>> rng = np.random.default_rng(0)
+    >>> u, e = np.sign(rng.normal(size=500)), 0.1 * rng.normal(size=500)
+    >>> y = lfilter([0.0, 0.2], [1.0, -0.9], u) + e  # measurement noise: C equals A
+    >>> model = ARMAX(na=1, nb=1, nc=1).fit(u[:, None], y)
+    >>> model.A_[1, 0].round(1), model.C_[1].round(1)
+    (array([-0.9]), array([-0.9]))
     """
 
-    def __init__(
-        self,
-        na: Order = 2,
-        nb: Order = 2,
-        nc: Order = 2,
-        nk: Order = 1,
-        *,
-        offset: bool = True,
-        stable: bool = False,
-        max_iterations: int = 50,
-    ) -> None:
-        self.na = na
-        self.nb = nb
-        self.nc = nc
-        self.nk = nk
-        self.offset = offset
-        self.stable = stable
-        self.max_iterations = max_iterations
-
-    def _orders(self, n_outputs: int, n_inputs: int) -> Orders:
-        return Orders.of(
-            n_outputs,
-            n_inputs,
-            na=self.na,
-            nb=self.nb,
-            nc=self.nc,
-            nk=self.nk,
-            offset=self.offset,
-        )
-
-    def _iterations(self) -> int:
-        if self.max_iterations < 1:
-            raise ModelError(f"max_iterations is {self.max_iterations}; it must be 1 or more")
-        return self.max_iterations
+    na: Order = 2
+    nb: Order = 2
+    nc: Order = 2
+    nk: Order = 1
+    _: KW_ONLY
+    offset: bool = True
+    stable: bool = False
+    max_iterations: int = 50

@@ -1,102 +1,173 @@
-"""Matrix polynomials in the delay q^-1: roots, stability, and moving roots inside the circle.
+"""A(q) y = B(q) u + offset + C(q) e: its coefficients, its poles, and running it through time.
 
-A polynomial P(q) = P_0 + P_1 q^-1 + ... is an array (n_lags + 1, rows, columns): the first index
-is the lag.
+A (n_lags + 1, q, q) and B (n_lags + 1, q, m) are full, by lag, for q outputs and m inputs; C
+(nc + 1, q) is the diagonal of a diagonal one. A_0 and C_0 are the identity.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import scipy.linalg
-from scipy.linalg import lapack
+from scipy.linalg import blas, lapack
 
-from sysid.arrays import ComplexArray, FloatArray
+from sysid.arrays import BoolArray, ComplexArray, FloatArray, IntArray
+from sysid.problem.model import ModelError
 
-# A noise model that forgets more slowly than this needs thousands of samples to start.
-NOISE_RADIUS = 0.999
-# A reflected pole stays this far inside, so that a pole found on the circle becomes stable.
-POLE_RADIUS = 0.9999
+# One number for all entries, or a table with one number for each.
+Order = int | Sequence[int] | Sequence[Sequence[int]] | IntArray
+
+# A reflected pole stays this far inside, so that a pole on the circle becomes stable.
+_POLE_RADIUS = 0.9999
+# From here on a pole is on the circle but for rounding.
+_CIRCLE = 1.0 - 1e-12
+
+
+class Layout:
+    """Which coefficients a model has, and where each stands in the parameter vector.
+
+    na: (q, q) lags of each output in each equation; nb: (q, m) coefficients of each input;
+    nc: (q,) lags of the noise; nk: (q, m) samples before an input first acts. free: (q, q + m + 2,
+    n_lags + 1), by equation, by the signal that is weighed (minus the outputs, inputs, 1, noise)
+    and by its lag: true for a coefficient, which follow each other in the vector in this order.
+    lag: rows at the start of a record that have no complete past.
+
+    Raises ModelError for a negative order, a table of the wrong shape, or no coefficient.
+    """
+
+    def __init__(self, q: int, m: int, *, offset: bool, na: Order, nb: Order, nc: Order, nk: Order):
+        self.na, self.nb = _table("na", na, (q, q)), _table("nb", nb, (q, m))
+        self.nc, self.nk = _table("nc", nc, (q,)), _table("nk", nk, (q, m))
+        last = np.where(self.nb > 0, self.nk + self.nb - 1, -1)
+        self._reach = int(self.na.max()), int(last.max(initial=0)), int(self.nc.max())
+        self.offset, self.lag = offset, max(self._reach[:2])
+        lag = np.arange(max(self._reach) + 1)
+        tables = (
+            (lag > 0) & (lag <= self.na[..., None]),
+            (lag >= self.nk[..., None]) & (lag <= last[..., None]),
+            np.broadcast_to((lag == 0) & bool(offset), (q, 1, len(lag))),
+            (lag > 0) & (lag <= self.nc[:, None, None]),
+        )
+        self.free: BoolArray = np.concatenate(tables, axis=1)
+        for row in np.flatnonzero(~self.free.any(axis=(1, 2))):
+            raise ModelError(
+                f"the equation of output {row} has no coefficients: "
+                "give na, nb or nc above 0, or offset=True"
+            )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the coefficients: ``a2[0,1]`` weighs y_1(t-2) in the equation of y_0."""
+        q, m = self.nb.shape
+        names = [f"a{{1}}[{{0}},{j}]" for j in range(q)] + [f"b{{1}}[{{0}},{j}]" for j in range(m)]
+        names += ["offset[{0}]", "c{1}[{0}]"]
+        return tuple(names[signal].format(row, lag) for row, signal, lag in np.argwhere(self.free))
+
+    def polynomials(
+        self, theta: FloatArray, leading: float = 1.0
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """A, B, C and offset (q,) of a parameter vector; leading: the diagonal of A_0 and C_0."""
+        q, table = len(self.na), np.zeros(self.free.shape)
+        table[self.free] = theta
+        table = table.transpose(2, 0, 1)
+        table[0, :, :q], table[0, :, -1] = leading * np.eye(q), leading
+        n_a, n_b, n_c = (reach + 1 for reach in self._reach)
+        return table[:n_a, :, :q], table[:n_b, :, q:-2], table[:n_c, :, -1], table[0, :, -2]
+
+
+def _table(name: str, order: Order, shape: tuple[int, ...]) -> IntArray:
+    try:
+        values = np.asarray(order)
+    except ValueError:
+        raise ModelError(f"{name} is ragged: give one number or a table of shape {shape}") from None
+    if values.dtype.kind not in "iu":
+        raise ModelError(f"{name} is {order!r}; it must be a whole number or a table of them")
+    if values.ndim and values.shape != shape:
+        meaning = {"na": "outputs x outputs", "nc": "one per output"}.get(name, "outputs x inputs")
+        raise ModelError(f"{name} has shape {values.shape}; give one number, or {meaning}: {shape}")
+    if np.any(values < 0):
+        raise ModelError(f"{name} is {order!r}; it must be 0 or more")
+    return np.broadcast_to(values.astype(np.int64), shape)
+
+
+def filtered(P: FloatArray, x: FloatArray, past: FloatArray) -> FloatArray:
+    """P(q) x, (n, rows). x: (n, columns); past: the rows before it, at least P's lags."""
+    joined = np.concatenate((past, x))
+    terms = [joined[len(past) - lag :][: len(x)] @ matrix.T for lag, matrix in enumerate(P)]
+    return np.sum(terms, axis=0)
+
+
+def innovations(
+    A: FloatArray, C: FloatArray, drive: FloatArray, past: FloatArray, outputs: Any = np.nan
+) -> tuple[FloatArray, FloatArray]:
+    """Outputs with lost samples predicted, and one-step prediction errors, each (n, q).
+
+    drive: (n, q), B(q) u + offset; past: outputs before the first row, n_lags or more, without
+    noise; outputs: (n, q), NaN where lost: there the error is zero and the output its prediction.
+    The recursion is a triangular banded system of equations, solved by forward substitution: the
+    same operations as a loop over time, at the speed of compiled code.
+    """
+    if not len(drive):
+        return drive, drive
+    # Unknown is the output where it was lost, else minus the error.
+    lost, q = np.broadcast_to(np.isnan(outputs), drive.shape), len(A[0])
+    measured, noise = np.where(lost, 0.0, outputs), C[:, None, :] * np.eye(q)
+    # Columns of the band matrices, each from its diagonal down.
+    bands = np.zeros((2, q, max(len(A), len(C)) * q))
+    for P, band in ((A, bands[0]), (noise, bands[1])):
+        for j in range(q):
+            band[j, : len(P) * q - j] = P.reshape(-1, q)[j:, j]
+    matrix = np.where(lost[..., None], *bands).reshape(lost.size, -1).T
+    # What an unstable model overflows to shows in the result.
+    with np.errstate(all="ignore"):
+        right = (drive - filtered(A, measured, past)).ravel()
+        unknown = blas.dtbsv(len(matrix) - 1, matrix, right, lower=1, diag=1).reshape(lost.shape)
+    return np.where(lost, unknown, measured), np.where(lost, 0.0, -unknown)
 
 
 def poles(A: FloatArray) -> ComplexArray:
-    """Roots of det A(q), complex (n_lags * n_outputs,), largest first.
-
-    A: (n_lags + 1, n_outputs, n_outputs) with A[0] the identity.
-    """
-    roots = _eigenvalues(companion(A)) if len(A) > 1 else np.zeros(0, dtype=np.complex128)
+    """Roots of det A(q), complex (n_lags * q,), largest first."""
+    roots = np.linalg.eigvals(_companion(A)).astype(np.complex128)
     return roots[np.argsort(-np.abs(roots), kind="stable")]
-
-
-def companion(A: FloatArray) -> FloatArray:
-    """Transition matrix of A(q) y = w for the state (y(t-1), ..., y(t-n_lags))."""
-    lags, q = len(A) - 1, A.shape[1]
-    F = np.eye(lags * q, k=-q)
-    F[:q] = -np.hstack(list(A[1:])) if lags else F[:q]
-    return F
-
-
-def reflect_noise(c: FloatArray) -> FloatArray:
-    """C(q) with the same spectrum and all roots inside the unit circle.
-
-    c: (nc,), the coefficients after the leading 1. Roots outside are mirrored, and none is left
-    beyond ``NOISE_RADIUS``. The predictor is stable only with C's roots inside.
-    """
-    return _with_roots(c, lambda size: np.minimum(1.0 / size, NOISE_RADIUS))
-
-
-def limit_noise(c: FloatArray) -> FloatArray:
-    """C(q) with roots beyond ``NOISE_RADIUS`` moved back to it along their direction."""
-    return _with_roots(c, lambda size: np.full_like(size, NOISE_RADIUS))
-
-
-def _with_roots(c: FloatArray, radius: Callable[[FloatArray], FloatArray]) -> FloatArray:
-    roots = np.roots(np.concatenate(([1.0], c)))
-    size = np.maximum(np.abs(roots), np.finfo(float).tiny)
-    if len(roots) == 0 or size.max() <= NOISE_RADIUS:
-        return c
-    moved = np.where(size > NOISE_RADIUS, roots / size * radius(size), roots)
-    result: FloatArray = np.real(np.poly(moved))[1:]
-    return result
 
 
 def reflect_poles(A: FloatArray) -> FloatArray:
     """A(q) with its unstable poles mirrored in the unit circle.
 
-    An unstable pole p becomes 1/conj(p), or ``POLE_RADIUS`` in size if that is less. Stable ones
+    An unstable pole p becomes 1/conj(p), or ``_POLE_RADIUS`` in size if that is less. Stable ones
     keep their directions among the outputs too. Entries of A that were zero may change.
     """
     if not np.any(np.abs(poles(A)) >= 1.0):
         return A
     lags, q = len(A) - 1, A.shape[1]
-    T, Z = scipy.linalg.schur(companion(A))
+    T, Z = scipy.linalg.schur(_companion(A))
     # What comes first in a Schur form keeps its directions when the rest changes.
-    stable = np.concatenate([np.full(b.stop - b.start, size < 1.0) for b, size in _blocks(T)])
-    T, Z = lapack.dtrsen(stable, T, Z, job="N")[:2]
-    for block, size in _blocks(T):
-        if size >= 1.0:
-            T[block, block] *= min(1.0 / size, POLE_RADIUS) / size
-    F = Z @ T @ Z.T
+    T, Z = lapack.dtrsen(_sizes(T) < _CIRCLE, T, Z, job="N")[:2]
+    size, pairs = np.maximum(_sizes(T), _CIRCLE), np.tril(T, -1) != 0.0
+    outside = (np.eye(len(T), dtype=bool) | pairs | pairs.T) & (size > _CIRCLE)
+    T = np.where(outside, T * np.minimum(1.0 / size, _POLE_RADIUS) / size, T)
     # The state is no longer a list of past outputs: read the recursion off those it produces.
-    produced = [np.eye(q, lags * q, k=(lags - 1) * q)]
+    outputs = [np.eye(q, lags * q, k=(lags - 1) * q)]
     for _ in range(lags):
-        produced.append(produced[-1] @ F)
-    past = np.linalg.solve(np.vstack(produced[:lags]).T, -produced[lags].T).T
+        outputs.append(outputs[-1] @ Z @ T @ Z.T)
+    past = np.linalg.solve(np.vstack(outputs[:lags]).T, -outputs[lags].T).T
     # Oldest first there, most recent first here.
     return np.concatenate((A[:1], past.reshape(q, lags, q).transpose(1, 0, 2)[::-1]))
 
 
-def _blocks(T: FloatArray) -> list[tuple[slice, float]]:
-    """The diagonal blocks of a real Schur form, a pole or a conjugate pair, and their size."""
-    found, start = [], 0
-    while start < len(T):
-        pair = start + 1 < len(T) and T[start + 1, start] != 0.0
-        block = slice(start, start + 1 + pair)
-        found.append((block, float(np.abs(np.linalg.eigvals(T[block, block])).max())))
-        start = block.stop
-    return found
+def _companion(A: FloatArray) -> FloatArray:
+    """Transition matrix of A(q) y = w for the state (y(t-1), ..., y(t-n_lags))."""
+    lags, q = len(A) - 1, A.shape[1]
+    F = np.eye(lags * q, k=-q)
+    F[:q] = -A[1:].transpose(1, 0, 2).reshape(q, lags * q)[: len(F)]
+    return F
 
 
-def _eigenvalues(matrix: FloatArray) -> ComplexArray:
-    return np.linalg.eigvals(matrix).astype(np.complex128)
+def _sizes(T: FloatArray) -> FloatArray:
+    """Sizes of the eigenvalues on the diagonal of a real Schur form, alike for conjugate pairs."""
+    squares, pairs = np.diag(T) ** 2, np.diag(T, -1) * np.diag(T, 1)
+    squares[:-1] -= pairs
+    squares[1:] -= pairs
+    return np.sqrt(squares)

@@ -6,17 +6,17 @@ import itertools
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
 from sklearn.base import clone
 
 from sysid.arrays import FloatArray
-from sysid.linear.base import PolynomialModel
-from sysid.linear.orders import Order
-from sysid.linear.records import check_alike
+from sysid.linear.estimator import PolynomialModel, check_alike, free_run_fit
+from sysid.linear.polynomials import Order
 from sysid.problem.data import Dataset
-from sysid.problem.metrics import evaluate
+from sysid.problem.metrics import mean_known
 from sysid.problem.model import ModelError
 from sysid.problem.records import given_datasets
 from sysid.threads import one_thread
@@ -24,16 +24,11 @@ from sysid.threads import one_thread
 Criterion = Literal["fit", "aic", "bic"]
 
 # Orders that ``tuned`` tries.
-TRIED: dict[str, Iterable[Order]] = {
-    "na": range(1, 7),
-    "nb": range(1, 5),
-    "nc": range(4),
-    "nk": (0, 1),
-}
+TRIED: dict[str, Any] = {"na": range(1, 7), "nb": range(1, 5), "nc": range(4), "nk": (0, 1)}
 
 
 @dataclass(frozen=True)
-class Candidate:
+class OrderCandidate:
     """One combination of orders and how well it did.
 
     fit, rmse: (n_outputs,), free run over the validation records, in % and relative to max|y|,
@@ -58,17 +53,22 @@ class Candidate:
         """Whether its free runs stay bounded."""
         return not self.problem and self.radius < 1.0
 
+    def cost(self, criterion: Criterion) -> float:
+        """To be minimised; infinite for a candidate that must not be chosen."""
+        cost = {"fit": -self.score, "aic": self.aic, "bic": self.bic}[criterion]
+        return np.inf if np.isnan(cost) or not self.stable else cost
+
 
 @dataclass(frozen=True)
 class Selection:
     """candidates: best first by ``criterion``; model: the best, fitted on the training records."""
 
     criterion: Criterion
-    candidates: tuple[Candidate, ...]
+    candidates: tuple[OrderCandidate, ...]
     model: Any
 
     @property
-    def best(self) -> Candidate:
+    def best(self) -> OrderCandidate:
         """The chosen candidate."""
         return self.candidates[0]
 
@@ -95,20 +95,41 @@ def select_orders(
     estimators with stable=True mend theirs. threads: the result does not depend on it. Raises
     ModelError without a validation record for ``fit``, or when no candidate is stable. Ljung,
     System Identification, section 16.4.
+
+    >>> import numpy as np
+    >>> from scipy.signal import lfilter
+    >>> from sysid import ARX, Dataset
+    >>> u = np.sign(np.random.default_rng(0).normal(size=200))
+    >>> e = 0.1 * np.random.default_rng(1).normal(size=200)
+    >>> record = Dataset(u, lfilter([0.0, 0.2], [1.0, -1.5, 0.7], u) + e, dt=0.01)
+    >>> select_orders(ARX(), record, criterion="bic", na=range(1, 4), nb=(1,)).best.orders
+    {'na': 2, 'nb': 1, 'nk': 1}
     """
     train, test = _datasets("training", training), _datasets("validation", validation)
-    _check(criterion, train, test, threads)
+    if criterion not in ("fit", "aic", "bic"):
+        raise ModelError(f"unknown criterion {criterion!r}; choose from fit, aic, bic")
+    if not train:
+        raise ModelError("training has no records")
+    if criterion == "fit" and not test:
+        raise ModelError(
+            "criterion 'fit' needs validation records: hold one back, or use criterion='bic'"
+        )
+    if threads < 1:
+        raise ModelError(f"threads is {threads}; it must be 1 or more")
     grid = _grid(estimator, {"na": na, "nb": nb, "nc": nc, "nk": nk})
-    judge = _Judge(estimator, train, test, grid)
+    lag = max(clone(estimator).set_params(**orders)._layout(train[0]).lag for orders in grid)
     with one_thread(), ThreadPoolExecutor(threads) as pool:
-        found = list(pool.map(judge.candidate, grid))
-        costs = [_cost(candidate, criterion) for candidate in found]
+        candidates = list(pool.map(partial(_candidate, estimator, train, test, lag), grid))
         # Among equals the one with fewer coefficients.
-        ranks = sorted(range(len(found)), key=lambda i: (costs[i], found[i].n_parameters))
-        if not np.isfinite(costs[ranks[0]]):
-            raise ModelError(_nothing(found))
-        model = judge.fitted(found[ranks[0]].orders)
-    return Selection(criterion, tuple(found[i] for i in ranks), model)
+        candidates.sort(key=lambda candidate: (candidate.cost(criterion), candidate.n_parameters))
+        if not np.isfinite(candidates[0].cost(criterion)):
+            problems = [candidate.problem for candidate in candidates if candidate.problem]
+            problem = "is stable: give the estimator stable=True, or try lower na"
+            if problems:
+                problem = f"can be used; the first: {problems[0]}"
+            raise ModelError(f"none of the {len(candidates)} candidates {problem}")
+        model = _fitted(estimator, train, lag, candidates[0].orders)
+    return Selection(criterion, tuple(candidates), model)
 
 
 def tuned(
@@ -125,138 +146,71 @@ def tuned(
     the result is fitted to all of the records. Raises ModelError as ``select_orders``.
     """
     data = _datasets("records", records)
-    first, last = [], []
-    for record in data:
-        cut = round(record.n_samples * (1.0 - held_back))
-        first.append(record.part(0, cut, record.name))
-        last.append(record.part(cut, record.n_samples, record.name))
-    known = estimator.get_params()
-    grid: dict[str, Any] = {name: values for name, values in TRIED.items() if name in known}
-    found = select_orders(estimator, first, last, **grid | orders)
-    return replace(found, model=clone(estimator).set_params(**found.best.orders).fit(data))
+    cuts = [round(record.n_samples * (1.0 - held_back)) for record in data]
+    first = [record.part(0, cut, record.name) for record, cut in zip(data, cuts, strict=True)]
+    last = [r.part(cut, r.n_samples, r.name) for r, cut in zip(data, cuts, strict=True)]
+    settings = estimator.get_params()
+    grid: dict[str, Any] = {name: values for name, values in TRIED.items() if name in settings}
+    selection = select_orders(estimator, first, last, **grid | orders)
+    model = clone(estimator).set_params(**selection.best.orders).fit(data)
+    return replace(selection, model=model)
 
 
-class _Judge:
-    """Fits and scores one combination of orders after the other on the same rows."""
-
-    def __init__(
-        self,
-        estimator: PolynomialModel,
-        training: list[Dataset],
-        validation: list[Dataset],
-        grid: list[dict[str, Order]],
-    ) -> None:
-        self._estimator = estimator
-        self._training = training
-        self._validation = validation
-        q, m = training[0].outputs.shape[1], training[0].inputs.shape[1]
-        self._orders = [self._model(orders)._orders(q, m) for orders in grid]
-        self._lag = max(orders.lag for orders in self._orders)
-        self._n_outputs = q
-
-    def _model(self, orders: dict[str, Order]) -> PolynomialModel:
-        model: PolynomialModel = clone(self._estimator).set_params(**orders)
-        return model
-
-    def fitted(self, orders: dict[str, Order]) -> PolynomialModel:
-        """The model of some orders, trained on the common rows."""
-        model = self._model(orders)
-        model._identify(model._training_data(self._training, None, None, None), self._lag)
-        return model
-
-    def candidate(self, orders: dict[str, Order]) -> Candidate:
-        """Fit, simulate the validation records, score."""
-        nothing = np.full(self._n_outputs, np.nan)
-        try:
-            model = self.fitted(orders)
-        except (ModelError, np.linalg.LinAlgError) as error:
-            return Candidate(orders, 0, nothing, nothing, problem=str(error))
-        fits, errors = [], []
-        for record in self._validation:
-            # The same rows for all, whatever past each of them starts from.
-            simulated = model.predict(record)[self._lag :]
-            with np.errstate(all="ignore"):
-                metrics = evaluate(record.outputs[self._lag :], simulated)
-            fits.append(np.where(np.isfinite(simulated).all(axis=0), metrics.fit, -np.inf))
-            errors.append(metrics.rmse)
-        return Candidate(
-            orders,
-            len(model.theta_),
-            _mean(fits) if fits else nothing,
-            _mean(errors) if errors else nothing,
-            float(_mean(np.ravel(fits))) / 100.0,
-            model.aic_,
-            model.bic_,
-            model.radius_,
-            model.reflected_,
-            model.converged_,
-        )
+def _fitted(
+    estimator: PolynomialModel, train: list[Dataset], lag: int, orders: dict[str, Order]
+) -> PolynomialModel:
+    model: PolynomialModel = clone(estimator).set_params(**orders)
+    model._fit_rows(lag, train)
+    return model
 
 
-def _mean(values: Any) -> FloatArray:
-    """Mean over the first axis of what is not NaN; NaN where nothing is left."""
-    array = np.asarray(values, dtype=np.float64)
-    counted = ~np.isnan(array)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        mean: FloatArray = np.where(counted, array, 0.0).sum(axis=0) / counted.sum(axis=0)
-    return mean
+def _candidate(
+    estimator: PolynomialModel,
+    train: list[Dataset],
+    test: list[Dataset],
+    lag: int,
+    orders: dict[str, Order],
+) -> OrderCandidate:
+    """Fit, simulate the validation records, score; all on the rows from ``lag`` on."""
+    q = train[0].outputs.shape[1]
+    try:
+        model = _fitted(estimator, train, lag, orders)
+    except (ModelError, np.linalg.LinAlgError) as error:
+        nothing = np.full(q, np.nan)
+        return OrderCandidate(orders, 0, nothing, nothing, problem=str(error))
+    runs = [(record.outputs[lag:], model.predict(record)[lag:]) for record in test]
+    fits, errors = np.array([free_run_fit(*run) for run in runs]).reshape(-1, 2, q).swapaxes(0, 1)
+    attributes = ("aic", "bic", "radius", "reflected", "converged")
+    return OrderCandidate(
+        orders,
+        len(model.theta_),
+        fit=mean_known(fits, axis=0),
+        rmse=mean_known(errors, axis=0),
+        score=float(mean_known(fits)) / 100.0,
+        **{name: getattr(model, f"{name}_") for name in attributes},
+    )
 
 
-def _datasets(what: str, given: Any) -> list[Dataset]:
-    if given is None:
+def _datasets(what: str, records: Any) -> list[Dataset]:
+    if records is None:
         return []
-    data = given_datasets(given)
+    data = given_datasets(records)
     if data is None:
         raise ModelError(f"{what} must be a Dataset or several: Dataset(inputs, outputs, dt)")
     check_alike(data)
     return data
 
 
-def _check(
-    criterion: str, training: list[Dataset], validation: list[Dataset], threads: int
-) -> None:
-    if criterion not in ("fit", "aic", "bic"):
-        raise ModelError(f"unknown criterion {criterion!r}; choose from fit, aic, bic")
-    if not training:
-        raise ModelError("training has no records")
-    if criterion == "fit" and not validation:
-        raise ModelError(
-            "criterion 'fit' needs validation records: hold one back, or use criterion='bic'"
-        )
-    if threads < 1:
-        raise ModelError(f"threads is {threads}; it must be 1 or more")
-
-
 def _grid(
-    estimator: PolynomialModel, given: dict[str, Iterable[Order] | None]
+    estimator: PolynomialModel, orders: dict[str, Iterable[Order] | None]
 ) -> list[dict[str, Order]]:
     settings = estimator.get_params()
-    lists: list[list[Order]] = []
-    for name, values in given.items():
-        if name not in settings:
-            if values is not None:
-                raise ModelError(f"{type(estimator).__name__} has no {name}; leave it out")
-            continue
-        lists.append([settings[name]] if values is None else list(values))
-        if not lists[-1]:
+    grid: dict[str, list[Order]] = {}
+    for name, values in orders.items():
+        if name in settings:
+            grid[name] = [settings[name]] if values is None else list(values)
+        elif values is not None:
+            raise ModelError(f"{type(estimator).__name__} has no {name}; leave it out")
+        if not grid.get(name, [0]):
             raise ModelError(f"{name} is empty: give at least one order to try")
-    names = [name for name in given if name in settings]
-    return [dict(zip(names, orders, strict=True)) for orders in itertools.product(*lists)]
-
-
-def _cost(candidate: Candidate, criterion: str) -> float:
-    """To be minimised; infinite for a candidate that must not be chosen."""
-    if not candidate.stable:
-        return np.inf
-    cost = {"fit": -candidate.score, "aic": candidate.aic, "bic": candidate.bic}[criterion]
-    return np.inf if np.isnan(cost) else cost
-
-
-def _nothing(candidates: Sequence[Candidate]) -> str:
-    problems = [candidate.problem for candidate in candidates if candidate.problem]
-    if problems:
-        return f"none of the {len(candidates)} candidates can be used; the first: {problems[0]}"
-    return (
-        f"none of the {len(candidates)} candidates is stable: give the estimator stable=True, or "
-        "try lower na"
-    )
+    return [dict(zip(grid, values, strict=True)) for values in itertools.product(*grid.values())]

@@ -9,9 +9,7 @@ from scipy.signal import lfilter
 from scipy.stats import multivariate_normal
 
 from sysid import ARMAX, ARX, Dataset, ModelError
-from sysid.linear.prediction_error import fit_row
-from sysid.linear.regression import Equations
-from sysid.linear.whitening import Whitener
+from sysid.linear.prediction_error import EquationFit, fit_equation
 from tests.sysid.linear_systems import (
     OFFSET,
     SIGMA,
@@ -245,11 +243,12 @@ def test_derivatives_of_the_sum_of_squares(c):
     position = np.concatenate((np.arange(30), np.arange(40, 52), [60], np.arange(70, 72)))
     runs = np.split(np.arange(45), [30, 42, 43])
     rng = np.random.default_rng(0)
-    rows = Equations(rng.normal(size=45), rng.normal(size=(45, 2)), position)
-    found = fit_row(rows, len(c), [c], max_iterations=1)
+    columns = rng.normal(size=(45, 3))
+    white = EquationFit(columns, position, np.zeros(len(c)))
+    found = fit_equation(white, [c], max_iterations=1)
 
     def squares(theta):
-        noise = rows.target - rows.regressors @ theta[:2]
+        noise = columns[:, 2] - columns[:, :2] @ theta[:2]
         return sum(determinant_and_squares(noise[run], theta[2:])[1] for run in runs)
 
     at = np.concatenate((found.theta, found.c))
@@ -267,11 +266,16 @@ def test_the_unknown_past_of_each_run(c):
     def terms(c):
         return np.sum([determinant_and_squares(noise[run], c) for run in runs], axis=0)
 
-    whitener = Whitener(np.array(c), position)
-    white = whitener.standardised(whitener.inverse(noise[:, None]))
-    assert (whitener.log_det, np.sum(white**2)) == pytest.approx(terms(c))
-    numeric = [(terms(c + s)[0] - terms(c - s)[0]) / 2e-6 for s in 1e-6 * np.eye(len(c))]
-    assert_allclose(whitener.log_det_slope(), numeric, atol=1e-6)
+    fit = EquationFit(noise[:, None], position, np.array(c))
+    assert (fit.log_det, fit.residual @ fit.residual) == pytest.approx(terms(c))
+
+    def likelihood_loss(c):
+        log_det, squares = terms(c)
+        return 0.5 * (np.log(squares) + log_det / 45)
+
+    steps = 1e-6 * np.eye(len(c))
+    numeric = [(likelihood_loss(c - s) - likelihood_loss(c + s)) / 2e-6 for s in steps]
+    assert_allclose(fit.descent[0], numeric, atol=1e-6)
 
 
 def test_white_residuals_are_left():
