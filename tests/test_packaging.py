@@ -13,6 +13,8 @@ import pytest
 
 from tests.daq.support import environment
 
+pytestmark = pytest.mark.soak
+
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("daq", "protocols", "sim_rig", "sysid")
 

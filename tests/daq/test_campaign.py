@@ -99,6 +99,7 @@ def test_every_log_with_every_model_and_seed(folder):
     assert kept["error"]["value"] == best["best"]
 
 
+@pytest.mark.soak
 def test_one_parameter_set_for_all_logs_together(folder):
     document = campaign(folder, "--together", "--jobs", 1, "--hold-back", 0.3, "--set", "seed=9")
     assert [(r["data"], r["seed"]) for r in document["runs"]] == [("2 logs", 0), ("2 logs", 1)] * 2
@@ -109,6 +110,7 @@ def test_one_parameter_set_for_all_logs_together(folder):
     assert validated == ["fast (last 30 %)", "slow (last 30 %)", "check"]
 
 
+@pytest.mark.soak
 def test_a_dask_cluster_by_one_setting_gives_the_same(folder):
     distributed = pytest.importorskip("distributed", reason="dask.distributed is not installed")
     here = campaign(folder, "--jobs", 1)

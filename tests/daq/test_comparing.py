@@ -105,6 +105,7 @@ def test_structures_and_a_linear_model_are_ranked_on_validation(folder):
     assert found["parameters"]["tau"]["value"] == pytest.approx(0.1, rel=0.02)
 
 
+@pytest.mark.soak
 def test_tables_for_people_and_a_page_that_says_how_to_do_it_again(folder):
     args = ("identify", "training.csv", "--validate", "validation.csv", "--config", "id.yaml",
             "--model", DOUBLE, "--model", LAG, "--arx", "--out", "found")  # fmt: skip
@@ -136,11 +137,13 @@ def test_without_validation_bic_ranks_and_that_is_said(folder):
     assert "outputs" not in report["structures"][0]
 
 
+@pytest.mark.soak
 def test_the_end_of_the_log_can_be_held_back(folder):
     report = document(folder, "--model", DOUBLE, "--model", LAG, "--hold-back", 0.4)
     assert report["validated"] and short(report["preferred"]) == LAG
 
 
+@pytest.mark.soak
 def test_seeds_of_one_model_give_the_best_of_them(folder):
     several = document(folder, "--model", LAG, "--seeds", "0:2", "--out", "several")
     errors = [

@@ -34,6 +34,7 @@ def test_the_files_work_as_they_are_and_the_next_commands_are_told(tmp_path):
         jsonschema.validate(yaml.safe_load(content), json.loads(schema.read_text()))
 
 
+@pytest.mark.soak
 def test_every_shipped_experiment_can_be_begun_with(tmp_path):
     with forked_rig() as run:
         for name in [path.stem for path in shipped_experiments().values()]:

@@ -10,6 +10,7 @@ SEED = 7
 LATE = 0.25  # s
 
 
+@pytest.mark.soak
 @pytest.mark.skipif(sys.platform == "win32", reason="there is no kill -9")
 def test_a_killed_run_leaves_a_log_that_loads_and_lacks_only_its_last_moment(tmp_path):
     afters = instants(6, SEED)

@@ -126,6 +126,7 @@ def test_importing_daq_imports_nothing_heavy(tmp_path):
     assert result.stdout == "[]\n"
 
 
+@pytest.mark.soak
 def test_the_notebook_does_what_it_shows(tmp_path, monkeypatch):
     cells = json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]
     code = [cell for cell in cells if cell["cell_type"] == "code"]

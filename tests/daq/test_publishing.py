@@ -262,6 +262,7 @@ def test_without_intervals_and_validation_the_page_says_so(work, rig):
     assert not any("data-quantity" in given for given, _ in page.rows)
 
 
+@pytest.mark.soak
 def test_figures_are_drawn_again_in_other_formats(result, work, rig):
     done = rig(["figures", "found", "--format", "png", "--format", "svg", "--out", "drawn",
                 "--json"], cwd=work)  # fmt: skip

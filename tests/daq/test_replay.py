@@ -154,12 +154,14 @@ def lab(tmp_path, capture):
     return tmp_path
 
 
+@pytest.mark.soak
 def test_the_documented_example_passes(lab):
     result = run_pytest(lab)
     assert result.returncode == 0, result.stdout + result.stderr
     assert "2 passed" in result.stdout
 
 
+@pytest.mark.soak
 def test_a_rig_that_is_another_fails_and_the_seed_is_told(lab):
     values = yaml.safe_load((lab / "parameters.yaml").read_text())
     values["parameters"]["K_m"] *= 2.0

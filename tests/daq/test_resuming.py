@@ -35,6 +35,7 @@ def parameters(folder):
     return {key: value for key, value in report.items() if key != "software"}
 
 
+@pytest.mark.soak
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no SIGKILL here")
 def test_a_killed_identification_goes_on_to_the_same_result(captured, tmp_path):
     root, folder = captured
@@ -70,6 +71,7 @@ def test_ctrl_c_says_how_to_go_on(captured, tmp_path):
     assert (out / "search.ckpt").exists() and (out / "parameters.yaml").exists()
 
 
+@pytest.mark.soak
 def test_nothing_is_left_of_an_identification_that_ended(captured, tmp_path):
     root, folder = captured
     result = rig(

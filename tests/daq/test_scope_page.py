@@ -136,6 +136,7 @@ def recording(root, name, **facts):
     capture.finish("completed", None)
 
 
+@pytest.mark.soak
 def test_it_follows_a_run_of_the_rig_from_its_beginning_to_its_end(scope, tmp_path):
     tab = scope()
     assert "No run under runs yet" in tab.head()
@@ -164,6 +165,7 @@ def test_it_follows_a_run_of_the_rig_from_its_beginning_to_its_end(scope, tmp_pa
     assert set(loaded) == {"127.0.0.1"} and not tab.errors()
 
 
+@pytest.mark.soak
 def test_a_paused_page_stands_still_until_it_is_let_go_on(scope, tmp_path):
     with recording(tmp_path, "first") as (_, log):
         log.append(samples(400))
@@ -192,6 +194,7 @@ def test_a_paused_page_stands_still_until_it_is_let_go_on(scope, tmp_path):
         assert len(tab.drawn()) == 0 and "waiting for the first sample" in tab.head()
 
 
+@pytest.mark.soak
 def test_a_finished_run_is_shown_whole_and_magnified_to_its_samples(scope, tmp_path):
     n = 100_000  # more than is kept as it is
     torque = np.sin(np.arange(n) / 5000.0)

@@ -13,6 +13,8 @@ import pytest
 
 from tests.daq.support import environment
 
+pytestmark = pytest.mark.soak
+
 TUTORIAL = Path(__file__).resolve().parents[2] / "docs" / "tutorial.md"
 BLOCK = re.compile(r"^```(sh|yaml)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 

@@ -42,6 +42,7 @@ def test_the_tutorial_shows_the_example_as_it_is():
         assert shown in (EXAMPLES / name).read_text(encoding="utf-8")
 
 
+@pytest.mark.soak
 def test_identification_finds_the_drive(data, tmp_path):
     data.save(tmp_path / "training.csv", data.training()[:6000])
     data.save(tmp_path / "validation.csv", data.validation())

@@ -24,6 +24,7 @@ def identify(logs, tmp_path, *options):
     return json.loads(result.stdout)
 
 
+@pytest.mark.soak
 @pytest.mark.skipif(not LOGS.is_dir(), reason=f"the measured logs are not at {LOGS}")
 def test_one_parameter_set_for_a_folder_of_measured_logs(tmp_path):
     model = f"{EXAMPLE / 'bouc_wen.py'}:model"
@@ -56,6 +57,7 @@ def synthetic_log(path, current):
     np.savetxt(path, table, delimiter=",", header=head, comments="")
 
 
+@pytest.mark.soak
 def test_the_shipped_model_and_columns_fit_their_own_kind_of_log(tmp_path):
     logs = []
     for current in (0.0, 1.0):

@@ -46,6 +46,7 @@ def between(tmp_path_factory):
     return settings, samples, extra, settings.findings(samples, extra)
 
 
+@pytest.mark.soak
 def test_with_the_sensor_between_c0_and_c1_are_the_plants(between):
     found = numbers(between[3])
     within(found["c0"], C0, 0.05)
@@ -101,6 +102,7 @@ def test_commands_stay_within_the_limit_and_the_shaft_is_left_at_rest(between):
     assert not samples.flags.any()
 
 
+@pytest.mark.soak
 def test_with_the_sensor_at_the_load_c0_has_the_motors_damping(tmp_path):
     settings = experiment(**QUICK, measure=1, torque_sensor="load")
     samples, extra = run(settings, tmp_path, {"load": "free"})
@@ -114,6 +116,7 @@ def test_with_the_sensor_at_the_load_c0_has_the_motors_damping(tmp_path):
     within(numbers(knows.findings(samples, extra))["c0"], C0, 0.05)
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize("place", ["between", "load"])
 def test_the_friction_of_worn_brushes_is_seen_along_a_turn(tmp_path, place):
     plant = {"load": "free", "sensor": place, "friction": "cyclic"}

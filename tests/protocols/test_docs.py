@@ -18,6 +18,7 @@ OWN = (DOCS.parent / "own-protocol.md").read_text()
 BLOCK = r"```\w+\n(.*?)```"
 
 
+@pytest.mark.soak
 def test_examples_of_own_protocols_run_as_written(tmp_path, command):
     files = re.findall(rf"<!-- file: (\S+) -->\n{BLOCK}", OWN, re.DOTALL)
     assert {name for name, _ in files} == {

@@ -162,6 +162,7 @@ CASES = {
 }
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize("case", CASES)
 def test_every_parts_energy_balance_closes(case):
     parts, inputs, changes, start, moved = CASES[case]

@@ -48,6 +48,7 @@ def check(model, vector, found):
         assert guess.low > parameter.lower or guess.high < parameter.upper
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize("drivers", [("closed", "closed"), ("open", "open"), ("open", "closed")])
 def test_the_truth_is_within_whatever_is_told(drivers):
     model = actuator(driver_motor=drivers[0], driver_brake=drivers[1])
@@ -66,6 +67,7 @@ def test_the_truth_is_within_whatever_is_told(drivers):
     assert told >= {*gains, "R_m", "K_m"}
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize("kind", ["bouc-wen", "dahl", "lugre"])
 def test_the_rigs_own_values_are_within_it(kind):
     model = actuator(hysteresis=kind, parameters="rig")
@@ -104,6 +106,7 @@ def test_a_fast_log_tells_the_cutoff_and_the_inductance_of_an_open_driver():
     assert "mean delay of current_motor" in found["omega_dm"].source
 
 
+@pytest.mark.soak
 def test_theta_serves_in_place_of_omega_and_without_either_the_motor_is_left_alone():
     model = actuator(parameters="rig", outputs=("current_motor", "current_brake", "theta"))
     found = guess_ranges(model, [record(model, model.nominal, 1, n=2000)])
@@ -114,6 +117,7 @@ def test_theta_serves_in_place_of_omega_and_without_either_the_motor_is_left_alo
     assert not {"K_dm", "R_m", "K_m", "c0"} & set(guess_ranges(currents, [alone]))
 
 
+@pytest.mark.soak
 def test_brush_friction_leaves_the_damping_alone():
     """Its torque falls with the speed, so that the slope is no limit."""
     model = actuator(parameters="rig", friction="stribeck")

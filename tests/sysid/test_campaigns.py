@@ -108,6 +108,7 @@ def test_processes_give_the_serial_result_to_the_bit(serial):
     same(found, campaign(todo, n_jobs=2))
 
 
+@pytest.mark.soak
 def test_a_dask_cluster_gives_the_serial_result_to_the_bit(serial):
     distributed = pytest.importorskip("distributed", reason="dask.distributed is not installed")
     todo, found = serial
@@ -142,6 +143,7 @@ def test_workers_find_the_kernels_that_are_already_compiled(serial, tmp_path, mo
     assert {path.name for path in cache.rglob("*") if path.is_file()} == before
 
 
+@pytest.mark.soak
 def test_a_model_of_a_users_file_and_its_neighbour_travel(tmp_path, monkeypatch):
     (tmp_path / "gains_of_mine.py").write_text(NEIGHBOUR)
     (tmp_path / "model_of_mine.py").write_text(MODEL_FILE)

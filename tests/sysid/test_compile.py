@@ -123,6 +123,7 @@ CHANGES = {
 }
 
 
+@pytest.mark.soak
 def test_every_kind_of_change_gets_a_kernel_of_its_own(workshop):
     """One after another, each on top of the ones before; nothing is compiled for it."""
     workshop.run(NAME_ONLY="1")
@@ -137,12 +138,14 @@ def test_every_kind_of_change_gets_a_kernel_of_its_own(workshop):
         assert workshop.kernels() == kernels, what
 
 
+@pytest.mark.soak
 def test_a_changed_helper_changes_the_result(workshop):
     workshop.run()
     workshop.edit("shared.py", "2.0 * value", "4.0 * value")
     assert workshop.run() == pytest.approx(settled(BEFORE + 0.5), rel=1e-3)
 
 
+@pytest.mark.soak
 def test_two_processes_that_start_at_once_both_work(workshop):
     processes = [workshop.start(), workshop.start()]
     one, two = [workshop.result(process) for process in processes]

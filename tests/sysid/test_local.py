@@ -80,6 +80,7 @@ def alias(target):
     return stuck.chromosome
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize("seed", range(4))
 def test_jumps_leave_a_minimum_that_a_descent_cannot(seed):
     target = objective(spring(), spring_record())
@@ -168,6 +169,7 @@ def test_flat_directions_cost_nothing():
     assert product.chromosome[0] * product.chromosome[1] == pytest.approx(2.0, rel=1e-8)
 
 
+@pytest.mark.soak
 def test_it_slides_along_a_constraint():
     """The minimum on a slanted constraint, against a search along the line that it is."""
     limit = Constraint("resistance >= 50 constant", lambda p: 50.0 * p[4] - p[0])  # truth: 42

@@ -45,6 +45,7 @@ def expected(model, vector, records, per_log, balance, weights):
     return np.sqrt(means) @ weights / weights.sum()
 
 
+@pytest.mark.soak
 @pytest.mark.filterwarnings("ignore:All-NaN slice")
 @pytest.mark.parametrize("per_log", [False, True])
 @pytest.mark.parametrize("balance", ["samples", "logs"])
@@ -64,6 +65,7 @@ def test_the_objective_of_uneven_logs_is_that_of_scipy(per_log, balance):
     )
 
 
+@pytest.mark.soak
 @pytest.mark.filterwarnings("ignore:All-NaN slice")
 @pytest.mark.parametrize("balance", ["samples", "logs"])
 def test_the_fit_of_uneven_logs_is_a_minimum_of_it(balance):

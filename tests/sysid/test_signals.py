@@ -31,6 +31,7 @@ NAMES = [
 ]
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize("names", NAMES)
 def test_chosen_outputs_follow_scipy(names):
     model = measured_by_function().with_outputs(names)

@@ -169,6 +169,7 @@ def test_linear_systems_follow_their_exact_discretisation(hold):
 # --- against SciPy --------------------------------------------------------------------------
 
 
+@pytest.mark.soak
 def test_the_actuator_follows_scipy_over_its_shipped_ranges():
     """Each with the steps that the search gives it, at the default accuracy."""
     rng = np.random.default_rng(20)

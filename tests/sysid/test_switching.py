@@ -76,6 +76,7 @@ def pushed(n=3000, dt=1e-3, seed=2):
     return Dataset(forces, slide(forces, dt), dt)
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize("sign", [branching, copied])
 def test_a_sign_that_jumps_at_the_start_is_no_endless_rate(sign):
     record = pushed()
@@ -86,6 +87,7 @@ def test_a_sign_that_jumps_at_the_start_is_no_endless_rate(sign):
     assert result.steps[0] <= 4 * record.n_samples
 
 
+@pytest.mark.soak
 def test_beyond_a_narrow_limit_of_a_hidden_state_the_position_is_right():
     record = pushed()
     truth = np.array([[MASS, FRICTION, OFFSET]])

@@ -873,6 +873,7 @@ def exact_groups(found):
     return {frozenset(a.parameters): a for a in found.ambiguities if a.kind != "vague"}
 
 
+@pytest.mark.soak
 def test_the_redundancies_of_the_actuator_are_found(rig_minimum):
     record, values, found = rig_minimum
     told = uncertainty(*rig_objective(record, found))
@@ -896,6 +897,7 @@ def test_the_redundancies_of_the_actuator_are_found(rig_minimum):
         assert estimate.why == "" and estimate.low < values[name] < estimate.high
 
 
+@pytest.mark.soak
 def test_what_to_measure_on_the_actuator_resolves_it(rig_minimum):
     record, _, found = rig_minimum
     told = uncertainty(*rig_objective(record, found))
