@@ -195,16 +195,16 @@ class History:
         """Lows and highs (m, n_columns) of stretches of so many rows or buckets."""
         shape = -1, together, low.shape[1]
         low = np.fmin.reduce(low.reshape(shape), axis=1)
-        flags = self._flags_of(high).reshape(-1, together)
-        high = np.fmax.reduce(high.reshape(shape), axis=1)
-        if self._flags is not None:
-            high[:, self._flags] = np.bitwise_or.reduce(flags, axis=1)
-        return low, high
+        highs: FloatArray = np.fmax.reduce(high.reshape(shape), axis=1)
+        if self._flags is not None and together > 1:
+            flags = self._flags_of(high).reshape(-1, together)
+            highs[:, self._flags] = np.bitwise_or.reduce(flags, axis=1)
+        return low, highs
 
     def _flags_of(self, rows: FloatArray) -> IntArray:
         if self._flags is None:
             return np.zeros(len(rows), dtype=np.int64)
-        return np.nan_to_num(rows[:, self._flags]).astype(np.int64)
+        return np.fmax(rows[:, self._flags], 0.0).astype(np.int64)  # none where it is unreadable
 
     def _drawn(
         self,
