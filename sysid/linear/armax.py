@@ -12,9 +12,9 @@ from sysid.linear.polynomials import Order
 class ARX(PolynomialModel):
     """Identify A(q) y = B(q) u + offset + e by linear least squares.
 
-    y(t) + A_1 y(t-1) + ... = B_nk u(t-nk) + ... + offset + e(t), with full matrices. Ljung,
-    System Identification, sections 4.2 and 10.1. Biased when the noise is not white; ``ARMAX``
-    models its colour.
+    y(t) + A_1 y(t-1) + ... = B_nk u(t-nk) + ... + offset + e(t), with full matrices. Biased when
+    the noise is not white; ``ARMAX`` models its colour. Ljung, System Identification, sections
+    4.2 and 10.1.
 
     Parameters
     ----------
@@ -28,24 +28,21 @@ class ARX(PolynomialModel):
 
     Attributes
     ----------
-    A_ : (n_lags + 1, n_outputs, n_outputs), by lag; A_[0] is the identity.
-    B_ : (n_lags + 1, n_outputs, n_inputs), by lag; zero where nk delays.
-    C_ : (nc + 1, n_outputs), the diagonal of C by lag; C_[0] is 1.
-    offset_ : (n_outputs,), zero with offset=False.
-    A_std_, B_std_, C_std_, offset_std_ : standard errors, of the same shapes; infinite where
-        the data do not determine a coefficient, NaN where ``stable`` moved it.
+    A_, B_ : (n_lags + 1, n_outputs, n_outputs) and (n_lags + 1, n_outputs, n_inputs), by lag.
+    C_, offset_ : (nc + 1, n_outputs), the diagonal of C by lag, and (n_outputs,).
+    A_std_, B_std_, C_std_, offset_std_ : standard errors; infinite where the data do not
+        determine a coefficient, NaN where ``stable`` moved it.
     theta_, names_, covariance_ : all coefficients (n,), their names (``a2[0,1]`` weighs
         y_1(t-2) in the equation of y_0) and covariance (n, n).
-    noise_covariance_ : (n_outputs, n_outputs) of e.
     residuals_ : per output (n_rows,), the estimate of e in each equation that was fitted.
-    loss_ : (n_outputs,) mean square of e, that before each record included.
+    loss_, noise_covariance_ : mean square of e (n_outputs,), that before each record included;
+        its covariance (n_outputs, n_outputs).
     log_likelihood_, aic_, bic_ : Gaussian, over the n_rows_ instants known for every output.
-    n_lags_ : rows of a record that have no complete past.
     poles_, radius_, stable_ : roots of det A, the largest one's size, whether that is below 1.
     reflected_ : whether ``stable`` had to move poles.
     input_mean_, output_mean_ : operating point that simulations start from; zero with
         offset=False.
-    dt_ : sample time [s], None if arrays came without.
+    n_lags_, dt_ : rows of a record that have no complete past; sample time [s] or None.
 
     >>> import numpy as np
     >>> from scipy.signal import lfilter
@@ -68,10 +65,9 @@ class ARX(PolynomialModel):
 class ARMAX(PolynomialModel):
     """Identify A(q) y = B(q) u + offset + C(q) e by minimising one-step prediction errors.
 
-    A and B are full, C is diagonal, so that each output's equation is a problem of its own: to
-    maximise the Gaussian likelihood of its one-step prediction errors. Each C has its roots
-    inside the unit circle. The noise before the first complete row of a record, and before the
-    first one after a gap, is unknown and counts as such (``prediction_error``).
+    A and B are full, C is diagonal with its roots inside the unit circle. Each output's equation
+    maximises the Gaussian likelihood of its own prediction errors, in which the noise before a
+    record, or after a gap, is as unknown as any other (``sysid.linear.prediction_error``).
 
     Parameters
     ----------
@@ -86,9 +82,8 @@ class ARMAX(PolynomialModel):
 
     >>> import numpy as np
     >>> from scipy.signal import lfilter
-    >>> rng = np.random.default_rng(0)
-    >>> u, e = np.sign(rng.normal(size=500)), 0.1 * rng.normal(size=500)
-    >>> y = lfilter([0.0, 0.2], [1.0, -0.9], u) + e  # measurement noise: C equals A
+    >>> u, e = np.random.default_rng(0).normal(size=(2, 500))
+    >>> y = lfilter([0.0, 0.2], [1.0, -0.9], u) + 0.1 * e  # measurement noise: C equals A
     >>> model = ARMAX(na=1, nb=1, nc=1).fit(u[:, None], y)
     >>> model.A_[1, 0].round(1), model.C_[1].round(1)
     (array([-0.9]), array([-0.9]))

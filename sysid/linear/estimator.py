@@ -11,7 +11,7 @@ from sklearn.utils.validation import check_is_fitted
 
 from sysid.arrays import BoolArray, FloatArray
 from sysid.linear.polynomials import Layout, Order, filtered, innovations, poles, reflect_poles
-from sysid.linear.prediction_error import EquationFit, Stack, fit_equations, influence
+from sysid.linear.prediction_error import EquationFit, Stack, first_guesses, fit_equation, influence
 from sysid.problem.data import Dataset
 from sysid.problem.metrics import evaluate
 from sysid.problem.model import ModelError
@@ -25,9 +25,6 @@ _GROWN = 1e6
 class PolynomialModel(RecordEstimator):
     """A(q) y = B(q) u + offset + C(q) e, resting at an operating point before each record."""
 
-    na: Order
-    nb: Order
-    nk: Order
     nc: Order = 0
     offset: bool
     stable: bool
@@ -36,13 +33,12 @@ class PolynomialModel(RecordEstimator):
     def fit(
         self, X: Data, y: FloatArray | None = None, *, records: Any = None, dt: float | None = None
     ) -> Self:
-        """Estimate the coefficients from one record or several.
+        """Estimate the coefficients from one record or several; warns if the model is unstable.
 
-        X: one Dataset, several of any lengths, or an (n_samples, n_inputs) array with
-        y (n_samples,) or (n_samples, n_outputs), NaN where a sample was lost. records:
-        (n_samples,), which record each row of the arrays belongs to, default one record.
-        dt: sample time [s] of the arrays, needed only to refuse Datasets of another one. Warns
-        when the model is unstable. Raises ModelError for orders or data that make no sense.
+        X: one Dataset, several of any lengths, or an (n_samples, n_inputs) array with y
+        (n_samples,) or (n_samples, n_outputs), NaN where a sample was lost. records: (n_samples,),
+        which record each row of the arrays belongs to, default one. dt: sample time [s] of the
+        arrays, to refuse Datasets of another one. Raises ModelError for senseless orders or data.
         """
         self._fit_rows(0, X, y, records, dt)
         if not self.stable_:
@@ -58,9 +54,8 @@ class PolynomialModel(RecordEstimator):
         """Free-run outputs of the identified model, (n_samples, n_outputs).
 
         A Dataset starts from the values of its first ``n_lags_`` rows that make the whole record
-        fit best, by least squares with each output in units of its residual, so that noise in
-        those rows does no harm. An array X starts from rest like ``simulate``, each
-        of its ``records`` anew; the outputs are (n_samples,) if those of ``fit`` were.
+        fit best, so that noise in those rows does no harm. An array X starts from rest like
+        ``simulate``, each of its ``records`` anew; (n_samples,) if the outputs of ``fit`` were.
         """
         check_is_fitted(self)
         datasets = given_datasets(X)
@@ -75,19 +70,19 @@ class PolynomialModel(RecordEstimator):
 
         X: (n_samples, n_inputs). initial: (k, n_outputs), outputs of the first k rows, returned
         as they are; ``n_lags_`` of them define the start completely. Before the first row inputs
-        are at ``input_mean_`` and outputs at ``initial[0]``, without ``initial`` at
-        ``output_mean_``: the model starts from rest at its operating point.
+        are at ``input_mean_`` and outputs at ``initial[0]``, by default ``output_mean_``.
         """
         check_is_fitted(self)
         inputs, q = self._inputs(X, reset=False), len(self.offset_)
         if initial is None:
             return self._shaped(self._free_run(inputs))
         first = np.asarray(initial, dtype=np.float64)
-        width = first.shape[-1] if first.ndim == 2 else q if first.ndim < 2 else 0
-        if width != q or first.size % q or not q <= first.size <= q * len(inputs):
+        if first.ndim < 2 and first.size % q == 0:
+            first = first.reshape(-1, q)
+        if first.shape[1:] != (q,) or not 1 <= len(first) <= len(inputs):
             raise ModelError(
-                f"initial has shape {first.shape}; give the outputs of the first rows, one to "
-                f"{len(inputs)} rows of {q}"
+                f"initial has shape {np.shape(initial)}; give the outputs of the first rows, one "
+                f"to {len(inputs)} rows of {q}"
             )
         if not np.all(np.isfinite(first)):
             raise ModelError("initial has an output that is not finite; give measured rows")
@@ -99,10 +94,9 @@ class PolynomialModel(RecordEstimator):
         """Row t: outputs predicted from those up to row t-k and the inputs up to row t.
 
         X, y: one Dataset, or arrays (n_samples, n_inputs) and (n_samples, n_outputs) of one
-        record. Lost outputs (NaN) are bridged by their prediction. Before the first row the model
-        rests at its operating point, so that k >= n_samples gives ``simulate(X)``; the first
-        ``n_lags_`` rows have no complete past, and no noise is read off them. Ljung, System
-        Identification, section 3.2.
+        record. Lost outputs (NaN) are bridged by their prediction. The model starts from rest, so
+        that k >= n_samples gives ``simulate(X)``; no noise is read off the first ``n_lags_`` rows,
+        which have no complete past. Ljung, System Identification, section 3.2.
         """
         check_is_fitted(self)
         if isinstance(k, bool) or not isinstance(k, int | np.integer) or k < 1:
@@ -128,18 +122,15 @@ class PolynomialModel(RecordEstimator):
     def score(
         self, X: Data, y: FloatArray | None = None, *, records: Any = None, dt: float | None = None
     ) -> float:
-        """Mean free-run fit % over outputs and records, divided by 100: 1 is perfect.
-
-        Each record starts where it fits best, like ``predict`` of a Dataset.
-        """
+        """Mean fit % / 100 of free runs like ``predict`` of a Dataset; 1 is perfect."""
         check_is_fitted(self)
         data = given_datasets(X) or self._arrays(X, y, records, dt, reset=False)
         runs = [(record.outputs, self._follow(self._single([record]))) for record in data]
         return float(np.nanmean([free_run_fit(*run)[0] for run in runs])) / 100.0
 
     def _layout(self, record: Dataset) -> Layout:
-        q, m = record.outputs.shape[1], record.inputs.shape[1]
-        return Layout(q, m, na=self.na, nb=self.nb, nc=self.nc, nk=self.nk, offset=self.offset)
+        orders = {name: getattr(self, name) for name in ("offset", "na", "nb", "nc", "nk")}
+        return Layout(record.outputs.shape[1], record.inputs.shape[1], **orders)
 
     @one_thread()
     def _fit_rows(
@@ -157,14 +148,18 @@ class PolynomialModel(RecordEstimator):
         layout, stack = self._layout(data[0]), Stack.of(data)
         if self.max_iterations < 1:
             raise ModelError(f"max_iterations is {self.max_iterations}; it must be 1 or more")
-        fits = fit_equations(stack, layout, lag, self.max_iterations)
+        lag, limit = max(lag, layout.lag), self.max_iterations
+        equations = stack.equations(layout, lag)
+        starts = first_guesses(stack, layout, equations)
+        fits = [fit_equation(*row, limit) for row in zip(equations, layout.nc, starts, strict=True)]
         self.theta_ = np.concatenate([np.append(fit.theta, fit.c) for fit in fits])
         A = layout.polynomials(self.theta_)[0]
         self.A_ = reflect_poles(A) if self.stable else A
         self.reflected_ = self.A_ is not A
         estimated = np.full(len(self.theta_), True)
         if self.reflected_:
-            fits = fit_equations(stack, layout, lag, self.max_iterations, self.A_, fits)
+            rows = zip(stack.equations(layout, lag, self.A_), fits, strict=True)
+            fits = [fit_equation(row, len(fit.c), [fit.c], limit) for row, fit in rows]
             estimated = np.nonzero(layout.free)[1] >= len(fits)
             moved = layout.free[:, : len(fits), : len(A)]
             self.theta_[~estimated] = self.A_.transpose(1, 2, 0)[moved]
@@ -183,10 +178,10 @@ class PolynomialModel(RecordEstimator):
     def _set_precision(
         self, layout: Layout, fits: Sequence[EquationFit], estimated: BoolArray, n: int
     ) -> None:
-        """Second-order statistics of fits of the estimated coefficients, to rows among n instants.
+        """Of fits of the estimated coefficients to rows among n instants.
 
-        The outputs' equations are estimated apart, but their errors at one instant may be
-        correlated. Ljung, System Identification, sections 9.2 and 9.3.
+        Errors of several outputs at one instant may be correlated, although their equations are
+        estimated apart. Ljung, System Identification, sections 9.2 and 9.3.
         """
         row, q, p = np.nonzero(layout.free)[0], len(fits), len(estimated)
         # Over all instants, zero at those that an equation was not fitted to.
@@ -231,7 +226,8 @@ class PolynomialModel(RecordEstimator):
 
     def _drive(self, inputs: FloatArray) -> FloatArray:
         """What inputs and offset add to each row's equation, (n, q)."""
-        return filtered(self.B_, inputs, self._rest(self.input_mean_)) + self.offset_
+        rest = self._rest(self.input_mean_)
+        return filtered(self.B_, np.vstack((rest, inputs)))[-len(inputs) :] + self.offset_
 
     def _rest(self, row: FloatArray) -> FloatArray:
         """Rows before a record, all alike."""
@@ -256,9 +252,8 @@ class PolynomialModel(RecordEstimator):
     def _follow(self, record: Dataset) -> FloatArray:
         """Free run whose first ``n_lags_`` rows are those that explain the record best, (n, q).
 
-        The outputs depend linearly on the last rows before the recursion begins: least squares,
-        each output in units of its residual. A model whose response to them grows out of
-        proportion starts where it was measured.
+        By least squares on the response to them, each output in units of its residual; where
+        that grows out of proportion, the run starts where it was measured.
         """
         first, na, q = self.n_lags_, len(self.A_) - 1, len(self.offset_)
         plain = self._free_run(record.inputs, self._held(record.outputs[:first]))

@@ -1,7 +1,6 @@
-"""A(q) y = B(q) u + offset + C(q) e: its coefficients, its poles, and running it through time.
+"""The polynomials of A(q) y = B(q) u + offset + C(q) e: coefficients, poles, running through time.
 
-A (n_lags + 1, q, q) and B (n_lags + 1, q, m) are full, by lag, for q outputs and m inputs; C
-(nc + 1, q) is the diagonal of a diagonal one. A_0 and C_0 are the identity.
+A (n_lags + 1, q, q) and B (n_lags + 1, q, m) are full, C (nc + 1, q) is a diagonal; by lag.
 """
 
 from __future__ import annotations
@@ -19,22 +18,18 @@ from sysid.problem.model import ModelError
 # One number for all entries, or a table with one number for each.
 Order = int | Sequence[int] | Sequence[Sequence[int]] | IntArray
 
-# A reflected pole stays this far inside, so that a pole on the circle becomes stable.
-_POLE_RADIUS = 0.9999
-# From here on a pole is on the circle but for rounding.
-_CIRCLE = 1.0 - 1e-12
+_POLE_RADIUS = 0.9999  # largest of a reflected pole, so that one on the circle becomes stable
+_CIRCLE = 1.0 - 1e-12  # from here on a pole is on the circle but for rounding
 
 
 class Layout:
-    """Which coefficients a model has, and where each stands in the parameter vector.
+    """Which coefficients a model of q outputs and m inputs has.
 
     na: (q, q) lags of each output in each equation; nb: (q, m) coefficients of each input;
     nc: (q,) lags of the noise; nk: (q, m) samples before an input first acts. free: (q, q + m + 2,
-    n_lags + 1), by equation, by the signal that is weighed (minus the outputs, inputs, 1, noise)
-    and by its lag: true for a coefficient, which follow each other in the vector in this order.
-    lag: rows at the start of a record that have no complete past.
-
-    Raises ModelError for a negative order, a table of the wrong shape, or no coefficient.
+    n_lags + 1), true for a coefficient, by equation, signal that it weighs (minus the outputs,
+    inputs, 1, noise) and its lag; the parameter vector has this order. lag: rows of a record that
+    have no complete past. Raises ModelError for orders that make no sense.
     """
 
     def __init__(self, q: int, m: int, *, offset: bool, na: Order, nb: Order, nc: Order, nk: Order):
@@ -42,12 +37,12 @@ class Layout:
         self.nc, self.nk = _table("nc", nc, (q,)), _table("nk", nk, (q, m))
         last = np.where(self.nb > 0, self.nk + self.nb - 1, -1)
         self._reach = int(self.na.max()), int(last.max(initial=0)), int(self.nc.max())
-        self.offset, self.lag = offset, max(self._reach[:2])
+        self.offset, self.lag = bool(offset), max(self._reach[:2])
         lag = np.arange(max(self._reach) + 1)
         tables = (
             (lag > 0) & (lag <= self.na[..., None]),
             (lag >= self.nk[..., None]) & (lag <= last[..., None]),
-            np.broadcast_to((lag == 0) & bool(offset), (q, 1, len(lag))),
+            np.broadcast_to((lag == 0) & self.offset, (q, 1, len(lag))),
             (lag > 0) & (lag <= self.nc[:, None, None]),
         )
         self.free: BoolArray = np.concatenate(tables, axis=1)
@@ -65,16 +60,14 @@ class Layout:
         names += ["offset[{0}]", "c{1}[{0}]"]
         return tuple(names[signal].format(row, lag) for row, signal, lag in np.argwhere(self.free))
 
-    def polynomials(
-        self, theta: FloatArray, leading: float = 1.0
-    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    def polynomials(self, theta: FloatArray, leading: float = 1.0) -> tuple[FloatArray, ...]:
         """A, B, C and offset (q,) of a parameter vector; leading: the diagonal of A_0 and C_0."""
         q, table = len(self.na), np.zeros(self.free.shape)
         table[self.free] = theta
         table = table.transpose(2, 0, 1)
         table[0, :, :q], table[0, :, -1] = leading * np.eye(q), leading
-        n_a, n_b, n_c = (reach + 1 for reach in self._reach)
-        return table[:n_a, :, :q], table[:n_b, :, q:-2], table[:n_c, :, -1], table[0, :, -2]
+        a, b, c = (reach + 1 for reach in self._reach)
+        return table[:a, :, :q], table[:b, :, q:-2], table[:c, :, -1], table[0, :, -2]
 
 
 def _table(name: str, order: Order, shape: tuple[int, ...]) -> IntArray:
@@ -92,22 +85,21 @@ def _table(name: str, order: Order, shape: tuple[int, ...]) -> IntArray:
     return np.broadcast_to(values.astype(np.int64), shape)
 
 
-def filtered(P: FloatArray, x: FloatArray, past: FloatArray) -> FloatArray:
-    """P(q) x, (n, rows). x: (n, columns); past: the rows before it, at least P's lags."""
-    joined = np.concatenate((past, x))
-    terms = [joined[len(past) - lag :][: len(x)] @ matrix.T for lag, matrix in enumerate(P)]
+def filtered(P: FloatArray, x: FloatArray) -> FloatArray:
+    """P(q) x from the first row on that has a complete past, (n - n_lags, rows); x: (n, columns)."""
+    n = len(x) - len(P) + 1
+    terms = [x[len(P) - 1 - lag :][:n] @ matrix.T for lag, matrix in enumerate(P)]
     return np.sum(terms, axis=0)
 
 
 def innovations(
     A: FloatArray, C: FloatArray, drive: FloatArray, past: FloatArray, outputs: Any = np.nan
 ) -> tuple[FloatArray, FloatArray]:
-    """Outputs with lost samples predicted, and one-step prediction errors, each (n, q).
+    """Outputs with lost samples (NaN) predicted, and one-step prediction errors, each (n, q).
 
     drive: (n, q), B(q) u + offset; past: outputs before the first row, n_lags or more, without
-    noise; outputs: (n, q), NaN where lost: there the error is zero and the output its prediction.
-    The recursion is a triangular banded system of equations, solved by forward substitution: the
-    same operations as a loop over time, at the speed of compiled code.
+    noise. Where an output is lost its error is zero. The recursion is a triangular banded system
+    of equations, solved by forward substitution: a loop over time at the speed of compiled code.
     """
     if not len(drive):
         return drive, drive
@@ -122,8 +114,9 @@ def innovations(
     matrix = np.where(lost[..., None], *bands).reshape(lost.size, -1).T
     # What an unstable model overflows to shows in the result.
     with np.errstate(all="ignore"):
-        right = (drive - filtered(A, measured, past)).ravel()
-        unknown = blas.dtbsv(len(matrix) - 1, matrix, right, lower=1, diag=1).reshape(lost.shape)
+        right = drive - filtered(A, np.vstack((past, measured)))[-len(drive) :]
+        unknown = blas.dtbsv(len(matrix) - 1, matrix, right.ravel(), lower=1, diag=1)
+    unknown = unknown.reshape(lost.shape)
     return np.where(lost, unknown, measured), np.where(lost, 0.0, -unknown)
 
 
@@ -134,10 +127,9 @@ def poles(A: FloatArray) -> ComplexArray:
 
 
 def reflect_poles(A: FloatArray) -> FloatArray:
-    """A(q) with its unstable poles mirrored in the unit circle.
+    """A(q) with its unstable poles mirrored in the unit circle, p to 1/conj(p).
 
-    An unstable pole p becomes 1/conj(p), or ``_POLE_RADIUS`` in size if that is less. Stable ones
-    keep their directions among the outputs too. Entries of A that were zero may change.
+    The others keep their directions among the outputs too. Zeros in A may fill up.
     """
     if not np.any(np.abs(poles(A)) >= 1.0):
         return A
@@ -166,7 +158,7 @@ def _companion(A: FloatArray) -> FloatArray:
 
 
 def _sizes(T: FloatArray) -> FloatArray:
-    """Sizes of the eigenvalues on the diagonal of a real Schur form, alike for conjugate pairs."""
+    """Of the poles on the diagonal of a real Schur form; those of a conjugate pair are alike."""
     squares, pairs = np.diag(T) ** 2, np.diag(T, -1) * np.diag(T, 1)
     squares[:-1] -= pairs
     squares[1:] -= pairs

@@ -37,15 +37,14 @@ from sysid.linear.polynomials import Layout, filtered
 from sysid.problem.data import Dataset
 from sysid.problem.model import ModelError
 
-# An iteration is not worth it when it promises to move the coefficients by less than this share
-# of their standard errors, or gains less than this in the logarithm of the likelihood.
-_TOLERANCE, _LEAST_GAIN = 1e-2, 1e-4
-# A step this short that does not help ends the search.
-_MOST_DAMPING = 1e8
-# Below this share of the signal a residual is rounding; there is no noise to model.
-_ROUNDING = 1e-11
-# A noise model that forgets more slowly than this needs thousands of samples to start.
-_NOISE_RADIUS = 0.999
+_TOLERANCE = 1e-2  # of a standard error: an iteration that promises less is not worth it
+_LEAST_GAIN = 1e-4  # of log likelihood: an iteration that gains less is the last
+_MOST_DAMPING = 1e8  # a step this short that does not help ends the search
+_ROUNDING = 1e-11  # of the signal: below it there is no noise to model
+_NOISE_RADIUS = 0.999  # a C that forgets more slowly needs thousands of samples to start
+
+# Regressors and target (n, p + 1), and instants (n,): rows follow where they grow by one.
+Equation = tuple[FloatArray, IntArray]
 
 
 class Stack(NamedTuple):
@@ -69,13 +68,32 @@ class Stack(NamedTuple):
         age = [np.append(np.arange(record.n_samples), -1) for record in records]
         return cls(table[:, :q], table[:, q:], np.concatenate(age))
 
-    def equations(
-        self, free: BoolArray, target: FloatArray, lag: int
-    ) -> tuple[FloatArray, IntArray]:
-        """Regressors and target (n, p + k), and the row of the stack (n,), of each equation.
+    def equations(self, layout: Layout, lag: int, A: FloatArray | None = None) -> list[Equation]:
+        """Of all outputs, on rows with a past of ``lag`` ones; for a given A, of the rest.
 
-        There is one at each instant with a past of ``lag`` rows in its record and no lost sample.
-        free: (q + m + 1, n_lags + 1), signals and lags to weigh; target: (n, k) over the stack.
+        Raises ModelError when an output has too few rows for its coefficients.
+        """
+        target, free, equations = self.outputs, layout.free.copy(), []
+        if A is not None:
+            free[:, : len(A[0])] = False
+            # The last row of the stack is lost, as are those before the first.
+            lost = np.full((len(A) - 2, len(A[0])), np.nan)
+            target = target + filtered(A[1:], np.roll(np.vstack((lost, target)), 1, axis=0))
+        for row, signals in enumerate(free):
+            columns, position = self.rows(signals[:-1], target[:, [row]], lag)
+            if len(columns) <= signals.sum():
+                raise ModelError(
+                    f"output {row} has {len(columns)} rows with a complete past for "
+                    f"{signals.sum()} coefficients: lower na, nb or nc, or give longer records "
+                    "with fewer lost samples"
+                )
+            equations.append((columns, position))
+        return equations
+
+    def rows(self, free: BoolArray, target: FloatArray, lag: int) -> Equation:
+        """Those with a past of ``lag`` ones in their record and no lost sample.
+
+        free: (q + m + 1, n_lags + 1), signals and lags to weigh; target: (n, k).
         """
         weighed, rows = np.argwhere(free), np.flatnonzero(self.age >= lag)
         columns = np.empty((len(rows), len(weighed) + target.shape[1]), order="F")
@@ -89,8 +107,7 @@ class Stack(NamedTuple):
 def least_squares(columns: FloatArray, p: int) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Fit the first p columns of (n, p + k) to the others; of several solutions the shortest.
 
-    Solution (p, k), residual (n, k) and orthonormal directions of the regressors (n, rank). QR
-    factorisation; singular values, in scaled units, where the regressors are dependent.
+    Solution (p, k), residual (n, k) and orthonormal directions of the regressors (n, rank).
     """
     regressors, target = columns[:, :p], columns[:, p:]
     Q, R = scipy.linalg.qr(columns, mode="economic", check_finite=False)
@@ -98,14 +115,14 @@ def least_squares(columns: FloatArray, p: int) -> tuple[FloatArray, FloatArray, 
     least = len(columns) * np.finfo(float).eps * np.linalg.norm(factor, axis=0)
     if np.all(np.abs(np.diag(factor)) > least):
         solution = scipy.linalg.solve_triangular(factor, R[:p, p:])
-    else:
+    else:  # they are dependent
         gain, basis, _ = influence(regressors)
         solution = gain @ target
     return solution, target - regressors @ solution, basis
 
 
 def influence(sensitivity: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """How parameters follow noise in n rows, from how the rows follow the parameters, (n, p).
+    """Of noise in n rows on parameters, from the rows' sensitivity to them, (n, p).
 
     Change of each parameter per noise (p, n), the pseudo-inverse; orthonormal combinations of the
     rows (n, rank) that move any; whether the data tell a parameter at all (p,).
@@ -121,16 +138,15 @@ def influence(sensitivity: FloatArray) -> tuple[FloatArray, FloatArray, BoolArra
 class EquationFit:
     """One equation at a given C(q), its other coefficients by least squares.
 
-    columns: (n, p + 1), X and y; position: (n,), instants; c: (nc,), C's coefficients after the
-    leading 1. theta: (p,); residual: (n,), S r; errors: (n,), the likeliest e; log_det: of
-    I + K K'; iterations, converged: of the search that ended here.
+    c: (nc,), C's coefficients after the leading 1; theta: (p,); residual: (n,), S r; errors:
+    (n,), the likeliest e; log_det: of I + K K'; iterations, converged: of the search.
     """
 
     iterations = 0
     converged = True
 
     def __init__(self, columns: FloatArray, position: IntArray, c: FloatArray) -> None:
-        self.columns, self.position, self.c = columns, position, c
+        self.position, self.c = position, c
         n, nc = len(columns), len(c)
         self._bands = np.zeros((nc + 1, n), order="F")
         self._bands[0] = 1.0
@@ -187,19 +203,19 @@ class EquationFit:
 
 
 def fit_equation(
-    white: EquationFit, starts: Sequence[FloatArray], max_iterations: int
+    equation: Equation, nc: int, starts: Sequence[FloatArray], limit: int
 ) -> EquationFit:
-    """Maximise the Gaussian likelihood of an equation: white e of least variance.
+    """Maximise the Gaussian likelihood of an equation in so many iterations at most.
 
-    white: the fit for C = 1; starts: coefficients of C to try beside it.
+    starts: coefficients of C to try beside C = 1.
     """
-    n, nc, columns, position = len(white.errors), len(white.c), white.columns, white.position
-    if nc == 0 or white.loss <= (_ROUNDING * np.linalg.norm(columns[:, -1])) ** 2:
-        return white
-    fits = [EquationFit(columns, position, _inside(start, mirrored=True)) for start in starts]
-    fit = min([white, *fits], key=lambda fit: fit.loss)
+    n, fit = len(equation[0]), EquationFit(*equation, np.zeros(nc))
+    if nc == 0 or fit.loss <= (_ROUNDING * np.linalg.norm(equation[0][:, -1])) ** 2:
+        return fit
+    fits = [EquationFit(*equation, _inside(start, mirrored=True)) for start in starts]
+    fit = min([fit, *fits], key=lambda fit: fit.loss)
     learnt, damping = np.zeros((nc, nc)), 1e-3
-    for iteration in range(1, max_iterations + 1):
+    for iteration in range(1, limit + 1):
         downhill, curvature = fit.descent
         # What the undamped step promises; the loss rises by 1/n of itself one standard error off.
         promise = 0.5 * float(downhill @ np.linalg.lstsq(curvature, downhill)[0])
@@ -210,8 +226,12 @@ def fit_equation(
             if damping > _MOST_DAMPING:
                 # On the rim of the stable region no step helps: that is the minimum there.
                 return fit
-            step = _step(downhill, curvature, learnt, damping)
-            trial = EquationFit(columns, position, _inside(fit.c + step))
+            scale = np.diag(curvature) + 1e-12 * curvature.trace()
+            damped = curvature + damping * np.diag(scale)
+            # Only downhill: where what was learnt spoils that, it is left out.
+            convex = np.linalg.eigvalsh(damped + learnt)[0] > 0.0
+            step = np.linalg.solve(damped + learnt if convex else damped, downhill)
+            trial = EquationFit(*equation, _inside(fit.c + step))
             damping *= 10.0
         damping = max(damping / 100.0, 1e-9)
         trial.iterations = iteration
@@ -221,16 +241,6 @@ def fit_equation(
         fit = trial
     fit.converged = False
     return fit
-
-
-def _step(
-    downhill: FloatArray, curvature: FloatArray, learnt: FloatArray, damping: float
-) -> FloatArray:
-    scale = np.diag(curvature) + 1e-12 * curvature.trace()
-    damped = curvature + damping * np.diag(scale)
-    # Only downhill: where what was learnt spoils that, it is left out.
-    convex = np.linalg.eigvalsh(damped + learnt)[0] > 0.0
-    return np.linalg.solve(damped + learnt if convex else damped, downhill)
 
 
 def _secant(learnt: FloatArray, fit: EquationFit, trial: EquationFit) -> FloatArray:
@@ -246,66 +256,33 @@ def _secant(learnt: FloatArray, fit: EquationFit, trial: EquationFit) -> FloatAr
     return learnt + cross + cross.T - (miss @ step) * np.outer(change, change) / along**2
 
 
-def fit_equations(
-    stack: Stack,
-    layout: Layout,
-    lag: int,
-    max_iterations: int,
-    A: FloatArray | None = None,
-    previous: Sequence[EquationFit] = (),
-) -> list[EquationFit]:
-    """Fits of all outputs' equations; for a given A, of B, offset and C, from previous fits on.
+def first_guesses(
+    stack: Stack, layout: Layout, equations: Sequence[Equation]
+) -> list[list[FloatArray]]:
+    """Of each output's C, none where data are too few: Hannan & Rissanen, Biometrika 69 (1982).
 
-    lag: rows left out at the start of each record, if more than have no complete past. Raises
-    ModelError when an output has too few rows for its coefficients.
-    """
-    target, free, fits, lag = stack.outputs, layout.free.copy(), [], max(lag, layout.lag)
-    noise = np.full_like(target, np.nan) if previous else _visible_noise(stack, layout)
-    if A is not None:
-        free[:, : len(previous)] = False
-        # The last row of the stack is lost, and so is that before the first.
-        past = np.roll(target, 1, axis=0)
-        target = target + filtered(A[1:], past, np.full_like(A[:, 0], np.nan))
-    for row, nc in enumerate(layout.nc):
-        columns, position = stack.equations(free[row, :-1], target[:, [row]], lag)
-        if len(columns) <= free[row].sum():
-            raise ModelError(
-                f"output {row} has {len(columns)} rows with a complete past for {free[row].sum()} "
-                "coefficients: lower na, nb or nc, or give longer records with fewer lost samples"
-            )
-        starts = [fit.c for fit in previous[row : row + 1]]
-        starts += _first_guesses(columns, noise[position[:, None] - np.arange(nc + 1), row])
-        white = EquationFit(columns, position, np.zeros(nc))
-        fits.append(fit_equation(white, starts, max_iterations))
-    return fits
-
-
-def _visible_noise(stack: Stack, layout: Layout) -> FloatArray:
-    """Residuals of a long ARX model of all outputs, (n, q) over the stack; NaN where unknown.
-
-    The past of the noise that it makes visible then counts as more measured signals: the method
-    of Hannan & Rissanen, Biometrika 69 (1982) 81-94.
+    A long ARX model makes the noise visible, whose past then counts as more measured signals.
     """
     (q, m), n, nc = layout.nb.shape, int(np.sum(stack.age >= 0)), int(layout.nc.max())
-    noise = np.full_like(stack.outputs, np.nan)
     # The noise's past must fit into the ARX order, and the ARX model into the data.
     length = min(max(layout.lag + nc, round(3.0 * np.log(max(n, 2)))), n // (4 * (q + m)))
-    if nc == 0 or length < nc:
-        return noise
-    nk = np.minimum(layout.nk, length)
+    if nc == 0 or length < 1:
+        return [[]] * q
+    nk, guesses, noise = np.minimum(layout.nk, length), [], np.full_like(stack.outputs, np.nan)
     long = Layout(q, m, na=length, nb=length + 1 - nk, nc=0, nk=nk, offset=layout.offset)
-    columns, position = stack.equations(long.free[0, :-1], stack.outputs, long.lag)
+    columns, position = stack.rows(long.free[0, :-1], stack.outputs, long.lag)
     p = columns.shape[1] - q
     if len(position) >= 2 * p:
         noise[position] = least_squares(columns, p)[1]
-    return noise
-
-
-def _first_guesses(columns: FloatArray, noise: FloatArray) -> list[FloatArray]:
-    """Start of C (nc,) from the visible noise of each row and its past (n, nc + 1), or none."""
-    seen, p = np.isfinite(noise[:, 0]), columns.shape[1] + noise.shape[1] - 2
-    long = np.column_stack((columns[:, :-1], np.nan_to_num(noise[:, 1:]), columns[:, -1]))[seen]
-    return [least_squares(long, p)[0][columns.shape[1] - 1 :, 0]] if len(long) > p else []
+    for nc, e, (columns, position) in zip(layout.nc, noise.T, equations, strict=True):
+        seen, p, past = np.isfinite(e[position]), columns.shape[1] - 1 + nc, np.zeros_like(e)
+        rows = position[seen]
+        past[rows] = e[rows]
+        past = past[np.maximum(rows[:, None] - np.arange(1, nc + 1), -1)]
+        signals = np.column_stack((columns[seen, :-1], past, columns[seen, -1]))
+        enough = nc and len(rows) > p
+        guesses.append([least_squares(signals, p)[0][p - nc :, 0]] if enough else [])
+    return guesses
 
 
 def _earlier(before: FloatArray, values: FloatArray) -> FloatArray:
@@ -315,10 +292,9 @@ def _earlier(before: FloatArray, values: FloatArray) -> FloatArray:
 
 
 def _inside(c: FloatArray, mirrored: bool = False) -> FloatArray:
-    """C(q) with roots beyond ``_NOISE_RADIUS`` moved back to it along their direction.
+    """C(q) with roots beyond ``_NOISE_RADIUS`` moved back to it, as a stable predictor needs.
 
-    mirrored: roots outside the unit circle become their mirror images, which leaves the spectrum
-    of the noise as it is. The predictor is stable only with C's roots inside.
+    mirrored: those outside the unit circle become their mirror images; the spectrum stays.
     """
     roots = np.roots(np.concatenate(([1.0], c)))
     size = np.maximum(np.abs(roots), np.finfo(float).tiny)

@@ -6,8 +6,7 @@ import itertools
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from sklearn.base import clone
@@ -22,9 +21,12 @@ from sysid.problem.records import given_datasets
 from sysid.threads import one_thread
 
 Criterion = Literal["fit", "aic", "bic"]
+Orders = dict[str, Order]
 
 # Orders that ``tuned`` tries.
 TRIED: dict[str, Any] = {"na": range(1, 7), "nb": range(1, 5), "nc": range(4), "nk": (0, 1)}
+
+_OF_MODEL = ("aic", "bic", "radius", "reflected", "converged")
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,7 @@ class OrderCandidate:
     the largest pole; reflected: poles were moved inside; problem: why it failed, else empty.
     """
 
-    orders: dict[str, Order]
+    orders: Orders
     n_parameters: int
     fit: FloatArray
     rmse: FloatArray
@@ -89,9 +91,8 @@ def select_orders(
 
     estimator: ARX or ARMAX with the settings that stay; orders not given are its own. criterion:
     ``fit``, the mean free-run fit % over outputs and validation records, as of ``score``, or
-    ``bic`` or ``aic`` of the training records. Fit % is relative to each output's own spread, so
-    that outputs of any scale count alike. All candidates are trained and judged on the rows that
-    the longest of them has a past for. Unstable ones are listed last and never chosen;
+    ``bic`` or ``aic`` of the training records. All candidates are trained and judged on the rows
+    that the longest of them has a past for. Unstable ones are listed last and never chosen;
     estimators with stable=True mend theirs. threads: the result does not depend on it. Raises
     ModelError without a validation record for ``fit``, or when no candidate is stable. Ljung,
     System Identification, section 16.4.
@@ -99,9 +100,8 @@ def select_orders(
     >>> import numpy as np
     >>> from scipy.signal import lfilter
     >>> from sysid import ARX, Dataset
-    >>> u = np.sign(np.random.default_rng(0).normal(size=200))
-    >>> e = 0.1 * np.random.default_rng(1).normal(size=200)
-    >>> record = Dataset(u, lfilter([0.0, 0.2], [1.0, -1.5, 0.7], u) + e, dt=0.01)
+    >>> u, e = np.random.default_rng(0).normal(size=(2, 200))
+    >>> record = Dataset(u, lfilter([0.0, 0.2], [1.0, -1.5, 0.7], u + 0.1 * e), dt=0.01)
     >>> select_orders(ARX(), record, criterion="bic", na=range(1, 4), nb=(1,)).best.orders
     {'na': 2, 'nb': 1, 'nk': 1}
     """
@@ -118,8 +118,9 @@ def select_orders(
         raise ModelError(f"threads is {threads}; it must be 1 or more")
     grid = _grid(estimator, {"na": na, "nb": nb, "nc": nc, "nk": nk})
     lag = max(clone(estimator).set_params(**orders)._layout(train[0]).lag for orders in grid)
+    judge = _Judge(estimator, train, test, lag)
     with one_thread(), ThreadPoolExecutor(threads) as pool:
-        candidates = list(pool.map(partial(_candidate, estimator, train, test, lag), grid))
+        candidates = list(pool.map(judge.candidate, grid))
         # Among equals the one with fewer coefficients.
         candidates.sort(key=lambda candidate: (candidate.cost(criterion), candidate.n_parameters))
         if not np.isfinite(candidates[0].cost(criterion)):
@@ -128,8 +129,7 @@ def select_orders(
             if problems:
                 problem = f"can be used; the first: {problems[0]}"
             raise ModelError(f"none of the {len(candidates)} candidates {problem}")
-        model = _fitted(estimator, train, lag, candidates[0].orders)
-    return Selection(criterion, tuple(candidates), model)
+        return Selection(criterion, tuple(candidates), judge.fitted(candidates[0].orders))
 
 
 def tuned(
@@ -145,72 +145,68 @@ def tuned(
     orders: as of ``select_orders``; default na to 6, nb to 4, nc to 3, nk 0 and 1. ``model`` of
     the result is fitted to all of the records. Raises ModelError as ``select_orders``.
     """
-    data = _datasets("records", records)
-    cuts = [round(record.n_samples * (1.0 - held_back)) for record in data]
-    first = [record.part(0, cut, record.name) for record, cut in zip(data, cuts, strict=True)]
-    last = [r.part(cut, r.n_samples, r.name) for r, cut in zip(data, cuts, strict=True)]
-    settings = estimator.get_params()
-    grid: dict[str, Any] = {name: values for name, values in TRIED.items() if name in settings}
+    first, last = [], []
+    for record in (data := _datasets("records", records)):
+        cut = round(record.n_samples * (1.0 - held_back))
+        first.append(record.part(0, cut, record.name))
+        last.append(record.part(cut, record.n_samples, record.name))
+    grid = {name: TRIED[name] for name in TRIED.keys() & estimator.get_params()}
     selection = select_orders(estimator, first, last, **grid | orders)
     model = clone(estimator).set_params(**selection.best.orders).fit(data)
     return replace(selection, model=model)
 
 
-def _fitted(
-    estimator: PolynomialModel, train: list[Dataset], lag: int, orders: dict[str, Order]
-) -> PolynomialModel:
-    model: PolynomialModel = clone(estimator).set_params(**orders)
-    model._fit_rows(lag, train)
-    return model
+class _Judge(NamedTuple):
+    """Fits and scores combinations of orders on the rows from ``lag`` on."""
+
+    estimator: PolynomialModel
+    training: list[Dataset]
+    validation: list[Dataset]
+    lag: int
+
+    def fitted(self, orders: Orders) -> PolynomialModel:
+        model: PolynomialModel = clone(self.estimator).set_params(**orders)
+        model._fit_rows(self.lag, self.training)
+        return model
+
+    def candidate(self, orders: Orders) -> OrderCandidate:
+        q = self.training[0].outputs.shape[1]
+        try:
+            model = self.fitted(orders)
+        except (ModelError, np.linalg.LinAlgError) as error:
+            nothing = np.full(q, np.nan)
+            return OrderCandidate(orders, 0, nothing, nothing, problem=str(error))
+        measured = [record.outputs[self.lag :] for record in self.validation]
+        simulated = [model.predict(record)[self.lag :] for record in self.validation]
+        runs = [free_run_fit(*run) for run in zip(measured, simulated, strict=True)]
+        fits, errors = np.reshape(runs, (-1, 2, q)).swapaxes(0, 1)
+        return OrderCandidate(
+            orders,
+            len(model.theta_),
+            mean_known(fits, axis=0),
+            mean_known(errors, axis=0),
+            float(mean_known(fits)) / 100.0,
+            **{name: getattr(model, f"{name}_") for name in _OF_MODEL},
+        )
 
 
-def _candidate(
-    estimator: PolynomialModel,
-    train: list[Dataset],
-    test: list[Dataset],
-    lag: int,
-    orders: dict[str, Order],
-) -> OrderCandidate:
-    """Fit, simulate the validation records, score; all on the rows from ``lag`` on."""
-    q = train[0].outputs.shape[1]
-    try:
-        model = _fitted(estimator, train, lag, orders)
-    except (ModelError, np.linalg.LinAlgError) as error:
-        nothing = np.full(q, np.nan)
-        return OrderCandidate(orders, 0, nothing, nothing, problem=str(error))
-    runs = [(record.outputs[lag:], model.predict(record)[lag:]) for record in test]
-    fits, errors = np.array([free_run_fit(*run) for run in runs]).reshape(-1, 2, q).swapaxes(0, 1)
-    attributes = ("aic", "bic", "radius", "reflected", "converged")
-    return OrderCandidate(
-        orders,
-        len(model.theta_),
-        fit=mean_known(fits, axis=0),
-        rmse=mean_known(errors, axis=0),
-        score=float(mean_known(fits)) / 100.0,
-        **{name: getattr(model, f"{name}_") for name in attributes},
-    )
-
-
-def _datasets(what: str, records: Any) -> list[Dataset]:
+def _datasets(name: str, records: Any) -> list[Dataset]:
     if records is None:
         return []
     data = given_datasets(records)
     if data is None:
-        raise ModelError(f"{what} must be a Dataset or several: Dataset(inputs, outputs, dt)")
+        raise ModelError(f"{name} must be a Dataset or several: Dataset(inputs, outputs, dt)")
     check_alike(data)
     return data
 
 
-def _grid(
-    estimator: PolynomialModel, orders: dict[str, Iterable[Order] | None]
-) -> list[dict[str, Order]]:
-    settings = estimator.get_params()
-    grid: dict[str, list[Order]] = {}
+def _grid(estimator: PolynomialModel, orders: dict[str, Iterable[Order] | None]) -> list[Orders]:
+    settings, grid = estimator.get_params(), {}
     for name, values in orders.items():
         if name in settings:
             grid[name] = [settings[name]] if values is None else list(values)
+            if not grid[name]:
+                raise ModelError(f"{name} is empty: give at least one order to try")
         elif values is not None:
             raise ModelError(f"{type(estimator).__name__} has no {name}; leave it out")
-        if not grid.get(name, [0]):
-            raise ModelError(f"{name} is empty: give at least one order to try")
     return [dict(zip(grid, values, strict=True)) for values in itertools.product(*grid.values())]

@@ -244,8 +244,7 @@ def test_derivatives_of_the_sum_of_squares(c):
     runs = np.split(np.arange(45), [30, 42, 43])
     rng = np.random.default_rng(0)
     columns = rng.normal(size=(45, 3))
-    white = EquationFit(columns, position, np.zeros(len(c)))
-    found = fit_equation(white, [c], max_iterations=1)
+    found = fit_equation((columns, position), len(c), [c], limit=1)
 
     def squares(theta):
         noise = columns[:, 2] - columns[:, :2] @ theta[:2]
