@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
-from sysid.engine.trace import Line, Tape
+from sysid.engine.tape import Line, Tape
 
 K = TypeVar("K")
 
