@@ -93,6 +93,11 @@ class Writer:
         return "\n".join([*text, f"    return {listed(values)}"])
 
 
+def block(head: str, *parts: Iterable[str]) -> list[str]:
+    """Lines that begin a block, and those within it."""
+    return [head, *(f"    {line}" for part in parts for line in part)]
+
+
 def listed(items: Iterable[str]) -> str:
     """Text of a tuple."""
     texts = list(items)
