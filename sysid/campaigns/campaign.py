@@ -20,7 +20,7 @@ from sysid.campaigns.parcels import pack, unpack
 from sysid.problem.data import Dataset
 from sysid.problem.metrics import Metrics, evaluate
 from sysid.problem.model import ModelError, ProcessModel
-from sysid.engine.simulation import available_cores
+from sysid.threads import available_cores
 
 if TYPE_CHECKING:
     import pandas as pd
