@@ -19,8 +19,8 @@ from daq.provenance import software_versions
 from daq.run.runner import run_experiment
 from sim_rig.backend import SimulatedDevice
 from sysid import Dataset
-from sysid.engine.simulation import available_cores
 from sysid.problem.model import ProcessModel
+from sysid.threads import available_cores
 
 
 def arguments(description: str) -> argparse.ArgumentParser:

@@ -95,9 +95,13 @@ def fixed_steps(simulator: BatchSimulator, record: Dataset, n_steps: int) -> flo
     """Seconds to the error sums of one chromosome, as one of a block, at so many steps."""
     parameters = np.repeat(simulator.model.nominal[None], LANES, axis=0)
     lanes, nothing = np.arange(LANES), np.empty((0, 0, 0))
-    runner = simulator._runner(record, np.ones(len(simulator.model.outputs)))
-    runner._run(parameters, lanes, n_steps, nothing)
-    return best(lambda: runner._run(parameters, lanes, n_steps, nothing)) / LANES
+    on_record = simulator._on(record, np.ones(len(simulator.model.outputs)))
+
+    def run() -> None:
+        on_record.block(parameters, None, lanes, n_steps, record.n_samples, nothing)
+
+    run()
+    return best(run) / LANES
 
 
 def _c_vectors(record: Dataset, model: ProcessModel) -> tuple[float, None]:

@@ -23,6 +23,13 @@ def one_thread() -> Iterator[None]:
         yield
 
 
+def available_cores() -> int:
+    """Cores this process may run on."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 class Workers:
     """So many threads, the calling one included, that wait for tasks from call to call."""
 

@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sysid.campaigns.parcels import pack, unpack
-from sysid.engine.simulation import available_cores
 from sysid.problem.data import Dataset
 from sysid.problem.metrics import Metrics, evaluate, mean_known
 from sysid.problem.model import ModelError, ProcessModel
+from sysid.threads import available_cores
 
 if TYPE_CHECKING:
     import pandas as pd

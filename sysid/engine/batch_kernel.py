@@ -12,18 +12,19 @@ import re
 from collections.abc import Sequence
 
 from sysid.engine.lanes import LANES
-from sysid.engine.program import listed
+from sysid.engine.program import block, listed
 from sysid.engine.scheme import (
     Place,
     Shape,
     call,
+    effects,
     error_of_n,
     fill,
     margins,
     missed,
     numbered,
-    product,
     slope,
+    stage_inputs,
     step,
     step_sizes,
 )
@@ -76,42 +77,37 @@ def _constants(s: Shape) -> str:
 
 def _simulate(s: Shape, paired: bool) -> str:
     q, rows = s.n_outputs, _Rows(s)
-    lines = [
-        "def simulate(X, rows, tables, u, y, w, start, p, dt, n_steps, sums, record):",
-        "    wide_vectors()",
-        "    n_samples = u.shape[0]",
-        "    h = dt / n_steps",
-        *[f"    {line}" for line in step_sizes()],
-        *[f"    {line}" for line in _begin(s)],
-        "    for k in range(n_samples):",
-        *[f"        v{j} = u[k, {j}]" for j in range(s.n_inputs)],
-        *[f"        y{j} = y[k, {j}]" for j in range(q)],
-        *[f"        w{j} = w[k, {j}]" for j in range(q)],
-        f"        for l in range({LANES}):",
-        *[f"            {line}" for line in _residuals(s)],
-        "        if record.shape[0] > 0:",
-        f"            for l in range({LANES}):",
-        *[f"                {line}" for line in _outputs(s)],
-        *[f"                record[k, {j}, l] = (o{j} - y{j}) * w{j}" for j in range(q)],
-        "        if k == n_samples - 1:",
-        "            break",
-        # A block in which every chromosome has blown up has nothing more to say.
-        "        if k % 64 == 63:",
-        "            alive = False",
-        f"            for l in range({LANES}):",
-        "                total = " + " + ".join(_at(rows.sums + j) for j in range(q)),
-        "                alive = alive or math.isfinite(total)",
-        "            if not alive:",
-        "                break",
-        *[f"        {line}" for line in _input_slopes(s)],
-        "        for step in range(n_steps):",
-        *[f"            {line}" for line in _stage_inputs(s)],
-        *[f"            {line}" for line in _all_lanes(s, paired)],
-        f"    for j in range({2 * q}):",
-        f"        for l in range({LANES}):",
-        f"            sums[j, l] = X[({rows.sums} + j) * {LANES} + l]",
+    each_lane = f"for l in range({LANES}):"
+    errors = [f"record[k, {j}, l] = (o{j} - y{j}) * w{j}" for j in range(q)]
+    total = " + ".join(_at(rows.sums + j) for j in range(q))
+    sample = [
+        *[f"v{j} = u[k, {j}]" for j in range(s.n_inputs)],
+        *[f"{name}{j} = {name}[k, {j}]" for name in "yw" for j in range(q)],
+        *block(each_lane, _residuals(s)),
+        *block("if record.shape[0] > 0:", block(each_lane, _outputs(s), errors)),
+        *block("if k == n_samples - 1:", ["break"]),
+        # A block in which all chromosomes have blown up has nothing more to say.
+        *block(
+            "if k % 64 == 63:",
+            ["alive = False"],
+            block(each_lane, [f"total = {total}", "alive = alive or math.isfinite(total)"]),
+            block("if not alive:", ["break"]),
+        ),
+        *_input_slopes(s),
+        *block("for step in range(n_steps):", _stage_inputs(s), _all_lanes(s, paired)),
     ]
-    return "\n".join(lines)
+    sums = f"sums[j, l] = X[({rows.sums} + j) * {LANES} + l]"
+    body = [
+        "wide_vectors()",
+        "n_samples = u.shape[0]",
+        "h = dt / n_steps",
+        *step_sizes(),
+        *_begin(s),
+        *block("for k in range(n_samples):", sample),
+        *block(f"for j in range({2 * q}):", block(each_lane, [sums])),
+    ]
+    head = "def simulate(X, rows, tables, u, y, w, start, p, dt, n_steps, sums, record):"
+    return "\n".join(block(head, body))
 
 
 def _begin(s: Shape) -> list[str]:
@@ -119,14 +115,16 @@ def _begin(s: Shape) -> list[str]:
     rows = _Rows(s)
     closure = s.structure.closure(s.n_states)
     p = listed(f"p[{i}, l]" for i in range(s.n_parameters))
+    lane = [
+        f"c = constants({p})",
+        *[f"{_at(rows.constants + i)} = c[{i}]" for i in range(s.n_constants)],
+        *[f"{_at(i)} = start[{i}, l]" for i in range(s.n_states)],
+        *[f"{_at(rows.sums + j)} = 0.0" for j in range(2 * s.n_outputs)],
+        *fill(s),
+    ]
     lines = [
         f"A = np.zeros(({len(closure)}, {LANES}))",
-        f"for l in range({LANES}):",
-        f"    c = constants({p})",
-        *[f"    {_at(rows.constants + i)} = c[{i}]" for i in range(s.n_constants)],
-        *[f"    {_at(i)} = start[{i}, l]" for i in range(s.n_states)],
-        *[f"    {_at(rows.sums + j)} = 0.0" for j in range(2 * s.n_outputs)],
-        *[f"    {line}" for line in fill(s)],
+        *block(f"for l in range({LANES}):", lane),
     ]
     if s.n_entries:
         lines.append(f"scheme_matrices(A, np.full({LANES}, h), *tables, rows)")
@@ -162,8 +160,8 @@ def _all_lanes(s: Shape, paired: bool) -> list[str]:
     """One step of all lanes."""
     lines = _lane_step(s)
     if paired:
-        return [f"for l in range({LANES // 2}):", *[f"    {line}" for line in _paired(lines)]]
-    return [f"for l in range({LANES}):", *[f"    {line}" for line in lines]]
+        return block(f"for l in range({LANES // 2}):", _paired(lines))
+    return block(f"for l in range({LANES}):", lines)
 
 
 def _paired(lines: list[str]) -> list[str]:
@@ -189,29 +187,25 @@ def _paired(lines: list[str]) -> list[str]:
 
 def _estimate(s: Shape, place: Place) -> list[str]:
     """Add the step's error estimate, as it shows in the outputs, to the lane's sums."""
-    lines = error_of_n(s) + _shown(s, place, "t", s.structure.driven)
+    lines = error_of_n(s) + _shown(s, effects(s, "t", s.structure.driven, place))
     if s.structure.guards:
         lines += slope(s, "n", "uc", "mn", "kn")
         lines += [*margins(s, "x", "ua", "q"), *margins(s, "n", "uc", "r"), *missed(s)]
-        lines += _shown(s, place, "f", s.guarded)
+        lines += _shown(s, effects(s, "f", s.guarded, place))
     return lines
 
 
-def _shown(s: Shape, place: Place, vector: str, known: Sequence[int]) -> list[str]:
-    """Add to the lane's sums what an error in N does to the outputs."""
-    terms = [
-        product(s, "G", i, vector, place, known=known).removeprefix(" + ")
-        for i in range(s.n_states)
-    ]
+def _shown(s: Shape, errors: Sequence[str]) -> list[str]:
+    """Add to the lane's sums what errors of the states do to the outputs."""
     lines: list[str] = []
     shown: list[str] = []
     if s.output_states is not None:
-        shown = [terms[i] for i in s.output_states]
-    elif any(terms):
+        shown = [errors[i] for i in s.output_states]
+    elif any(errors):
         u, n = numbered("uc", s.n_inputs), numbered("n", s.n_states)
-        moved = [f"n{i} - ({term})" if term else f"n{i}" for i, term in enumerate(terms)]
+        exact = [f"n{i} - ({error})" if error else f"n{i}" for i, error in enumerate(errors)]
         lines += call("observe", "o", s.n_outputs, n, u)
-        lines += call("observe", "p", s.n_outputs, moved, u)
+        lines += call("observe", "p", s.n_outputs, exact, u)
         shown = [f"o{j} - p{j}" for j in range(s.n_outputs)]
     for j, error in enumerate(shown):
         if error:
@@ -232,13 +226,7 @@ def _input_slopes(s: Shape) -> list[str]:
 
 def _stage_inputs(s: Shape) -> list[str]:
     """Inputs at the start (a), middle (b) and end (c) of a step."""
-    lines = []
-    for j, foh in enumerate(s.foh):
-        if foh:
-            lines += [f"ua{j} = v{j} + i{j} * step", f"ub{j} = ua{j} + 0.5 * i{j}"]
-            lines.append(f"uc{j} = ua{j} + i{j}")
-        else:
-            lines += [f"u{stage}{j} = v{j}" for stage in "abc"]
+    lines = stage_inputs(s, "step")
     if any(s.spline):
         lines += [f"r{stage} = (step + {part}) / n_steps" for stage, part in _STAGES.items()]
     for j in (j for j, spline in enumerate(s.spline) if spline):
@@ -263,27 +251,31 @@ def _spectrum(s: Shape) -> str:
     block of driven rows and columns.
     """
     rows = s.structure.driven
-    head = ["def spectrum(u, x, p, rate):"]
+    head = "def spectrum(u, x, p, rate):"
     if not rows:
-        return "\n".join([*head, "    pass"])
+        return "\n".join(block(head, ["pass"]))
     finite = " and ".join(f"math.isfinite(X[{i}])" for i in range(s.n_states))
-    head += [
-        # Not a literal: the compiler would unroll the matrix products for seconds.
-        f"    n = min(x.shape[1], {len(rows)})",
-        "    J = np.empty((n, n))",
-        "    T = np.empty((n, n))",
-        f"    X = np.empty({s.n_states})",
-        f"    N = np.empty({len(rows)})",
-        "    for l in range(rate.shape[0]):",
-        f"        c = constants({listed(f'p[{i}, l]' for i in range(s.n_parameters))})",
-        *[f"        rate[l] = max(rate[l], abs({text}))" for text in _hidden_limits(s)],
-        "        for k in range(u.shape[0]):",
-        *[f"            X[{i}] = x[k, {i}, l]" for i in range(s.n_states)],
-        f"            if not ({finite}):",
-        "                continue",
-        *[f"            {line}" for line in [*_jacobian(s), *_radius()]],
+    at_sample = [
+        *[f"X[{i}] = x[k, {i}, l]" for i in range(s.n_states)],
+        *block(f"if not ({finite}):", ["continue"]),
+        *_jacobian(s),
+        *_radius(),
     ]
-    return "\n".join(head)
+    lane = [
+        f"c = constants({listed(f'p[{i}, l]' for i in range(s.n_parameters))})",
+        *[f"rate[l] = max(rate[l], abs({text}))" for text in _hidden_limits(s)],
+        *block("for k in range(u.shape[0]):", at_sample),
+    ]
+    body = [
+        # Not a literal: the compiler would unroll the matrix products for seconds.
+        f"n = min(x.shape[1], {len(rows)})",
+        "J = np.empty((n, n))",
+        "T = np.empty((n, n))",
+        f"X = np.empty({s.n_states})",
+        f"N = np.empty({len(rows)})",
+        *block("for l in range(rate.shape[0]):", lane),
+    ]
+    return "\n".join(block(head, body))
 
 
 def _hidden_limits(s: Shape) -> list[str]:
@@ -310,57 +302,56 @@ def _jacobian(s: Shape) -> list[str]:
     rows = s.structure.driven
     x = [f"X[{i}]" for i in range(s.n_states)]
     u = [f"u[k, {j}]" for j in range(s.n_inputs)]
+    beside = [
+        *[f"q = {row} if j == {j} else q" for j, row in enumerate(rows)],
+        "kept = X[q]",
+        "d = 1e-7 * max(abs(kept), 1e-2)",
+        "X[q] = kept + d",
+    ]
+    difference = [f"J[{i}, j] = (a{row} - N[{i}]) / d" for i, row in enumerate(rows)]
     return [
         *[f"X[{i}] += 1e-5 * max(abs(X[{i}]), 1e-2)" for i in rows],
         # Round -1 evaluates at the point itself; a single call site keeps compilation short.
-        f"for j in range(-1, {len(rows)}):",
-        "    d = 0.0",
-        "    q = 0",
-        "    kept = X[0]",
-        "    if j >= 0:",
-        *[f"        q = {row} if j == {j} else q" for j, row in enumerate(rows)],
-        "        kept = X[q]",
-        "        d = 1e-7 * max(abs(kept), 1e-2)",
-        "        X[q] = kept + d",
-        *[f"    {line}" for line in call("remainder", "a", s.n_states, x, u)],
-        "    if j < 0:",
-        *[f"        N[{i}] = a{row}" for i, row in enumerate(rows)],
-        "    else:",
-        "        X[q] = kept",
-        *[f"        J[{i}, j] = (a{row} - N[{i}]) / d" for i, row in enumerate(rows)],
+        *block(
+            f"for j in range(-1, {len(rows)}):",
+            ["d = 0.0", "q = 0", "kept = X[0]"],
+            block("if j >= 0:", beside),
+            call("remainder", "a", s.n_states, x, u),
+            block("if j < 0:", [f"N[{i}] = a{row}" for i, row in enumerate(rows)]),
+            block("else:", ["X[q] = kept"], difference),
+        ),
     ]
 
 
 def _radius() -> list[str]:
     """Raise lane l's rate to a bound on the spectral radius of J, by repeated squaring."""
-    return [
-        "exponent = 0.0",
-        f"for squaring in range({_SQUARINGS + 1}):",
-        "    norm = 0.0",
-        "    for i in range(n):",
-        "        for j in range(n):",
-        "            norm += J[i, j] * J[i, j]",
-        "    norm = math.sqrt(norm)",
-        "    if norm == 0.0:",
-        "        exponent = -math.inf",
-        "        break",
-        "    if not math.isfinite(norm):",
-        "        exponent = math.inf",
-        "        break",
-        "    exponent += math.log(norm) / 2.0 ** squaring",
-        f"    if squaring == {_SQUARINGS}:",
-        "        break",
-        "    for i in range(n):",
-        "        for j in range(n):",
-        "            J[i, j] /= norm",
-        "    for i in range(n):",
-        "        for j in range(n):",
-        "            t = 0.0",
-        "            for q in range(n):",
-        "                t += J[i, q] * J[q, j]",
-        "            T[i, j] = t",
-        "    for i in range(n):",
-        "        for j in range(n):",
-        "            J[i, j] = T[i, j]",
-        "rate[l] = max(rate[l], math.exp(exponent))",
-    ]
+    return f"""\
+exponent = 0.0
+for squaring in range({_SQUARINGS + 1}):
+    norm = 0.0
+    for i in range(n):
+        for j in range(n):
+            norm += J[i, j] * J[i, j]
+    norm = math.sqrt(norm)
+    if norm == 0.0:
+        exponent = -math.inf
+        break
+    if not math.isfinite(norm):
+        exponent = math.inf
+        break
+    exponent += math.log(norm) / 2.0 ** squaring
+    if squaring == {_SQUARINGS}:
+        break
+    for i in range(n):
+        for j in range(n):
+            J[i, j] /= norm
+    for i in range(n):
+        for j in range(n):
+            t = 0.0
+            for q in range(n):
+                t += J[i, q] * J[q, j]
+            T[i, j] = t
+    for i in range(n):
+        for j in range(n):
+            J[i, j] = T[i, j]
+rate[l] = max(rate[l], math.exp(exponent))""".splitlines()

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
-from sysid.engine.trace import Line, Tape
+from sysid.engine.tape import Line, Tape
 
 K = TypeVar("K")
 
@@ -91,6 +91,11 @@ class Writer:
                 text.append(f"    {name} = {places.get(name) or f'{name[0]}[{name[1:]}]'}")
         text += [f"    {line.name} = {line.text}" for line in lines]
         return "\n".join([*text, f"    return {listed(values)}"])
+
+
+def block(head: str, *parts: Iterable[str]) -> list[str]:
+    """Lines that begin a block, and those within it."""
+    return [head, *(f"    {line}" for part in parts for line in part)]
 
 
 def listed(items: Iterable[str]) -> str:

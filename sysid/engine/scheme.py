@@ -143,6 +143,13 @@ def error_of_n(s: Shape) -> list[str]:
     return [f"t{i} = v_{i} - w_{i}" for i in s.structure.driven]
 
 
+def effects(s: Shape, vector: str, rows: Iterable[int], place: Place) -> list[str]:
+    """What an error ``vector`` in such rows of N does to each state, empty for nothing."""
+    return [
+        product(s, "G", i, vector, place, known=rows).removeprefix(" + ") for i in range(s.n_states)
+    ]
+
+
 def margins(s: Shape, x: str, u: str, target: str) -> list[str]:
     """How far each guarded number is above each of its limits."""
     if not s.n_margins:
@@ -177,6 +184,22 @@ def missed(s: Shape) -> list[str]:
             if row in guard.gains
         ]
         lines.append(f"f{row} = " + " + ".join(terms))
+    return lines
+
+
+def stage_inputs(s: Shape, begun: str, share: str = "") -> list[str]:
+    """Inputs at the start (a), middle (b) and end (c) of a step.
+
+    v are those of the sample, i what interpolated ones change by in a base step; begun: base
+    steps that have passed; share: factor, how much of a base step this one is.
+    """
+    lines = []
+    for j, foh in enumerate(s.foh):
+        if foh:
+            lines += [f"ua{j} = v{j} + i{j} * {begun}", f"ub{j} = ua{j} + 0.5 * {share}i{j}"]
+            lines.append(f"uc{j} = ua{j} + {share}i{j}")
+        else:
+            lines += [f"u{stage}{j} = v{j}" for stage in "abc"]
     return lines
 
 

@@ -14,7 +14,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from sysid.engine.program import Followed, Program, Writer
-from sysid.engine.trace import Clamp, Tape, Trace, traced
+from sysid.engine.split import Clamp, Split, Splitter
+from sysid.engine.tape import Tape
+from sysid.engine.trace import followed, operands, traces
 from sysid.problem.model import Function, ProcessModel
 
 Entry = tuple[int, int]
@@ -79,10 +81,11 @@ class Structure:
 
 def analyse(model: ProcessModel, *, exact: bool = True) -> Structure:
     """Take a model's equations apart; without ``exact`` all of them are left in N."""
-    tape = Tape()
-    rows = _followed(tape, model, model.derivative)
-    clamps = _clamps(tape, rows or ())
-    parts = [_split(row) if exact else ({}, row.total) for row in rows or ()]
+    splitter = Splitter()
+    tape = splitter.tape
+    rows = _splits(splitter, model, model.derivative)
+    clamps = _clamps(splitter, rows or ())
+    parts = [_parts(splitter, row) if exact else ({}, row.total) for row in rows or ()]
     linear = {(i, j): name for i, (piece, _) in enumerate(parts) for j, name in piece.items()}
     gains = {
         k: {i: row.kinks[k] for i, row in enumerate(rows or ()) if k in row.kinks} for k in clamps
@@ -92,7 +95,7 @@ def analyse(model: ProcessModel, *, exact: bool = True) -> Structure:
     }
     shown = frozenset(model.output_states or range(len(model.states)))
     if model.output is not None:
-        outputs = _followed(tape, model, model.output)
+        outputs = _splits(splitter, model, model.output)
         totals = None if outputs is None else [value.total for value in outputs]
         functions["observe"] = ("output", totals)
         if outputs is not None:
@@ -119,7 +122,7 @@ def _margins(tape: Tape, clamps: Iterable[Clamp]) -> list[str]:
 
 
 def _driven(
-    model: ProcessModel, rows: Sequence[Trace] | None, clamps: Mapping[int, Clamp]
+    model: ProcessModel, rows: Sequence[Split] | None, clamps: Mapping[int, Clamp]
 ) -> tuple[tuple[int, ...], bool]:
     """Rows of N that change within a sample, and whether any depends on a state."""
     if rows is None:
@@ -130,26 +133,28 @@ def _driven(
     return tuple(driven), any(bent)
 
 
-def _clamps(tape: Tape, rows: Sequence[Trace]) -> dict[int, Clamp]:
-    """Limits on straight pieces that the rows are sums of, by their place on the tape."""
-    found = sorted({k for row in rows for k in row.kinks})
-    return {k: tape.clamps[k] for k in found if tape.clamps[k].base.linear}
+def _clamps(splitter: Splitter, rows: Sequence[Split]) -> dict[int, Clamp]:
+    """Limits on straight pieces that the rows are sums of, by their place among all."""
+    places = sorted({k for row in rows for k in row.kinks})
+    return {k: splitter.clamps[k] for k in places if splitter.clamps[k].base.linear}
 
 
-def _followed(tape: Tape, model: ProcessModel, function: Function) -> tuple[Trace, ...] | None:
-    """A function's values on the tape; None where it cannot be followed."""
-    counts = len(model.states), len(model.inputs), len(model.parameters)
+def _splits(splitter: Splitter, model: ProcessModel, function: Function) -> list[Split] | None:
+    """A function's values, split; None where it cannot be followed."""
+    equations = Tape()
+    sides = zip("xup", (model.states, model.inputs, model.parameters), strict=True)
     try:
-        return traced(tape, function, *counts)
+        values = followed(function)(*(traces(equations, name, len(of)) for name, of in sides))
+        return splitter.split(equations, operands(values))
     except Exception:
         # Whatever it does that a trace cannot follow, the compiler may well be able to.
         return None
 
 
-def _split(row: Trace) -> tuple[Mapping[int, str], str]:
+def _parts(splitter: Splitter, row: Split) -> tuple[Mapping[int, str], str]:
     """Straight piece of a row, without the states it depends on in other ways, and the rest."""
     linear = {j: c for j, c in row.linear.items() if j not in row.nonlinear}
     if not linear:
         return {}, row.total
-    other = row.tape.straight({j: c for j, c in row.linear.items() if j in row.nonlinear})
-    return linear, row.tape.join("+", row.rest, other) or "0.0"
+    mixed = splitter.straight({j: c for j, c in row.linear.items() if j in row.nonlinear})
+    return linear, splitter.tape.join("+", row.rest, mixed) or "0.0"

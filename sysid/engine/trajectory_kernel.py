@@ -12,18 +12,19 @@ look the same at both its ends and in its middle, and run into limits in between
 from __future__ import annotations
 
 from sysid.engine.lanes import LANES
-from sysid.engine.program import listed
+from sysid.engine.program import block, listed
 from sysid.engine.scheme import (
     Place,
     Shape,
     call,
+    effects,
     error_of_n,
     fill,
     margins,
     missed,
     numbered,
-    product,
     slope,
+    stage_inputs,
     step,
     step_sizes,
 )
@@ -55,56 +56,55 @@ def _first_entry(s: Shape) -> int:
 def _levels(s: Shape) -> str:
     """Fill the work area, and A; each level is a lane while its matrices are made."""
     closure = s.structure.closure(s.n_states)
-    lines = [
-        "def levels(X, tables, p, scale, h, a):",
-        f"    c = constants({listed(f'p[{i}]' for i in range(s.n_parameters))})",
-        *[f"    X[{i}] = c[{i}]" for i in range(s.n_constants)],
-        f"    for i in range({s.n_states}):",
-        f"        X[{s.n_constants} + i] = 1.0 / scale[i]",
-        *[f"    a[{i}, {j}] = {text}" for (i, j), text in s.structure.coefficients.items()],
+    body = [
+        f"c = constants({listed(f'p[{i}]' for i in range(s.n_parameters))})",
+        *[f"X[{i}] = c[{i}]" for i in range(s.n_constants)],
+        *block(f"for i in range({s.n_states}):", [f"X[{s.n_constants} + i] = 1.0 / scale[i]"]),
+        *[f"a[{i}, {j}] = {text}" for (i, j), text in s.structure.coefficients.items()],
     ]
     if s.n_entries:
-        lines += [
-            f"    A = np.zeros(({len(closure)}, {LANES}))",
-            f"    H = np.zeros({LANES})",
-            f"    rows = np.empty(({s.n_entries}, {LANES}))",
-            f"    for l in range({LEVELS + 1}):",
-            "        H[l] = h * 0.5 ** l",
-            *[f"        {line}" for line in fill(s)],
-            "    scheme_matrices(A, H, *tables, rows)",
-            f"    for l in range({LEVELS + 1}):",
-            f"        for k in range({s.n_entries}):",
-            f"            X[{_first_entry(s)} + l * {s.n_entries} + k] = rows[k, l]",
+        each = f"for l in range({LEVELS + 1}):"
+        stored = f"X[{_first_entry(s)} + l * {s.n_entries} + k] = rows[k, l]"
+        body += [
+            f"A = np.zeros(({len(closure)}, {LANES}))",
+            f"H = np.zeros({LANES})",
+            f"rows = np.empty(({s.n_entries}, {LANES}))",
+            *block(each, ["H[l] = h * 0.5 ** l"], fill(s)),
+            "scheme_matrices(A, H, *tables, rows)",
+            *block(each, block(f"for k in range({s.n_entries}):", [stored])),
         ]
-    return "\n".join(lines)
+    return "\n".join(block("def levels(X, tables, p, scale, h, a):", body))
 
 
 def _advance(s: Shape) -> str:
     n, whole = s.n_states, 2**LEVELS
-    lines = [
-        "def advance(X, u, x, base, n_steps, least, limit, trace, outputs):",
-        f"    c = {listed(f'X[{i}]' for i in range(s.n_constants))}",
-        *[f"    z{i} = X[{s.n_constants + i}]" for i in range(n)],
-        *[f"    x{i} = x[{i}]" for i in range(n)],
-        "    for k in range(u.shape[0] - 1):",
-        *[f"        v{j} = u[k, {j}]" for j in range(s.n_inputs)],
-        *[f"        {line}" for line in _outputs(s)],
-        *[f"        i{j} = (u[k + 1, {j}] - v{j}) / n_steps" for j, foh in enumerate(s.foh) if foh],
-        *[f"        {line}" for line in slope(s, "x", "v", "m", "k")],
-        *[f"        {line}" for line in margins(s, "x", "v", "q")],
-        "        level = least",
-        "        for step in range(n_steps):",
-        *[f"            trace[k * n_steps + step, {i}] = x{i}" for i in range(n)],
+    base_step = [
+        *[f"trace[k * n_steps + step, {i}] = x{i}" for i in range(n)],
         # What is not finite any more gets no better by halving.
-        f"            finite = math.isfinite({' + '.join(numbered('k', n))})",
-        f"            deepest = {LEVELS} if finite else least",
-        "            level = min(level, deepest)",
-        "            done = 0",
-        f"            while done < {whole}:",
-        *[f"                {line}" for line in _part(s)],
-        *[f"    x[{i}] = x{i}" for i in range(n)],
+        f"finite = math.isfinite({' + '.join(numbered('k', n))})",
+        f"deepest = {LEVELS} if finite else least",
+        "level = min(level, deepest)",
+        "done = 0",
+        *block(f"while done < {whole}:", _part(s)),
     ]
-    return "\n".join(lines)
+    interval = [
+        *[f"v{j} = u[k, {j}]" for j in range(s.n_inputs)],
+        *_outputs(s),
+        *[f"i{j} = (u[k + 1, {j}] - v{j}) / n_steps" for j, foh in enumerate(s.foh) if foh],
+        *slope(s, "x", "v", "m", "k"),
+        *margins(s, "x", "v", "q"),
+        "level = least",
+        *block("for step in range(n_steps):", base_step),
+    ]
+    body = [
+        f"c = {listed(f'X[{i}]' for i in range(s.n_constants))}",
+        *[f"z{i} = X[{s.n_constants + i}]" for i in range(n)],
+        *[f"x{i} = x[{i}]" for i in range(n)],
+        *block("for k in range(u.shape[0] - 1):", interval),
+        *[f"x[{i}] = x{i}" for i in range(n)],
+    ]
+    head = "def advance(X, u, x, base, n_steps, least, limit, trace, outputs):"
+    return "\n".join(block(head, body))
 
 
 def _part(s: Shape) -> list[str]:
@@ -114,27 +114,32 @@ def _part(s: Shape) -> list[str]:
     def place(entry: int) -> str:
         return f"X[first + {entry}]"
 
+    kept = (("x", "n", s.n_states), ("m", "mn", s.n_states), ("k", "kn", s.n_states))
+    taken = [
+        *[
+            f"{now}{i} = {new}{i}"
+            for now, new, n in (*kept, ("q", "r", s.n_margins))
+            for i in range(n)
+        ],
+        "done += part",
+        *block(
+            f"if level > least and error <= {_COARSER!r} * limit and done % (2 * part) == 0:",
+            ["level -= 1"],
+        ),
+    ]
     return [
         f"part = {whole} >> level",
         f"share = part * {1.0 / whole!r}",
         "h = base * share",
         f"first = {_first_entry(s)} + level * {s.n_entries}",
         *step_sizes(),
-        *_stage_inputs(s),
+        *stage_inputs(s, f"(step + done * {1.0 / whole!r})", "share * "),
         *step(s, place),
         *slope(s, "n", "uc", "mn", "kn"),
         *margins(s, "n", "uc", "r"),
         *_error(s, place),
-        "if error <= limit or level == deepest:",
-        *[f"    x{i} = n{i}" for i in range(s.n_states)],
-        *[f"    m{i} = mn{i}" for i in range(s.n_states)],
-        *[f"    k{i} = kn{i}" for i in range(s.n_states)],
-        *[f"    q{i} = r{i}" for i in range(s.n_margins)],
-        "    done += part",
-        f"    if level > least and error <= {_COARSER!r} * limit and done % (2 * part) == 0:",
-        "        level -= 1",
-        "else:",
-        "    level += 1",
+        *block("if error <= limit or level == deepest:", taken),
+        *block("else:", ["level += 1"]),
     ]
 
 
@@ -147,26 +152,12 @@ def _error(s: Shape, place: Place) -> list[str]:
     lines += [f"o{i} = db{i} - da{i}" for i in driven]
     lines += missed(s)
     squares = []
-    for vector, known in (("t", driven), ("o", driven), ("f", s.guarded)):
-        for i in range(s.n_states):
-            if term := product(s, "G", i, vector, place, known=known).removeprefix(" + "):
-                name = f"e{vector}{i}"
-                lines.append(f"{name} = ({term}) * z{i}")
-                squares.append(f"{name} * {name}")
+    for vector, rows in (("t", driven), ("o", driven), ("f", s.guarded)):
+        for i, effect in enumerate(effects(s, vector, rows, place)):
+            if effect:
+                lines.append(f"e{vector}{i} = ({effect}) * z{i}")
+                squares.append(f"e{vector}{i} * e{vector}{i}")
     return [*lines, f"error = {' + '.join(squares) or '0.0'}"]
-
-
-def _stage_inputs(s: Shape) -> list[str]:
-    """Inputs at the start (a), middle (b) and end (c) of a part."""
-    lines = []
-    for j, foh in enumerate(s.foh):
-        if foh:
-            lines.append(f"ua{j} = v{j} + i{j} * (step + done * {2.0**-LEVELS!r})")
-            lines.append(f"ub{j} = ua{j} + 0.5 * share * i{j}")
-            lines.append(f"uc{j} = ua{j} + share * i{j}")
-        else:
-            lines += [f"u{stage}{j} = v{j}" for stage in "abc"]
-    return lines
 
 
 def _outputs(s: Shape) -> list[str]:

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 
 from sysid.arrays import FloatArray
-from sysid.engine.substitution import substituted
-from sysid.problem.model import Function, ModelError, ProcessModel
-from sysid.response.dual import Dual, on_duals
+from sysid.engine.gradient import Gradient
+from sysid.problem.model import ModelError, ProcessModel
 
 # How far beside the guess an equilibrium is looked for in turn, in the states' own units.
 _NUDGES = (0.0, 0.1, -0.1, 1.0, -1.0)
@@ -46,9 +45,9 @@ def linearize(
     """
     x, u, p = _point(model, x, u, p)
     n, m = len(x), len(u)
-    slopes = _gradient(model, model.derivative, x, u, p)
+    slopes = _at(model, _gradient(model.derivative, n, m), x, u, p)
     if model.output is not None:
-        outputs = _gradient(model, model.output, x, u, p)
+        outputs = _at(model, _gradient(model.output, n, m), x, u, p)
     else:
         assert model.output_states is not None
         outputs = np.eye(n + m)[list(model.output_states)]
@@ -60,7 +59,7 @@ def jacobian(
 ) -> FloatArray:
     """df/dx at a point, (n_states, n_states); see ``linearize``."""
     x, u, p = _point(model, x, u, p)
-    return _gradient(model, model.derivative, x, u, p)[:, : len(x)]
+    return _at(model, _gradient(model.derivative, len(x), len(u)), x, u, p)[:, : len(x)]
 
 
 def jacobians(model: ProcessModel, x: FloatArray, u: FloatArray, p: FloatArray) -> FloatArray:
@@ -69,22 +68,17 @@ def jacobians(model: ProcessModel, x: FloatArray, u: FloatArray, p: FloatArray) 
     p: (m, n_parameters). All at once, unless the equations branch on what differs between them.
     NaN where there is no slope, as of a root at zero.
     """
-    states, n = len(x), len(p)
-    seeds = np.eye(states)[:, :, None]
-    columns = tuple(float(c[0]) if np.all(c == c[0]) else c for c in p.T)
+    n, m = len(x), len(p)
+    gradient = _gradient(model.derivative, n, 0)
+    columns = [float(c[0]) if np.all(c == c[0]) else c for c in p.T]
     try:
         with np.errstate(all="ignore"):
-            values = _on_duals(model.derivative)(
-                tuple(Dual(float(v), seeds[i]) for i, v in enumerate(x)),
-                tuple(float(v) for v in u),
-                columns,
-            )
+            slopes = gradient.at(x.tolist(), u.tolist(), columns, (m,))
     except ArithmeticError:
-        return np.full((n, states, states), np.nan)
+        return np.full((m, n, n), np.nan)
     except (TypeError, ValueError):
-        return np.stack([jacobian(model, x, u, row) for row in p])
-    slopes = [np.broadcast_to(getattr(v, "slope", np.zeros((1, 1))), (states, n)) for v in values]
-    return np.ascontiguousarray(np.moveaxis(np.array(slopes), 2, 0))
+        return np.stack([_at(model, gradient, x, u, row) for row in p])
+    return np.ascontiguousarray(np.moveaxis(slopes, 2, 0))
 
 
 def equilibrium(
@@ -146,26 +140,17 @@ def equilibrium(
     )
 
 
-def _gradient(
-    model: ProcessModel, function: Function, x: FloatArray, u: FloatArray, p: FloatArray
+def _at(
+    model: ProcessModel, gradient: Gradient, x: FloatArray, u: FloatArray, p: FloatArray
 ) -> FloatArray:
-    """Derivatives of a function of (x, u, p) with respect to x and u, (m, n_x + n_u)."""
-    n, width = len(x), len(x) + len(u)
-    seeds = np.eye(width)
-    states = tuple(Dual(float(v), seeds[i]) for i, v in enumerate(x))
-    inputs = tuple(Dual(float(v), seeds[n + j]) for j, v in enumerate(u))
+    """Derivatives of one of the model's functions at a point; ModelError where none is known."""
     try:
-        values = _on_duals(function)(states, inputs, tuple(float(v) for v in p))
+        return gradient.at(x.tolist(), u.tolist(), p.tolist())
     except TypeError as error:
         raise ModelError(f"model {model.name} cannot be differentiated: {error}") from None
-    return np.array([v.slope if isinstance(v, Dual) else np.zeros(width) for v in values])
 
 
-@functools.lru_cache(maxsize=16)
-def _on_duals(function: Function) -> Function:
-    """A copy of a model's function that takes dual numbers."""
-    copy: Function = substituted(function, on_duals)
-    return copy
+_gradient = functools.lru_cache(maxsize=16)(Gradient)
 
 
 def _point(

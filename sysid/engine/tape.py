@@ -1,0 +1,118 @@
+"""Straight-line code, written down line by line while a model's equations run.
+
+A tape may stand at a point: then each number has its value there too, and where the equations
+branch it notes which way they went.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
+
+from sysid.engine.arithmetic import arrays, constant, operation
+
+
+class Line(NamedTuple):
+    """``name = text``, the text a form with places for operands; fixed by the parameters alone."""
+
+    name: str
+    form: str
+    operands: tuple[str, ...]
+    text: str
+    fixed: bool
+
+
+class Tape:
+    """Straight-line code over states x0.., inputs u0.., parameters p0.. and results t0..
+
+    point: values of the states, inputs and parameters by name, floats or arrays of many; without
+    it the code knows no values. decisions: conditions met on the way and their outcomes there.
+    """
+
+    def __init__(self, point: Mapping[str, Any] | None = None) -> None:
+        self.decisions: dict[str, bool] = {}
+        self._values = None if point is None else dict(point)
+        self._lines: dict[str, Line] = {}  # by text: what is computed twice is written once
+        self._by_name: dict[str, Line] = {}
+
+    @property
+    def lines(self) -> list[Line]:
+        """All lines, in order."""
+        return list(self._by_name.values())
+
+    def emit(self, form: str, *operands: str) -> str:
+        """Name of the result of an operation, ``form`` with places for its operands."""
+        text = form.format(*operands)
+        if not any(map(self.named, operands)):
+            return f"({text})"  # literals alone, which the compiler works out
+        if text not in self._lines:
+            fixed = all(map(self.fixed, operands))
+            line = Line(f"t{len(self._lines)}", form, operands, text, fixed)
+            self._lines[text] = self._by_name[line.name] = line
+            if self._values is not None:
+                evaluate(line, self._values)
+        return self._lines[text].name
+
+    def decide(self, form: str, *operands: str) -> bool:
+        """Whether a condition holds at the tape's point; raises TypeError where it has none."""
+        if self._values is None:
+            raise TypeError("a condition needs the value of a number")
+        name = self.emit(form, *operands)
+        self.decisions[name] = bool(self.value(name))
+        return self.decisions[name]
+
+    def single(self, operands: Iterable[str]) -> bool:
+        """Whether the tape stands at a single point, as far as these numbers tell."""
+        return self._values is not None and not arrays(map(self.value, operands))
+
+    def value(self, operand: str) -> Any:
+        """What a name or a literal stands for at the tape's point."""
+        assert self._values is not None
+        return looked_up(operand, self._values)
+
+    def fixed(self, operand: str) -> bool:
+        """Whether a name or a literal depends on the parameters alone."""
+        line = self._by_name.get(operand)
+        return line.fixed if line else operand[0] not in "xu"
+
+    def named(self, operand: str) -> bool:
+        """Whether it is a name and not a literal."""
+        return operand in self._by_name or operand[0] in "xup"
+
+    def needed(self, names: Iterable[str]) -> list[Line]:
+        """Lines that the named numbers need, in order."""
+        wanted = set(names)
+        lines = []
+        for line in reversed(self._lines.values()):
+            if line.name in wanted:
+                wanted.update(line.operands)
+                lines.append(line)
+        return lines[::-1]
+
+    def join(self, sign: str, a: str | None, b: str | None) -> str | None:
+        """``a + b`` or ``a - b``, where None is nothing."""
+        if a is None or b is None:
+            return a if b is None else b if sign == "+" else self.emit("-{}", b)
+        return self.emit(f"{{}} {sign} {{}}", a, b)
+
+    def join_all(self, sign: str, a: Mapping[int, str], b: Mapping[int, str]) -> dict[int, str]:
+        """The same of coefficients."""
+        joined = {k: self.join(sign, a.get(k), b.get(k)) for k in [*a, *b]}
+        return {k: c for k, c in joined.items() if c is not None}
+
+    def multiply(self, a: str, b: str) -> str:
+        """Product, without multiplying by a literal one."""
+        if "1.0" in (a, b):
+            return a if b == "1.0" else b
+        return self.emit("{} * {}", a, b)
+
+
+def evaluate(line: Line, values: dict[str, Any]) -> None:
+    """Work a line out and add its result to the values by name."""
+    arguments = [looked_up(operand, values) for operand in line.operands]
+    values[line.name] = operation(line.form, len(arguments))(*arguments)
+
+
+def looked_up(operand: str, values: Mapping[str, Any]) -> Any:
+    """The value of a name, or of a literal."""
+    return values[operand] if operand in values else constant(operand)
