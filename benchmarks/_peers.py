@@ -136,9 +136,9 @@ def _short(record: Dataset) -> Dataset:
 
 def _derivative(model: ProcessModel) -> Any:
     """The model's derivative compiled, on arrays, with nominal parameters."""
-    from sysid.engine.compiler import _jit
+    from sysid.engine.compiler import machine_code
 
-    compiled = _jit(model.derivative)
+    compiled = machine_code(model.derivative)
     p = tuple(float(v) for v in model.nominal)
     return lambda x, u: compiled(x, u, p)
 
@@ -149,9 +149,9 @@ def _scipy(
     short = _short(record)
     chosen = model
     if compiled:
-        from sysid.engine.compiler import _jit
+        from sysid.engine.compiler import machine_code
 
-        chosen = replace(model, derivative=_jit(model.derivative))
+        chosen = replace(model, derivative=machine_code(model.derivative))
 
     def run() -> FloatArray:
         return simulate(chosen, model.nominal, short, method=method, rtol=1e-4, atol=1e-7)

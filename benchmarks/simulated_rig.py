@@ -110,10 +110,10 @@ def _peer(plant: Plant, commands: FloatArray) -> float:
     """SciPy, with the derivative compiled."""
     from scipy.integrate import solve_ivp
 
-    from sysid.engine.compiler import _jit
+    from sysid.engine.compiler import machine_code
 
     model = plant.build()
-    compiled = _jit(model.derivative)
+    compiled = machine_code(model.derivative)
     model = replace(model, derivative=compiled)
     p, x = tuple(model.nominal), model.initial_state
     rest = (0.0,) * (len(model.inputs) - 2)

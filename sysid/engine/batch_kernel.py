@@ -182,7 +182,7 @@ def _paired(lines: list[str]) -> list[str]:
         renamed = re.sub(r"\w+", lambda m: m[0] + "_" * (m[0] in assigned), line)
         return renamed.replace("+ l]", second)
 
-    return [both for line in lines for both in (line, moved(line))]
+    return [twin for line in lines for twin in (line, moved(line))]
 
 
 def _estimate(s: Shape, place: Place) -> list[str]:

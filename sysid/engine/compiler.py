@@ -20,8 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from sysid.arrays import IntArray
-from sysid.engine import batch_kernel as _kernel
-from sysid.engine import trajectory_kernel as _trajectory_kernel
+from sysid.engine import batch_kernel, trajectory_kernel
 from sysid.engine.scheme import Shape
 from sysid.engine.structure import analyse
 from sysid.engine.substitution import KNOWN_MODULES, names_in, rebuilt
@@ -62,8 +61,8 @@ class Guarded:
 class Kernels:
     """Compiled functions of one model, the floats of the work areas and the tables they need.
 
-    simulate, spectrum, work_rows and tables: see ``_kernel``; levels, advance, levels_size and
-    levels_tables: see ``_trajectory_kernel``. fewest_steps: see ``_kernel_text.Shape``. guarded:
+    simulate, spectrum, work_rows and tables: see ``batch_kernel``; levels, advance, levels_size
+    and levels_tables: see ``trajectory_kernel``. fewest_steps: see ``scheme.Shape``. guarded:
     whether there are limits that fast linear parts may run into.
     """
 
@@ -100,9 +99,9 @@ def kernels(model: ProcessModel, *, exact: bool = True) -> Kernels:
     }
     return Kernels(
         **guarded,
-        work_rows=_kernel.work_rows(shape),
-        tables=_tables(shape, _kernel.first_entry(shape)),
-        levels_size=_trajectory_kernel.work_size(shape),
+        work_rows=batch_kernel.work_rows(shape),
+        tables=_tables(shape, batch_kernel.first_entry(shape)),
+        levels_size=trajectory_kernel.work_size(shape),
         levels_tables=_tables(shape, 0),
         fewest_steps=shape.fewest_steps,
         guarded=bool(shape.structure.guards),
@@ -127,8 +126,8 @@ def _text(model: ProcessModel, shape: Shape) -> tuple[str, dict[str, Any]]:
     from sysid.engine.intrinsics import many_registers
 
     program = shape.structure.program
-    batch = _kernel.source(shape, many_registers=many_registers())
-    text = "\n\n".join((program.text, batch, _trajectory_kernel.source(shape)))
+    batch = batch_kernel.source(shape, many_registers=many_registers())
+    text = "\n\n".join((program.text, batch, trajectory_kernel.source(shape)))
     return text, {name: getattr(model, name) for name in sorted(program.calls)}
 
 
@@ -157,17 +156,17 @@ def _scope(called: Mapping[str, Any]) -> dict[str, Any]:
     """Globals of the kernels' text."""
     import numpy as np
 
-    from sysid.engine import intrinsics as _intrinsics
+    from sysid.engine import intrinsics
     from sysid.engine.phi import scheme_matrices
 
     return {
         "np": np,
         "math": _vector_math(),
         "scheme_matrices": scheme_matrices,
-        "wide_vectors": _intrinsics.wide_vectors,
-        "always_inline": _intrinsics.always_inline,
+        "wide_vectors": intrinsics.wide_vectors,
+        "always_inline": intrinsics.always_inline,
         "__name__": __name__,  # a module that exists when Numba loads the kernel from its cache
-        **{name: _jit(function) for name, function in called.items()},
+        **{name: machine_code(function) for name, function in called.items()},
     }
 
 
@@ -200,8 +199,8 @@ def _explain(model: ProcessModel, error: Exception) -> str:
     )
 
 
-def _jit(function: Any) -> Any:
-    """Compile a function and every plain function it refers to, also through a module."""
+def machine_code(function: Any) -> Any:
+    """A function compiled, with all plain functions that it refers to, also through a module."""
     return rebuilt(function, _vector_math(), _njit)
 
 

@@ -144,7 +144,7 @@ def scheme_matrices(  # noqa: PLR0912  (a function's call copies its arrays' des
     places: IntArray,
     X: FloatArray,
 ) -> None:
-    """Q, F, G and H of the scheme (see ``_kernel_text``) for lanes of A.
+    """Q, F, G and H of the scheme (see ``scheme``) for lanes of A.
 
     a: (m, lanes), overwritten; h: (lanes,), step sizes. entries: (m, 2), row and column of each
     entry of the pattern of e^A, the diagonal among them, in order. triples: (t, 3), see

@@ -50,8 +50,8 @@ class Writer:
         used = set(coefficients)
         for _, values in functions.values():
             used |= self._used(self._varying(values), values) if values else {*self._parameters}
-        known = [name for name in used if tape.named(name) and tape.fixed(name)]
-        self._constants = sorted(known, key=lambda name: (name[0], int(name[1:])))
+        constants = [name for name in used if tape.named(name) and tape.fixed(name)]
+        self._constants = sorted(constants, key=lambda name: (name[0], int(name[1:])))
         self._places = {name: f"c[{k}]" for k, name in enumerate(self._constants)}
 
     def placed(self, names: Mapping[K, str]) -> dict[K, str]:
@@ -85,8 +85,8 @@ class Writer:
         self, head: str, lines: list[Line], values: Sequence[str], places: Mapping[str, str]
     ) -> str:
         text = [f"def {head}:", "    always_inline()"]
-        own = {line.name for line in lines}
-        for name in sorted(self._used(lines, values) - own):
+        results = {line.name for line in lines}
+        for name in sorted(self._used(lines, values) - results):
             if self._tape.named(name):
                 text.append(f"    {name} = {places.get(name) or f'{name[0]}[{name[1:]}]'}")
         text += [f"    {line.name} = {line.text}" for line in lines]

@@ -146,7 +146,8 @@ def error_of_n(s: Shape) -> list[str]:
 def effects(s: Shape, vector: str, rows: Iterable[int], place: Place) -> list[str]:
     """What an error ``vector`` in such rows of N does to each state, empty for nothing."""
     return [
-        product(s, "G", i, vector, place, known=rows).removeprefix(" + ") for i in range(s.n_states)
+        product(s, "G", i, vector, place, columns=rows).removeprefix(" + ")
+        for i in range(s.n_states)
     ]
 
 
@@ -229,22 +230,22 @@ def product(
     place: Place,
     *,
     factor: str = "",
-    known: Iterable[int] | None = None,
+    columns: Iterable[int] | None = None,
 ) -> str:
     """`` + M[row, j] * vector_j`` for the entries of a row that are not zero.
 
-    known: the j for which there is a vector_j; default all for k, else the driven rows.
+    columns: the j for which there is a vector_j; default all for k, else the driven rows.
     """
-    if known is None:
-        known = range(s.n_states) if vector == "k" else s.structure.driven
-    known = set(known)
+    if columns is None:
+        columns = range(s.n_states) if vector == "k" else s.structure.driven
+    columns = set(columns)
     if s.plain(row):
-        return f" + {_PLAIN[matrix]} * {vector}{row}" if row in known else ""
+        return f" + {_PLAIN[matrix]} * {vector}{row}" if row in columns else ""
     entries = s.entries()
     return "".join(
         f" + {factor}{place(entries.index((matrix, (i, j))))} * {vector}{j}"
         for i, j in s.pattern(matrix)
-        if i == row and j in known
+        if i == row and j in columns
     )
 
 

@@ -22,7 +22,11 @@ _MOST_RECORDS = 64  # that a simulator keeps ready
 
 
 class Status(enum.IntEnum):
-    """How a chromosome's simulation ended."""
+    """How a chromosome's simulation ended.
+
+    >>> Status(2).name
+    'OVER_BUDGET'
+    """
 
     OK = 0
     UNBOUNDED = 1
@@ -38,6 +42,10 @@ class BatchResult:
     sse: (n_chromosomes, n_records, n_outputs), sum of squared weighted residuals, infinite
     where the status is not OK. status: (n_chromosomes,), of ``Status``. steps:
     (n_chromosomes,), integration steps spent.
+
+    >>> result = BatchResult(np.array([[[0.5]], [[np.inf]]]), np.array([0, 1]), np.array([12, 96]))
+    >>> result.sse[result.status == Status.OK].sum().item()
+    0.5
     """
 
     sse: FloatArray
@@ -67,6 +75,24 @@ class BatchSimulator:
     threads: default all cores this process may use. max_steps: budget of integration steps per
     sample; a chromosome that needs more is reported OVER_BUDGET. The result for a chromosome
     depends on neither the number of threads nor the rest of the population.
+
+    >>> import numpy as np
+    >>> from sysid import BatchSimulator, Dataset, Input, Output, Parameter, ProcessModel
+    >>> from sysid import State, Status
+    >>> lag = ProcessModel(
+    ...     "lag", [State("y", "1")], [Input("u", "V")], [Output("y", "1")],
+    ...     [Parameter("tau", "s", 0.05, 0.01, 1.0)], lambda x, u, p: ((u[0] - x[0]) / p[0],)
+    ... )
+    >>> record = Dataset(np.ones(4), np.zeros(4), dt=0.05)  # a step, of which nothing was measured
+    >>> simulator = BatchSimulator(lag)
+    >>> y = simulator.trajectories(np.array([[0.05], [0.1]]), record)
+    >>> y[:, :, 0].round(3).tolist()
+    [[0.0, 0.632, 0.865, 0.95], [0.0, 0.393, 0.632, 0.777]]
+    >>> result = simulator.errors(np.array([[0.05], [-1e-4]]), [record])
+    >>> result.sse[:, 0, 0].round(2).tolist()
+    [2.05, inf]
+    >>> [Status(status).name for status in result.status]
+    ['OK', 'UNBOUNDED']
     """
 
     def __init__(

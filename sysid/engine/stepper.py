@@ -25,6 +25,18 @@ class Stepper:
     as the accuracy asks for. accuracy: error, in parts of ``scale``, that the trajectory is to
     keep. scale: (n_states,), magnitudes that matter; default the larger of 1 and the state's
     initial value. Raises ModelError for settings that do not fit the model.
+
+    >>> import numpy as np
+    >>> from sysid import Input, Output, Parameter, ProcessModel, State, Stepper
+    >>> lag = ProcessModel(
+    ...     "lag", [State("y", "1")], [Input("u", "V")], [Output("y", "1")],
+    ...     [Parameter("tau", "s", 0.05, 0.01, 1.0)], lambda x, u, p: ((u[0] - x[0]) / p[0],)
+    ... )
+    >>> stepper = Stepper(lag, np.array([0.05]), dt=0.05)
+    >>> x = lag.initial_state
+    >>> states, outputs = stepper.advance(x, np.ones((3, 1)))  # two intervals
+    >>> outputs[:, 0].round(3).tolist(), x.round(3).tolist()
+    ([0.0, 0.632], [0.865])
     """
 
     def __init__(
@@ -88,16 +100,17 @@ class Stepper:
 
     def _prepare(self, x: FloatArray, u: FloatArray) -> Callable[..., None]:
         """Fill the work area, once for all runs, and compile what advances."""
-        made, n = self._kernels, len(x)
+        n = len(x)
         a = np.zeros((n, n))
-        made.levels(self._work, made.levels_tables, self.parameters, self.scale, self._base, a)
-        if made.guarded and np.isfinite(a).all():
+        compiled, work = self._kernels, self._work
+        compiled.levels(work, compiled.levels_tables, self.parameters, self.scale, self._base, a)
+        if compiled.guarded and np.isfinite(a).all():
             periods = np.abs(np.linalg.eigvals(a)).max() * self._base / (2.0 * math.pi)
             self._least = min(math.ceil(math.log2(max(periods, 1.0))), LEVELS)
         # A call over no interval, by which the compiler's complaints are explained.
         nothing = np.empty((0, n)), np.empty((0, self._n_outputs))
-        made.advance(
-            self._work, u[:1], x, self._base, self.n_steps, self._least, self._limit, *nothing
+        compiled.advance(
+            work, u[:1], x, self._base, self.n_steps, self._least, self._limit, *nothing
         )
-        self._run = made.advance.compiled
+        self._run = compiled.advance.compiled
         return self._run

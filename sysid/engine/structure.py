@@ -53,11 +53,6 @@ class Structure:
     shown: frozenset[int]
     program: Program
 
-    @property
-    def constant(self) -> tuple[Entry, ...]:
-        """Entries of A, in order."""
-        return tuple(sorted(self.coefficients))
-
     def closure(self, n_states: int) -> tuple[Entry, ...]:
         """Entries of exp(A t) that can differ from zero for this pattern of A."""
         reach = {(i, i) for i in range(n_states)} | set(self.coefficients)

@@ -52,8 +52,8 @@ class Trace:
     __floordiv__, __rfloordiv__ = _operation("{} // {}"), _reflected("{} // {}")
     __lt__, __le__ = _condition("{} < {}"), _condition("{} <= {}")
     __gt__, __ge__ = _condition("{} > {}"), _condition("{} >= {}")
-    __eq__ = _condition("{} == {}")  # type: ignore[assignment]
-    __ne__ = _condition("{} != {}")  # type: ignore[assignment]
+    __eq__ = _condition("{} == {}")
+    __ne__ = _condition("{} != {}")
     __hash__ = object.__hash__
 
     def __neg__(self) -> Trace:

@@ -52,6 +52,12 @@ def frequency_response(records: Sequence[Dataset]) -> FrequencyResponse:
     one sample time. Segments with a lost sample are left out. Raises ModelError when there are
     too few segments, or none of the inputs changes. Bendat & Piersol, "Random Data", chapter 7;
     Welch, IEEE Trans. Audio Electroacoustics 15 (1967).
+
+    >>> u = np.random.default_rng(0).normal(size=2000)
+    >>> y = 3.0 * u
+    >>> response = frequency_response([Dataset(u, y, dt=0.01)])
+    >>> np.abs(response.response[:3, 0, 0]).round(6).tolist()
+    [3.0, 3.0, 3.0]
     """
     dt = records[0].dt
     if any(abs(record.dt - dt) > 1e-6 * dt for record in records):
@@ -116,7 +122,7 @@ def _spectra(records: Sequence[Dataset], length: int) -> tuple[ComplexArray, Com
     window: FloatArray = np.sqrt(2.0 / 3.0) * (
         1.0 - np.cos(2.0 * np.pi * np.arange(length) / length)
     )
-    found: list[tuple[ComplexArray, ComplexArray]] = []
+    segments: list[tuple[ComplexArray, ComplexArray]] = []
     for record in records:
         with np.errstate(invalid="ignore"):
             middle = np.nanmean(record.outputs, axis=0) if record.outputs.size else 0.0
@@ -124,11 +130,11 @@ def _spectra(records: Sequence[Dataset], length: int) -> tuple[ComplexArray, Com
         for begin in range(0, record.n_samples - length + 1, length // 2):
             rows = slice(begin, begin + length)
             if np.isfinite(y[rows]).all():
-                found.append((_transform(u[rows], window), _transform(y[rows], window)))
+                segments.append((_transform(u[rows], window), _transform(y[rows], window)))
     n, m, q = length // 2 - 1, records[0].inputs.shape[1], records[0].outputs.shape[1]
     return (
-        np.array([u for u, _ in found], dtype=np.complex128).reshape(-1, n, m),
-        np.array([y for _, y in found], dtype=np.complex128).reshape(-1, n, q),
+        np.array([u for u, _ in segments], dtype=np.complex128).reshape(-1, n, m),
+        np.array([y for _, y in segments], dtype=np.complex128).reshape(-1, n, q),
     )
 
 

@@ -22,6 +22,10 @@ class LinearModel:
 
     A: (n_states, n_states), B: (n_states, n_inputs), C: (n_outputs, n_states),
     D: (n_outputs, n_inputs). Unpacks to (A, B, C, D).
+
+    >>> A, B, C, D = LinearModel(-np.eye(1), np.eye(1), np.eye(1), np.zeros((1, 1)))
+    >>> (-C @ np.linalg.inv(A) @ B + D).item()  # gain at rest
+    1.0
     """
 
     A: FloatArray
@@ -42,6 +46,15 @@ def linearize(
     rounding wherever the model is differentiable; at a kink (|x| at zero) the slope of |x| is
     taken as 0. The result's four matrices are what ``control.ss`` takes. Raises ModelError for
     wrong shapes or a function that has no known derivative.
+
+    >>> from sysid import Input, Output, Parameter, State
+    >>> lag = ProcessModel(
+    ...     "lag", [State("y", "1")], [Input("u", "V")], [Output("y", "1")],
+    ...     [Parameter("tau", "s", 0.05, 0.01, 1.0)], lambda x, u, p: ((u[0] - x[0]) / p[0],)
+    ... )
+    >>> linear = linearize(lag, np.zeros(1), np.zeros(1))
+    >>> linear.A.item(), linear.B.item(), linear.C.item(), linear.D.item()
+    (-20.0, 20.0, 1.0, 0.0)
     """
     x, u, p = _point(model, x, u, p)
     n, m = len(x), len(u)
@@ -57,7 +70,16 @@ def linearize(
 def jacobian(
     model: ProcessModel, x: FloatArray, u: FloatArray, p: FloatArray | None = None
 ) -> FloatArray:
-    """df/dx at a point, (n_states, n_states); see ``linearize``."""
+    """df/dx at a point, (n_states, n_states); see ``linearize``.
+
+    >>> from sysid import Output, Parameter, State
+    >>> cooling = ProcessModel(
+    ...     "cooling", [State("T", "K")], [], [Output("T", "K")],
+    ...     [Parameter("k", "1/(K^3*s)", 2e-9, 1e-9, 1e-8)], lambda x, u, p: (-p[0] * x[0] ** 4,)
+    ... )
+    >>> jacobian(cooling, np.array([300.0]), np.zeros(0)).round(3).tolist()
+    [[-0.216]]
+    """
     x, u, p = _point(model, x, u, p)
     return _at(model, _gradient(model.derivative, len(x), len(u)), x, u, p)[:, : len(x)]
 
@@ -95,6 +117,15 @@ def equilibrium(
     a speed whose driving torque is asked for; the derivative of a held state need not vanish.
     guess: where to start, default the declared initial state. Raises ModelError when none is
     found, with the largest remaining derivative.
+
+    >>> from sysid import Input, Output, Parameter, State
+    >>> tank = ProcessModel(
+    ...     "tank", [State("level", "m", 1.0)], [Input("flow", "m/s")], [Output("level", "m")],
+    ...     [Parameter("a", "m^0.5/s", 2.0, 0.1, 10.0)],
+    ...     lambda x, u, p: (u[0] - p[0] * max(x[0], 0.0) ** 0.5,),
+    ... )
+    >>> equilibrium(tank, np.array([1.0])).round(6).tolist()
+    [0.25]
     """
     from scipy.optimize import least_squares
 
@@ -121,12 +152,17 @@ def equilibrium(
 
     def solve(nudge: float) -> tuple[FloatArray, FloatArray]:
         """A stationary point of the search, and its derivatives in parts of their terms."""
-        found = least_squares(
-            slopes, x[free] + nudge, jac=slopes_jacobian,
-            x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-15,
-        )  # fmt: skip
-        size = np.abs(slopes_jacobian(found.x)) @ np.maximum(np.abs(found.x), 1e-6)
-        return found.x, np.abs(found.fun) / np.maximum(size, 1e-12)
+        fit = least_squares(
+            slopes,
+            x[free] + nudge,
+            jac=slopes_jacobian,
+            x_scale="jac",
+            xtol=1e-15,
+            ftol=1e-15,
+            gtol=1e-15,
+        )
+        terms = np.abs(slopes_jacobian(fit.x)) @ np.maximum(np.abs(fit.x), 1e-6)
+        return fit.x, np.abs(fit.fun) / np.maximum(terms, 1e-12)
 
     # A start at which an equation has no slope is no help: then from beside it.
     for nudge in _NUDGES:
