@@ -273,7 +273,8 @@ class PolynomialModel(RecordEstimator):
         if not np.all(np.abs(responses) < _GROWN):
             return plain
         start = np.linalg.lstsq(responses[:, seen].T, (residual / unit)[seen])[0]
-        return plain + unit * np.tensordot(start, responses, axes=1)
+        corrected: FloatArray = plain + unit * np.tensordot(start, responses, axes=1)
+        return corrected
 
 
 def free_run_fit(measured: FloatArray, simulated: FloatArray) -> tuple[FloatArray, FloatArray]:

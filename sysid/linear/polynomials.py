@@ -86,10 +86,11 @@ def _table(name: str, order: Order, shape: tuple[int, ...]) -> IntArray:
 
 
 def filtered(P: FloatArray, x: FloatArray) -> FloatArray:
-    """P(q) x from the first row on that has a complete past, (n - n_lags, rows); x: (n, columns)."""
+    """P(q) x from the first row with a complete past on, (n - n_lags, rows); x: (n, columns)."""
     n = len(x) - len(P) + 1
     terms = [x[len(P) - 1 - lag :][:n] @ matrix.T for lag, matrix in enumerate(P)]
-    return np.sum(terms, axis=0)
+    total: FloatArray = np.sum(terms, axis=0)
+    return total
 
 
 def innovations(
@@ -111,7 +112,7 @@ def innovations(
     for P, band in ((A, bands[0]), (noise, bands[1])):
         for j in range(q):
             band[j, : len(P) * q - j] = P.reshape(-1, q)[j:, j]
-    matrix = np.where(lost[..., None], *bands).reshape(lost.size, -1).T
+    matrix = np.where(lost[..., None], bands[0], bands[1]).reshape(lost.size, -1).T
     # What an unstable model overflows to shows in the result.
     with np.errstate(all="ignore"):
         right = drive - filtered(A, np.vstack((past, measured)))[-len(drive) :]

@@ -111,7 +111,8 @@ def least_squares(columns: FloatArray, p: int) -> tuple[FloatArray, FloatArray, 
     """
     regressors, target = columns[:, :p], columns[:, p:]
     Q, R = scipy.linalg.qr(columns, mode="economic", check_finite=False)
-    basis, factor = Q[:, :p], R[:p, :p]
+    basis: FloatArray = np.asarray(Q[:, :p], dtype=np.float64)
+    factor = R[:p, :p]
     least = len(columns) * np.finfo(float).eps * np.linalg.norm(factor, axis=0)
     if np.all(np.abs(np.diag(factor)) > least):
         solution = scipy.linalg.solve_triangular(factor, R[:p, p:])
