@@ -151,7 +151,7 @@ def _lists(factory: Callable[..., Any]) -> frozenset[str]:
 
 def _made(factory: Callable[..., Any], where: str, options: dict[str, Any]) -> Any:
     """The model that a function makes of options given as text."""
-    from pydantic import ValidationError, validate_call
+    from pydantic import ValidationError
 
     names = list(inspect.signature(factory).parameters)
     for key in options:
@@ -159,7 +159,7 @@ def _made(factory: Callable[..., Any], where: str, options: dict[str, Any]) -> A
             raise ConfigError(f"{where} has no option {key!r}", cure=suggestion(key, names))
     try:
         # Turns text into what the function's annotations ask for.
-        return validate_call(factory)(**options) if options else factory()
+        return _validated(factory)(**options) if options else factory()
     except ValidationError as error:
         first = error.errors()[0]
         key = str(first["loc"][0]) if first["loc"] else "its options"
@@ -170,6 +170,14 @@ def _made(factory: Callable[..., Any], where: str, options: dict[str, Any]) -> A
         raise ConfigError(
             f"calling it fails: {type(error).__name__}: {error}", file=where
         ) from None
+
+
+def _validated(_factory: Callable[..., Any]) -> Callable[..., Any]:
+    # pydantic looks names of annotations up among the caller's variables first: there are no
+    # others here that a user's module may have, too.
+    from pydantic import validate_call
+
+    return validate_call(_factory)
 
 
 def model_options(name: str) -> list[ModelOption]:

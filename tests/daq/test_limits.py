@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from daq.cli.terminal import report
+from daq.cli.terminal import report_event
 from daq.config.rig import RigConfig
 from daq.errors import ConfigError
 from daq.hal import Flag, Mode, Phase, Samples
@@ -263,10 +263,10 @@ def test_commands_follow_no_faster_than_the_slew():
 
 
 def test_a_cables_limit_is_left_out_where_the_plant_has_no_cable(capsys):
-    config, _ = load_rig("simulated.yaml", {"plant": {"load": "free"}}, report)
+    config, _ = load_rig("simulated.yaml", {"plant": {"load": "free"}}, report_event)
     assert config.limits.winding is None
     assert "limits.winding of 0.25 turns is left out" in capsys.readouterr().err
-    config, _ = load_rig("simulated.yaml", watch=report)
+    config, _ = load_rig("simulated.yaml", watch=report_event)
     assert config.limits.winding == 0.25 and not capsys.readouterr().err
 
 
