@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from joblib.externals.loky import get_reusable_executor
 
-import sysid.campaigns.campaign
 from sysid import GASSI, Constraint, Dataset, ModelError, Run, campaign, combinations, fit_percent
 from sysid.campaigns.parcels import pack, unpack
 from tests.sysid.support import lag
@@ -232,7 +231,8 @@ def test_the_cores_are_shared_among_the_runs(monkeypatch):
         return original(self, *args, **kwargs)
 
     monkeypatch.setattr(GASSI, "fit", fit)
-    monkeypatch.setattr(sysid.campaigns.campaign, "available_cores", lambda: 8)
+    module = sys.modules["sysid.campaigns.campaign"]  # the package has the function of that name
+    monkeypatch.setattr(module, "available_cores", lambda: 8)
     todo = runs(seeds=(0,))
     with joblib.parallel_config(backend="threading"):
         campaign(todo, n_jobs=3)
