@@ -149,9 +149,7 @@ class Campaign:
 
         What satisfies the model's constraints comes before what does not.
         """
-        return {
-            key: done[0] for key, group in self._groups().items() if (done := _ranked(group))
-        }
+        return {key: done[0] for key, group in self._groups().items() if (done := _ranked(group))}
 
     def spread(self) -> list[Spread]:
         """Each structure on each set of records over its seeds."""
