@@ -39,14 +39,15 @@ class Drawing:
     svg: str
 
 
-def page(model: ProcessModel, document: Mapping[str, Any], drawings: Sequence[Drawing]) -> str:
-    """The page of a report's document.
+def page(
+    model: ProcessModel, document: Mapping[str, Any], rows: Rows, drawings: Sequence[Drawing]
+) -> str:
+    """The page of a report's document; rows: its tables.
 
     Every number shown carries the document's own in ``data-value``.
     """
     first = next((drawing for drawing in drawings if drawing.topic == "responses"), None)
     ordered = sorted(drawings, key=lambda d: -1 if d is first else TOPICS.index(d.topic))
-    rows = Rows.of(document)
     variables = {"rows": rows, **view(model, document, rows)}
     return _rendered("report.html.j2", document, variables, ordered)
 

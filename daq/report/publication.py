@@ -19,7 +19,6 @@ from daq.identification.baseline import Baseline, baseline_of
 from daq.identification.records import LoggedRecord
 from daq.identification.request import SettingsRequest
 from daq.identification.result import Identification, errors_document
-from daq.identification.rows import Rows
 from daq.logs.recording import read_record
 from daq.lookup.models import DEFAULT_MODEL
 from daq.progress import Progress, Watch, ignore
@@ -62,9 +61,9 @@ def publish(result: Identification, folder: Path, watch: Watch = ignore) -> dict
         count = len(drawings)
         watch(Progress("Report", min(count, _STEPS - 1), _STEPS, f"{count} figures"))
     pages = {
-        "report": (_PAGE, page(result.model, document, drawings)),
+        "report": (_PAGE, page(result.model, document, subject.rows, drawings)),
         "data": (DATA, json.dumps(document, indent=1) + "\n"),
-        "latex": (_TABLE, latex(Rows.of(document))),
+        "latex": (_TABLE, latex(subject.rows)),
     }
     for name, content in pages.values():
         write_whole(folder / name, content)
