@@ -1,7 +1,5 @@
 """Documents for machines: what JSON can hold."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

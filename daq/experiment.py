@@ -4,8 +4,6 @@ A protocol is a subclass of one of three: ``Timed``, commands known beforehand f
 ``OpenLoop``, commands known beforehand; ``ClosedLoop``, a controller answers every sample.
 """
 
-from __future__ import annotations
-
 import abc
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Files and folders written for a user: whole or not at all, with the cure where it fails."""
 
-from __future__ import annotations
-
 import contextlib
 from pathlib import Path
 

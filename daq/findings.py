@@ -1,7 +1,5 @@
 """What a protocol concludes from its run: numbers, tables and charts, however they are shown."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field

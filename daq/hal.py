@@ -8,8 +8,6 @@ A backend implements ``Device`` in raw volts and counts. ``daq.rig.Rig`` puts SI
 and interlocks around any device, so that those exist once.
 """
 
-from __future__ import annotations
-
 import enum
 import math
 from dataclasses import dataclass

@@ -4,8 +4,6 @@
 (``current_motor``) stays one. Whatever comes from users is escaped.
 """
 
-from __future__ import annotations
-
 import html as _html
 import math
 import re

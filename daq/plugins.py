@@ -1,7 +1,5 @@
 """Backends, protocols, models and limits found by name, whichever installed package brings them."""
 
-from __future__ import annotations
-
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Literal
 

@@ -3,8 +3,6 @@
 A use case takes ``watch``, a function of one event, and never prints. ``ignore`` watches nothing.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal

@@ -1,7 +1,5 @@
 """What a result was made with: versions of this program, of Python and of libraries."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Sines that sweep through a band, on each channel."""
 
-from __future__ import annotations
-
 import math
 from typing import Literal
 

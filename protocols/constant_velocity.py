@@ -1,7 +1,5 @@
 """Torque against velocity: a staircase of constant velocities at each of several brake commands."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Annotated

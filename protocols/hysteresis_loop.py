@@ -1,7 +1,5 @@
 """Hysteresis loops: the shaft swung to and fro at each of several brake commands."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Mapping

@@ -6,8 +6,6 @@ the circle; on odd harmonics even nonlinearities show between the lines, and on 
 grid odd ones too, in the harmonic that each group leaves out.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, Literal, NamedTuple
 

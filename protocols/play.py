@@ -1,7 +1,5 @@
 """Commands from a file: a CSV of one's own, or the log of another run."""
 
-from __future__ import annotations
-
 import hashlib
 from pathlib import Path
 from typing import Any, Literal, NamedTuple

@@ -1,7 +1,5 @@
 """Pseudo-random binary sequences on both channels."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A sine on each channel."""
 
-from __future__ import annotations
-
 import numpy as np
 from pydantic import Field
 

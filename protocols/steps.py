@@ -1,7 +1,5 @@
 """Levels held for some time, or staircases up and down."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

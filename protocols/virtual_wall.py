@@ -1,7 +1,5 @@
 """A virtual wall, spring and damper, at each point of a grid: which of them are stable."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

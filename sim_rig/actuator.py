@@ -5,8 +5,6 @@ with ``sensor="between"``, the motor, the torque sensor, the brake and the load 
 The brushes of the torque sensor, where their friction is modelled, rub on its brake side.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

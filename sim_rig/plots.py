@@ -4,8 +4,6 @@ The torque that resists the shaft is computed from the model's own equations, dr
 sinusoidal speed with the brake's current held: its hysteresis loops.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 

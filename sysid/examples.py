@@ -1,7 +1,5 @@
 """A first-order lag and a record of it, to try things on."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Who gets the processor's cores: simulations all of them, linear algebra one."""
 
-from __future__ import annotations
-
 import os
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence

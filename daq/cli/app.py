@@ -1,7 +1,5 @@
 """The commands of ``rig``, each a module of its own. Heavy imports stay inside the commands."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 from typing import Annotated

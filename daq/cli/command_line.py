@@ -1,7 +1,5 @@
 """A command line whose commands all take ``--quiet`` and ``--verbose``."""
 
-from __future__ import annotations
-
 import functools
 import inspect
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """What the shell offers for a value when Tab is pressed (see ``rig --install-completion``)."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Literal

@@ -1,7 +1,5 @@
 """``rig emulate``: the simulated rig behind the serial protocol."""
 
-from __future__ import annotations
-
 import os
 import sys
 from pathlib import Path

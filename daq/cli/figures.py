@@ -1,7 +1,5 @@
 """``rig figures``: the figures of a finished identification, in other formats."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

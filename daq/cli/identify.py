@@ -1,7 +1,5 @@
 """``rig identify``: parameters from logs, or several structures compared on them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any

@@ -1,7 +1,5 @@
 """``rig init``: a folder with an experiment, a rig and settings of an identification to change."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """Reference pages in Markdown: every key of every kind of file, and the command line."""
 
-from __future__ import annotations
-
 import inspect
 import json
 from collections.abc import Iterator, Mapping

@@ -1,7 +1,5 @@
 """``rig schema``: JSON Schemas of the YAML files, and reference pages."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

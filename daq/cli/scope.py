@@ -1,7 +1,5 @@
 """``rig scope``: a page that follows a run."""
 
-from __future__ import annotations
-
 import sys
 import webbrowser
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What people and machines read: tables and progress on a terminal, plain lines, or JSON."""
 
-from __future__ import annotations
-
 import functools
 import json
 import re

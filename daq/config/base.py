@@ -1,7 +1,5 @@
 """Shared base of the configuration models."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Any, get_args, get_origin
 

@@ -1,7 +1,5 @@
 """Configuration files against their models: every mistake at once, each with place and cure."""
 
-from __future__ import annotations
-
 import difflib
 import math
 import re

@@ -1,7 +1,5 @@
 """The rig's configuration: which backend, which calibration, which limits."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Annotated, Any, Literal
 

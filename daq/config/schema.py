@@ -1,7 +1,5 @@
 """JSON Schemas of the configuration models, as editors read them (draft 7, without references)."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from typing import Any
 

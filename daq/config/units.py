@@ -9,8 +9,6 @@ in the JSON Schema, so a description does not repeat it. A number whose unit onl
 another key can tell is a ``Quantity``, as ``converted`` or ``split`` makes it a number.
 """
 
-from __future__ import annotations
-
 import functools
 import re
 import typing

@@ -1,7 +1,5 @@
 """Whether a computer suits a rig in real time: its ports, scheduling, memory and disk."""
 
-from __future__ import annotations
-
 import os
 import sys
 import time

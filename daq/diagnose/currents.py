@@ -1,7 +1,5 @@
 """Whether the currents of a run are what its commands and the amplifiers' gains make of them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Texts on how punctual a run was."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from daq.run.runner import RunResult

@@ -1,7 +1,5 @@
 """A linear model beside an identification: what physics adds to knowing none."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Campaigns: every log with every model and every seed, over cores or a cluster."""
 
-from __future__ import annotations
-
 import dataclasses
 import datetime
 import math

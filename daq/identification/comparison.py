@@ -1,7 +1,5 @@
 """Comparison of models, seeds and linear baselines: which structure to believe."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace

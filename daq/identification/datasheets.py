@@ -1,7 +1,5 @@
 """Data sheets on disk: ranges and fixed values for parameters of which nothing else is said."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Parameters of a model on disk, as an identification wrote them or a person did."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Numbers in a file whose units a process model declares, such as ``fixed: {L_m: 0.5 mH}``."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar

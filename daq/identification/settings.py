@@ -1,7 +1,5 @@
 """From configuration and command line to a checked model and its search settings."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -5,8 +5,6 @@ arrays; a block of one sample, as in closed loop, by plain numbers, which takes 
 time.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """What a limit is, and judging a block of samples at little cost."""
 
-from __future__ import annotations
-
 import abc
 import math
 

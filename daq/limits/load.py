@@ -1,7 +1,5 @@
 """Limits of what is measured: currents, their heat, torque, speed."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from daq.config.rig import Overload

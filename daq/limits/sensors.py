@@ -1,7 +1,5 @@
 """Limits of what sensors that work can show: jumps, silence, readings frozen to the bit."""
 
-from __future__ import annotations
-
 import abc
 import math
 

@@ -1,7 +1,5 @@
 """Limits of where the shaft may be: its travel, and what stays wound up."""
 
-from __future__ import annotations
-
 import math
 
 from daq.hal import FloatArray, Phase, Samples

@@ -1,7 +1,5 @@
 """Columns of a log and their units."""
 
-from __future__ import annotations
-
 # The first eight are what the lab's existing scripts read; the original program wrote no more.
 ORIGINAL_COLUMNS = (
     "t",

@@ -1,7 +1,5 @@
 """Sequence numbers and sample time of a log's rows."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

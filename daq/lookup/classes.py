@@ -1,7 +1,5 @@
 """Classes by the names that users write: installed ones, or ``FILE.py:CLASS``."""
 
-from __future__ import annotations
-
 import inspect
 import re
 from collections.abc import Callable

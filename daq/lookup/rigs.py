@@ -1,7 +1,5 @@
 """Rigs by the names that users write: configuration and device."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """JSON Schemas of every kind of file, over the installed protocols and backends."""
 
-from __future__ import annotations
-
 import inspect
 import json
 import math

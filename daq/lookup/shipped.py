@@ -1,7 +1,5 @@
 """YAML files that lie beside the installed protocols and backends."""
 
-from __future__ import annotations
-
 import importlib.util
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path

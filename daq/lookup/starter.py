@@ -1,7 +1,5 @@
 """Commented files to begin with: an experiment, a rig and settings of an identification."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Objects of a user's own Python files: models, protocols, limits."""
 
-from __future__ import annotations
-
 import importlib.util
 import sys
 from collections.abc import Callable

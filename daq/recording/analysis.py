@@ -1,7 +1,5 @@
 """What a protocol concludes from its run, in numbers, tables and figures."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from pathlib import Path

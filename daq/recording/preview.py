@@ -1,7 +1,5 @@
 """What an experiment would do, without energising anything."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The page of a comparison of models, with its figures."""
 
-from __future__ import annotations
-
 import datetime
 from collections.abc import Iterator, Mapping
 from pathlib import Path

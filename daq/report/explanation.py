@@ -1,7 +1,5 @@
 """What a report's page says beside its tables: sentences, and what to do next."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Identified parameters as a LaTeX table."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from daq import notation

@@ -1,7 +1,5 @@
 """A report as one HTML page that needs nothing else: figures and style are inside it."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """The report of an identification: a page, figures, a LaTeX table and a JSON document."""
 
-from __future__ import annotations
-
 import datetime
 import hashlib
 import json

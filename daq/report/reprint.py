@@ -1,7 +1,5 @@
 """The figures of a finished identification's report, in other formats."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Mapping, Sequence

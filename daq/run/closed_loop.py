@@ -1,7 +1,5 @@
 """The run phase in closed loop: a controller answers every sample with a command."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The run phase in open loop: a waveform known beforehand, played by the device's clock."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from daq.errors import DeviceError

@@ -1,7 +1,5 @@
 """What a run will do, checked against the rig's limits before anything is energised."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from daq.config.rig import RigConfig

@@ -1,7 +1,5 @@
 """Phases at zero command before a run: offsets of the inputs, winding of the load."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Asking a protocol, whose code may be anybody's: its answers are checked, its mistakes placed."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import math

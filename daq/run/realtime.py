@@ -1,7 +1,5 @@
 """Real-time scheduling while a run is on, as far as the operating system grants it."""
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import gc

@@ -1,7 +1,5 @@
 """The run loop: open, calibrate, home, excite, make safe, close, logging every sample."""
 
-from __future__ import annotations
-
 import contextlib
 from dataclasses import dataclass
 from pathlib import Path

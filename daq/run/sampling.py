@@ -1,7 +1,5 @@
 """Samples of a run, each shown to the limits before anything else is done with it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
 

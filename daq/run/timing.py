@@ -1,7 +1,5 @@
 """How punctual a run was: time between blocks, from a sample to its answer, late and lost ones."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass, field
 from typing import Any

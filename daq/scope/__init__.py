@@ -1,7 +1,5 @@
 """A page that shows a run's log while it grows; the run knows nothing of it."""
 
-from __future__ import annotations
-
 import importlib.util
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The figures of a page: one for each quantity, over one axis of time."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Mapping, Sequence

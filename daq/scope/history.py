@@ -1,7 +1,5 @@
 """A run's samples in bounded memory: the newest as they are, all of them as lows and highs."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """One browser tab: what is drawn 30 times a second, and what the controls do."""
 
-from __future__ import annotations
-
 import time
 from html import escape
 from typing import Any

@@ -1,7 +1,5 @@
 """Serving the page to this machine, and to no other."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import signal

@@ -1,7 +1,5 @@
 """Reading a log that is still being written: whole lines only, and whatever of them is readable."""
 
-from __future__ import annotations
-
 import io
 import math
 import warnings

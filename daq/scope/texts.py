@@ -1,7 +1,5 @@
 """The texts of a page, as HTML: the run's state above, the values beside the figures."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from html import escape

@@ -1,7 +1,5 @@
 """The run that is shown: the newest under a folder, or a named one, as it grows."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A rig on a serial port, as a ``daq.hal.Device``."""
 
-from __future__ import annotations
-
 import contextlib
 from typing import Annotated, Any
 

@@ -1,7 +1,5 @@
 """Relation between the host's clock and the device's: offset and drift, from round trips."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from typing import Any

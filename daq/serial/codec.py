@@ -6,8 +6,6 @@ All numbers little-endian. A frame is accepted only when its COBS code, its leng
 CRC all agree; whatever else came between two zero bytes is counted and dropped.
 """
 
-from __future__ import annotations
-
 import struct
 import zlib
 from dataclasses import dataclass

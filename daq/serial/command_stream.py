@@ -1,7 +1,5 @@
 """The host's side of a run's commands: given by the program, sent as the device has room."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A session with the device behind a port: its machine, and the threads that serve it."""
 
-from __future__ import annotations
-
 import contextlib
 import getpass
 import math

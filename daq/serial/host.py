@@ -4,8 +4,6 @@ A program around it feeds bytes (``feed``), calls ``poll`` every few millisecond
 what ``take`` gives. Times are seconds of the host's monotonic clock.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass

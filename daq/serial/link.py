@@ -3,8 +3,6 @@
 The only file of the package that touches an operating system.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import os

@@ -5,8 +5,6 @@ has them as byte tables. Unpacking raises one of ``MALFORMED`` for a payload of 
 with a number that means nothing; a receiver counts it like a frame with a wrong CRC.
 """
 
-from __future__ import annotations
-
 import enum
 import struct
 from collections.abc import Sequence

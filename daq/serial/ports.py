@@ -1,7 +1,5 @@
 """Which serial ports this computer has, and who answers on them."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor

@@ -1,7 +1,5 @@
 """Volts of the HAL as converter codes of a device, by its channel table, and back."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -11,8 +11,6 @@ both of which have closed solutions. Torque is kappa w + (c0 + c1 i) omega + J d
 with kappa = alpha A / (beta + gamma), so that of z and alpha only their product shows.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

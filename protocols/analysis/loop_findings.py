@@ -1,7 +1,5 @@
 """Findings of a run of hysteresis loops: energy, shape and the parameters behind them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import replace

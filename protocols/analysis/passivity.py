@@ -1,7 +1,5 @@
 """When a rendered wall is stable: the passivity bound, and the sampled loop's eigenvalues."""
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Sequence

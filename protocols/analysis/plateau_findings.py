@@ -1,7 +1,5 @@
 """Findings of a run at constant velocities: torque over velocity, c0, c1, what recurs in a turn."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass

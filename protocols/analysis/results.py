@@ -1,7 +1,5 @@
 """What findings are made of: estimates with their intervals, axes, model lines, tables by rows."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The part of a torque that recurs with every turn of the shaft."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -11,8 +11,6 @@ All of it is linear in the unknowns. Between motor and brake both lines hold tog
 tells K_m and the motor's losses (B_m, T_m), and the current, by far the quieter signal, the rest.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

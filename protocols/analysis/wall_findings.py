@@ -1,7 +1,5 @@
 """Findings of a run of virtual walls: which of them rang, beside what theory says."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

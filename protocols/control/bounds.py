@@ -1,7 +1,5 @@
 """Bounds of the commands that a controller confines itself to."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Annotated
 

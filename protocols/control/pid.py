@@ -1,7 +1,5 @@
 """A PID controller for sampled loops, its gains, and a reference that rises slowly."""
 
-from __future__ import annotations
-
 import math
 from typing import Annotated
 

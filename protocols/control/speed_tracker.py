@@ -1,7 +1,5 @@
 """The estimate of speed that a loop is given, from the encoder's angle."""
 
-from __future__ import annotations
-
 import math
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """A velocity loop on the motor: the settings of its protocols, and the loop itself."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Annotated, Literal
 

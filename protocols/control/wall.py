@@ -1,7 +1,5 @@
 """A virtual wall, spring and damper, rendered at each point of a grid: settings and controller."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

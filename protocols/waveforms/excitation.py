@@ -1,7 +1,5 @@
 """Excitations: both channels moved around their offsets, brought in from zero and out to it."""
 
-from __future__ import annotations
-
 import abc
 from dataclasses import replace
 from typing import Generic, TypeVar

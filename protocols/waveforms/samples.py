@@ -1,7 +1,5 @@
 """Times as numbers of samples, and the rise from zero."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Commands that wait for their ticks."""
 
-from __future__ import annotations
-
 from collections import deque
 
 import numpy as np

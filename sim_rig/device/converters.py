@@ -1,7 +1,5 @@
 """Converters of the simulated rig: volts at its inputs and outputs as the electronics see them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The device's own interlock, checked every tick as a board does in its timer's interrupt."""
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit
 

@@ -1,7 +1,5 @@
 """The simulated user: winds the load when asked, then keeps off, or moves the handle in the run."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

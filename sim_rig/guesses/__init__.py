@@ -1,7 +1,5 @@
 """Starting ranges of the actuator's parameters, read from its logs before any search."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from sim_rig.guesses import damping, electrical

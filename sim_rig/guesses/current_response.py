@@ -4,8 +4,6 @@ The motor's current also feels the speed at its sample and before, by the back-E
 are grouped, eight groups of one sample, then eight twice as wide, and so on for some octaves.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ Of the torque that resists the shaft, at moments at which the speed is steady an
 under an unchanged command. Coulomb's jump at zero speed adds to the slope, so it is a limit.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

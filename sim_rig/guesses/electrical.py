@@ -12,8 +12,6 @@ inductance and driver cutoff how large and how small they may be. What is assume
 the others.
 """
 
-from __future__ import annotations
-
 import math
 
 from sim_rig.guesses.current_response import CurrentResponse

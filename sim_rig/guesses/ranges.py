@@ -1,7 +1,5 @@
 """Ranges of parameters as measured data narrow them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 

@@ -4,8 +4,6 @@ Equation numbers here and in the neighbouring files are those of the thesis this
 as ("Hybrid Haptic Device Modeling and System Identification").
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

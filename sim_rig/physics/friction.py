@@ -7,8 +7,6 @@ compensation methods for the control of machines with friction", Automatica 30, 
 brushes press unevenly along a turn: that part is a harmonic of the shaft angle.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

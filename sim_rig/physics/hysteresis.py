@@ -8,8 +8,6 @@ passive brake deliver energy. The smooth forms put tanh(rho x) in place of the s
 they can be differentiated everywhere.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """What hangs on the shaft: nothing, a lock, a mass on a pulley, a hand, or a measured torque."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 The same types stand in the call ``actuator(...)``, in a rig's YAML and in ``rig models``.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated, Literal
 

@@ -5,8 +5,6 @@ keeps one long tuple; a ``Layout`` has each part's slice of it, so that no equat
 through the parameters of another.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Sequence
 from typing import Any

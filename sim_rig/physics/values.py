@@ -4,8 +4,6 @@ Each value of the rig has the reason for it beside it. "Assumed" ones stand in n
 Identification models have none of them unless a set is named.
 """
 
-from __future__ import annotations
-
 from sim_rig.physics.options import Design, SetName
 
 # Motor and its driver; what a row does not name stays as the rig has it.

@@ -6,8 +6,6 @@ packages, this one) as its name. An array unpickled from a parcel may be written
 made here: the kernels are compiled for such, and would be compiled again for others.
 """
 
-from __future__ import annotations
-
 import pickle
 import sys
 import sysconfig

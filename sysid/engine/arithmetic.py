@@ -1,7 +1,5 @@
 """What the forms of a tape's lines compute, of floats and of arrays alike."""
 
-from __future__ import annotations
-
 import functools
 import math
 import types

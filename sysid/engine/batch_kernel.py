@@ -6,8 +6,6 @@ LLVM turns each line into vector instructions. Two-dimensional arrays or an inne
 stages give scalar code, about five times slower (docs/decisions/0003-batch-kernel.md).
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 

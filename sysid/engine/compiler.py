@@ -5,8 +5,6 @@ text and of those of the model's functions that it calls, with all that these ca
 changed model file therefore gets a new name, and an old kernel is never used for it.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import hashlib

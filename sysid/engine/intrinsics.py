@@ -1,8 +1,6 @@
 # mypy: ignore-errors
 """What compiled code needs and Python has no words for."""
 
-from __future__ import annotations
-
 import platform
 from typing import Any
 

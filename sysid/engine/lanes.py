@@ -1,7 +1,5 @@
 """Lanes: how many chromosomes one block of the batch simulator holds, and where they live."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sysid.arrays import FloatArray

@@ -9,8 +9,6 @@ Only entries that can differ from zero are kept: a matrix is an array (entries, 
 doubles as often as its own norm asks for, so that what it gets does not depend on the others.
 """
 
-from __future__ import annotations
-
 import contextlib
 import math
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Source text of functions that were written down on a tape."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeVar

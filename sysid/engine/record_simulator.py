@@ -1,7 +1,5 @@
 """Simulations of one record: the steps that each parameter vector needs, and blocks of lanes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

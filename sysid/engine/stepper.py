@@ -1,7 +1,5 @@
 """One trajectory, advanced sample by sample: what a simulated rig needs."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -8,8 +8,6 @@ while it is not at a limit; N is what is left, zero until then. Where the equati
 value nothing is claimed to be linear, and N is the user's function itself.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ directly or through a module. To compile, trace or differentiate them, copies ar
 library functions have stand-ins; the user's functions themselves stay untouched.
 """
 
-from __future__ import annotations
-
 import math
 import types
 from collections.abc import Callable, Mapping

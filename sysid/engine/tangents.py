@@ -1,7 +1,5 @@
 """Tangents: how numbers on a tape move with its variables, as further lines of the same tape."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 
 from sysid.engine.tape import Line, Tape

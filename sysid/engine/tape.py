@@ -4,8 +4,6 @@ A tape may stand at a point: then each number has its value there too, and where
 branch it notes which way they went.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 

@@ -9,8 +9,6 @@ interval: what happens in one depends on nothing but the state it starts from.
 look the same at both its ends and in its middle, and run into limits in between.
 """
 
-from __future__ import annotations
-
 from sysid.engine.lanes import LANES
 from sysid.engine.program import block, listed
 from sysid.engine.scheme import (

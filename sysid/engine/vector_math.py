@@ -6,8 +6,6 @@ keep the whole lane loop scalar. Relative errors stay below 1e-14 over the range
 number in gives not a number out.
 """
 
-from __future__ import annotations
-
 # Whatever is not defined below is math's own.
 from math import *  # noqa: F403
 from typing import Any

@@ -1,7 +1,5 @@
 """Free runs of a record's inputs, and where they start when the record does not say."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sysid.arrays import FloatArray

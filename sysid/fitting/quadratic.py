@@ -23,8 +23,6 @@ quadratic promises to gain is the share -(g'd + d'H d / 2) / E_f. Steps and slop
 the ranges.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ A strategy returns a stalled descent as it goes on, or None where it gives up. T
 stall, which stand at the end, are tried in turn; a descent that they all give up has finished.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

@@ -18,8 +18,6 @@ squares", Quarterly of Applied Mathematics 2, 1944) as scaled by Marquardt (1963
 course depends on nothing but itself, whatever others share its batches.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 

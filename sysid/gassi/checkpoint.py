@@ -5,8 +5,6 @@ it holds the search's origin, in words and hashes, so that it is never continued
 settings or equations.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

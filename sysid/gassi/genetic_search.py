@@ -3,8 +3,6 @@
 The presets are settings of one loop, in which a generation is evaluated, ranked and bred.
 """
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Mapping
 from dataclasses import dataclass, fields

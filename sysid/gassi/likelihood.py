@@ -9,8 +9,6 @@ Among minima the likelihood chooses once more, each output counted by as many in
 as the colour of its errors leaves; those that it cannot tell apart are rivals.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property

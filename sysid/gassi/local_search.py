@@ -6,8 +6,6 @@ parameters away from one another. So the best minimum is varied, one parameter a
 whole range, and new descents start from the dips of the error along these lines.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any

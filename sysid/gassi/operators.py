@@ -6,8 +6,6 @@ before and after the step: taken literally, the mutation's right-hand side would
 crossover.)
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from sysid.arrays import BoolArray, FloatArray

@@ -6,8 +6,6 @@ paper, the paper is followed: (4.15) uses max(0, |h| - delta), and the outer cas
 compare the worst infeasible error with the best and scale by the population's highest error.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

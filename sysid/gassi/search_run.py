@@ -1,7 +1,5 @@
 """A whole search, step by step: genetic search, then local refinement."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any

@@ -1,7 +1,5 @@
 """How far an identified model may be trusted: its errors, residuals, intervals, in one verdict."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal

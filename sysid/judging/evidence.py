@@ -1,7 +1,5 @@
 """How much coloured residuals tell: ratios of losses, and independent samples."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ Autocorrelation (are they white?) and correlation with past and present inputs (
 dynamics left in them?), each with 95 % bands (Ljung, "System Identification", section 16.6).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

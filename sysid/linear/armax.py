@@ -1,7 +1,5 @@
 """ARX and ARMAX models as scikit-learn regressors."""
 
-from __future__ import annotations
-
 from dataclasses import KW_ONLY, dataclass
 
 from sysid.linear.estimator import PolynomialModel

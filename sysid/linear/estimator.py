@@ -1,7 +1,5 @@
 """What ARX and ARMAX share: identification, free runs and predictions of a linear model."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Sequence
 from typing import Any, Self

@@ -3,8 +3,6 @@
 A (n_lags + 1, q, q) and B (n_lags + 1, q, m) are full, C (nc + 1, q) is a diagonal; by lag.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

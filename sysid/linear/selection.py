@@ -1,7 +1,5 @@
 """Choice of model orders: every combination of a grid, compared on the same rows."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor

@@ -10,8 +10,6 @@ records: ``Measured``, signals by name. known: {parameter: (low, high)}, the ran
 parameter so far, low = high for a fixed one. A parameter that it does not return keeps its range.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ Inputs are (n_samples, n_outputs); lost samples (NaN in the measurement) do not 
 are (n_outputs,).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ brake over its angle: ``ProcessModel(..., plots=plots)`` with a function of the 
 ``Evidence`` that gives ``Plot``s. It draws nothing itself.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Where a parameter is searched, and which parameters follow others."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

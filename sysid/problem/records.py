@@ -1,7 +1,5 @@
 """What a user hands to an estimator, arrays or Datasets, as a list of records."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Frequency responses: estimated from records, and of linear models as a sampler sees them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

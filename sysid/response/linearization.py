@@ -1,7 +1,5 @@
 """Exact Jacobians of any process model, operating points, and linear models at them."""
 
-from __future__ import annotations
-
 import functools
 from dataclasses import dataclass
 from typing import Any

@@ -6,8 +6,6 @@ hides are not determined: the parameters in them get no interval, but the combin
 data do determine (products, sums) do.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace

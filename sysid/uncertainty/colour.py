@@ -6,8 +6,6 @@ white eps, has the covariance (H' S)' cov(eps) (H' S); H' is the same recursion 
 time, so that nothing of the size of the record squared is ever formed.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Which directions of parameter space the data determine, and how well."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """An identified quantity: a parameter, or a product or sum of several."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal

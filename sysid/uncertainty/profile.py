@@ -1,7 +1,5 @@
 """Profile likelihood: how much worse the best fit becomes as one parameter is moved."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import dataclass
 

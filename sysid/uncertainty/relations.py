@@ -1,7 +1,5 @@
 """Relations hidden in undetermined directions: which parameters act only together, and how."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Slopes of the simulated outputs over the parameters, and what errors of the sensors change."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property

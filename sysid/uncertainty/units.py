@@ -1,7 +1,5 @@
 """The unit of a product of parameters."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Iterable

@@ -1,7 +1,5 @@
 """A simulated rig as a board behind the wire: its converters, its counter and its identity."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from daq.hal import ANALOG_INPUTS, CHANNELS, Electronics, Guard, IntArray, Mode, Phase, Simulation

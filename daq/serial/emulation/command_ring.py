@@ -1,7 +1,5 @@
 """The device's queue of commands."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from daq.hal import CHANNELS

@@ -1,7 +1,5 @@
 """A device in software at an endpoint: the reference state machine, run with faults on request."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import select

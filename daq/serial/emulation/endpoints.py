@@ -1,7 +1,5 @@
 """Where a host connects to an emulator: a pty, or a TCP port of the loopback interface."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import socket

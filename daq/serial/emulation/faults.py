@@ -1,7 +1,5 @@
 """Faults of lines and devices, on purpose: what ``rig emulate --fault`` can do."""
 
-from __future__ import annotations
-
 import math
 import random
 from collections import deque

@@ -5,8 +5,6 @@ A program around it feeds bytes as they come (``receive``), calls ``poll`` no la
 ``Board`` is what a port to a microcontroller writes anew: converters, counter and timer.
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections import deque
 from collections.abc import Callable
