@@ -15,10 +15,9 @@ def write_whole(path: Path, content: str | bytes) -> None:
     except OSError as error:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
-        folder = path.parent
-        reason = (
-            error.strerror if folder.is_dir() else f"there is no folder {folder}, make it first"
-        )
+        reason = error.strerror
+        if not path.parent.is_dir():
+            reason = f"there is no folder {path.parent}, make it first"
         raise RunError(f"cannot be written: {reason}", file=path) from None
 
 

@@ -5,18 +5,17 @@ from typing import Any, Literal
 
 from daq.errors import ConfigError, suggestion
 
-Group = Literal["rig.backends", "rig.protocols", "rig.models", "rig.limits"]
+Kind = Literal["backend", "limit", "model", "protocol"]
 
 
-def installed(group: Group) -> dict[str, EntryPoint]:
-    """Entry points of a group, by name."""
-    return {point.name: point for point in entry_points(group=group)}
+def installed(kind: Kind) -> dict[str, EntryPoint]:
+    """Entry points of a kind, whichever installed package brings them, by name."""
+    return {point.name: point for point in entry_points(group=f"rig.{kind}s")}
 
 
-def load_plugin(group: Group, name: str) -> Any:
+def load_plugin(kind: Kind, name: str) -> Any:
     """The object registered under a name; ConfigError names those that exist."""
-    kind = group.removeprefix("rig.").removesuffix("s")
-    points = installed(group)
+    points = installed(kind)
     if name not in points:
         raise ConfigError(f"unknown {kind} {name!r}", cure=suggestion(name, list(points)))
     try:

@@ -6,7 +6,6 @@ Installed with the package. Options: ``--rig-seed N`` seeds ``simulated_rig``.
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -117,11 +116,11 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 @pytest.fixture
-def simulated_rig(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[SimulatedRig]:
+def simulated_rig(request: pytest.FixtureRequest, tmp_path: Path) -> SimulatedRig:
     """A simulated rig; logs go to the test's temporary folder, the seed into a failure's report."""
     seed = request.config.getoption("--rig-seed")
     request.node.add_report_section("setup", "rig", f"simulated rig with --rig-seed {seed}")
-    yield SimulatedRig(seed, request.path.parent, tmp_path / "runs")
+    return SimulatedRig(seed, request.path.parent, tmp_path / "runs")
 
 
 @pytest.fixture

@@ -11,40 +11,30 @@ _INTERRUPTED = 130  # what Typer makes of Ctrl-C
 def main() -> None:
     """Run the command line; expected errors end it with their message and exit status."""
     try:
-        # Ctrl-C may come while these are imported, too.
+        # Ctrl-C may come while this is imported, too.
         from daq.cli.app import app
-        from daq.cli.terminal import report_error
 
         app()
     except RigError as error:
-        _report_notes(error)
-        report_error(str(error))
-        sys.exit(error.exit_status)
+        _end(error, str(error), error.exit_status)
     except Terminated as signal:
-        _report_notes(signal)
-        report_error(f"stopped by {signal}; outputs are zero")
-        sys.exit(1)
+        _end(signal, f"stopped by {signal}; outputs are zero")
     except KeyboardInterrupt as interrupt:
-        _stopped(interrupt)
+        _end(interrupt, "stopped by Ctrl-C")
     except SystemExit as exit:
         if exit.code == _INTERRUPTED:
-            _stopped(exit)
+            _end(exit, "stopped by Ctrl-C")
         raise
 
 
-def _stopped(error: BaseException) -> NoReturn:
+def _end(error: BaseException, message: str, status: int = 1) -> NoReturn:
+    """Exit with a message, behind the notes of the error and of those that led to it."""
     from daq.cli.terminal import report_error
 
-    _report_notes(error)
-    report_error("stopped by Ctrl-C")
-    sys.exit(1)
-
-
-def _report_notes(error: BaseException | None) -> None:
-    """What an error, or the one behind it, has to say besides."""
-    from daq.cli.terminal import report_error
-
-    while error is not None:
-        for note in getattr(error, "__notes__", ()):
+    cause: BaseException | None = error
+    while cause is not None:
+        for note in getattr(cause, "__notes__", ()):
             report_error(note)
-        error = error.__context__
+        cause = cause.__context__
+    report_error(message)
+    sys.exit(status)

@@ -6,21 +6,20 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Argument
 
 from daq import notation
-from daq.cli import terminal
-from daq.cli.options import AsJson
+from daq.cli import options, terminal
 
 if TYPE_CHECKING:
-    from daq.findings import Findings, Number, Table
+    from daq.findings import Findings, Number
 
 _WIDTH = 2 * 1.96  # standard deviations in a 95 % interval
 
 
 def analyse(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="Capture folder.")],
-    json: AsJson = False,
+    run: Annotated[Path, Argument(metavar="RUN", help="Capture folder.")],
+    json: options.AsJson = False,
 ) -> None:
     """Conclude from a log what its protocol is for.
 
@@ -28,7 +27,7 @@ def analyse(
     """
     from daq.recording import analysis
 
-    with terminal.Watching(quiet=json) as watch:
+    with terminal.watching(json) as watch:
         result = analysis.analyse(run, watch=watch)
     if json:
         terminal.print_json(result.document)
@@ -63,26 +62,22 @@ def show_findings(findings: Findings, folder: Path) -> None:
             text=["unit", "meaning"],
         )
     for table in filter(lambda table: table.printed, findings.tables):
-        heads = [_with_unit(name, table) for name in table.columns]
+        units = {name: f" [{unit}]" for name, unit in table.units.items()}
+        heads = [f"{name}{units.get(name, '')}" for name in table.columns]
         rows = zip(*(values.tolist() for values in table.columns.values()), strict=True)
-        terminal.print_table(
-            table.title, heads, [[terminal.number(v) for v in row] for row in rows]
-        )
+        terminal.print_table(table.title, heads, [list(map(terminal.number, row)) for row in rows])
     for remark in findings.remarks:
         terminal.print_text(remark)
-    terminal.print_line(f"Results: {folder / RESULTS}")
+    print(f"Results: {folder / RESULTS}")
 
 
 def _number_row(number: Number) -> list[str]:
     scale, unit = notation.engineering(number.value, number.unit)
-    value, interval, digits = scale * number.value, "-", 4
+    interval, digits = "-", 4
     if number.low is not None and number.high is not None:
         if math.isfinite(number.high - number.low):
             digits = notation.digits(number.value, (number.high - number.low) / _WIDTH)
         ends = (terminal.number(scale * end, digits) for end in (number.low, number.high))
         interval = " .. ".join(ends)
-    return [number.name, terminal.number(value, digits), interval, unit, number.meaning]
-
-
-def _with_unit(name: str, table: Table) -> str:
-    return f"{name} [{table.units[name]}]" if name in table.units else name
+    value = terminal.number(scale * number.value, digits)
+    return [number.name, value, interval, unit, number.meaning]

@@ -1,15 +1,16 @@
 """The commands of ``rig``, each a module of its own. Heavy imports stay inside the commands."""
 
+import functools
 import sys
 from collections.abc import Callable
-from typing import Annotated
+from inspect import Parameter, signature
+from typing import Annotated, Any
 
-import typer
+from typer import BadParameter, Exit, Option, Typer
 
 from daq.cli.analyse import analyse
 from daq.cli.campaign import campaign
 from daq.cli.check import check
-from daq.cli.command_line import CommandLine
 from daq.cli.doctor import doctor
 from daq.cli.emulate import emulate
 from daq.cli.figures import figures
@@ -21,20 +22,7 @@ from daq.cli.replay import replay
 from daq.cli.run import run
 from daq.cli.schema import schema
 from daq.cli.scope import scope
-
-app = CommandLine(
-    name="rig",
-    help=(
-        "Excite a hybrid haptic actuator (DC motor and magnetorheological brake), log every "
-        "sample, and identify its parameters.\n\n"
-        "Start with:  rig run prbs.yaml --identify"
-    ),
-    no_args_is_help=True,
-    # Frames are for people: in a pipe help and errors are plain lines.
-    rich_markup_mode="rich" if sys.stderr.isatty() else None,
-    pretty_exceptions_enable=False,
-    add_completion=True,
-)
+from daq.cli.terminal import Volume, output
 
 _COMMANDS: tuple[tuple[Callable[..., None], str], ...] = (
     (run, "rig run prbs.yaml --identify"),
@@ -56,17 +44,56 @@ _COMMANDS: tuple[tuple[Callable[..., None], str], ...] = (
     (ports, "rig ports"),
     (doctor, "rig doctor /dev/ttyACM0"),
 )
+_QUIET = Option("--quiet", "-q", help="Results and warnings only: no progress, no hints.")
+_VERBOSE = Option("--verbose", "-v", help="Also which files and plugins are used.")
+_VOLUME_OPTIONS = [
+    Parameter(name, Parameter.KEYWORD_ONLY, default=False, annotation=Annotated[bool, option])
+    for name, option in (("quiet", _QUIET), ("verbose", _VERBOSE))
+]
+
+
+def _with_volume(function: Callable[..., None]) -> Callable[..., None]:
+    """A command that takes ``--quiet`` and ``--verbose`` as well, and keeps to them."""
+
+    @functools.wraps(function)
+    def command(*args: Any, quiet: bool, verbose: bool, **options: Any) -> None:
+        if quiet and verbose:
+            raise BadParameter("give --quiet or --verbose, not both")
+        level = Volume.QUIET if quiet else Volume.VERBOSE if verbose else Volume.NORMAL
+        with output(level, options.get("json", False)):
+            function(*args, **options)
+
+    # Typer reads the options from the signature and the annotations.
+    plain = signature(function, eval_str=True)
+    parameters = [*plain.parameters.values(), *_VOLUME_OPTIONS]
+    command.__signature__ = plain.replace(parameters=parameters)  # type: ignore[attr-defined]
+    command.__annotations__ = {each.name: each.annotation for each in parameters}
+    return command
+
+
+app = Typer(
+    name="rig",
+    help=(
+        "Excite a hybrid haptic actuator (DC motor and magnetorheological brake), log every "
+        "sample, and identify its parameters.\n\n"
+        "Start with:  rig run prbs.yaml --identify"
+    ),
+    no_args_is_help=True,
+    # Frames are for people: in a pipe help and errors are plain lines.
+    rich_markup_mode="rich" if sys.stderr.isatty() else None,
+    pretty_exceptions_enable=False,
+)
 for _command, _example in _COMMANDS:
-    app.command(epilog=f"Example:  {_example}")(_command)
+    app.command(epilog=f"Example:  {_example}")(_with_volume(_command))
 
 
 @app.callback(invoke_without_command=True)
 def program(
-    version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False,
+    version: Annotated[bool, Option("--version", help="Print the version and exit.")] = False,
 ) -> None:
     """Nothing but its version, without a command."""
     if version:
         from importlib.metadata import version as installed
 
         print(f"hybrid-rig {installed('hybrid-rig')}")
-        raise typer.Exit
+        raise Exit

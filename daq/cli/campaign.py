@@ -5,23 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Option
 
-from daq.cli import terminal
-from daq.cli.options import (
-    AsJson,
-    ConfigFile,
-    Dask,
-    Generations,
-    HoldBack,
-    Jobs,
-    ModelNames,
-    Population,
-    Preset,
-    Seeds,
-    Settings,
-    Validation,
-)
+from daq.cli import options, terminal
 
 if TYPE_CHECKING:
     from daq.identification.campaign import CampaignResult
@@ -29,31 +15,25 @@ if TYPE_CHECKING:
 
 
 def campaign(
-    logs: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="RUN_OR_CSV...", help="Capture folders, CSV logs, or folders of them."
-        ),
-    ],
-    model: ModelNames = None,
-    config: ConfigFile = None,
-    validate: Validation = None,
+    logs: Annotated[list[Path], options.LOGS],
+    model: options.ModelNames = None,
+    config: options.ConfigFile = None,
+    validate: options.Validation = None,
     out: Annotated[
-        Path | None,
-        typer.Option("--out", metavar="DIR", help="Where results go; default under campaigns/."),
+        Path | None, Option(metavar="DIR", help="Where results go; default under campaigns/.")
     ] = None,
-    seeds: Seeds = None,
+    seeds: options.Seeds = None,
     together: Annotated[
-        bool, typer.Option("--together", help="One parameter set for all logs, not one for each.")
+        bool, Option("--together", help="One parameter set for all logs, not one for each.")
     ] = False,
-    preset: Preset = None,
-    population: Population = None,
-    generations: Generations = None,
-    hold_back: HoldBack = None,
-    settings: Settings = None,
-    jobs: Jobs = None,
-    dask: Dask = None,
-    json: AsJson = False,
+    preset: options.Preset = None,
+    population: options.Population = None,
+    generations: options.Generations = None,
+    hold_back: options.HoldBack = None,
+    settings: options.Settings = None,
+    jobs: options.Jobs = None,
+    dask: options.Dask = None,
+    json: options.AsJson = False,
 ) -> None:
     """Identify every log with every model and seed.
 
@@ -62,23 +42,21 @@ def campaign(
     from daq.identification import campaign as use_case
     from daq.identification.request import SettingsRequest
 
-    options = {
-        "preset": preset,
-        "population": population,
-        "generations": generations,
-        "hold_back": hold_back,
-    }
-    request = use_case.CampaignRequest(
-        logs,
-        validate or [],
-        model or [],
-        seeds,
-        SettingsRequest(None if config is None else str(config), options, settings or []),
-        together,
-        use_case.Workers(jobs, dask),
-        out,
+    chosen = SettingsRequest(
+        None if config is None else str(config),
+        {
+            "preset": preset,
+            "population": population,
+            "generations": generations,
+            "hold_back": hold_back,
+        },
+        settings or [],
     )
-    with terminal.Watching(quiet=json) as watch:
+    workers = use_case.Workers(jobs, dask)
+    request = use_case.CampaignRequest(
+        logs, validate or [], model or [], seeds, chosen, together, workers, out
+    )
+    with terminal.watching(json) as watch:
         result = use_case.campaign(request, watch)
     if json:
         terminal.print_json(result.document)
@@ -88,7 +66,7 @@ def campaign(
 
 def _show(result: CampaignResult) -> None:
     runs = result.campaign
-    terminal.print_line()
+    print()
     terminal.print_table(
         "Error over seeds: mean over outputs of the RMSE in parts of max|y|",
         ["model", "log", "runs", "best", "median", "worst", "within 1 %", "fit [%]", "failed"],
@@ -96,26 +74,19 @@ def _show(result: CampaignResult) -> None:
         text=["log"],
     )
     for problem in dict.fromkeys(f"{o.run.name}: {o.problem}" for o in runs.failed):
-        terminal.print_line(f"Failed: {problem}")
+        print(f"Failed: {problem}")
     if runs.interrupted:
-        terminal.print_line(f"Stopped by Ctrl-C: {len(runs.outcomes)} runs are in the table.")
+        print(f"Stopped by Ctrl-C: {len(runs.outcomes)} runs are in the table.")
     for (model, data), path in result.files.items():
-        terminal.print_line(f"Best of {model} on {data}: {path}")
-    terminal.print_line(f"All runs with their parameters: {result.table}")
+        print(f"Best of {model} on {data}: {path}")
+    print(f"All runs with their parameters: {result.table}")
     if result.files:
         terminal.print_next(f"rig replay LOG --parameters {next(iter(result.files.values()))}")
 
 
 def _spread_row(spread: Spread, result: CampaignResult) -> list[str]:
     best, number = result.campaign.best().get((spread.model, spread.data)), terminal.number
-    return [
-        spread.model,
-        spread.data,
-        str(spread.runs),
-        number(spread.best),
-        number(spread.median),
-        number(spread.worst),
-        str(spread.agreeing),
-        f"{best.row()['fit']:.1f}" if best is not None else "-",
-        str(spread.failed),
-    ]
+    errors = [number(error) for error in (spread.best, spread.median, spread.worst)]
+    fit = f"{best.row()['fit']:.1f}" if best is not None else "-"
+    counts = [str(spread.agreeing), fit, str(spread.failed)]
+    return [spread.model, spread.data, str(spread.runs), *errors, *counts]

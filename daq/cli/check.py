@@ -6,13 +6,11 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Option
 
-from daq.cli import terminal
-from daq.cli.options import AsJson, ExperimentName, PortName, RigOfRun
+from daq.cli import options, terminal
 
 if TYPE_CHECKING:
-    from daq.experiment import Experiment
     from daq.hal import FloatArray
     from daq.recording.preview import ChannelFacts, Preview
 
@@ -21,16 +19,13 @@ _WIDE, _HIGH = 60, 48.0  # letters and dB of a spectrum's sketch
 
 
 def check(
-    experiment: ExperimentName,
-    rig: RigOfRun = None,
-    port: PortName = None,
+    experiment: options.ExperimentName,
+    rig: options.RigOfRun = None,
+    port: options.PortName = None,
     plot: Annotated[
-        Path | None,
-        typer.Option(
-            "--plot", metavar="FILE.png|pdf|svg", help="Draw waveforms and spectra there."
-        ),
+        Path | None, Option(metavar="FILE.png|pdf|svg", help="Draw waveforms and spectra there.")
     ] = None,
-    json: AsJson = False,
+    json: options.AsJson = False,
 ) -> None:
     """Say what an experiment will do, and energise nothing.
 
@@ -38,17 +33,16 @@ def check(
     """
     from daq.recording import preview
 
-    with terminal.Watching(quiet=json) as watch:
+    with terminal.watching(json) as watch:
         checked = preview.check(experiment, rig, port, watch=watch)
     if plot is not None:
         preview.draw_preview(checked, plot)
     if json:
-        figure = {"plot": None if plot is None else str(plot)}
-        terminal.print_json({**checked.document, **figure})
+        terminal.print_json({**checked.document, "plot": plot})
         return
     _show(checked)
     if plot is not None:
-        terminal.print_line(f"Figure: {plot}")
+        print(f"Figure: {plot}")
     on = f" --rig {rig}" if rig is not None else ""
     on += f" --port {port}" if port is not None else ""
     identify = " --identify" if checked.session.validation and not checked.concludes else ""
@@ -66,11 +60,23 @@ def _show(checked: Preview) -> None:
     _show_references(checked)
     _sketch(checked)
     for remark in plan.remarks:
-        terminal.print_line(remark)
+        print(remark)
     if plan.commands is not None:
-        terminal.print_line(f"Frequency resolution: {checked.resolution:.4g} Hz")
-    terminal.print_line(_before(experiment))
-    terminal.print_line(_after(checked))
+        print(f"Frequency resolution: {checked.resolution:.4g} Hz")
+    before = [f"{experiment.calibration.samples} samples of offset calibration"]
+    if experiment.homing.turns > 0:
+        before.append(
+            f"{experiment.homing.turns:g} turns to wind within {experiment.homing.timeout:g} s"
+        )
+    print(f"Before it: {', '.join(before)}.")
+    if checked.concludes:
+        print("It concludes by itself: results stand in the run's folder.")
+    elif session.validation:
+        print("With --identify a validation run follows.")
+    else:
+        print(
+            "It has no 'validation' section: rig run --identify will identify without validation."
+        )
 
 
 def _show_channels(title: str, channels: dict[str, ChannelFacts]) -> None:
@@ -83,56 +89,27 @@ def _show_channels(title: str, channels: dict[str, ChannelFacts]) -> None:
     ]
     if any(facts.mean_volts is not None for facts in each):
         rows += [
-            ["mean", *(_or_dash(facts.mean_volts) for facts in each)],
-            ["rms about the mean", *(_or_dash(facts.rms_volts) for facts in each)],
-            ["crest factor [1]", *(_or_dash(facts.crest_factor) for facts in each)],
-            ["90 % of power [Hz]", *(_band(facts.power_band_hz) for facts in each)],
+            ["mean", *(_numbers(facts.mean_volts) for facts in each)],
+            ["rms about the mean", *(_numbers(facts.rms_volts) for facts in each)],
+            ["crest factor [1]", *(_numbers(facts.crest_factor) for facts in each)],
+            ["90 % of power [Hz]", *(_numbers(*(facts.power_band_hz or [None])) for facts in each)],
         ]
     terminal.print_table(title, ["command [V]", *channels], rows)
 
 
-def _band(ends: tuple[float, float] | None) -> str:
-    return "-" if ends is None else " to ".join(terminal.number(end, 3) for end in ends)
-
-
-def _or_dash(value: float | None) -> str:
-    return "-" if value is None else terminal.number(value, 3)
+def _numbers(*values: float | None) -> str:
+    return " to ".join("-" if value is None else terminal.number(value, 3) for value in values)
 
 
 def _show_references(checked: Preview) -> None:
-    if not checked.plan.references:
-        return
-    terminal.print_table(
-        "The controller will ask for",
-        ["reference", "lowest", "highest", "unit"],
-        [
-            [
-                name,
-                terminal.number(values.min(), 3),
-                terminal.number(values.max(), 3),
-                checked.units.get(name, ""),
-            ]
-            for name, values in checked.plan.references.items()
-        ],
-        text=["unit"],
-    )
-
-
-def _before(experiment: Experiment) -> str:
-    before = [f"{experiment.calibration.samples} samples of offset calibration"]
-    if experiment.homing.turns > 0:
-        before.append(
-            f"{experiment.homing.turns:g} turns to wind within {experiment.homing.timeout:g} s"
-        )
-    return f"Before it: {', '.join(before)}."
-
-
-def _after(checked: Preview) -> str:
-    if checked.concludes:
-        return "It concludes by itself: results stand in the run's folder."
-    if checked.session.validation:
-        return "With --identify a validation run follows."
-    return "It has no 'validation' section: rig run --identify will identify without validation."
+    number, units = terminal.number, checked.units
+    rows = [
+        [name, number(values.min(), 3), number(values.max(), 3), units.get(name, "")]
+        for name, values in checked.plan.references.items()
+    ]
+    if rows:
+        head = ["reference", "lowest", "highest", "unit"]
+        terminal.print_table("The controller will ask for", head, rows, text=["unit"])
 
 
 def _sketch(checked: Preview) -> None:
@@ -149,10 +126,10 @@ def _sketch(checked: Preview) -> None:
         frequency, sizes = spectral_lines(column, checked.experiment.sample_rate)
         low, high = float(frequency[0]), float(frequency[-1])
         if sizes.any():
-            terminal.print_line(f"{name:<8} {_bars(frequency, sizes)}")
+            print(f"{name:<8} {_bars(frequency, sizes)}")
     ends = f"{low:.3g} Hz", f"{high:.3g} Hz"
     scale = f"{ends[0]}{' logarithmic '.center(_WIDE - len(''.join(ends)), '·')}{ends[1]}"
-    terminal.print_line(f"{'':<8} {scale}  bars: {_HIGH:g} dB\n")
+    print(f"{'':<8} {scale}  bars: {_HIGH:g} dB\n")
 
 
 def _bars(frequency: FloatArray, sizes: FloatArray) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from daq.cli import terminal
@@ -30,16 +29,16 @@ def show_comparison(
 
         files["page"] = publish_comparison(result)
         if not json:
-            terminal.print_line(f"Page: {files['page']}")
-    preferred = result.comparison.preferred
-    if not json and preferred in result.files:
-        terminal.print_next(f"rig replay LOG --parameters {result.files[preferred]}")
+            print(f"Page: {files['page']}")
+    preferred = result.files.get(result.comparison.preferred)
+    if not json and preferred is not None:
+        terminal.print_next(f"rig replay LOG --parameters {preferred}")
     return {**result.document, "files": files}
 
 
 def _show(result: ComparisonResult) -> None:
     comparison = result.comparison
-    terminal.print_line()
+    print()
     if comparison.validated:
         terminal.print_table(
             "Validation, free run: RMSE in parts of max|y| (fit in %)",
@@ -59,13 +58,9 @@ def _show(result: ComparisonResult) -> None:
     terminal.print_text(comparison.verdict)
     for line in _runs_lines(result.campaign):
         terminal.print_text(line)
-    _show_files(result.files)
-    terminal.print_line(f"Comparison: {result.file}")
-
-
-def _show_files(files: Mapping[str, Any]) -> None:
-    for name, path in files.items():
-        terminal.print_line(f"Parameters of {name}: {path}")
+    for name, path in result.files.items():
+        print(f"Parameters of {name}: {path}")
+    print(f"Comparison: {result.file}")
 
 
 def _runs_lines(campaign: Campaign) -> list[str]:
@@ -97,11 +92,6 @@ def _validation_row(row: Row) -> list[str]:
 
 
 def _training_row(row: Row) -> list[str]:
-    return [
-        row.name,
-        str(row.n_free),
-        str(row.n_effective),
-        terminal.number(row.training_error, 3),
-        f"{row.daic:.1f}",
-        f"{row.dbic:.1f}",
-    ]
+    error = terminal.number(row.training_error, 3)
+    counts = [str(row.n_free), str(row.n_effective)]
+    return [row.name, *counts, error, f"{row.daic:.1f}", f"{row.dbic:.1f}"]

@@ -5,39 +5,38 @@ from pathlib import Path
 from typing import Literal
 
 Offer = tuple[str, str]  # a value and what it is
-Kind = Literal["experiments", "rigs"]
+Kind = Literal["protocol", "backend"]
 
 _FIRST = 4096  # characters of a file that say what kind it is
 
 
 def experiments(incomplete: str) -> list[Offer]:
     """Shipped experiments, and YAML files here that name a protocol."""
-    return _matching(
-        incomplete, [*_shipped("experiments"), *_local(incomplete, ".yaml", "protocol:")]
-    )
+    local = _local(incomplete, ".yaml", "protocol:")
+    return _matching(incomplete, [*_shipped("protocol"), *local])
 
 
 def rigs(incomplete: str) -> list[Offer]:
     """Shipped rigs, and YAML files here that name a backend or have its options."""
     local = _local(incomplete, ".yaml", "backend:", "options:")
-    return _matching(incomplete, [*_shipped("rigs"), *local])
+    return _matching(incomplete, [*_shipped("backend"), *local])
 
 
 def rig_names(incomplete: str) -> list[Offer]:
     """Shipped rigs by name."""
-    return _matching(incomplete, _stems("rigs"))
+    return _matching(incomplete, _stems("backend"))
 
 
 def protocols(incomplete: str) -> list[Offer]:
     """Shipped experiments by protocol."""
-    return _matching(incomplete, _stems("experiments"))
+    return _matching(incomplete, _stems("protocol"))
 
 
 def models(incomplete: str) -> list[Offer]:
     """Installed models, and Python files here."""
     from daq.plugins import installed
 
-    names = [(name, point.value) for name, point in installed("rig.models").items()]
+    names = [(name, point.value) for name, point in installed("model").items()]
     return _matching(incomplete, [*names, *_local(incomplete, ".py", "")])
 
 
@@ -57,36 +56,25 @@ def _matching(incomplete: str, offers: Iterable[Offer]) -> list[Offer]:
 
 
 def _stems(kind: Kind) -> Iterator[Offer]:
-    for name, text in _shipped(kind):
-        yield name.removesuffix(".yaml"), text
+    return ((name.removesuffix(".yaml"), text) for name, text in _shipped(kind))
 
 
 def _shipped(kind: Kind) -> Iterator[Offer]:
-    from daq.lookup.shipped import shipped_experiments, shipped_rigs
+    from daq.lookup.shipped import shipped_files
 
-    files = shipped_experiments() if kind == "experiments" else shipped_rigs()
-    for name, path in files.items():
-        yield name, _about(path)
+    return ((name, _about(path)) for name, path in shipped_files(kind).items())
 
 
 def _local(incomplete: str, suffix: str, *keys: str) -> Iterator[Offer]:
     """Files of a kind that have one of the keys, and folders, in the folder that is being typed."""
-    for path in _beside(incomplete, suffix):
+    folder = Path(incomplete) if incomplete.endswith("/") else Path(incomplete).parent
+    for path in sorted(folder.iterdir()) if folder.is_dir() else []:
+        if path.name.startswith("."):
+            continue
         if path.is_dir():
             yield f"{path.as_posix()}/", "folder"
-        elif any(key in _beginning(path) for key in keys):
+        elif path.suffix == suffix and any(key in _beginning(path) for key in keys):
             yield path.as_posix(), _about(path)
-
-
-def _beside(incomplete: str, suffix: str) -> list[Path]:
-    folder = Path(incomplete) if incomplete.endswith("/") else Path(incomplete).parent
-    if not folder.is_dir():
-        return []
-    return sorted(
-        path
-        for path in folder.iterdir()
-        if not path.name.startswith(".") and (path.suffix == suffix or path.is_dir())
-    )
 
 
 def _about(path: Path) -> str:

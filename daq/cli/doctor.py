@@ -1,64 +1,43 @@
 """``rig doctor``: does this computer suit a rig in real time, and what to do where it does not."""
 
-from __future__ import annotations
-
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
-import typer
+from typer import Argument
 
-from daq.cli import terminal
-from daq.cli.options import AsJson, RunsFolder
-
-if TYPE_CHECKING:
-    from daq.diagnose.computer import Check, Diagnosis
+from daq.cli import options, terminal
+from daq.errors import RunError
 
 
 def doctor(
     names: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[PORT...]", help="Device names; default all that exist."),
+        Argument(metavar="[PORT...]", help="Device names; default all that exist."),
     ] = None,
-    out: RunsFolder = Path("runs"),
-    json: AsJson = False,
+    out: options.RunsFolder = Path("runs"),
+    json: options.AsJson = False,
 ) -> None:
     """Check whether this computer suits a rig in real time.
 
     What does not is told with its cure.
     """
     from daq.diagnose.computer import diagnose
-    from daq.errors import RunError
     from daq.serial.ports import ports_of
 
     diagnosis = diagnose(ports_of(names or []), out)
     if json:
-        checks = [_document(check) for check in diagnosis.checks]
+        checks = [
+            {"what": c.subject, "verdict": c.verdict, "found": c.observation, "cure": c.cure}
+            for c in diagnosis.checks
+        ]
         terminal.print_json({"checks": checks, "good": not diagnosis.bad})
     else:
-        _show(diagnosis)
+        rows = [[check.subject, check.verdict, check.observation] for check in diagnosis.checks]
+        head = ["what", "verdict", "found"]
+        terminal.print_table("This computer", head, rows, text=["verdict", "found"])
+        for check in diagnosis.checks:
+            if check.cure:
+                print(f"{check.subject}: {check.cure}")
     if diagnosis.bad:
-        raise RunError(
-            f"not fit for a rig in real time: {', '.join(diagnosis.bad)}",
-            cure="the cures stand above",
-        )
-
-
-def _document(check: Check) -> dict[str, str]:
-    return {
-        "what": check.subject,
-        "verdict": check.verdict,
-        "found": check.observation,
-        "cure": check.cure,
-    }
-
-
-def _show(diagnosis: Diagnosis) -> None:
-    terminal.print_table(
-        "This computer",
-        ["what", "verdict", "found"],
-        [[check.subject, check.verdict, check.observation] for check in diagnosis.checks],
-        text=["verdict", "found"],
-    )
-    for check in diagnosis.checks:
-        if check.cure:
-            terminal.print_line(f"{check.subject}: {check.cure}")
+        problem = f"not fit for a rig in real time: {', '.join(diagnosis.bad)}"
+        raise RunError(problem, cure="the cures stand above")

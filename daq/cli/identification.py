@@ -11,14 +11,7 @@ from daq.cli import terminal
 
 if TYPE_CHECKING:
     from daq.identification.result import Identification
-    from daq.identification.rows import (
-        AmbiguityRow,
-        LogErrors,
-        OutputErrors,
-        ParameterRow,
-        QuantityRow,
-        Rows,
-    )
+    from daq.identification.rows import LogErrors, OutputErrors, ParameterRow, QuantityRow, Rows
     from sysid.uncertainty import Profile
 
 _STRONG = 0.95  # correlation above which two parameters are named together
@@ -31,7 +24,6 @@ def show_identification(
 
     seeds: lines on the other seeds, of which this result is the best.
     """
-    assert result.folder is not None
     document = {**result.document, "files": {"parameters": str(result.parameters_file)}}
     if not json:
         _show(result)
@@ -39,9 +31,9 @@ def show_identification(
             terminal.print_text(line)
     if result.interrupted:
         if json:
-            resumable = {"resume": result.resume_command}
-            return {**document, "search": {**document["search"], **resumable}}
-        terminal.print_line(f"Go on with the search: {result.resume_command}")
+            document["search"] = {**document["search"], "resume": result.resume_command}
+            return document
+        print(f"Go on with the search: {result.resume_command}")
         return document
     if report:
         document["files"] |= _publish(result, json)
@@ -55,17 +47,17 @@ def _publish(result: Identification, json: bool) -> dict[str, str]:
     from daq.report.publication import publish
 
     assert result.folder is not None
-    with terminal.Watching(quiet=json) as watch:
+    with terminal.watching(json) as watch:
         files = publish(result, result.folder, watch)
     if not json:
-        terminal.print_line(f"Report: {files['report']}")
+        print(f"Report: {files['report']}")
     return files
 
 
 def _show(result: Identification) -> None:
     """Tables and sentences on standard output."""
     rows = result.rows
-    terminal.print_line()
+    print()
     _show_parameters(result)
     for name, guess in result.estimator.guesses_.items():
         terminal.print_text(f"{name} searched as the data suggest: {guess.source}.")
@@ -75,7 +67,7 @@ def _show(result: Identification) -> None:
     _show_errors(rows)
     _show_residuals(rows)
     _show_notes(result)
-    terminal.print_line(f"Parameters: {result.parameters_file}")
+    print(f"Parameters: {result.parameters_file}")
 
 
 def _show_next(result: Identification) -> None:
@@ -88,19 +80,13 @@ def _show_next(result: Identification) -> None:
 def _show_parameters(result: Identification) -> None:
     head = ["parameter", "value", "95 % interval", "unit", "searched in", "from", ""]
     rows = [_parameter_row(result, row) for row in result.rows.parameters]
+    shown = [True] * len(head)
+    shown[head.index("95 % interval")] = result.rows.refined
     # Ranges that all come from the model need no column that says so.
-    hidden = set()
-    if all(row.source == "model" for row in result.rows.parameters):
-        hidden.add(head.index("from"))
-    if not result.rows.refined:
-        hidden.add(head.index("95 % interval"))
-    kept = [i for i in range(len(head)) if i not in hidden]
-    terminal.print_table(
-        f"Parameters of {result.model.name}",
-        [head[i] for i in kept],
-        [[row[i] for i in kept] for row in rows],
-        text=["unit", "from", ""],
-    )
+    shown[head.index("from")] = any(row.source != "model" for row in result.rows.parameters)
+    head, *rows = (list(itertools.compress(cells, shown)) for cells in (head, *rows))
+    title = f"Parameters of {result.model.name}"
+    terminal.print_table(title, head, rows, text=["unit", "from", ""])
 
 
 def _parameter_row(result: Identification, row: ParameterRow) -> list[str]:
@@ -136,12 +122,7 @@ def _interval(row: QuantityRow, scale: float) -> str:
 def _show_open_questions(rows: Rows) -> None:
     """What the data do not tell, what they tell instead, and what measurement would."""
     _show_rivals(rows)
-    exact = rows.ambiguities_of("product", "sum")
-    if exact:
-        terminal.print_line("What these data cannot tell apart:")
-    for ambiguity in exact:
-        for line in _exact_lines(ambiguity):
-            terminal.print_text(line)
+    _show_products(rows)
     vague = rows.ambiguities_of("vague")
     if vague:
         names = "; ".join(" with ".join(a.parameters) for a in vague)
@@ -154,23 +135,21 @@ def _show_open_questions(rows: Rows) -> None:
     if close:
         pairs = "; ".join(close)
         terminal.print_text(f"Known mostly together (correlation above {_STRONG:g}): {pairs}.")
-    if exact or vague or close:
-        terminal.print_line()
+    if rows.ambiguities_of("product", "sum", "vague") or close:
+        print()
 
 
 def _show_rivals(rows: Rows) -> None:
     """Other minima that explain the data as well."""
     for ambiguity in rows.ambiguities_of("rival"):
-        terminal.print_table(
-            "Sets of parameters that explain these data alike",
-            ["parameter", "this one", *["another"] * len(rows.rivals), "unit"],
-            [_rival_row(rows.parameter(name), rows.rivals) for name in ambiguity.parameters],
-            text=["unit"],
-        )
+        table = [_rival_row(rows.parameter(name), rows.rivals) for name in ambiguity.parameters]
+        head = ["parameter", "this one", *["another"] * len(rows.rivals), "unit"]
+        title = "Sets of parameters that explain these data alike"
+        terminal.print_table(title, head, table, text=["unit"])
         terminal.print_text(
             f"A measured {ambiguity.measure[0]}, given under 'fixed', would tell which it is."
         )
-        terminal.print_line()
+        print()
 
 
 def _rival_row(row: ParameterRow, rivals: Sequence[Mapping[str, float]]) -> list[str]:
@@ -180,37 +159,33 @@ def _rival_row(row: ParameterRow, rivals: Sequence[Mapping[str, float]]) -> list
     return [row.name, *(terminal.number(scale * value, 3) for value in values), unit]
 
 
-def _exact_lines(ambiguity: AmbiguityRow) -> list[str]:
-    lines = [f"  {', '.join(ambiguity.parameters)} act only together."]
-    for row in ambiguity.determined:
-        scale, unit = notation.engineering(row.value, row.unit)
-        value = terminal.number(scale * row.value, row.digits)
-        quantity = value if unit in {"", "1"} else f"{value} {unit}"
-        lines.append(f"    {row.name} = {quantity}, 95 % interval {_interval(row, scale)}")
-    lines.append(
-        f"    To tell them apart, measure {' and '.join(ambiguity.measure)} by other means (or "
-        "choose a value) and give it under 'fixed'."
-    )
-    return lines
+def _show_products(rows: Rows) -> None:
+    """Products and sums of parameters that are known where the parameters are not."""
+    for index, ambiguity in enumerate(rows.ambiguities_of("product", "sum")):
+        if index == 0:
+            print("What these data cannot tell apart:")
+        terminal.print_text(f"  {', '.join(ambiguity.parameters)} act only together.")
+        for row in ambiguity.determined:
+            scale, unit = notation.engineering(row.value, row.unit)
+            value = terminal.number(scale * row.value, row.digits)
+            quantity = value if unit in {"", "1"} else f"{value} {unit}"
+            interval = _interval(row, scale)
+            terminal.print_text(f"    {row.name} = {quantity}, 95 % interval {interval}")
+        terminal.print_text(
+            f"    To tell them apart, measure {' and '.join(ambiguity.measure)} by other means (or "
+            "choose a value) and give it under 'fixed'."
+        )
 
 
 def _show_profiles(profiles: Sequence[Profile]) -> None:
-    if not profiles:
-        return
-    terminal.print_table(
-        "Profile likelihood",
-        ["parameter", "value", "95 % interval", "unit"],
-        [
-            [p.name, terminal.number(p.value), " .. ".join(map(_end, (p.low, p.high))), p.unit]
-            for p in profiles
-        ],
-        text=["unit"],
-    )
-
-
-def _end(value: float | None) -> str:
-    """An end of an interval; the data set none where the profile stays low."""
-    return "open" if value is None else terminal.number(value)
+    rows = []
+    for profile in profiles:
+        # The data set no end where the profile stays low.
+        ends = ["open" if p is None else terminal.number(p) for p in (profile.low, profile.high)]
+        rows.append([profile.name, terminal.number(profile.value), " .. ".join(ends), profile.unit])
+    if rows:
+        head = ["parameter", "value", "95 % interval", "unit"]
+        terminal.print_table("Profile likelihood", head, rows, text=["unit"])
 
 
 def _show_errors(rows: Rows) -> None:
@@ -218,22 +193,20 @@ def _show_errors(rows: Rows) -> None:
     if len(training) == 1 and len(validation) <= 1:
         print_errors(training[0].outputs, [log.outputs for log in validation])
         return
-    _print_logs("Training logs", training, rows.mean_errors("training"))
-    if validation:
-        _print_logs("Validation logs", validation, rows.mean_errors("validation"))
+    for part, logs in rows.logs.items():
+        if logs:
+            _print_logs(f"{part.capitalize()} logs", logs, rows.mean_errors(part))
 
 
 def _show_residuals(rows: Rows) -> None:
     """Residual tests on the validation data, or else on the training data."""
     table = rows.residuals
-    terminal.print_table(
-        f"Residuals, {table.part}: share of correlations inside their 95 % band",
-        ["residual of", "with itself", *(f"with {name}" for name in table.inputs)],
-        [
-            [output, *(f"{100.0 * share:.0f} %" for share in shares)]
-            for output, shares in table.shares.items()
-        ],
-    )
+    head = ["residual of", "with itself", *(f"with {name}" for name in table.inputs)]
+    cells = [
+        [name, *(f"{100.0 * s:.0f} %" for s in shares)] for name, shares in table.shares.items()
+    ]
+    title = f"Residuals, {table.part}: share of correlations inside their 95 % band"
+    terminal.print_table(title, head, cells)
 
 
 def _show_notes(result: Identification) -> None:
@@ -268,35 +241,20 @@ def print_errors(
     head = ["output", f"RMSE, {label}", "MSD", "fit [%]"]
     if validation:
         head += ["RMSE, validation", "MSD", "fit [%]"]
-    rows = [
-        [
-            output,
-            *itertools.chain.from_iterable(
-                _error_cells(log[output]) for log in (training, *validation)
-            ),
-        ]
-        for output in training
-    ]
+    rows = []
+    for output in training:
+        row = [output]
+        for errors in (log[output] for log in (training, *validation)):
+            row += [terminal.number(errors.rmse, 3), terminal.number(errors.msd, 2)]
+            row.append(f"{errors.fit_percent:.1f}")
+        rows.append(row)
     terminal.print_table("Free-run simulation, RMSE and MSD in parts of max|y|", head, rows)
-
-
-def _error_cells(errors: OutputErrors) -> tuple[str, str, str]:
-    number = terminal.number
-    return number(errors.rmse, 3), number(errors.msd, 2), f"{errors.fit_percent:.1f}"
 
 
 def _print_logs(title: str, logs: Sequence[LogErrors], mean: Mapping[str, OutputErrors]) -> None:
     head = ["log", *(f"fit of {name} [%]" for name in mean), *(f"RMSE of {n}" for n in mean)]
-    rows = [(log.name, log.outputs) for log in logs] + [("mean", mean)]
-    terminal.print_table(
-        title,
-        head,
-        [
-            [
-                name,
-                *(f"{errors.fit_percent:.1f}" for errors in outputs.values()),
-                *(terminal.number(errors.rmse, 3) for errors in outputs.values()),
-            ]
-            for name, outputs in rows
-        ],
-    )
+    rows = []
+    for name, outputs in [*((log.name, log.outputs) for log in logs), ("mean", mean)]:
+        fits = [f"{errors.fit_percent:.1f}" for errors in outputs.values()]
+        rows.append([name, *fits, *(terminal.number(e.rmse, 3) for e in outputs.values())])
+    terminal.print_table(title, head, rows)

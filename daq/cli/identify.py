@@ -4,82 +4,52 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
+from typer import BadParameter, Context, Option
 
-from daq.cli import terminal
+from daq.cli import options, terminal
 from daq.cli.identification import show_identification
-from daq.cli.options import (
-    AsJson,
-    ConfigFile,
-    Dask,
-    Generations,
-    HoldBack,
-    Jobs,
-    ModelNames,
-    Population,
-    Preset,
-    Seeds,
-    Settings,
-    Validation,
-    WithReport,
-)
 
 _WITH_RESUME = {"resume", "report", "json", "quiet", "verbose"}
 
 
 def identify(
-    context: typer.Context,
-    logs: Annotated[
-        list[Path] | None,
-        typer.Argument(
-            metavar="RUN_OR_CSV...", help="Capture folders, CSV logs, or folders of them."
-        ),
-    ] = None,
-    model: ModelNames = None,
-    config: ConfigFile = None,
-    validate: Validation = None,
+    context: Context,
+    logs: Annotated[list[Path] | None, options.LOGS] = None,
+    model: options.ModelNames = None,
+    config: options.ConfigFile = None,
+    validate: options.Validation = None,
     out: Annotated[
-        Path | None,
-        typer.Option("--out", metavar="DIR", help="Where results go; default beside the log."),
+        Path | None, Option(metavar="DIR", help="Where results go; default beside the log.")
     ] = None,
-    preset: Preset = None,
-    population: Population = None,
-    generations: Generations = None,
-    seed: Annotated[
-        int | None, typer.Option("--seed", metavar="N", help="One seed gives one result.")
-    ] = None,
-    hold_back: HoldBack = None,
+    preset: options.Preset = None,
+    population: options.Population = None,
+    generations: options.Generations = None,
+    seed: Annotated[int | None, Option(metavar="N", help="One seed gives one result.")] = None,
+    hold_back: options.HoldBack = None,
     profile: Annotated[
         list[str] | None,
-        typer.Option(
-            "--profile",
+        Option(
             metavar="PARAMETER",
             help="Trace how the fit worsens as this one moves; may be repeated.",
         ),
     ] = None,
     guess: Annotated[
-        bool, typer.Option("--guess", help="Starting ranges from the logs, where none are given.")
+        bool, Option("--guess", help="Starting ranges from the logs, where none are given.")
     ] = False,
     datasheet: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--datasheet", metavar="FILE.yaml", help="Data-sheet values; may be repeated."
-        ),
+        list[str] | None, Option(metavar="FILE.yaml", help="Data-sheet values; may be repeated.")
     ] = None,
-    settings: Settings = None,
-    arx: Annotated[bool, typer.Option("--arx", help="Compare with an ARX model.")] = False,
-    armax: Annotated[bool, typer.Option("--armax", help="Compare with an ARMAX model.")] = False,
-    seeds: Seeds = None,
-    jobs: Jobs = None,
-    dask: Dask = None,
+    settings: options.Settings = None,
+    arx: Annotated[bool, Option("--arx", help="Compare with an ARX model.")] = False,
+    armax: Annotated[bool, Option("--armax", help="Compare with an ARMAX model.")] = False,
+    seeds: options.Seeds = None,
+    jobs: options.Jobs = None,
+    dask: options.Dask = None,
     resume: Annotated[
-        Path | None,
-        typer.Option(
-            "--resume", metavar="DIR", help="Go on with what was interrupted, as it was asked."
-        ),
+        Path | None, Option(metavar="DIR", help="Go on with what was interrupted, as it was asked.")
     ] = None,
-    report: WithReport = True,
-    json: AsJson = False,
+    report: options.WithReport = True,
+    json: options.AsJson = False,
 ) -> None:
     """Identify a model's parameters from one or more logs.
 
@@ -91,16 +61,16 @@ def identify(
 
     if resume is not None:
         if any(context.params[name] for name in context.params if name not in _WITH_RESUME):
-            raise typer.BadParameter(
+            raise BadParameter(
                 "--resume goes on as it was asked; give nothing but --json or --no-report"
             )
-        with terminal.Watching(quiet=json) as watch:
+        with terminal.watching(json) as watch:
             result = fit.resume(resume, watch)
         _finish(show_identification(result, report, json), json)
         return
     if not logs:
-        raise typer.BadParameter("name the logs to identify from, or a folder with --resume")
-    options = {
+        raise BadParameter("name the logs to identify from, or a folder with --resume")
+    chosen = {
         "preset": preset,
         "population": population,
         "generations": generations,
@@ -110,7 +80,7 @@ def identify(
         "datasheet": datasheet,
         "profile": profile,
     }
-    request = SettingsRequest(None if config is None else str(config), options, settings or [])
+    request = SettingsRequest(None if config is None else str(config), chosen, settings or [])
     baselines = [name for name, wanted in (("ARX", arx), ("ARMAX", armax)) if wanted]
     if len(model or []) > 1 or baselines or seeds is not None:
         from daq.cli.compare import show_comparison
@@ -120,15 +90,14 @@ def identify(
         wanted = ComparisonRequest(
             logs, validate or [], model or [], baselines, seeds, request, Workers(jobs, dask), out
         )
-        with terminal.Watching(quiet=json) as watch:
+        with terminal.watching(json) as watch:
             compared = compare(wanted, watch)
         _finish(show_comparison(compared, report, json), json)
         return
-    request = replace(request, options={**options, "model": model[0] if model else None})
-    with terminal.Watching(quiet=json) as watch:
-        result = fit.identify_request(
-            fit.IdentificationRequest(logs, validate or [], request, out, save=True), watch
-        )
+    request = replace(request, options={**chosen, "model": model[0] if model else None})
+    one_model = fit.IdentificationRequest(logs, validate or [], request, out, save=True)
+    with terminal.watching(json) as watch:
+        result = fit.identify_request(one_model, watch)
     _finish(show_identification(result, report, json), json)
 
 

@@ -3,61 +3,46 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Argument, Option
 
-from daq.cli import completion, terminal
-from daq.cli.options import AsJson
+from daq.cli import options, terminal
+from daq.cli.completion import protocols, rig_names
 
 
 def init(
     folder: Annotated[
-        Path, typer.Argument(metavar="[FOLDER]", help="Where the files go; default this folder.")
+        Path, Argument(metavar="[FOLDER]", help="Where the files go; default this folder.")
     ] = Path(),
     protocol: Annotated[
         str,
-        typer.Option(
-            "--protocol",
-            metavar="NAME",
-            help="Shipped experiment to begin with.",
-            autocompletion=completion.protocols,
-        ),
+        Option(metavar="NAME", help="Shipped experiment to begin with.", autocompletion=protocols),
     ] = "prbs",
     rig: Annotated[
         str,
-        typer.Option(
-            "--rig",
-            metavar="NAME",
-            help="Shipped rig to begin with.",
-            autocompletion=completion.rig_names,
-        ),
+        Option(metavar="NAME", help="Shipped rig to begin with.", autocompletion=rig_names),
     ] = "simulated",
-    json: AsJson = False,
+    json: options.AsJson = False,
 ) -> None:
     """Write commented YAML files to begin with.
 
     What is there already stays as it is. Editors complete and check the files by the JSON Schemas
     written beside them.
     """
-    from daq.lookup import starter
+    from daq.lookup import schemas, starter
 
-    files = starter.write_starter(folder, protocol, rig, terminal.report_event)
+    written, kept, validated = starter.write_starter(folder, protocol, rig, terminal.report_event)
+    schema_folder = folder / schemas.FOLDER
     if json:
-        terminal.print_json(
-            {
-                "written": list(map(str, files.written)),
-                "kept": list(map(str, files.kept)),
-                "schemas": str(files.schemas),
-            }
-        )
+        terminal.print_json({"written": written, "kept": kept, "schemas": schema_folder})
         return
-    for path in files.written:
-        terminal.print_line(f"Written: {path}")
-    terminal.print_line(f"Written: {files.schemas}, by which editors check these files")
-    for path in files.kept:
-        terminal.print_line(f"Kept as it was: {path}")
+    for path in written:
+        print(f"Written: {path}")
+    print(f"Written: {schema_folder}, by which editors check these files")
+    for path in kept:
+        print(f"Kept as it was: {path}")
     there = [] if folder.resolve() == Path.cwd() else [f"cd {folder}"]
     # An experiment without a validation run is mostly not for an identification.
-    identify = f" --identify --config {starter.SETTINGS}" if files.validated else ""
+    identify = f" --identify --config {starter.SETTINGS}" if validated else ""
     terminal.print_next(
         *there,
         f"rig check {protocol}.yaml --rig {starter.RIG}",

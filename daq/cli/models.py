@@ -2,30 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+from typer import Argument
 
-from daq.cli import completion, terminal
-from daq.cli.options import AsJson
+from daq.cli import completion, options, terminal
 
 if TYPE_CHECKING:
-    from daq.lookup.models import ModelOption
     from sysid import ProcessModel
-    from sysid.problem.model import State
+    from sysid.problem.model import Parameter, State
 
 
 def models(
     name: Annotated[
         str | None,
-        typer.Argument(
+        Argument(
             metavar="[NAME|FILE.py:OBJECT]",
             help="Show this model in full.",
             autocompletion=completion.models,
         ),
     ] = None,
-    json: AsJson = False,
+    json: options.AsJson = False,
 ) -> None:
     """List the installed models, or describe one.
 
@@ -34,11 +31,11 @@ def models(
     from daq.lookup.models import describe, find_model, model_options
     from daq.plugins import installed
 
-    names = [name] if name is not None else sorted(installed("rig.models"))
+    names = [name] if name is not None else sorted(installed("model"))
     installed_models = {key: find_model(key) for key in names}
     if json:
         documents = {
-            key: {**describe(model), "options": [asdict(o) for o in model_options(key)]}
+            key: {**describe(model), "options": model_options(key)}
             for key, model in installed_models.items()
         }
         terminal.print_json(documents if name is None else documents[name])
@@ -52,28 +49,23 @@ def _show_list(models: dict[str, ProcessModel]) -> None:
     terminal.print_table(
         "Process models",
         ["name", "states", "inputs", "outputs", "free parameters", "what it is"],
-        [
-            [
-                key,
-                str(len(model.states)),
-                str(len(model.inputs)),
-                str(len(model.outputs)),
-                str(sum(not p.fixed for p in model.parameters)),
-                model.description,
-            ]
-            for key, model in models.items()
-        ],
+        [[key, *map(str, _sizes(model)), model.description] for key, model in models.items()],
         text=["what it is"],
     )
     terminal.print_next("rig models NAME, or rig models my_model.py:model for one of your own")
 
 
-def _show(name: str, model: ProcessModel, options: list[ModelOption]) -> None:
-    terminal.print_line(f"{model.name}: {model.description}")
+def _sizes(model: ProcessModel) -> tuple[int, int, int, int]:
+    free = sum(not parameter.fixed for parameter in model.parameters)
+    return len(model.states), len(model.inputs), len(model.outputs), free
+
+
+def _show(name: str, model: ProcessModel, options: list[dict[str, Any]]) -> None:
+    print(f"{model.name}: {model.description}")
     for equation in model.equations:
-        terminal.print_line(f"  {equation}")
+        print(f"  {equation}")
     if model.equations:
-        terminal.print_line()
+        print()
     rows = [["state", s.name, s.unit, _start(s)] for s in model.states]
     rows += [["input", s.name, s.unit, s.hold] for s in model.inputs]
     rows += [["output", s.name, s.unit, s.description] for s in model.outputs]
@@ -84,38 +76,31 @@ def _show(name: str, model: ProcessModel, options: list[ModelOption]) -> None:
     terminal.print_table(
         "Parameters",
         ["name", "unit", "nominal", "range", "scale", "what it is"],
-        [
-            [
-                p.name,
-                p.unit,
-                number(p.nominal),
-                "fixed" if p.fixed else f"{number(p.lower)} .. {number(p.upper)}",
-                "" if p.fixed else p.scale,
-                p.description,
-            ]
-            for p in model.parameters
-        ],
+        [[p.name, p.unit, number(p.nominal), *_range(p), p.description] for p in model.parameters],
         text=["unit", "scale", "what it is"],
     )
     for constraint in model.constraints:
-        terminal.print_line(f"Constraint: {constraint.text}")
+        print(f"Constraint: {constraint.text}")
     if options:
         _show_options(name, options)
 
 
-def _show_options(name: str, options: list[ModelOption]) -> None:
-    from daq.lookup.models import ModelName
+def _show_options(name: str, options: list[dict[str, Any]]) -> None:
+    from daq.lookup.models import name_parts
 
     terminal.print_table(
         "Options",
         ["name", "default", "choices", "what it is"],
-        [[o.name, _as_text(o.default), ", ".join(o.choices), o.description] for o in options],
+        [
+            [o["name"], _as_text(o["default"]), ", ".join(o["choices"]), o["description"]]
+            for o in options
+        ],
         text=["default", "choices", "what it is"],
     )
     last = options[-1]
-    terminal.print_line(
-        f"Another combination: rig models {ModelName.parse(name).source}:{last.name}="
-        f"{last.choices[-1]}, with a comma between options; --model takes the same name"
+    print(
+        f"Another combination: rig models {name_parts(name)[0]}:{last['name']}="
+        f"{last['choices'][-1]}, with a comma between options; --model takes the same name"
     )
 
 
@@ -124,6 +109,12 @@ def _start(state: State) -> str:
         return f"starts at {state.initial:g}"
     low, high = state.initial_range
     return f"start estimated from each log, {low:g} .. {high:g}"
+
+
+def _range(parameter: Parameter) -> tuple[str, str]:
+    """Range and scale that are searched."""
+    ends = terminal.number(parameter.lower), terminal.number(parameter.upper)
+    return ("fixed", "") if parameter.fixed else (" .. ".join(ends), parameter.scale)
 
 
 def _as_text(value: Any) -> str:

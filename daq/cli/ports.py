@@ -5,26 +5,24 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+from typer import Argument, Option
 
-from daq.cli import terminal
-from daq.cli.options import AsJson
+from daq.cli import options, terminal
 
 if TYPE_CHECKING:
-    from daq.serial.messages import Welcome
     from daq.serial.ports import Inquiry, PortFacts
 
 
 def ports(
     names: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[PORT...]", help="Device names or URLs; default all that exist."),
+        Argument(metavar="[PORT...]", help="Device names or URLs; default all that exist."),
     ] = None,
     unasked: Annotated[
-        bool, typer.Option("--list", help="Send nothing: list the ports without asking.")
+        bool, Option("--list", help="Send nothing: list the ports without asking.")
     ] = False,
-    baud: Annotated[int, typer.Option("--baud", help="Of UARTs; USB does not care.")] = 2_000_000,
-    json: AsJson = False,
+    baud: Annotated[int, Option(help="Of UARTs; USB does not care.")] = 2_000_000,
+    json: options.AsJson = False,
 ) -> None:
     """List serial ports, and who answers there."""
     from daq.serial.ports import Inquiry, inquire, ports_of
@@ -39,7 +37,7 @@ def ports(
 
 def _show(inquiries: list[Inquiry], unasked: bool) -> None:
     if not inquiries:
-        terminal.print_line(
+        print(
             "No serial port has hardware behind it. Plug the device in, or start 'rig emulate' "
             "and name the port that it prints:  rig ports PORT"
         )
@@ -47,38 +45,37 @@ def _show(inquiries: list[Inquiry], unasked: bool) -> None:
     terminal.print_table(
         "Serial ports",
         ["port", "what it is", "who answers"],
-        [[_name(i.port), _description(i.port), _answer(i, unasked)] for i in inquiries],
+        [
+            [i.port.lasting_name or i.port.name, _description(i.port), _answer(i, unasked)]
+            for i in inquiries
+        ],
         text=["what it is", "who answers"],
     )
     answered = [inquiry.port for inquiry in inquiries if inquiry.welcome is not None]
     if answered:
-        terminal.print_next(f"rig run prbs.yaml --rig serial.yaml --port {_name(answered[0])}")
+        port = answered[0].lasting_name or answered[0].name
+        terminal.print_next(f"rig run prbs.yaml --rig serial.yaml --port {port}")
 
 
 def _document(inquiry: Inquiry, unasked: bool) -> dict[str, Any]:
-    document = asdict(inquiry.port)
-    if not unasked:
-        document["answers"] = None if inquiry.welcome is None else _identity(inquiry.welcome)
-        document["problem"] = inquiry.problem
+    document, welcome = asdict(inquiry.port), inquiry.welcome
+    if unasked:
+        return document
+    document["answers"] = None
+    if welcome is not None:
+        document["answers"] = {
+            "device": welcome.device,
+            "firmware": welcome.firmware,
+            "serial_number": welcome.serial,
+            "protocol_version": welcome.version,
+            "clock_hz": welcome.clock,
+            "max_rate_hz": welcome.max_rate,
+            "queue": welcome.queue,
+            "outputs_held_at_zero_by": welcome.latch.name.lower(),
+            "channels": [asdict(channel) for channel in welcome.channels],
+        }
+    document["problem"] = inquiry.problem
     return document
-
-
-def _identity(welcome: Welcome) -> dict[str, Any]:
-    return {
-        "device": welcome.device,
-        "firmware": welcome.firmware,
-        "serial_number": welcome.serial,
-        "protocol_version": welcome.version,
-        "clock_hz": welcome.clock,
-        "max_rate_hz": welcome.max_rate,
-        "queue": welcome.queue,
-        "outputs_held_at_zero_by": welcome.latch.name.lower(),
-        "channels": [asdict(channel) for channel in welcome.channels],
-    }
-
-
-def _name(port: PortFacts) -> str:
-    return port.lasting_name or port.name
 
 
 def _description(port: PortFacts) -> str:
@@ -93,7 +90,7 @@ def _description(port: PortFacts) -> str:
 
 
 def _answer(inquiry: Inquiry, unasked: bool) -> str:
-    if inquiry.welcome is not None:
-        welcome = inquiry.welcome
+    welcome = inquiry.welcome
+    if welcome is not None:
         return f"{welcome.device}, firmware {welcome.firmware}, up to {welcome.max_rate:g} Hz"
     return "not asked" if unasked else inquiry.problem or ""

@@ -2,7 +2,7 @@
 
 import inspect
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +10,11 @@ import typer
 from typer.cli import get_docs_for_click
 
 from daq.cli import terminal
-from daq.config.schema import Schema, branches, unit_in
 from daq.experiment import ClosedLoop, Experiment
 from daq.files import make_folder, write_whole
 from daq.lookup import schemas
-from daq.lookup.shipped import shipped_experiments
+from daq.lookup.schemas import Schema, branches, unit_in
+from daq.lookup.shipped import shipped_files
 
 _HEAD = "<!-- Made by `rig schema --reference`; what it says stands in the code. Do not edit. -->\n"
 _TABLE = "| key | value | unit | default | allowed | meaning |\n|---|---|---|---|---|---|\n"
@@ -45,11 +45,8 @@ _KINDS = {
 def write_reference(folder: Path, command: Any) -> list[Path]:
     """Write all pages; the paths written. ConfigError when they cannot be."""
     make_folder(folder)
-    protocols, backends = (
-        schemas.protocols(terminal.report_event),
-        schemas.backend_options(terminal.report_event),
-    )
-    texts = pages(protocols, backends, command)
+    watch = terminal.report_event
+    texts = pages(schemas.protocols(watch), schemas.backend_options(watch), command)
     for name, text in texts.items():
         write_whole(folder / name, text)
     return [folder / name for name in texts]
@@ -78,9 +75,8 @@ def pages(
 
 def _index(protocols: Mapping[str, type[Experiment]]) -> str:
     first_lines = {k: (inspect.getdoc(p) or "").partition("\n")[0] for k, p in protocols.items()}
-    experiments = "".join(
-        f"- [`{name}`](protocol-{name}.md): {line}\n" for name, line in first_lines.items()
-    )
+    links = [f"- [`{name}`](protocol-{name}.md): {line}\n" for name, line in first_lines.items()]
+    experiments = "".join(links)
     return (
         f"{_HEAD}\n# Reference\n\nExperiments, by protocol:\n\n{experiments}\n"
         "Other files and commands:\n\n- [rig](rig.md)\n- [identification](identification.md)\n"
@@ -90,13 +86,12 @@ def _index(protocols: Mapping[str, type[Experiment]]) -> str:
 
 
 def _protocol(name: str, kind: type[Experiment]) -> str:
-    text = _page(
-        f"Protocol `{name}`", inspect.getdoc(kind) or "", _rows(schemas.protocol_schema(kind))
-    )
+    rows = _rows(schemas.protocol_schema(kind))
+    text = _page(f"Protocol `{name}`", inspect.getdoc(kind) or "", rows)
     if issubclass(kind, ClosedLoop) and kind.columns:
         text += "\nBeside every sample it logs:\n\n| column | unit |\n|---|---|\n"
         text += "".join(f"| `{column}` | {unit} |\n" for column, unit in kind.columns.items())
-    shipped = shipped_experiments().get(f"{name}.yaml")
+    shipped = shipped_files("protocol").get(f"{name}.yaml")
     if shipped is not None:
         content = schemas.without_schema_comment(shipped.read_text(encoding="utf-8"))
         text += f"\nThe shipped `{name}.yaml`:\n\n```yaml\n{content}```\n"
@@ -151,10 +146,10 @@ def _row(key: str, item: Schema, is_required: bool, is_section: bool) -> str:
     has_default = not is_section and default not in (None, "", [], {})
     cells = (
         f"`{key}`",
-        _value(item),
+        _each(_kind, item),
         "" if is_section or unit in (None, "1") else unit,
         "required" if is_required else f"`{_number(default)}`" if has_default else "",
-        _allowed(item),
+        _each(_bounds, item),
         meaning,
     )
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |\n"
@@ -169,8 +164,9 @@ def _number(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value)
 
 
-def _value(item: Schema) -> str:
-    return " or ".join(dict.fromkeys(_kind(branch) for branch in branches(item)))
+def _each(describe: Callable[[Schema], str], item: Schema) -> str:
+    """What may stand at a key, each kind of value described."""
+    return " or ".join(dict.fromkeys(filter(None, map(describe, branches(item)))))
 
 
 def _kind(schema: Schema) -> str:
@@ -187,14 +183,10 @@ def _kind(schema: Schema) -> str:
     if kind == "array" and isinstance(items, dict):
         same = schema.get("minItems", 0) == schema.get("maxItems")
         whole = f"{schema['minItems']} values" if same else "list"
-        return f"{whole}, each {_value(items)}"
+        return f"{whole}, each {_each(_kind, items)}"
     if kind == "object" and isinstance(named, dict):
-        return f"by name, each {_value(named)}"
+        return f"by name, each {_each(_kind, named)}"
     return _KINDS.get(str(kind), str(kind))
-
-
-def _allowed(item: Schema) -> str:
-    return " or ".join(dict.fromkeys(filter(None, map(_bounds, branches(item)))))
 
 
 def _bounds(schema: Schema) -> str:
@@ -203,18 +195,19 @@ def _bounds(schema: Schema) -> str:
         return ", ".join(f"`{value}`" for value in schema["enum"])
     inner = schema.get("items") or schema.get("additionalProperties")
     if isinstance(inner, list):
-        return _allowed(inner[0])
+        return _each(_bounds, inner[0])
     bounds = [f"{words} {_number(schema[key])}" for key, words in _BOUNDS.items() if key in schema]
     if "items" in schema and schema.get("minItems", 0) not in (0, schema.get("maxItems")):
         bounds.append(f"at least {schema['minItems']} of them")
     if isinstance(inner, dict) and "properties" not in inner:
-        bounds.append(_allowed(inner))
+        bounds.append(_each(_bounds, inner))
     return ", ".join(filter(None, bounds))
 
 
 def _command_line(command: Any) -> str:
     context = typer.Context(command, info_name="rig")
-    return f"{_HEAD}\n# Command line\n\n{_STATUS}\n\n" + "".join(
-        get_docs_for_click(obj=subcommand, ctx=context, indent=1, call_prefix="rig")
-        for subcommand in command.commands.values()
-    )
+    texts = [
+        get_docs_for_click(obj=each, ctx=context, indent=1, call_prefix="rig")
+        for each in command.commands.values()
+    ]
+    return f"{_HEAD}\n# Command line\n\n{_STATUS}\n\n{''.join(texts)}"

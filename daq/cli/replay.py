@@ -4,61 +4,74 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Argument, Option
 
-from daq.cli import terminal
-from daq.cli.options import AsJson, ConfigFile, RigName
+from daq.cli import options, terminal
+from daq.errors import ConfigError, RunError, suggestion
 
 if TYPE_CHECKING:
     from daq.identification.replay import Replay
 
 
 def replay(
-    log: Annotated[Path, typer.Argument(metavar="RUN_OR_CSV", help="Capture folder or CSV log.")],
-    rig: RigName = "simulated.yaml",
+    log: Annotated[Path, Argument(metavar="RUN_OR_CSV", help="Capture folder or CSV log.")],
+    rig: options.RigName = "simulated.yaml",
     parameters: Annotated[
         Path | None,
-        typer.Option(
-            "--parameters",
+        Option(
             metavar="PARAMETERS.yaml",
             help="Result of an identification; default the simulated rig's own values.",
         ),
     ] = None,
-    config: ConfigFile = None,
+    config: options.ConfigFile = None,
     figure: Annotated[
-        Path | None,
-        typer.Option("--figure", metavar="FILE.png|pdf|svg", help="Default beside the log."),
+        Path | None, Option(metavar="FILE.png|pdf|svg", help="Default beside the log.")
     ] = None,
     fail_under: Annotated[
         list[str] | None,
-        typer.Option(
-            "--fail-under",
-            metavar="OUTPUT=PERCENT",
-            help="Exit status 1 when its fit is below; may be repeated.",
+        Option(
+            metavar="OUTPUT=PERCENT", help="Exit status 1 when its fit is below; may be repeated."
         ),
     ] = None,
-    json: AsJson = False,
+    json: options.AsJson = False,
 ) -> None:
     """Simulate a log's commands, and say how well that fits it.
 
     The model is given the applied commands and the measured load torque, never the outputs.
     """
-    from daq.errors import RunError
     from daq.identification.replay import replay as simulate
 
     bounds = _bounds(fail_under or [])
     result = simulate(log, parameters, rig, config)
-    _require_outputs(bounds, result)
+    model = result.model
+    for name in bounds:
+        if name not in result.fit:
+            problem = f"--fail-under {name}: model {model.name} has no such output"
+            raise ConfigError(problem, cure=suggestion(name, model.output_names))
     if result.warning is not None:
-        terminal.report_warning(result.warning)
+        terminal.report("warning", result.warning)
     drawn = _draw(result, figure)
     missed = result.below(bounds)
+    errors = {
+        name: {"rmse": result.rmse[name], "msd": result.msd[name], "fit_percent": result.fit[name]}
+        for name in model.output_names
+    }
     if json:
-        terminal.print_json(_document(result, drawn, bounds, missed))
+        document = {
+            "log": result.path,
+            "model": model.name,
+            "parameters": result.source,
+            "outputs": errors,
+            "figure": drawn,
+            "fail_under": bounds,
+            "passed": not missed,
+        }
+        terminal.print_json(document)
     else:
-        _show(result, drawn)
+        through = f"{result.path} through {model.name} with the parameters of {result.source}"
+        _show(through, errors, drawn)
         if not missed:
             columns = f" --config {config}" if config is not None else ""
             again = f"rig replay ANOTHER_LOG --parameters {parameters}{columns}"
@@ -71,75 +84,33 @@ def replay(
         raise RunError(f"{result.path}: {'; '.join(shortfalls)}")
 
 
-def _show(result: Replay, drawn: Path | None) -> None:
+def _show(title: str, errors: dict[str, dict[str, float]], drawn: Path | None) -> None:
     from daq.cli.identification import print_errors
     from daq.identification.rows import OutputErrors
 
-    terminal.print_line(
-        f"{result.path} through {result.model.name} with the parameters of {result.source}"
-    )
-    errors = {
-        name: OutputErrors(result.rmse[name], result.msd[name], result.fit[name])
-        for name in result.model.output_names
-    }
-    print_errors(errors, label="replay")
+    print(title)
+    print_errors({name: OutputErrors(**each) for name, each in errors.items()}, label="replay")
     if drawn is not None:
-        terminal.print_line(f"Figure: {drawn}")
-
-
-def _document(
-    result: Replay, drawn: Path | None, bounds: dict[str, float], missed: dict[str, float]
-) -> dict[str, Any]:
-    return {
-        "log": str(result.path),
-        "model": result.model.name,
-        "parameters": result.source,
-        "outputs": {
-            name: {
-                "rmse": result.rmse[name],
-                "msd": result.msd[name],
-                "fit_percent": result.fit[name],
-            }
-            for name in result.model.output_names
-        },
-        "figure": None if drawn is None else str(drawn),
-        "fail_under": bounds,
-        "passed": not missed,
-    }
+        print(f"Figure: {drawn}")
 
 
 def _bounds(texts: list[str]) -> dict[str, float]:
     """``omega=80`` as the least fit [%] of an output."""
-    from daq.errors import ConfigError
-
     bounds = {}
     for text in texts:
         name, _, value = text.partition("=")
         try:
-            bounds[name.strip()] = float(value)
-            if not math.isfinite(bounds[name.strip()]):
-                raise ValueError
+            least = float(value)
         except ValueError:
-            raise ConfigError(
-                f"--fail-under {text}: write OUTPUT=PERCENT, for example omega=80"
-            ) from None
+            least = math.nan
+        if not math.isfinite(least):
+            raise ConfigError(f"--fail-under {text}: write OUTPUT=PERCENT, for example omega=80")
+        bounds[name.strip()] = least
     return bounds
-
-
-def _require_outputs(bounds: dict[str, float], result: Replay) -> None:
-    from daq.errors import ConfigError, suggestion
-
-    for name in bounds:
-        if name not in result.fit:
-            raise ConfigError(
-                f"--fail-under {name}: model {result.model.name} has no such output",
-                cure=suggestion(name, result.model.output_names),
-            )
 
 
 def _draw(result: Replay, path: Path | None) -> Path | None:
     """The figure at a path; without one beside the log, if that can be."""
-    from daq.errors import ConfigError, RunError
     from daq.logs.capture import LOG_NAME
     from daq.report.pictures import draw_replay
 
@@ -150,6 +121,6 @@ def _draw(result: Replay, path: Path | None) -> Path | None:
     except RunError as error:
         if path is not None:
             raise ConfigError(str(error), cure="or choose another with --figure FILE.png") from None
-        terminal.report_warning(str(error))
+        terminal.report("warning", str(error))
         return None
     return chosen

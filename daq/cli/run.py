@@ -5,19 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+from typer import Option
 
-from daq.cli import terminal
-from daq.cli.options import (
-    AsJson,
-    ConfigFile,
-    ExperimentName,
-    ModelName,
-    PortName,
-    RigOfRun,
-    RunsFolder,
-    WithReport,
-)
+from daq.cli import options, terminal
 
 if TYPE_CHECKING:
     from daq.identification.settings import Problem
@@ -25,29 +15,25 @@ if TYPE_CHECKING:
 
 
 def run(
-    experiment: ExperimentName,
-    rig: RigOfRun = None,
-    port: PortName = None,
-    out: RunsFolder = Path("runs"),
+    experiment: options.ExperimentName,
+    rig: options.RigOfRun = None,
+    port: options.PortName = None,
+    out: options.RunsFolder = Path("runs"),
     identify: Annotated[
-        bool,
-        typer.Option(
-            "--identify", help="Record a validation run as well, then identify the model."
-        ),
+        bool, Option("--identify", help="Record a validation run as well, then identify the model.")
     ] = False,
-    model: ModelName = None,
-    config: ConfigFile = None,
+    model: options.ModelName = None,
+    config: options.ConfigFile = None,
     realtime: Annotated[
-        bool,
-        typer.Option("--realtime", help="Keep a simulated rig at the pace of the clock."),
+        bool, Option("--realtime", help="Keep a simulated rig at the pace of the clock.")
     ] = False,
-    report: WithReport = True,
-    json: AsJson = False,
+    report: options.WithReport = True,
+    json: options.AsJson = False,
 ) -> None:
     """Run an experiment on a rig and log every sample."""
     from daq.recording.session import open_session
 
-    with terminal.Watching(quiet=json) as watch:
+    with terminal.watching(json) as watch:
         session = open_session(experiment, rig, port, realtime, watch=watch)
         # A mistake in the model must show before the rig moves.
         problem = _problem(config, model, watch) if identify else None
@@ -57,9 +43,9 @@ def run(
         _show(result, identify)
     if problem is not None:
         if result.validation is None and not json:
-            terminal.report_note(
-                f"{session.loaded.file.path} has no 'validation' section, so there is no "
-                "validation run"
+            path = session.loaded.file.path
+            terminal.report(
+                "note", f"{path} has no 'validation' section, so there is no validation run"
             )
         document["identification"] = _identify(problem, result, report, json)
     if json:
@@ -80,20 +66,20 @@ def _identify(problem: Problem, result: SessionResult, report: bool, json: bool)
 
     validation = [result.validation.folder] if result.validation is not None else []
     folder = result.run.folder / "identification"
-    with terminal.Watching(quiet=json) as watch:
+    with terminal.watching(json) as watch:
         identification = fit(problem, [result.run.folder], validation, folder, watch)
     return show_identification(identification, report, json)
 
 
 def _document(result: SessionResult) -> dict[str, Any]:
-    from daq.diagnose import punctuality
+    from daq.diagnose.punctuality import as_document
     from daq.recording.analysis import findings_document
 
-    runs = {"run": result.run, "validation": result.validation}
     document: dict[str, Any] = {
-        name: None if run is None else punctuality.as_document(run) for name, run in runs.items()
+        "run": as_document(result.run),
+        "validation": None if result.validation is None else as_document(result.validation),
+        "warnings": result.doubts,
     }
-    document["warnings"] = result.doubts
     if result.findings is not None:
         document["findings"] = findings_document(result.findings, result.run.folder)
     return document
@@ -108,18 +94,16 @@ def _show(result: SessionResult, identified: bool) -> None:
     for label, run in (("Log", result.run), ("Validation log", result.validation)):
         if run is None:
             continue
-        flagged = run.timing["flagged_samples"]
-        notes = ", ".join(f"{count} {name}" for name, count in flagged.items())
-        terminal.print_line(
-            f"{label}: {run.folder / 'log.csv'} ({run.n_samples} samples"
-            + (f"; flagged: {notes})" if notes else ")")
-        )
+        flags = run.timing["flagged_samples"].items()
+        flagged = f"; flagged: {', '.join(f'{count} {name}' for name, count in flags)}"
+        samples = f"{run.n_samples} samples{flagged if flags else ''}"
+        print(f"{label}: {run.folder / 'log.csv'} ({samples})")
         line = punctuality.summary_line(run)
         if line is not None:
-            terminal.print_line(line)
+            print(line)
         for note in punctuality.notes(run):
-            terminal.report_note(note)
+            terminal.report("note", note)
     for doubt in result.doubts:
-        terminal.report_warning(doubt)
+        terminal.report("warning", doubt)
     if not identified:
         terminal.print_next(*next_commands(result.run.folder))

@@ -1,26 +1,23 @@
 """``rig schema``: JSON Schemas of the YAML files, and reference pages."""
 
+import itertools
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Argument, Context, Option
 
-from daq.cli import terminal
-from daq.cli.options import AsJson
+from daq.cli import options, terminal
 
 
 def schema(
-    context: typer.Context,
+    context: Context,
     folder: Annotated[
-        Path, typer.Argument(metavar="[FOLDER]", help="Where the schemas go; default schemas.")
+        Path, Argument(metavar="[FOLDER]", help="Where the schemas go; default schemas.")
     ] = Path("schemas"),
     reference: Annotated[
-        Path | None,
-        typer.Option(
-            "--reference", metavar="DIR", help="Write reference pages (Markdown) there as well."
-        ),
+        Path | None, Option(metavar="DIR", help="Write reference pages (Markdown) there as well.")
     ] = None,
-    json: AsJson = False,
+    json: options.AsJson = False,
 ) -> None:
     """Write JSON Schemas of the YAML files, for editors.
 
@@ -28,17 +25,15 @@ def schema(
     """
     from daq.lookup import schemas
 
-    watch = terminal.report_event
-    written = {"schemas": schemas.write_schemas(folder, watch)}
+    written = {"schemas": schemas.write_schemas(folder, terminal.report_event)}
     if reference is not None:
         from daq.cli.reference import write_reference
 
         written["reference"] = write_reference(reference, context.find_root().command)
     if json:
-        terminal.print_json({key: list(map(str, paths)) for key, paths in written.items()})
+        terminal.print_json(written)
         return
-    for paths in written.values():
-        for path in paths:
-            terminal.print_line(f"Written: {path}")
+    for path in itertools.chain(*written.values()):
+        print(f"Written: {path}")
     first = schemas.schema_comment("experiment", folder)
     terminal.print_next(f"begin an experiment's YAML with the line {first}")

@@ -5,30 +5,26 @@ import webbrowser
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Argument, Option
 
-from daq.cli import terminal
-from daq.cli.options import AsJson
+from daq.cli import options, terminal
 
 
 def scope(
     run: Annotated[
         Path | None,
-        typer.Argument(
-            metavar="[RUN_OR_CSV]", help="Capture folder or log; default the newest run."
-        ),
+        Argument(metavar="[RUN_OR_CSV]", help="Capture folder or log; default the newest run."),
     ] = None,
-    out: Annotated[
-        Path, typer.Option("--out", metavar="DIR", help="Where the runs are that it follows.")
-    ] = Path("runs"),
+    out: Annotated[Path, Option(metavar="DIR", help="Where the runs are that it follows.")] = Path(
+        "runs"
+    ),
     port: Annotated[
-        int | None,
-        typer.Option("--port", min=0, max=65535, help="Of the page; default 5006, 0 for any."),
+        int | None, Option(min=0, max=65535, help="Of the page; default 5006, 0 for any.")
     ] = None,
     browser: Annotated[
-        bool, typer.Option("--browser/--no-browser", help="Open a browser on the page.")
+        bool, Option("--browser/--no-browser", help="Open a browser on the page.")
     ] = True,
-    json: AsJson = False,
+    json: options.AsJson = False,
 ) -> None:
     """Show a run in the browser, also while it is recorded."""
     from daq import scope as use_case
@@ -38,9 +34,9 @@ def scope(
             terminal.print_json({"address": address, "run": run, "out": out})
         else:
             shown = str(run) if run else f"the newest run under {out}"
-            terminal.print_line(f"{address} shows {shown}; Ctrl-C ends it")
+            print(f"{address} shows {shown}; Ctrl-C ends it")
         sys.stdout.flush()
         if browser and not json and not webbrowser.open(address):
-            terminal.report_note(f"no browser could be opened; open {address} in one")
+            terminal.report("note", f"no browser could be opened; open {address} in one")
 
     use_case.show(run, out, port, ready)

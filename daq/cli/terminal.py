@@ -1,22 +1,20 @@
 """What people and machines read: tables and progress on a terminal, plain lines, or JSON."""
 
-import functools
 import json
 import re
 import shutil
 import sys
 import textwrap
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext, redirect_stdout
 from contextvars import ContextVar
 from enum import IntEnum
-from types import TracebackType
-from typing import Any, Protocol, TextIO
+from typing import Any, TextIO
 
 from daq import notation
 from daq.documents import plain
-from daq.progress import Event, Note, Progress, Started, Watch
+from daq.progress import Event, Level, Note, Progress, Watch, ignore
 
 number = notation.number  # pages and tables print numbers alike
 
@@ -24,41 +22,30 @@ number = notation.number  # pages and tables print numbers alike
 class Volume(IntEnum):
     """How much a command says."""
 
-    QUIET = 0
-    """Results, warnings and errors."""
-    NORMAL = 1
-    """Progress and what to do next as well."""
-    VERBOSE = 2
-    """Which files and plugins are used as well, and progress as it goes."""
+    QUIET = 0  # results, warnings and errors
+    NORMAL = 1  # progress and what to do next as well
+    VERBOSE = 2  # which files and plugins are used as well, and progress as it goes
 
 
 _volume: ContextVar[Volume] = ContextVar("volume", default=Volume.NORMAL)
 _documents: ContextVar[TextIO | None] = ContextVar("documents", default=None)
+_VOLUMES = {"warning": Volume.QUIET, "note": Volume.NORMAL, "detail": Volume.VERBOSE}
 _VERBOSE_PERIOD = 1.0  # s between lines of progress
 
 
 @contextmanager
-def volume(level: Volume) -> Iterator[None]:
-    """Within it, commands say as much as this."""
-    token = _volume.set(level)
-    try:
-        yield
-    finally:
-        _volume.reset(token)
+def output(level: Volume, documents_alone: bool) -> Iterator[None]:
+    """Within it commands say as much as this; standard output may be for documents only.
 
-
-@contextmanager
-def documents_alone(wanted: bool) -> Iterator[None]:
-    """Within it, where wanted, standard output is for documents only.
-
-    What else is printed, such as by a user's own protocol, goes to standard error.
+    What else is printed, such as by a user's own protocol, then goes to standard error.
     """
-    token = _documents.set(sys.stdout if wanted else None)
+    before = _volume.set(level), _documents.set(sys.stdout if documents_alone else None)
     try:
-        with redirect_stdout(sys.stderr) if wanted else nullcontext():
+        with redirect_stdout(sys.stderr) if documents_alone else nullcontext():
             yield
     finally:
-        _documents.reset(token)
+        _volume.reset(before[0])
+        _documents.reset(before[1])
 
 
 def report_error(message: str) -> None:
@@ -67,34 +54,24 @@ def report_error(message: str) -> None:
         sys.stderr.write(f"rig: {line}\n")
 
 
-def report_warning(message: str) -> None:
-    """One line on standard error of what a user must know, however quiet."""
-    sys.stderr.write(f"rig: warning: {message}\n")
+def report(level: Level, text: str) -> None:
+    """One line on standard error, where that level is to be heard."""
+    if _volume.get() >= _VOLUMES[level]:
+        mark = "" if level == "detail" else f"{level}: "
+        sys.stderr.write(f"rig: {mark}{text}\n")
 
 
 def report_event(event: Event) -> None:
     """A note as loud as it is meant, without showing progress: a ``watch`` for what is quick."""
     if isinstance(event, Note):
-        _REPORTERS[event.level](event.text)
-
-
-def report_note(message: str) -> None:
-    """One line of notice on standard error."""
-    if _volume.get() >= Volume.NORMAL:
-        sys.stderr.write(f"rig: note: {message}\n")
-
-
-def report_detail(message: str) -> None:
-    """One line on standard error for those who want to know more."""
-    if _volume.get() >= Volume.VERBOSE:
-        sys.stderr.write(f"rig: {message}\n")
+        report(event.level, event.text)
 
 
 def print_next(*commands: str) -> None:
     """Which commands a user may want now."""
     if _volume.get() >= Volume.NORMAL:
-        for word, command in zip(["Next", *["Then"] * len(commands)], commands, strict=False):
-            print_line(f"{word}: {command}")
+        for index, command in enumerate(commands):
+            print(f"{'Then' if index else 'Next'}: {command}")
 
 
 def print_json(document: Any) -> None:
@@ -102,11 +79,6 @@ def print_json(document: Any) -> None:
     out = _documents.get() or sys.stdout
     out.write(json.dumps(plain(document), indent=2) + "\n")
     out.flush()
-
-
-def print_line(text: str = "") -> None:
-    """One line of result on standard output."""
-    sys.stdout.write(text + "\n")
 
 
 def print_text(text: str) -> None:
@@ -117,7 +89,7 @@ def print_text(text: str) -> None:
             text.strip(), shutil.get_terminal_size().columns, initial_indent=indent,
             subsequent_indent=indent, break_long_words=False, break_on_hyphens=False,
         )  # fmt: skip
-    print_line(text)
+    print(text)
 
 
 def print_table(
@@ -133,8 +105,7 @@ def print_table(
     from rich.table import Table
 
     # A unit in brackets is no markup, nor is text between colons an emoji.
-    make = functools.partial(Console, file=sys.stdout, highlight=False, markup=False, emoji=False)
-    console = make()
+    console = Console(file=sys.stdout, highlight=False, markup=False, emoji=False)
     words = [index == 0 or name in text for index, name in enumerate(head)]
     columns = [[name, *(row[index] for row in rows)] for index, name in enumerate(head)]
     whole = [max(map(len, column)) for column in columns]
@@ -153,10 +124,7 @@ def print_table(
     for row in rows:
         table.add_row(*row)
     # Where even the longest words have no room, the terminal breaks the lines.
-    console = make(
-        width=max(console.width, sum(widths) + 3 * len(head)),
-        no_color=None if console.is_terminal else True,
-    )
+    console.width = max(console.width, sum(widths) + 3 * len(head))
     # Above the table rather than in it, where a long title would wrap to the table's width.
     console.print(title, style="bold", soft_wrap=True)
     console.print(table)
@@ -197,89 +165,61 @@ def _folded(head: str, width: int) -> str:
     return "\n".join(lines)
 
 
-class Watching:
-    """Shows what a use case says while it works; within it, the function to give as ``watch``.
+@contextmanager
+def watching(quiet: bool) -> Iterator[Watch]:
+    """Shows what a use case says while it works, by the function to give it as ``watch``.
 
     Progress is a bar on a terminal, one plain line per finished activity otherwise; quiet: notes
-    and warnings only. Notes end the bars before them.
+    and warnings only. Notes end the bars before them; an activity that an error ended is not shown
+    as finished.
     """
+    update: Callable[[Progress], None] | None = None
 
-    def __init__(self, quiet: bool = False) -> None:
-        self._quiet = quiet
-        self._display: Display | None = None
-        self._open = ExitStack()
-
-    def __enter__(self) -> Watch:
-        return self._show
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        # An activity that an error ended is not shown as finished.
-        self._open.__exit__(kind, error, trace)
-
-    def _show(self, event: Event) -> None:
+    def show(event: Event) -> None:
+        nonlocal update
         if isinstance(event, Progress):
-            if self._display is None:
-                self._display = self._open.enter_context(_display(self._quiet))
-            self._display.update(event)
+            update = update or display.enter_context(_progress(quiet))
+            update(event)
             return
-        self._close()
-        if isinstance(event, Started):
-            if not self._quiet:
-                report_note(event.title)
-        else:
-            report_event(event)
+        update = None
+        display.close()
+        if isinstance(event, Note):
+            report(event.level, event.text)
+        elif not quiet:
+            report("note", event.title)
 
-    def _close(self) -> None:
-        self._display = None
-        self._open.close()
-
-
-class Display(Protocol):
-    """Shows how far activities are: ``update`` as often as one likes."""
-
-    def update(self, step: Progress) -> None:
-        """Show a step."""
+    with ExitStack() as display:
+        yield show
 
 
 @contextmanager
-def _display(quiet: bool) -> Iterator[Display]:
+def _progress(quiet: bool) -> Iterator[Callable[[Progress], None]]:
+    """How far activities are, by a function to call as often as one likes."""
     if quiet or _volume.get() == Volume.QUIET:
-        yield _Silent()
+        yield ignore
     elif sys.stderr.isatty():
-        with _terminal_bars() as bars:
-            yield bars
+        with _bars() as update:
+            yield update
     else:
-        lines = _PlainLines(_volume.get() == Volume.VERBOSE)
-        yield lines
+        lines = _PlainLines()
+        yield lines.update
         lines.finish()
 
 
-class _Silent:
-    def update(self, step: Progress) -> None:
-        """Show nothing."""
-
-
 class _PlainLines:
-    """One line per activity, when it is finished."""
+    """One line per activity when it is finished, and some meanwhile for those who want more."""
 
-    def __init__(self, verbose: bool) -> None:
-        self._activity = ""
-        self._text = ""
+    def __init__(self) -> None:
+        self._activity = self._text = ""
         self._started = self._written = time.perf_counter()
-        self._verbose = verbose
 
     def update(self, step: Progress) -> None:
+        now = time.perf_counter()
         if step.activity != self._activity:
             self.finish()
-            self._activity, self._started = step.activity, time.perf_counter()
+            self._activity, self._started = step.activity, now
         self._text = f"{step.activity}: {step.status}"
-        now = time.perf_counter()
-        if self._verbose and now - self._written > _VERBOSE_PERIOD:
+        if _volume.get() == Volume.VERBOSE and now - self._written > _VERBOSE_PERIOD:
             self._written = now
             sys.stderr.write(f"{self._text} ...\n")
 
@@ -291,34 +231,25 @@ class _PlainLines:
 
 
 @contextmanager
-def _terminal_bars() -> Iterator[Display]:
+def _bars() -> Iterator[Callable[[Progress], None]]:
+    from rich import progress
     from rich.console import Console
-    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
-    from rich.progress import Progress as RichProgress
-    from rich.progress import TimeRemainingColumn as Remaining
 
     columns = (
-        TextColumn("{task.description:<22}"),
-        BarColumn(bar_width=30),
-        TextColumn("{task.fields[note]}"),
-        TimeElapsedColumn(),
-        TextColumn("[dim]left"),
-        Remaining(),
+        progress.TextColumn("{task.description:<22}"),
+        progress.BarColumn(bar_width=30),
+        progress.TextColumn("{task.fields[note]}"),
+        progress.TimeElapsedColumn(),
+        progress.TextColumn("[dim]left"),
+        progress.TimeRemainingColumn(),
     )
-    with RichProgress(*columns, console=Console(file=sys.stderr)) as shown:
-        tasks: dict[str, Any] = {}
+    with progress.Progress(*columns, console=Console(file=sys.stderr)) as bars:
+        tasks: dict[str, progress.TaskID] = {}
 
-        class Bars:
-            def update(self, step: Progress) -> None:
-                if step.activity not in tasks:
-                    tasks[step.activity] = shown.add_task(
-                        step.activity, total=step.total, note=step.status
-                    )
-                shown.update(
-                    tasks[step.activity], completed=step.done, total=step.total, note=step.status
-                )
+        def update(step: Progress) -> None:
+            name, total, note = step.activity, step.total, step.status
+            if name not in tasks:
+                tasks[name] = bars.add_task(name, total=total, note=note)
+            bars.update(tasks[name], completed=step.done, total=total, note=note)
 
-        yield Bars()
-
-
-_REPORTERS = {"warning": report_warning, "note": report_note, "detail": report_detail}
+        yield update

@@ -22,14 +22,9 @@ class Section(BaseModel):
             if isinstance(part, bool):
                 # Of ``parameters``: parameter R_m.
                 entry = f"{(info.field_name or '').removesuffix('s')} {name}: " if name else ""
-                raise ValueError(
-                    f"{entry}{_expected(kind)}; YAML reads yes, no, on and off as true and false"
-                )
+                cure = "expected a number" if _has(kind, {float, int}) else "put text in quotes"
+                raise ValueError(f"{entry}{cure}; YAML reads yes, no, on and off as true and false")
         return value
-
-
-def _expected(kind: Any) -> str:
-    return "expected a number" if _has(kind, {float, int}) else "put text in quotes"
 
 
 def _has(kind: Any, wanted: set[Any]) -> bool:

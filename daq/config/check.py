@@ -50,14 +50,12 @@ def mistakes(
 
 
 def refuse(mistakes: Sequence[Mistake]) -> None:
-    """Raise a ConfigError of all mistakes, if any, in the order of the file."""
+    """Raise a ConfigError of all mistakes, if any: what was typed, then in the file's order."""
     if mistakes:
-        raise ConfigError.of(sorted(set(mistakes), key=_order))
-
-
-def _order(mistake: Mistake) -> tuple[int, int, str]:
-    """By place in the file, what was typed first."""
-    return mistake.line or 0, mistake.column or 0, mistake.text
+        ordered = sorted(
+            set(mistakes), key=lambda each: (each.line or 0, each.column or 0, each.text)
+        )
+        raise ConfigError.of(ordered)
 
 
 # Keys by which each kind of file is known when it is given in another's place, and the cure.
@@ -95,16 +93,17 @@ class _Explainer:
         meant = set()
         for item, key in _of_best_branch([(item, self._key(item)) for item in errors]):
             if item["type"] in {"extra_forbidden", "invalid_key"}:
-                near = self._near(key)
-                meant.add((*key[:-1], near))
-                complaints[key] = [("unknown key", self._cure(key, near))]
+                names = self._fields(key[:-1])
+                near = difflib.get_close_matches(str(key[-1]), names, n=1, cutoff=0.6)
+                meant.update((*key[:-1], name) for name in near)
+                complaints[key] = [("unknown key", self._cure(key, names, bool(near)))]
             else:
                 complaints.setdefault(key, []).append(self._complaint(item, key))
         return [
             self.file.mistake((*self.at, *key), *_either(list(dict.fromkeys(alternatives))))
             for key, alternatives in complaints.items()
             # What is missing because it is misspelt is said once.
-            if key not in meant or self._is_there(key)
+            if key not in meant or (*self.at, *key) in self.file.places
         ]
 
     def _key(self, item: ErrorDetails) -> Key:
@@ -124,9 +123,6 @@ class _Explainer:
             key.append(item["ctx"]["discriminator"].strip("'"))
         return tuple(key)
 
-    def _is_there(self, key: Key) -> bool:
-        return (*self.at, *key) in self.file.places
-
     def _value(self, key: Key) -> Any:
         value: Any = self.content
         for part in key:
@@ -136,11 +132,7 @@ class _Explainer:
                 return None
         return value
 
-    def _near(self, key: Key) -> str | None:
-        names = self._fields(key[:-1])
-        return next(iter(difflib.get_close_matches(str(key[-1]), names, n=1, cutoff=0.6)), None)
-
-    def _cure(self, key: Key, near: str | None) -> str:
+    def _cure(self, key: Key, names: Sequence[str], is_near: bool) -> str:
         """Where an unknown key belongs, or what it may have meant."""
         sections = [at for at in _sections_with(self.model, str(key[-1])) if at != key[:-1]]
         if sections:
@@ -148,11 +140,9 @@ class _Explainer:
             if under := " or ".join(dotted(section) for section in sections if section):
                 places.append(f"under {under}")
             return f"it belongs {' or '.join(places)}"
-        if near is not None:
-            return f"did you mean {near!r}?"
-        if str(key[-1]).isdigit():
+        if not is_near and str(key[-1]).isdigit():
             return "between braces a comma begins the next key; write decimals with a point"
-        return suggestion(str(key[-1]), self._fields(key[:-1]))
+        return suggestion(str(key[-1]), names)
 
     def _complaint(self, item: ErrorDetails, key: Key) -> Complaint:
         kind = item["type"]
@@ -170,7 +160,7 @@ class _Explainer:
             for kind in self._types(key[:-1]):
                 field = getattr(kind, "model_fields", {}).get(key[-1])
                 if field is not None and field.description:
-                    unit = unit_of(field)
+                    unit = unit_of(field.annotation, field.metadata)
                     shown = f" [{unit}]" if unit not in {None, "1"} else ""
                     return f" ({field.description}{shown})"
             key = key[:-1]
@@ -259,21 +249,15 @@ def _sections_with(model: Any, name: str, at: Key = ()) -> list[Key]:
     return list(dict.fromkeys(sections))
 
 
-_NUMBER, _WHOLE, _TRUTH = "expected a number", "expected a whole number", "expected true or false"
+_NUMBER, _WHOLE = "expected a number", "expected a whole number"
+_LINES = "expected 'key: value' lines"
 _EXPECTED = {
-    "float_parsing": _NUMBER,
-    "float_type": _NUMBER,
+    **dict.fromkeys(("float_parsing", "float_type"), _NUMBER),
     "finite_number": "expected a finite number",
-    "int_parsing": _WHOLE,
-    "int_parsing_size": _WHOLE,
-    "int_type": _WHOLE,
-    "int_from_float": _WHOLE,
-    "bool_parsing": _TRUTH,
-    "bool_type": _TRUTH,
+    **dict.fromkeys(("int_parsing", "int_parsing_size", "int_type", "int_from_float"), _WHOLE),
+    **dict.fromkeys(("bool_parsing", "bool_type"), "expected true or false"),
     "string_type": "expected text",
-    "dict_type": "expected 'key: value' lines",
-    "model_type": "expected 'key: value' lines",
-    "model_attributes_type": "expected 'key: value' lines",
+    **dict.fromkeys(("dict_type", "model_type", "model_attributes_type"), _LINES),
     "list_type": "expected a list [a, b]",
     "greater_than": "it must be above {gt:g}",
     "greater_than_equal": "it must be at least {ge:g}",
@@ -285,9 +269,6 @@ _EXPECTED = {
     "string_too_short": "it must not be empty",
     "string_too_long": "it must have at most {max_length} characters",
 }
-
-
-_SECTIONS = {"dict_type", "model_type", "model_attributes_type"}
 _NO_SECTION = {
     "list": "write its keys without '-' and brackets",
     "NoneType": "indent its keys below it",
@@ -298,7 +279,7 @@ def _complaint(kind: str, item: ErrorDetails, value: object, types: Sequence[Any
     """What is wrong with a value, in plain English, with the value and a cure if it is plain."""
     context = item.get("ctx", {})
     expected = _EXPECTED.get(kind) or _expected_values(kind, context, types)
-    if expected is not None:
+    if expected:
         problem = f"{expected.format(**context)}, found {_shown(value)}"
         return problem, _cure_of_value(kind, value, context)
     message = item["msg"].removeprefix("Value error, ")
@@ -306,8 +287,8 @@ def _complaint(kind: str, item: ErrorDetails, value: object, types: Sequence[Any
     return message[0].lower() + message[1:] + shown, ""
 
 
-def _expected_values(kind: str, context: Mapping[str, Any], types: Sequence[Any]) -> str | None:
-    """How many values are expected."""
+def _expected_values(kind: str, context: Mapping[str, Any], types: Sequence[Any]) -> str:
+    """How many values are expected; empty where that is not what is wrong."""
     if kind == "too_short" and context.get("field_type") != "Tuple":
         least = context["min_length"]
         return f"it needs at least {least} {'value' if least == 1 else 'values'}"
@@ -318,14 +299,17 @@ def _expected_values(kind: str, context: Mapping[str, Any], types: Sequence[Any]
         if lengths == {2}:
             return "expected two values [low, high]"
         return f"expected {' or '.join(map(str, sorted(lengths)))} values [a, b, ...]"
-    return None
+    return ""
 
 
 def _cure_of_value(kind: str, value: object, context: Mapping[str, Any]) -> str:
     """What to write instead, where that is plain from the value."""
     if _EXPECTED.get(kind) in {_NUMBER, _WHOLE}:
-        return _cure_of_number(str(value))
-    if kind in _SECTIONS:
+        if re.match(r"[-+]?\d+,\d", str(value)):
+            return "write a decimal point"
+        has_unit = re.match(r"[-+]?[\d.]+\s*[^\W\d]", str(value))
+        return "this one takes no unit" if has_unit else ""
+    if _EXPECTED.get(kind) == _LINES:
         return _NO_SECTION.get(type(value).__name__, "")
     if kind == "list_type" and isinstance(value, str | int | float):
         return f"write [{value}]"
@@ -334,12 +318,6 @@ def _cure_of_value(kind: str, value: object, context: Mapping[str, Any]) -> str:
     words = re.findall(r"'([^']+)'", context.get("expected", context.get("expected_tags", "")))
     near = difflib.get_close_matches(str(value), words, n=1, cutoff=0.5)
     return f"did you mean {near[0]!r}?" if near else ""
-
-
-def _cure_of_number(text: str) -> str:
-    if re.match(r"[-+]?\d+,\d", text):
-        return "write a decimal point"
-    return "this one takes no unit" if re.match(r"[-+]?[\d.]+\s*[^\W\d]", text) else ""
 
 
 def _shown(value: object) -> str:

@@ -6,15 +6,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, PrivateAttr, create_model, field_validator
 
 from daq.config.base import Section
-from daq.config.units import (
-    Amperes,
-    NewtonMetres,
-    RadiansPerSecond,
-    Seconds,
-    Turns,
-    Unit,
-    Volts,
-)
+from daq.config.units import Amperes, NewtonMetres, RadiansPerSecond, Seconds, Turns, Unit, Volts
 from daq.errors import ConfigError
 
 Sign = Literal[-1, 1]
@@ -69,8 +61,7 @@ class CommandLimits(Section):
 
     motor: tuple[Volts, Volts] = Field((-5.0, 5.0), description="lowest and highest motor command")
     brake: tuple[Volts, Volts] = Field(
-        (0.0, 0.38),
-        description="lowest and highest brake command (at 0.5 A/V, 0.38 V give 0.19 A)",
+        (0.0, 0.38), description="lowest and highest brake command (at 0.5 A/V, 0.38 V give 0.19 A)"
     )
 
     @field_validator("motor", "brake")

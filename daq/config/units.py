@@ -11,20 +11,17 @@ another key can tell is a ``Quantity``, as ``converted`` or ``split`` makes it a
 
 import functools
 import re
-import typing
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
-from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
-from pydantic.fields import FieldInfo
+from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler, WithJsonSchema
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 # Atomic: 1e3 is no 1 with the unit e3.
 _QUANTITY = re.compile(rf"\s*((?>{_NUMBER}))\s*([^\s\d.,].*?)\s*")
-
-
 # Bounds in a JSON Schema hold for numbers only, and patterns for text only.
 QUANTITY_SCHEMA: JsonSchemaValue = {
     "type": ["number", "string"],
@@ -57,15 +54,6 @@ class Unit:
         return {**handler(schema), **QUANTITY_SCHEMA, "unit": self.symbol}
 
 
-class _UnitElsewhere:
-    """Marks a number that a schema takes with its unit, and that is one when it is checked."""
-
-    def __get_pydantic_json_schema__(
-        self, schema: CoreSchema, handler: GetJsonSchemaHandler
-    ) -> JsonSchemaValue:
-        return {**handler(schema), **QUANTITY_SCHEMA}
-
-
 Volts = Annotated[float, Unit("V")]
 Amperes = Annotated[float, Unit("A")]
 Seconds = Annotated[float, Unit("s")]
@@ -76,12 +64,16 @@ NewtonMetres = Annotated[float, Unit("N*m")]
 Turns = Annotated[float, Unit("turn")]
 Percent = Annotated[float, Unit("%")]
 Part = Annotated[float, Unit("1")]
-Quantity = Annotated[float, _UnitElsewhere()]
+# Given with a unit that stands elsewhere, and a plain number when it is checked.
+Quantity = Annotated[float, WithJsonSchema(QUANTITY_SCHEMA)]
 
 
-def unit_of(field: FieldInfo) -> str | None:
-    """The unit of a field's numbers, wherever in its type it stands; None without one."""
-    return _unit_in(field.metadata) or _unit_of_type(field.annotation)
+def unit_of(kind: Any, marks: Iterable[Any] = ()) -> str | None:
+    """The unit of a type's numbers, among its marks or wherever in it; None without one."""
+    for mark in (*marks, *getattr(kind, "__metadata__", ())):
+        if isinstance(mark, Unit):
+            return mark.symbol
+    return next(filter(None, map(unit_of, get_args(kind))), None)
 
 
 def converted(value: Any, unit: str) -> Any:
@@ -115,9 +107,8 @@ def factor(given: str, wanted: str) -> float:
     except pint.DimensionalityError:
         raise ValueError(f"{given!r} does not convert to {wanted!r}") from None
     except Exception:
-        raise ValueError(
-            f"unit {given!r} is not understood; write it as in 'mm/s' or 'N*m'"
-        ) from None
+        problem = f"unit {given!r} is not understood; write it as in 'mm/s' or 'N*m'"
+        raise ValueError(problem) from None
     if _angles(have) != _angles(want):
         # A number per minute may count turns or radians, and so may hertz.
         raise ValueError(
@@ -142,14 +133,3 @@ def _angles(quantity: Any) -> float:
 
 def _spelt(unit: str) -> str:
     return unit.replace("·", "*").replace("^", "**") if unit != "1" else "dimensionless"
-
-
-def _unit_in(metadata: typing.Iterable[Any]) -> str | None:
-    return next((item.symbol for item in metadata if isinstance(item, Unit)), None)
-
-
-def _unit_of_type(kind: Any) -> str | None:
-    marked = _unit_in(getattr(kind, "__metadata__", ()))
-    if marked is not None:
-        return marked
-    return next((unit for part in typing.get_args(kind) if (unit := _unit_of_type(part))), None)

@@ -17,6 +17,7 @@ Key = tuple[str | int, ...]
 _DEEPEST = 20  # levels of nesting
 _MOST_COPIES = 10_000  # of keys and values by aliases; a few lines of them could make billions
 _LISTED = 8  # line numbers in a message
+_TYPED = "command line"  # in place of a file's name
 _LOOK = "{problem}; check the indentation, colons and quotes here and in the line before"
 
 
@@ -65,12 +66,12 @@ class YamlFile:
         return [mistake.behind(self.mistake(key, "")) for mistake in error.mistakes]
 
     def where(self, key: Key) -> str:
-        """``FILE:LINE:COLUMN`` of a key."""
-        return self.mistake(key, "").place
+        """``FILE:LINE:COLUMN`` of a key, or ``command line``."""
+        return self.mistake(key, "").place or _TYPED
 
     def line(self, key: Key) -> str:
-        """``FILE:LINE`` of a key."""
-        return replace(self.mistake(key, ""), column=None).place
+        """``FILE:LINE`` of a key, or ``command line``."""
+        return replace(self.mistake(key, ""), column=None).place or _TYPED
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,7 @@ class TypedSettings(YamlFile):
         typed: dict[str, Any] = dict(options)
         for text in settings:
             typed = merge(typed, _setting(text))
-        path = file.path if file else Path("command line")
+        path = file.path if file else Path(_TYPED)
         content = merge(file.content if file else {}, typed)
         places, repeated = (file.places, file.repeated) if file else ({}, ())
         return cls(path, content, places, repeated, typed, frozenset(options))
@@ -107,14 +108,6 @@ class TypedSettings(YamlFile):
         is_option = key[0] in self.named_options
         option = f"--{dotted(key).replace('_', '-')}" if is_option else f"--set {dotted(key)}"
         return Mistake(problem, cure, key=option)
-
-    def where(self, key: Key) -> str:
-        """``command line``, or the place in the file."""
-        return super().where(key) or "command line"
-
-    def line(self, key: Key) -> str:
-        """``command line``, or the line in the file."""
-        return super().line(key) or "command line"
 
     def _is_typed(self, key: Key) -> bool:
         """Whether a key, or all there is of the section it belongs in, was typed."""
@@ -239,9 +232,8 @@ class _Places:
             child, place = (*key, str(name.value)), _place(name)
             if name.value in seen:
                 problem = f"this key stands twice, first in line {seen[name.value]}"
-                self.repeated.append(
-                    Mistake(problem, "keep one", self._path, *place, dotted(child))
-                )
+                mistake = Mistake(problem, "keep one", self._path, *place, dotted(child))
+                self.repeated.append(mistake)
             seen.setdefault(str(name.value), place[0])
             self.places[child] = place
             self.collect(value, child)
@@ -289,7 +281,8 @@ def _syntax_mistake(path: Path, text: str, error: yaml.YAMLError) -> Mistake:
         return Mistake(f"not valid YAML: {problem}", file=path)
     tabs = [i for i, line in enumerate(text.splitlines(), 1) if re.match(r" *\t", line)]
     if mark.line + 1 in tabs:
-        lines = "this line begins" if len(tabs) == 1 else f"lines {_listed(tabs)} begin"
+        shown = ", ".join(map(str, tabs[:_LISTED])) + ", ..." * (len(tabs) > _LISTED)
+        lines = "this line begins" if len(tabs) == 1 else f"lines {shown} begin"
         cause = f"{lines} with a tab; indent with spaces"
     else:
         opened = getattr(error, "context_mark", None) or mark
@@ -297,11 +290,6 @@ def _syntax_mistake(path: Path, text: str, error: yaml.YAMLError) -> Mistake:
         cause = cure.format(problem=problem, context=opened.line + 1)
     place = (path, mark.line + 1, mark.column + 1)
     return Mistake(f"not valid YAML: {cause}", "", *place)
-
-
-def _listed(numbers: Sequence[int]) -> str:
-    shown = ", ".join(map(str, numbers[:_LISTED]))
-    return f"{shown}, ..." if len(numbers) > _LISTED else shown
 
 
 def _kind(content: object) -> str:

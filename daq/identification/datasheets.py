@@ -5,8 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from daq.config import check, yaml_file
-from daq.config.datasheet import DatasheetEntry
-from daq.config.identification import IdentificationConfig
+from daq.config.identification import DatasheetEntry, IdentificationConfig
 from daq.config.yaml_file import YamlFile
 from daq.errors import suggestion
 from daq.identification.records import unit_factor

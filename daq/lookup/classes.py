@@ -3,7 +3,7 @@
 import inspect
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,28 +12,24 @@ from daq.errors import ConfigError
 from daq.experiment import Experiment
 from daq.hal import Device
 from daq.limits import Limit
-from daq.lookup.user_code import Kind, from_file, locate
-from daq.plugins import Group, load_plugin
+from daq.lookup.user_code import from_file, locate
+from daq.plugins import Kind, load_plugin
 
 
-def find_protocol(name: str, folder: Path) -> type[Experiment]:
-    """An installed protocol, or a class in a file given as ``FILE.py:CLASS``.
+def find_class(kind: Kind, name: str, folder: Path) -> Any:
+    """A class fit for its kind: an installed one, or in a file given as ``FILE.py:CLASS``.
 
     File names are looked up from the working folder, then from ``folder``. Raises ConfigError.
     """
-    protocol: type[Experiment] = _find(name, folder, _PROTOCOL)
-    return protocol
-
-
-def find_limit(name: str, folder: Path) -> type[Limit]:
-    """The same for a limit."""
-    limit: type[Limit] = _find(name, folder, _LIMIT)
-    return limit
-
-
-def find_backend(name: str, folder: Path) -> Any:
-    """The same for a backend: a class with ``Options`` that makes devices."""
-    return _find(name, folder, _BACKEND)
+    is_fit, cure = _CLASSES[kind]
+    parts = file_and_class(name)
+    if parts is None:
+        candidate = load_plugin(kind, name)
+    else:
+        candidate = from_file(locate(parts[0], kind, folder), parts[1], kind, is_fit)
+    if not is_fit(candidate):
+        raise ConfigError(f"{name} is no {kind}", cure=cure)
+    return candidate
 
 
 def file_and_class(name: str) -> tuple[Path, str] | None:
@@ -43,29 +39,7 @@ def file_and_class(name: str) -> tuple[Path, str] | None:
     return (Path(parts[1]), parts[2]) if parts else None
 
 
-@dataclass(frozen=True)
-class _Role:
-    """What a class can be to a rig; cure: for a class that is not fit for it."""
-
-    kind: Kind
-    group: Group
-    is_fit: Callable[[Any], bool]
-    cure: str
-
-
-def _find(name: str, folder: Path, role: _Role) -> Any:
-    parts = file_and_class(name)
-    if parts is None:
-        candidate = load_plugin(role.group, name)
-    else:
-        path = locate(parts[0], role.kind, folder)
-        candidate = from_file(path, parts[1], role.kind, role.is_fit)
-    if not role.is_fit(candidate):
-        raise ConfigError(f"{name} is no {role.kind}", cure=role.cure)
-    return candidate
-
-
-def _is_concrete(candidate: Any, base: type) -> bool:
+def _is_concrete(base: type, candidate: Any) -> bool:
     is_subclass = inspect.isclass(candidate) and issubclass(candidate, base)
     return is_subclass and not inspect.isabstract(candidate)
 
@@ -79,22 +53,16 @@ def _is_backend(candidate: Any) -> bool:
     return is_device and has_options
 
 
-_PROTOCOL = _Role(
-    "protocol",
-    "rig.protocols",
-    lambda candidate: _is_concrete(candidate, Experiment),
-    "make it a class derived from daq.experiment.Timed, OpenLoop or ClosedLoop, with all of its "
-    "methods",
-)
-_LIMIT = _Role(
-    "limit",
-    "rig.limits",
-    lambda candidate: _is_concrete(candidate, Limit),
-    "make it a class derived from daq.limits.Limit with a method check",
-)
-_BACKEND = _Role(
-    "backend",
-    "rig.backends",
-    _is_backend,
-    "make it a class with Options and the methods of daq.hal.Device",
-)
+# Whether a class is fit for its kind, and the cure for one that is not.
+_CLASSES: dict[Kind, tuple[Callable[[Any], bool], str]] = {
+    "protocol": (
+        partial(_is_concrete, Experiment),
+        "make it a class derived from daq.experiment.Timed, OpenLoop or ClosedLoop, with all of "
+        "its methods",
+    ),
+    "limit": (
+        partial(_is_concrete, Limit),
+        "make it a class derived from daq.limits.Limit with a method check",
+    ),
+    "backend": (_is_backend, "make it a class with Options and the methods of daq.hal.Device"),
+}

@@ -13,8 +13,8 @@ from daq.config.rig import RigConfig
 from daq.config.yaml_file import Key, YamlFile
 from daq.errors import ConfigError, Mistake
 from daq.experiment import Experiment, Plan
-from daq.lookup.classes import file_and_class, find_protocol
-from daq.lookup.shipped import find_file, shipped_experiments
+from daq.lookup.classes import file_and_class, find_class
+from daq.lookup.shipped import find_file
 from daq.lookup.user_code import locate
 from daq.progress import Note, Watch, ignore
 from daq.run.plan import plan
@@ -53,10 +53,14 @@ class LoadedExperiment:
 
 def load_experiment(name: str, watch: Watch = ignore) -> LoadedExperiment:
     """Read and check an experiment; ConfigError names file, line, key and cure."""
-    file = yaml_file.load(find_file(name, shipped_experiments, watch))
+    file = yaml_file.load(find_file("protocol", name, watch))
     check.refuse_other_kind(file, "an experiment")
+    protocol_name = file.content.get("protocol")
     try:
-        protocol = find_protocol(_protocol_name(file), file.path.parent)
+        if not isinstance(protocol_name, str):
+            problem = "this key is missing or not a name"
+            raise ConfigError(problem, cure="for example 'protocol: prbs'")
+        protocol = find_class("protocol", protocol_name, file.path.parent)
     except ConfigError as error:
         check.validate(file, _common_settings(), others=file.blamed(("protocol",), error))
         raise
@@ -103,14 +107,6 @@ def _experiment(file: YamlFile, protocol: type[Experiment]) -> Experiment:
     experiment = check.validate(file, protocol, content)
     experiment._folder = file.path.parent
     return experiment
-
-
-def _protocol_name(file: YamlFile) -> str:
-    name = file.content.get("protocol")
-    if not isinstance(name, str):
-        problem = "this key is missing or not a name"
-        raise ConfigError(problem, cure="for example 'protocol: prbs'")
-    return name
 
 
 def _common_settings() -> type[Section]:

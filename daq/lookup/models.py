@@ -5,7 +5,6 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
@@ -17,36 +16,17 @@ from sysid import ModelError, ProcessModel
 DEFAULT_MODEL = "actuator"
 
 
-@dataclass(frozen=True)
-class ModelName:
-    """``model`` or ``file.py:object``, and ``:option=value,...`` behind either.
+def name_parts(name: str) -> tuple[str, str | None, str]:
+    """Parts of ``model`` or ``file.py:object``, and ``:option=value,...`` behind either.
 
-    attribute: the object in a file, None for an installed model.
+    The model or file, the object in a file or None for an installed model, and the options.
     """
-
-    source: str
-    attribute: str | None
-    options: str
-
-    @classmethod
-    def parse(cls, text: str) -> ModelName:
-        """Take a name apart."""
-        # Not at the first colon: a Windows path has one behind its drive.
-        file = re.match(r"^(.*\.py)(?::([^:=]*))?(?::(.*))?$", text)
-        if file:
-            return cls(file[1], file[2] or "model", file[3] or "")
-        source, _, options = text.partition(":")
-        return cls(source, None, options)
-
-
-@dataclass(frozen=True)
-class ModelOption:
-    """An option of a function that makes models, and what may be written for it."""
-
-    name: str
-    default: Any
-    choices: list[str]
-    description: str
+    # Not at the first colon: a Windows path has one behind its drive.
+    file = re.match(r"^(.*\.py)(?::([^:=]*))?(?::(.*))?$", name)
+    if file:
+        return file[1], file[2] or "model", file[3] or ""
+    source, _, options = name.partition(":")
+    return source, None, options
 
 
 def find_model(name: str, relative_to: Path | None = None) -> ProcessModel:
@@ -56,67 +36,12 @@ def find_model(name: str, relative_to: Path | None = None) -> ProcessModel:
     are the function's arguments. File names are looked up from the working folder, then from
     ``relative_to``. Raises ConfigError naming file, line and cause.
     """
-    parsed = ModelName.parse(name)
-    where = f"model {parsed.source!r}"
-    if parsed.attribute is not None:
-        where = f"{locate(Path(parsed.source), 'model', relative_to)}:{parsed.attribute}"
-    return _as_model(_source(parsed, relative_to), where, parsed.options)
-
-
-def _source(name: ModelName, relative_to: Path | None = None) -> Any:
-    """The model, or the function that makes it."""
-    if name.attribute is None:
-        return load_plugin("rig.models", name.source)
-    path = locate(Path(name.source), "model", relative_to)
-    return from_file(path, name.attribute, "model", lambda value: isinstance(value, ProcessModel))
-
-
-def whole_name(name: str, relative_to: Path | None = None) -> str:
-    """The name by which ``find_model`` finds the same model from any folder."""
-    parsed = ModelName.parse(name)
-    if parsed.attribute is None:
-        return name
-    path = locate(Path(parsed.source), "model", relative_to).resolve()
-    return f"{path}{name.removeprefix(parsed.source)}"
-
-
-def describe(model: ProcessModel) -> dict[str, Any]:
-    """All that a model declares, for machines."""
-    signals = {
-        "states": [
-            {"name": s.name, "unit": s.unit, "initial": s.initial, "estimated": s.initial_range}
-            for s in model.states
-        ],
-        "inputs": [{"name": s.name, "unit": s.unit, "hold": s.hold} for s in model.inputs],
-        "outputs": [{"name": s.name, "unit": s.unit} for s in model.outputs],
-    }
-    parameters = [
-        {
-            "name": p.name,
-            "unit": p.unit,
-            "nominal": p.nominal,
-            "range": None if p.fixed else [p.lower, p.upper],
-            "scale": p.scale,
-            "fixed": p.fixed,
-            "description": p.description,
-        }
-        for p in model.parameters
-    ]
-    return {
-        "name": model.name,
-        "description": model.description,
-        "equations": list(model.equations),
-        **signals,
-        "parameters": parameters,
-        "constraints": [constraint.text for constraint in model.constraints],
-    }
-
-
-def _as_model(source: Any, where: str, options: str) -> ProcessModel:
+    source, where, options = _source(name, relative_to)
     if callable(source) and not isinstance(source, ProcessModel):
-        source = _made(source, where, _split(options, where, _lists(source)))
+        source = _made(source, where, options)
     elif options:
-        raise ConfigError(f"{where} is a finished model", cure=f"it takes no options ({options!r})")
+        cure = f"it takes no options ({options!r})"
+        raise ConfigError(f"{where} is a finished model", cure=cure)
     if not isinstance(source, ProcessModel):
         raise ConfigError(
             f"{where} is of type {type(source).__name__}, not a sysid.ProcessModel or a function "
@@ -125,8 +50,54 @@ def _as_model(source: Any, where: str, options: str) -> ProcessModel:
     return source
 
 
-def _split(options: str, where: str, lists: frozenset[str]) -> dict[str, Any]:
-    """``a=1,b=2`` by name; an option among ``lists`` takes values up to the next one's name."""
+def _source(name: str, relative_to: Path | None = None) -> tuple[Any, str, str]:
+    """The model, or the function that makes it; where it is, and the options behind its name."""
+    source, attribute, options = name_parts(name)
+    if attribute is None:
+        return load_plugin("model", source), f"model {source!r}", options
+    path = locate(Path(source), "model", relative_to)
+    model = from_file(path, attribute, "model", lambda value: isinstance(value, ProcessModel))
+    return model, f"{path}:{attribute}", options
+
+
+def whole_name(name: str, relative_to: Path | None = None) -> str:
+    """The name by which ``find_model`` finds the same model from any folder."""
+    source, attribute, _ = name_parts(name)
+    if attribute is None:
+        return name
+    path = locate(Path(source), "model", relative_to).resolve()
+    return f"{path}{name.removeprefix(source)}"
+
+
+def describe(model: ProcessModel) -> dict[str, Any]:
+    """All that a model declares, for machines."""
+    return {
+        **_attributes(model, "name", "description", "equations"),
+        "states": [
+            {**_attributes(s, "name", "unit", "initial"), "estimated": s.initial_range}
+            for s in model.states
+        ],
+        "inputs": [_attributes(signal, "name", "unit", "hold") for signal in model.inputs],
+        "outputs": [_attributes(signal, "name", "unit") for signal in model.outputs],
+        "parameters": [
+            {
+                **_attributes(p, "name", "unit", "nominal"),
+                "range": None if p.fixed else [p.lower, p.upper],
+                **_attributes(p, "scale", "fixed", "description"),
+            }
+            for p in model.parameters
+        ],
+        "constraints": [constraint.text for constraint in model.constraints],
+    }
+
+
+def _attributes(part: Any, *names: str) -> dict[str, Any]:
+    return {name: getattr(part, name) for name in names}
+
+
+def _split(options: str, where: str, factory: Callable[..., Any]) -> dict[str, Any]:
+    """``a=1,b=2`` by name; one that takes several values takes those up to the next name."""
+    lists = {key for key, hint in get_type_hints(factory).items() if get_origin(hint) is tuple}
     chosen: dict[str, Any] = {}
     last = ""
     for item in filter(None, options.split(",")):
@@ -135,24 +106,18 @@ def _split(options: str, where: str, lists: frozenset[str]) -> dict[str, Any]:
             chosen[last] = (*chosen[last], key)
             continue
         if not (key and equals and value):
-            raise ConfigError(
-                f"{item!r} is no option", cure="write NAME:option=value,option=value", file=where
-            )
+            cure = "write NAME:option=value,option=value"
+            raise ConfigError(f"{item!r} is no option", cure=cure, file=where)
         chosen[key] = (value,) if key in lists else value
         last = key
     return chosen
 
 
-def _lists(factory: Callable[..., Any]) -> frozenset[str]:
-    """Options of a function that take several values."""
-    hints = get_type_hints(factory)
-    return frozenset(key for key, hint in hints.items() if get_origin(hint) is tuple)
-
-
-def _made(factory: Callable[..., Any], where: str, options: dict[str, Any]) -> Any:
+def _made(factory: Callable[..., Any], where: str, text: str) -> Any:
     """The model that a function makes of options given as text."""
     from pydantic import ValidationError
 
+    options = _split(text, where, factory)
     names = list(inspect.signature(factory).parameters)
     for key in options:
         if key not in names:
@@ -167,9 +132,8 @@ def _made(factory: Callable[..., Any], where: str, options: dict[str, Any]) -> A
     except ModelError as error:
         raise ConfigError(str(error), file=where) from None
     except Exception as error:
-        raise ConfigError(
-            f"calling it fails: {type(error).__name__}: {error}", file=where
-        ) from None
+        problem = f"calling it fails: {type(error).__name__}: {error}"
+        raise ConfigError(problem, file=where) from None
 
 
 def _validated(_factory: Callable[..., Any]) -> Callable[..., Any]:
@@ -180,9 +144,12 @@ def _validated(_factory: Callable[..., Any]) -> Callable[..., Any]:
     return validate_call(_factory)
 
 
-def model_options(name: str) -> list[ModelOption]:
-    """Options of the function that makes a model; none of a finished model. ConfigError."""
-    factory = _source(ModelName.parse(name))
+def model_options(name: str) -> list[dict[str, Any]]:
+    """Options of the function that makes a model, with what may be written for each.
+
+    None of a finished model. Raises ConfigError.
+    """
+    factory, _, _ = _source(name)
     if not callable(factory) or isinstance(factory, ProcessModel):
         return []
     hints = get_type_hints(factory, include_extras=True)
@@ -195,7 +162,8 @@ def model_options(name: str) -> list[ModelOption]:
         choices = _choices(hint)
         if choices and parameter.default is not inspect.Parameter.empty:
             text = next((t for note in notes if (t := getattr(note, "description", None))), "")
-            options.append(ModelOption(key, parameter.default, choices, text))
+            facts = {"name": key, "default": parameter.default, "choices": choices}
+            options.append({**facts, "description": text})
     return options
 
 

@@ -10,8 +10,8 @@ from daq.config.yaml_file import Key, YamlFile
 from daq.errors import ConfigError
 from daq.hal import Device
 from daq.limits import Limit
-from daq.lookup.classes import find_backend, find_limit
-from daq.lookup.shipped import find_file, shipped_experiments, shipped_rigs
+from daq.lookup.classes import find_class
+from daq.lookup.shipped import find_file
 from daq.progress import Note, Watch, ignore
 
 DEFAULT_RIG = "simulated.yaml"
@@ -20,7 +20,7 @@ DEFAULT_RIG = "simulated.yaml"
 def rig_for(experiment: str, watch: Watch = ignore) -> str:
     """The rig file that an experiment's file says it is for; the simulated rig's without."""
     try:
-        file = yaml_file.load(find_file(experiment, shipped_experiments, watch))
+        file = yaml_file.load(find_file("protocol", experiment, watch))
     except ConfigError:
         return DEFAULT_RIG  # what is wrong with the experiment is told when it is loaded
     name = file.content.get("rig")
@@ -37,7 +37,7 @@ def load_rig(
 
     options: the backend's own settings that take precedence over the file's.
     """
-    file = yaml_file.load(find_file(name, shipped_rigs, watch))
+    file = yaml_file.load(find_file("backend", name, watch))
     check.refuse_other_kind(file, "a rig")
     if options:
         content = yaml_file.merge(file.content, {"options": options})
@@ -59,7 +59,7 @@ def _backend(file: YamlFile) -> tuple[str, Any]:
     if not isinstance(name, str):
         check.validate(file, RigConfig)
     try:
-        return name, find_backend(name, file.path.parent)
+        return name, find_class("backend", name, file.path.parent)
     except ConfigError as error:
         check.validate(file, RigConfig, others=file.blamed(("backend",), error))
         raise
@@ -79,7 +79,7 @@ def _with_fitting_limits(config: RigConfig, watch: Watch) -> RigConfig:
 def _limit_maker(file: YamlFile, limit: UserLimit, key: Key) -> Callable[[], Limit]:
     """What makes the limit that an entry of ``limits.own`` names, its settings checked."""
     try:
-        kind = find_limit(limit.use, file.path.parent)
+        kind: type[Limit] = find_class("limit", limit.use, file.path.parent)
     except ConfigError as error:
         raise ConfigError.of(file.blamed((*key, "use"), error)) from None
     if kind.Options is None:

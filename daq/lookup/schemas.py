@@ -1,27 +1,29 @@
-"""JSON Schemas of every kind of file, over the installed protocols and backends."""
+"""JSON Schemas of every kind of file, as editors read them (draft 7, without references)."""
 
 import inspect
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import yaml
+from pydantic import BaseModel
 
 from daq.config.base import Section
-from daq.config.datasheet import DatasheetEntry
-from daq.config.identification import IdentificationConfig
+from daq.config.identification import DatasheetEntry, IdentificationConfig
 from daq.config.rig import RigConfig, with_options
-from daq.config.schema import DRAFT, Schema, json_schema, partial
 from daq.errors import ConfigError
 from daq.experiment import Experiment
 from daq.files import make_folder, write_whole
-from daq.plugins import Group, installed, load_plugin
+from daq.plugins import Kind, installed, load_plugin
 from daq.progress import Note, Watch, ignore
 
+Schema = dict[str, Any]
 FOLDER = "schemas"
-
+DRAFT = "http://json-schema.org/draft-07/schema#"
+# What pydantic calls a bound that it could not put where the number is.
+_BOUNDS = {"gt": "exclusiveMinimum", "ge": "minimum", "lt": "exclusiveMaximum", "le": "maximum"}
 _FILE_AND_CLASS = {"type": "string", "pattern": r"\.py:\w+$", "description": "FILE.py:CLASS"}
 
 
@@ -55,28 +57,25 @@ def write_schemas(folder: Path, watch: Watch = ignore) -> list[Path]:
 
 def protocols(watch: Watch = ignore) -> dict[str, type[Experiment]]:
     """The installed protocols that load, by name."""
-    return _loaded("rig.protocols", watch)
+    return _loaded("protocol", watch)
 
 
 def backend_options(watch: Watch = ignore) -> dict[str, type[Section]]:
     """What the installed backends that load take as options, by name."""
-    return {name: backend.Options for name, backend in _loaded("rig.backends", watch).items()}
+    return {name: backend.Options for name, backend in _loaded("backend", watch).items()}
 
 
 def documents(
     protocols: Mapping[str, type[Experiment]], backends: Mapping[str, type[Section]]
 ) -> dict[str, Schema]:
     """The schemas by kind of file: experiment, rig, identification, datasheet."""
-    entry = json_schema(DatasheetEntry)
+    settings = json_schema(IdentificationConfig)
+    by_name = {"type": "object", "additionalProperties": json_schema(DatasheetEntry)}
     return {
         "experiment": _document("An experiment", experiment_schema(protocols)),
         "rig": _document("A rig", rig_schema(backends)),
-        "identification": _document(
-            "Settings of an identification", json_schema(IdentificationConfig)
-        ),
-        "datasheet": _document(
-            "A data sheet: parameters by name", {"type": "object", "additionalProperties": entry}
-        ),
+        "identification": _document("Settings of an identification", settings),
+        "datasheet": _document("A data sheet: parameters by name", by_name),
     }
 
 
@@ -118,15 +117,10 @@ def rig_schema(backends: Mapping[str, type[Section]]) -> Schema:
         common["properties"][name].pop("default", None)
     named = [{"const": name} for name in backends]
     common["properties"]["backend"] |= {"oneOf": [*named, _FILE_AND_CLASS], "default": default}
-    common["allOf"] = [
-        _when(
-            "backend",
-            name,
-            {"properties": {"options": rig_options(options)}},
-            or_absent=name == default,
-        )
-        for name, options in backends.items()
-    ]
+    common["allOf"] = []
+    for name, options in backends.items():
+        then = {"properties": {"options": rig_options(options)}}
+        common["allOf"].append(_when("backend", name, then, or_absent=name == default))
     return common
 
 
@@ -148,11 +142,72 @@ def _document(title: str, schema: Schema) -> Schema:
     return {"$schema": DRAFT, "title": title, **schema}
 
 
-def _loaded(group: Group, watch: Watch) -> dict[str, Any]:
+def _loaded(kind: Kind, watch: Watch) -> dict[str, Any]:
     plugins = {}
-    for name in sorted(installed(group)):
+    for name in sorted(installed(kind)):
         try:
-            plugins[name] = load_plugin(group, name)
+            plugins[name] = load_plugin(kind, name)
         except ConfigError as error:
             watch(Note("warning", f"left out: {error}"))
     return plugins
+
+
+def json_schema(model: type[BaseModel]) -> Schema:
+    """The schema of a model's content; a ``description`` ends with the unit, if there is one."""
+    raw = model.model_json_schema()
+    return cast(Schema, _clean(raw, raw.get("$defs", {})))
+
+
+def partial(schema: Any) -> Any:
+    """The schema of content of which any part may be left out."""
+    if isinstance(schema, list):
+        return [partial(item) for item in schema]
+    if not isinstance(schema, dict):
+        return schema
+    return {key: partial(item) for key, item in schema.items() if key not in {"required", "oneOf"}}
+
+
+def unit_in(schema: Schema) -> str | None:
+    """The unit of the numbers at a key, wherever in its schema it stands."""
+    return schema.get("unit") or next(filter(None, map(unit_in, _inner(schema))), None)
+
+
+def branches(schema: Schema) -> list[Schema]:
+    """What may stand at a key, one schema for each kind, without null."""
+    return [s for s in schema.get("anyOf", [schema]) if s.get("type") != "null"]
+
+
+def _clean(node: Any, defs: Mapping[str, Any]) -> Any:
+    if isinstance(node, list):
+        return [_clean(item, defs) for item in node]
+    if not isinstance(node, dict):
+        return node
+    if "$ref" in node:
+        target = defs[node["$ref"].rpartition("/")[2]]
+        node = {**target, **{key: value for key, value in node.items() if key != "$ref"}}
+    cleaned: Schema = {}
+    for key, value in node.items():
+        if key == "properties":
+            cleaned[key] = {name: _with_unit(_clean(item, defs)) for name, item in value.items()}
+        elif key == "prefixItems":
+            cleaned["items"] = _clean(value, defs)
+        elif key in {"default", "enum", "const", "examples"}:
+            cleaned[key] = value
+        elif key not in {"title", "$defs", "discriminator"}:
+            cleaned[_BOUNDS.get(key, key)] = _clean(value, defs)
+    return cleaned
+
+
+def _with_unit(schema: Schema) -> Schema:
+    unit = unit_in(schema)
+    if unit in {None, "1"} or "description" not in schema or "properties" in schema:
+        return schema
+    return {**schema, "description": f"{schema['description']} [{unit}]"}
+
+
+def _inner(schema: Schema) -> Iterator[Schema]:
+    items = schema.get("items", [])
+    yield from schema.get("anyOf", [])
+    yield from items if isinstance(items, list) else [items]
+    if isinstance(schema.get("additionalProperties"), dict):
+        yield schema["additionalProperties"]

@@ -1,33 +1,29 @@
 """YAML files that lie beside the installed protocols and backends."""
 
 import importlib.util
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from daq.config.yaml_file import nearest_file
 from daq.errors import USER_CODE_ERRORS, ConfigError
-from daq.plugins import Group, installed
+from daq.plugins import Kind, installed
 from daq.progress import Note, Watch, ignore
 
 
-def shipped_experiments() -> dict[str, Path]:
-    """Experiments beside the installed protocols, by file name in its order."""
-    return _beside("rig.protocols")
+def shipped_files(kind: Kind) -> dict[str, Path]:
+    """Experiments beside the installed protocols, or rigs beside the backends, by file name."""
+    packages = dict.fromkeys(point.module.rpartition(".")[0] for point in installed(kind).values())
+    folders = [Path(folder) for package in packages for folder in _folders(package)]
+    paths = [path for folder in folders for path in folder.glob("*.yaml")]
+    return {path.name: path for path in sorted(paths, key=lambda path: path.name)}
 
 
-def shipped_rigs() -> dict[str, Path]:
-    """Rigs beside the installed backends, by file name in its order."""
-    return _beside("rig.backends")
-
-
-def find_file(
-    name: str, shipped_files: Callable[[], Mapping[str, Path]], watch: Watch = ignore
-) -> Path:
+def find_file(kind: Kind, name: str, watch: Watch = ignore) -> Path:
     """A file in the working folder, or a shipped one under its bare name; ConfigError for none."""
     path = Path(name)
     if path.exists():
         return path
-    shipped, is_bare = shipped_files(), path.name == name
+    shipped, is_bare = shipped_files(kind), path.name == name
     if is_bare:
         for candidate in [name] if path.suffix else [name, f"{name}.yaml"]:
             if Path(candidate).exists():
@@ -38,13 +34,6 @@ def find_file(
     cure = nearest_file(path, list(shipped) if is_bare else [])
     cure = cure or f"check its name, or use a shipped one: {', '.join(shipped)}"
     raise ConfigError("there is no such file", cure=cure, file=name)
-
-
-def _beside(group: Group) -> dict[str, Path]:
-    packages = dict.fromkeys(point.module.rpartition(".")[0] for point in installed(group).values())
-    folders = [Path(folder) for package in packages for folder in _folders(package)]
-    paths = [path for folder in folders for path in folder.glob("*.yaml")]
-    return {path.name: path for path in sorted(paths, key=lambda path: path.name)}
 
 
 def _folders(package: str) -> Sequence[str]:

@@ -1,14 +1,12 @@
 """Commented files to begin with: an experiment, a rig and settings of an identification."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
-from daq.config.schema import Schema
 from daq.errors import ConfigError, RunError, suggestion
 from daq.files import make_folder
 from daq.lookup import schemas
-from daq.lookup.shipped import shipped_experiments, shipped_rigs
+from daq.lookup.shipped import shipped_files
 from daq.progress import Watch, ignore
 
 RIG, SETTINGS = "rig.yaml", "identification.yaml"
@@ -20,34 +18,29 @@ _HEAD = """\
 _ACTIVE = {"model": "actuator", "preset": "default"}
 
 
-@dataclass(frozen=True)
-class StarterFiles:
-    """Files that were written, files that were there before, and the folder of schemas.
+def write_starter(
+    folder: Path, protocol: str, rig: str, watch: Watch = ignore
+) -> tuple[list[Path], list[Path], bool]:
+    """Write the files that are not there yet, and a folder of schemas.
 
-    validated: whether the experiment has a validation run.
+    Files written, files kept as they were, and whether the experiment has a validation run. Raises
+    ConfigError for names of nothing shipped.
     """
-
-    written: list[Path]
-    kept: list[Path]
-    schemas: Path
-    validated: bool
-
-
-def write_starter(folder: Path, protocol: str, rig: str, watch: Watch = ignore) -> StarterFiles:
-    """Write the files that are not there yet. Raises ConfigError for names of nothing shipped."""
     experiment = f"{protocol}.yaml"
     texts = {
-        experiment: _copy(shipped_experiments(), protocol, "protocol", "experiment"),
-        RIG: _copy(shipped_rigs(), rig, "rig", "rig"),
+        experiment: _copy(shipped_files("protocol"), protocol, "protocol", "experiment"),
+        RIG: _copy(shipped_files("backend"), rig, "rig", "rig"),
         SETTINGS: settings_text(),
-        **_companions(protocol),
     }
+    # Tables that a shipped experiment reads lie beside it under its name.
+    table = shipped_files("protocol")[experiment].with_suffix(".csv")
+    if table.exists():
+        texts[table.name] = table.read_text(encoding="utf-8")
     make_folder(folder)
     written = [folder / name for name, text in texts.items() if _write_new(folder / name, text)]
     kept = [folder / name for name in texts if folder / name not in written]
     schemas.write_schemas(folder / schemas.FOLDER, watch)
-    validated = "\nvalidation:" in texts[experiment]
-    return StarterFiles(written, kept, folder / schemas.FOLDER, validated)
+    return written, kept, "\nvalidation:" in texts[experiment]
 
 
 def settings_text() -> str:
@@ -58,10 +51,8 @@ def settings_text() -> str:
     return f"{schemas.schema_comment('identification')}\n{_HEAD}\n{settings}"
 
 
-def _setting(name: str, item: Schema) -> str:
-    value = _ACTIVE.get(name, item.get("default"))
-    if "examples" in item:
-        value = item["examples"][0]
+def _setting(name: str, item: schemas.Schema) -> str:
+    value = item.get("examples", [_ACTIVE.get(name, item.get("default"))])[0]
     mark = "" if name in _ACTIVE else "#"
     return f"# {item['description']}\n{mark}{name}: {schemas.as_yaml(value)}\n"
 
@@ -70,20 +61,10 @@ def _copy(files: Mapping[str, Path], name: str, option: str, kind: str) -> str:
     """A shipped file's text, for a folder that has its schema in it."""
     shipped = {path.stem: path for path in files.values()}
     if name not in shipped:
-        raise ConfigError(
-            f"--{option}: no {name!r} to begin with", cure=suggestion(name, list(shipped))
-        )
+        cure = suggestion(name, list(shipped))
+        raise ConfigError(f"--{option}: no {name!r} to begin with", cure=cure)
     text = shipped[name].read_text(encoding="utf-8")
     return f"{schemas.schema_comment(kind)}\n{schemas.without_schema_comment(text)}"
-
-
-def _companions(protocol: str) -> dict[str, str]:
-    """Tables that a shipped experiment reads, which lie beside it under its name."""
-    shipped = shipped_experiments()[f"{protocol}.yaml"]
-    return {
-        path.name: path.read_text(encoding="utf-8")
-        for path in shipped.parent.glob(f"{protocol}.csv")
-    }
 
 
 def _write_new(path: Path, text: str) -> bool:

@@ -5,26 +5,26 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Literal
+from typing import Any
 
 from daq.config.yaml_file import nearest_file
 from daq.errors import USER_CODE_ERRORS, ConfigError, line_in, same_file, suggestion
+from daq.plugins import Kind
 from sysid.problem.model import ModelError
-
-Kind = Literal["backend", "limit", "model", "protocol"]
 
 
 def locate(path: Path, kind: Kind, relative_to: Path | None = None) -> Path:
     """A file looked up from the working folder, then from ``relative_to``; else ConfigError."""
-    for candidate in (path, *([relative_to / path] if relative_to else [])):
+    candidates = [path, *([relative_to / path] if relative_to else [])]
+    for candidate in candidates:
         if candidate.is_file():
             return candidate
-    cure = nearest_file(path) or (nearest_file(relative_to / path) if relative_to else "")
-    raise ConfigError(f"there is no such {kind} file", cure=cure or "check its name", file=path)
+    cure = next(filter(None, map(nearest_file, candidates)), "check its name")
+    raise ConfigError(f"there is no such {kind} file", cure=cure, file=path)
 
 
 def from_file(path: Path, attribute: str, kind: Kind, is_valid: Callable[[Any], bool]) -> Any:
-    """An object of a Python file.
+    """An object of a user's own Python file.
 
     is_valid: whether an object is of the kind, for suggestions. Raises ConfigError naming file,
     line and cause.
@@ -50,11 +50,9 @@ def _import(path: Path, kind: Kind) -> ModuleType:
         spec.loader.exec_module(module)
     except USER_CODE_ERRORS as error:
         del sys.modules[spec.name]
-        problem = (
-            str(error)
-            if isinstance(error, ModelError)
-            else f"the {kind} file does not import: {type(error).__name__}: {error}"
-        )
+        problem = str(error)
+        if not isinstance(error, ModelError):
+            problem = f"the {kind} file does not import: {type(error).__name__}: {error}"
         raise ConfigError(problem, file=path, line=_line(path, error)) from None
     finally:
         sys.path.remove(folder)

@@ -14,7 +14,7 @@ from daq.files import make_folder, write_whole
 from daq.findings import Findings
 from daq.logs.capture import LOG_NAME, RUN_NAME
 from daq.logs.recording import end_of_run, load, log_path, read_record
-from daq.lookup.classes import find_protocol
+from daq.lookup.classes import find_class
 from daq.progress import Watch, ignore, warn
 from daq.run.protocol import failure
 
@@ -74,7 +74,7 @@ def recorded_experiment(folder: Path) -> Experiment:
     settings = record.get("experiment")
     if not isinstance(settings, dict) or not isinstance(settings.get("protocol"), str):
         raise ConfigError("experiment.protocol: the name of a protocol is missing", file=path)
-    kind = find_protocol(settings["protocol"], folder)
+    kind: type[Experiment] = find_class("protocol", settings["protocol"], folder)
     # Beside the settings stands what the protocol made of them.
     written = {name: value for name, value in settings.items() if name != "excitation"}
     try:

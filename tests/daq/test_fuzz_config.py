@@ -13,7 +13,7 @@ from daq.identification.request import SettingsRequest
 from daq.identification.settings import problem_of
 from daq.lookup.experiments import load_experiment
 from daq.lookup.rigs import load_rig
-from daq.lookup.shipped import shipped_experiments, shipped_rigs
+from daq.lookup.shipped import shipped_files
 
 WORDS = st.sampled_from(
     [
@@ -61,8 +61,11 @@ def content_of(path):
 
 
 FILES = [
-    *((path.name, content_of(path), load_experiment) for path in shipped_experiments().values()),
-    *((path.name, content_of(path), load_rig) for path in shipped_rigs().values()),
+    *(
+        (path.name, content_of(path), load_experiment)
+        for path in shipped_files("protocol").values()
+    ),
+    *((path.name, content_of(path), load_rig) for path in shipped_files("backend").values()),
     ("identification.yaml", SETTINGS, lambda path: problem_of(SettingsRequest(str(path)))),
 ]
 

@@ -11,7 +11,7 @@ from daq.config.identification import IdentificationConfig
 from daq.config.yaml_file import YamlFile
 from daq.identification.quantities import in_model_units
 from daq.lookup.models import find_model
-from daq.lookup.shipped import shipped_experiments
+from daq.lookup.shipped import shipped_files
 from daq.lookup.starter import settings_text
 from tests.daq.support import forked_rig, rig
 
@@ -37,7 +37,7 @@ def test_the_files_work_as_they_are_and_the_next_commands_are_told(tmp_path):
 @pytest.mark.soak
 def test_every_shipped_experiment_can_be_begun_with(tmp_path):
     with forked_rig() as run:
-        for name in [path.stem for path in shipped_experiments().values()]:
+        for name in [path.stem for path in shipped_files("protocol").values()]:
             made = run(["init", name, "--protocol", name], tmp_path)
             assert made.returncode == 0, made.stderr
             checked = run(["check", f"{name}.yaml", "--rig", "rig.yaml"], tmp_path / name)

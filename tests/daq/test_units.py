@@ -73,7 +73,10 @@ def test_what_does_not_convert_is_refused_where_it_stands(content, place, said):
 
 
 def test_the_unit_of_a_field_is_found_wherever_it_stands():
-    units = {name: unit_of(field) for name, field in Example.model_fields.items()}
+    units = {
+        name: unit_of(field.annotation, field.metadata)
+        for name, field in Example.model_fields.items()
+    }
     assert units == {
         "single": "V",
         "optional": "Hz",

@@ -40,7 +40,7 @@ def test_examples_of_own_protocols_run_as_written(tmp_path, command):
     assert 0.005 < found["rise_time"]["value"] < 1.0
 
 
-@pytest.mark.parametrize("name", sorted(installed("rig.protocols")))
+@pytest.mark.parametrize("name", sorted(installed("protocol")))
 def test_every_protocol_has_its_file_its_page_and_a_line_in_the_index(name):
     assert (DOCS / f"{name}.md").exists()
     assert f"({name}.md)" in TEXT

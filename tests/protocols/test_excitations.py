@@ -310,7 +310,7 @@ def length(settings):
           suppress_health_check=[HealthCheck.too_slow])  # fmt: skip
 @given(experiments())
 def test_any_settings_give_a_clear_error_or_commands_within_what_they_declare(content):
-    kind = load_plugin("rig.protocols", content["protocol"])
+    kind = load_plugin("protocol", content["protocol"])
     experiment = kind.model_validate(content)
     try:
         plan = experiment.plan()
