@@ -90,7 +90,7 @@ class _Explainer:
     def mistakes(self, errors: Sequence[ErrorDetails]) -> list[Mistake]:
         """One mistake for each key that is wrong."""
         complaints: dict[Key, list[Complaint]] = {}
-        meant = set()
+        meant: set[Key] = set()
         for item, key in _of_best_branch([(item, self._key(item)) for item in errors]):
             if item["type"] in {"extra_forbidden", "invalid_key"}:
                 names = self._fields(key[:-1])
