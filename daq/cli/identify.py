@@ -126,9 +126,7 @@ def identify(
         return
     request = replace(request, options={**options, "model": model[0] if model else None})
     with terminal.Watching(quiet=json) as watch:
-        result = fit.identify_request(
-            fit.IdentificationRequest(logs, validate or [], request, out, save=True), watch
-        )
+        result = fit.identify_files(logs, validate or [], request, out, watch)
     _finish(show_identification(result, report, json), json)
 
 
