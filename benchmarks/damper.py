@@ -59,7 +59,7 @@ def main() -> None:
 def load(folder: Path) -> tuple[ProcessModel, list[Dataset]]:
     """The example's model, and a folder's logs read through the example's columns."""
     prepared = problem_of(SettingsRequest(str(CONFIG)))
-    paths = datasets.expand([folder])
+    paths = datasets.expand(folder)
     model = prepared.model
     return model, [datasets.load(path, model, prepared.mapping).dataset for path in paths]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from sysid.campaigns.campaign import Campaign, Outcome, Run, Spread, campaign, combinations
+from sysid.campaigns.runs import Campaign, Outcome, Run, Spread, campaign, combinations
 from sysid.engine.simulation import BatchResult, BatchSimulator, Status
 from sysid.engine.stepper import Stepper
 from sysid.fitting.free_run import free_run

@@ -95,9 +95,8 @@ def identify(
         _finish(show_comparison(compared, report, json), json)
         return
     request = replace(request, options={**chosen, "model": model[0] if model else None})
-    one_model = fit.IdentificationRequest(logs, validate or [], request, out, save=True)
     with terminal.watching(json) as watch:
-        result = fit.identify_request(one_model, watch)
+        result = fit.identify_files(logs, validate or [], request, out, watch)
     _finish(show_identification(result, report, json), json)
 
 

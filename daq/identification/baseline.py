@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from daq.identification.records import LoggedRecord
-from sysid import Dataset, ModelError
+from sysid import ModelError
 from sysid.arrays import FloatArray
 from sysid.linear import ARMAX, tuned
 from sysid.problem.metrics import Metrics, evaluate
@@ -34,42 +34,31 @@ class Baseline:
 def baseline_of(
     model: ProcessModel, training: Sequence[LoggedRecord], validation: Sequence[LoggedRecord]
 ) -> Baseline | str:
-    """A linear model of the same logs, or why there is none."""
-    try:
-        return armax(model, [log.dataset for log in training], [log.dataset for log in validation])
-    except ModelError as error:
-        return str(error)
+    """ARMAX with orders chosen on the ends of the training logs, or why there is none.
 
-
-def armax(
-    model: ProcessModel, training: Sequence[Dataset], validation: Sequence[Dataset]
-) -> Baseline:
-    """ARMAX with orders chosen on the ends of the training records.
-
-    Raises ModelError where there is none: records too short, too long for the time that a report
-    may take, of several sample times, or free runs that grow without bounds.
+    There is none for logs too short, too long for the time that a report may take, of several
+    sample times, or with free runs that grow without bounds.
     """
     q, m = len(model.outputs), len(model.inputs)
-    rows = sum(record.n_samples for record in training)
+    groups = [[log.dataset for log in logs] for logs in (training, validation)]
+    rows = sum(record.n_samples for record in groups[0])
     if not m:
-        raise ModelError("the model has no inputs")
+        return "the model has no inputs"
     if rows * q * (q + m) > _LARGEST:
-        raise ModelError(
+        return (
             f"choosing its orders on {rows} samples takes longer than a report may; "
             "rig identify --armax does it"
         )
     # An input held from its sample on acts first on the next row; an interpolated one at once.
     first = [[int(signal.hold == "zoh") for signal in model.inputs]] * q
-    selection = tuned(ARMAX(stable=True), list(training), na=_NA, nb=_NB, nc=_NC, nk=[first])
-    runs = {id(record): selection.model.predict(record) for record in (*training, *validation)}
-
-    def metrics(records: Sequence[Dataset]) -> list[Metrics]:
-        return [evaluate(record.outputs, runs[id(record)]) for record in records]
-
-    return Baseline(
-        "ARMAX",
-        {name: order for name, order in selection.best.orders.items() if name != "nk"},
-        metrics(training),
-        metrics(validation),
-        [runs[id(record)] for record in validation],
-    )
+    try:
+        selection = tuned(ARMAX(stable=True), groups[0], na=_NA, nb=_NB, nc=_NC, nk=[first])
+        runs = [[selection.model.predict(record) for record in records] for records in groups]
+    except ModelError as error:
+        return str(error)
+    trained, validated = [
+        [evaluate(record.outputs, run) for record, run in zip(records, simulated, strict=True)]
+        for records, simulated in zip(groups, runs, strict=True)
+    ]
+    orders = {name: order for name, order in selection.best.orders.items() if name != "nk"}
+    return Baseline("ARMAX", orders, trained, validated, runs[1])

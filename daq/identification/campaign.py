@@ -21,7 +21,7 @@ from daq.identification.settings import Problem, gassi_settings, problems_of
 from daq.logs.capture import LOG_NAME
 from daq.progress import Progress, Watch, ignore, warn
 from daq.provenance import software_versions
-from sysid import Campaign, ModelError, Outcome, Run
+from sysid import Campaign, Dataset, ModelError, Outcome, Run
 from sysid import campaign as run_campaign
 
 _SEEDS_HELP = "write 0:10 for the seeds 0 to 9, or 3,5,8"
@@ -40,9 +40,8 @@ class Workers:
     def ready(self) -> Iterator[int | None]:
         """Set joblib's backend; the number of jobs to ask it for."""
         if self.jobs == 0:
-            raise ConfigError(
-                "0 runs at a time do nothing", cure="give 1 or more, -1 for all cores", key="--jobs"
-            )
+            cure = "give 1 or more, -1 for all cores"
+            raise ConfigError("0 runs at a time do nothing", cure=cure, key="--jobs")
         if self.dask is None:
             yield -1 if self.jobs is None else self.jobs
             return
@@ -62,25 +61,15 @@ class Group:
     validation: list[LoggedRecord]
 
     @property
-    def key(self) -> tuple[str, str]:
-        """Model and logs, as a campaign's spread is sorted by."""
-        return self.problem.model_name, self.name
+    def datasets(self) -> tuple[list[Dataset], list[Dataset]]:
+        """Records for training and for validation."""
+        return [log.dataset for log in self.training], [log.dataset for log in self.validation]
 
     def runs(self, seeds: Sequence[int]) -> list[Run]:
         """One run for each seed."""
-        settings = gassi_settings(self.problem.settings)
-        return [
-            Run(
-                self.problem.model,
-                [log.dataset for log in self.training],
-                settings,
-                seed,
-                self.problem.model_name,
-                self.name,
-                [log.dataset for log in self.validation],
-            )
-            for seed in seeds
-        ]
+        problem, settings = self.problem, gassi_settings(self.problem.settings)
+        names, (training, validation) = (problem.model_name, self.name), self.datasets
+        return [Run(problem.model, training, settings, seed, *names, validation) for seed in seeds]
 
     def result(self, outcome: Outcome) -> Identification:
         """The finished identification of a run that did not fail."""
@@ -128,17 +117,13 @@ class CampaignResult:
     @property
     def document(self) -> dict[str, Any]:
         """The same for machines."""
+        spreads = [dataclasses.asdict(spread) for spread in self.campaign.spread()]
+        for spread in spreads:
+            if (key := (spread["model"], spread["data"])) in self.files:
+                spread["parameters_file"] = str(self.files[key])
         return {
             "runs": [outcome.row() for outcome in self.campaign.outcomes],
-            "spread": [
-                dataclasses.asdict(spread)
-                | (
-                    {"parameters_file": str(self.files[spread.model, spread.data])}
-                    if (spread.model, spread.data) in self.files
-                    else {}
-                )
-                for spread in self.campaign.spread()
-            ],
+            "spread": spreads,
             "interrupted": self.campaign.interrupted,
             "software": software_versions(),
             "files": {"table": str(self.table)},
@@ -158,18 +143,29 @@ def campaign(wanted: CampaignRequest, watch: Watch = ignore) -> CampaignResult:
     """
     problems = problems_of(wanted.settings, distinct(wanted.models), watch)
     seeds = parse_seeds(wanted.seeds) or [problems[0].settings.seed]
-    folder = wanted.out or _default_folder()
+    now = datetime.datetime.now(datetime.UTC)
+    folder = wanted.out or Path("campaigns") / f"{now:%Y%m%dT%H%M%SZ}"
     check_writable(folder)
-    groups = [
-        group
-        for problem in problems
-        for group in groups_of(problem, wanted.logs, wanted.validate, wanted.together)
-    ]
+    groups = []
+    for problem in problems:
+        groups += groups_of(problem, wanted.logs, wanted.validate, wanted.together)
     warn_of_logs(groups, watch)
     runs = [run for group in groups for run in group.runs(seeds)]
-    result = run_all(runs, wanted.workers, watch, _TableKeeper(folder))
+    outcomes: list[Outcome] = []
+    written = -math.inf
+
+    def keep(outcome: Outcome) -> None:
+        """Write the table, so that little is lost with a campaign that is killed."""
+        nonlocal written
+        outcomes.append(outcome)
+        # Not at each of thousands: writing is of all that there is.
+        if time.monotonic() - written > _WRITE_EVERY:
+            _write_table(folder, Campaign(tuple(outcomes)))
+            written = time.monotonic()
+
+    result = run_all(runs, wanted.workers, watch, keep)
     table = _write_table(folder, result)
-    by_key = {group.key: group for group in groups}
+    by_key = {(group.problem.model_name, group.name): group for group in groups}
     files = {
         key: by_key[key].result(outcome).save(folder / f"best-{place}")
         for place, (key, outcome) in enumerate(result.best().items(), 1)
@@ -208,10 +204,11 @@ def groups_of(
 ) -> list[Group]:
     """The logs for one model, each by itself or all together, less what is held back of them."""
     training, validation = load_logs(problem, logs, validate)
-    names = [_joint_name(training)] if together else _log_names(training)
-    sets = [training] if together else [[log] for log in training]
+    sets = list(zip(_log_names(training), [[log] for log in training], strict=True))
+    if together and len(training) != 1:
+        sets = [(f"{len(training)} logs", training)]
     groups = []
-    for name, train in zip(names, sets, strict=True):
+    for name, train in sets:
         begins, ends = records.hold_back(train, problem.settings.hold_back)
         groups.append(Group(problem, name, begins, [*ends, *validation]))
     return groups
@@ -233,15 +230,13 @@ def parse_seeds(text: str | None) -> list[int]:
             seeds = list(range(int(first or 0), int(end)))
         else:
             seeds = [int(part) for part in text.split(",")]
+        outside = [seed for seed in seeds if not 0 <= seed < 2**32]
+        problem = f"{outside[0]} is outside 0 .. 4294967295" if outside else ""
+        problem = problem if seeds else f"{text!r} holds no seed"
     except ValueError:
-        raise ConfigError(
-            f"{text!r} is no list of seeds", cure=_SEEDS_HELP, key="--seeds"
-        ) from None
-    if not seeds:
-        raise ConfigError(f"{text!r} holds no seed", cure=_SEEDS_HELP, key="--seeds")
-    for seed in seeds:
-        if not 0 <= seed < 2**32:
-            raise ConfigError(f"{seed} is outside 0 .. 4294967295", cure=_SEEDS_HELP, key="--seeds")
+        problem = f"{text!r} is no list of seeds"
+    if problem:
+        raise ConfigError(problem, cure=_SEEDS_HELP, key="--seeds")
     return list(dict.fromkeys(seeds))
 
 
@@ -253,71 +248,36 @@ def distinct(models: Sequence[str]) -> list[str | None]:
     return [*models] or [None]
 
 
-class _TableKeeper:
-    """Writes the table as outcomes come, so that little is lost with a campaign that is killed."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._outcomes: list[Outcome] = []
-        self._written = -math.inf
-
-    def __call__(self, outcome: Outcome) -> None:
-        self._outcomes.append(outcome)
-        # Not each of thousands: writing is of all that there is.
-        if time.monotonic() - self._written > _WRITE_EVERY:
-            _write_table(self._folder, Campaign(tuple(self._outcomes)))
-            self._written = time.monotonic()
-
-
 @contextmanager
 def _client(address: str) -> Iterator[Any]:
     try:
         import distributed
     except ImportError:
-        raise ConfigError(
-            "dask is not installed",
-            cure="install it with: pip install 'hybrid-rig[cluster]'",
-            key="--dask",
-        ) from None
+        cure = "install it with: pip install 'hybrid-rig[cluster]'"
+        raise ConfigError("dask is not installed", cure=cure, key="--dask") from None
     connect: Any = distributed.Client
     try:
         client = connect(address, timeout=CONNECT_TIMEOUT, set_as_default=False)
     except (OSError, ValueError, TimeoutError) as error:
         raise ConfigError(
             f"no scheduler answers at {address} ({type(error).__name__})",
-            cure=(
-                "start one with 'dask scheduler', workers with 'dask worker "
-                "ADDRESS', and give the address that it prints, as "
-                "tcp://192.168.0.10:8786"
-            ),
+            cure="start one with 'dask scheduler', workers with 'dask worker ADDRESS', and give "
+            "the address that it prints, as tcp://192.168.0.10:8786",
             key="--dask",
         ) from None
     with client:
         if not client.ncores():
-            raise ConfigError(
-                f"the scheduler at {address} has no workers",
-                cure=f"start some with 'dask worker {address}'",
-                key="--dask",
-            )
+            cure = f"start some with 'dask worker {address}'"
+            raise ConfigError(f"the scheduler at {address} has no workers", cure=cure, key="--dask")
         yield client
-
-
-def _default_folder() -> Path:
-    now = datetime.datetime.now(datetime.UTC)
-    return Path("campaigns") / f"{now:%Y%m%dT%H%M%SZ}"
 
 
 def _log_names(logs: Sequence[LoggedRecord]) -> list[str]:
     """Names that tell logs apart: the capture folder's, or the file's."""
-    names = [log.path.parent.name if log.path.name == LOG_NAME else log.path.stem for log in logs]
-    return [
-        str(log.path) if names.count(name) > 1 else name
-        for name, log in zip(names, logs, strict=True)
-    ]
-
-
-def _joint_name(logs: Sequence[LoggedRecord]) -> str:
-    return _log_names(logs)[0] if len(logs) == 1 else f"{len(logs)} logs"
+    paths = [log.path for log in logs]
+    names = [path.parent.name if path.name == LOG_NAME else path.stem for path in paths]
+    named = zip(names, paths, strict=True)
+    return [str(path) if names.count(name) > 1 else name for name, path in named]
 
 
 def _write_table(folder: Path, result: Campaign) -> Path:

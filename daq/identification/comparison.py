@@ -102,7 +102,31 @@ class ComparisonResult:
     @cached_property
     def document(self) -> dict[str, Any]:
         """What ``comparison.yaml`` holds."""
-        return _document(self)
+        comparison, campaign, group = self.comparison, self.campaign, self.group
+        spreads = {spread.model: spread for spread in campaign.spread()}
+        structures = []
+        for row in comparison.rows:
+            entry = _row_document(row, self.outputs)
+            if row.name in spreads:
+                entry["seeds"] = _spread_document(spreads[row.name])
+                entry["parameters_file"] = str(self.files[row.name])
+            structures.append(entry)
+        return {
+            "preferred": comparison.preferred,
+            "verdict": comparison.verdict,
+            "validated": comparison.validated,
+            "training": [str(log.path) for log in group.training],
+            "validation": [str(log.path) for log in group.validation],
+            "structures": structures,
+            "criteria": {
+                "formula": _FORMULA,
+                "samples": comparison.n_samples,
+                "independent_samples": comparison.n_independent,
+            },
+            "failed": [f"{o.run.name}, seed {o.run.seed}: {o.problem}" for o in campaign.failed],
+            "interrupted": campaign.interrupted,
+            "software": software_versions(),
+        }
 
 
 def compare(wanted: ComparisonRequest, watch: Watch = ignore) -> ComparisonResult | SeedsResult:
@@ -159,24 +183,17 @@ def _require_same_outputs(groups: Sequence[Group]) -> None:
     for group in groups[1:]:
         problem = group.problem
         if problem.model.output_names != first.model.output_names:
+            outputs, others = (", ".join(p.model.output_names) for p in (first, problem))
             raise ConfigError(
-                f"{first.model_name} has the outputs "
-                f"{', '.join(first.model.output_names)}, "
-                f"{problem.model_name} "
-                f"{', '.join(problem.model.output_names)}",
-                cure=(
-                    "to be compared they must have the same, chosen with "
-                    "'outputs' in a file given with --config"
-                ),
+                f"{first.model_name} has the outputs {outputs}, {problem.model_name} {others}",
+                cure="to be compared they must have the same, chosen with 'outputs' in a file "
+                "given with --config",
                 key="--model",
             )
 
 
 def _candidates(
-    groups: Sequence[Group],
-    best: Mapping[str, Outcome],
-    baselines: Sequence[str],
-    watch: Watch,
+    groups: Sequence[Group], best: Mapping[str, Outcome], baselines: Sequence[str], watch: Watch
 ) -> list[Candidate]:
     """Every structure fitted, with its free runs."""
     candidates = []
@@ -184,8 +201,8 @@ def _candidates(
         name = group.problem.model_name
         estimator = best[name].estimator
         assert estimator is not None
-        candidates.append(Candidate.of(name, estimator, *_datasets(group)))
-    training, validation = _datasets(groups[0])
+        candidates.append(Candidate.of(name, estimator, *group.datasets))
+    training, validation = groups[0].datasets
     for kind in baselines:
         try:
             selection = tuned({"ARX": ARX, "ARMAX": ARMAX}[kind](stable=True), training)
@@ -197,49 +214,13 @@ def _candidates(
     return candidates
 
 
-def _datasets(group: Group) -> tuple[list[Any], list[Any]]:
-    return [log.dataset for log in group.training], [log.dataset for log in group.validation]
-
-
 def _rank(group: Group, candidates: Sequence[Candidate]) -> Comparison:
-    weights = group.problem.settings.weights
-    names = group.problem.model.output_names
+    by_name, names = group.problem.settings.weights, group.problem.model.output_names
+    weights = np.array([by_name.get(name, 1.0) for name in names])
     try:
-        return compare_candidates(
-            candidates,
-            *_datasets(group),
-            weights=np.array([weights.get(name, 1.0) for name in names]),
-        )
+        return compare_candidates(candidates, *group.datasets, weights=weights)
     except ModelError as error:
         raise ConfigError(str(error)) from None
-
-
-def _document(result: ComparisonResult) -> dict[str, Any]:
-    comparison, campaign, group = result.comparison, result.campaign, result.group
-    spreads = {spread.model: spread for spread in campaign.spread()}
-    rows = []
-    for row in comparison.rows:
-        entry = _row_document(row, result.outputs)
-        if row.name in spreads:
-            entry["seeds"] = _spread_document(spreads[row.name])
-            entry["parameters_file"] = str(result.files[row.name])
-        rows.append(entry)
-    return {
-        "preferred": comparison.preferred,
-        "verdict": comparison.verdict,
-        "validated": comparison.validated,
-        "training": [str(log.path) for log in group.training],
-        "validation": [str(log.path) for log in group.validation],
-        "structures": rows,
-        "criteria": {
-            "formula": _FORMULA,
-            "samples": comparison.n_samples,
-            "independent_samples": comparison.n_independent,
-        },
-        "failed": [f"{o.run.name}, seed {o.run.seed}: {o.problem}" for o in campaign.failed],
-        "interrupted": campaign.interrupted,
-        "software": software_versions(),
-    }
 
 
 def _row_document(row: Row, outputs: Sequence[str]) -> dict[str, Any]:
@@ -253,13 +234,10 @@ def _row_document(row: Row, outputs: Sequence[str]) -> dict[str, Any]:
         "dbic": row.dbic,
     }
     if not np.isnan(row.rmse).all():
+        errors = zip(row.rmse.tolist(), row.msd.tolist(), row.fit.tolist(), strict=True)
         entry["outputs"] = {
-            name: {
-                "rmse": float(row.rmse[j]),
-                "msd": float(row.msd[j]),
-                "fit_percent": float(row.fit[j]),
-            }
-            for j, name in enumerate(outputs)
+            name: {"rmse": rmse, "msd": msd, "fit_percent": fit}
+            for name, (rmse, msd, fit) in zip(outputs, errors, strict=True)
         }
     if row.ratio is not None:
         entry["squared_errors_relative"] = {
@@ -271,14 +249,8 @@ def _row_document(row: Row, outputs: Sequence[str]) -> dict[str, Any]:
 
 
 def _spread_document(spread: Spread) -> dict[str, Any]:
-    return {
-        "runs": spread.runs,
-        "failed": spread.failed,
-        "best": spread.best,
-        "median": spread.median,
-        "worst": spread.worst,
-        "within_1_percent": spread.agreeing,
-    }
+    figures = {k: getattr(spread, k) for k in ("runs", "failed", "best", "median", "worst")}
+    return {**figures, "within_1_percent": spread.agreeing}
 
 
 def _folder_name(place: int, name: str) -> str:

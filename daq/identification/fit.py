@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import datetime
 import json
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -20,11 +18,10 @@ from daq.identification.settings import Problem, gassi_settings, problem_of
 from daq.logs.capture import LOG_NAME
 from daq.logs.recording import Recording, log_path
 from daq.progress import Progress, Watch, ignore, warn
-from sysid import Dataset, ModelError, ProcessModel
+from sysid import ModelError, ProcessModel
 from sysid.gassi import GASSI, PRESETS
 from sysid.gassi import Progress as SearchProgress
 from sysid.judging.assessment import examine
-from sysid.uncertainty import Profile
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -36,22 +33,6 @@ _STAGES = {
     "refine": ("Local refinement", "generation"),
     "weigh": ("Weighing by noise", "iteration"),
 }
-
-
-@dataclass(frozen=True)
-class IdentificationRequest:
-    """One parameter set wanted from logs.
-
-    logs, validate: run folders, CSV files, folders of them, recordings, or tables with a column
-    ``t`` [s] and one for each of the model's signals. out: the folder for results. save: write
-    them, into ``out`` or else beside the log.
-    """
-
-    logs: Sequence[Source]
-    validate: Sequence[Source] = ()
-    settings: SettingsRequest = field(default_factory=SettingsRequest)
-    out: Path | None = None
-    save: bool = False
 
 
 def identify(
@@ -77,28 +58,27 @@ def identify(
     >>> result.trust in ("good", "limited", "poor")
     True
     """
-    return identify_request(
-        IdentificationRequest(
-            _as_sources(logs),
-            _as_sources(validate),
-            SettingsRequest(
-                None if config is None else str(config),
-                {"model": model},
-                [f"{key}={json.dumps(value)}" for key, value in settings.items()],
-            ),
-        ),
-        watch,
-    )
+    typed = [f"{key}={json.dumps(value)}" for key, value in settings.items()]
+    file = None if config is None else str(config)
+    problem = problem_of(SettingsRequest(file, {"model": model}, typed), watch)
+    return fit(problem, _as_sources(logs), _as_sources(validate), None, watch)
 
 
-def identify_request(wanted: IdentificationRequest, watch: Watch = ignore) -> Identification:
-    """Identify as requested; ConfigError before anything is computed, with cause and cure."""
-    problem = problem_of(wanted.settings, watch)
-    folder = None
-    if wanted.save:
-        folder = wanted.out or default_folder(_paths(wanted.logs), problem.model.name)
-        check_writable(folder)
-    return fit(problem, wanted.logs, wanted.validate, folder, watch)
+def identify_files(
+    logs: Sequence[Path],
+    validate: Sequence[Path],
+    settings: SettingsRequest,
+    out: Path | None,
+    watch: Watch = ignore,
+) -> Identification:
+    """Identify and write the results into ``out``, or else beside the log.
+
+    Raises ConfigError before anything is computed, with cause and cure.
+    """
+    problem = problem_of(settings, watch)
+    folder = out or default_folder(logs, problem.model.name)
+    check_writable(folder)
+    return fit(problem, logs, validate, folder, watch)
 
 
 def resume(folder: str | Path, watch: Watch = ignore) -> Identification:
@@ -110,10 +90,8 @@ def resume(folder: str | Path, watch: Watch = ignore) -> Identification:
     Traceback (most recent call last):
     daq.errors.ConfigError: runs: no identification was interrupted there; name the folder ...
     """
-    interrupted = request.recall(Path(folder))
-    problem = problem_of(interrupted.settings, watch)
-    logs = interrupted.training, interrupted.validation
-    return fit(problem, *logs, interrupted.folder, watch, resume=True)
+    place, settings, training, validation = request.recall(Path(folder))
+    return fit(problem_of(settings, watch), training, validation, place, watch, resume=True)
 
 
 def fit(
@@ -135,13 +113,11 @@ def fit(
     if folder is not None and not resume:
         request.remember(folder, problem.request, _paths(training), _paths(validation))
     estimator = _searched(problem, train, folder, watch, resume)
-    result = assemble(problem, estimator, train, [*ends, *check], watch)
-    if folder is None:
-        return result
-    result = dataclasses.replace(result, folder=folder)
-    result.save(folder)
-    if not result.interrupted:
-        request.forget(folder)
+    result = assemble(problem, estimator, train, [*ends, *check], folder, watch)
+    if folder is not None:
+        result.save(folder)
+        if not result.interrupted:
+            request.forget(folder)
     return result
 
 
@@ -154,11 +130,9 @@ def load_logs(
     paths = {log.path.resolve() for log in train}
     for log in check:
         if log.path.resolve() in paths:
-            raise ConfigError(
-                "the same log is given for training and for validation",
-                cure="a model proves itself only on data it has not seen",
-                file=log.path,
-            )
+            cure = "a model proves itself only on data it has not seen"
+            twice = "the same log is given for training and for validation"
+            raise ConfigError(twice, cure=cure, file=log.path)
     return train, check
 
 
@@ -175,15 +149,10 @@ def default_folder(logs: Sequence[Path], model: str) -> Path:
 def check_writable(folder: Path) -> None:
     """Raise ConfigError now, not after a long search, when results could not be written."""
     there = next((path for path in (folder, *folder.absolute().parents) if path.exists()), folder)
-    if not there.is_dir():
-        reason = f"{there} is not a folder"
-    elif not os.access(there, os.W_OK | os.X_OK):
-        reason = "permission denied"
-    else:
-        return
-    raise ConfigError(
-        f"cannot be created: {reason}", cure="choose a folder with --out", file=folder
-    )
+    if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
+        reason = "permission denied" if there.is_dir() else f"{there} is not a folder"
+        cure = "choose a folder with --out"
+        raise ConfigError(f"cannot be created: {reason}", cure=cure, file=folder)
 
 
 def assemble(
@@ -191,19 +160,20 @@ def assemble(
     estimator: GASSI,
     train: Sequence[LoggedRecord],
     check: Sequence[LoggedRecord],
+    folder: Path | None = None,
     watch: Watch = ignore,
 ) -> Identification:
     """A fitted estimator with its intervals and profiles, and how it does on every log."""
     datasets = [log.dataset for log in train]
     refined = PRESETS[estimator.preset].refine and estimator.stopped_ != "interrupted"
-    return Identification(
-        problem=problem,
-        estimator=estimator,
-        uncertainty=estimator.uncertainty(datasets) if refined else None,
-        profiles=_profiles(problem, estimator, datasets, watch) if refined else [],
-        training=[_fitted(log, estimator) for log in train],
-        validation=[_fitted(log, estimator) for log in check],
-    )
+    uncertainty = estimator.uncertainty(datasets) if refined else None
+    profiles, names = [], problem.settings.profile if refined else []
+    for k, name in enumerate(names):
+        watch(Progress("Profiles", k, len(names), f"of {name}"))
+        profiles.append(estimator.profile(name, datasets))
+        watch(Progress("Profiles", k + 1, len(names), f"of {name}"))
+    training, validation = ([_fitted(log, estimator) for log in part] for part in (train, check))
+    return Identification(problem, estimator, uncertainty, profiles, training, validation, folder)
 
 
 def take(
@@ -228,8 +198,7 @@ def take(
 
 def _fitted(log: LoggedRecord, estimator: GASSI) -> FittedLog:
     run = estimator.predict(log.dataset)
-    (result,) = examine([log.dataset], lambda record: run)
-    return FittedLog(log, run, result)
+    return FittedLog(log, run, examine(log.dataset, run))
 
 
 def _searched(
@@ -240,7 +209,7 @@ def _searched(
         status = f"{unit} {step.done}/{step.total}, best error {step.error:.3g}"
         watch(Progress(activity, step.done, step.total, status))
 
-    checkpoint = request.checkpoint(folder) if folder is not None else None
+    checkpoint = folder / request.CHECKPOINT if folder is not None else None
     try:
         estimator = GASSI(problem.model, **gassi_settings(problem.settings))
         return estimator.fit(
@@ -255,33 +224,15 @@ def _searched(
         raise ConfigError(str(error)) from None
 
 
-def _profiles(
-    problem: Problem, estimator: GASSI, datasets: list[Dataset], watch: Watch
-) -> list[Profile]:
-    names = problem.settings.profile
-    profiles = []
-    for k, name in enumerate(names):
-        watch(Progress("Profiles", k, len(names), f"of {name}"))
-        profiles.append(estimator.profile(name, datasets))
-        watch(Progress("Profiles", k + 1, len(names), f"of {name}"))
-    return profiles
-
-
 def _records(sources: Sequence[Source], name: str, problem: Problem) -> list[LoggedRecord]:
-    logs = _expanded(sources)
-    labels = [f"{name} {k}" for k in range(1, len(logs) + 1)] if len(logs) != 1 else [name]
-    return [
-        take(log, label, problem.model, problem.mapping)
-        for log, label in zip(logs, labels, strict=True)
-    ]
-
-
-def _expanded(sources: Sequence[Source]) -> list[Source]:
-    """Each log by itself; a folder without a log.csv stands for the CSVs in it."""
     logs: list[Source] = []
     for source in sources:
-        logs += records.expand([Path(source)]) if isinstance(source, str | Path) else [source]
-    return logs
+        logs += records.expand(Path(source)) if isinstance(source, str | Path) else [source]
+    several = len(logs) != 1
+    return [
+        take(log, f"{name} {k}" if several else name, problem.model, problem.mapping)
+        for k, log in enumerate(logs, 1)
+    ]
 
 
 def _as_sources(given: Source | Sequence[Source]) -> list[Source]:
@@ -293,8 +244,5 @@ def _as_sources(given: Source | Sequence[Source]) -> list[Source]:
 
 def _paths(sources: Sequence[Source]) -> list[Path]:
     """Files that sources were read from."""
-    return [
-        source.path if isinstance(source, Recording) else Path(source)
-        for source in sources
-        if isinstance(source, str | Path | Recording)
-    ]
+    files = [s.path if isinstance(s, Recording) else s for s in sources]
+    return [Path(file) for file in files if isinstance(file, str | Path)]

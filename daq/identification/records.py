@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -25,6 +26,9 @@ from sysid.problem.model import Input, ModelError, Output, ProcessModel
 if TYPE_CHECKING:
     import pandas as pd
 
+Signal = Input | Output
+SignalGroup = tuple[str, dict[str, Column], Sequence[Signal]]
+
 
 @dataclass(frozen=True)
 class ColumnMapping:
@@ -43,20 +47,15 @@ class LoggedRecord:
     warning: str | None
 
 
-def expand(paths: list[Path]) -> list[Path]:
+def expand(path: Path) -> list[Path]:
     """Logs named on the command line: a folder without a log.csv stands for the CSVs in it."""
-    logs: list[Path] = []
-    for path in paths:
-        if path.is_dir() and not (path / LOG_NAME).exists():
-            inside = sorted(path.glob("*.csv"))
-            if not inside:
-                raise ConfigError(
-                    "neither a capture folder (with log.csv) nor a folder of CSV files", file=path
-                )
-            logs += inside
-        else:
-            logs.append(path)
-    return logs
+    if not path.is_dir() or (path / LOG_NAME).exists():
+        return [path]
+    if logs := sorted(path.glob("*.csv")):
+        return logs
+    raise ConfigError(
+        "neither a capture folder (with log.csv) nor a folder of CSV files", file=path
+    )
 
 
 def load(path: Path, model: ProcessModel, mapping: ColumnMapping | None) -> LoggedRecord:
@@ -71,7 +70,11 @@ def load(path: Path, model: ProcessModel, mapping: ColumnMapping | None) -> Logg
 
 def from_recording(recording: Recording, model: ProcessModel) -> LoggedRecord:
     """A log that has been read as a record; ConfigError, ModelError."""
-    dataset = _with_noise(_from_log(recording, model, recording.name), recording, model)
+    dataset = _from_log(recording, model, recording.name)
+    # What the offset calibration measured: standard deviations of noise and of zeros.
+    noise, zero = np.array([recording.noise(n) for n in model.input_names]).reshape(-1, 2).T
+    output_zero = np.array([recording.noise(name)[1] for name in model.output_names])
+    dataset = replace(dataset, input_noise=noise, input_zero=zero, output_zero=output_zero)
     return LoggedRecord(dataset, recording.path, recording.warning)
 
 
@@ -80,11 +83,9 @@ def from_frame(frame: pd.DataFrame, name: str, model: ProcessModel) -> LoggedRec
     path, wanted = Path(name), ("t", *model.input_names, *model.output_names)
     for column in wanted:
         if column not in frame:
-            raise ConfigError(
-                f"model {model.name} needs the column {column!r}",
-                cure=f"the table has {', '.join(map(str, frame.columns))}. Rename or add it",
-                file=name,
-            )
+            cure = f"the table has {', '.join(map(str, frame.columns))}. Rename or add it"
+            problem = f"model {model.name} needs the column {column!r}"
+            raise ConfigError(problem, cure=cure, file=name)
     require_rows(path, len(frame))
     try:
         numbers = frame.loc[:, list(wanted)].astype(np.float64)
@@ -106,7 +107,7 @@ def hold_back(
     if part == 0.0:
         return logs, []
     halves = [_halves(log, part) for log in logs]
-    return [half[0] for half in halves], [half[1] for half in halves]
+    return [begin for begin, _ in halves], [end for _, end in halves]
 
 
 def _halves(log: LoggedRecord, part: float) -> tuple[LoggedRecord, LoggedRecord]:
@@ -120,87 +121,67 @@ def _halves(log: LoggedRecord, part: float) -> tuple[LoggedRecord, LoggedRecord]
         measured = np.isfinite(whole.outputs[first:last]).any(axis=0)
         if last - first < 2 or not measured.all():
             raise ConfigError(
-                f"with hold_back {part:g} the {share} of it hold "
-                f"{last - first} "
-                f"samples{'' if measured.all() else ' and miss an output'}",
+                f"with hold_back {part:g} the {share} of it hold {last - first} samples"
+                f"{'' if measured.all() else ' and miss an output'}",
                 cure="hold back another part, or validate with another log",
                 file=log.path,
             )
-        dataset = whole.part(first, last, f"{whole.name} ({share})")
-        halves.append(replace(log, dataset=dataset))
+        halves.append(replace(log, dataset=whole.part(first, last, f"{whole.name} ({share})")))
     return halves[0], halves[1]
 
 
 def check_mapping(
-    model: ProcessModel, mapping: ColumnMapping, spare: dict[str, tuple[str, ...]]
+    model: ProcessModel, mapping: ColumnMapping, spare: Mapping[str, Collection[str]]
 ) -> None:
     """Raise ConfigError unless every signal of the model, and no other, has its column.
 
     spare: ``inputs`` and ``outputs`` that may have one as well though this model is used without
     them.
     """
-    groups = (
-        ("inputs", mapping.columns.inputs, model.input_names),
-        ("outputs", mapping.columns.outputs, model.output_names),
-    )
-    for group, given, needed in groups:
+    file, groups = mapping.file, _groups(model, mapping.columns)
+    for group, given, signals in groups:
+        needed = [signal.name for signal in signals]
         for name in given:
             if name not in needed and name not in spare[group]:
-                raise mapping.file.error(
-                    ("columns", group, name),
-                    f"model {model.name} has no such signal; {suggestion(name, needed)}",
-                )
+                problem = f"model {model.name} has no such signal; {suggestion(name, needed)}"
+                raise file.error(("columns", group, name), problem)
         for name in needed:
             if name not in given:
-                raise mapping.file.error(
-                    ("columns", group), f"{name!r} of model {model.name} is missing; add it"
-                )
+                problem = f"{name!r} of model {model.name} is missing; add it"
+                raise file.error(("columns", group), problem)
     for name, column in mapping.columns.outputs.items():
         if column.constant is not None:
-            raise mapping.file.error(
-                ("columns", "outputs", name), "an output must be measured, not constant"
-            )
-    for group, given, signals in (
-        ("inputs", mapping.columns.inputs, [(s.name, s.unit) for s in model.inputs]),
-        ("outputs", mapping.columns.outputs, [(s.name, s.unit) for s in model.outputs]),
-    ):
-        for name, unit in signals:
-            unit_factor(mapping.file, ("columns", group, name, "unit"), given[name].unit, unit)
+            key = ("columns", "outputs", name)
+            raise file.error(key, "an output must be measured, not constant")
+    for group, given, signals in groups:
+        for signal in signals:
+            key = ("columns", group, signal.name, "unit")
+            unit_factor(file, key, given[signal.name].unit, signal.unit)
+
+
+def _groups(model: ProcessModel, columns: Columns) -> list[SignalGroup]:
+    return [("inputs", columns.inputs, model.inputs), ("outputs", columns.outputs, model.outputs)]
 
 
 def _from_log(log: Recording, model: ProcessModel, title: str) -> Dataset:
     columns = list(log.frame.columns)
     for name in (*model.input_names, *model.output_names):
         if name not in columns:
-            raise ConfigError(
-                f"model {model.name} needs {name!r}, which is no column of this log",
-                cure=(
-                    f"{suggestion(name, columns)} Name the column in the "
-                    "'columns' section of a file given with --config"
-                ),
-                file=log.path,
-            )
+            problem = f"model {model.name} needs {name!r}, which is no column of this log"
+            section = "Name the column in the 'columns' section of a file given with --config"
+            cure = f"{suggestion(name, columns)} {section}"
+            raise ConfigError(problem, cure=cure, file=log.path)
     inputs = log.frame[list(model.input_names)].to_numpy(dtype=np.float64)
     outputs = log.frame[list(model.output_names)].to_numpy(dtype=np.float64)
     tick = log.frame["tick"].to_numpy()
     return _dataset(log.path, model, inputs, outputs, tick, log.dt, title)
 
 
-def _with_noise(dataset: Dataset, recording: Recording, model: ProcessModel) -> Dataset:
-    """The record with what its offset calibration told of noise and zeros."""
-    inputs = np.array([recording.noise(name) for name in model.input_names]).reshape(-1, 2)
-    outputs = np.array([recording.noise(name) for name in model.output_names]).reshape(-1, 2)
-    return replace(
-        dataset, input_noise=inputs[:, 0], input_zero=inputs[:, 1], output_zero=outputs[:, 1]
-    )
-
-
 def _load_foreign(path: Path, model: ProcessModel, mapping: ColumnMapping) -> LoggedRecord:
     columns = mapping.columns
     _check_columns(path, model, mapping)
-    inputs_from = {columns.inputs[name].column for name in model.input_names}
+    gapless = {columns.time.column, *(columns.inputs[name].column for name in model.input_names)}
     outputs_from = {columns.outputs[name].column for name in model.output_names}
-    gapless = {columns.time.column, *inputs_from}
     used = sorted(name for name in gapless | outputs_from if name is not None)
     frame, first_line, torn = read_table(
         path,
@@ -211,52 +192,37 @@ def _load_foreign(path: Path, model: ProcessModel, mapping: ColumnMapping) -> Lo
     require_rows(path, len(frame))
     tick, dt = _foreign_time(path, frame, first_line, mapping)
 
-    def values(signal: Input | Output, group: str, source: Column) -> FloatArray:
-        key = ("columns", group, signal.name, "unit")
-        factor = source.sign * unit_factor(mapping.file, key, source.unit, signal.unit)
-        if source.column is None:
-            assert source.constant is not None
-            return np.full(len(frame), source.constant * factor)
-        return np.asarray(frame[source.column].to_numpy() * factor)
+    def values(group: str, given: dict[str, Column], signals: Sequence[Signal]) -> FloatArray:
+        table = np.zeros((len(frame), len(signals)))
+        for j, signal in enumerate(signals):
+            source, key = given[signal.name], ("columns", group, signal.name, "unit")
+            factor = source.sign * unit_factor(mapping.file, key, source.unit, signal.unit)
+            if source.column is not None:
+                table[:, j] = frame[source.column].to_numpy() * factor
+            elif source.constant is not None:
+                table[:, j] = source.constant * factor
+        return table
 
-    inputs = [values(s, "inputs", columns.inputs[s.name]) for s in model.inputs]
-    outputs = np.stack(
-        [values(s, "outputs", columns.outputs[s.name]) for s in model.outputs], axis=1
-    )
+    inputs, outputs = (values(*group) for group in _groups(model, columns))
     # The first sample tells where the model starts.
-    begin = int(np.argmax(np.isfinite(outputs).all(axis=1)))
-    dataset = _dataset(
-        path,
-        model,
-        (np.stack(inputs, axis=1) if inputs else np.zeros((len(frame), 0)))[begin:],
-        outputs[begin:],
-        tick[begin:],
-        dt,
-        path.stem,
-    )
+    first = int(np.argmax(np.isfinite(outputs).all(axis=1)))
+    rows = slice(first, None)
+    dataset = _dataset(path, model, inputs[rows], outputs[rows], tick[rows], dt, path.stem)
     return LoggedRecord(dataset, path, end_of_run(path, read_record(path), torn))
 
 
 def _check_columns(path: Path, model: ProcessModel, mapping: ColumnMapping) -> None:
     """Raise ConfigError at each key that names a column which a file does not have."""
-    present = column_names(path)
-    columns = mapping.columns
+    present, columns = column_names(path), mapping.columns
     wanted: list[tuple[Key, str | None]] = [(("columns", "time", "column"), columns.time.column)]
-    for group, given, names in (
-        ("inputs", columns.inputs, model.input_names),
-        ("outputs", columns.outputs, model.output_names),
-    ):
-        wanted += [(("columns", group, name, "column"), given[name].column) for name in names]
-    refuse(
-        [
-            mapping.file.mistake(
-                key,
-                f"{path} has no column {name!r}; {suggestion(name, list(filter(None, present)))}",
-            )
-            for key, name in wanted
-            if name is not None and name not in present
-        ]
-    )
+    for group, given, signals in _groups(model, columns):
+        wanted += [(("columns", group, s.name, "column"), given[s.name].column) for s in signals]
+    mistakes = []
+    for key, name in wanted:
+        if name is not None and name not in present:
+            hint = suggestion(name, list(filter(None, present)))
+            mistakes.append(mapping.file.mistake(key, f"{path} has no column {name!r}; {hint}"))
+    refuse(mistakes)
 
 
 def _foreign_time(
@@ -277,11 +243,9 @@ def _foreign_time(
     if time.grid is not None:
         tick = np.round((values - values[0]) / time.grid)
         if np.any(np.diff(tick) == 0.0) and np.all(np.diff(values) > 0.0):
-            raise mapping.file.error(
-                ("columns", "time", "grid"),
-                f"{time.grid:g} s is too coarse: rows of {path} are "
-                f"{np.diff(values).min():g} s apart; take a tenth of that",
-            )
+            apart = f"rows of {path} are {np.diff(values).min():g} s apart; take a tenth of that"
+            problem = f"{time.grid:g} s is too coarse: {apart}"
+            raise mapping.file.error(("columns", "time", "grid"), problem)
         values = tick * time.grid
     return time_base(path, values, tick, first_line=first_line, column=time.column, cure=cure)
 
@@ -299,11 +263,9 @@ def _dataset(
     rows = tick - tick[0]
     length = int(rows[-1]) + 1
     if length > 50 * len(rows) + 1000:
-        raise ConfigError(
-            f"the log covers {length} sample times but holds {len(rows)} samples",
-            cure="too much is missing to identify anything from it",
-            file=path,
-        )
+        problem = f"the log covers {length} sample times but holds {len(rows)} samples"
+        cure = "too much is missing to identify anything from it"
+        raise ConfigError(problem, cure=cure, file=path)
     whole = np.full((length, len(model.outputs)), np.nan)
     whole[rows] = outputs
     latest = np.zeros(length, dtype=np.int64)

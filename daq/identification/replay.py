@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,12 +10,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.errors import ConfigError
+from daq.config import check, yaml_file
+from daq.config.identification import Signals
+from daq.errors import ConfigError, suggestion
 from daq.hal import FloatArray, Simulation
 from daq.identification.fit import take
-from daq.identification.parameters import read_parameters
 from daq.identification.result import Identification
-from daq.identification.settings import columns_of
+from daq.identification.settings import columns_of, with_signals
+from daq.lookup.models import find_model
 from daq.lookup.rigs import DEFAULT_RIG, load_rig
 from sysid import BatchSimulator, Metrics, ModelError, ProcessModel, evaluate, free_run
 
@@ -67,10 +70,9 @@ class Replay:
         import pandas as pd
 
         names = self.model.output_names
-        columns = {"t": self.time, **dict(zip(names, self.measured.T, strict=True))}
-        for name, values in zip(names, self.simulated.T, strict=True):
-            columns[f"{name}_simulated"] = values
-        return pd.DataFrame(columns)
+        signals = (*names, *(f"{name}_simulated" for name in names))
+        values = (*self.measured.T, *self.simulated.T)
+        return pd.DataFrame({"t": self.time, **dict(zip(signals, values, strict=True))})
 
     def below(self, bounds: Mapping[str, float]) -> dict[str, float]:
         """Of least fits [%] by output, those that are missed.
@@ -107,39 +109,58 @@ def replay(
         simulated = free_run(BatchSimulator(model), model.vector(values), record)
     except ModelError as error:
         raise ConfigError(str(error)) from None
-    return Replay(
-        logged.path,
-        model,
-        source,
-        np.arange(record.n_samples, dtype=np.float64) * record.dt,
-        record.outputs,
-        simulated,
-        evaluate(record.outputs, simulated),
-        logged.warning,
-    )
+    time = np.arange(record.n_samples, dtype=np.float64) * record.dt
+    metrics, measured = evaluate(record.outputs, simulated), record.outputs
+    return Replay(logged.path, model, source, time, measured, simulated, metrics, logged.warning)
 
 
 def _parameters(
     parameters: Identification | str | Path | None, rig: str
 ) -> tuple[ProcessModel, dict[str, float], str]:
     """Model and values, and whose they are."""
-    if parameters is None:
-        return *_parameters_of_rig(rig), rig
     if isinstance(parameters, Identification):
         return parameters.model, dict(parameters.estimator.parameters_), "identification"
-    return *read_parameters(Path(parameters)), str(parameters)
-
-
-def _parameters_of_rig(rig: str) -> tuple[ProcessModel, dict[str, float]]:
+    if parameters is not None:
+        return *read_parameters(Path(parameters)), str(parameters)
     _, device = load_rig(rig)
     if not isinstance(device, Simulation):
-        raise ConfigError(
-            "only a simulated rig knows its own parameters",
-            cure="give those of an identification with --parameters",
-            file=rig,
-        )
+        cure = "give those of an identification with --parameters"
+        raise ConfigError("only a simulated rig knows its own parameters", cure=cure, file=rig)
     try:
         model = device.process_model()
     except ModelError as error:
         raise ConfigError(str(error), file=rig) from None
-    return model, dict(zip(model.parameter_names, model.nominal, strict=True))
+    return model, dict(zip(model.parameter_names, model.nominal, strict=True)), rig
+
+
+def read_parameters(path: Path) -> tuple[ProcessModel, dict[str, float]]:
+    """Model and parameters from a parameters.yaml, as identification writes it.
+
+    Raises ConfigError naming line and key of what is missing or wrong.
+    """
+    file = yaml_file.load(path)
+    name = file.content.get("model")
+    if not isinstance(name, str):
+        raise file.error(("model",), "this key is missing; it names the process model")
+    try:
+        model = find_model(name, path.parent)
+    except ConfigError as error:
+        raise file.error(("model",), str(error)) from None
+    signals = {key: file.content[key] for key in Signals.model_fields if key in file.content}
+    model = with_signals(file, check.validate(file, Signals, signals), model)
+    entries = file.content.get("parameters")
+    if not isinstance(entries, dict):
+        raise file.error(("parameters",), "this key is missing; it holds 'name: value' lines")
+    values = {}
+    for name, entry in entries.items():
+        key = ("parameters", str(name))
+        if name not in model.parameter_names:
+            hint = suggestion(str(name), model.parameter_names)
+            raise file.error(key, f"model {model.name} has no such parameter; {hint}")
+        value = entry.get("value") if isinstance(entry, dict) else entry
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise file.error(key, f"expected a number, found {value!r}")
+        if not math.isfinite(value):
+            raise file.error(key, f"expected a finite number, found {value}")
+        values[name] = float(value)
+    return model, values

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -12,7 +11,9 @@ from typing import Any
 from daq.errors import ConfigError
 from daq.files import make_folder, write_whole
 
-_CHECKPOINT, _REQUEST = "search.ckpt", "search.json"
+CHECKPOINT = "search.ckpt"
+"""Where the search of an identification keeps its state, in the folder of its results."""
+_REQUEST = "search.json"
 
 
 @dataclass(frozen=True)
@@ -41,25 +42,8 @@ class SettingsRequest:
         options = {**(self.options or {}), "model": model}
         if options.get("datasheet"):
             options["datasheet"] = _absolute(options["datasheet"])
-        config = self.config_file
-        return SettingsRequest(
-            None if config is None else str(config.resolve()), options, list(self.settings)
-        )
-
-
-@dataclass(frozen=True)
-class InterruptedFit:
-    """An identification that can be continued: where its results go, its settings and logs."""
-
-    folder: Path
-    settings: SettingsRequest
-    training: list[Path]
-    validation: list[Path]
-
-
-def checkpoint(folder: Path) -> Path:
-    """Where the search of an identification keeps its state."""
-    return folder / _CHECKPOINT
+        config = None if self.config is None else _absolute([self.config])[0]
+        return SettingsRequest(config, options, list(self.settings))
 
 
 def remember(
@@ -67,48 +51,34 @@ def remember(
 ) -> None:
     """Write a request into the folder that the results will go to."""
     make_folder(folder)
-    content = {
-        "asked": asdict(settings),
-        "training": _absolute(training),
-        "validation": _absolute(validation),
-    }
+    logs = {"training": _absolute(training), "validation": _absolute(validation)}
+    content = {"asked": asdict(settings), **logs}
     write_whole(folder / _REQUEST, json.dumps(content, indent=1))
 
 
-def recall(folder: Path) -> InterruptedFit:
-    """The request in a folder, or in the folder ``identification`` below it.
+def recall(folder: Path) -> tuple[Path, SettingsRequest, list[Path], list[Path]]:
+    """The folder of a request, this one or ``identification`` below, its settings and logs.
 
-    Raises ConfigError when there is none.
+    Logs are those for training, then for validation. Raises ConfigError when there is no request.
     """
     for place in (folder, folder / "identification"):
         if not (place / _REQUEST).exists():
             continue
         try:
             content = json.loads((place / _REQUEST).read_text(encoding="utf-8"))
-            return InterruptedFit(
-                place,
-                SettingsRequest(**content["asked"]),
-                [Path(path) for path in content["training"]],
-                [Path(path) for path in content["validation"]],
-            )
+            settings = SettingsRequest(**content["asked"])
+            training = [Path(path) for path in content["training"]]
+            return place, settings, training, [Path(path) for path in content["validation"]]
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise ConfigError(f"cannot be read: {error}", file=place / _REQUEST) from None
-    raise ConfigError(
-        "no identification was interrupted there",
-        cure="name the folder that its results were to go to",
-        file=folder,
-    )
+    cure = "name the folder that its results were to go to"
+    raise ConfigError("no identification was interrupted there", cure=cure, file=folder)
 
 
 def forget(folder: Path) -> None:
     """Remove what is needed only to continue."""
-    for name in (_CHECKPOINT, _REQUEST):
+    for name in (CHECKPOINT, _REQUEST):
         (folder / name).unlink(missing_ok=True)
-
-
-def resume_command(folder: Path) -> str:
-    """What to type to continue."""
-    return f"rig identify --resume {shlex.quote(str(folder))}"
 
 
 def _absolute(paths: Sequence[Path | str]) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,7 +16,6 @@ import yaml
 from daq.config.identification import Signals
 from daq.files import make_folder, write_whole
 from daq.identification.records import LoggedRecord
-from daq.identification.request import resume_command
 from daq.identification.rows import Rows
 from daq.identification.settings import Problem
 from daq.provenance import software_versions
@@ -88,7 +88,7 @@ class Identification:
     @property
     def reasons(self) -> tuple[str, ...]:
         """What the verdict rests on."""
-        return tuple(self.verdict.reasons)
+        return self.verdict.reasons
 
     @property
     def interrupted(self) -> bool:
@@ -98,7 +98,9 @@ class Identification:
     @property
     def resume_command(self) -> str | None:
         """What to type to continue an interrupted search; None where there is nothing to."""
-        return resume_command(self.folder) if self.interrupted and self.folder else None
+        if not self.interrupted or self.folder is None:
+            return None
+        return f"rig identify --resume {shlex.quote(str(self.folder))}"
 
     @property
     def parameters_file(self) -> Path | None:
@@ -108,7 +110,39 @@ class Identification:
     @cached_property
     def document(self) -> dict[str, Any]:
         """What ``parameters.yaml`` holds, and ``rig identify --json`` prints beside the files."""
-        return _document(self)
+        estimator, settings, verdict = self.estimator, self.problem.settings, self.verdict
+        signals = settings.model_dump(mode="json", include=set(Signals.model_fields))
+        starts = estimator.initial_states_
+        profiles = {profile.name: _profile(profile) for profile in self.profiles}
+        return {
+            "model": self.problem.model_name,
+            # How the model was used where not as it declares; ``rig replay`` uses it likewise.
+            **{key: value for key, value in signals.items() if value},
+            "verdict": {"trust": verdict.trust, "reasons": list(verdict.reasons)},
+            "parameters": {p.name: _parameter(self, p) for p in self.model.parameters},
+            **({"initial_states": starts} if any(starts) else {}),
+            **(_uncertainty(self.uncertainty) if self.uncertainty is not None else {}),
+            **({"profiles": profiles} if profiles else {}),
+            "error": {
+                "value": estimator.error_,
+                "meaning": "mean over outputs of the RMSE on outputs normalised by max|y|",
+                "before_refinement": estimator.search_error_,
+            },
+            "metrics": {
+                "training": [_log(self.model, log) for log in self.training],
+                "validation": [_log(self.model, log) for log in self.validation],
+            },
+            "search": {
+                **{key: getattr(settings, key) for key in ("preset", "seed", "population")},
+                "generations": len(estimator.history_),
+                "simulations": estimator.n_simulations_,
+                "stopped": estimator.stopped_,
+                "flagged": estimator.flagged_,
+                "feasible": estimator.feasible_,
+            },
+            "software": software_versions(),
+            **({"seeds": dict(self.seeds)} if self.seeds is not None else {}),
+        }
 
     @cached_property
     def rows(self) -> Rows:
@@ -126,15 +160,12 @@ class Identification:
 
         nothing = (float("nan"), float("nan"))
         rows = {
-            row.name: {
-                "value": row.value,
-                **dict(zip(("low", "high"), row.interval or nothing, strict=True)),
-                "unit": row.unit,
-                "note": row.undetermined_label,
-            }
+            row.name: [row.value, *(row.interval or nothing), row.unit, row.undetermined_label]
             for row in self.rows.parameters
         }
-        return pd.DataFrame.from_dict(rows, orient="index").rename_axis("parameter")
+        columns = ["value", "low", "high", "unit", "note"]
+        table = pd.DataFrame.from_dict(rows, orient="index", columns=columns)
+        return table.rename_axis("parameter")
 
     @property
     def metrics(self) -> pd.DataFrame:
@@ -156,103 +187,34 @@ class Identification:
         """Write ``parameters.yaml`` into a folder; its path. Raises ConfigError."""
         make_folder(Path(folder))
         path = Path(folder) / PARAMETERS
-        text = yaml.safe_dump(self.document, sort_keys=False, allow_unicode=True)
-        write_whole(path, text)
+        write_whole(path, yaml.safe_dump(self.document, sort_keys=False, allow_unicode=True))
         return path
-
-    def source(self, name: str) -> str:
-        """Where a parameter's range or value comes from."""
-        if name in self.problem.sources:
-            return self.problem.sources[name]
-        guess = self.estimator.guesses_.get(name)
-        return guess.source if guess is not None else "model"
-
-    def estimate(self, name: str) -> Estimate | None:
-        """Value and interval of a free parameter; None where there was no refinement."""
-        estimates = self.uncertainty.parameters if self.uncertainty is not None else ()
-        return next((e for e in estimates if e.name == name), None)
-
-    def on_bound(self, name: str) -> bool:
-        """Whether a free parameter is held by an end of its range."""
-        if (estimate := self.estimate(name)) is not None:
-            return estimate.why == "bound"
-        space = self.estimator.space_
-        return bool(space.on_bound(self.estimator.chromosome_)[space.names.index(name)])
-
-
-def _document(identification: Identification) -> dict[str, Any]:
-    estimator, problem = identification.estimator, identification.problem
-    settings, verdict = problem.settings, identification.verdict
-    parts = {"training": identification.training, "validation": identification.validation}
-    return {
-        "model": problem.model_name,
-        **_signals(settings),
-        "verdict": {"trust": verdict.trust, "reasons": list(verdict.reasons)},
-        "parameters": {p.name: _parameter(identification, p) for p in problem.model.parameters},
-        **({"initial_states": starts} if any(starts := estimator.initial_states_) else {}),
-        **_uncertainty(identification.uncertainty),
-        **_profiles(identification.profiles),
-        "error": {
-            "value": estimator.error_,
-            "meaning": "mean over outputs of the RMSE on outputs normalised by max|y|",
-            "before_refinement": estimator.search_error_,
-        },
-        "metrics": {
-            part: [
-                {
-                    "log": str(log.log.path),
-                    "name": log.result.name,
-                    "outputs": _outputs(problem.model, log.result),
-                }
-                for log in logs
-            ]
-            for part, logs in parts.items()
-        },
-        "search": {
-            "preset": settings.preset,
-            "seed": settings.seed,
-            "population": settings.population,
-            "generations": len(estimator.history_),
-            "simulations": estimator.n_simulations_,
-            "stopped": estimator.stopped_,
-            "flagged": estimator.flagged_,
-            "feasible": estimator.feasible_,
-        },
-        "software": software_versions(),
-        **({"seeds": dict(identification.seeds)} if identification.seeds is not None else {}),
-    }
-
-
-def _signals(signals: Signals) -> dict[str, Any]:
-    """How the model was used where not as it declares; ``rig replay`` uses it likewise."""
-    chosen = {
-        "outputs": list(signals.outputs),
-        "initial": {
-            name: list(start) if isinstance(start, tuple) else start
-            for name, start in signals.initial.items()
-        },
-        "hold": dict(signals.hold),
-    }
-    return {key: value for key, value in chosen.items() if value}
 
 
 def _parameter(identification: Identification, parameter: Parameter) -> dict[str, Any]:
-    name, estimator = parameter.name, identification.estimator
+    name, estimator, problem = parameter.name, identification.estimator, identification.problem
     entry: dict[str, Any] = {"value": estimator.parameters_[name], "unit": parameter.unit}
-    space, tied = estimator.space_, identification.problem.settings.tied
-    if name in space.names:
-        searched = space.parameters[space.names.index(name)]
-        entry["range"] = [searched.lower, searched.upper]
-        entry["scale"] = searched.scale
-        entry["on_bound"] = identification.on_bound(name)
-        if (estimate := identification.estimate(name)) is not None:
-            entry |= _interval(estimate)
-    elif name in tied:
-        entry["tied"] = tied[name]
+    if name in estimator.space_.names:
+        entry |= _searched(identification, estimator.space_.names.index(name))
+    elif name in problem.settings.tied:
+        entry["tied"] = problem.settings.tied[name]
     else:
         entry["fixed"] = True
-    entry["source"] = identification.source(name)
+    guess = estimator.guesses_.get(name)
+    entry["source"] = problem.sources.get(name, "model" if guess is None else guess.source)
     return entry
+
+
+def _searched(identification: Identification, place: int) -> dict[str, Any]:
+    """Range and interval of the free parameter at a place of the search space."""
+    space, uncertainty = identification.estimator.space_, identification.uncertainty
+    parameter = space.parameters[place]
+    entry: dict[str, Any] = {"range": [parameter.lower, parameter.upper], "scale": parameter.scale}
+    if uncertainty is None:
+        on_bound = space.on_bound(identification.estimator.chromosome_)
+        return {**entry, "on_bound": bool(on_bound[place])}
+    estimate = uncertainty.parameters[place]
+    return {**entry, "on_bound": estimate.why == "bound", **_interval(estimate)}
 
 
 def _interval(estimate: Estimate) -> dict[str, Any]:
@@ -262,16 +224,13 @@ def _interval(estimate: Estimate) -> dict[str, Any]:
     return {"std": float(estimate.std), "interval": [float(estimate.low), float(estimate.high)]}
 
 
-def _uncertainty(uncertainty: Uncertainty | None) -> dict[str, Any]:
-    if uncertainty is None:
-        return {}
-    names = [parameter.name for parameter in uncertainty.parameters]
+def _uncertainty(uncertainty: Uncertainty) -> dict[str, Any]:
+    determined = {k: e.name for k, e in enumerate(uncertainty.parameters) if not e.why}
     correlation = uncertainty.correlation()
     pairs = [
-        {"parameters": [names[i], names[j]], "correlation": round(float(correlation[i, j]), 4)}
-        for i, j in itertools.combinations(range(len(names)), 2)
+        {"parameters": [first, second], "correlation": round(float(correlation[i, j]), 4)}
+        for (i, first), (j, second) in itertools.combinations(determined.items(), 2)
         if np.isfinite(correlation[i, j])
-        and not (uncertainty.parameters[i].why or uncertainty.parameters[j].why)
     ]
     return {
         "determined_directions": uncertainty.rank,
@@ -293,45 +252,34 @@ def _uncertainty(uncertainty: Uncertainty | None) -> dict[str, Any]:
     }
 
 
-def _profiles(profiles: Sequence[Profile]) -> dict[str, Any]:
-    if not profiles:
-        return {}
+def _profile(profile: Profile) -> dict[str, Any]:
     return {
-        "profiles": {
-            profile.name: {
-                "interval": [profile.low, profile.high],
-                "values": profile.values.tolist(),
-                "statistic": profile.statistic.tolist(),
-            }
-            for profile in profiles
-        }
+        "interval": [profile.low, profile.high],
+        "values": profile.values.tolist(),
+        "statistic": profile.statistic.tolist(),
     }
 
 
 def errors_document(model: ProcessModel, metrics: Metrics) -> dict[str, dict[str, float]]:
     """Errors of each output on one log."""
+    figures = {"rmse": metrics.rmse, "msd": metrics.msd, "fit_percent": metrics.fit}
+    figures["max_abs"] = metrics.scale
     return {
-        name: {
-            "rmse": float(metrics.rmse[j]),
-            "msd": float(metrics.msd[j]),
-            "fit_percent": float(metrics.fit[j]),
-            "max_abs": float(metrics.scale[j]),
-        }
+        name: {key: float(values[j]) for key, values in figures.items()}
         for j, name in enumerate(model.output_names)
     }
 
 
-def _outputs(model: ProcessModel, record: RecordResult) -> dict[str, dict[str, Any]]:
-    residuals = record.residuals
-    return {
-        name: {
+def _log(model: ProcessModel, log: FittedLog) -> dict[str, Any]:
+    """Errors and residual tests of each output on one log."""
+    residuals, outputs = log.result.residuals, {}
+    for j, (name, errors) in enumerate(errors_document(model, log.result.metrics).items()):
+        outputs[name] = {
             **errors,
             "residual_autocorrelation_in_band": float(residuals.white[j]),
             "residual_independent_of": {
-                signal: float(residuals.independent[j, i])
-                for i, signal in enumerate(model.input_names)
-                if residuals.tested[i]
+                model.input_names[i]: float(residuals.independent[j, i])
+                for i in np.flatnonzero(residuals.tested)
             },
         }
-        for j, (name, errors) in enumerate(errors_document(model, record.metrics).items())
-    }
+    return {"log": str(log.log.path), "name": log.result.name, "outputs": outputs}

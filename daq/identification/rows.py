@@ -137,7 +137,6 @@ class OutputErrors:
 class LogErrors:
     """Errors of the free run on one log, by output."""
 
-    path: str
     name: str
     outputs: Mapping[str, OutputErrors]
 
@@ -228,11 +227,7 @@ class Rows:
 def logs_of(metrics: Mapping[str, Any], part: str) -> tuple[LogErrors, ...]:
     """Errors on the logs of a part, from the ``metrics`` of a document."""
     return tuple(
-        LogErrors(
-            log.get("log", ""),
-            log.get("name", ""),
-            {name: OutputErrors.of(entry) for name, entry in log["outputs"].items()},
-        )
+        LogErrors(log.get("name", ""), {k: OutputErrors.of(e) for k, e in log["outputs"].items()})
         for log in metrics[part]
     )
 
@@ -248,12 +243,7 @@ def mean_errors(logs: Sequence[LogErrors]) -> dict[str, OutputErrors]:
 
 def _parameter(name: str, entry: Mapping[str, Any]) -> ParameterRow:
     return ParameterRow(
-        name,
-        entry["value"],
-        entry["unit"],
-        _ends(entry.get("interval")),
-        entry.get("std"),
-        entry.get("undetermined", ""),
+        **_quantity(name, entry),
         range=_ends(entry.get("range")),
         logarithmic=entry.get("scale") == "log",
         on_bound=bool(entry.get("on_bound")),
@@ -263,18 +253,20 @@ def _parameter(name: str, entry: Mapping[str, Any]) -> ParameterRow:
     )
 
 
+def _quantity(name: str, entry: Mapping[str, Any]) -> dict[str, Any]:
+    """Fields of a ``QuantityRow``."""
+    return {
+        "name": name,
+        "value": entry["value"],
+        "unit": entry["unit"],
+        "interval": _ends(entry.get("interval")),
+        "std": entry.get("std"),
+        "undetermined": entry.get("undetermined", ""),
+    }
+
+
 def _ambiguity(entry: Mapping[str, Any]) -> AmbiguityRow:
-    determined = tuple(
-        QuantityRow(
-            quantity["name"],
-            quantity["value"],
-            quantity["unit"],
-            _ends(quantity.get("interval")),
-            quantity.get("std"),
-            quantity.get("undetermined", ""),
-        )
-        for quantity in entry["determined"]
-    )
+    determined = tuple(QuantityRow(**_quantity(q["name"], q)) for q in entry["determined"])
     return AmbiguityRow(
         entry["kind"], tuple(entry["parameters"]), determined, tuple(entry["measure"])
     )

@@ -1,21 +1,35 @@
 """From configuration and command line to a checked model and its search settings."""
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from daq.config import check, yaml_file
 from daq.config.identification import IdentificationConfig, Signals
+from daq.config.units import converted
 from daq.config.yaml_file import TypedSettings, YamlFile
-from daq.errors import ConfigError, suggestion
+from daq.errors import ConfigError, Mistake, suggestion
 from daq.identification import datasheets, records
-from daq.identification.quantities import in_model_units
 from daq.identification.records import ColumnMapping
 from daq.identification.request import SettingsRequest
 from daq.lookup.models import DEFAULT_MODEL, find_model, whole_name
 from daq.progress import Note, Watch, ignore
 from sysid import ModelError, ProcessModel, SearchSpace
+
+File = TypeVar("File", bound=YamlFile)
+
+# Settings with a key for each of a model's names, by what these are names of.
+_KEYED_BY = {
+    "ranges": "parameter_names",
+    "fixed": "parameter_names",
+    "tied": "parameter_names",
+    "scale": "parameter_names",
+    "weights": "output_names",
+    "initial": "state_names",
+    "hold": "input_names",
+}
 
 
 @dataclass(frozen=True)
@@ -61,31 +75,55 @@ def problems_of(
     models = [_with_outputs(file, settings, model) for model, _ in declared]
     _check_names(file, settings, models)
     mapping = ColumnMapping(file, settings.columns) if settings.columns else None
-    spare = {
-        "inputs": _all_names(models, "input_names"),
-        "outputs": tuple(
-            n for model, _ in declared for n in (*model.output_names, *model.state_names)
-        ),
-    }
-    sheets = [datasheets.load(path) for path in _datasheets(config, file, settings)]
-    datasheets.check_names(sheets, models)
+    signals = [name for m, _ in declared for name in (*m.output_names, *m.state_names)]
+    spare = {"inputs": _all_names(models, "input_names"), "outputs": signals}
+    # Typed names are relative to where they are typed, those in a file to that file.
+    beside = config.parent if config is not None and "datasheet" not in file.typed else Path()
+    entries = datasheets.load([beside / name for name in settings.datasheet], models)
     problems = []
     for (_, name), model in zip(declared, models, strict=True):
-        restricted = _restricted(settings, model)
-        completed, sources = datasheets.under(restricted, sheets, model)
+        completed, sources = datasheets.under(_restricted(settings, model), entries, model)
         _check_space(file, completed, model)
         if mapping is not None:
             records.check_mapping(model, mapping, spare)
         started = _with_starts(file, completed, model)
         if completed.guess and model.guesses is None:
-            raise file.error(
-                ("guess",),
-                f"model {model.name} has no 'guesses' function that reads ranges from logs; leave "
-                "this out",
-            )
-        sources |= _range_sources(file)
+            missing = "no 'guesses' function that reads ranges from logs; leave this out"
+            raise file.error(("guess",), f"model {model.name} has {missing}")
+        sources |= {
+            str(parameter): file.line((group, str(parameter)))
+            for group in ("ranges", "fixed", "tied")
+            for parameter in file.content.get(group) or {}
+        }
         problems.append(Problem(started, name, completed, mapping, sources, request.absolute(name)))
     return problems
+
+
+def in_model_units(file: File, models: Sequence[ProcessModel]) -> tuple[File, list[Mistake]]:
+    """The file with plain numbers for ``fixed: {L_m: 0.5 mH}``, and what does not convert."""
+    parameters = {p.name: p.unit for model in models for p in model.parameters}
+    states = {s.name: s.unit for model in models for s in model.states}
+    content, mistakes = dict(file.content), []
+    for group, units in (("ranges", parameters), ("fixed", parameters), ("initial", states)):
+        given = content.get(group)
+        if not isinstance(given, Mapping):
+            continue
+        content[group] = numbers = dict(given)
+        for name, value in given.items():
+            if name not in units:
+                continue
+            try:
+                numbers[name] = _in_unit(value, units[name])
+            except ValueError as error:
+                mistakes.append(file.mistake((group, name), f"{error}; found {value!r}"))
+                del numbers[name]  # said once
+    return dataclasses.replace(file, content=content), mistakes
+
+
+def _in_unit(value: Any, unit: str) -> Any:
+    return (
+        [converted(e, unit) for e in value] if isinstance(value, list) else converted(value, unit)
+    )
 
 
 def with_signals(file: YamlFile, signals: Signals, model: ProcessModel) -> ProcessModel:
@@ -100,40 +138,23 @@ def columns_of(config: Path | None, model: ProcessModel) -> ColumnMapping | None
     """
     if config is None:
         return None
-    file = yaml_file.load(config)
-    file, unconverted = in_model_units(file, [model])
-    settings = check.validate(file, IdentificationConfig, others=unconverted)
-    if settings.columns is None:
+    file, unconverted = in_model_units(yaml_file.load(config), [model])
+    columns = check.validate(file, IdentificationConfig, others=unconverted).columns
+    if columns is None:
         return None
-    mapping = ColumnMapping(file, settings.columns)
+    mapping = ColumnMapping(file, columns)
     # The file may be of a comparison, in which other models have other signals.
-    columns = settings.columns
-    records.check_mapping(
-        model, mapping, {"inputs": tuple(columns.inputs), "outputs": tuple(columns.outputs)}
-    )
+    records.check_mapping(model, mapping, {"inputs": columns.inputs, "outputs": columns.outputs})
     return mapping
 
 
 def gassi_settings(settings: IdentificationConfig) -> dict[str, Any]:
     """Arguments of ``GASSI``, all but the model."""
-    return {
-        "preset": settings.preset,
-        "population": settings.population,
-        "generations": settings.generations,
-        "ranges": settings.ranges,
-        "fixed": settings.fixed,
-        "tied": settings.tied,
-        "scale": settings.scale,
-        "guess": settings.guess,
-        "elite_percent": settings.elite_percent,
-        "weights": settings.weights or None,
-        "per_log": settings.per_log,
-        "balance": settings.balance,
-        "criterion": settings.criterion,
-        "accuracy": settings.accuracy,
-        "max_steps": settings.max_steps,
-        "random_state": settings.seed,
-    }
+    search = ("preset", "population", "generations", "elite_percent", "accuracy", "max_steps")
+    space = ("ranges", "fixed", "tied", "scale", "guess")
+    error = ("per_log", "balance", "criterion")
+    arguments = {name: getattr(settings, name) for name in (*search, *space, *error)}
+    return {**arguments, "weights": settings.weights or None, "random_state": settings.seed}
 
 
 def _find_models(
@@ -169,60 +190,31 @@ def _find_model(
 
 
 def _with_outputs(file: YamlFile, signals: Signals, model: ProcessModel) -> ProcessModel:
-    if not signals.outputs:
-        return model
     try:
-        return model.with_outputs(signals.outputs)
+        return model.with_outputs(signals.outputs) if signals.outputs else model
     except ModelError as error:
         raise file.error(("outputs",), str(error)) from None
 
 
 def _with_starts(file: YamlFile, signals: Signals, model: ProcessModel) -> ProcessModel:
-    for name, start in signals.initial.items():
-        try:
-            model = model.with_initial({name: start})
-        except ModelError as error:
-            raise file.error(("initial", name), str(error)) from None
+    key: tuple[str, ...] = ()
     try:
+        for name, start in signals.initial.items():
+            key = ("initial", name)
+            model = model.with_initial({name: start})
+        key = ("hold",)
         return model.with_holds(signals.hold)
     except ModelError as error:
-        raise file.error(("hold",), str(error)) from None
-
-
-def _datasheets(
-    config: Path | None, file: TypedSettings, settings: IdentificationConfig
-) -> list[Path]:
-    """Typed names are relative to where they are typed, those in a file to that file."""
-    beside = config.parent if config is not None and "datasheet" not in file.typed else Path()
-    return [beside / name for name in settings.datasheet]
-
-
-def _range_sources(file: TypedSettings) -> dict[str, str]:
-    """Where the range or value of each parameter was given, for those not left to the model."""
-    return {
-        str(name): file.line((group, str(name)))
-        for group in ("ranges", "fixed", "tied")
-        for name in file.content.get(group) or {}
-    }
+        raise file.error(key, str(error)) from None
 
 
 def _check_names(
     file: YamlFile, settings: IdentificationConfig, models: Sequence[ProcessModel]
 ) -> None:
     names = " or ".join(dict.fromkeys(model.name for model in models))
-    parameters, outputs = _all_names(models, "parameter_names"), _all_names(models, "output_names")
-    groups: tuple[tuple[str, dict[str, Any], tuple[str, ...]], ...] = (
-        ("ranges", settings.ranges, parameters),
-        ("fixed", settings.fixed, parameters),
-        ("tied", settings.tied, parameters),
-        ("scale", settings.scale, parameters),
-        ("weights", settings.weights, outputs),
-        ("initial", settings.initial, _all_names(models, "state_names")),
-        ("hold", settings.hold, _all_names(models, "input_names")),
-        ("profile", dict.fromkeys(settings.profile), parameters),
-    )
-    for group, given, declared in groups:
-        for name in given:
+    for group, kind in (*_KEYED_BY.items(), ("profile", "parameter_names")):
+        declared = _all_names(models, kind)
+        for name in getattr(settings, group):
             if name not in declared:
                 hint = f"model {names} has no such name; {suggestion(name, declared)}"
                 if isinstance(file.content.get(group), dict):
@@ -236,15 +228,11 @@ def _all_names(models: Sequence[ProcessModel], kind: str) -> tuple[str, ...]:
 
 def _restricted(settings: IdentificationConfig, model: ProcessModel) -> IdentificationConfig:
     """The settings without what is meant for other models."""
-    names = dict.fromkeys(("ranges", "fixed", "tied", "scale"), model.parameter_names)
-    names |= {"weights": model.output_names, "initial": model.state_names}
-    names["hold"] = model.input_names
-    return settings.model_copy(
-        update={
-            group: {name: v for name, v in getattr(settings, group).items() if name in allowed}
-            for group, allowed in names.items()
-        }
-    )
+    update = {}
+    for group, kind in _KEYED_BY.items():
+        values = getattr(settings, group)
+        update[group] = {name: values[name] for name in values if name in getattr(model, kind)}
+    return settings.model_copy(update=update)
 
 
 def _check_space(file: YamlFile, settings: IdentificationConfig, model: ProcessModel) -> None:
@@ -263,9 +251,8 @@ def _check_space(file: YamlFile, settings: IdentificationConfig, model: ProcessM
     space = _try_space(file, (group,), model, ranges, fixed, tied=tied, scale=scale)
     for name in settings.profile:
         if name not in space.names:
-            raise file.error(
-                ("profile",), f"{name} is not searched, so it has no profile; free it by a range"
-            )
+            problem = f"{name} is not searched, so it has no profile; free it by a range"
+            raise file.error(("profile",), problem)
 
 
 def _try_space(file: YamlFile, key: tuple[str, ...], *args: Any, **more: Any) -> SearchSpace:

@@ -10,8 +10,8 @@ from daq.errors import ConfigError
 from daq.figures.style import Format
 from daq.identification import records
 from daq.identification.baseline import Baseline, baseline_of
-from daq.identification.parameters import read_parameters
 from daq.identification.records import LoggedRecord
+from daq.identification.replay import read_parameters
 from daq.identification.settings import columns_of
 from daq.progress import Progress, Watch, ignore
 from daq.report.pictures import Subject

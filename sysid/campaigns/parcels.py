@@ -10,8 +10,7 @@ import pickle
 import sys
 import sysconfig
 import types
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +27,13 @@ def pack(what: str, value: Any) -> bytes:
     """
     import cloudpickle
 
+    registered = cloudpickle.list_registry_pickle_by_value()
     try:
-        with _by_value(_not_installed()):
+        with ExitStack() as stack:
+            for module in _not_installed():
+                if module.__name__ in sys.modules and module.__name__ not in registered:
+                    cloudpickle.register_pickle_by_value(module)
+                    stack.callback(cloudpickle.unregister_pickle_by_value, module)
             parcel: bytes = cloudpickle.dumps(value)
     except (pickle.PicklingError, TypeError, ValueError) as error:
         raise ModelError(
@@ -48,36 +52,16 @@ def unpack(parcel: bytes) -> Any:
 def _not_installed() -> list[types.ModuleType]:
     """Loaded modules that another process may not find by their name."""
     paths = sysconfig.get_paths()
-    places = {Path(paths[key]) for key in ("stdlib", "platstdlib", "purelib", "platlib")}
+    places = {paths[key] for key in ("stdlib", "platstdlib", "purelib", "platlib")}
     everywhere = (__name__.partition(".")[0], "__main__")
     modules = []
     for name, module in list(sys.modules.items()):
-        file = getattr(module, "__file__", None)
+        file = Path(getattr(module, "__file__", None) or "")
         # Compiled modules have no code that could travel.
-        if file is None or not file.endswith(".py") or name.partition(".")[0] in everywhere:
+        if file.suffix != ".py" or name.partition(".")[0] in everywhere:
             continue
-        if not _installed(Path(file), places):
+        # Another environment's folder will do as well.
+        installed = not _INSTALLED.isdisjoint(file.parts)
+        if not installed and not any(file.is_relative_to(place) for place in places):
             modules.append(module)
     return modules
-
-
-def _installed(file: Path, places: set[Path]) -> bool:
-    """Whether a file lies where packages are installed, be it another environment's folder."""
-    if not _INSTALLED.isdisjoint(file.parts):
-        return True
-    return any(file.is_relative_to(place) for place in places)
-
-
-@contextmanager
-def _by_value(modules: list[types.ModuleType]) -> Iterator[None]:
-    import cloudpickle
-
-    registered = cloudpickle.list_registry_pickle_by_value()
-    added = [m for m in modules if m.__name__ in sys.modules and m.__name__ not in registered]
-    for module in added:
-        cloudpickle.register_pickle_by_value(module)
-    try:
-        yield
-    finally:
-        for module in added:
-            cloudpickle.unregister_pickle_by_value(module)

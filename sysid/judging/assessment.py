@@ -1,6 +1,6 @@
 """How far an identified model may be trusted: its errors, residuals, intervals, in one verdict."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -47,24 +47,14 @@ class Verdict:
     reasons: tuple[str, ...]
 
 
-def examine(
-    records: Sequence[Dataset], predict: Callable[[Dataset], FloatArray]
-) -> list[RecordResult]:
-    """Errors and residual tests of a model's free run on each record.
-
-    predict: outputs (n_samples, n_outputs) of a record, as estimators' ``predict``.
-    """
-
-    def result(record: Dataset) -> RecordResult:
-        simulated = predict(record)
-        return RecordResult(
-            record.name,
-            bool(np.all(np.isfinite(simulated))),
-            evaluate(record.outputs, simulated),
-            residual_test(record.outputs - simulated, record.inputs, record.input_noise),
-        )
-
-    return [result(record) for record in records]
+def examine(record: Dataset, simulated: FloatArray) -> RecordResult:
+    """Errors and residual tests of a model's free run, (n_samples, n_outputs), on a record."""
+    return RecordResult(
+        record.name,
+        bool(np.all(np.isfinite(simulated))),
+        evaluate(record.outputs, simulated),
+        residual_test(record.outputs - simulated, record.inputs, record.input_noise),
+    )
 
 
 def judge(
@@ -140,10 +130,7 @@ def _input_traces(model: ProcessModel, results: Sequence[RecordResult]) -> Itera
 
 
 def _input_correlations(results: Sequence[RecordResult]) -> tuple[FloatArray, FloatArray]:
-    """Share of each input's correlations inside their band, and the largest of them.
-
-    Both (n_outputs, n_inputs), means over the records: of many, one is outside by chance.
-    """
+    """Share of correlations inside their band and the largest, (n_outputs, n_inputs), means."""
     shares = mean_known([result.residuals.independent for result in results], 0)
     sizes = np.mean([np.abs(result.residuals.cross).max(axis=0) for result in results], axis=0)
     return shares, sizes
@@ -176,15 +163,12 @@ def _praise(validation: Sequence[RecordResult]) -> tuple[str]:
     fit = float(mean_known([result.metrics.fit for result in validation]))
     shares, sizes = _input_correlations(validation)
     traces = sizes[shares < _INDEPENDENT]
-    inputs = ""
-    if len(traces):
-        inputs = (
-            ", and of the inputs no more than a trace is left in the residuals (correlations of "
-            f"at most {traces.max():.2f})"
-        )
-    elif np.isfinite(shares).any():
-        inputs = ", and nothing of the inputs is left in the residuals"
-    return (
-        f"Data not used in the fit are explained as well as those that were (mean fit {fit:.1f} "
-        f"%){inputs}.",
+    reason = (
+        f"Data not used in the fit are explained as well as those that were (mean fit {fit:.1f} %)"
     )
+    if len(traces):
+        reason += ", and of the inputs no more than a trace is left in the residuals "
+        reason += f"(correlations of at most {traces.max():.2f})"
+    elif np.isfinite(shares).any():
+        reason += ", and nothing of the inputs is left in the residuals"
+    return (f"{reason}.",)

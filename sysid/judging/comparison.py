@@ -25,7 +25,7 @@ nothing.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Literal
@@ -35,7 +35,7 @@ import numpy as np
 from sysid.arrays import BoolArray, FloatArray
 from sysid.judging.evidence import Ratio, independent_samples, ratio_of_means
 from sysid.problem.data import Dataset, output_scale
-from sysid.problem.metrics import fit_percent, mean_known, msd, rmse
+from sysid.problem.metrics import Metrics, fit_percent, mean_known, msd, rmse
 from sysid.problem.model import ModelError
 
 if TYPE_CHECKING:
@@ -166,7 +166,12 @@ class Comparison:
                 "Without validation data this ranks by BIC on the training data, which favours "
                 f"{best.name}; validation data would decide better."
             ]
-            sentences += [_against_training(row) for row in rest]
+            sentences += [
+                f"{row.name} failed: its free run grows out of bounds."
+                if row.verdict == "failed"
+                else f"{row.name} is {row.dbic:.3g} above it: {row.verdict}."
+                for row in rest
+            ]
         return " ".join([*sentences, *self._preference()])
 
     def _preference(self) -> list[str]:
@@ -219,25 +224,29 @@ def compare(
     q = training[0].outputs.shape[1]
     importance = np.ones(q) if weights is None else np.asarray(weights, dtype=np.float64)
     importance = importance / importance.sum()
-    trained = [_FreeRuns.of(training, candidate.training, lag) for candidate in candidates]
+    trained = [_FreeRuns(training, candidate.training, lag) for candidate in candidates]
     aic, bic, n, worth = _criteria(trained, [candidate.n_effective for candidate in candidates])
-    tested = [_FreeRuns.of(validation, c.validation, lag) for c in candidates if validation]
+    tested = [_FreeRuns(validation, c.validation, lag) for c in candidates if validation]
     score = np.array([runs.score(importance) for runs in tested]) if tested else bic
     best = int(np.argmin(score))
     ratios = _ratios(tested, best, importance) if tested else [None] * len(names)
     order = np.argsort(score, kind="stable").tolist()
     if np.isposinf(score[best]):
         raise ModelError("no structure has a free run that stays finite")
-    daic, dbic, unknown = _above_lowest(aic), _above_lowest(bic), np.full(q, np.nan)
+    with np.errstate(invalid="ignore"):  # all may be infinite
+        daic, dbic = (aic - aic.min()).tolist(), (bic - bic.min()).tolist()
+    unknown = np.full(q, np.nan)
+    unmeasured = [Metrics(unknown, unknown, unknown, unknown)] * len(names)
+    metrics = [runs.metrics for runs in tested] or unmeasured
     rows = [
         Row(
             candidates[i].name,
             candidates[i].n_free,
             candidates[i].n_effective,
             trained[i].mean_rmse(importance),
-            tested[i].rmse if tested else unknown,
-            tested[i].msd if tested else unknown,
-            tested[i].fit if tested else unknown,
+            metrics[i].rmse,
+            metrics[i].msd,
+            metrics[i].fit,
             daic[i],
             dbic[i],
             ratios[i],
@@ -251,24 +260,17 @@ def compare(
     return Comparison(tuple(rows), preferred.name, bool(validation), n, worth)
 
 
-@dataclass(frozen=True)
 class _FreeRuns:
-    """Free runs of a structure on the rows of some records that all structures are judged by.
+    """Free runs of a structure on some records, without the first ``lag`` rows of each.
 
     measured, simulated: per record (n_rows, n_outputs). scale: (n_outputs,), max|y| over all
     records.
     """
 
-    measured: list[FloatArray]
-    simulated: list[FloatArray]
-    scale: FloatArray
-
-    @classmethod
-    def of(cls, records: Sequence[Dataset], runs: Sequence[FloatArray], lag: int) -> _FreeRuns:
-        """Without the first ``lag`` rows of each record."""
-        simulated = [np.ascontiguousarray(run[lag:]) for run in runs]
-        measured = [record.outputs[lag:] for record in records]
-        return cls(measured, simulated, output_scale(list(records))[0])
+    def __init__(self, records: Sequence[Dataset], runs: Sequence[FloatArray], lag: int) -> None:
+        self.measured = [record.outputs[lag:] for record in records]
+        self.simulated = [np.ascontiguousarray(run[lag:]) for run in runs]
+        self.scale = output_scale(list(records))[0]
 
     @cached_property
     def finite(self) -> bool:
@@ -289,48 +291,34 @@ class _FreeRuns:
         return [(simulated - measured) / self.scale for measured, simulated in pairs]
 
     @cached_property
-    def rmse(self) -> FloatArray:
-        """Over all records, (n_outputs,); infinite for a free run that failed."""
-        return self._over_all(rmse, np.inf)
-
-    @property
-    def msd(self) -> FloatArray:
-        """Over all records, (n_outputs,)."""
-        return self._over_all(msd, np.nan)
-
-    @property
-    def fit(self) -> FloatArray:
-        """Fit %, mean over the records, (n_outputs,)."""
+    def metrics(self) -> Metrics:
+        """RMSE and MSD over all records, mean fit %; infinitely bad where a run failed."""
         if not self.finite:
-            return np.full(len(self.scale), -np.inf)
+            rmses, msds, fits = np.outer([np.inf, np.nan, -np.inf], np.ones(len(self.scale)))
+            return Metrics(rmses, msds, fits, self.scale)
+        measured, simulated = np.concatenate(self.measured), np.concatenate(self.simulated)
         pairs = zip(self.measured, self.simulated, strict=True)
-        return mean_known([fit_percent(measured, simulated) for measured, simulated in pairs], 0)
+        fit = mean_known([fit_percent(*pair) for pair in pairs], 0)
+        rmses, msds = (metric(measured, simulated, self.scale) for metric in (rmse, msd))
+        return Metrics(rmses, msds, fit, self.scale)
 
     def mean_rmse(self, importance: FloatArray) -> float:
         """Mean over the outputs that were measured."""
         share = np.where(self.seen, importance, 0.0)
-        return float(np.where(self.seen, self.rmse, 0.0) @ share / share.sum())
+        return float(np.where(self.seen, self.metrics.rmse, 0.0) @ share / share.sum())
 
     def score(self, importance: FloatArray) -> float:
         """Logarithm of the geometric mean of the RMSEs of the outputs that were measured."""
         with np.errstate(divide="ignore"):
-            logs = np.log(self.rmse)
+            logs = np.log(self.metrics.rmse)
         counted = self.seen & (importance > 0.0)
         return float(logs[counted] @ importance[counted] / importance[counted].sum())
-
-    def _over_all(self, metric: Callable[..., FloatArray], otherwise: float) -> FloatArray:
-        if not self.finite:
-            return np.full(len(self.scale), otherwise)
-        return metric(np.concatenate(self.measured), np.concatenate(self.simulated), self.scale)
 
 
 def _criteria(
     trained: Sequence[_FreeRuns], n_effective: Sequence[int]
 ) -> tuple[FloatArray, FloatArray, int, float]:
-    """AIC and BIC, the rows behind them and how many independent ones these are worth.
-
-    The criteria are (n_candidates,), infinite for a free run that failed.
-    """
+    """AIC and BIC, (n_candidates,), the rows behind them and how many independent these are."""
     log_det = np.full(len(trained), np.inf)
     residuals: list[list[FloatArray]] = []
     for i, runs in enumerate(trained):
@@ -353,7 +341,7 @@ def _ratios(tested: Sequence[_FreeRuns], best: int, importance: FloatArray) -> l
     reference = tested[best]
     if not reference.finite:
         return [None] * len(tested)
-    unit = np.maximum(reference.rmse**2, np.finfo(float).tiny)
+    unit = np.maximum(reference.metrics.rmse**2, np.finfo(float).tiny)
     counts = np.isfinite(np.concatenate(reference.measured)).sum(axis=0)
     rows = sum(map(len, reference.measured))
     # An output that was not measured everywhere counts by its mean all the same.
@@ -368,12 +356,6 @@ def _ratios(tested: Sequence[_FreeRuns], best: int, importance: FloatArray) -> l
         ratio_of_means(losses(runs), baseline) if runs.finite and runs is not reference else None
         for runs in tested
     ]
-
-
-def _above_lowest(values: FloatArray) -> list[float]:
-    """Differences from the lowest; NaN when all are infinite."""
-    with np.errstate(invalid="ignore"):
-        return [float(value) for value in values - values.min()]
 
 
 def _standing(best: bool, score: float, ratio: Ratio | None, dbic: float) -> Standing:
@@ -391,17 +373,9 @@ def _against_validation(row: Row, best: str) -> str:
     value, low, high = (_times(x) for x in (row.ratio.value, row.ratio.low, row.ratio.high))
     size = f"{row.name} has squared errors {value} times those of {best} (95 %: {low} to {high})"
     if row.verdict == "worse":
-        p = row.ratio.p_value
-        return (
-            f"{size}: worse, by more than chance ({'p < 0.001' if p < 1e-3 else f'p = {p:.2g}'})."
-        )
+        p = "p < 0.001" if row.ratio.p_value < 1e-3 else f"p = {row.ratio.p_value:.2g}"
+        return f"{size}: worse, by more than chance ({p})."
     return f"{size}: as good, as far as these data tell."
-
-
-def _against_training(row: Row) -> str:
-    if row.verdict == "failed":
-        return f"{row.name} failed: its free run grows out of bounds."
-    return f"{row.name} is {row.dbic:.3g} above it: {row.verdict}."
 
 
 def _times(ratio: float) -> str:

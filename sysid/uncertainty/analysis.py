@@ -17,7 +17,7 @@ from scipy.linalg import null_space
 from sysid.arrays import FloatArray, IntArray
 from sysid.fitting.objective import Objective
 from sysid.uncertainty.directions import PART, Directions, directions
-from sysid.uncertainty.estimate import Z95, Estimate, Why, product_text, sum_text
+from sysid.uncertainty.estimate import Z95, Estimate, Why, product_text, product_unit, sum_text
 from sysid.uncertainty.relations import (
     Kind,
     Relation,
@@ -28,7 +28,6 @@ from sysid.uncertainty.relations import (
     sparse,
 )
 from sysid.uncertainty.sensitivity import Sensitivity, sensitivity
-from sysid.uncertainty.units import product_unit
 
 _ALIKE = 0.05  # rivals closer than this are one
 _WHOLE = 1e-3  # a factor this close to a whole number is meant to be one
@@ -100,7 +99,7 @@ def uncertainty(
     if len(inert):
         local = replace(local, slopes=local.slopes - local.slopes @ inert.T @ inert)
         determined = directions(local)
-    analysis = _Analysis(local, determined, relations(local, determined))
+    analysis = _Analysis(local, determined)
     result = Uncertainty(
         tuple(analysis.parameter(j) for j in range(len(chromosome))),
         tuple(analysis.ambiguities()),
@@ -121,53 +120,43 @@ def _among_rivals(result: Uncertainty, rivals: Sequence[Mapping[str, float]]) ->
 
     several = [e for e in result.parameters if disputed(e)]
     names = tuple(e.name for e in sorted(several, key=lambda e: _effort(e.unit)))
+    parameters = tuple(
+        replace(e, std=None, low=None, high=None, why="rival") if e in several else e
+        for e in result.parameters
+    )
     ambiguities = [
         replace(a, determined=tuple(e for e in a.determined if not disputed(e)))
         for a in result.ambiguities
     ]
     if names:
         ambiguities.insert(0, Ambiguity("rival", names, (), names[:1]))
-    apart = [rival for rival in rivals if any(e.excludes(rival) for e in several)]
-    return replace(
-        result,
-        parameters=tuple(
-            replace(e, std=None, low=None, high=None, why="rival") if e in several else e
-            for e in result.parameters
-        ),
-        ambiguities=tuple(ambiguities),
-        rivals=tuple(_unlike(apart, names)),
-    )
-
-
-def _unlike(
-    rivals: Sequence[Mapping[str, float]], names: Sequence[str]
-) -> list[Mapping[str, float]]:
-    """The rivals that differ from each other in one of the named parameters at least."""
-    kept: list[Mapping[str, float]] = []
+    # Of those that differ in no disputed parameter the first stands for all.
+    unlike: list[Mapping[str, float]] = []
     values: list[list[float]] = []
     for rival in rivals:
         named = [rival[name] for name in names]
-        if not any(np.allclose(named, before, rtol=_ALIKE) for before in values):
-            kept.append(rival)
+        apart = any(e.excludes(rival) for e in several)
+        if apart and not any(np.allclose(named, before, rtol=_ALIKE) for before in values):
+            unlike.append(rival)
             values.append(named)
-    return kept
+    return replace(
+        result, parameters=parameters, ambiguities=tuple(ambiguities), rivals=tuple(unlike)
+    )
 
 
 class _Analysis:
     """Estimates and ambiguities from the directions that the data determine."""
 
-    def __init__(
-        self, local: Sensitivity, determined: Directions, relations: list[Relation]
-    ) -> None:
-        self.determined, self.relations = determined, relations
+    def __init__(self, local: Sensitivity, determined: Directions) -> None:
+        self.determined, self.relations = determined, relations(local, determined)
         self.chromosome, self.increments = local.chromosome, local.increments
         self.log = local.objective.space.log
         self.names = local.objective.space.names
         self.units = [parameter.unit for parameter in local.objective.space.parameters]
         # Relative change of each parameter per unit of its coordinate; none of what is zero.
-        nonzero = self.chromosome != 0.0
+        nothing, nonzero = np.zeros(len(self.chromosome)), self.chromosome != 0.0
         self.relative_increments = np.divide(
-            self.increments, self.chromosome, out=np.zeros(len(nonzero)), where=nonzero
+            self.increments, self.chromosome, out=nothing, where=nonzero
         )
 
     def parameter(self, j: int) -> Estimate:
@@ -188,8 +177,15 @@ class _Analysis:
     def ambiguities(self) -> Iterator[Ambiguity]:
         """Exact relations that share parameters together, each vague direction by itself."""
         exact = [relation for relation in self.relations if relation.exact]
-        for members in overlapping([relation.support for relation in exact]):
-            yield self._exact([exact[i] for i in members])
+        for places in overlapping([relation.support for relation in exact]):
+            members = [exact[i] for i in places]
+            group = np.flatnonzero(np.any([relation.support for relation in members], axis=0))
+            vectors = np.stack([relation.vector[group] for relation in members])
+            if all(relation.kind == "sum" for relation in members):
+                yield self._ambiguity("sum", group, members, self._sums(group, vectors))
+            else:
+                products = self._products(group, len(group) - len(members))
+                yield self._ambiguity("product", group, members, products)
         for relation in self.relations:
             if not relation.exact:
                 yield self._ambiguity("vague", main_parameters(relation.vector), [relation], [])
@@ -199,15 +195,12 @@ class _Analysis:
         used = np.flatnonzero(exponents)
         value = float(np.prod(self.chromosome[used] ** exponents[used]))
         deviation = self._deviation(exponents * self.relative_increments)
-        ends = value * np.exp(-Z95 * deviation), value * np.exp(Z95 * deviation)
+        low, high = sorted(value * np.exp(factor * deviation) for factor in (-Z95, Z95))
         unit = self.units[used[0]]
         if len(used) > 1:
             unit = product_unit((self.units[i], exponents[i]) for i in used)
-        terms = self._terms(exponents)
-        std = abs(value) * deviation
-        return Estimate(
-            product_text(terms), unit, value, terms, "product", std, min(ends), max(ends)
-        )
+        terms, std = self._terms(exponents), abs(value) * deviation
+        return Estimate(product_text(terms), unit, value, terms, "product", std, low, high)
 
     def _sum(self, factors: FloatArray) -> Estimate:
         """Estimate of a weighted sum of the parameters."""
@@ -225,15 +218,6 @@ class _Analysis:
         variance = float(direction @ self.determined.covariance @ direction)
         return float(np.sqrt(max(variance, 0.0)))
 
-    def _exact(self, members: list[Relation]) -> Ambiguity:
-        """Exact relations that hang together, and the combinations that they leave determined."""
-        group = np.flatnonzero(np.any([relation.support for relation in members], axis=0))
-        if all(relation.kind == "sum" for relation in members):
-            vectors = np.stack([relation.vector[group] for relation in members])
-            return self._ambiguity("sum", group, members, self._sums(group, vectors))
-        products = self._products(group, len(group) - len(members))
-        return self._ambiguity("product", group, members, products)
-
     def _ambiguity(
         self, kind: Kind, group: IntArray, members: list[Relation], determined: list[Estimate]
     ) -> Ambiguity:
@@ -243,18 +227,11 @@ class _Analysis:
         for i in group.tolist():
             if np.linalg.matrix_rank(vectors[:, [*measure, i]]) > len(measure):
                 measure.append(i)
-        return Ambiguity(
-            kind,
-            tuple(self.names[i] for i in group),
-            tuple(determined),
-            tuple(self.names[i] for i in measure),
-        )
+        parameters, measured = (tuple(self.names[i] for i in places) for places in (group, measure))
+        return Ambiguity(kind, parameters, tuple(determined), measured)
 
     def _sums(self, group: IntArray, vectors: FloatArray) -> list[Estimate]:
-        """Sums of the group's parameters that the data determine.
-
-        vectors: (n_relations, n_group), directions that leave them alone.
-        """
+        """Sums of the group's parameters that the data determine, orthogonal to the vectors."""
         sums = []
         for direction in sparse(null_space(vectors).T):
             factors = np.zeros(len(self.chromosome))
@@ -276,9 +253,9 @@ class _Analysis:
                 break
             exponents = np.zeros(len(self.chromosome))
             exponents[group] = powers
-            if self._is_determined(exponents * self.relative_increments) and np.linalg.matrix_rank(
-                np.array([*chosen, exponents])
-            ) > len(chosen):
+            trial = np.array([*chosen, exponents])
+            is_determined = self._is_determined(exponents * self.relative_increments)
+            if is_determined and np.linalg.matrix_rank(trial) > len(chosen):
                 chosen.append(exponents)
         return [self._product(exponents) for exponents in chosen]
 

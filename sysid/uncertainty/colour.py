@@ -49,7 +49,11 @@ def colour(residual: FloatArray, seen: BoolArray, lengths: Sequence[int]) -> Aut
         criterion = len(y) * size + np.log(max(len(y), 2)) * order * q * q
         if sign > 0 and criterion < lowest:
             best, lowest = order, criterion
-    return _fit(*_regression(residual, whole, lengths, best), q)
+    y, past = _regression(residual, whole, lengths, best)
+    solution = np.asarray(np.linalg.lstsq(past, y, rcond=None)[0], dtype=np.float64)
+    noise = _covariance(y - past @ solution, best)
+    coefficients = np.moveaxis(solution.reshape(best, q, q), 1, 2)
+    return Autoregression(_decaying(coefficients, len(y)), noise)
 
 
 def record_rows(lengths: Iterable[int]) -> list[slice]:
@@ -121,19 +125,8 @@ def _regression(
     return residual[rows], past.reshape(len(rows), -1)
 
 
-def _fit(y: FloatArray, past: FloatArray, q: int) -> Autoregression:
-    order = past.shape[1] // q
-    solution = np.asarray(np.linalg.lstsq(past, y, rcond=None)[0], dtype=np.float64)
-    noise = _covariance(y - past @ solution, order)
-    coefficients = np.moveaxis(solution.reshape(order, q, q), 1, 2)
-    return Autoregression(_decaying(coefficients, len(y)), noise)
-
-
 def _decaying(coefficients: FloatArray, samples: int) -> FloatArray:
-    """An autoregression whose memory is no longer than the samples it was found from.
-
-    Least squares may find one that grows with time, where its response would have no end.
-    """
+    """Coefficients whose response decays within so many samples: least squares may make it grow."""
     order, q, _ = coefficients.shape
     if order == 0:
         return coefficients

@@ -72,6 +72,7 @@ def directions(sensitivity: Sensitivity) -> Directions:
     weighted = slopes * weight[:, None]
     noise = colour(residual, sensitivity.seen, sensitivity.lengths)
     score = score_covariance(weighted, sensitivity.lengths, noise)
+    # Not all that the inputs' noise does is seen in residuals: parameters take up slow changes.
     score = _larger(score, _score_covariance_by(weighted, input_noises(sensitivity)))
     score += _score_covariance_by(weighted, zero_errors(sensitivity))
     free = _decompose(rows, score, np.zeros(slopes.shape[2], dtype=bool))
@@ -81,10 +82,7 @@ def directions(sensitivity: Sensitivity) -> Directions:
 
 
 def _decompose(rows: FloatArray, score: FloatArray, held: BoolArray) -> Directions:
-    """Directions of the parameters that are not held.
-
-    rows: (n_rows, n_free), weighted sensitivity. score: its covariance, (n_free, n_free).
-    """
+    """Directions of what is not held: rows are the weighted sensitivity, (n_rows, n_free)."""
     n, kept = rows.shape[1], np.flatnonzero(~held)
     _, values, vectors = np.linalg.svd(rows[:, kept], full_matrices=False)
     moving = values > _EXACT * values[0] if len(values) else np.zeros(0, dtype=bool)
@@ -108,11 +106,7 @@ def _score_covariance_by(weighted: FloatArray, changes: Iterable[FloatArray]) ->
 
 
 def _larger(seen: FloatArray, stated: FloatArray) -> FloatArray:
-    """A covariance as large in every direction as the larger of two.
-
-    What the inputs' noise does is part of the residuals, but not all of it is seen there: slow
-    changes are taken for parameters.
-    """
+    """A covariance as large in every direction as the larger of two."""
     values, vectors = np.linalg.eigh(seen)
     root = np.sqrt(np.maximum(values, 1e-14 * max(values[-1], 1e-300)))
     relative = (vectors.T @ stated @ vectors) / np.outer(root, root)

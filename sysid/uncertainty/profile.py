@@ -51,32 +51,22 @@ def profile(objective: Objective, chromosome: FloatArray, name: str) -> Profile:
     """
     space = objective.space
     if name not in space.names:
-        raise ModelError(
-            f"parameter {name!r} is not free, so it has no profile; free are "
-            + ", ".join(space.names)
-        )
+        free = ", ".join(space.names)
+        raise ModelError(f"parameter {name!r} is not free, so it has no profile; free are {free}")
     place = space.names.index(name)
     tracer = _Tracer(objective, chromosome, place)
-    below, above = tracer.side(-1.0), tracer.side(1.0)
     centre = (tracer.centre, 0.0)
-    points = [*reversed(below), centre, *above]
-    return Profile(
-        name,
-        space.parameters[place].unit,
-        float(chromosome[place]),
-        np.array([tracer.value(coordinate) for coordinate, _ in points]),
-        np.array([statistic for _, statistic in points]),
-        tracer.crossing([centre, *below]),
-        tracer.crossing([centre, *above]),
-    )
+    below, above = [centre, *tracer.side(-1.0)], [centre, *tracer.side(1.0)]
+    points = [*reversed(below), *above[1:]]
+    values = np.array([tracer.value(coordinate) for coordinate, _ in points])
+    statistic = np.array([statistic for _, statistic in points])
+    unit, value = space.parameters[place].unit, float(chromosome[place])
+    ends = tracer.crossing(below), tracer.crossing(above)
+    return Profile(name, unit, value, values, statistic, *ends)
 
 
 class _Tracer:
-    """Moves one coordinate outwards and fits the others.
-
-    centre: the coordinate at the estimate. unit: its standard deviation. factor: statistic per
-    loss of error.
-    """
+    """Moves a coordinate from ``centre`` by parts of its deviation ``unit`` and fits the others."""
 
     def __init__(self, objective: Objective, chromosome: FloatArray, place: int) -> None:
         self.objective, self.space, self.place = objective, objective.space, place
@@ -92,10 +82,11 @@ class _Tracer:
         if has_deviation:
             self.unit = float(np.sqrt(variance) * coordinate_units(objective, chromosome)[place])
         inflation = determined.inflation(place if has_deviation else None)
+        # Statistic per loss of error.
         self.factor = 2.0 * sum(local.lengths) / inflation
 
     def side(self, sign: float) -> list[_Point]:
-        """Points on one side of the estimate, until well beyond the 95 % level."""
+        """Points on one side, each from the best fit before, until well beyond the 95 % level."""
         lower, upper = self.space.coded_bounds
         end = float((lower if sign < 0.0 else upper)[self.place])
         at, points = self.start, []
@@ -105,7 +96,12 @@ class _Tracer:
             coordinate = end if beyond else coordinate
             if coordinate == self.centre:
                 break
-            at, statistic = self._fitted(at, coordinate)
+            held = self.space.holding(self.place, coordinate)
+            at = at.copy()
+            at[self.place] = coordinate
+            best = refine(self.objective.over(held), held.decode(at), max_iterations=_ITERATIONS)
+            at = held.encode(best.chromosome)
+            statistic = max(0.0, self.factor * (best.error - self.error))
             points.append((coordinate, statistic))
             if beyond or statistic > 1.5 * Z95**2:
                 break
@@ -124,12 +120,3 @@ class _Tracer:
             if below <= Z95 < above:
                 return self.value(float(a + (b - a) * (Z95 - below) / (above - below)))
         return None
-
-    def _fitted(self, at: FloatArray, coordinate: float) -> tuple[FloatArray, float]:
-        """Search coordinates of the best fit with the coordinate held, and the statistic there."""
-        held = self.space.holding(self.place, coordinate)
-        moved = at.copy()
-        moved[self.place] = coordinate
-        best = refine(self.objective.over(held), held.decode(moved), max_iterations=_ITERATIONS)
-        statistic = max(0.0, self.factor * (best.error - self.error))
-        return held.encode(best.chromosome), statistic

@@ -129,12 +129,9 @@ class _Follower:
         return None
 
     def _candidates(self, vector: FloatArray, members: list[int]) -> Iterator[FloatArray]:
-        """Directions of these parameters alone that may be the exact one near ``vector``.
-
-        Slopes at kinks have errors that mix what does nothing with what does little: so the
-        direction is sought anew without the other parameters, and with whole numbers for what is
-        near them.
-        """
+        """Directions of these parameters alone that may be the exact one near ``vector``."""
+        # Slopes at kinks mix what does nothing with what does little: so it is sought anew
+        # without the other parameters, and with whole numbers for what is near them.
         best = np.zeros_like(vector)
         rows = self.sensitivity.rows[:, members]
         best[members] = np.linalg.svd(rows, full_matrices=False)[2][-1]

@@ -9,7 +9,7 @@ import yaml
 
 from daq.config.identification import IdentificationConfig
 from daq.config.yaml_file import YamlFile
-from daq.identification.quantities import in_model_units
+from daq.identification.settings import in_model_units
 from daq.lookup.models import find_model
 from daq.lookup.shipped import shipped_files
 from daq.lookup.starter import settings_text

@@ -35,8 +35,7 @@ def result(seed, error=(NOISE, NOISE), left=0.0, size=1.0, **noise):
     data = record(seed, size=size, **noise)
     wrong = np.random.default_rng([seed, 2]).standard_normal((N, 2)) * error
     wrong[:, 0] += left * data.inputs[:, 1]
-    (found,) = examine([data], lambda r: r.outputs - wrong)
-    return found
+    return examine(data, data.outputs - wrong)
 
 
 def estimate(name, why=""):
@@ -59,7 +58,7 @@ def verdict(training=None, validation=None, uncertainty=None, feasible=True):
 
 def test_examine_measures_each_record_with_its_own_scale_and_inputs():
     records = [record(1, "a"), record(2, "b", size=3.0, input_noise=np.array([0.0, 0.1]))]
-    first, second = examine(records, lambda r: 0.9 * r.outputs)
+    first, second = (examine(r, 0.9 * r.outputs) for r in records)
     assert (first.name, second.name) == ("a", "b")
     np.testing.assert_allclose(second.metrics.scale, np.abs(records[1].outputs).max(axis=0))
     np.testing.assert_allclose(first.metrics.fit, 90.0, atol=0.1)
@@ -139,7 +138,7 @@ def test_what_follows_an_input_is_named():
         data = record(seed)
         wrong = NOISE * np.random.default_rng([seed, 2]).standard_normal((N, 2))
         wrong[:, 0] += lfilter([0.03], [1.0, -0.9], data.inputs[:, 1])
-        return examine([data], lambda r: r.outputs - wrong)[0]
+        return examine(data, data.outputs - wrong)
 
     found = verdict([slow(1)], [slow(2)])
     assert found.trust == "limited"
@@ -160,7 +159,7 @@ def test_a_trace_of_an_input_in_a_long_record_is_nothing_to_mend():
         slow = np.sin(np.arange(n) / 300.0)[:, None] * [1.0, 1.0]
         data = Dataset(slow, slow + 0.5, 0.01, "long")
         wrong = NOISE * (np.random.default_rng(6).standard_normal((n, 2)) + part * slow)
-        return examine([data], lambda r: r.outputs - wrong)[0]
+        return examine(data, data.outputs - wrong)
 
     trace, much = long(0.07), long(0.3)
     assert np.all(trace.residuals.independent < 0.1)
@@ -179,7 +178,7 @@ def test_what_follows_a_noisy_input_is_not_held_against_the_model():
     noise = {"input_noise": np.array([0.0, 0.3])}
     data = record(3, **noise)
     wrong = 0.1 * np.cumsum(data.inputs[:, [1, 1]], axis=0)
-    (found,) = examine([data], lambda r: r.outputs - wrong)
+    found = examine(data, data.outputs - wrong)
     assert "follow" not in " ".join(judge(MODEL, [found], [found], None).reasons)
 
 
@@ -212,13 +211,13 @@ def test_an_output_that_never_changes_or_was_never_measured_is_no_reason():
         outputs = data.outputs.copy()
         outputs[:, 1] = value
         simulated[:, 1] = 0.7
-        (found,) = examine([replace(data, outputs=outputs)], lambda r, s=simulated: s)
+        found = examine(replace(data, outputs=outputs), simulated)
         assert verdict(validation=[found]).trust == "good"
 
 
 def test_a_free_run_that_fails_is_no_proof_of_anything():
     data = record(2, "failing")
-    (failed,) = examine([data], lambda r: np.full_like(r.outputs, np.nan))
+    failed = examine(data, np.full_like(data.outputs, np.nan))
     for validation in ([failed], [result(3), failed]):
         found = verdict(validation=validation)
         assert found.trust == "poor"
@@ -237,8 +236,7 @@ def test_much_that_wanders_makes_parameters_doubtful(size, pole, trust):
         wrong = lfilter([1.0], [1.0, -pole], noise, axis=0)
         wrong -= wrong.mean(axis=0)
         wrong *= [size, NOISE] / wrong.std(axis=0)
-        (found,) = examine([data], lambda r: r.outputs - wrong)
-        return found
+        return examine(data, data.outputs - wrong)
 
     found = verdict([slow(1)], [slow(2)])
     assert found.trust == trust, found.reasons

@@ -231,8 +231,7 @@ def test_the_cores_are_shared_among_the_runs(monkeypatch):
         return original(self, *args, **kwargs)
 
     monkeypatch.setattr(GASSI, "fit", fit)
-    module = sys.modules["sysid.campaigns.campaign"]  # the package has the function of that name
-    monkeypatch.setattr(module, "available_cores", lambda: 8)
+    monkeypatch.setattr("sysid.campaigns.runs.available_cores", lambda: 8)
     todo = runs(seeds=(0,))
     with joblib.parallel_config(backend="threading"):
         campaign(todo, n_jobs=3)

@@ -8,9 +8,11 @@ on all of them.
 from __future__ import annotations
 
 import functools
+import itertools
 import time
 import warnings
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -219,10 +221,11 @@ def campaign(
     if not runs:
         raise ModelError("a campaign needs at least one run")
     threads = _threads(n_jobs, len(runs))
-    packed = _Packed()
+    order = _order(runs)
+    parcels = _packed([runs[place] for place in order])
     jobs = [
-        joblib.delayed(_identify)(place, *packed.arguments(runs[place]), runs[place].seed, threads)
-        for place in _order(runs)
+        joblib.delayed(_identify)(place, *packed, runs[place].seed, threads)
+        for place, packed in zip(order, parcels, strict=True)
     ]
     outcomes: dict[int, Outcome] = {}
     interrupted, problem = False, ""
@@ -249,25 +252,24 @@ def campaign(
     return Campaign(tuple(outcomes[place] for place in sorted(outcomes)), interrupted)
 
 
-class _Packed:
-    """Parcels of what runs share, each packed once."""
+def _packed(runs: Sequence[Run]) -> list[tuple[bytes, bytes, bytes]]:
+    """Model, records and settings of each run; what several runs share is packed once."""
+    parcels: dict[tuple[int, ...], bytes] = {}
 
-    def __init__(self) -> None:
-        self._parcels: dict[tuple[int, ...], bytes] = {}
+    def parcel(what: str, value: Any, *parts: Any) -> bytes:
+        key = tuple(map(id, parts))
+        if key not in parcels:
+            parcels[key] = pack(what, value)
+        return parcels[key]
 
-    def arguments(self, run: Run) -> tuple[bytes, bytes, bytes]:
-        """Model, records and settings."""
-        records = tuple(map(id, (*run.records, None, *run.validation)))
-        return (
-            self._parcel(f"model {run.name}", (id(run.model),), run.model),
-            self._parcel("the records", records, (run.records, run.validation)),
-            self._parcel(f"settings of {run.name}", (id(run.settings),), dict(run.settings)),
+    return [
+        (
+            parcel(f"model {r.name}", r.model, r.model),
+            parcel("the records", (r.records, r.validation), *r.records, None, *r.validation),
+            parcel(f"settings of {r.name}", dict(r.settings), r.settings),
         )
-
-    def _parcel(self, what: str, key: tuple[int, ...], value: Any) -> bytes:
-        if key not in self._parcels:
-            self._parcels[key] = pack(what, value)
-        return self._parcels[key]
+        for r in runs
+    ]
 
 
 def _identify(
@@ -318,26 +320,20 @@ def _parallel(n_jobs: int | None) -> Any:
     import joblib
 
     # Each run by itself: a batch of several would only be finished as a whole.
-    settings: dict[str, Any] = {"n_jobs": n_jobs, "batch_size": 1}
     try:
-        return joblib.Parallel(return_as="generator_unordered", **settings)
+        return joblib.Parallel(n_jobs, batch_size=1, return_as="generator_unordered")
     except ValueError:
-        return joblib.Parallel(**settings)
+        return joblib.Parallel(n_jobs, batch_size=1)
 
 
 def _threads(n_jobs: int | None, n_runs: int) -> int:
     """Cores of this machine for each of the runs that go on at a time; 1 on a cluster."""
     import joblib
-    from joblib.parallel import (
-        LokyBackend,
-        MultiprocessingBackend,
-        SequentialBackend,
-        ThreadingBackend,
-        get_active_backend,
-    )
+    from joblib import parallel
 
-    local = (LokyBackend, MultiprocessingBackend, SequentialBackend, ThreadingBackend)
-    if not isinstance(get_active_backend()[0], local):
+    processes = parallel.LokyBackend, parallel.MultiprocessingBackend
+    local = (*processes, parallel.SequentialBackend, parallel.ThreadingBackend)
+    if not isinstance(parallel.get_active_backend()[0], local):
         return 1
     at_a_time = min(int(joblib.effective_n_jobs(n_jobs)), n_runs)
     return max(1, available_cores() // at_a_time)
@@ -348,11 +344,8 @@ def _order(runs: Sequence[Run]) -> list[int]:
 
     Workers then compile different models at the same time, not all of them the first one.
     """
-    turn: dict[int, int] = {}
-    turns = []
-    for run in runs:
-        turns.append(turn.get(id(run.model), 0))
-        turn[id(run.model)] = turns[-1] + 1
+    counts: dict[int, Iterator[int]] = defaultdict(itertools.count)
+    turns = [next(counts[id(run.model)]) for run in runs]
     return sorted(range(len(runs)), key=lambda place: turns[place])
 
 
@@ -365,9 +358,7 @@ def _close(results: Any) -> None:
 
 
 def _described(error: Exception) -> str:
-    if isinstance(error, ModelError):
-        return str(error)
-    return f"{type(error).__name__}: {error}"
+    return str(error) if isinstance(error, ModelError) else f"{type(error).__name__}: {error}"
 
 
 def _ranked(group: Sequence[Outcome]) -> list[Outcome]:
@@ -379,20 +370,12 @@ def _ranked(group: Sequence[Outcome]) -> list[Outcome]:
 
 def _spread(model: str, data: str, group: Sequence[Outcome]) -> Spread:
     done = _ranked(group)
-    errors = np.array([outcome.error for outcome in done]) if done else np.array([np.nan])
-    agreeing = [o.estimator for o in done if o.error <= (1.0 + _SAME) * errors.min()]
-    values = {
-        name: [e.parameters_[name] for e in agreeing if e is not None]
-        for name in (done[0].run.model.parameter_names if done else ())
-    }
-    return Spread(
-        model,
-        data,
-        len(group),
-        len(group) - len(done),
-        float(errors.min()),
-        float(np.median(errors)),
-        float(errors.max()),
-        len(agreeing),
-        {name: (min(numbers), max(numbers)) for name, numbers in values.items()},
-    )
+    errors = np.array([outcome.error for outcome in done] or [np.nan])
+    agreeing = [o.row() for o in done if o.error <= (1.0 + _SAME) * errors.min()]
+    ends = {}
+    for name in done[0].run.model.parameter_names if done else ():
+        values = [row[name] for row in agreeing]
+        ends[name] = min(values), max(values)
+    failed, best, worst = len(group) - len(done), float(errors.min()), float(errors.max())
+    middle = float(np.median(errors))
+    return Spread(model, data, len(group), failed, best, middle, worst, len(agreeing), ends)
