@@ -12,11 +12,11 @@ from daq.errors import DeviceError
 from daq.hal import DeviceInfo, FloatArray, Guard, Mode, Phase, RawSamples
 from daq.serial import messages
 from daq.serial.connection import Connection
-from daq.serial.messages import Latch, LoopMode, Start, Type, Welcome
+from daq.serial.host import HostMachine
+from daq.serial.messages import Latch, Start, Type, Welcome
 from daq.serial.scaling import Scaling
 
 _SAFE_PATIENCE = 0.25  # s to hear that the outputs are zero
-_PRELOAD_PATIENCE = 2.0  # s for the device to take what is sent ahead
 _RATE_TOLERANCE = 5e-5  # as good as a quartz
 
 
@@ -53,8 +53,7 @@ class SerialDevice:
 
     def open(self) -> DeviceInfo:
         """Connect, agree on the protocol, and clear what an earlier run left behind."""
-        if self._connection is not None:
-            self.close()
+        self.close()
         if not self.options.port:
             raise DeviceError(
                 "no port is named; write options.port in the rig file or give --port. 'rig ports' "
@@ -62,10 +61,9 @@ class SerialDevice:
             )
         options = self.options
         connection = Connection(options.port, options.baud, options.watchdog)
-        welcome = connection.welcome
-        self._connection, self._warnings = connection, connection.warnings
+        welcome, self._warnings = connection.welcome, connection.warnings
         self._facts = {
-            "port": self.options.port,
+            "port": options.port,
             "device": welcome.device,
             "firmware": welcome.firmware,
             "serial_number": welcome.serial,
@@ -76,15 +74,15 @@ class SerialDevice:
             connection.check_delay()
             connection.ask(Type.CLEAR)
         except BaseException:
-            self._disconnect()
+            connection.close()
             raise
-        self._scaling = Scaling(welcome.channels)
+        self._connection, self._scaling = connection, Scaling(welcome.channels)
         volts_in = self._scaling.input_range
         return DeviceInfo(_name(welcome), welcome.max_rate, welcome.queue, volts_in)
 
     def announce(self, phase: Phase, turns: float = 0.0) -> None:
         """Tell the device which phase begins; an emulator's user winds the handle then."""
-        payload = messages.pack_announce(list(Phase).index(phase), turns)
+        payload = messages.ANNOUNCE.pack(list(Phase).index(phase), turns)
         self._opened().ask(Type.ANNOUNCE, payload)
 
     def start(self, sample_rate: float, mode: Mode, guard: Guard) -> None:
@@ -93,8 +91,7 @@ class SerialDevice:
         self._run = (self._run + 1) & 0xFFFF
         self._going = False
         period, watchdog = self._timing(sample_rate, connection.welcome)
-        loop = LoopMode.OPEN if mode is Mode.OPEN_LOOP else LoopMode.CLOSED
-        start = Start(self._run, loop, period, watchdog, self._scaling.coded(guard))
+        start = Start(self._run, mode, period, watchdog, self._scaling.coded(guard))
         connection.schedule_as_caller()
         self._armed = True
         connection.request(lambda machine, now: machine.start(start, now))
@@ -107,13 +104,14 @@ class SerialDevice:
 
     def room(self) -> int:
         """Commands that may be sent now."""
-        return self._sampling().act(lambda machine, now: machine.room)
+        return self._sampling().act(lambda machine, now: machine.commands.room)
 
     def receive(self) -> RawSamples:
         """Samples received so far; waits for the first."""
         connection = self._sampling()
         if not self._going:
-            self._go(connection)
+            connection.go()
+            self._going = True
         return self._scaling.samples(connection.samples())
 
     def stop(self) -> None:
@@ -121,7 +119,7 @@ class SerialDevice:
         connection = self._opened()
         self._armed = False
         self._record = connection.describe()
-        connection.request(lambda machine, now: machine.stop(now))
+        connection.request(HostMachine.stop)
 
     def safe(self) -> None:
         """Zero both outputs now. Where the device cannot be reached, its watchdog does it."""
@@ -133,10 +131,13 @@ class SerialDevice:
     def close(self) -> None:
         """Zero the outputs and disconnect."""
         self.safe()
-        if self._connection is not None and self._armed:
+        if self._connection is None:
+            return
+        if self._armed:
             with contextlib.suppress(DeviceError):
                 self.stop()
-        self._disconnect()
+        self._connection.close()
+        self._connection = None
 
     def report(self) -> dict[str, Any]:
         """Device, connection and line, for the record of a run."""
@@ -146,15 +147,6 @@ class SerialDevice:
             self._record = self._connection.describe()
         warnings = [*self._warnings, *_losses(self._record.get("line", {}))]
         return {**self._facts, "warnings": warnings, **self._record}
-
-    def _disconnect(self) -> None:
-        if self._connection is None:
-            return
-        if self._armed:
-            self._record = self._connection.describe()
-        self._armed = False
-        self._connection.close()
-        self._connection = None
 
     def _opened(self) -> Connection:
         if self._connection is None:
@@ -188,16 +180,6 @@ class SerialDevice:
                 f"not {watchdog} ms"
             )
         return period, watchdog
-
-    def _go(self, connection: Connection) -> None:
-        """Start the clock once the device has what was sent ahead."""
-        if not connection.wait_for_preload(_PRELOAD_PATIENCE):
-            raise DeviceError(
-                "the device does not take the commands sent ahead; the line loses more "
-                "than it carries. Look at cable and baud rate"
-            )
-        connection.request(lambda machine, now: machine.go(now))
-        self._going = True
 
 
 def _name(welcome: Welcome) -> str:

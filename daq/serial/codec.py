@@ -57,9 +57,7 @@ def decode(coded: bytes) -> Frame | None:
     if len(body) < _SMALLEST:
         return None
     type_, reserved, session, seq, length = _HEADER.unpack_from(body)
-    if length != len(body) - _SMALLEST or reserved != 0:
-        return None
-    if zlib.crc32(body) != _RESIDUE:
+    if length != len(body) - _SMALLEST or reserved != 0 or zlib.crc32(body) != _RESIDUE:
         return None
     return Frame(type_, session, seq, body[_HEADER.size : -_CRC.size])
 

@@ -14,13 +14,14 @@ _REWIND = 0.05  # s between two repetitions that a device asked for
 
 
 class CommandStream:
-    """Commands by tick, from the program to the device's queue of ``queue`` commands.
+    """Commands by tick, from the program to the device's queue, in frames of ``chunk`` at most.
 
     given, sent: tick after the last command of the program, and on the line. taken: tick after the
     last that the device has received in order. Nothing is sent without credit.
     """
 
-    def __init__(self, queue: int, now: float = 0.0) -> None:
+    def __init__(self, queue: int, chunk: int, now: float = 0.0) -> None:
+        self._chunk = chunk
         self.given = self.sent = self.taken = 0
         self._credit = 0  # until the device has answered
         self._ring = np.zeros((2 * queue, len(CHANNELS)), messages.COMMAND_DTYPE)
@@ -50,11 +51,11 @@ class CommandStream:
             self._progress = now
         self.given = max(self.given, end)
 
-    def chunks(self, size: int, now: float) -> Iterator[tuple[int, Codes]]:
-        """First tick and codes of what may be sent now, in parts of at most ``size`` ticks."""
+    def chunks(self, now: float) -> Iterator[tuple[int, Codes]]:
+        """First tick and codes of what may be sent now, a frame at a time."""
         end = min(self.given, self._credit)
         while self.sent < end:
-            first, self.sent = self.sent, min(self.sent + size, end)
+            first, self.sent = self.sent, min(self.sent + self._chunk, end)
             self._progress = now
             yield first, self._ring[np.arange(first, self.sent) % len(self._ring)]
 

@@ -21,8 +21,9 @@ _SLOW_TIMER = 2  # ms; an adapter's latency timer above it delays every sample
 def _gone(port: str, error: Exception | None = None) -> DeviceError:
     reason = "" if error is None else f" ({error})"
     return DeviceError(
-        f"{port}: the port has gone{reason}; check the cable and the device's supply. The device "
-        "makes itself safe when it hears nothing"
+        f"the port has gone{reason}; check the cable and the device's supply. The device makes "
+        "itself safe when it hears nothing",
+        file=port,
     )
 
 
@@ -72,8 +73,11 @@ class SerialLink:
 
     def write(self, data: bytes) -> None:
         """Send all of it."""
+        left = data
         try:
-            left = data[self._write_now(data) :]
+            if self._descriptor is not None:
+                with contextlib.suppress(BlockingIOError):
+                    left = data[os.write(self._descriptor, data) :]
             if left:
                 self._serial.write(left)
         except self._failures as error:
@@ -85,42 +89,28 @@ class SerialLink:
         with contextlib.suppress(*self._failures):
             self._serial.close()
 
-    def _write_now(self, data: bytes) -> int:
-        """Write without waiting; the number of bytes that the port took."""
-        if self._descriptor is None:
-            return 0
-        try:
-            return os.write(self._descriptor, data)
-        except BlockingIOError:
-            return 0
-
     def _prepare(self) -> None:
         """Drop old input, ask the adapter for low latency, and keep DTR up on closing."""
         with contextlib.suppress(*self._failures):
             self._serial.reset_input_buffer()
         if not sys.platform.startswith("linux") or "://" in self._port:
             return
+        import termios
+
         # Ports without such a mode, CDC-ACM among them, do not delay.
-        with contextlib.suppress(*self._failures, ValueError, AttributeError):
+        with contextlib.suppress(*self._failures, AttributeError):
             self._serial.set_low_latency_mode(True)
-        self._keep_line_up()
+        # Boards that reset on an edge of DTR stay as they are.
+        with contextlib.suppress(termios.error, *self._failures):
+            attributes = termios.tcgetattr(self._serial.fileno())
+            attributes[2] &= ~termios.HUPCL
+            termios.tcsetattr(self._serial.fileno(), termios.TCSANOW, attributes)
         timer = latency_timer(self._port)
         if timer is not None and timer[1] > _SLOW_TIMER:
             self.warnings.append(
                 f"{self._port}: its adapter waits up to {timer[1]} ms before it hands on samples; "
                 f"as root: echo 1 > {timer[0]}"
             )
-
-    def _keep_line_up(self) -> None:
-        """Do not lower DTR on closing: boards that reset on its edge stay as they are."""
-        if sys.platform == "win32":
-            return
-        import termios
-
-        with contextlib.suppress(termios.error, *self._failures):
-            attributes = termios.tcgetattr(self._serial.fileno())
-            attributes[2] &= ~termios.HUPCL
-            termios.tcsetattr(self._serial.fileno(), termios.TCSANOW, attributes)
 
 
 class SocketLink:
@@ -131,13 +121,14 @@ class SocketLink:
         self._port = port
         host, _, number = port.removeprefix("socket://").strip("/").rpartition(":")
         if not host or not number.isdigit():
-            raise DeviceError(f"{port}: not an address; write socket://HOST:PORT")
+            raise DeviceError("not an address; write socket://HOST:PORT", file=port)
         try:
             self._socket = socket.create_connection((host.strip("[]"), int(number)), timeout=2.0)
         except OSError as error:
             raise DeviceError(
-                f"{port}: nobody answers there ({error}); check address and port number, and that "
-                "the emulator or device server is running"
+                f"nobody answers there ({error}); check address and port number, and that the "
+                "emulator or device server is running",
+                file=port,
             ) from None
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._socket.settimeout(_WRITE_PATIENCE)
@@ -171,8 +162,9 @@ class SocketLink:
 
     def _closed(self) -> DeviceError:
         return DeviceError(
-            f"{self._port}: the other side has closed the connection. It serves one program "
-            "at a time: another may have it, or the emulator or device server has ended"
+            "the other side has closed the connection. It serves one program at a time: another "
+            "may have it, or the emulator or device server has ended",
+            file=self._port,
         )
 
 
@@ -201,18 +193,17 @@ def _not_opened(port: str, error: Exception) -> DeviceError:
     text = str(error)
     if number == errno.ENOENT or "FileNotFoundError" in text:
         cure = "there is no such port; 'rig ports' lists those that there are"
-    elif number == errno.EACCES or "Permission" in text or "PermissionError" in text:
+    elif number == errno.EACCES or "Permission" in text:
+        cure = f"no permission; {permission_cure(port)}"
         if os.name == "nt":
             cure = "another program has it open; close that first"
-        else:
-            cure = f"no permission; {permission_cure(port)}"
     elif number in {errno.EAGAIN, errno.EBUSY} or "exclusively lock" in text:
         cure = f"another program has it open{_holder(port)}; close that first"
     elif number in {errno.ENOTTY, errno.EISDIR} or f"({errno.ENOTTY}," in text:
         cure = "that is no serial port; 'rig ports' lists those that there are"
     else:
         cure = f"it cannot be opened ({text}); 'rig ports' lists the ports that there are"
-    return DeviceError(f"{port}: {cure}")
+    return DeviceError(cure, file=port)
 
 
 def permission_cure(port: str) -> str:

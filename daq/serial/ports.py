@@ -49,9 +49,7 @@ def ports_of(names: Sequence[str]) -> list[PortFacts]:
 
 def inquire(ports: Sequence[PortFacts], baud: int) -> list[Inquiry]:
     """Ask all ports at once who is there; takes as long as the slowest answer."""
-    if not ports:
-        return []
-    with ThreadPoolExecutor(len(ports)) as pool:
+    with ThreadPoolExecutor(max(1, len(ports))) as pool:
         return list(pool.map(lambda port: _inquire(port, baud), ports))
 
 
@@ -59,7 +57,7 @@ def _inquire(port: PortFacts, baud: int) -> Inquiry:
     try:
         connection = Connection(port.name, baud)
     except DeviceError as error:
-        return Inquiry(port, problem=str(error).removeprefix(f"{port.name}: "))
+        return Inquiry(port, problem=error.mistakes[0].problem)
     connection.close()
     return Inquiry(port, connection.welcome)
 
@@ -67,21 +65,16 @@ def _inquire(port: PortFacts, baud: int) -> Inquiry:
 def _system_ports() -> list[PortFacts]:
     from serial.tools import list_ports
 
-    lasting_names = _lasting_names()
+    links = _BY_ID.iterdir() if _BY_ID.is_dir() else ()
+    lasting_names = {os.path.realpath(link): str(link) for link in links}
     # The system names serial ports of mainboards that have none; those say nothing of hardware.
     ports = [port for port in list_ports.comports() if port.hwid not in {None, "n/a"}]
     facts = []
     for port in sorted(ports, key=lambda port: port.device):
-        lasting_name = lasting_names.get(os.path.realpath(port.device))
         usb = f"{port.vid:04x}:{port.pid:04x}" if port.vid is not None else None
-        timer = latency_timer(port.device)
-        milliseconds = timer[1] if timer else None
-        description = port.description or ""
-        facts.append(PortFacts(port.device, description, lasting_name, usb, milliseconds))
+        _, milliseconds = latency_timer(port.device) or (None, None)
+        lasting_name = lasting_names.get(os.path.realpath(port.device))
+        facts.append(
+            PortFacts(port.device, port.description or "", lasting_name, usb, milliseconds)
+        )
     return facts
-
-
-def _lasting_names() -> dict[str, str]:
-    if not _BY_ID.is_dir():
-        return {}
-    return {os.path.realpath(link): str(link) for link in _BY_ID.iterdir()}

@@ -33,13 +33,7 @@ class EncoderCounter:
         return EncoderCounter(self.counts_per_turn, self._memory.copy(), self._started)
 
     def latch(
-        self,
-        angles: FloatArray,
-        last: float,
-        origin: float,
-        first: int,
-        step: float,
-        per_tick: int,
+        self, angles: FloatArray, last: float, origin: float, first: int, step: float, per_tick: int
     ) -> tuple[FloatArray, FloatArray]:
         """Counts and their rate [1/s] at every ``per_tick``-th of the angles.
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from daq.hal import ANALOG_INPUTS, CHANNELS, Electronics, Guard, IntArray, Mode, Phase, Simulation
+from daq.hal import ANALOG_INPUTS, CHANNELS, Electronics, Guard, Mode, Phase, Simulation
 from daq.serial import messages
 from daq.serial.messages import Channel, CodedGuard, Codes, Records, Welcome
 
@@ -76,7 +76,8 @@ class SimulatedBoard:
         self._device.send(self._tick, commands.astype(np.float64) * step_out)
         raw = self._device.receive()
         records["analog"] = np.rint(raw.analog / step_in)
-        records["counts"] = _wrapped(np.rint(raw.counts).astype(np.int64))
+        # As a counter of 32 bits shows them.
+        records["counts"] = (np.rint(raw.counts).astype(np.int64) + 2**31) % 2**32 - 2**31
         records["count_rate"] = raw.count_rate
         records["applied"] = np.rint(raw.applied / step_out)
         records["flags"] = raw.flags
@@ -115,8 +116,3 @@ def warm_up(simulation: Simulation) -> float:
         device.receive()
     device.close()
     return info.max_rate
-
-
-def _wrapped(counts: IntArray) -> IntArray:
-    """Counts as a counter of 32 bits shows them."""
-    return (counts + 2**31) % 2**32 - 2**31

@@ -27,7 +27,9 @@ KINDS: dict[str, tuple[float | None, str]] = {
     "garbage": (1.0, "the device answers with random bytes"),
     "stuck-encoder": (1.0, "the counter stands still"),
 }
-_EVENTS = frozenset({"stall", "disconnect", "reboot", "overflow"})
+EVENTS = frozenset({"stall", "disconnect", "reboot", "overflow"})
+"""Faults that happen at an instant, and not from then on."""
+
 _PIECE_SECONDS = 1e-4  # between the pieces of a frame that arrives split
 
 
@@ -39,11 +41,6 @@ class Fault:
     value: float
     phase: Phase | None = None
     after: float = 0.0
-
-    @property
-    def once(self) -> bool:
-        """Whether it happens at an instant, and not from then on."""
-        return self.name in _EVENTS
 
 
 def parse(text: str) -> Fault:
