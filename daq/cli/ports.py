@@ -11,8 +11,9 @@ from daq.cli import terminal
 from daq.cli.options import AsJson
 
 if TYPE_CHECKING:
+    from daq.serial.connection import Inquiry
     from daq.serial.messages import Welcome
-    from daq.serial.ports import Inquiry, PortFacts
+    from daq.serial.ports import PortFacts
 
 
 def ports(
@@ -27,7 +28,8 @@ def ports(
     json: AsJson = False,
 ) -> None:
     """List serial ports, and who answers there."""
-    from daq.serial.ports import Inquiry, inquire, ports_of
+    from daq.serial.connection import Inquiry, inquire
+    from daq.serial.ports import ports_of
 
     wanted = ports_of(names or [])
     inquiries = [Inquiry(port) for port in wanted] if unasked else inquire(wanted, baud)

@@ -1,4 +1,4 @@
-"""A session with the device behind a port: its machine, and the threads that serve it."""
+"""A session with the device behind a port: its machine, its threads, and who answers."""
 
 import contextlib
 import getpass
@@ -8,15 +8,17 @@ import platform
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from daq.errors import DeviceError
 from daq.serial import messages
 from daq.serial.codec import Decoder
 from daq.serial.host import GIVE_UP, HostMachine, refusal
-from daq.serial.link import open_link
 from daq.serial.messages import Block, Result, Type, Welcome
+from daq.serial.ports import PortFacts, open_link
 
 _HANDSHAKE = 2.0  # s in which a device says who it is: a board resets in less
 _FEED = 0.01  # s between two looks at what is to be sent, or sent again
@@ -49,11 +51,10 @@ class Connection:
         self._changed = threading.Condition()
         self._called = 0.0
         self._threads = [
-            threading.Thread(target=self._serve, args=(work,), name=name, daemon=True)
-            for name, work in (
-                ("serial rig, reading", self._read),
-                ("serial rig, watchdog", self._feed),
+            threading.Thread(
+                target=self._serve, args=(work,), name=f"serial rig, {name}", daemon=True
             )
+            for name, work in (("reading", self._read), ("watchdog", self._feed))
         ]
         for thread in self._threads:
             thread.start()
@@ -96,13 +97,12 @@ class Connection:
 
     def samples(self) -> list[Block]:
         """Blocks received so far; waits for the first."""
-        blocks = self._machine.blocks
+        machine = self._machine
         with self._changed:
-            if not self._wait(lambda: bool(blocks)) and self._machine.failure is not None:
-                raise self._machine.failure
+            if not self._wait(lambda: bool(machine.blocks)) and machine.failure is not None:
+                raise machine.failure
             self._called = time.monotonic()
-            taken = list(blocks)
-            blocks.clear()
+            taken, machine.blocks = machine.blocks, []
         return taken
 
     def go(self) -> None:
@@ -198,8 +198,6 @@ class Connection:
                 self._changed.wait(min(_LOOK, deadline - self._called))
         return True
 
-    # --- the threads --------------------------------------------------------------------------
-
     def _serve(self, work: Callable[[], None]) -> None:
         """Do a thread's work until the session ends, be it by a port that fails."""
         failure: DeviceError | None = None
@@ -235,6 +233,30 @@ class Connection:
         data = self._machine.take()
         if data:
             self._link.write(data)
+
+
+@dataclass(frozen=True)
+class Inquiry:
+    """Who answers on a port, or why nobody does; neither where nobody was asked."""
+
+    port: PortFacts
+    welcome: Welcome | None = None
+    problem: str | None = None
+
+
+def inquire(ports: Sequence[PortFacts], baud: int) -> list[Inquiry]:
+    """Ask all ports at once who is there; takes as long as the slowest answer."""
+    with ThreadPoolExecutor(max(1, len(ports))) as pool:
+        return list(pool.map(lambda port: _inquire(port, baud), ports))
+
+
+def _inquire(port: PortFacts, baud: int) -> Inquiry:
+    try:
+        connection = Connection(port.name, baud)
+    except DeviceError as error:
+        return Inquiry(port, problem=error.mistakes[0].problem)
+    connection.close()
+    return Inquiry(port, connection.welcome)
 
 
 def _user() -> str:

@@ -4,6 +4,7 @@ A program around it feeds bytes (``feed``), calls ``poll`` every few millisecond
 what ``take`` gives. Times are seconds of the host's monotonic clock.
 """
 
+import itertools
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from daq.hal import CHANNELS, Mode
 from daq.serial import codec, messages
 from daq.serial.clock import ClockEstimator
 from daq.serial.codec import Decoder, Frame
-from daq.serial.command_stream import CommandStream
+from daq.serial.commands import CommandStream
 from daq.serial.messages import Block, Latch, Pong, Reply, Result, Start, State, Status, Type
 
 RETRY = 0.1  # s until a request is sent again
@@ -70,7 +71,7 @@ class HostMachine:
         self.decoder = Decoder()
         self.clock = ClockEstimator()
         self.counters = Counters()
-        self.blocks: deque[Block] = deque()
+        self.blocks: list[Block] = []
         self.failure: DeviceError | None = None
         self.welcome: messages.Welcome | None = None
         self.other_version: int | None = None
@@ -79,11 +80,12 @@ class HostMachine:
         self.reply: Reply | None = None
         self.commands = CommandStream(queue=1, chunk=1)
         self._outbox: deque[bytes] = deque()
-        self._request_seq = self._seq = 0
+        self._request_seq = 0
+        self._sequence = itertools.count(1)
         self._heard_seq: int | None = None
+        self._state = State.IDLE
         self._run = 0
-        self._start: Start | None = None
-        self._going = False
+        self._start: Start  # of the run, unless IDLE
         self._expected = 0  # tick of the next sample
         self._sample_at = self._frame_at = self._pinged = 0.0
         self._rejected = 0  # damaged frames, by the time of the last good frame
@@ -95,25 +97,23 @@ class HostMachine:
             Type.WELCOME: (_unpack_welcome, self._greet),
         }
 
-    # --- the program around it ----------------------------------------------------------------
-
     def feed(self, data: bytes, now: float) -> None:
         """Take bytes that came from the line."""
         for frame in self.decoder.feed(data):
             if frame.session == self.session:
-                self._take(frame, now)
+                self._receive(frame, now)
 
     def poll(self, now: float, keep_alive: bool = True) -> None:
         """Send again what was not answered, keep the device's watchdog fed, notice silence."""
         self._retry(now)
-        if self._start is None or self.failure is not None:
+        if self._state is State.IDLE or self.failure is not None:
             return
         if keep_alive and now - self._pinged >= 0.25e-3 * self._start.watchdog:
             self.ping(now)
         if self.commands.lags(now):
             self._rewind(now)
         self._pump(now)
-        if self._going and now - self._sample_at > SILENCE:
+        if self._state is State.RUNNING and now - self._sample_at > SILENCE:
             self._fail(self._why_silent(now))
 
     def take(self) -> bytes:
@@ -121,8 +121,6 @@ class HostMachine:
         data = b"".join(self._outbox)
         self._outbox.clear()
         return data
-
-    # --- requests -----------------------------------------------------------------------------
 
     def ask(self, type_: Type, payload: bytes, now: float, give_up: float = GIVE_UP) -> None:
         """Send a request, in place of any that is outstanding.
@@ -137,18 +135,16 @@ class HostMachine:
 
     def ping(self, now: float) -> None:
         """Feed the watchdog, and learn about the clocks."""
-        if self._going:
+        if self._state is State.RUNNING:
             pause = now - self._pinged
             self.counters.longest_pause = max(self.counters.longest_pause, pause)
         self._pinged = now
         self._send(Type.PING, messages.PING.pack(round(now * 1e9)))
 
-    # --- the run ------------------------------------------------------------------------------
-
     def start(self, start: Start, now: float) -> None:
         """Arm a run; commands may follow at once."""
         assert self.welcome is not None
-        self._run, self._start, self._going = start.run, start, False
+        self._state, self._run, self._start = State.ARMED, start.run, start
         self.blocks.clear()
         self.status = None
         self._expected = 0
@@ -159,13 +155,13 @@ class HostMachine:
 
     def go(self, now: float) -> None:
         """Start the clock."""
-        self._going = True
+        self._state = State.RUNNING
         self._sample_at = self._pinged = now
         self.ask(Type.GO, messages.RUN.pack(self._run), now)
 
     def stop(self, now: float) -> None:
         """End the run; samples still on their way are not wanted."""
-        self._start, self._going = None, False
+        self._state = State.IDLE
         self.blocks.clear()
         self.ask(Type.STOP, messages.RUN.pack(self._run), now)
 
@@ -189,9 +185,7 @@ class HostMachine:
             "clock": self.clock.describe(),
         }
 
-    # --- what comes in ------------------------------------------------------------------------
-
-    def _take(self, frame: Frame, now: float) -> None:
+    def _receive(self, frame: Frame, now: float) -> None:
         self._frame_at, self._rejected = now, self.decoder.rejected
         try:
             unpack, receive = self._receivers[frame.type]
@@ -202,7 +196,7 @@ class HostMachine:
             receive(message, frame.seq, now)
 
     def _add_samples(self, block: Block, seq: int, now: float) -> None:
-        if block.status.run != self._run or self._start is None:
+        if self._state is State.IDLE or block.status.run != self._run:
             return  # of a run that was stopped
         if block.first < self._expected:
             self.counters.duplicate_blocks += 1
@@ -224,9 +218,10 @@ class HostMachine:
     def _update(self, status: Status, seq: int, now: float) -> None:
         """Take in a STATUS; without progress it says that commands before the last are missing."""
         self._count(seq)
-        if status.run == self._run and self.commands.lacks(status.queued_until, now):
-            self._rewind(now)
-        self._learn(status, now)
+        if self._state is not State.IDLE and status.run == self._run:
+            if self.commands.lacks(status.queued_until, now):
+                self._rewind(now)
+            self._learn(status, now)
 
     def _answer(self, reply: Reply, seq: int, now: float) -> None:
         if reply.result is Result.NO_SESSION:
@@ -251,25 +246,22 @@ class HostMachine:
     def _learn(self, status: Status, now: float) -> None:
         """Take in the state of the device's queue and outputs, unless it is an old one."""
         old = self.status is not None and status.tick < self.status.tick
-        if status.run != self._run or self._start is None or old:
+        if self._state is State.IDLE or status.run != self._run or old:
             return
         self.status = status
         self.commands.acknowledge(status.queued_until, status.credit_until, now)
         self._pump(now)
-        if self._going and status.latch is Latch.WATCHDOG:
+        if self._state is State.RUNNING and status.latch is Latch.WATCHDOG:
             self._fail(self._why_tripped(now, self._start.watchdog))
-        elif self._going and status.state is State.IDLE and self.pending is None:
+        elif self._state is State.RUNNING and status.state is State.IDLE and self.pending is None:
             self._fail("the device has ended the run by itself; its outputs are zero")
 
-    # --- what goes out ------------------------------------------------------------------------
-
     def _send(self, type_: Type, payload: bytes) -> None:
-        self._seq = (self._seq + 1) & 0xFFFF
-        self._outbox.append(codec.encode(type_, self.session, self._seq, payload))
+        self._outbox.append(codec.encode(type_, self.session, next(self._sequence), payload))
 
     def _rewind(self, now: float) -> None:
         """Send again the commands that an open loop's device lacks; a closed loop holds on."""
-        if self._start is not None and self._start.mode is Mode.OPEN_LOOP:
+        if self._start.mode is Mode.OPEN_LOOP:
             self.counters.resent_commands += self.commands.rewind(now)
             self._pump(now)
 
@@ -301,8 +293,6 @@ class HostMachine:
             request.sent = now
             self.counters.retries += 1
             self._outbox.append(request.frame)
-
-    # --- failures -----------------------------------------------------------------------------
 
     def _why_unanswered(self, name: str, now: float) -> str:
         if now - self._frame_at < 0.5 * GIVE_UP:

@@ -91,7 +91,7 @@ class Result(enum.IntEnum):
     UNKNOWN = 5
 
 
-# By their numbers; quicker than the enums.
+# By their numbers on the wire; quicker than the enums.
 _STATES, _LATCHES, _MODES = tuple(State), tuple(Latch), tuple(Mode)
 
 RUN = struct.Struct("<H")
@@ -253,10 +253,10 @@ class Reply(NamedTuple):
 class CodedGuard(NamedTuple):
     """A ``daq.hal.Guard`` in converter codes and counts; a range's ends: not watched."""
 
-    command_low: tuple[int, ...]
-    command_high: tuple[int, ...]
-    analog_low: tuple[int, ...]
-    analog_high: tuple[int, ...]
+    command_low: Sequence[int]
+    command_high: Sequence[int]
+    analog_low: Sequence[int]
+    analog_high: Sequence[int]
     counts_low: int
     counts_high: int
     count_rate: float
@@ -286,8 +286,7 @@ class Start(NamedTuple):
     def unpack(cls, payload: bytes) -> Self:
         """The message."""
         run, mode, period, watchdog, *codes = _START.unpack(payload)
-        low, high, under, over = (codes[a:b] for a, b in ((0, 2), (2, 4), (4, 7), (7, 10)))
-        guard = CodedGuard(tuple(low), tuple(high), tuple(under), tuple(over), *codes[10:])
+        guard = CodedGuard(codes[:2], codes[2:4], codes[4:7], codes[7:10], *codes[10:])
         return cls(run, _MODES[mode], period, watchdog, guard)
 
 

@@ -107,9 +107,9 @@ class Line:
             arrived.append(self._due.popleft()[1])
         return b"".join(arrived)
 
-    def next_arrival(self) -> float | None:
-        """When the next bytes arrive, or None."""
-        return self._due[0][0] if self._due else None
+    def next_arrival(self) -> float:
+        """When the next bytes arrive; infinity when none are on the way."""
+        return self._due[0][0] if self._due else math.inf
 
     def clear(self) -> None:
         """Lose what is on the way."""

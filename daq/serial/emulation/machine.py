@@ -6,6 +6,7 @@ A program around it feeds bytes as they come (``receive``), calls ``poll`` no la
 """
 
 import contextlib
+import itertools
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
@@ -16,7 +17,7 @@ import numpy as np
 from daq.hal import ANALOG_INPUTS, CHANNELS, Flag, Mode
 from daq.serial import codec, messages
 from daq.serial.codec import Decoder, Frame
-from daq.serial.emulation.command_ring import CommandRing
+from daq.serial.commands import CommandRing
 from daq.serial.messages import Block, Latch, Pong, Reply, Result, Start, State, Status, Type
 
 BLOCK_SECONDS = 0.02
@@ -74,10 +75,10 @@ class DeviceMachine:
         self._session = 0  # none yet
         self._answered: tuple[int, bytes] | None = None  # last request's seq, and its answer
         self._start: Start  # from the first that is carried out
-        self._seq = self._run = self._origin = self._overflow = self._first = 0
+        self._sequence = itertools.count(1)
+        self._run = self._origin = self._overflow = self._first = 0
         self._samples: list[messages.Records] = []
         self._outbox: deque[bytes] = deque()
-        self._backlog = 0
         # How a request's payload is unpacked, and what carries it out.
         self._requests: dict[int, tuple[Callable[[bytes], Any], Callable[..., Result]]] = {
             Type.START: (Start.unpack, self._arm),
@@ -87,8 +88,6 @@ class DeviceMachine:
             Type.SAFE: (bytes, self._safe),
             Type.CLEAR: (bytes, self._clear),
         }
-
-    # --- the program around it ----------------------------------------------------------------
 
     def receive(self, data: bytes, now: int) -> None:
         """Take bytes from the line that arrived at ``now``."""
@@ -126,13 +125,7 @@ class DeviceMachine:
 
     def take(self) -> bytes | None:
         """The next frame to write, or None."""
-        if not self._outbox:
-            return None
-        frame = self._outbox.popleft()
-        self._backlog -= len(frame)
-        return frame
-
-    # --- frames -------------------------------------------------------------------------------
+        return self._outbox.popleft() if self._outbox else None
 
     def _dispatch(self, frame: Frame, now: int) -> None:
         if frame.type == Type.COMMANDS:
@@ -141,7 +134,7 @@ class DeviceMachine:
             with contextlib.suppress(*messages.MALFORMED):
                 (stamp,) = messages.PING.unpack(frame.payload)
                 pong = Pong(stamp, now, now, self._status())
-                self._write(codec.encode(Type.PONG, frame.session, frame.seq, pong.pack()))
+                self._answer(frame, Type.PONG, pong.pack())
         else:
             self._request(frame, now)
 
@@ -157,19 +150,18 @@ class DeviceMachine:
             self._end()
             self._session, self._answered, self.heard = frame.session, None, now
             self._outbox.clear()
-            self._backlog = 0
             if self.latch is not Latch.WATCHDOG:
                 self.latch = Latch.NONE
             self._board.connect()
         welcome = replace(self.identity, latch=self.latch)
-        self._write(codec.encode(Type.WELCOME, frame.session, frame.seq, welcome.pack()))
+        self._answer(frame, Type.WELCOME, welcome.pack())
 
     def _request(self, frame: Frame, now: int) -> None:
         """Carry out a request once, however often it comes."""
         if self._answered is not None:
             ahead = (frame.seq - self._answered[0]) & 0xFFFF
             if ahead == 0:
-                self._write(self._answered[1])
+                self._outbox.append(self._answered[1])
             if ahead == 0 or ahead >= _NEWER:
                 return  # a repetition, or one that was overtaken
         result = self._carry_out(frame, now)
@@ -198,8 +190,6 @@ class DeviceMachine:
         self._end()
         self.latch = Latch.NONE
         return Result.OK
-
-    # --- the run ------------------------------------------------------------------------------
 
     def _arm(self, start: Start, now: int) -> Result:
         if not self._possible(start):
@@ -309,8 +299,6 @@ class DeviceMachine:
         self._samples = []
         self.state = State.IDLE
 
-    # --- what goes out ------------------------------------------------------------------------
-
     def _waiting(self) -> int:
         return sum(map(len, self._samples))
 
@@ -328,20 +316,17 @@ class DeviceMachine:
         self._samples = []
         lost = min(self.to_lose, len(joined))
         self.to_lose -= lost
-        self._pass_over(lost)
+        self._overflow += lost
+        self._first += lost
         for at in range(lost, len(joined), _LARGEST_BLOCK):
             part = joined[at : at + _LARGEST_BLOCK]
-            if self._backlog > TRANSMIT_BUFFER:
-                self._pass_over(len(part))
-                continue
-            time = self._origin + self._first * self._start.period
-            block = Block(self._status(), self._first, time, part)
-            self._send(Type.SAMPLES, block.pack())
+            if sum(map(len, self._outbox)) > TRANSMIT_BUFFER:
+                self._overflow += len(part)
+            else:
+                time = self._origin + self._first * self._start.period
+                block = Block(self._status(), self._first, time, part)
+                self._send(Type.SAMPLES, block.pack())
             self._first += len(part)
-
-    def _pass_over(self, samples: int) -> None:
-        self._overflow += samples
-        self._first += samples
 
     def _status(self) -> Status:
         ring = self._ring
@@ -349,15 +334,12 @@ class DeviceMachine:
         return Status(self._run, self.state, self.latch, *queue, self._overflow)
 
     def _reply(self, frame: Frame, result: Result) -> bytes:
-        answer = Reply(frame.type, result, self._status()).pack()
-        reply = codec.encode(Type.REPLY, frame.session, frame.seq, answer)
-        self._write(reply)
-        return reply
+        return self._answer(frame, Type.REPLY, Reply(frame.type, result, self._status()).pack())
+
+    def _answer(self, frame: Frame, type_: Type, payload: bytes) -> bytes:
+        answer = codec.encode(type_, frame.session, frame.seq, payload)
+        self._outbox.append(answer)
+        return answer
 
     def _send(self, type_: Type, payload: bytes) -> None:
-        self._seq = (self._seq + 1) & 0xFFFF
-        self._write(codec.encode(type_, self._session, self._seq, payload))
-
-    def _write(self, frame: bytes) -> None:
-        self._outbox.append(frame)
-        self._backlog += len(frame)
+        self._outbox.append(codec.encode(type_, self._session, next(self._sequence), payload))
