@@ -66,8 +66,8 @@ def codec_speed(block: int, samples: int) -> dict[str, float]:
         decoder, n = Decoder(), 0
         # As the host reads: what 20 ms bring, made into volts.
         for frame in frames:
-            parts = [messages.unpack_samples(item.payload) for item in decoder.feed(frame)]
-            records = messages.joined([part for part in parts if part is not None])
+            parts = [Block.unpack(item.payload) for item in decoder.feed(frame)]
+            records = messages.joined(parts)
             n += len(records["analog"] * 3e-4)
         return n
 

@@ -29,9 +29,8 @@ from daq.hal import (
 )
 from sim_rig.device import command_queue, converters
 from sim_rig.device.command_queue import CommandQueue
-from sim_rig.device.converters import Converters
+from sim_rig.device.converters import Converters, Interlock
 from sim_rig.device.encoder import EncoderCounter
-from sim_rig.device.interlock import Interlock
 from sim_rig.device.user import SimulatedUser
 from sim_rig.plant import Plant, state_sizes
 from sysid import ProcessModel, Stepper
@@ -284,7 +283,7 @@ class SimulatedDevice:
     def _play(self, applied: FloatArray, flags: IntArray, guarded: bool) -> RawSamples:
         """Simulate the ticks; where an input passes its guard, again with zeros from there."""
         n = len(applied)
-        noise, encoder = self._unit_noise(n), self._encoder.copy()
+        noise, memory = self._unit_noise(n), self._encoder.memory.copy()
         raw, trace = self._simulate(applied, flags, noise)
         row = self._interlock.first_beyond(raw.analog, raw.counts, raw.count_rate) if guarded else n
         if row < n:
@@ -292,7 +291,7 @@ class SimulatedDevice:
             flags[row:] = 0
             flags[row] = _INTERLOCK
             # The trace begins with where the ticks began.
-            self._x, self._encoder = trace[0].copy(), encoder
+            self._x, self._encoder.memory = trace[0].copy(), memory
             raw, _ = self._simulate(applied, flags, noise)
             self._queue.latch()
         self._queue.advance(n)

@@ -46,7 +46,7 @@ def emulate(
     from daq.lookup.rigs import load_rig
     from daq.run.realtime import RealTime
     from daq.serial.emulation import faults
-    from daq.serial.emulation.emulator import emulate as serve
+    from daq.serial.emulation.emulator import Emulator
     from daq.serial.emulation.endpoints import port_of
 
     if "help" in (fault or []):
@@ -72,7 +72,8 @@ def emulate(
         sys.stdout.flush()
 
     port = port_of(link, tcp)
-    serve(device, config.name, port, chosen, 1e-6 * drift, seed, journal, ready)
+    emulator = Emulator(device, config.name, port, chosen, 1e-6 * drift, seed)
+    emulator.serve(journal, ready)
 
 
 def _list_faults(json: bool) -> None:

@@ -10,7 +10,8 @@ from typer import Argument, Option
 from daq.cli import options, terminal
 
 if TYPE_CHECKING:
-    from daq.serial.ports import Inquiry, PortFacts
+    from daq.serial.connection import Inquiry
+    from daq.serial.ports import PortFacts
 
 
 def ports(
@@ -25,7 +26,8 @@ def ports(
     json: options.AsJson = False,
 ) -> None:
     """List serial ports, and who answers there."""
-    from daq.serial.ports import Inquiry, inquire, ports_of
+    from daq.serial.connection import Inquiry, inquire
+    from daq.serial.ports import ports_of
 
     wanted = ports_of(names or [])
     inquiries = [Inquiry(port) for port in wanted] if unasked else inquire(wanted, baud)

@@ -10,8 +10,7 @@ from typing import Literal
 
 from daq.files import make_folder
 from daq.run.realtime import RealTime
-from daq.serial.link import latency_timer, permission_cure
-from daq.serial.ports import PortFacts
+from daq.serial.ports import PortFacts, latency_timer, permission_cure
 
 Verdict = Literal["good", "could be better", "bad"]
 

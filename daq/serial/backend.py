@@ -1,23 +1,28 @@
 """A rig on a serial port, as a ``daq.hal.Device``."""
 
 import contextlib
+import math
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 import numpy as np
+import numpy.typing as npt
 from pydantic import Field
 
 from daq.config.base import Section
 from daq.config.units import Seconds, Unit
 from daq.errors import DeviceError
-from daq.hal import DeviceInfo, FloatArray, Guard, Mode, Phase, RawSamples
+from daq.hal import ANALOG_INPUTS, CHANNELS, DeviceInfo, FloatArray, Guard, Mode, Phase, RawSamples
 from daq.serial import messages
 from daq.serial.connection import Connection
-from daq.serial.messages import Latch, LoopMode, Start, Type, Welcome
-from daq.serial.scaling import Scaling
+from daq.serial.host import HostMachine
+from daq.serial.messages import Block, Channel, CodedGuard, Codes, Latch, Start, Type, Welcome
 
 _SAFE_PATIENCE = 0.25  # s to hear that the outputs are zero
-_PRELOAD_PATIENCE = 2.0  # s for the device to take what is sent ahead
 _RATE_TOLERANCE = 5e-5  # as good as a quartz
+_N_IN, _N_OUT = len(ANALOG_INPUTS), len(CHANNELS)
+_ROUNDING = 1e-9  # codes, by which a quotient may miss a whole number
+_LARGEST_RATE = float(np.finfo(np.float32).max)  # 1/s
 
 
 class SerialOptions(Section):
@@ -53,8 +58,7 @@ class SerialDevice:
 
     def open(self) -> DeviceInfo:
         """Connect, agree on the protocol, and clear what an earlier run left behind."""
-        if self._connection is not None:
-            self.close()
+        self.close()
         if not self.options.port:
             raise DeviceError(
                 "no port is named; write options.port in the rig file or give --port. 'rig ports' "
@@ -62,10 +66,9 @@ class SerialDevice:
             )
         options = self.options
         connection = Connection(options.port, options.baud, options.watchdog)
-        welcome = connection.welcome
-        self._connection, self._warnings = connection, connection.warnings
+        welcome, self._warnings = connection.welcome, connection.warnings
         self._facts = {
-            "port": self.options.port,
+            "port": options.port,
             "device": welcome.device,
             "firmware": welcome.firmware,
             "serial_number": welcome.serial,
@@ -76,15 +79,15 @@ class SerialDevice:
             connection.check_delay()
             connection.ask(Type.CLEAR)
         except BaseException:
-            self._disconnect()
+            connection.close()
             raise
-        self._scaling = Scaling(welcome.channels)
+        self._connection, self._scaling = connection, Scaling(welcome.channels)
         volts_in = self._scaling.input_range
         return DeviceInfo(_name(welcome), welcome.max_rate, welcome.queue, volts_in)
 
     def announce(self, phase: Phase, turns: float = 0.0) -> None:
         """Tell the device which phase begins; an emulator's user winds the handle then."""
-        payload = messages.pack_announce(list(Phase).index(phase), turns)
+        payload = messages.ANNOUNCE.pack(list(Phase).index(phase), turns)
         self._opened().ask(Type.ANNOUNCE, payload)
 
     def start(self, sample_rate: float, mode: Mode, guard: Guard) -> None:
@@ -93,8 +96,7 @@ class SerialDevice:
         self._run = (self._run + 1) & 0xFFFF
         self._going = False
         period, watchdog = self._timing(sample_rate, connection.welcome)
-        loop = LoopMode.OPEN if mode is Mode.OPEN_LOOP else LoopMode.CLOSED
-        start = Start(self._run, loop, period, watchdog, self._scaling.coded(guard))
+        start = Start(self._run, mode, period, watchdog, self._scaling.coded(guard))
         connection.schedule_as_caller()
         self._armed = True
         connection.request(lambda machine, now: machine.start(start, now))
@@ -107,13 +109,14 @@ class SerialDevice:
 
     def room(self) -> int:
         """Commands that may be sent now."""
-        return self._sampling().act(lambda machine, now: machine.room)
+        return self._sampling().act(lambda machine, now: machine.commands.room)
 
     def receive(self) -> RawSamples:
         """Samples received so far; waits for the first."""
         connection = self._sampling()
         if not self._going:
-            self._go(connection)
+            connection.go()
+            self._going = True
         return self._scaling.samples(connection.samples())
 
     def stop(self) -> None:
@@ -121,7 +124,7 @@ class SerialDevice:
         connection = self._opened()
         self._armed = False
         self._record = connection.describe()
-        connection.request(lambda machine, now: machine.stop(now))
+        connection.request(HostMachine.stop)
 
     def safe(self) -> None:
         """Zero both outputs now. Where the device cannot be reached, its watchdog does it."""
@@ -133,10 +136,13 @@ class SerialDevice:
     def close(self) -> None:
         """Zero the outputs and disconnect."""
         self.safe()
-        if self._connection is not None and self._armed:
+        if self._connection is None:
+            return
+        if self._armed:
             with contextlib.suppress(DeviceError):
                 self.stop()
-        self._disconnect()
+        self._connection.close()
+        self._connection = None
 
     def report(self) -> dict[str, Any]:
         """Device, connection and line, for the record of a run."""
@@ -144,17 +150,15 @@ class SerialDevice:
             return {}
         if self._connection is not None and self._armed:
             self._record = self._connection.describe()
-        warnings = [*self._warnings, *_losses(self._record.get("line", {}))]
+        line = self._record.get("line", {})
+        warnings = list(self._warnings)
+        if line.get("lost_samples"):
+            warnings.append(
+                f"{line['lost_samples']} samples were lost ({line['device_overflow_samples']} of "
+                "them by the device, for which the line was too slow) and "
+                f"{line['rejected_frames']} damaged frames refused; the log shows the gaps"
+            )
         return {**self._facts, "warnings": warnings, **self._record}
-
-    def _disconnect(self) -> None:
-        if self._connection is None:
-            return
-        if self._armed:
-            self._record = self._connection.describe()
-        self._armed = False
-        self._connection.close()
-        self._connection = None
 
     def _opened(self) -> Connection:
         if self._connection is None:
@@ -189,27 +193,70 @@ class SerialDevice:
             )
         return period, watchdog
 
-    def _go(self, connection: Connection) -> None:
-        """Start the clock once the device has what was sent ahead."""
-        if not connection.wait_for_preload(_PRELOAD_PATIENCE):
-            raise DeviceError(
-                "the device does not take the commands sent ahead; the line loses more "
-                "than it carries. Look at cable and baud rate"
-            )
-        connection.request(lambda machine, now: machine.go(now))
-        self._going = True
-
 
 def _name(welcome: Welcome) -> str:
     return f"{welcome.device} (firmware {welcome.firmware})"
 
 
-def _losses(line: dict[str, Any]) -> list[str]:
-    """A warning of what the line lost of a run."""
-    lost, dropped = line.get("lost_samples", 0), line.get("device_overflow_samples", 0)
-    if not lost:
-        return []
-    return [
-        f"{lost} samples were lost ({dropped} of them by the device, for which the line was too "
-        f"slow) and {line['rejected_frames']} damaged frames refused; the log shows the gaps"
-    ]
+class Scaling:
+    """Scales of a device's codes. input_range: volts that every analog input can measure."""
+
+    def __init__(self, channels: Sequence[Channel]) -> None:
+        inputs, outputs = channels[:_N_IN], channels[_N_IN : _N_IN + _N_OUT]
+        self.input_range = max(c.low for c in inputs), min(c.high for c in inputs)
+        self._in_scale, self._in_offset = _columns(inputs)
+        self._out_scale, self._out_offset = _columns(outputs)
+        self._guard: Guard  # of the run
+
+    def coded(self, guard: Guard) -> CodedGuard:
+        """A run's guard in codes; commands within its clamps stay within them from now on."""
+        low, high = self._out(guard.command_low), self._out(guard.command_high)
+        self._low, self._high = _within(low, high, np.int16)
+        self._guard = guard
+        analog = _within(self._in(guard.analog_low), self._in(guard.analog_high), np.int32)
+        counts = _within(guard.counts_low, guard.counts_high, np.int32)
+        rate = guard.count_rate if guard.count_rate < _LARGEST_RATE else math.inf
+        _, step = _within(0.0, guard.count_step, np.uint32)
+        return CodedGuard(self._low, self._high, *analog, *counts, rate, step)
+
+    def commands(self, volts: FloatArray) -> Codes:
+        """Converter codes (n, 2) of commands (n, 2) [V], the nearest to each.
+
+        A command within the clamps is not rounded to beyond them, where the device would flag it.
+        """
+        codes = np.rint(self._out(volts))
+        codes = np.where(volts <= self._guard.command_high, np.minimum(codes, self._high), codes)
+        codes = np.where(volts >= self._guard.command_low, np.maximum(codes, self._low), codes)
+        info = np.iinfo(np.int16)
+        return np.clip(codes, info.min, info.max).astype(messages.COMMAND_DTYPE)
+
+    def samples(self, blocks: Sequence[Block]) -> RawSamples:
+        """Blocks of records in volts and counts."""
+        records = messages.joined(blocks)
+        ticks = [np.arange(b.first, b.first + len(b.records), dtype=np.int64) for b in blocks]
+        return RawSamples(
+            tick=np.concatenate(ticks),
+            analog=records["analog"] * self._in_scale + self._in_offset,
+            counts=records["counts"].astype(np.float64),
+            count_rate=records["count_rate"].astype(np.float64),
+            applied=records["applied"] * self._out_scale + self._out_offset,
+            flags=records["flags"].astype(np.int64),
+        )
+
+    def _in(self, volts: FloatArray) -> FloatArray:
+        return np.asarray((volts - self._in_offset) / self._in_scale, dtype=np.float64)
+
+    def _out(self, volts: FloatArray) -> FloatArray:
+        return np.asarray((volts - self._out_offset) / self._out_scale, dtype=np.float64)
+
+
+def _columns(channels: Sequence[Channel]) -> tuple[FloatArray, FloatArray]:
+    return np.array([c.scale for c in channels]), np.array([c.offset for c in channels])
+
+
+def _within(low: npt.ArrayLike, high: npt.ArrayLike, kind: type[np.integer]) -> tuple[Any, Any]:
+    """The outermost whole numbers of an integer type within limits; infinite ones are its ends."""
+    bounds = np.iinfo(kind)
+    ends = np.ceil(np.asarray(low) - _ROUNDING), np.floor(np.asarray(high) + _ROUNDING)
+    lowest, highest = (np.clip(end, bounds.min, bounds.max).astype(np.int64) for end in ends)
+    return lowest.tolist(), highest.tolist()

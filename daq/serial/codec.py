@@ -57,9 +57,7 @@ def decode(coded: bytes) -> Frame | None:
     if len(body) < _SMALLEST:
         return None
     type_, reserved, session, seq, length = _HEADER.unpack_from(body)
-    if length != len(body) - _SMALLEST or reserved != 0:
-        return None
-    if zlib.crc32(body) != _RESIDUE:
+    if length != len(body) - _SMALLEST or reserved != 0 or zlib.crc32(body) != _RESIDUE:
         return None
     return Frame(type_, session, seq, body[_HEADER.size : -_CRC.size])
 
@@ -83,14 +81,8 @@ class Decoder:
         *pieces, rest = (self._partial + data).split(b"\0")
         # What is longer than any frame stays so, and is rejected at the next zero.
         self._partial = rest[: _LONGEST + 1]
-        frames = []
-        for piece in pieces:
-            if not piece:
-                continue
-            frame = decode(piece)
-            if frame is None:
-                self.rejected += 1
-            else:
-                self.accepted += 1
-                frames.append(frame)
+        decoded = [decode(piece) for piece in pieces if piece]
+        frames = [frame for frame in decoded if frame is not None]
+        self.accepted += len(frames)
+        self.rejected += len(decoded) - len(frames)
         return frames

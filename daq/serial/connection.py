@@ -1,4 +1,4 @@
-"""A session with the device behind a port: its machine, and the threads that serve it."""
+"""A session with the device behind a port: its machine, its threads, and who answers."""
 
 import contextlib
 import getpass
@@ -8,19 +8,23 @@ import platform
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from daq.errors import DeviceError
 from daq.serial import messages
+from daq.serial.codec import Decoder
 from daq.serial.host import GIVE_UP, HostMachine, refusal
-from daq.serial.link import open_link
 from daq.serial.messages import Block, Result, Type, Welcome
+from daq.serial.ports import PortFacts, open_link
 
 _HANDSHAKE = 2.0  # s in which a device says who it is: a board resets in less
 _FEED = 0.01  # s between two looks at what is to be sent, or sent again
 _PINGS = 6  # round trips measured before a run
 _PING_PATIENCE = 0.5  # s for all of them
+_PRELOAD_PATIENCE = 2.0  # s for the device to take what is sent ahead
 _PATIENCE = 1.0  # s without a call from the run until the watchdog is no longer fed
 _LOOK = 0.05  # s between two looks at the clock while waiting
 
@@ -42,13 +46,14 @@ class Connection:
         self._port = port
         self._watchdog = watchdog
         self._link = open_link(port, baud)
-        session = int.from_bytes(os.urandom(2), "little") or 1
-        self._machine = HostMachine(session, f"{_user()}@{platform.node()}")
+        self._machine = HostMachine(int.from_bytes(os.urandom(2), "little") or 1)
         self._leaving = threading.Event()
         self._changed = threading.Condition()
         self._called = 0.0
         self._threads = [
-            threading.Thread(target=work, name=f"serial rig, {name}", daemon=True)
+            threading.Thread(
+                target=self._serve, args=(work,), name=f"serial rig, {name}", daemon=True
+            )
             for name, work in (("reading", self._read), ("watchdog", self._feed))
         ]
         for thread in self._threads:
@@ -58,7 +63,7 @@ class Connection:
         except BaseException:
             self.close()
             raise
-        self.warnings = list(self._link.warnings)
+        self.warnings = self._link.warnings
 
     def close(self) -> None:
         """Disconnect; the device's watchdog does the rest."""
@@ -78,7 +83,7 @@ class Connection:
     def request(self, action: Callable[[HostMachine, float], None]) -> None:
         """Act, and wait until the device has answered. Raises DeviceError for a refusal."""
         self.act(action)
-        self._wait(lambda: not self._machine.waiting)
+        self._wait(lambda: self._machine.pending is None)
         reply, failure = self._machine.reply, self._machine.failure
         # Samples that came before a failure are still to be had from samples().
         if reply is None and failure is not None:
@@ -92,19 +97,25 @@ class Connection:
 
     def samples(self) -> list[Block]:
         """Blocks received so far; waits for the first."""
-        blocks = self._machine.blocks
+        machine = self._machine
         with self._changed:
-            if not self._wait(lambda: bool(blocks)) and self._machine.failure is not None:
-                raise self._machine.failure
+            if not self._wait(lambda: bool(machine.blocks)) and machine.failure is not None:
+                raise machine.failure
             self._called = time.monotonic()
-            taken = list(blocks)
-            blocks.clear()
+            taken, machine.blocks = machine.blocks, []
         return taken
 
-    def wait_for_preload(self, patience: float) -> bool:
-        """Wait until the device has what was sent ahead; whether it has within so long [s]."""
-        preloaded = self._wait(lambda: self._machine.preloaded, time.monotonic() + patience)
-        return preloaded or self._machine.failure is not None
+    def go(self) -> None:
+        """Start the clock once the device has what was sent ahead."""
+        machine = self._machine
+        deadline = time.monotonic() + _PRELOAD_PATIENCE
+        preloaded = self._wait(lambda: machine.commands.preloaded, deadline)
+        if not preloaded and machine.failure is None:
+            raise DeviceError(
+                "the device does not take the commands sent ahead; the line loses more "
+                "than it carries. Look at cable and baud rate"
+            )
+        self.request(HostMachine.go)
 
     def describe(self) -> dict[str, Any]:
         """The line's record."""
@@ -122,8 +133,9 @@ class Connection:
             return
         if not clock.round_trips and decoder.rejected:
             raise DeviceError(
-                f"{self._port}: {decoder.rejected} damaged frames came, and not one answer in "
-                f"{1e3 * _PING_PATIENCE:.0f} ms; check cable, connectors and baud rate"
+                f"{decoder.rejected} damaged frames came, and not one answer in "
+                f"{1e3 * _PING_PATIENCE:.0f} ms; check cable, connectors and baud rate",
+                file=self._port,
             )
         slow = (
             f"took {1e3 * clock.quickest:.0f} ms to answer"
@@ -131,9 +143,10 @@ class Connection:
             else f"does not answer within {1e3 * _PING_PATIENCE:.0f} ms"
         )
         raise DeviceError(
-            f"{self._port}: the device {slow}, too slow for its watchdog of "
-            f"{1e3 * self._watchdog:.0f} ms. Look at the adapter's latency timer ('rig "
-            "doctor'), at a hub in between, or raise options.watchdog in the rig file"
+            f"the device {slow}, too slow for its watchdog of {1e3 * self._watchdog:.0f} ms. Look "
+            "at the adapter's latency timer ('rig doctor'), at a hub in between, or raise "
+            "options.watchdog in the rig file",
+            file=self._port,
         )
 
     def schedule_as_caller(self) -> None:
@@ -149,21 +162,23 @@ class Connection:
                     break
 
     def _shake_hands(self) -> Welcome:
-        machine, port = self._machine, self._port
-        self.act(lambda machine, now: machine.hello(now, _HANDSHAKE))
-        self._wait(lambda: not machine.waiting)
+        machine = self._machine
+        host = messages.pack_hello(f"{_user()}@{platform.node()}")
+        self.act(lambda machine, now: machine.ask(Type.HELLO, host, now, _HANDSHAKE))
+        self._wait(lambda: machine.pending is None)
         if machine.failure is not None:
             raise machine.failure
         if machine.other_version is not None:
-            raise DeviceError(_version_mismatch(port, machine.other_version))
+            raise DeviceError(_version_mismatch(machine.other_version), file=self._port)
         welcome = machine.welcome
         if welcome is None:
-            raise DeviceError(_no_answer(port, machine))
+            raise DeviceError(_no_answer(machine.decoder), file=self._port)
         names = tuple(channel.name for channel in welcome.channels)
         if names != messages.CHANNEL_NAMES:
             raise DeviceError(
-                f"{port}: {welcome.device} has the channels {', '.join(names) or 'none'}, "
-                f"not {', '.join(messages.CHANNEL_NAMES)}; its firmware is for another rig"
+                f"{welcome.device} has the channels {', '.join(names) or 'none'}, "
+                f"not {', '.join(messages.CHANNEL_NAMES)}; its firmware is for another rig",
+                file=self._port,
             )
         return welcome
 
@@ -183,45 +198,65 @@ class Connection:
                 self._changed.wait(min(_LOOK, deadline - self._called))
         return True
 
-    # --- the threads --------------------------------------------------------------------------
+    def _serve(self, work: Callable[[], None]) -> None:
+        """Do a thread's work until the session ends, be it by a port that fails."""
+        failure: DeviceError | None = None
+        try:
+            work()
+        except DeviceError as error:
+            failure = error
+        with self._changed:
+            self._machine.failure = self._machine.failure or failure
+            self._changed.notify_all()
 
     def _read(self) -> None:
         while not self._leaving.is_set() and self._machine.failure is None:
-            try:
-                data = self._link.read()
-                if data:
-                    with self._changed:
-                        self._machine.feed(data, time.monotonic())
-                        self._write()
-                        self._changed.notify_all()
-            except DeviceError as error:
-                self._fail(error)
-        with self._changed:
-            self._changed.notify_all()
+            data = self._link.read()
+            if data:
+                with self._changed:
+                    self._machine.feed(data, time.monotonic())
+                    self._write()
+                    self._changed.notify_all()
 
     def _feed(self) -> None:
         machine, pause = self._machine, min(_FEED, 0.2 * self._watchdog)
         while not self._leaving.wait(pause) and machine.failure is None:
-            try:
-                with self._changed:
-                    now, waiting = time.monotonic(), machine.waiting
-                    machine.poll(now, keep_alive=now - self._called < _PATIENCE)
-                    self._write()
-                    if machine.failure is not None or machine.waiting != waiting:
-                        self._changed.notify_all()
-            except DeviceError as error:
-                self._fail(error)
-
-    def _fail(self, error: DeviceError) -> None:
-        with self._changed:
-            self._machine.failure = self._machine.failure or error
-            self._changed.notify_all()
+            with self._changed:
+                now, pending = time.monotonic(), machine.pending
+                machine.poll(now, keep_alive=now - self._called < _PATIENCE)
+                self._write()
+                if machine.failure is not None or machine.pending is not pending:
+                    self._changed.notify_all()
 
     def _write(self) -> None:
         """Write the machine's frames; the lock is held, so they stay whole."""
         data = self._machine.take()
         if data:
             self._link.write(data)
+
+
+@dataclass(frozen=True)
+class Inquiry:
+    """Who answers on a port, or why nobody does; neither where nobody was asked."""
+
+    port: PortFacts
+    welcome: Welcome | None = None
+    problem: str | None = None
+
+
+def inquire(ports: Sequence[PortFacts], baud: int) -> list[Inquiry]:
+    """Ask all ports at once who is there; takes as long as the slowest answer."""
+    with ThreadPoolExecutor(max(1, len(ports))) as pool:
+        return list(pool.map(lambda port: _inquire(port, baud), ports))
+
+
+def _inquire(port: PortFacts, baud: int) -> Inquiry:
+    try:
+        connection = Connection(port.name, baud)
+    except DeviceError as error:
+        return Inquiry(port, problem=error.mistakes[0].problem)
+    connection.close()
+    return Inquiry(port, connection.welcome)
 
 
 def _user() -> str:
@@ -231,30 +266,25 @@ def _user() -> str:
         return "unknown"
 
 
-def _version_mismatch(port: str, version: int) -> str:
-    mismatch = (
-        f"{port}: the device speaks version {version} of the protocol, this program "
-        f"{messages.VERSION}"
-    )
+def _version_mismatch(version: int) -> str:
+    spoken = f"the device speaks version {version} of the protocol, this program {messages.VERSION}"
     if version > messages.VERSION:
-        return f"{mismatch}. This program is the old one: update hybrid-rig"
-    return f"{mismatch}. The device's firmware is the old one: update that"
+        return f"{spoken}. This program is the old one: update hybrid-rig"
+    return f"{spoken}. The device's firmware is the old one: update that"
 
 
-def _no_answer(port: str, machine: HostMachine) -> str:
-    decoder = machine.decoder
+def _no_answer(decoder: Decoder) -> str:
     if decoder.accepted:
         return (
-            f"{port}: what answers speaks the protocol but does not say who it is; its firmware is "
+            "what answers speaks the protocol but does not say who it is; its firmware is "
             "incomplete"
         )
     if decoder.received:
         return (
-            f"{port}: {decoder.received} bytes came in {_HANDSHAKE:g} s but no frame of the "
-            "protocol; the baud rate is wrong, or it is another device ('rig ports' shows who "
-            "answers)"
+            f"{decoder.received} bytes came in {_HANDSHAKE:g} s but no frame of the protocol; the "
+            "baud rate is wrong, or it is another device ('rig ports' shows who answers)"
         )
     return (
-        f"{port}: no answer in {_HANDSHAKE:g} s; check that the device has power and runs the "
-        "firmware of the protocol, and that this is its port ('rig ports' shows who answers)"
+        f"no answer in {_HANDSHAKE:g} s; check that the device has power and runs the firmware of "
+        "the protocol, and that this is its port ('rig ports' shows who answers)"
     )

@@ -4,31 +4,19 @@ A program around it feeds bytes (``feed``), calls ``poll`` every few millisecond
 what ``take`` gives. Times are seconds of the host's monotonic clock.
 """
 
+import itertools
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 from daq.errors import DeviceError
-from daq.hal import CHANNELS
+from daq.hal import CHANNELS, Mode
 from daq.serial import codec, messages
 from daq.serial.clock import ClockEstimator
 from daq.serial.codec import Decoder, Frame
-from daq.serial.command_stream import CommandStream
-from daq.serial.messages import (
-    Block,
-    Codes,
-    Latch,
-    LoopMode,
-    Pong,
-    Reply,
-    Result,
-    Start,
-    State,
-    Status,
-    Type,
-    Welcome,
-)
+from daq.serial.commands import CommandStream
+from daq.serial.messages import Block, Latch, Pong, Reply, Result, Start, State, Status, Type
 
 RETRY = 0.1  # s until a request is sent again
 HELLO_RETRY = 0.2
@@ -51,7 +39,6 @@ class PendingRequest:
     type: Type
     seq: int
     frame: bytes
-    interval: float
     give_up: float
     sent: float
 
@@ -74,60 +61,59 @@ class HostMachine:
     """One session with a device.
 
     blocks: samples received, in order, for the program to take. failure: set once, when the
-    session cannot go on. welcome: who answered. status: the newest state of the device.
+    session cannot go on. welcome: who answered; other_version: of the protocol, of one that cannot
+    be understood. status: the newest state of the device. pending: the request that is outstanding;
+    reply: the answer to the last. commands: of the run, on their way to the device.
     """
 
-    def __init__(self, session: int, host: str) -> None:
+    def __init__(self, session: int) -> None:
         self.session = session
         self.decoder = Decoder()
         self.clock = ClockEstimator()
         self.counters = Counters()
-        self.blocks: deque[Block] = deque()
+        self.blocks: list[Block] = []
         self.failure: DeviceError | None = None
-        self.welcome: Welcome | None = None
-        self.status: Status | None = None
-        self.reply: Reply | None = None
+        self.welcome: messages.Welcome | None = None
         self.other_version: int | None = None
-        self._host = host
+        self.status: Status | None = None
+        self.pending: PendingRequest | None = None
+        self.reply: Reply | None = None
+        self.commands = CommandStream(queue=1, chunk=1)
         self._outbox: deque[bytes] = deque()
-        self._request: PendingRequest | None = None
         self._request_seq = 0
-        self._seq = 0
+        self._sequence = itertools.count(1)
         self._heard_seq: int | None = None
+        self._state = State.IDLE
         self._run = 0
-        self._start: Start | None = None
-        self._going = False
+        self._start: Start  # of the run, unless IDLE
         self._expected = 0  # tick of the next sample
-        self._commands = CommandStream(queue=1)
         self._sample_at = self._frame_at = self._pinged = 0.0
         self._rejected = 0  # damaged frames, by the time of the last good frame
         self._receivers: dict[int, tuple[Callable[[bytes], Any], Callable[..., None]]] = {
-            Type.SAMPLES: (messages.unpack_samples, self._add_samples),
-            Type.PONG: (messages.unpack_pong, self._add_round_trip),
-            Type.STATUS: (messages.unpack_status, self._update),
-            Type.REPLY: (messages.unpack_reply, self._answer),
+            Type.SAMPLES: (Block.unpack, self._add_samples),
+            Type.PONG: (Pong.unpack, self._add_round_trip),
+            Type.STATUS: (Status.unpack, self._update),
+            Type.REPLY: (Reply.unpack, self._answer),
             Type.WELCOME: (_unpack_welcome, self._greet),
         }
-
-    # --- the program around it ----------------------------------------------------------------
 
     def feed(self, data: bytes, now: float) -> None:
         """Take bytes that came from the line."""
         for frame in self.decoder.feed(data):
             if frame.session == self.session:
-                self._take(frame, now)
+                self._receive(frame, now)
 
     def poll(self, now: float, keep_alive: bool = True) -> None:
         """Send again what was not answered, keep the device's watchdog fed, notice silence."""
         self._retry(now)
-        if self._start is None or self.failure is not None:
+        if self._state is State.IDLE or self.failure is not None:
             return
         if keep_alive and now - self._pinged >= 0.25e-3 * self._start.watchdog:
             self.ping(now)
-        if self._commands.lags(now):
+        if self.commands.lags(now):
             self._rewind(now)
         self._pump(now)
-        if self._going and now - self._sample_at > SILENCE:
+        if self._state is State.RUNNING and now - self._sample_at > SILENCE:
             self._fail(self._why_silent(now))
 
     def take(self) -> bytes:
@@ -136,78 +122,53 @@ class HostMachine:
         self._outbox.clear()
         return data
 
-    # --- requests -----------------------------------------------------------------------------
+    def ask(self, type_: Type, payload: bytes, now: float, give_up: float = GIVE_UP) -> None:
+        """Send a request, in place of any that is outstanding.
 
-    def hello(self, now: float, give_up: float) -> None:
-        """Ask who is there; answered when ``welcome`` is set or ``other_version`` is."""
-        self.ask(Type.HELLO, messages.Hello(self._host).pack(), now, give_up, HELLO_RETRY)
-
-    def ask(
-        self,
-        type_: Type,
-        payload: bytes,
-        now: float,
-        give_up: float = GIVE_UP,
-        interval: float = RETRY,
-    ) -> None:
-        """Send a request, in place of any that is outstanding; answered when ``reply`` is set."""
+        HELLO is answered when ``welcome`` is set or ``other_version`` is, others when ``reply`` is.
+        """
         seq = self._request_seq = (self._request_seq + 1) & 0xFFFF
         frame = codec.encode(type_, self.session, seq, payload)
         self.reply = None
-        self._request = PendingRequest(type_, seq, frame, interval, now + give_up, now)
+        self.pending = PendingRequest(type_, seq, frame, now + give_up, now)
         self._outbox.append(frame)
-
-    @property
-    def waiting(self) -> bool:
-        """Whether a request is outstanding."""
-        return self._request is not None
 
     def ping(self, now: float) -> None:
         """Feed the watchdog, and learn about the clocks."""
-        if self._going:
+        if self._state is State.RUNNING:
             pause = now - self._pinged
             self.counters.longest_pause = max(self.counters.longest_pause, pause)
         self._pinged = now
-        self._send(Type.PING, messages.pack_ping(round(now * 1e9)))
-
-    # --- the run ------------------------------------------------------------------------------
+        self._send(Type.PING, messages.PING.pack(round(now * 1e9)))
 
     def start(self, start: Start, now: float) -> None:
         """Arm a run; commands may follow at once."""
         assert self.welcome is not None
-        self._run, self._start, self._going = start.run, start, False
+        self._state, self._run, self._start = State.ARMED, start.run, start
         self.blocks.clear()
         self.status = None
         self._expected = 0
-        self._commands = CommandStream(self.welcome.queue, now)
+        size = len(CHANNELS) * messages.COMMAND_DTYPE.itemsize
+        chunk = min(_CHUNK, (self.welcome.max_payload - messages.COMMANDS_OVERHEAD) // size)
+        self.commands = CommandStream(self.welcome.queue, chunk, now)
         self.ask(Type.START, start.pack(), now)
 
     def go(self, now: float) -> None:
         """Start the clock."""
-        self._going = True
+        self._state = State.RUNNING
         self._sample_at = self._pinged = now
-        self.ask(Type.GO, messages.pack_run(self._run), now)
+        self.ask(Type.GO, messages.RUN.pack(self._run), now)
 
     def stop(self, now: float) -> None:
         """End the run; samples still on their way are not wanted."""
-        self._start, self._going = None, False
+        self._state = State.IDLE
         self.blocks.clear()
-        self.ask(Type.STOP, messages.pack_run(self._run), now)
+        self.ask(Type.STOP, messages.RUN.pack(self._run), now)
 
-    def send(self, tick: int, codes: Codes, now: float) -> None:
+    def send(self, tick: int, codes: messages.Codes, now: float) -> None:
         """Queue commands (n, 2) from ``tick`` on; they go out as the device has room."""
-        self._commands.give(tick, codes, now)
+        self.commands.give(tick, codes, now)
         self._pump(now)
-
-    @property
-    def room(self) -> int:
-        """Commands that may still be sent."""
-        return self._commands.room
-
-    @property
-    def preloaded(self) -> bool:
-        """Whether the device has all that fits it of what was sent."""
-        return self._commands.preloaded
 
     def describe(self) -> dict[str, Any]:
         """The line's record: counts of bytes, frames and errors, and the clocks' relation."""
@@ -224,24 +185,18 @@ class HostMachine:
             "clock": self.clock.describe(),
         }
 
-    # --- what comes in ------------------------------------------------------------------------
-
-    def _take(self, frame: Frame, now: float) -> None:
+    def _receive(self, frame: Frame, now: float) -> None:
         self._frame_at, self._rejected = now, self.decoder.rejected
-        receiver = self._receivers.get(frame.type)
-        if receiver is None:
-            self.counters.malformed += 1
-            return
-        unpack, receive = receiver
         try:
+            unpack, receive = self._receivers[frame.type]
             message = unpack(frame.payload)
-        except messages.MALFORMED:
+        except (KeyError, *messages.MALFORMED):
             self.counters.malformed += 1
         else:
             receive(message, frame.seq, now)
 
     def _add_samples(self, block: Block, seq: int, now: float) -> None:
-        if block.status.run != self._run or self._start is None:
+        if self._state is State.IDLE or block.status.run != self._run:
             return  # of a run that was stopped
         if block.first < self._expected:
             self.counters.duplicate_blocks += 1
@@ -253,23 +208,22 @@ class HostMachine:
         self._sample_at = now
         self._learn(block.status, now)
 
-    def _add_round_trip(self, message: tuple[Pong, Status], seq: int, now: float) -> None:
-        pong, status = message
+    def _add_round_trip(self, pong: Pong, seq: int, now: float) -> None:
         if self.welcome is None:
             return  # of a ping that nobody has sent
         middle = 0.5 * (pong.received + pong.answered) / self.welcome.clock
         self.clock.add(pong.stamp * 1e-9, middle, now)
-        self._learn(status, now)
+        self._learn(pong.status, now)
 
     def _update(self, status: Status, seq: int, now: float) -> None:
         """Take in a STATUS; without progress it says that commands before the last are missing."""
         self._count(seq)
-        if status.run == self._run and self._commands.lacks(status.queued_until, now):
-            self._rewind(now)
-        self._learn(status, now)
+        if self._state is not State.IDLE and status.run == self._run:
+            if self.commands.lacks(status.queued_until, now):
+                self._rewind(now)
+            self._learn(status, now)
 
-    def _answer(self, message: tuple[Reply, Status], seq: int, now: float) -> None:
-        reply, status = message
+    def _answer(self, reply: Reply, seq: int, now: float) -> None:
         if reply.result is Result.NO_SESSION:
             if self.welcome is not None:
                 self._fail(
@@ -277,51 +231,43 @@ class HostMachine:
                     "for a supply that breaks down, a reset by the port, or firmware that crashed"
                 )
             return
-        self._learn(status, now)
-        if self._request is not None and seq == self._request.seq:
-            self.reply, self._request = reply, None
+        self._learn(reply.status, now)
+        if self.pending is not None and seq == self.pending.seq:
+            self.reply, self.pending = reply, None
 
-    def _greet(self, welcome: Welcome | int, seq: int, now: float) -> None:
+    def _greet(self, welcome: messages.Welcome | int, seq: int, now: float) -> None:
         if isinstance(welcome, int):
             self.other_version = welcome
         else:
             self.welcome = welcome
-        if self._request is not None and self._request.type is Type.HELLO:
-            self._request = None
+        if self.pending is not None and self.pending.type is Type.HELLO:
+            self.pending = None
 
     def _learn(self, status: Status, now: float) -> None:
         """Take in the state of the device's queue and outputs, unless it is an old one."""
         old = self.status is not None and status.tick < self.status.tick
-        if status.run != self._run or self._start is None or old:
+        if self._state is State.IDLE or status.run != self._run or old:
             return
         self.status = status
-        self._commands.acknowledge(status.queued_until, status.credit_until, now)
+        self.commands.acknowledge(status.queued_until, status.credit_until, now)
         self._pump(now)
-        if self._going and status.latch is Latch.WATCHDOG:
+        if self._state is State.RUNNING and status.latch is Latch.WATCHDOG:
             self._fail(self._why_tripped(now, self._start.watchdog))
-        elif self._going and status.state is State.IDLE and self._request is None:
+        elif self._state is State.RUNNING and status.state is State.IDLE and self.pending is None:
             self._fail("the device has ended the run by itself; its outputs are zero")
 
-    # --- what goes out ------------------------------------------------------------------------
-
     def _send(self, type_: Type, payload: bytes) -> None:
-        self._seq = (self._seq + 1) & 0xFFFF
-        self._outbox.append(codec.encode(type_, self.session, self._seq, payload))
+        self._outbox.append(codec.encode(type_, self.session, next(self._sequence), payload))
 
     def _rewind(self, now: float) -> None:
         """Send again the commands that an open loop's device lacks; a closed loop holds on."""
-        if self._start is None or self._start.mode is not LoopMode.OPEN:
-            return
-        self.counters.resent_commands += self._commands.rewind(now)
-        self._pump(now)
+        if self._start.mode is Mode.OPEN_LOOP:
+            self.counters.resent_commands += self.commands.rewind(now)
+            self._pump(now)
 
     def _pump(self, now: float) -> None:
         """Send commands as far as there is credit."""
-        if self._start is None or self.welcome is None:
-            return
-        size = len(CHANNELS) * messages.COMMAND_DTYPE.itemsize
-        chunk = min(_CHUNK, (self.welcome.max_payload - messages.COMMANDS_OVERHEAD) // size)
-        for first, codes in self._commands.chunks(chunk, now):
+        for first, codes in self.commands.chunks(now):
             self._send(Type.COMMANDS, messages.pack_commands(self._run, first, codes))
 
     def _count(self, seq: int) -> None:
@@ -335,19 +281,18 @@ class HostMachine:
         self._heard_seq = seq
 
     def _retry(self, now: float) -> None:
-        request = self._request
+        request = self.pending
         if request is None or self.failure is not None:
             return
+        interval = HELLO_RETRY if request.type is Type.HELLO else RETRY
         if now >= request.give_up:
-            self._request = None
+            self.pending = None
             if request.type is not Type.HELLO:
                 self._fail(self._why_unanswered(request.type.name, now))
-        elif now - request.sent >= request.interval:
+        elif now - request.sent >= interval:
             request.sent = now
             self.counters.retries += 1
             self._outbox.append(request.frame)
-
-    # --- failures -----------------------------------------------------------------------------
 
     def _why_unanswered(self, name: str, now: float) -> str:
         if now - self._frame_at < 0.5 * GIVE_UP:
@@ -401,10 +346,10 @@ class HostMachine:
             self.failure = DeviceError(reason)
 
 
-def _unpack_welcome(payload: bytes) -> Welcome | int:
+def _unpack_welcome(payload: bytes) -> messages.Welcome | int:
     """Who answers, or the version of the protocol that it speaks where that is another."""
     version = messages.version_of(payload)
-    return Welcome.unpack(payload) if version == messages.VERSION else version
+    return messages.Welcome.unpack(payload) if version == messages.VERSION else version
 
 
 def refusal(reply: Reply) -> str:

@@ -14,7 +14,7 @@ from typing import NamedTuple, Self
 import numpy as np
 import numpy.typing as npt
 
-from daq.hal import ANALOG_INPUTS, CHANNELS
+from daq.hal import ANALOG_INPUTS, CHANNELS, Mode
 
 MALFORMED = (struct.error, ValueError, IndexError)
 """What unpacking raises for a payload that is not of its type."""
@@ -91,26 +91,28 @@ class Result(enum.IntEnum):
     UNKNOWN = 5
 
 
-class LoopMode(enum.IntEnum):
-    """Mode byte of START."""
+# By their numbers on the wire; quicker than the enums.
+_STATES, _LATCHES, _MODES = tuple(State), tuple(Latch), tuple(Mode)
 
-    OPEN = 0
-    CLOSED = 1
+RUN = struct.Struct("<H")
+"""Payload of GO and STOP: the run."""
 
+ANNOUNCE = struct.Struct("<B3xf")
+"""Payload of ANNOUNCE: the phase's number in the order of ``daq.hal.Phase``, and turns."""
+
+PING = struct.Struct("<Q")
+"""Payload of PING: the host's own time, which the device only returns."""
 
 _VERSIONED = struct.Struct("<4sH")
-_HELLO = struct.Struct("<4sHH32s")
-_WELCOME = struct.Struct("<4sHBBIfIHHHH32s32s32s")
+_HELLO = struct.Struct("<4sH2x32s")
+_WELCOME = struct.Struct("<4sHBBIfIHHH2x32s32s32s")
 _CHANNEL = struct.Struct("<16s8sdddd")
 _STATUS = struct.Struct("<HBBIIIII")
-_REPLY = struct.Struct("<BBH")
-_START = struct.Struct("<HBBIHH2h2h3i3i2ifI")
-_RUN = struct.Struct("<H")
-_ANNOUNCE = struct.Struct("<B3xf")
+_REPLY = struct.Struct("<BB2x")
+_START = struct.Struct("<HBxIH2x2h2h3i3i2ifI")
 _COMMANDS = struct.Struct("<HHI")
-_PING = struct.Struct("<Q")
 _PONG = struct.Struct("<QQQ")
-_SAMPLES = struct.Struct("<IHHQ")
+_SAMPLES = struct.Struct("<IH2xQ")
 _SAMPLES_HEAD = struct.Struct(_STATUS.format + _SAMPLES.format[1:])
 
 COMMANDS_OVERHEAD = _COMMANDS.size
@@ -129,15 +131,9 @@ def _text(field: bytes) -> str:
     return field.split(b"\0", 1)[0].decode("utf-8", "replace")
 
 
-@dataclass(frozen=True)
-class Hello:
-    """A host opens a session. host: who it is, for a device's own log."""
-
-    host: str
-
-    def pack(self) -> bytes:
-        """Payload of the frame."""
-        return _HELLO.pack(MAGIC, VERSION, 0, self.host.encode()[:31])
+def pack_hello(host: str) -> bytes:
+    """Payload of HELLO, which opens a session. host: who it is, for a device's own log."""
+    return _HELLO.pack(MAGIC, VERSION, host.encode()[:31])
 
 
 @dataclass(frozen=True)
@@ -185,7 +181,7 @@ class Welcome:
     def pack(self) -> bytes:
         """Payload of the frame."""
         head = (MAGIC, self.version, len(self.channels), self.latch, self.clock, self.max_rate)
-        limits = (self.queue, self.max_payload, self.watchdog_default, self.watchdog_longest, 0)
+        limits = (self.queue, self.max_payload, self.watchdog_default, self.watchdog_longest)
         names = (name.encode()[:31] for name in (self.device, self.firmware, self.serial))
         rows = b"".join(channel.pack() for channel in self.channels)
         return _WELCOME.pack(*head, *limits, *names) + rows
@@ -196,23 +192,12 @@ class Welcome:
         fields = _WELCOME.unpack_from(payload)
         _, version, n, latch = fields[:4]
         facts: tuple[int, float, int, int, int, int] = fields[4:10]
-        device, firmware, serial = map(_text, fields[11:])
+        device, firmware, serial = map(_text, fields[10:])
         rows = list(_CHANNEL.iter_unpack(payload[_WELCOME.size :]))
-        if version_of(payload) != VERSION or len(rows) != n:
-            raise ValueError("a WELCOME of another version, or with another number of channels")
+        if len(rows) != n:
+            raise ValueError("another number of channels")
         channels = tuple(Channel(_text(name), _text(unit), *row) for name, unit, *row in rows)
         return cls(device, firmware, serial, *facts, channels, Latch(latch), version)
-
-
-class Reply(NamedTuple):
-    """A device's answer to a request, which carries the request's seq in its header."""
-
-    request: int
-    result: Result
-
-    def pack(self) -> bytes:
-        """Payload, without the status that follows it."""
-        return _REPLY.pack(*self, 0)
 
 
 class Status(NamedTuple):
@@ -236,32 +221,42 @@ class Status(NamedTuple):
         """The 24 bytes."""
         return _STATUS.pack(*self)
 
+    @classmethod
+    def of(cls, run: int, state: int, latch: int, *counts: int) -> Self:
+        """The numbers of a payload."""
+        return cls(run, _STATES[state], _LATCHES[latch], *counts)
 
-_STATES, _LATCHES = tuple(State), tuple(Latch)  # by their numbers, quicker than the enums
-
-
-def _status(run: int, state: int, latch: int, *counts: int) -> Status:
-    return Status(run, _STATES[state], _LATCHES[latch], *counts)
-
-
-def unpack_status(payload: bytes) -> Status:
-    """A STATUS payload."""
-    return _status(*_STATUS.unpack(payload))
+    @classmethod
+    def unpack(cls, payload: bytes) -> Self:
+        """A STATUS payload."""
+        return cls.of(*_STATUS.unpack(payload))
 
 
-def unpack_reply(payload: bytes) -> tuple[Reply, Status]:
-    """A REPLY payload."""
-    request, result, _ = _REPLY.unpack_from(payload)
-    return Reply(request, Result(result)), unpack_status(payload[_REPLY.size :])
+class Reply(NamedTuple):
+    """A device's answer to a request, which carries the request's seq in its header."""
+
+    request: int
+    result: Result
+    status: Status
+
+    def pack(self) -> bytes:
+        """Payload of the frame."""
+        return _REPLY.pack(self.request, self.result) + self.status.pack()
+
+    @classmethod
+    def unpack(cls, payload: bytes) -> Self:
+        """The message."""
+        request, result = _REPLY.unpack_from(payload)
+        return cls(request, Result(result), Status.unpack(payload[_REPLY.size :]))
 
 
 class CodedGuard(NamedTuple):
     """A ``daq.hal.Guard`` in converter codes and counts; a range's ends: not watched."""
 
-    command_low: tuple[int, ...]
-    command_high: tuple[int, ...]
-    analog_low: tuple[int, ...]
-    analog_high: tuple[int, ...]
+    command_low: Sequence[int]
+    command_high: Sequence[int]
+    analog_low: Sequence[int]
+    analog_high: Sequence[int]
     counts_low: int
     counts_high: int
     count_rate: float
@@ -275,7 +270,7 @@ class Start(NamedTuple):
     """
 
     run: int
-    mode: LoopMode
+    mode: Mode
     period: int
     watchdog: int
     guard: CodedGuard
@@ -284,36 +279,15 @@ class Start(NamedTuple):
         """Payload of the frame."""
         command_low, command_high, analog_low, analog_high, *counts = self.guard
         codes = (*command_low, *command_high, *analog_low, *analog_high)
-        return _START.pack(self.run, self.mode, 0, self.period, self.watchdog, 0, *codes, *counts)
+        mode = _MODES.index(self.mode)
+        return _START.pack(self.run, mode, self.period, self.watchdog, *codes, *counts)
 
     @classmethod
     def unpack(cls, payload: bytes) -> Self:
         """The message."""
-        run, mode, _, period, watchdog, _, *codes = _START.unpack(payload)
-        low, high, under, over = (codes[a:b] for a, b in ((0, 2), (2, 4), (4, 7), (7, 10)))
-        guard = CodedGuard(tuple(low), tuple(high), tuple(under), tuple(over), *codes[10:])
-        return cls(run, LoopMode(mode), period, watchdog, guard)
-
-
-def pack_run(run: int) -> bytes:
-    """Payload of GO and STOP."""
-    return _RUN.pack(run)
-
-
-def unpack_run(payload: bytes) -> int:
-    """The run that a GO or STOP names."""
-    return int(_RUN.unpack(payload)[0])
-
-
-def pack_announce(phase: int, turns: float) -> bytes:
-    """Payload of ANNOUNCE: the phase's number in the order of ``daq.hal.Phase``."""
-    return _ANNOUNCE.pack(phase, turns)
-
-
-def unpack_announce(payload: bytes) -> tuple[int, float]:
-    """Phase and turns."""
-    phase, turns = _ANNOUNCE.unpack(payload)
-    return phase, turns
+        run, mode, period, watchdog, *codes = _START.unpack(payload)
+        guard = CodedGuard(codes[:2], codes[2:4], codes[4:7], codes[7:10], *codes[10:])
+        return cls(run, _MODES[mode], period, watchdog, guard)
 
 
 def pack_commands(run: int, first: int, codes: Codes) -> bytes:
@@ -328,31 +302,23 @@ def unpack_commands(payload: bytes) -> tuple[int, int, Codes]:
     return run, first, codes.reshape(count, len(CHANNELS))
 
 
-def pack_ping(stamp: int) -> bytes:
-    """Payload of PING: the host's own time, which the device only returns."""
-    return _PING.pack(stamp)
-
-
-def unpack_ping(payload: bytes) -> int:
-    """The host's stamp."""
-    return int(_PING.unpack(payload)[0])
-
-
 class Pong(NamedTuple):
     """Answer to PING: its stamp, and the device's clock at its arrival and at the answer."""
 
     stamp: int
     received: int
     answered: int
+    status: Status
 
-    def pack(self, status: Status) -> bytes:
+    def pack(self) -> bytes:
         """Payload of the frame."""
-        return _PONG.pack(*self) + status.pack()
+        return _PONG.pack(*self[:3]) + self.status.pack()
 
-
-def unpack_pong(payload: bytes) -> tuple[Pong, Status]:
-    """A PONG payload."""
-    return Pong(*_PONG.unpack_from(payload)), unpack_status(payload[_PONG.size :])
+    @classmethod
+    def unpack(cls, payload: bytes) -> Self:
+        """The message."""
+        stamp, received, answered = _PONG.unpack_from(payload)
+        return cls(stamp, received, answered, Status.unpack(payload[_PONG.size :]))
 
 
 class Block(NamedTuple):
@@ -368,17 +334,17 @@ class Block(NamedTuple):
 
     def pack(self) -> bytes:
         """Payload of SAMPLES."""
-        head = _SAMPLES.pack(self.first, len(self.records), 0, self.time)
+        head = _SAMPLES.pack(self.first, len(self.records), self.time)
         return self.status.pack() + head + self.records.tobytes()
 
-
-def unpack_samples(payload: bytes) -> Block:
-    """A SAMPLES payload; the records are a view of it."""
-    *status, first, count, _, time = _SAMPLES_HEAD.unpack_from(payload)
-    records = np.frombuffer(payload, SAMPLE_DTYPE, offset=SAMPLES_OVERHEAD)
-    if not 0 < len(records) == count:
-        raise ValueError("another number of samples")
-    return Block(_status(*status), first, time, records)
+    @classmethod
+    def unpack(cls, payload: bytes) -> Self:
+        """The message; the records are a view of it."""
+        *status, first, count, time = _SAMPLES_HEAD.unpack_from(payload)
+        records = np.frombuffer(payload, SAMPLE_DTYPE, offset=SAMPLES_OVERHEAD)
+        if not 0 < len(records) == count:
+            raise ValueError("another number of samples")
+        return cls(Status.of(*status), first, time, records)
 
 
 def joined(blocks: Sequence[Block]) -> Records:

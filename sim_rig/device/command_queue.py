@@ -67,19 +67,14 @@ class CommandQueue:
             filled += count
         if filled:
             self._last = applied[filled - 1 : filled].copy()
-        if filled < n:
-            self._missing(applied, flags, filled)
+        if filled < n and self._closed:
+            applied[filled:], flags[filled:] = self._last[-1], _HELD
+        elif filled < n and self.tick + filled > 0:
+            flags[filled:] = _UNDERFLOW
+            self.latched = True
         return applied, flags
 
     def advance(self, n: int) -> None:
         """Let n ticks pass."""
         self.tick += n
         self._until = max(self._until, self.tick)
-
-    def _missing(self, applied: FloatArray, flags: IntArray, first: int) -> None:
-        if self._closed:
-            applied[first:] = self._last[-1]
-            flags[first:] |= _HELD
-        elif self.tick + first > 0:
-            flags[first:] |= _UNDERFLOW
-            self.latched = True

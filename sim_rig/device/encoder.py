@@ -1,7 +1,5 @@
 """Quadrature encoder with the speed estimate of a counter that times its edges."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 
@@ -24,22 +22,11 @@ class EncoderCounter:
     """
 
     counts_per_turn: int
-    # last count, time of the last edge, its direction, estimated rate
-    _memory: FloatArray = field(default_factory=lambda: np.array([0.0, -1.0, 0.0, 0.0]))
-    _started: bool = False
-
-    def copy(self) -> EncoderCounter:
-        """An independent counter in the same state."""
-        return EncoderCounter(self.counts_per_turn, self._memory.copy(), self._started)
+    # Last count (none yet), time of the last edge, its direction, estimated rate.
+    memory: FloatArray = field(default_factory=lambda: np.array([np.nan, -1.0, 0.0, 0.0]))
 
     def latch(
-        self,
-        angles: FloatArray,
-        last: float,
-        origin: float,
-        first: int,
-        step: float,
-        per_tick: int,
+        self, angles: FloatArray, last: float, origin: float, first: int, step: float, per_tick: int
     ) -> tuple[FloatArray, FloatArray]:
         """Counts and their rate [1/s] at every ``per_tick``-th of the angles.
 
@@ -49,13 +36,7 @@ class EncoderCounter:
         into calls.
         """
         per_radian = self.counts_per_turn / (2.0 * math.pi)
-        if not self._started:
-            self._memory[0] = math.floor(angles[0] * per_radian)
-            self._started = True
-        ticks = -(-len(angles) // per_tick)
-        counts = np.empty(ticks)
-        rates = np.empty(ticks)
-        _count(angles, last, per_radian, origin, first, step, per_tick, self._memory, counts, rates)
+        counts, rates = _count(angles, last, per_radian, origin, first, step, per_tick, self.memory)
         return counts, rates
 
 
@@ -69,12 +50,12 @@ def _count(
     step: float,
     per_tick: int,
     memory: FloatArray,
-    counts: FloatArray,
-    rates: FloatArray,
-) -> None:
+) -> tuple[FloatArray, FloatArray]:
+    n, there = len(angles), angles[0] * per_radian
+    counts, rates = np.empty(-(-n // per_tick)), np.empty(-(-n // per_tick))
+    if math.isnan(memory[0]):
+        memory[0] = math.floor(there)
     count, edge_time, direction, rate = memory[0], memory[1], memory[2], memory[3]
-    n = len(angles)
-    there = angles[0] * per_radian
     for i in range(n):
         now = origin + (first + i) * step
         here, there = there, (angles[i + 1] if i + 1 < n else last) * per_radian
@@ -102,3 +83,4 @@ def _count(
             rate = 0.0
         count, edge_time, direction = math.floor(there), crossing, sign
     memory[0], memory[1], memory[2], memory[3] = count, edge_time, direction, rate
+    return counts, rates

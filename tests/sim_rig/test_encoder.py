@@ -104,7 +104,7 @@ def test_a_copy_is_independent():
     counter = EncoderCounter(PER_TURN)
     angles = np.linspace(0.0, 1.0, 5 * PER_TICK + 1)
     counter.latch(angles[:-1], angles[-1], 0.0, 0, STEP, PER_TICK)
-    copy = counter.copy()
+    copy = EncoderCounter(PER_TURN, counter.memory.copy())
     further = np.linspace(1.0, 2.0, 5 * PER_TICK + 1)
     one = counter.latch(further[:-1], further[-1], 0.0, 5 * PER_TICK, STEP, PER_TICK)
     two = copy.latch(further[:-1], further[-1], 0.0, 5 * PER_TICK, STEP, PER_TICK)

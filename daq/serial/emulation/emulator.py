@@ -1,12 +1,13 @@
-"""A device in software at an endpoint: the reference state machine, run with faults on request."""
+"""A simulated rig as a device in software: its board, and the machine served at an endpoint."""
 
-import contextlib
 import json
+import math
+import os
 import select
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,122 +15,193 @@ from typing import Any
 import numpy as np
 
 from daq.errors import ConfigError
-from daq.hal import Phase, Simulation
-from daq.serial.emulation.board import SimulatedBoard, identity, warm_up
+from daq.hal import ANALOG_INPUTS, CHANNELS, Electronics, Guard, Mode, Phase, Simulation
+from daq.serial import messages
 from daq.serial.emulation.endpoints import Port
-from daq.serial.emulation.faults import Fault, Line
+from daq.serial.emulation.faults import EVENTS, Fault, Line
 from daq.serial.emulation.machine import DeviceMachine
-from daq.serial.messages import Welcome
+from daq.serial.messages import Channel, CodedGuard, Codes, Records, Welcome
 
 _LONGEST_WAIT = 0.1  # s between two looks at faults and stop requests
 _GARBAGE_BYTES = 64
 _FORGIVEN = 0.005  # s that this process may wake late before it counts as a pause
+_CLOCK = 48_000_000  # Hz, of a microcontroller with USB
+_QUEUE = 16_384  # commands; 64 KiB of its memory
+_LARGEST_BLOCK = 256  # ticks that the simulated rig computes at once
 
-Journal = Callable[[dict[str, Any]], object]
 
+class SimulatedBoard:
+    """A simulated rig as ``machine.Board``. Its time is the machine's: it plays ticks on request.
 
-def emulate(
-    simulation: Simulation,
-    name: str,
-    port: Port,
-    faults: Sequence[Fault] = (),
-    drift: float = 0.0,
-    seed: int = 0,
-    journal: Path | None = None,
-    ready: Callable[[str], None] = lambda port: None,
-) -> None:
-    """Serve a simulated rig of some name on a port until Ctrl-C or SIGTERM.
-
-    drift: of its clock against the computer's, as a quartz has it. seed: of the faults' chances.
-    journal: a file of JSON lines on what became of the outputs. ready: is called with the port's
-    name. Raises ConfigError for a port or a journal that cannot be.
+    watched: whether the guard's limits of the counter act. phase: of the run. outputs: codes that
+    both have. stuck: whether the counter stands still.
     """
-    max_rate = warm_up(simulation)
-    electronics = simulation.board()
-    welcome = identity(name, electronics, max_rate)
-    sticks = any(fault.name == "stuck-encoder" for fault in faults)
-    board = SimulatedBoard(electronics, watched=not sticks)
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda number, frame: stop.set())
-    with _journal(journal) as note:
-        port.connect()
-        emulator = Emulator(board, welcome, port, faults, drift, seed, note)
-        ready(port.name)
-        emulator.run(stop.is_set)
+
+    def __init__(self, electronics: Electronics, watched: bool = True) -> None:
+        self.phase = Phase.OPEN
+        self.outputs = [0] * len(CHANNELS)
+        self.stuck = False
+        self._device = electronics.device
+        self._step_in, self._step_out = electronics.step_in, electronics.step_out
+        self._watched = watched
+        self._tick = self._count = 0
+
+    def connect(self) -> None:
+        """The rig as it stands when somebody switches it on, its load let down."""
+        self.phase = Phase.OPEN
+        self._device.open()
+
+    def announce(self, phase: int, turns: float) -> None:
+        """The simulated user winds the handle when asked to."""
+        phases = list(Phase)
+        if phase < len(phases):
+            self.phase = phases[phase]
+            self._device.announce(self.phase, turns)
+
+    def start(self, rate: float, guard: CodedGuard) -> None:
+        """Sampling from tick 0 on."""
+        counts = (guard.counts_low, guard.counts_high, guard.count_rate, guard.count_step)
+        volts = Guard(
+            np.array(guard.command_low) * self._step_out,
+            np.array(guard.command_high) * self._step_out,
+            np.array(guard.analog_low) * self._step_in,
+            np.array(guard.analog_high) * self._step_in,
+            *(counts if self._watched else ()),
+        )
+        # Each tick comes with its command: missing ones are the machine's matter.
+        self._device.start(rate, Mode.CLOSED_LOOP, volts)
+        self._tick = 0
+
+    def play(self, commands: Codes) -> Records:
+        """Simulate n ticks."""
+        records = np.zeros(len(commands), dtype=messages.SAMPLE_DTYPE)
+        for at in range(0, len(commands), _LARGEST_BLOCK):
+            part = slice(at, at + _LARGEST_BLOCK)
+            self._play(commands[part], records[part])
+        if self.stuck:
+            records["counts"], records["count_rate"] = self._count, 0.0
+        self._count = int(records["counts"][-1])
+        self.outputs = records["applied"][-1].tolist()
+        return records
+
+    def zero(self) -> None:
+        """Outputs to zero until the next start."""
+        self.outputs = [0] * len(CHANNELS)
+        self._device.safe()
+
+    def _play(self, commands: Codes, records: Records) -> None:
+        self._device.send(self._tick, commands.astype(np.float64) * self._step_out)
+        raw = self._device.receive()
+        records["analog"] = np.rint(raw.analog / self._step_in)
+        # As a counter of 32 bits shows them.
+        records["counts"] = (np.rint(raw.counts).astype(np.int64) + 2**31) % 2**32 - 2**31
+        records["count_rate"] = raw.count_rate
+        records["applied"] = np.rint(raw.applied / self._step_out)
+        records["flags"] = raw.flags
+        self._tick += len(raw.tick)
 
 
-@contextlib.contextmanager
-def _journal(path: Path | None) -> Iterator[Journal]:
-    """Writer of a file of JSON lines, each on disk before the device goes on."""
-    if path is None:
-        yield lambda entry: None
-        return
-    try:
-        file = path.open("w", encoding="utf-8", buffering=1)
-    except OSError as error:
-        raise ConfigError(f"--journal {path}: {error.strerror}") from None
-    with file:
-        yield lambda entry: file.write(json.dumps(entry) + "\n")
+def identity(name: str, electronics: Electronics, max_rate: float) -> Welcome:
+    """WELCOME of a microcontroller with such converters."""
+    low, high = electronics.volts
+    inputs = [Channel(item, "V", electronics.step_in, 0.0, low, high) for item in ANALOG_INPUTS]
+    outputs = [Channel(item, "V", electronics.step_out, 0.0, low, high) for item in CHANNELS]
+    counts = np.iinfo(np.int32)
+    counter = Channel("encoder", "count", 1.0, 0.0, float(counts.min), float(counts.max))
+    return Welcome(
+        device=name,
+        firmware="emulator 1",
+        serial="simulated",
+        clock=_CLOCK,
+        max_rate=max_rate,
+        queue=_QUEUE,
+        max_payload=1024,
+        watchdog_default=100,
+        watchdog_longest=10_000,
+        channels=(*inputs, *outputs, counter),
+    )
+
+
+def warm_up(simulation: Simulation) -> float:
+    """Compile what the rig computes with, before a host waits for it; its highest rate [Hz]."""
+    device = simulation.board().device
+    wide = np.full(3, 1e9)
+    info = device.open()
+    device.start(1000.0, Mode.CLOSED_LOOP, Guard(np.full(2, -1.0), np.full(2, 1.0), -wide, wide))
+    for tick, n in ((0, 1), (1, 20)):
+        device.send(tick, np.zeros((n, len(CHANNELS))))
+        device.receive()
+    device.close()
+    return info.max_rate
 
 
 class Emulator:
-    """Runs a device machine in real time on a port, with its faults.
+    """A simulated rig behind the device's state machine, served in real time on a port.
 
-    journal: is called at each change of state, with the outputs and how long the host had been
-    silent.
+    name: of the device. drift: of its clock against the computer's, as a quartz has it. seed: of
+    the faults' chances.
     """
 
     def __init__(
-        self,
-        board: SimulatedBoard,
-        identity: Welcome,
-        port: Port,
-        faults: Sequence[Fault],
-        drift: float,
-        seed: int,
-        journal: Journal,
+        self, rig: Simulation, name: str, port: Port, faults: list[Fault], drift: float, seed: int
     ) -> None:
-        self._board = board
-        self._identity = identity
+        max_rate = warm_up(rig)
+        electronics = rig.board()
+        sticks = any(fault.name == "stuck-encoder" for fault in faults)
+        self._board = SimulatedBoard(electronics, watched=not sticks)
+        self._identity = identity(name, electronics, max_rate)
+        self._machine = DeviceMachine(self._board, self._identity)
         self._port = port
-        self._rate = identity.clock * (1.0 + drift)
-        self._machine = DeviceMachine(board, identity)
-        self._journal = journal
+        self._rate = self._identity.clock * (1.0 + drift)
         self._noted: tuple[Any, ...] = ()
         self._waiting = list(faults)  # for their instant
         self._active: dict[str, float] = {}
         self._inward, self._outward = Line(seed), Line(seed + 1)
         self._noise = np.random.default_rng(seed)
         self._phase: Phase | None = None
-        self._phase_at = 0.0
-        self._quiet_until = 0.0
-        self._back_at: float | None = None
-        self._booting_until = 0.0
+        self._phase_at = self._quiet_until = self._booting_until = 0.0
+        self._back_at = math.inf
         self._unsent = b""
 
-    def run(self, stopped: Callable[[], bool]) -> None:
-        """Serve until ``stopped`` says so."""
-        self._awake_by = time.perf_counter()
-        while not stopped():
-            # The machine lives at this instant, before the port is read: a pause of this
-            # process after it must not look like silence of the host.
-            now = time.perf_counter()
-            self._forgive(now - self._awake_by)
-            self._trigger(now)
-            self._come_back(now)
-            self._receive(now)
-            self._note()
-            self._machine.poll(self._ticks(now))
-            self._note()
-            self._transmit(time.perf_counter())
-            self._wait()
-        self._port.disconnect()
+    def serve(self, journal: Path | None, ready: Callable[[str], None]) -> None:
+        """Serve until Ctrl-C or SIGTERM.
 
-    def _forgive(self, overslept: float) -> None:
-        """A pause of this process is no silence of a host that shares its computer."""
-        if overslept > _FORGIVEN:
-            self._machine.heard += self._ticks(overslept)
+        journal: a file of JSON lines on what became of the outputs, and how long the host had been
+        silent. ready: is called with the port's name. Raises ConfigError for a port or a journal
+        that cannot be.
+        """
+        stop = threading.Event()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda number, frame: stop.set())
+        path = journal or Path(os.devnull)
+        try:
+            self._journal = path.open("w", encoding="utf-8", buffering=1)
+        except OSError as error:
+            raise ConfigError(f"--journal {path}: {error.strerror}") from None
+        with self._journal:
+            self._port.connect()
+            ready(self._port.name)
+            self._awake_by = time.perf_counter()
+            while not stop.is_set():
+                self._cycle()
+            self._port.disconnect()
+
+    def _cycle(self) -> None:
+        # The machine lives at this instant, before the port is read: a pause of this process,
+        # before or after it, must not look like silence of the host.
+        now = time.perf_counter()
+        if now - self._awake_by > _FORGIVEN:
+            self._machine.heard += self._ticks(now - self._awake_by)
+        self._trigger(now)
+        if now >= self._back_at:
+            self._back_at = math.inf
+            self._port.connect()
+        self._receive(now)
+        self._note()
+        self._machine.poll(self._ticks(now))
+        self._note()
+        self._transmit(time.perf_counter())
+        self._wait()
 
     def _note(self) -> None:
         """A line in the journal when something about the device has changed."""
@@ -138,21 +210,18 @@ class Emulator:
         if state != self._noted:
             self._noted = state
             now = time.perf_counter()
-            self._journal(
-                {
-                    "seconds": now,
-                    "phase": self._board.phase.value,
-                    "state": machine.state.name,
-                    "latch": machine.latch.name,
-                    "outputs": self._board.outputs,
-                    "silence_seconds": now - machine.heard / self._rate,
-                }
-            )
+            entry = {
+                "seconds": now,
+                "phase": self._board.phase.value,
+                "state": machine.state.name,
+                "latch": machine.latch.name,
+                "outputs": self._board.outputs,
+                "silence_seconds": now - machine.heard / self._rate,
+            }
+            self._journal.write(json.dumps(entry) + "\n")
 
     def _ticks(self, now: float) -> int:
         return int(now * self._rate)
-
-    # --- bytes --------------------------------------------------------------------------------
 
     def _receive(self, now: float) -> None:
         data = self._port.read() if self._port.files() else b""
@@ -174,13 +243,12 @@ class Emulator:
         while not self._unsent and (frame := self._machine.take()) is not None:
             if not silent:
                 self._outward.put(frame, now, self._line_faults())
-            self._unsent = self._outward.ready(now)
-            self._push()
-        if not self._unsent:
-            self._unsent = self._outward.ready(now)
-        self._push()
+            self._push(now)
+        self._push(now)
 
-    def _push(self) -> None:
+    def _push(self, now: float) -> None:
+        """Write what the port did not take the last time, or what has come through the line."""
+        self._unsent = self._unsent or self._outward.ready(now)
         if self._unsent:
             self._unsent = self._unsent[self._port.write(self._unsent) :]
 
@@ -190,15 +258,16 @@ class Emulator:
 
     def _wait(self) -> None:
         now = time.perf_counter()
-        until = [now + _LONGEST_WAIT]
+        until = [now + _LONGEST_WAIT, self._back_at, self._inward.next_arrival()]
         event = self._machine.next_event()
         if event is not None:
             until.append((event + 1) / self._rate)
         quiet = now < self._quiet_until
         # What the port does not take, or must not get yet, is not waited for here.
-        lines = [self._inward] if quiet or self._unsent else [self._inward, self._outward]
-        until += [at for line in lines if (at := line.next_arrival()) is not None]
-        until += [at for at in (self._quiet_until, self._back_at) if at is not None and at > now]
+        if quiet:
+            until.append(self._quiet_until)
+        elif not self._unsent:
+            until.append(self._outward.next_arrival())
         timeout = max(0.0, min(until) - now)
         self._awake_by = now + timeout
         files = self._port.files()
@@ -208,18 +277,15 @@ class Emulator:
         else:
             time.sleep(timeout)
 
-    # --- faults -------------------------------------------------------------------------------
-
     def _trigger(self, now: float) -> None:
         if self._board.phase is not self._phase:
             self._phase, self._phase_at = self._board.phase, now
         for fault in list(self._waiting):
-            if fault.phase is not None and (
-                fault.phase is not self._phase or now < self._phase_at + fault.after
-            ):
+            due = fault.phase is self._phase and now >= self._phase_at + fault.after
+            if fault.phase is not None and not due:
                 continue
             self._waiting.remove(fault)
-            if fault.once:
+            if fault.name in EVENTS:
                 self._happen(fault, now)
             else:
                 self._active[fault.name] = fault.value
@@ -230,7 +296,7 @@ class Emulator:
 
     def _happen(self, fault: Fault, now: float) -> None:
         if fault.name == "overflow":
-            self._machine.lose(int(fault.value))
+            self._machine.to_lose += int(fault.value)
         elif fault.name == "stall":
             self._quiet_until = now + fault.value
         else:
@@ -244,8 +310,3 @@ class Emulator:
             else:
                 self._port.disconnect()
                 self._back_at = now + fault.value
-
-    def _come_back(self, now: float) -> None:
-        if self._back_at is not None and now >= self._back_at:
-            self._back_at = None
-            self._port.connect()

@@ -18,48 +18,46 @@ class PtyPort:
     def __init__(self, link: Path | None) -> None:
         self.name = ""
         self._link = link
-        self._master = self._slave = -1
+        self._ends: list[int] = []  # master and slave, while connected
 
     def files(self) -> list[int]:
         """Descriptors to wait on: the master's."""
-        return [self._master] if self._master >= 0 else []
+        return self._ends[:1]
 
     def read(self) -> bytes:
         """Bytes received."""
         with contextlib.suppress(BlockingIOError):
-            return os.read(self._master, 65_536)
+            return os.read(self._ends[0], 65_536)
         return b""
 
     def write(self, data: bytes) -> int:
         """Number of bytes that the pty took."""
-        if self._master < 0:
+        if not self._ends:
             return len(data)
         with contextlib.suppress(BlockingIOError):
-            return os.write(self._master, data)
+            return os.write(self._ends[0], data)
         return 0
 
     def connect(self) -> None:
         """Open a new pty."""
-        if sys.platform == "win32":
-            raise NotImplementedError("there are no pseudo-terminals; serve a TcpPort")
+        assert sys.platform != "win32", "port_of serves a TcpPort there"
         import tty
 
-        self._master, self._slave = os.openpty()
+        master, slave = self._ends = [*os.openpty()]
         # The slave stays open here: without a host there would be errors to read otherwise,
         # and the host's settings would not be raw before it has made them so.
-        tty.setraw(self._slave)
-        os.set_blocking(self._master, False)
-        self.name = os.ttyname(self._slave)
+        tty.setraw(slave)
+        os.set_blocking(master, False)
+        self.name = os.ttyname(slave)
         if self._link is not None:
             _point(self._link, self.name)
             self.name = str(self._link)
 
     def disconnect(self) -> None:
         """Close both ends, as when a cable is pulled; a host reads an error."""
-        for descriptor in (self._master, self._slave):
-            if descriptor >= 0:
-                os.close(descriptor)
-        self._master = self._slave = -1
+        for descriptor in self._ends:
+            os.close(descriptor)
+        self._ends = []
         if self._link is not None:
             self._link.unlink(missing_ok=True)
 

@@ -27,7 +27,9 @@ KINDS: dict[str, tuple[float | None, str]] = {
     "garbage": (1.0, "the device answers with random bytes"),
     "stuck-encoder": (1.0, "the counter stands still"),
 }
-_EVENTS = frozenset({"stall", "disconnect", "reboot", "overflow"})
+EVENTS = frozenset({"stall", "disconnect", "reboot", "overflow"})
+"""Faults that happen at an instant, and not from then on."""
+
 _PIECE_SECONDS = 1e-4  # between the pieces of a frame that arrives split
 
 
@@ -39,11 +41,6 @@ class Fault:
     value: float
     phase: Phase | None = None
     after: float = 0.0
-
-    @property
-    def once(self) -> bool:
-        """Whether it happens at an instant, and not from then on."""
-        return self.name in _EVENTS
 
 
 def parse(text: str) -> Fault:
@@ -110,9 +107,9 @@ class Line:
             arrived.append(self._due.popleft()[1])
         return b"".join(arrived)
 
-    def next_arrival(self) -> float | None:
-        """When the next bytes arrive, or None."""
-        return self._due[0][0] if self._due else None
+    def next_arrival(self) -> float:
+        """When the next bytes arrive; infinity when none are on the way."""
+        return self._due[0][0] if self._due else math.inf
 
     def clear(self) -> None:
         """Lose what is on the way."""

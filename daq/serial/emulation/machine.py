@@ -6,6 +6,7 @@ A program around it feeds bytes as they come (``receive``), calls ``poll`` no la
 """
 
 import contextlib
+import itertools
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,26 +14,11 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from daq.hal import ANALOG_INPUTS, CHANNELS, Flag
+from daq.hal import ANALOG_INPUTS, CHANNELS, Flag, Mode
 from daq.serial import codec, messages
 from daq.serial.codec import Decoder, Frame
-from daq.serial.emulation.command_ring import CommandRing
-from daq.serial.messages import (
-    Block,
-    CodedGuard,
-    Codes,
-    Latch,
-    LoopMode,
-    Pong,
-    Records,
-    Reply,
-    Result,
-    Start,
-    State,
-    Status,
-    Type,
-    Welcome,
-)
+from daq.serial.commands import CommandRing
+from daq.serial.messages import Block, Latch, Pong, Reply, Result, Start, State, Status, Type
 
 BLOCK_SECONDS = 0.02
 """Samples that nobody waits for are sent in blocks of this length."""
@@ -56,10 +42,10 @@ class Board(Protocol):
     def announce(self, phase: int, turns: float) -> None:
         """Which phase of a run begins (order of ``daq.hal.Phase``); may light a lamp."""
 
-    def start(self, rate: float, guard: CodedGuard) -> None:
+    def start(self, rate: float, guard: messages.CodedGuard) -> None:
         """Prepare the timer for ``rate`` [Hz], the clamps and the guard; outputs are zero."""
 
-    def play(self, commands: Codes) -> Records:
+    def play(self, commands: messages.Codes) -> messages.Records:
         """The next n ticks with commands (n, 2), in the timer's interrupt; n samples.
 
         In each tick, in this order: latch all inputs and the counter; if one of them is beyond
@@ -74,49 +60,50 @@ class Board(Protocol):
 class DeviceMachine:
     """A device: sessions, requests, the run, and everything that makes its outputs zero.
 
-    heard: when the last frame of the session came.
+    heard: when the last frame of the session came. to_lose: samples that are dropped next as if the
+    line were full (a fault, to test hosts with).
     """
 
-    def __init__(self, board: Board, identity: Welcome) -> None:
+    def __init__(self, board: Board, identity: messages.Welcome) -> None:
         self.identity = identity
         self.state = State.IDLE
         self.latch = Latch.NONE
         self.decoder = Decoder()
+        self.heard = self.to_lose = 0
         self._board = board
         self._ring = CommandRing(identity.queue)
         self._session = 0  # none yet
         self._answered: tuple[int, bytes] | None = None  # last request's seq, and its answer
-        self._seq = 0
-        self._run = 0
-        self._start: Start | None = None
-        self._origin = 0
-        self.heard = 0
-        self._overflow = 0
-        self._samples: list[Records] = []
-        self._first = 0
-        self._to_lose = 0
+        self._start: Start  # from the first that is carried out
+        self._sequence = itertools.count(1)
+        self._run = self._origin = self._overflow = self._first = 0
+        self._samples: list[messages.Records] = []
         self._outbox: deque[bytes] = deque()
-        self._backlog = 0
         # How a request's payload is unpacked, and what carries it out.
         self._requests: dict[int, tuple[Callable[[bytes], Any], Callable[..., Result]]] = {
             Type.START: (Start.unpack, self._arm),
-            Type.GO: (messages.unpack_run, self._go),
-            Type.STOP: (messages.unpack_run, self._stop),
-            Type.ANNOUNCE: (messages.unpack_announce, self._announce),
+            Type.GO: (messages.RUN.unpack, self._go),
+            Type.STOP: (messages.RUN.unpack, self._stop),
+            Type.ANNOUNCE: (messages.ANNOUNCE.unpack, self._announce),
             Type.SAFE: (bytes, self._safe),
             Type.CLEAR: (bytes, self._clear),
         }
 
-    # --- the program around it ----------------------------------------------------------------
-
     def receive(self, data: bytes, now: int) -> None:
         """Take bytes from the line that arrived at ``now``."""
         for frame in self.decoder.feed(data):
-            self._take(frame, now)
+            if frame.type == Type.HELLO:
+                self._hello(frame, now)
+            elif frame.session != self._session or self._session == 0:
+                # After a restart of the device: the host must hear that its run is gone.
+                self._reply(frame, Result.NO_SESSION)
+            else:
+                self.heard = now
+                self._dispatch(frame, now)
 
     def poll(self, now: int) -> None:
         """Play the ticks that are due, watch the host, and send what is ready."""
-        if self.state is not State.RUNNING or self._start is None:
+        if self.state is not State.RUNNING:
             return
         deadline = self.heard + self._watchdog
         self._play_until(min(now, deadline))
@@ -128,7 +115,7 @@ class DeviceMachine:
 
     def next_event(self) -> int | None:
         """When ``poll`` has something to do at the latest; None while nothing runs."""
-        if self.state is not State.RUNNING or self._start is None:
+        if self.state is not State.RUNNING:
             return None
         ticks = max(1, self._wanted() - self._waiting())
         due = self._origin + (self._ring.tick + ticks - 1) * self._start.period
@@ -138,35 +125,16 @@ class DeviceMachine:
 
     def take(self) -> bytes | None:
         """The next frame to write, or None."""
-        if not self._outbox:
-            return None
-        frame = self._outbox.popleft()
-        self._backlog -= len(frame)
-        return frame
-
-    def lose(self, samples: int) -> None:
-        """Drop the next ``samples`` as if the line were full (a fault, to test hosts with)."""
-        self._to_lose += samples
-
-    # --- frames -------------------------------------------------------------------------------
-
-    def _take(self, frame: Frame, now: int) -> None:
-        if frame.type == Type.HELLO:
-            self._hello(frame, now)
-        elif frame.session != self._session or self._session == 0:
-            # After a restart of the device: the host must hear that its run is gone.
-            self._reply(frame, Result.NO_SESSION)
-        else:
-            self.heard = now
-            self._dispatch(frame, now)
+        return self._outbox.popleft() if self._outbox else None
 
     def _dispatch(self, frame: Frame, now: int) -> None:
         if frame.type == Type.COMMANDS:
             self._commands(frame)
         elif frame.type == Type.PING:
             with contextlib.suppress(*messages.MALFORMED):
-                pong = Pong(messages.unpack_ping(frame.payload), now, now)
-                self._send(Type.PONG, frame.seq, pong.pack(self._status()))
+                (stamp,) = messages.PING.unpack(frame.payload)
+                pong = Pong(stamp, now, now, self._status())
+                self._answer(frame, Type.PONG, pong.pack())
         else:
             self._request(frame, now)
 
@@ -182,19 +150,18 @@ class DeviceMachine:
             self._end()
             self._session, self._answered, self.heard = frame.session, None, now
             self._outbox.clear()
-            self._backlog = 0
             if self.latch is not Latch.WATCHDOG:
                 self.latch = Latch.NONE
             self._board.connect()
         welcome = replace(self.identity, latch=self.latch)
-        self._write(codec.encode(Type.WELCOME, frame.session, frame.seq, welcome.pack()))
+        self._answer(frame, Type.WELCOME, welcome.pack())
 
     def _request(self, frame: Frame, now: int) -> None:
         """Carry out a request once, however often it comes."""
         if self._answered is not None:
             ahead = (frame.seq - self._answered[0]) & 0xFFFF
             if ahead == 0:
-                self._write(self._answered[1])
+                self._outbox.append(self._answered[1])
             if ahead == 0 or ahead >= _NEWER:
                 return  # a repetition, or one that was overtaken
         result = self._carry_out(frame, now)
@@ -210,8 +177,8 @@ class DeviceMachine:
             return Result.BAD_VALUE
         return carry_out(payload, now)
 
-    def _announce(self, announced: tuple[int, float], now: int) -> Result:
-        self._board.announce(*announced)
+    def _announce(self, payload: tuple[int, float], now: int) -> Result:
+        self._board.announce(*payload)
         return Result.OK
 
     def _safe(self, payload: bytes, now: int) -> Result:
@@ -224,8 +191,6 @@ class DeviceMachine:
         self.latch = Latch.NONE
         return Result.OK
 
-    # --- the run ------------------------------------------------------------------------------
-
     def _arm(self, start: Start, now: int) -> Result:
         if not self._possible(start):
             return Result.BAD_VALUE
@@ -233,11 +198,10 @@ class DeviceMachine:
             return Result.LATCHED
         self._end()
         self._run, self._start = start.run, start._replace(guard=self._narrowed(start.guard))
-        self._watchdog = round(
-            (start.watchdog or self.identity.watchdog_default) * 1e-3 * self.identity.clock
-        )
+        watchdog = start.watchdog or self.identity.watchdog_default
+        self._watchdog = round(watchdog * 1e-3 * self.identity.clock)
         self._ring.restart(start.mode)
-        self._overflow = self._first = self._to_lose = 0
+        self._overflow = self._first = self.to_lose = 0
         rate = self.identity.clock / start.period
         self._block = max(1, min(round(BLOCK_SECONDS * rate), _LARGEST_BLOCK))
         self._board.start(rate, self._start.guard)
@@ -254,7 +218,7 @@ class DeviceMachine:
             and all(low <= 0 <= high for low, high in clamps)
         )
 
-    def _narrowed(self, guard: CodedGuard) -> CodedGuard:
+    def _narrowed(self, guard: messages.CodedGuard) -> messages.CodedGuard:
         """The host's guard, its clamps narrowed to what this device ever gives."""
         outputs = self.identity.channels[len(ANALOG_INPUTS) : len(ANALOG_INPUTS) + len(CHANNELS)]
         lowest = [int(np.ceil((item.low - item.offset) / item.scale)) for item in outputs]
@@ -263,16 +227,16 @@ class DeviceMachine:
         high = tuple(map(min, guard.command_high, highest))
         return guard._replace(command_low=low, command_high=high)
 
-    def _go(self, run: int, now: int) -> Result:
-        if run != self._run or self.state is State.IDLE:
+    def _go(self, payload: tuple[int], now: int) -> Result:
+        if payload != (self._run,) or self.state is State.IDLE:
             return Result.WRONG_STATE
         if self.state is State.ARMED:
             self._origin = self.heard = now
             self.state = State.RUNNING
         return Result.OK
 
-    def _stop(self, run: int, now: int) -> Result:
-        if run == self._run:
+    def _stop(self, payload: tuple[int], now: int) -> Result:
+        if payload == (self._run,):
             self._end()
         return Result.OK
 
@@ -288,10 +252,9 @@ class DeviceMachine:
             self._ring.forget()
         if self.state is State.ARMED or not in_order:
             # While it runs, the samples carry the same news.
-            self._send(Type.STATUS, self._next_seq(), self._status().pack())
+            self._send(Type.STATUS, self._status().pack())
 
     def _play_until(self, now: int) -> None:
-        assert self._start is not None
         due = (now - self._origin) // self._start.period + 1 - self._ring.tick
         while due > 0:
             n = min(due, self._block)
@@ -302,17 +265,11 @@ class DeviceMachine:
 
     def _play(self, n: int) -> None:
         """Play n ticks: commands and flags, the board's samples, and the latches that they set."""
-        assert self._start is not None
-        codes, unbroken = self._ring.take(n)
-        flags = np.zeros(n, dtype=np.uint32)
+        codes, flags = self._ring.take(n)
         if self.latch is not Latch.NONE:
             codes = np.zeros_like(codes)
             flags[:] = int(Flag.UNDERFLOW) if self.latch is Latch.UNDERFLOW else 0
         else:
-            if self._start.mode is LoopMode.CLOSED:
-                flags[self._ring.held] = int(Flag.HELD)
-            else:
-                flags[unbroken:] = int(Flag.UNDERFLOW)
             guard = self._start.guard
             clamped = np.clip(codes, guard.command_low, guard.command_high)
             flags[(clamped != codes).any(axis=1)] |= np.uint32(Flag.CLAMPED)
@@ -342,16 +299,13 @@ class DeviceMachine:
         self._samples = []
         self.state = State.IDLE
 
-    # --- what goes out ------------------------------------------------------------------------
-
     def _waiting(self) -> int:
         return sum(map(len, self._samples))
 
     def _wanted(self) -> int:
         """How many samples make a block: one when a host may be waiting to answer it."""
-        assert self._start is not None
         ahead = self._ring.until - self._ring.tick
-        hurry = self._start.mode is LoopMode.CLOSED and self.latch is Latch.NONE
+        hurry = self._start.mode is Mode.CLOSED_LOOP and self.latch is Latch.NONE
         return 1 if hurry and ahead < self._block else self._block
 
     def _flush(self) -> None:
@@ -360,23 +314,19 @@ class DeviceMachine:
             return
         joined = np.concatenate(self._samples)
         self._samples = []
-        lost = min(self._to_lose, len(joined))
-        self._to_lose -= lost
-        self._pass_over(lost)
+        lost = min(self.to_lose, len(joined))
+        self.to_lose -= lost
+        self._overflow += lost
+        self._first += lost
         for at in range(lost, len(joined), _LARGEST_BLOCK):
             part = joined[at : at + _LARGEST_BLOCK]
-            if self._backlog > TRANSMIT_BUFFER:
-                self._pass_over(len(part))
-                continue
-            assert self._start is not None
-            time = self._origin + self._first * self._start.period
-            block = Block(self._status(), self._first, time, part)
-            self._send(Type.SAMPLES, self._next_seq(), block.pack())
+            if sum(map(len, self._outbox)) > TRANSMIT_BUFFER:
+                self._overflow += len(part)
+            else:
+                time = self._origin + self._first * self._start.period
+                block = Block(self._status(), self._first, time, part)
+                self._send(Type.SAMPLES, block.pack())
             self._first += len(part)
-
-    def _pass_over(self, samples: int) -> None:
-        self._overflow += samples
-        self._first += samples
 
     def _status(self) -> Status:
         ring = self._ring
@@ -384,18 +334,12 @@ class DeviceMachine:
         return Status(self._run, self.state, self.latch, *queue, self._overflow)
 
     def _reply(self, frame: Frame, result: Result) -> bytes:
-        payload = Reply(frame.type, result).pack() + self._status().pack()
-        reply = codec.encode(Type.REPLY, frame.session, frame.seq, payload)
-        self._write(reply)
-        return reply
+        return self._answer(frame, Type.REPLY, Reply(frame.type, result, self._status()).pack())
 
-    def _next_seq(self) -> int:
-        self._seq = (self._seq + 1) & 0xFFFF
-        return self._seq
+    def _answer(self, frame: Frame, type_: Type, payload: bytes) -> bytes:
+        answer = codec.encode(type_, frame.session, frame.seq, payload)
+        self._outbox.append(answer)
+        return answer
 
-    def _send(self, type_: Type, seq: int, payload: bytes) -> None:
-        self._write(codec.encode(type_, self._session, seq, payload))
-
-    def _write(self, frame: bytes) -> None:
-        self._outbox.append(frame)
-        self._backlog += len(frame)
+    def _send(self, type_: Type, payload: bytes) -> None:
+        self._outbox.append(codec.encode(type_, self._session, next(self._sequence), payload))

@@ -61,8 +61,8 @@ def emulator(folder, *arguments, plant=None):
 # Imports and compiles what an emulator needs, then becomes one per line of standard input.
 _FORKING = """
 import json, os, signal, sys, traceback
-import daq.cli, daq.cli.app, daq.serial.emulation.emulator
-from daq.serial.emulation.board import warm_up
+import daq.cli, daq.cli.app
+from daq.serial.emulation.emulator import warm_up
 from sim_rig.backend import SimulatedDevice, Simulation
 
 warm_up(SimulatedDevice(Simulation()))

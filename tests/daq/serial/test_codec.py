@@ -7,6 +7,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from daq.hal import Mode
 from daq.serial import codec, messages
 from daq.serial.codec import Decoder, decode, encode
 
@@ -123,7 +124,7 @@ def test_a_block_of_samples_comes_back_as_it_was(n, first, time):
         info = np.iinfo(records[name].dtype)
         records[name] = rng.integers(info.min, info.max, records[name].shape, endpoint=True)
     records["count_rate"] = rng.standard_normal(n)
-    block = messages.unpack_samples(messages.Block(STATUS, first, time, records).pack())
+    block = messages.Block.unpack(messages.Block(STATUS, first, time, records).pack())
     assert (block.status, block.first, block.time) == (STATUS, first, time)
     assert np.array_equal(block.records, records)
 
@@ -131,17 +132,17 @@ def test_a_block_of_samples_comes_back_as_it_was(n, first, time):
 @pytest.mark.parametrize(
     ("unpack", "payload"),
     [
-        (messages.unpack_status, STATUS.pack()),
-        (messages.unpack_samples, messages.Block(
+        (messages.Status.unpack, STATUS.pack()),
+        (messages.Block.unpack, messages.Block(
             STATUS, 0, 0, np.zeros(3, messages.SAMPLE_DTYPE)).pack()),
-        (messages.unpack_reply, messages.Reply(2, messages.Result.OK).pack() + STATUS.pack()),
-        (messages.unpack_pong, messages.Pong(1, 2, 3).pack(STATUS)),
+        (messages.Reply.unpack, messages.Reply(2, messages.Result.OK, STATUS).pack()),
+        (messages.Pong.unpack, messages.Pong(1, 2, 3, STATUS).pack()),
         (messages.unpack_commands, messages.pack_commands(1, 2, np.zeros((3, 2), "<i2"))),
-        (messages.unpack_announce, messages.pack_announce(2, 5.0)),
-        (messages.unpack_run, messages.pack_run(3)),
-        (messages.unpack_ping, messages.pack_ping(3)),
+        (messages.ANNOUNCE.unpack, messages.ANNOUNCE.pack(2, 5.0)),
+        (messages.RUN.unpack, messages.RUN.pack(3)),
+        (messages.PING.unpack, messages.PING.pack(3)),
         (messages.Start.unpack, messages.Start(
-            1, messages.LoopMode.OPEN, 60_000, 100, messages.CodedGuard(
+            1, Mode.OPEN_LOOP, 60_000, 100, messages.CodedGuard(
                 (-1, 0), (1, 1), (-5,) * 3, (5,) * 3, -9, 9, 1e3, 4)).pack()),
         (messages.Welcome.unpack, messages.Welcome(
             "d", "f", "s", 1, 1.0, 1, 64, 100, 1000,

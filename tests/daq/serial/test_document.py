@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daq.hal import Phase
+from daq.hal import Mode, Phase
 from daq.serial import codec, host, messages
 from daq.serial.emulation import machine as device
 from daq.serial.messages import (
@@ -15,7 +15,6 @@ from daq.serial.messages import (
     Channel,
     CodedGuard,
     Latch,
-    LoopMode,
     Pong,
     Reply,
     Result,
@@ -32,7 +31,7 @@ ARMED = Status(1, State.ARMED, Latch.NONE, 0, 0, 512, 0, 0)
 PRELOADED = Status(1, State.ARMED, Latch.NONE, 0, 3, 512, 0, 0)
 RUNNING = Status(1, State.RUNNING, Latch.NONE, 1, 3, 513, 0, 0)
 START = Start(
-    1, LoopMode.OPEN, 60_000, 100, CodedGuard(
+    1, Mode.OPEN_LOOP, 60_000, 100, CodedGuard(
         (-16384, 0), (16384, 1245), (-15729, -1245, -(2**31)), (15729, 1245, 2**31 - 1),
         -(2**31), 40_960, 260_760.0, 1629,
     ),
@@ -63,16 +62,16 @@ WELCOME = Welcome(
 )  # fmt: skip
 
 EXAMPLES = {
-    "HELLO": (Type.HELLO, 1, messages.Hello("ana@lab").pack()),
+    "HELLO": (Type.HELLO, 1, messages.pack_hello("ana@lab")),
     "WELCOME": (Type.WELCOME, 1, WELCOME.pack()),
     "START": (Type.START, 2, START.pack()),
-    "REPLY to START": (Type.REPLY, 2, Reply(Type.START, Result.OK).pack() + ARMED.pack()),
+    "REPLY to START": (Type.REPLY, 2, Reply(Type.START, Result.OK, ARMED).pack()),
     "COMMANDS": (Type.COMMANDS, 7, messages.pack_commands(1, 0, COMMANDS)),
     "STATUS": (Type.STATUS, 1, PRELOADED.pack()),
-    "GO": (Type.GO, 3, messages.pack_run(1)),
+    "GO": (Type.GO, 3, messages.RUN.pack(1)),
     "SAMPLES": (Type.SAMPLES, 2, Block(RUNNING, 0, 96_000_000, _record()).pack()),
-    "PING": (Type.PING, 8, messages.pack_ping(1_000_000_000)),
-    "PONG": (Type.PONG, 8, Pong(1_000_000_000, 96_000_480, 96_000_490).pack(RUNNING)),
+    "PING": (Type.PING, 8, messages.PING.pack(1_000_000_000)),
+    "PONG": (Type.PONG, 8, Pong(1_000_000_000, 96_000_480, 96_000_490, RUNNING).pack()),
     "SAFE": (Type.SAFE, 4, b""),
 }
 
@@ -104,10 +103,10 @@ SIZES = {
     "WELCOME": messages._WELCOME.size,
     "Channel": messages._CHANNEL.size,
     "START": messages._START.size,
-    "GO, STOP": messages._RUN.size,
-    "ANNOUNCE": messages._ANNOUNCE.size,
+    "GO, STOP": messages.RUN.size,
+    "ANNOUNCE": messages.ANNOUNCE.size,
     "COMMANDS": messages._COMMANDS.size,
-    "PING": messages._PING.size,
+    "PING": messages.PING.size,
     "REPLY": messages._REPLY.size + messages._STATUS.size,
     "Status": messages._STATUS.size,
     "PONG": messages._PONG.size + messages._STATUS.size,

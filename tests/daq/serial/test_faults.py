@@ -15,7 +15,7 @@ from daq.hal import Flag, Guard, Mode
 from daq.logs.recording import load
 from daq.serial.backend import SerialDevice, SerialOptions
 from daq.serial.emulation import faults
-from daq.serial.link import open_link
+from daq.serial.ports import open_link
 from tests.daq.serial.support import forked_emulators, write_serial_rig
 from tests.daq.support import (
     forked_rig,

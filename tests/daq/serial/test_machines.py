@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from daq.hal import ANALOG_INPUTS, CHANNELS, Flag
+from daq.hal import ANALOG_INPUTS, CHANNELS, Flag, Mode
 from daq.serial import codec, messages
 from daq.serial.emulation.faults import Line
 from daq.serial.emulation.machine import DeviceMachine
@@ -12,7 +12,6 @@ from daq.serial.messages import (
     Channel,
     CodedGuard,
     Latch,
-    LoopMode,
     Result,
     Start,
     State,
@@ -93,7 +92,7 @@ class Bench:
         self.now = 100.0
         self.board = CountingBoard()
         self.device = DeviceMachine(self.board, identity(**device))
-        self.host = HostMachine(4711, "test")
+        self.host = HostMachine(4711)
         self.to_device, self.to_host = Line(seed), Line(seed + 1)
         self.alive = True
 
@@ -124,23 +123,23 @@ class Bench:
             self.step()
 
     def connect(self):
-        self.host.hello(self.now, 2.0)
+        self.host.ask(Type.HELLO, messages.pack_hello("test"), self.now, 2.0)
         self.until(lambda: self.host.welcome)
 
     def ask(self, type_, payload=b""):
         self.host.ask(type_, payload, self.now)
-        self.until(lambda: not self.host.waiting)
+        self.until(lambda: self.host.pending is None)
         return self.host.reply.result
 
     def start(self, mode, **changes):
         self.host.start(start_message(mode, **changes), self.now)
-        self.until(lambda: not self.host.waiting)
+        self.until(lambda: self.host.pending is None)
         assert self.host.reply.result is Result.OK
 
     def go(self):
-        self.until(lambda: self.host.preloaded)
+        self.until(lambda: self.host.commands.preloaded)
         self.host.go(self.now)
-        self.until(lambda: not self.host.waiting)
+        self.until(lambda: self.host.pending is None)
 
     def take(self):
         blocks = list(self.host.blocks)
@@ -175,11 +174,11 @@ class Log:
 
 def play_open(bench, n):
     commands = wave(n)
-    bench.start(LoopMode.OPEN)
+    bench.start(Mode.OPEN_LOOP)
     log, sent = Log(), 0
     while not log.ticks or log.ticks[-1] < n - 1:
         assert bench.host.failure is None, bench.host.failure
-        room = min(bench.host.room, n - sent)
+        room = min(bench.host.commands.room, n - sent)
         if room > 0:
             bench.host.send(sent, commands[sent : sent + room], bench.now)
             sent += room
@@ -191,7 +190,7 @@ def play_open(bench, n):
 
 
 def play_closed(bench, n, ahead=1):
-    bench.start(LoopMode.CLOSED)
+    bench.start(Mode.CLOSED_LOOP)
     commands = wave(3 * n)
     bench.host.send(0, commands[:ahead], bench.now)
     bench.go()
@@ -268,20 +267,20 @@ def test_closed_loop_holds_and_flags_and_never_misplaces_a_command(faults):
 def test_requests_are_carried_out_once_however_often_they_come():
     bench = Bench()
     bench.connect()
-    bench.start(LoopMode.CLOSED)
-    start = codec.encode(Type.START, 4711, 2, start_message(LoopMode.CLOSED).pack())
+    bench.start(Mode.CLOSED_LOOP)
+    start = codec.encode(Type.START, 4711, 2, start_message(Mode.CLOSED_LOOP).pack())
     bench.go()
     bench.wait(0.05)
     before = bench.device.state, bench.board.tick
     for _ in range(3):
         bench.device.receive(start, round(bench.now * CLOCK))
     assert before == (State.RUNNING, bench.board.tick), "an old START does not start anew"
-    hello = codec.encode(Type.HELLO, 4711, 1, messages.Hello("test").pack())
+    hello = codec.encode(Type.HELLO, 4711, 1, messages.pack_hello("test"))
     bench.device.receive(hello, round(bench.now * CLOCK))
     assert bench.device.state is State.RUNNING, "nor does a repeated HELLO end the run"
 
 
-@pytest.mark.parametrize("mode", list(LoopMode))
+@pytest.mark.parametrize("mode", list(Mode))
 def test_a_dead_host_means_zero_within_the_watchdogs_time_until_it_is_cleared(mode):
     bench = Bench()
     bench.connect()
@@ -304,7 +303,7 @@ def test_a_dead_host_means_zero_within_the_watchdogs_time_until_it_is_cleared(mo
     bench.wait(0.1)
     assert not bench.board.output.any()
     assert "watchdog" in str(bench.host.failure)
-    bench.host = HostMachine(99, "another")
+    bench.host = HostMachine(99)
     bench.connect()
     assert bench.host.welcome.latch is Latch.WATCHDOG
     assert bench.ask(Type.START, start_message(mode).pack()) is Result.LATCHED
@@ -315,7 +314,7 @@ def test_a_dead_host_means_zero_within_the_watchdogs_time_until_it_is_cleared(mo
 def test_a_device_that_is_left_alone_stops_sampling_too():
     bench = Bench()
     bench.connect()
-    bench.start(LoopMode.OPEN)
+    bench.start(Mode.OPEN_LOOP)
     bench.host.send(0, wave(500), bench.now)
     bench.go()
     bench.alive = False
@@ -326,7 +325,7 @@ def test_a_device_that_is_left_alone_stops_sampling_too():
 def test_a_waveform_that_runs_dry_is_flagged_and_zero_for_good():
     bench = Bench()
     bench.connect()
-    bench.start(LoopMode.OPEN)
+    bench.start(Mode.OPEN_LOOP)
     bench.host.send(0, wave(100), bench.now)
     bench.go()
     bench.wait(0.2)
@@ -344,7 +343,7 @@ def test_an_input_beyond_the_guard_is_zero_from_its_own_row_on():
     bench = Bench()
     bench.board.trip_at = 60
     bench.connect()
-    bench.start(LoopMode.OPEN)
+    bench.start(Mode.OPEN_LOOP)
     bench.host.send(0, wave(400), bench.now)
     bench.go()
     bench.wait(0.2)
@@ -361,7 +360,7 @@ def test_a_device_clamps_to_the_narrower_of_its_own_and_the_hosts_limits():
     own[3] = Channel("motor", "V", 1e-3, 0.0, -2.0, 2.0)
     bench = Bench(channels=tuple(own))
     bench.connect()
-    bench.start(LoopMode.OPEN, command_high=(32767, 32767), command_low=(-32768, -32768))
+    bench.start(Mode.OPEN_LOOP, command_high=(32767, 32767), command_low=(-32768, -32768))
     asked = np.array([[5000, 500], [-5000, -500], [1999, 10], [2000, 10]], dtype="<i2")
     bench.host.send(0, asked, bench.now)
     bench.go()
@@ -381,8 +380,8 @@ def test_a_device_clamps_to_the_narrower_of_its_own_and_the_hosts_limits():
 def test_a_start_that_the_device_cannot_do_is_refused(changes):
     bench = Bench()
     bench.connect()
-    bench.host.start(start_message(LoopMode.OPEN, **changes), bench.now)
-    bench.until(lambda: not bench.host.waiting)
+    bench.host.start(start_message(Mode.OPEN_LOOP, **changes), bench.now)
+    bench.until(lambda: bench.host.pending is None)
     assert bench.host.reply.result is Result.BAD_VALUE
     assert bench.device.state is State.IDLE
 
@@ -390,7 +389,7 @@ def test_a_start_that_the_device_cannot_do_is_refused(changes):
 def test_a_device_that_restarts_is_noticed():
     bench = Bench()
     bench.connect()
-    bench.start(LoopMode.CLOSED)
+    bench.start(Mode.CLOSED_LOOP)
     bench.go()
     bench.wait(0.05)
     bench.device = DeviceMachine(bench.board, identity())
@@ -402,11 +401,11 @@ def test_a_device_that_restarts_is_noticed():
 def test_a_full_line_costs_samples_that_are_counted_and_no_others():
     bench = Bench()
     bench.connect()
-    bench.start(LoopMode.CLOSED)
+    bench.start(Mode.CLOSED_LOOP)
     bench.host.send(0, wave(10), bench.now)
     bench.go()
     bench.wait(0.05)
-    bench.device.lose(17)
+    bench.device.to_lose += 17
     bench.wait(0.2)
     log = Log()
     log.add(bench.take())
@@ -417,7 +416,7 @@ def test_a_full_line_costs_samples_that_are_counted_and_no_others():
 
 def test_another_version_is_named_and_changes_nothing_in_the_device():
     bench = Bench(version=2)
-    bench.host.hello(bench.now, 1.0)
+    bench.host.ask(Type.HELLO, messages.pack_hello("test"), bench.now, 1.0)
     bench.until(lambda: bench.host.other_version is not None)
     assert bench.host.other_version == 2 and bench.host.welcome is None
     assert bench.device.state is State.IDLE
@@ -427,7 +426,7 @@ def test_random_bytes_never_move_a_device():
     rng = np.random.default_rng(2)
     bench = Bench()
     bench.connect()
-    bench.start(LoopMode.OPEN)
+    bench.start(Mode.OPEN_LOOP)
     accepted = bench.device.decoder.accepted
     for _ in range(200):
         bench.device.receive(rng.bytes(300), round(bench.now * CLOCK))
