@@ -18,10 +18,10 @@ from pathlib import Path
 from typing import Any
 
 from sysid.arrays import IntArray
-from sysid.engine import batch_kernel, trajectory_kernel
-from sysid.engine.scheme import Shape
+from sysid.engine.batch_kernel import BatchKernel
 from sysid.engine.structure import analyse
 from sysid.engine.substitution import KNOWN_MODULES, names_in, rebuilt
+from sysid.engine.trajectory_kernel import TrajectoryKernel
 from sysid.problem.model import ModelError, ProcessModel
 
 _OPTIONS: dict[str, Any] = {
@@ -30,9 +30,6 @@ _OPTIONS: dict[str, Any] = {
     "error_model": "numpy",
     "fastmath": {"contract", "arcp", "nsz"},
 }
-
-
-Tables = tuple[IntArray, IntArray, IntArray]
 
 
 class Guarded:
@@ -59,19 +56,20 @@ class Guarded:
 class Kernels:
     """Compiled functions of one model, the floats of the work areas and the tables they need.
 
-    simulate, spectrum, work_rows and tables: see ``batch_kernel``; levels, advance, levels_size
-    and levels_tables: see ``trajectory_kernel``. fewest_steps: see ``scheme.Shape``. guarded:
-    whether there are limits that fast linear parts may run into.
+    simulate, spectrum, work_rows and tables: see ``BatchKernel``; levels, advance, levels_size
+    and levels_tables: see ``TrajectoryKernel``. fewest_steps: per sample, below which the error
+    estimate is not to be trusted. guarded: whether there are limits that fast linear parts may
+    run into.
     """
 
     simulate: Guarded
     spectrum: Guarded
-    work_rows: int
-    tables: Tables
     levels: Guarded
     advance: Guarded
+    work_rows: int
+    tables: tuple[IntArray, ...]
     levels_size: int
-    levels_tables: Tables
+    levels_tables: tuple[IntArray, ...]
     fewest_steps: int
     guarded: bool
 
@@ -83,26 +81,30 @@ def kernels(model: ProcessModel, *, exact: bool = True) -> Kernels:
     Compilation itself happens at the first call. Without ``exact`` nothing is integrated
     exactly. Raises ModelError when the model's functions use something that cannot be compiled.
     """
-    shape = Shape.of(model, analyse(model, exact=exact))
-    text, called = _text(model, shape)
-    path = _source_file(f"{_safe(model.name)}_{_key(text, called)}.py", text)
+    structure = analyse(model, exact=exact)
+    batch, trajectory = BatchKernel(model, structure), TrajectoryKernel(model, structure)
+    text, called = _text(model, batch, trajectory)
+    name = "".join(c if c.isalnum() else "_" for c in model.name)[:40]
+    path = _source_file(f"{name}_{_key(text, called)}.py", text)
     scope = _scope(called)
     exec(compile(text, str(path or "<kernel>"), "exec"), scope)
     for name in ("constants", "remainder", "observe", "margins"):
         if name in scope:
             scope[name] = _njit(scope[name])
-    guarded = {
+    compiled = {
         name: Guarded(model, _njit(scope[name], nogil=True, cache=path is not None))
         for name in ("simulate", "spectrum", "levels", "advance")
     }
     return Kernels(
-        **guarded,
-        work_rows=batch_kernel.work_rows(shape),
-        tables=_tables(shape, batch_kernel.first_entry(shape)),
-        levels_size=trajectory_kernel.work_size(shape),
-        levels_tables=_tables(shape, 0),
-        fewest_steps=shape.fewest_steps,
-        guarded=bool(shape.structure.guards),
+        **compiled,
+        work_rows=batch.work_rows,
+        tables=batch.tables(batch.first_entry),
+        levels_size=trajectory.work_size,
+        levels_tables=trajectory.tables(0),
+        # Fast linear parts that feed a nonlinear one swing within a sample: a single step of any
+        # size may happen to meet them at rest.
+        fewest_steps=2 if structure.coefficients and structure.nonlinear else 1,
+        guarded=bool(structure.guards),
     )
 
 
@@ -111,31 +113,24 @@ def fingerprint(model: ProcessModel) -> str:
 
     The equations, the constraints, and how this computer's processor is made use of.
     """
-    text, called = _text(model, Shape.of(model, analyse(model, exact=True)))
-    key = hashlib.sha256(_key(text, called).encode())
+    structure = analyse(model)
+    batch, trajectory = BatchKernel(model, structure), TrajectoryKernel(model, structure)
+    key = hashlib.sha256(_key(*_text(model, batch, trajectory)).encode())
     for constraint in model.constraints:
         _fingerprint(constraint.function, key, set())
     return key.hexdigest()
 
 
-def _text(model: ProcessModel, shape: Shape) -> tuple[str, dict[str, Any]]:
+def _text(
+    model: ProcessModel, batch: BatchKernel, trajectory: TrajectoryKernel
+) -> tuple[str, dict[str, Any]]:
     """Text of a model's kernels, and the model's functions that it calls."""
     # Numba is slow to import.
     from sysid.engine.intrinsics import many_registers
 
-    program = shape.structure.program
-    batch = batch_kernel.source(shape, many_registers=many_registers())
-    text = "\n\n".join((program.text, batch, trajectory_kernel.source(shape)))
-    return text, {name: getattr(model, name) for name in sorted(program.calls)}
-
-
-def _tables(shape: Shape, first: int) -> Tables:
-    """Tables of ``scheme_matrices`` for matrices that stand from row ``first`` on."""
-    import numpy as np
-
-    entries = np.array(shape.structure.closure(shape.n_states), dtype=np.int64)
-    triples = np.array(shape.structure.products(shape.n_states), dtype=np.int64)
-    return entries, triples, np.array(shape.places(first), dtype=np.int64)
+    structure = batch.structure
+    texts = structure.program, batch.text(many_registers=many_registers()), trajectory.text
+    return "\n\n".join(texts), {name: getattr(model, name) for name in sorted(structure.calls)}
 
 
 def _key(text: str, called: Mapping[str, Any]) -> str:
@@ -263,7 +258,3 @@ def _source_file(name: str, text: str) -> Path | None:
     except OSError:
         return None
     return path
-
-
-def _safe(name: str) -> str:
-    return "".join(c if c.isalnum() else "_" for c in name)[:40]

@@ -8,7 +8,7 @@ from llvmlite import binding, ir
 from numba import types
 from numba.core.extending import intrinsic as _intrinsic
 
-from sysid.engine.lanes import LANES
+from sysid.engine.scheme import LANES
 
 # What it makes is called without the context that its functions take first.
 intrinsic: Any = _intrinsic

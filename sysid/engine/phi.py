@@ -19,7 +19,7 @@ from numba import njit
 
 from sysid.arrays import FloatArray, IntArray
 from sysid.engine.intrinsics import from_bits, multiply_add, to_bits, wide_vectors
-from sysid.engine.lanes import LANES
+from sysid.engine.scheme import LANES
 
 _SMALL = 0.5  # norm at which the series takes over
 _TERMS = 10  # leaves 0.5^10/13! = 2e-13

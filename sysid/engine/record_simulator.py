@@ -6,7 +6,7 @@ import numpy as np
 
 from sysid.arrays import BoolArray, FloatArray, IntArray
 from sysid.engine.compiler import Kernels
-from sysid.engine.lanes import LANES, work_area
+from sysid.engine.scheme import LANES, work_area
 from sysid.problem.data import Dataset
 from sysid.problem.model import ProcessModel
 from sysid.threads import Workers

@@ -10,8 +10,8 @@ import numpy as np
 
 from sysid.arrays import FloatArray, IntArray
 from sysid.engine.compiler import kernels
-from sysid.engine.lanes import LANES
 from sysid.engine.record_simulator import RecordSimulator
+from sysid.engine.scheme import LANES
 from sysid.problem.data import Dataset
 from sysid.problem.model import ModelError, ProcessModel
 from sysid.threads import Workers, available_cores

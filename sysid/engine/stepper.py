@@ -7,7 +7,7 @@ import numpy as np
 
 from sysid.arrays import FloatArray
 from sysid.engine.compiler import kernels
-from sysid.engine.lanes import work_area
+from sysid.engine.scheme import work_area
 from sysid.engine.trajectory_kernel import LEVELS
 from sysid.problem.model import ModelError, ProcessModel
 
