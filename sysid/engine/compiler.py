@@ -20,7 +20,7 @@ from typing import Any
 from sysid.arrays import IntArray
 from sysid.engine.batch_kernel import BatchKernel
 from sysid.engine.structure import analyse
-from sysid.engine.substitution import KNOWN_MODULES, names_in, rebuilt
+from sysid.engine.substitution import KNOWN_MODULES, Copier, names_in
 from sysid.engine.trajectory_kernel import TrajectoryKernel
 from sysid.problem.model import ModelError, ProcessModel
 
@@ -194,7 +194,7 @@ def _explain(model: ProcessModel, error: Exception) -> str:
 
 def machine_code(function: Any) -> Any:
     """A function compiled, with all plain functions that it refers to, also through a module."""
-    return rebuilt(function, _vector_math(), _njit)
+    return Copier(_vector_math(), _njit).copied(function)
 
 
 def _vector_math() -> Any:

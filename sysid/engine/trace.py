@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 import numbers
+import types
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from sysid.engine.substitution import substituted
+from sysid.engine.substitution import Copier
 from sysid.engine.tape import Tape
 
 
@@ -71,7 +72,10 @@ class Trace:
 
 def followed(function: Any) -> Callable[..., tuple[Any, ...]]:
     """A copy of a model's function that takes traces."""
-    copy: Callable[..., tuple[Any, ...]] = substituted(function, _follow)
+    library = {name: _follow(f) if callable(f) else f for name, f in vars(math).items()}
+    builtins = {"min": _follow(min), "max": _follow(max)}
+    copier = Copier(types.SimpleNamespace(**library), lambda copy: copy, builtins, unwrap=True)
+    copy: Callable[..., tuple[Any, ...]] = copier.copied(function)
     return copy
 
 
