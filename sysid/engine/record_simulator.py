@@ -60,7 +60,6 @@ class RecordSimulator:
         kernels: Kernels,
         record: Dataset,
         scale: FloatArray | None,
-        *,
         accuracy: float,
         max_steps: int,
         workers: Workers,
@@ -160,20 +159,12 @@ class RecordSimulator:
         n_outputs = self._measured.shape[1]
         sums = np.empty((2 * n_outputs, LANES))
         work = work_area(self._kernels.work_rows * LANES)
+        record = (signal[:n_samples] for signal in (self._inputs, self._measured, self._weights))
+        start, p = self._initial(starts, padded), np.ascontiguousarray(parameters[padded].T)
         self._kernels.simulate(
-            work,
-            work.reshape(-1, LANES),
-            self._kernels.tables,
-            self._inputs[:n_samples],
-            self._measured[:n_samples],
-            self._weights[:n_samples],
-            self._initial(starts, padded),
-            np.ascontiguousarray(parameters[padded].T),
-            self.record.dt,
-            n_steps,
-            sums,
-            residuals,
-        )
+            work, work.reshape(-1, LANES), self._kernels.tables, *record, start, p,
+            self.record.dt, n_steps, sums, residuals,
+        )  # fmt: skip
         return sums[:n_outputs].T[: len(lanes)], sums[n_outputs:].T[: len(lanes)]
 
     def _attempt(

@@ -117,12 +117,8 @@ class BatchSimulator:
 
     def finer(self, accuracy: float) -> BatchSimulator:
         """The same simulations at another accuracy, stiff ones given the steps."""
-        return BatchSimulator(
-            self.model,
-            accuracy=accuracy,
-            threads=self.threads,
-            max_steps=max(self.max_steps, _MOST_STEPS),
-        )
+        most = max(self.max_steps, _MOST_STEPS)
+        return BatchSimulator(self.model, accuracy=accuracy, threads=self.threads, max_steps=most)
 
     def errors(
         self,
@@ -168,7 +164,7 @@ class BatchSimulator:
         (n, n_states), initial states; default the record's own.
         """
         parameters = self._check(parameters, [record])
-        n_steps = n_steps or int(self._steps(parameters, record, starts).max())
+        n_steps = n_steps or int(self.steps_of_each(parameters, record, starts).max())
         outputs = np.empty((record.n_samples, len(self.model.outputs), len(parameters)))
         on_record = self._on(record)
 
@@ -215,15 +211,12 @@ class BatchSimulator:
         self._workers.each(run, tasks)
         return Residuals(values, sse, excess)
 
-    def steps_of_each(self, parameters: FloatArray, record: Dataset) -> IntArray:
-        """Integration steps per sample that each parameter vector needs, (n,)."""
-        return self._steps(self._check(parameters, [record]), record)
-
-    def _steps(
+    def steps_of_each(
         self, parameters: FloatArray, record: Dataset, starts: FloatArray | None = None
     ) -> IntArray:
-        population = self._on(record).population(parameters, starts)
-        return np.minimum(population.n_steps, self.max_steps)
+        """Integration steps per sample that each parameter vector needs, (n,)."""
+        parameters = self._check(parameters, [record])
+        return np.minimum(self._on(record).population(parameters, starts).n_steps, self.max_steps)
 
     def _on(self, record: Dataset, scale: FloatArray | None = None) -> RecordSimulator:
         """What simulates a record; without a scale residuals are the outputs themselves."""
@@ -233,14 +226,9 @@ class BatchSimulator:
                 self._records.clear()
             # It holds the record, whose address stays its own as long.
             self._records[key] = RecordSimulator(
-                self.model,
-                self._kernels,
-                record,
-                scale,
-                accuracy=self.accuracy,
-                max_steps=self.max_steps,
-                workers=self._workers,
-            )
+                self.model, self._kernels, record, scale,
+                self.accuracy, self.max_steps, self._workers,
+            )  # fmt: skip
         return self._records[key]
 
     def _check(self, parameters: FloatArray, records: Sequence[Dataset]) -> FloatArray:

@@ -68,7 +68,7 @@ class Stepper:
         self._kernels = kernels(model)
         self._n_states, self._n_inputs = len(model.states), len(model.inputs)
         self._n_outputs = len(model.outputs)
-        self._base = dt / self.n_steps
+        self._base = dt / n_steps
         self._limit = (_ESTIMATE_LIMIT * accuracy) ** 2
         self._work = work_area(self._kernels.levels_size)
         self._least = 0
@@ -100,15 +100,13 @@ class Stepper:
         """Fill the work area, once for all runs, and compile what advances."""
         n = len(x)
         a = np.zeros((n, n))
-        compiled, work = self._kernels, self._work
-        compiled.levels(work, compiled.levels_tables, self.parameters, self.scale, self._base, a)
+        compiled, work, base = self._kernels, self._work, self._base
+        compiled.levels(work, compiled.levels_tables, self.parameters, self.scale, base, a)
         if compiled.guarded and np.isfinite(a).all():
-            periods = np.abs(np.linalg.eigvals(a)).max() * self._base / (2.0 * math.pi)
+            periods = np.abs(np.linalg.eigvals(a)).max() * base / (2.0 * math.pi)
             self._least = min(math.ceil(math.log2(max(periods, 1.0))), LEVELS)
         # A call over no interval, by which the compiler's complaints are explained.
         nothing = np.empty((0, n)), np.empty((0, self._n_outputs))
-        compiled.advance(
-            work, u[:1], x, self._base, self.n_steps, self._least, self._limit, *nothing
-        )
+        compiled.advance(work, u[:1], x, base, self.n_steps, self._least, self._limit, *nothing)
         self._run = compiled.advance.compiled
         return self._run

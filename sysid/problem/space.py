@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from sysid.arrays import BoolArray, FloatArray, IntArray
+from sysid.arrays import BoolArray, FloatArray
 from sysid.problem.data import Dataset
 from sysid.problem.model import ModelError, Parameter, ProcessModel, Scale
 from sysid.problem.ranges import Range, Tie, ties, with_search_range
@@ -33,9 +35,11 @@ class SearchSpace:
     initial states that are estimated, record by record. ``encode`` maps it to search coordinates
     (logarithm where the scale is log), ``decode`` back.
 
-    lower, upper: where the search starts. hard_lower, hard_upper: what it keeps within; for a
-    range with one end given these are that end and the physical limit, else lower and upper.
-    one_sided: names of the parameters with such a range. held: a search coordinate and the value
+    lower, upper: where the search starts. minimum, maximum: physical limits. hard_lower,
+    hard_upper: what the search keeps within; for a range with one end given these are that end
+    and the physical limit, else lower and upper. log: mask of the parameters searched by
+    logarithm. coded_lower, width: low ends and widths in search coordinates. All (n_free,).
+    one_sided: names of the parameters with one end given. held: a search coordinate and the value
     that it keeps.
 
     >>> from sysid.examples import lag
@@ -52,6 +56,24 @@ class SearchSpace:
     ties: tuple[Tie, ...] = ()
     one_sided: frozenset[str] = frozenset()
     held: tuple[int, float] | None = None
+    lower: FloatArray = field(init=False, repr=False)
+    upper: FloatArray = field(init=False, repr=False)
+    minimum: FloatArray = field(init=False, repr=False)
+    maximum: FloatArray = field(init=False, repr=False)
+    log: BoolArray = field(init=False, repr=False)
+    coded_lower: FloatArray = field(init=False, repr=False)
+    width: FloatArray = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        for name in ("lower", "upper", "minimum", "maximum"):
+            self._keep(name, np.array([getattr(p, name) for p in self.parameters], np.float64))
+        self._keep("log", np.array([p.scale == "log" for p in self.parameters], bool))
+        self._keep("coded_lower", self.encode(self.lower))
+        self._keep("width", self.encode(self.upper) - self.coded_lower)
+
+    def _keep(self, name: str, values: npt.NDArray[Any]) -> None:
+        values.setflags(write=False)
+        object.__setattr__(self, name, values)
 
     @classmethod
     def of(
@@ -152,43 +174,6 @@ class SearchSpace:
         """Names of the free parameters, in order."""
         return tuple(parameter.name for parameter in self.parameters)
 
-    @cached_property
-    def lower(self) -> FloatArray:
-        """Low ends of the ranges, (n_free,)."""
-        return _constant([parameter.lower for parameter in self.parameters])
-
-    @cached_property
-    def upper(self) -> FloatArray:
-        """High ends of the ranges, (n_free,)."""
-        return _constant([parameter.upper for parameter in self.parameters])
-
-    @cached_property
-    def minimum(self) -> FloatArray:
-        """Physical minima, (n_free,)."""
-        return _constant([parameter.minimum for parameter in self.parameters])
-
-    @cached_property
-    def maximum(self) -> FloatArray:
-        """Physical maxima, (n_free,)."""
-        return _constant([parameter.maximum for parameter in self.parameters])
-
-    @cached_property
-    def log(self) -> BoolArray:
-        """Mask of the parameters searched by logarithm, (n_free,)."""
-        mask = np.array([parameter.scale == "log" for parameter in self.parameters], dtype=bool)
-        mask.setflags(write=False)
-        return mask
-
-    @cached_property
-    def coded_lower(self) -> FloatArray:
-        """Low ends of the ranges in search coordinates, (n_free,)."""
-        return _constant(self.encode(self.lower))
-
-    @cached_property
-    def width(self) -> FloatArray:
-        """Widths of the ranges in search coordinates, (n_free,)."""
-        return _constant(self.encode(self.upper) - self.encode(self.lower))
-
     @property
     def hard_lower(self) -> FloatArray:
         """Low ends that the search keeps to, (n_free,); -inf where there is none."""
@@ -209,7 +194,9 @@ class SearchSpace:
         if self.held is not None:
             place, value = self.held
             lower[place] = upper[place] = value
-        return _constant(lower), _constant(upper)
+        lower.setflags(write=False)
+        upper.setflags(write=False)
+        return lower, upper
 
     def holding(self, place: int, value: float) -> SearchSpace:
         """The space with a search coordinate held at a value."""
@@ -222,11 +209,6 @@ class SearchSpace:
         at = self.encode(chromosome)
         mask: BoolArray = (at < lower + near) | (at > upper - near)
         return mask
-
-    @cached_property
-    def _places(self) -> IntArray:
-        """Where the free parameters stand in a complete vector."""
-        return np.array(self.index, dtype=np.int64)
 
     @property
     def _open_ended(self) -> BoolArray:
@@ -264,7 +246,7 @@ class SearchSpace:
         chromosomes = np.asarray(chromosomes)
         vectors = np.empty((*chromosomes.shape[:-1], len(self.base)))
         vectors[:] = self.base
-        vectors[..., self._places] = chromosomes[..., : len(self.index)]
+        vectors[..., list(self.index)] = chromosomes[..., : len(self.index)]
         for tie in self.ties:
             vectors[..., tie.index] = tie.factor * vectors[..., tie.source]
         return vectors
@@ -284,28 +266,21 @@ class SearchSpace:
         for tie in self.ties:
             parameter, values = self.model.parameters[tie.index], vectors[:, tie.index]
             rows.append(np.maximum(parameter.minimum - values, values - parameter.maximum)[:, None])
-        rows.append(self._constraints_of(vectors))
+        rows.append(self._constraints(vectors))
         violations = np.maximum(0.0, np.concatenate(rows, axis=1))
         # Not-a-number is no proof of feasibility.
         return np.where(np.isnan(violations), np.inf, violations)
 
     def constraint_values(self, chromosomes: FloatArray) -> FloatArray:
         """The model's constraints g, satisfied where not above 0, (n_chromosomes, n)."""
-        return self._constraints_of(self.full(chromosomes))
+        return self._constraints(self.full(chromosomes))
 
-    def _constraints_of(self, vectors: FloatArray) -> FloatArray:
+    def _constraints(self, vectors: FloatArray) -> FloatArray:
         columns = tuple(vectors.T)
         values = np.zeros((len(vectors), len(self.model.constraints)))
         for i, constraint in enumerate(self.model.constraints):
             values[:, i] = constraint.function(columns)
         return values
-
-
-def _constant(values: Sequence[float] | FloatArray) -> FloatArray:
-    """A read-only array, which caches may share."""
-    array = np.array(values, dtype=np.float64)
-    array.setflags(write=False)
-    return array
 
 
 def _check_conflicts(*settings: Mapping[str, object]) -> None:

@@ -21,7 +21,7 @@ from sysid import (
     linearize,
 )
 from sysid.response.linearization import jacobians
-from tests.sysid.support import motor, motor_matrices
+from tests.sysid.support import motor, motor_matrices, outputs_of
 
 MODELS = {
     "motor": motor(),
@@ -56,8 +56,8 @@ def test_jacobians_agree_with_finite_differences(name, seed):
     for matrix, function, point in (
         (found.A, lambda v: model.derivative(tuple(v), tuple(u), p), x),
         (found.B, lambda v: model.derivative(tuple(x), tuple(v), p), u),
-        (found.C, lambda v: model.evaluate_output(tuple(v), tuple(u), p), x),
-        (found.D, lambda v: model.evaluate_output(tuple(x), tuple(v), p), u),
+        (found.C, lambda v: outputs_of(model, tuple(v), tuple(u), p), x),
+        (found.D, lambda v: outputs_of(model, tuple(x), tuple(v), p), u),
     ):
         expected = central_differences(function, point, 1e-6)
         size = np.abs(expected).max(axis=1, keepdims=True) + 1e-9
