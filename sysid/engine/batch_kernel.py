@@ -25,15 +25,15 @@ class BatchKernel(Scheme):
 
     ``simulate`` runs lanes of chromosomes over a record, ``spectrum`` bounds the fastest rate
     of what is not integrated exactly. The work area holds rows of lanes: states, constants, sums
-    of squared residuals, those of error estimates, and from ``first_entry`` on the matrices.
+    of squared residuals, those of error estimates, and from ``first_row`` on the matrices.
     """
 
     def __init__(self, model: ProcessModel, structure: Structure) -> None:
         super().__init__(model, structure)
         self._sums = self.n_states + self.n_constants
         self._estimates = self._sums + self.n_outputs
-        self.first_entry = self._estimates + self.n_outputs
-        self.work_rows = self.first_entry + self.n_entries
+        self.first_row = self._estimates + self.n_outputs
+        self.work_rows = self.first_row + self.n_entries
 
     def text(self, *, many_registers: bool) -> str:
         """Python text of both."""
@@ -42,7 +42,7 @@ class BatchKernel(Scheme):
         return "\n\n".join((self._simulate(paired), self._spectrum(), ""))
 
     def _place(self, entry: int) -> str:
-        return _at(self.first_entry + entry)
+        return _at(self.first_row + entry)
 
     def _constants(self) -> str:
         return "c = " + listed(_at(self.n_states + i) for i in range(self.n_constants))
@@ -50,11 +50,16 @@ class BatchKernel(Scheme):
     def _simulate(self, paired: bool) -> str:
         q = self.n_outputs
         errors = [f"record[k, {j}, l] = (o{j} - y{j}) * w{j}" for j in range(q)]
+        squares = [
+            line
+            for j in range(q)
+            for line in (f"e = (o{j} - y{j}) * w{j}", f"{_at(self._sums + j)} += e * e")
+        ]
         total = " + ".join(_at(self._sums + j) for j in range(q))
         sample = [
             *[f"v{j} = u[k, {j}]" for j in range(self.n_inputs)],
             *[f"{name}{j} = {name}[k, {j}]" for name in "yw" for j in range(q)],
-            *block(_EACH_LANE, self._residuals()),
+            *block(_EACH_LANE, self._outputs(), squares),
             *block("if record.shape[0] > 0:", block(_EACH_LANE, self._outputs(), errors)),
             *block("if k == n_samples - 1:", ["break"]),
             # A block in which all chromosomes have blown up has nothing more to say.
@@ -92,12 +97,6 @@ class BatchKernel(Scheme):
         lines = [f"A = np.zeros(({len(self.closure)}, {LANES}))", *block(_EACH_LANE, lane)]
         if self.n_entries:
             lines.append(f"scheme_matrices(A, np.full({LANES}, h), *tables, rows)")
-        return lines
-
-    def _residuals(self) -> list[str]:
-        lines = self._outputs()
-        for j in range(self.n_outputs):
-            lines += [f"e = (o{j} - y{j}) * w{j}", f"{_at(self._sums + j)} += e * e"]
         return lines
 
     def _all_lanes(self, paired: bool) -> list[str]:

@@ -8,7 +8,6 @@ changed model file therefore gets a new name, and an old kernel is never used fo
 import contextlib
 import functools
 import hashlib
-import importlib
 import os
 import tempfile
 import types
@@ -17,7 +16,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sysid.arrays import IntArray
 from sysid.engine.batch_kernel import BatchKernel
 from sysid.engine.structure import analyse
 from sysid.engine.substitution import KNOWN_MODULES, Copier, names_in
@@ -54,24 +52,16 @@ class Guarded:
 
 @dataclass(frozen=True)
 class Kernels:
-    """Compiled functions of one model, the floats of the work areas and the tables they need.
-
-    simulate, spectrum, work_rows and tables: see ``BatchKernel``; levels, advance, levels_size
-    and levels_tables: see ``TrajectoryKernel``. fewest_steps: per sample, below which the error
-    estimate is not to be trusted. guarded: whether there are limits that fast linear parts may
-    run into.
+    """Compiled functions of one model: ``simulate`` and ``spectrum`` of the batch kernel,
+    ``levels`` and ``advance`` of that of a trajectory.
     """
 
+    batch: BatchKernel
+    trajectory: TrajectoryKernel
     simulate: Guarded
     spectrum: Guarded
     levels: Guarded
     advance: Guarded
-    work_rows: int
-    tables: tuple[IntArray, ...]
-    levels_size: int
-    levels_tables: tuple[IntArray, ...]
-    fewest_steps: int
-    guarded: bool
 
 
 @functools.lru_cache(maxsize=8)
@@ -81,9 +71,7 @@ def kernels(model: ProcessModel, *, exact: bool = True) -> Kernels:
     Compilation itself happens at the first call. Without ``exact`` nothing is integrated
     exactly. Raises ModelError when the model's functions use something that cannot be compiled.
     """
-    structure = analyse(model, exact=exact)
-    batch, trajectory = BatchKernel(model, structure), TrajectoryKernel(model, structure)
-    text, called = _text(model, batch, trajectory)
+    batch, trajectory, text, called = _source(model, exact)
     name = "".join(c if c.isalnum() else "_" for c in model.name)[:40]
     path = _source_file(f"{name}_{_key(text, called)}.py", text)
     scope = _scope(called)
@@ -95,17 +83,7 @@ def kernels(model: ProcessModel, *, exact: bool = True) -> Kernels:
         name: Guarded(model, _njit(scope[name], nogil=True, cache=path is not None))
         for name in ("simulate", "spectrum", "levels", "advance")
     }
-    return Kernels(
-        **compiled,
-        work_rows=batch.work_rows,
-        tables=batch.tables(batch.first_entry),
-        levels_size=trajectory.work_size,
-        levels_tables=trajectory.tables(0),
-        # Fast linear parts that feed a nonlinear one swing within a sample: a single step of any
-        # size may happen to meet them at rest.
-        fewest_steps=2 if structure.coefficients and structure.nonlinear else 1,
-        guarded=bool(structure.guards),
-    )
+    return Kernels(batch, trajectory, **compiled)
 
 
 def fingerprint(model: ProcessModel) -> str:
@@ -113,24 +91,25 @@ def fingerprint(model: ProcessModel) -> str:
 
     The equations, the constraints, and how this computer's processor is made use of.
     """
-    structure = analyse(model)
-    batch, trajectory = BatchKernel(model, structure), TrajectoryKernel(model, structure)
-    key = hashlib.sha256(_key(*_text(model, batch, trajectory)).encode())
+    _, _, text, called = _source(model)
+    key = hashlib.sha256(_key(text, called).encode())
     for constraint in model.constraints:
         _fingerprint(constraint.function, key, set())
     return key.hexdigest()
 
 
-def _text(
-    model: ProcessModel, batch: BatchKernel, trajectory: TrajectoryKernel
-) -> tuple[str, dict[str, Any]]:
-    """Text of a model's kernels, and the model's functions that it calls."""
+def _source(
+    model: ProcessModel, exact: bool = True
+) -> tuple[BatchKernel, TrajectoryKernel, str, dict[str, Any]]:
+    """A model's kernels, their text, and the model's functions that it calls."""
     # Numba is slow to import.
     from sysid.engine.intrinsics import many_registers
 
-    structure = batch.structure
+    structure = analyse(model, exact=exact)
+    batch, trajectory = BatchKernel(model, structure), TrajectoryKernel(model, structure)
     texts = structure.program, batch.text(many_registers=many_registers()), trajectory.text
-    return "\n\n".join(texts), {name: getattr(model, name) for name in sorted(structure.calls)}
+    called = {name: getattr(model, name) for name in sorted(structure.calls)}
+    return batch, trajectory, "\n\n".join(texts), called
 
 
 def _key(text: str, called: Mapping[str, Any]) -> str:
@@ -149,12 +128,12 @@ def _scope(called: Mapping[str, Any]) -> dict[str, Any]:
     """Globals of the kernels' text."""
     import numpy as np
 
-    from sysid.engine import intrinsics
+    from sysid.engine import intrinsics, vector_math
     from sysid.engine.phi import scheme_matrices
 
     return {
         "np": np,
-        "math": _vector_math(),
+        "math": vector_math,
         "scheme_matrices": scheme_matrices,
         "wide_vectors": intrinsics.wide_vectors,
         "always_inline": intrinsics.always_inline,
@@ -166,19 +145,10 @@ def _scope(called: Mapping[str, Any]) -> dict[str, Any]:
 def _njit(function: Any, *, nogil: bool = False, cache: bool = False) -> Any:
     import numba
 
-    if cache:
-        # RuntimeError: neither beside the text nor elsewhere can the compiler write.
-        with contextlib.suppress(RuntimeError):
-            return numba.njit(nogil=nogil, cache=True, **_OPTIONS)(function)
+    # RuntimeError: neither beside the text nor elsewhere can the compiler write.
+    with contextlib.suppress(RuntimeError):
+        return numba.njit(nogil=nogil, cache=cache, **_OPTIONS)(function)
     return numba.njit(nogil=nogil, **_OPTIONS)(function)
-
-
-def cache_folder() -> Path:
-    """Where compiled kernels are kept: RIG_CACHE_DIR, or the user's cache folder."""
-    import platformdirs
-
-    chosen = os.environ.get("RIG_CACHE_DIR")
-    return Path(chosen) if chosen else Path(platformdirs.user_cache_dir("hybrid-rig", False))
 
 
 def _explain(model: ProcessModel, error: Exception) -> str:
@@ -194,12 +164,9 @@ def _explain(model: ProcessModel, error: Exception) -> str:
 
 def machine_code(function: Any) -> Any:
     """A function compiled, with all plain functions that it refers to, also through a module."""
-    return Copier(_vector_math(), _njit).copied(function)
+    from sysid.engine import vector_math
 
-
-def _vector_math() -> Any:
-    # Imported here because Numba is slow to.
-    return importlib.import_module("sysid.engine.vector_math")
+    return Copier(vector_math, _njit).copied(function)
 
 
 def _fingerprint(value: Any, key: Any, seen: set[int]) -> None:
@@ -235,16 +202,20 @@ def _fingerprint_names(scope: dict[str, Any], names: set[str], key: Any, seen: s
         item = scope[name]
         key.update(f"{name}=".encode())
         _fingerprint(item, key, seen)
-        if (
-            isinstance(item, types.ModuleType)
-            and item.__name__.partition(".")[0] not in KNOWN_MODULES
-        ):
+        module = isinstance(item, types.ModuleType)
+        if module and item.__name__.partition(".")[0] not in KNOWN_MODULES:
             _fingerprint_names(vars(item), names, key, seen)
 
 
 def _source_file(name: str, text: str) -> Path | None:
-    """Write the kernel's text where Numba can cache beside it; None when nowhere is writable."""
-    folder = cache_folder()
+    """Write the kernel's text where Numba can cache beside it; None when nowhere is writable.
+
+    The folder is RIG_CACHE_DIR, or the user's cache folder.
+    """
+    import platformdirs
+
+    chosen = os.environ.get("RIG_CACHE_DIR")
+    folder = Path(chosen or platformdirs.user_cache_dir("hybrid-rig", False))
     path = folder / name
     try:
         if path.exists():

@@ -133,7 +133,7 @@ def _add(p: FloatArray, entries: IntArray, value: float) -> None:
                 p[k, lane] += value
 
 
-_aligned = njit(work_area)
+_aligned: Any = njit(work_area)
 
 
 @_kept

@@ -21,6 +21,7 @@ pattern of A keeps at zero are never computed.
 """
 
 from collections.abc import Iterable, Sequence
+from functools import cached_property
 
 import numpy as np
 
@@ -41,8 +42,11 @@ class Scheme:
     """Lines of code of which the kernels of a model are made.
 
     guarded: rows of N that guarded numbers count in. closure: entries of exp(A t) that can differ
-    from zero. entries: matrix and place in it of all that is stored, in order.
+    from zero. entries: matrix and place in it of all that is stored, in order. fewest_steps: per
+    sample, below which the error estimate is not to be trusted.
     """
+
+    first_row = 0
 
     def __init__(self, model: ProcessModel, structure: Structure) -> None:
         self.structure = structure
@@ -62,6 +66,9 @@ class Scheme:
             if not self.plain(i) and (matrix in "QF" or j in structure.driven)
         ]
         self.n_entries = len(self.entries)
+        # Fast linear parts that feed a nonlinear one swing within a sample: a single step of any
+        # size may happen to meet them at rest.
+        self.fewest_steps = 2 if structure.coefficients and structure.nonlinear else 1
 
     def _place(self, entry: int) -> str:
         """Where an entry of the matrices stands."""
@@ -75,8 +82,9 @@ class Scheme:
             reach |= {(i, j) for i in via for j in to}
         return sorted(reach)
 
-    def tables(self, first: int) -> tuple[IntArray, ...]:
-        """Tables of ``scheme_matrices`` for matrices that stand from row ``first`` on."""
+    @cached_property
+    def tables(self) -> tuple[IntArray, ...]:
+        """Tables of ``scheme_matrices`` for matrices that stand from row ``first_row`` on."""
         number = {entry: k for k, entry in enumerate(self.closure)}
         triples = [
             (number[i, k], number[k, j], number[i, j])
@@ -84,7 +92,7 @@ class Scheme:
             for row, j in self.closure
             if row == k
         ]
-        stored = {entry: first + k for k, entry in enumerate(self.entries)}
+        stored = {entry: self.first_row + k for k, entry in enumerate(self.entries)}
         places = [[stored.get((matrix, at), -1) for at in self.closure] for matrix in _MATRICES]
         return tuple(np.array(table, dtype=np.int64) for table in (self.closure, triples, places))
 

@@ -76,19 +76,13 @@ class BatchSimulator:
     sample; a chromosome that needs more is reported OVER_BUDGET. The result for a chromosome
     depends on neither the number of threads nor the rest of the population.
 
-    >>> import numpy as np
-    >>> from sysid import BatchSimulator, Dataset, Input, Output, Parameter, ProcessModel
-    >>> from sysid import State, Status
-    >>> lag = ProcessModel(
-    ...     "lag", [State("y", "1")], [Input("u", "V")], [Output("y", "1")],
-    ...     [Parameter("tau", "s", 0.05, 0.01, 1.0)], lambda x, u, p: ((u[0] - x[0]) / p[0],)
-    ... )
+    >>> from sysid.examples import lag
     >>> record = Dataset(np.ones(4), np.zeros(4), dt=0.05)  # a step, of which nothing was measured
-    >>> simulator = BatchSimulator(lag)
-    >>> y = simulator.trajectories(np.array([[0.05], [0.1]]), record)
+    >>> simulator = BatchSimulator(lag())
+    >>> y = simulator.trajectories(np.array([[1.0, 0.05], [1.0, 0.1]]), record)
     >>> y[:, :, 0].round(3).tolist()
     [[0.0, 0.632, 0.865, 0.95], [0.0, 0.393, 0.632, 0.777]]
-    >>> result = simulator.errors(np.array([[0.05], [-1e-4]]), [record])
+    >>> result = simulator.errors(np.array([[1.0, 0.05], [1.0, -1e-4]]), [record])
     >>> result.sse[:, 0, 0].round(2).tolist()
     [2.05, inf]
     >>> [Status(status).name for status in result.status]

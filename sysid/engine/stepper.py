@@ -24,14 +24,9 @@ class Stepper:
     keep. scale: (n_states,), magnitudes that matter; default the larger of 1 and the state's
     initial value. Raises ModelError for settings that do not fit the model.
 
-    >>> import numpy as np
-    >>> from sysid import Input, Output, Parameter, ProcessModel, State, Stepper
-    >>> lag = ProcessModel(
-    ...     "lag", [State("y", "1")], [Input("u", "V")], [Output("y", "1")],
-    ...     [Parameter("tau", "s", 0.05, 0.01, 1.0)], lambda x, u, p: ((u[0] - x[0]) / p[0],)
-    ... )
-    >>> stepper = Stepper(lag, np.array([0.05]), dt=0.05)
-    >>> x = lag.initial_state
+    >>> from sysid.examples import lag
+    >>> stepper = Stepper(lag(), np.array([1.0, 0.05]), dt=0.05)
+    >>> x = lag().initial_state
     >>> states, outputs = stepper.advance(x, np.ones((3, 1)))  # two intervals
     >>> outputs[:, 0].round(3).tolist(), x.round(3).tolist()
     ([0.0, 0.632], [0.865])
@@ -70,7 +65,7 @@ class Stepper:
         self._n_outputs = len(model.outputs)
         self._base = dt / n_steps
         self._limit = (_ESTIMATE_LIMIT * accuracy) ** 2
-        self._work = work_area(self._kernels.levels_size)
+        self._work = work_area(self._kernels.trajectory.work_size)
         self._least = 0
         self._run: Callable[..., None] | None = None
 
@@ -101,8 +96,8 @@ class Stepper:
         n = len(x)
         a = np.zeros((n, n))
         compiled, work, base = self._kernels, self._work, self._base
-        compiled.levels(work, compiled.levels_tables, self.parameters, self.scale, base, a)
-        if compiled.guarded and np.isfinite(a).all():
+        compiled.levels(work, compiled.trajectory.tables, self.parameters, self.scale, base, a)
+        if compiled.trajectory.structure.guards and np.isfinite(a).all():
             periods = np.abs(np.linalg.eigvals(a)).max() * base / (2.0 * math.pi)
             self._least = min(math.ceil(math.log2(max(periods, 1.0))), LEVELS)
         # A call over no interval, by which the compiler's complaints are explained.

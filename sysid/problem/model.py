@@ -378,7 +378,7 @@ def _as_tuple(model: str, kind: str, items: Any) -> tuple[Any, ...]:
 
 
 def _check_names(model: str, kind: str, names: list[str]) -> None:
-    if not names and kind in ("states", "outputs", "parameters"):
+    if not names and kind != "inputs":
         raise ModelError(f"model {model}: it has no {kind}")
     repeated = sorted({name for name in names if names.count(name) > 1})
     if repeated:

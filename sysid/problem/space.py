@@ -20,14 +20,6 @@ _ON_BOUND = 1e-3
 
 
 @dataclass(frozen=True)
-class Start:
-    """An estimated initial state: index of its record and of the state in the model."""
-
-    record: int
-    state: int
-
-
-@dataclass(frozen=True)
 class SearchSpace:
     """The free parameters of a model between their ranges; the rest stay fixed.
 
@@ -39,6 +31,7 @@ class SearchSpace:
     hard_upper: what the search keeps within; for a range with one end given these are that end
     and the physical limit, else lower and upper. log: mask of the parameters searched by
     logarithm. coded_lower, width: low ends and widths in search coordinates. All (n_free,).
+    estimated: record and state of each initial state that is estimated, by their places.
     one_sided: names of the parameters with one end given. held: a search coordinate and the value
     that it keeps.
 
@@ -52,7 +45,7 @@ class SearchSpace:
     parameters: tuple[Parameter, ...]
     base: FloatArray
     index: tuple[int, ...]
-    estimated: tuple[Start, ...] = ()
+    estimated: tuple[tuple[int, int], ...] = ()
     ties: tuple[Tie, ...] = ()
     one_sided: frozenset[str] = frozenset()
     held: tuple[int, float] | None = None
@@ -140,7 +133,7 @@ class SearchSpace:
                 parameters.append(
                     Parameter(name, state.unit, begin, *ends, minimum=-np.inf, description=about)
                 )
-                starts.append(Start(k, i))
+                starts.append((k, i))
         return replace(self, parameters=tuple(parameters), estimated=tuple(starts))
 
     def with_nominal_starts(self, chromosomes: FloatArray) -> FloatArray:
@@ -156,17 +149,18 @@ class SearchSpace:
         declared: (n_states,), initial states of those that are not estimated.
         """
         states = np.repeat(declared[None], len(chromosomes), axis=0)
-        for start, values in zip(self.estimated, chromosomes.T[len(self.index) :], strict=True):
-            if start.record == record:
-                states[:, start.state] = values
+        columns = chromosomes.T[len(self.index) :]
+        for (number, state), values in zip(self.estimated, columns, strict=True):
+            if number == record:
+                states[:, state] = values
         return states
 
     def named_starts(self, chromosome: FloatArray) -> list[dict[str, float]]:
         """The estimated initial states in a chromosome (n_free,), by state, for each record."""
-        last = max((start.record for start in self.estimated), default=-1)
+        last = max((record for record, _ in self.estimated), default=-1)
         named: list[dict[str, float]] = [{} for _ in range(last + 1)]
-        for start, value in zip(self.estimated, chromosome[len(self.index) :], strict=True):
-            named[start.record][self.model.states[start.state].name] = float(value)
+        for (record, i), value in zip(self.estimated, chromosome[len(self.index) :], strict=True):
+            named[record][self.model.states[i].name] = float(value)
         return named
 
     @property

@@ -60,10 +60,8 @@ def frequency_response(records: Sequence[Dataset]) -> FrequencyResponse:
     dt = records[0].dt
     if any(abs(record.dt - dt) > 1e-6 * dt for record in records):
         raise ModelError("records of different sample times have no common frequency response")
-    varied: BoolArray = np.array(
-        np.any([np.ptp(record.inputs, axis=0) > 0.0 for record in records], axis=0),
-        dtype=np.bool_,
-    )
+    changes = [np.ptp(record.inputs, axis=0) > 0.0 for record in records]
+    varied: BoolArray = np.array(np.any(changes, axis=0), dtype=np.bool_)
     m, length = int(varied.sum()), _segment_length(records)
     if not m:
         raise ModelError("no input changes, so there is no frequency response")
