@@ -10,7 +10,7 @@ from sysid.arrays import FloatArray
 from sysid.engine.arithmetic import constant, operation
 from sysid.engine.tangents import Tangent, differentiate
 from sysid.engine.tape import Tape
-from sysid.engine.trace import followed, operands, traces
+from sysid.engine.trace import followed, operand, traces
 from sysid.problem.model import Function
 
 _MOST_BRANCHES = 64
@@ -99,4 +99,4 @@ class Gradient:
         n = sum(name[0] == "p" for name in point)
         parameters = traces(tape, "p", n) if p is None else tuple(p)
         values = self._function(traces(tape, "x", len(x)), traces(tape, "u", len(u)), parameters)
-        return Branch(tape, operands(values), self._variables)
+        return Branch(tape, list(map(operand, values)), self._variables)

@@ -159,31 +159,26 @@ class BatchSimulator:
         """
         parameters = self._check(parameters, [record])
         n_steps = n_steps or int(self.steps_of_each(parameters, record, starts).max())
-        outputs = np.empty((record.n_samples, len(self.model.outputs), len(parameters)))
-        on_record = self._on(record)
-
-        def run(task: tuple[slice, int]) -> None:
-            rows, steps = task
-            on_record.residuals(parameters, starts, rows, steps, outputs[..., rows])
-
-        self._workers.each(run, _runs(np.full(len(parameters), n_steps)))
+        steps = np.full((len(parameters), 1), n_steps)
+        outputs = self.residuals(parameters, [record], [None], steps, [starts]).values
         return np.ascontiguousarray(np.moveaxis(outputs, 2, 0))
 
     def residuals(
         self,
         parameters: FloatArray,
         records: Sequence[Dataset],
-        scales: Sequence[FloatArray],
+        scales: Sequence[FloatArray | None],
         n_steps: IntArray,
-        starts: Sequence[FloatArray],
+        starts: Sequence[FloatArray | None],
         *,
         keep: bool = True,
     ) -> Residuals:
         """Residuals of every parameter vector on every record at given steps.
 
         n_steps: (n, n_records), integration steps per sample; rows of like steps had better be
-        neighbours, to share a block. scales, starts: as those of ``errors``. Without ``keep``
-        there are no values, only their sums of squares.
+        neighbours, to share a block. scales, starts: as those of ``errors``; without a scale
+        residuals are the outputs themselves. Without ``keep`` there are no values, only their
+        sums of squares.
         """
         parameters = self._check(parameters, records)
         n, q = len(parameters), len(self.model.outputs)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from sysid.engine.program import Writer
 from sysid.engine.split import Clamp, Split, Splitter
 from sysid.engine.tape import Tape
-from sysid.engine.trace import followed, operands, traces
+from sysid.engine.trace import followed, operand, traces
 from sysid.problem.model import Function, ProcessModel
 
 
@@ -112,7 +112,7 @@ def _splits(splitter: Splitter, model: ProcessModel, function: Function) -> list
     sides = zip("xup", (model.states, model.inputs, model.parameters), strict=True)
     try:
         values = followed(function)(*(traces(equations, name, len(of)) for name, of in sides))
-        return splitter.split(equations, operands(values))
+        return splitter.split(equations, map(operand, values))
     except Exception:
         # Whatever it does that a trace cannot follow, the compiler may well be able to.
         return None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import numbers
 import types
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 from sysid.engine.substitution import Copier
@@ -94,11 +94,6 @@ def operand(value: Any) -> str:
     return f"({text})" if text.startswith("-") else text
 
 
-def operands(values: Sequence[Any]) -> list[str]:
-    """The same of several."""
-    return [operand(value) for value in values]
-
-
 def _follow(function: Callable[..., Any]) -> Callable[..., Any]:
     """A library function that passes plain numbers on and follows traces."""
     prefix = "" if function in (min, max) else "math."
@@ -106,7 +101,7 @@ def _follow(function: Callable[..., Any]) -> Callable[..., Any]:
     def call(*args: Any) -> Any:
         first = next((a for a in args if isinstance(a, Trace)), None)
         # At a single point a comparison picks the least or largest, derivatives and all.
-        if first is None or (function in (min, max) and first.tape.single(operands(args))):
+        if first is None or (function in (min, max) and first.tape.single(map(operand, args))):
             return function(*args)
         places = ", ".join("{}" for _ in args)
         return first.result(f"{prefix}{function.__name__}({places})", *args)
