@@ -53,6 +53,8 @@ class SearchSpace:
     upper: FloatArray = field(init=False, repr=False)
     minimum: FloatArray = field(init=False, repr=False)
     maximum: FloatArray = field(init=False, repr=False)
+    hard_lower: FloatArray = field(init=False, repr=False)
+    hard_upper: FloatArray = field(init=False, repr=False)
     log: BoolArray = field(init=False, repr=False)
     coded_lower: FloatArray = field(init=False, repr=False)
     width: FloatArray = field(init=False, repr=False)
@@ -61,6 +63,11 @@ class SearchSpace:
         for name in ("lower", "upper", "minimum", "maximum"):
             self._keep(name, np.array([getattr(p, name) for p in self.parameters], np.float64))
         self._keep("log", np.array([p.scale == "log" for p in self.parameters], bool))
+        open_ended = np.array([p.name in self.one_sided for p in self.parameters], bool)
+        # A logarithm cannot pass zero, wherever the physical limit is.
+        least = np.where(self.log, np.maximum(self.minimum, 0.0), self.minimum)
+        self._keep("hard_lower", np.where(open_ended, least, self.lower))
+        self._keep("hard_upper", np.where(open_ended, self.maximum, self.upper))
         self._keep("coded_lower", self.encode(self.lower))
         self._keep("width", self.encode(self.upper) - self.coded_lower)
 
@@ -168,18 +175,6 @@ class SearchSpace:
         """Names of the free parameters, in order."""
         return tuple(parameter.name for parameter in self.parameters)
 
-    @property
-    def hard_lower(self) -> FloatArray:
-        """Low ends that the search keeps to, (n_free,); -inf where there is none."""
-        # A logarithm cannot pass zero, wherever the physical limit is.
-        least = np.where(self.log, np.maximum(self.minimum, 0.0), self.minimum)
-        return np.where(self._open_ended, least, self.lower)
-
-    @property
-    def hard_upper(self) -> FloatArray:
-        """High ends that the search keeps to, (n_free,); inf where there is none."""
-        return np.where(self._open_ended, self.maximum, self.upper)
-
     @cached_property
     def coded_bounds(self) -> tuple[FloatArray, FloatArray]:
         """``hard_lower`` and ``hard_upper`` in search coordinates, (n_free,) each."""
@@ -203,10 +198,6 @@ class SearchSpace:
         at = self.encode(chromosome)
         mask: BoolArray = (at < lower + near) | (at > upper - near)
         return mask
-
-    @property
-    def _open_ended(self) -> BoolArray:
-        return np.array([parameter.name in self.one_sided for parameter in self.parameters], bool)
 
     def encode(self, chromosomes: FloatArray) -> FloatArray:
         """Search coordinates of chromosomes, (..., n_free)."""
