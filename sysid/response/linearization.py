@@ -1,8 +1,7 @@
 """Exact Jacobians of any process model, operating points, and linear models at them."""
 
 import functools
-from dataclasses import dataclass
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,8 +13,7 @@ from sysid.problem.model import ModelError, ProcessModel
 _NUDGES = (0.0, 0.1, -0.1, 1.0, -1.0)
 
 
-@dataclass(frozen=True)
-class LinearModel:
+class LinearModel(NamedTuple):
     """dx/dt = A x + B u, y = C x + D u for small deviations from an operating point.
 
     A: (n_states, n_states), B: (n_states, n_inputs), C: (n_outputs, n_states),
@@ -30,9 +28,6 @@ class LinearModel:
     B: FloatArray
     C: FloatArray
     D: FloatArray
-
-    def __iter__(self) -> Any:
-        return iter((self.A, self.B, self.C, self.D))
 
 
 def linearize(
