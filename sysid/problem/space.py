@@ -49,15 +49,15 @@ class SearchSpace:
     ties: tuple[Tie, ...] = ()
     one_sided: frozenset[str] = frozenset()
     held: tuple[int, float] | None = None
-    lower: FloatArray = field(init=False, repr=False)
-    upper: FloatArray = field(init=False, repr=False)
-    minimum: FloatArray = field(init=False, repr=False)
-    maximum: FloatArray = field(init=False, repr=False)
-    hard_lower: FloatArray = field(init=False, repr=False)
-    hard_upper: FloatArray = field(init=False, repr=False)
-    log: BoolArray = field(init=False, repr=False)
-    coded_lower: FloatArray = field(init=False, repr=False)
-    width: FloatArray = field(init=False, repr=False)
+    lower: FloatArray = field(init=False, repr=False, compare=False)
+    upper: FloatArray = field(init=False, repr=False, compare=False)
+    minimum: FloatArray = field(init=False, repr=False, compare=False)
+    maximum: FloatArray = field(init=False, repr=False, compare=False)
+    hard_lower: FloatArray = field(init=False, repr=False, compare=False)
+    hard_upper: FloatArray = field(init=False, repr=False, compare=False)
+    log: BoolArray = field(init=False, repr=False, compare=False)
+    coded_lower: FloatArray = field(init=False, repr=False, compare=False)
+    width: FloatArray = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         for name in ("lower", "upper", "minimum", "maximum"):
