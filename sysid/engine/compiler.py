@@ -107,7 +107,7 @@ def _source(
 
     structure = analyse(model, exact=exact)
     batch, trajectory = BatchKernel(model, structure), TrajectoryKernel(model, structure)
-    texts = structure.program, batch.text(many_registers=many_registers()), trajectory.text
+    texts = structure.program, batch.text(many_registers=many_registers()), trajectory.text()
     called = {name: getattr(model, name) for name in sorted(structure.calls)}
     return batch, trajectory, "\n\n".join(texts), called
 

@@ -26,7 +26,6 @@ class TrajectoryKernel(Scheme):
     ``levels`` fills a work area once per parameter vector, ``advance`` uses it.
     """
 
-    @property
     def text(self) -> str:
         """Python text of both."""
         return "\n\n".join((self._levels(), self._advance(), ""))
