@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -102,7 +103,7 @@ def sampled_response(
     return result
 
 
-def _solved(matrices: ComplexArray, columns: FloatArray) -> ComplexArray:
+def _solved(matrices: npt.NDArray[Any], columns: FloatArray) -> ComplexArray:
     right = np.broadcast_to(columns.astype(np.complex128), (len(matrices), *columns.shape))
     return np.linalg.solve(matrices, right).astype(np.complex128)
 
