@@ -17,7 +17,7 @@ import numpy as np
 from sysid import BatchSimulator, Dataset
 from sysid.arrays import FloatArray
 from sysid.engine.compiler import kernels
-from sysid.engine.lanes import LANES
+from sysid.engine.scheme import LANES
 from sysid.problem.model import ProcessModel
 from tests.sysid.reference import simulate
 

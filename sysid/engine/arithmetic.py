@@ -2,6 +2,7 @@
 
 import functools
 import math
+import operator
 import types
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -9,17 +10,12 @@ from typing import Any
 import numpy as np
 
 # What a library function of one float is called for arrays.
+_SAME_NAMES = (
+    "exp expm1 log log1p log2 log10 sqrt fabs hypot copysign sin cos tan sinh cosh tanh floor ceil"
+)
 _OF_ARRAYS = {
-    name: getattr(np, name)
-    for name in (
-        *("exp", "expm1", "log", "log1p", "log2", "log10", "sqrt", "fabs", "hypot", "copysign"),
-        *("sin", "cos", "tan", "sinh", "cosh", "tanh", "floor", "ceil"),
-    )
-} | {
-    "asin": np.arcsin,
-    "acos": np.arccos,
-    "atan": np.arctan,
-    "atan2": np.arctan2,
+    **{name: getattr(np, name) for name in _SAME_NAMES.split()},
+    **{"asin": np.arcsin, "acos": np.arccos, "atan": np.arctan, "atan2": np.arctan2},
     "pow": np.power,
 }
 
@@ -67,12 +63,9 @@ def _select(condition: Any, first: Any, second: Any) -> Any:
     return first if condition else second
 
 
-def _least(first: Any, *others: Any) -> Any:
-    return functools.reduce(lambda a, b: _select(b < a, b, a), others, first)
-
-
-def _largest(first: Any, *others: Any) -> Any:
-    return functools.reduce(lambda a, b: _select(b > a, b, a), others, first)
+def _extreme(better: Callable[[Any, Any], Any]) -> Callable[..., Any]:
+    """The first of several numbers than which none is better."""
+    return lambda *args: functools.reduce(lambda a, b: _select(better(b, a), b, a), args)
 
 
 def _sign(a: Any) -> Any:
@@ -112,8 +105,8 @@ _SCOPE: dict[str, Any] = {
             for name, item in vars(math).items()
         }
     ),
-    "min": _least,
-    "max": _largest,
+    "min": _extreme(operator.lt),
+    "max": _extreme(operator.gt),
     "select": _select,
     "sign": _sign,
     "power": _power,

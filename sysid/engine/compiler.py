@@ -8,7 +8,6 @@ changed model file therefore gets a new name, and an old kernel is never used fo
 import contextlib
 import functools
 import hashlib
-import importlib
 import os
 import tempfile
 import types
@@ -17,11 +16,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sysid.arrays import IntArray
-from sysid.engine import batch_kernel, trajectory_kernel
-from sysid.engine.scheme import Shape
+from sysid.engine.batch_kernel import BatchKernel
 from sysid.engine.structure import analyse
-from sysid.engine.substitution import KNOWN_MODULES, names_in, rebuilt
+from sysid.engine.substitution import KNOWN_MODULES, Copier, names_in
+from sysid.engine.trajectory_kernel import TrajectoryKernel
 from sysid.problem.model import ModelError, ProcessModel
 
 _OPTIONS: dict[str, Any] = {
@@ -30,9 +28,6 @@ _OPTIONS: dict[str, Any] = {
     "error_model": "numpy",
     "fastmath": {"contract", "arcp", "nsz"},
 }
-
-
-Tables = tuple[IntArray, IntArray, IntArray]
 
 
 class Guarded:
@@ -57,23 +52,16 @@ class Guarded:
 
 @dataclass(frozen=True)
 class Kernels:
-    """Compiled functions of one model, the floats of the work areas and the tables they need.
-
-    simulate, spectrum, work_rows and tables: see ``batch_kernel``; levels, advance, levels_size
-    and levels_tables: see ``trajectory_kernel``. fewest_steps: see ``scheme.Shape``. guarded:
-    whether there are limits that fast linear parts may run into.
+    """Compiled functions of one model: ``simulate`` and ``spectrum`` of the batch kernel,
+    ``levels`` and ``advance`` of that of a trajectory.
     """
 
+    batch: BatchKernel
+    trajectory: TrajectoryKernel
     simulate: Guarded
     spectrum: Guarded
-    work_rows: int
-    tables: Tables
     levels: Guarded
     advance: Guarded
-    levels_size: int
-    levels_tables: Tables
-    fewest_steps: int
-    guarded: bool
 
 
 @functools.lru_cache(maxsize=8)
@@ -83,27 +71,19 @@ def kernels(model: ProcessModel, *, exact: bool = True) -> Kernels:
     Compilation itself happens at the first call. Without ``exact`` nothing is integrated
     exactly. Raises ModelError when the model's functions use something that cannot be compiled.
     """
-    shape = Shape.of(model, analyse(model, exact=exact))
-    text, called = _text(model, shape)
-    path = _source_file(f"{_safe(model.name)}_{_key(text, called)}.py", text)
+    batch, trajectory, text, called = _source(model, exact)
+    name = "".join(c if c.isalnum() else "_" for c in model.name)[:40]
+    path = _source_file(f"{name}_{_key(text, called)}.py", text)
     scope = _scope(called)
     exec(compile(text, str(path or "<kernel>"), "exec"), scope)
     for name in ("constants", "remainder", "observe", "margins"):
         if name in scope:
             scope[name] = _njit(scope[name])
-    guarded = {
+    compiled = {
         name: Guarded(model, _njit(scope[name], nogil=True, cache=path is not None))
         for name in ("simulate", "spectrum", "levels", "advance")
     }
-    return Kernels(
-        **guarded,
-        work_rows=batch_kernel.work_rows(shape),
-        tables=_tables(shape, batch_kernel.first_entry(shape)),
-        levels_size=trajectory_kernel.work_size(shape),
-        levels_tables=_tables(shape, 0),
-        fewest_steps=shape.fewest_steps,
-        guarded=bool(shape.structure.guards),
-    )
+    return Kernels(batch, trajectory, **compiled)
 
 
 def fingerprint(model: ProcessModel) -> str:
@@ -111,31 +91,25 @@ def fingerprint(model: ProcessModel) -> str:
 
     The equations, the constraints, and how this computer's processor is made use of.
     """
-    text, called = _text(model, Shape.of(model, analyse(model, exact=True)))
+    _, _, text, called = _source(model)
     key = hashlib.sha256(_key(text, called).encode())
     for constraint in model.constraints:
         _fingerprint(constraint.function, key, set())
     return key.hexdigest()
 
 
-def _text(model: ProcessModel, shape: Shape) -> tuple[str, dict[str, Any]]:
-    """Text of a model's kernels, and the model's functions that it calls."""
+def _source(
+    model: ProcessModel, exact: bool = True
+) -> tuple[BatchKernel, TrajectoryKernel, str, dict[str, Any]]:
+    """A model's kernels, their text, and the model's functions that it calls."""
     # Numba is slow to import.
     from sysid.engine.intrinsics import many_registers
 
-    program = shape.structure.program
-    batch = batch_kernel.source(shape, many_registers=many_registers())
-    text = "\n\n".join((program.text, batch, trajectory_kernel.source(shape)))
-    return text, {name: getattr(model, name) for name in sorted(program.calls)}
-
-
-def _tables(shape: Shape, first: int) -> Tables:
-    """Tables of ``scheme_matrices`` for matrices that stand from row ``first`` on."""
-    import numpy as np
-
-    entries = np.array(shape.structure.closure(shape.n_states), dtype=np.int64)
-    triples = np.array(shape.structure.products(shape.n_states), dtype=np.int64)
-    return entries, triples, np.array(shape.places(first), dtype=np.int64)
+    structure = analyse(model, exact=exact)
+    batch, trajectory = BatchKernel(model, structure), TrajectoryKernel(model, structure)
+    texts = structure.program, batch.text(many_registers=many_registers()), trajectory.text()
+    called = {name: getattr(model, name) for name in sorted(structure.calls)}
+    return batch, trajectory, "\n\n".join(texts), called
 
 
 def _key(text: str, called: Mapping[str, Any]) -> str:
@@ -154,12 +128,12 @@ def _scope(called: Mapping[str, Any]) -> dict[str, Any]:
     """Globals of the kernels' text."""
     import numpy as np
 
-    from sysid.engine import intrinsics
+    from sysid.engine import intrinsics, vector_math
     from sysid.engine.phi import scheme_matrices
 
     return {
         "np": np,
-        "math": _vector_math(),
+        "math": vector_math,
         "scheme_matrices": scheme_matrices,
         "wide_vectors": intrinsics.wide_vectors,
         "always_inline": intrinsics.always_inline,
@@ -171,19 +145,10 @@ def _scope(called: Mapping[str, Any]) -> dict[str, Any]:
 def _njit(function: Any, *, nogil: bool = False, cache: bool = False) -> Any:
     import numba
 
-    if cache:
-        # RuntimeError: neither beside the text nor elsewhere can the compiler write.
-        with contextlib.suppress(RuntimeError):
-            return numba.njit(nogil=nogil, cache=True, **_OPTIONS)(function)
+    # RuntimeError: neither beside the text nor elsewhere can the compiler write.
+    with contextlib.suppress(RuntimeError):
+        return numba.njit(nogil=nogil, cache=cache, **_OPTIONS)(function)
     return numba.njit(nogil=nogil, **_OPTIONS)(function)
-
-
-def cache_folder() -> Path:
-    """Where compiled kernels are kept: RIG_CACHE_DIR, or the user's cache folder."""
-    import platformdirs
-
-    chosen = os.environ.get("RIG_CACHE_DIR")
-    return Path(chosen) if chosen else Path(platformdirs.user_cache_dir("hybrid-rig", False))
 
 
 def _explain(model: ProcessModel, error: Exception) -> str:
@@ -199,12 +164,9 @@ def _explain(model: ProcessModel, error: Exception) -> str:
 
 def machine_code(function: Any) -> Any:
     """A function compiled, with all plain functions that it refers to, also through a module."""
-    return rebuilt(function, _vector_math(), _njit)
+    from sysid.engine import vector_math
 
-
-def _vector_math() -> Any:
-    # Imported here because Numba is slow to.
-    return importlib.import_module("sysid.engine.vector_math")
+    return Copier(vector_math, _njit).copied(function)
 
 
 def _fingerprint(value: Any, key: Any, seen: set[int]) -> None:
@@ -240,16 +202,20 @@ def _fingerprint_names(scope: dict[str, Any], names: set[str], key: Any, seen: s
         item = scope[name]
         key.update(f"{name}=".encode())
         _fingerprint(item, key, seen)
-        if (
-            isinstance(item, types.ModuleType)
-            and item.__name__.partition(".")[0] not in KNOWN_MODULES
-        ):
+        module = isinstance(item, types.ModuleType)
+        if module and item.__name__.partition(".")[0] not in KNOWN_MODULES:
             _fingerprint_names(vars(item), names, key, seen)
 
 
 def _source_file(name: str, text: str) -> Path | None:
-    """Write the kernel's text where Numba can cache beside it; None when nowhere is writable."""
-    folder = cache_folder()
+    """Write the kernel's text where Numba can cache beside it; None when nowhere is writable.
+
+    The folder is RIG_CACHE_DIR, or the user's cache folder.
+    """
+    import platformdirs
+
+    chosen = os.environ.get("RIG_CACHE_DIR")
+    folder = Path(chosen or platformdirs.user_cache_dir("hybrid-rig", False))
     path = folder / name
     try:
         if path.exists():
@@ -263,7 +229,3 @@ def _source_file(name: str, text: str) -> Path | None:
     except OSError:
         return None
     return path
-
-
-def _safe(name: str) -> str:
-    return "".join(c if c.isalnum() else "_" for c in name)[:40]

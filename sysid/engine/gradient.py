@@ -1,57 +1,51 @@
 """Derivatives of a model's functions at points, along the way that each takes through them."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from sysid.arrays import FloatArray
+from sysid.engine.arithmetic import constant, operation
 from sysid.engine.tangents import Tangent, differentiate
-from sysid.engine.tape import Line, Tape, evaluate, looked_up
-from sysid.engine.trace import followed, operands, traces
+from sysid.engine.tape import Tape
+from sysid.engine.trace import followed, operand, traces
 from sysid.problem.model import Function
 
 _MOST_BRANCHES = 64
 
 
-@dataclass(frozen=True)
 class Branch:
     """One way through a function's conditions, and the derivatives on it.
 
-    shape: (n_values, n_variables). slopes: names of the derivatives that are not always zero, by
-    value and variable. decisions: outcomes of the conditions, by name. lines: what all need.
+    names: values that equations left on the tape; variables: what they are differentiated by.
     """
 
-    shape: tuple[int, int]
-    slopes: Mapping[tuple[int, int], str]
-    decisions: Mapping[str, bool]
-    lines: Sequence[Line]
-
-    @classmethod
-    def of(cls, tape: Tape, names: Sequence[str], variables: Mapping[str, Tangent]) -> Branch:
-        """The way that equations took which left the named values on a tape."""
-        slopes = differentiate(tape, names, variables)
-        lines = tape.needed([*slopes.values(), *tape.decisions])
-        return cls((len(names), len(variables)), slopes, tape.decisions, lines)
+    def __init__(self, tape: Tape, names: Sequence[str], variables: Mapping[str, Tangent]) -> None:
+        self._shape = len(names), len(variables)
+        self._slopes = differentiate(tape, names, variables)
+        self._decisions = tape.decisions
+        lines = tape.needed([*self._slopes.values(), *tape.decisions])
+        self._steps = [
+            (line.name, operation(line.form, len(line.operands)), line.operands) for line in lines
+        ]
+        used = set(self._slopes.values()).union(*(line.operands for line in lines))
+        self._literals = {text: constant(text) for text in used if not tape.named(text)}
 
     def at(self, point: Mapping[str, Any], many: tuple[int, ...]) -> FloatArray | None:
         """The derivatives at a point, (*shape, *many); None where it goes another way."""
-        values = dict(point)
+        values = {**self._literals, **point}
         try:
-            for line in self.lines:
-                evaluate(line, values)
-                way = self.decisions.get(line.name)
-                if way is not None and bool(values[line.name]) != way:
+            for name, compute, operands in self._steps:
+                values[name] = compute(*[values[operand] for operand in operands])
+                if name in self._decisions and bool(values[name]) != self._decisions[name]:
                     return None
         except (ArithmeticError, ValueError):
             return None
-        matrix = np.zeros((*self.shape, *many))
-        for place, name in self.slopes.items():
-            matrix[place] = looked_up(name, values)
+        matrix = np.zeros((*self._shape, *many))
+        for place, name in self._slopes.items():
+            matrix[place] = values[name]
         return matrix
 
 
@@ -105,4 +99,4 @@ class Gradient:
         n = sum(name[0] == "p" for name in point)
         parameters = traces(tape, "p", n) if p is None else tuple(p)
         values = self._function(traces(tape, "x", len(x)), traces(tape, "u", len(u)), parameters)
-        return Branch.of(tape, operands(values), self._variables)
+        return Branch(tape, list(map(operand, values)), self._variables)

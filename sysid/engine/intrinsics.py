@@ -8,7 +8,7 @@ from llvmlite import binding, ir
 from numba import types
 from numba.core.extending import intrinsic as _intrinsic
 
-from sysid.engine.lanes import LANES
+from sysid.engine.scheme import LANES
 
 # What it makes is called without the context that its functions take first.
 intrinsic: Any = _intrinsic
@@ -20,62 +20,44 @@ def many_registers() -> bool:
     return arm or binding.get_host_cpu_features().get("avx512f", False)
 
 
-@intrinsic
-def wide_vectors(context: Any) -> Any:
-    """Let the calling function use the widest vectors there are, and keep them aligned.
+def _mark(*attributes: str) -> Any:
+    """An intrinsic that adds attributes to the function that calls it."""
 
-    Where the processor has 512 bits LLVM keeps to 256 by itself, for code with few vectors in
-    it; and what does not fit the registers it would store across cache lines.
-    """
+    def mark(context: Any) -> Any:
+        def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            for attribute in attributes:
+                # The set knows LLVM's keywords only, and some of these are strings.
+                set.add(builder.function.attributes, attribute)
+            return context.get_dummy_value()
 
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        for attribute in ('"prefer-vector-width"="512"', '"stackrealign"'):
-            # The set knows LLVM's keywords only, and these are strings.
-            set.add(builder.function.attributes, attribute)
-        return context.get_dummy_value()
+        return types.none(), generate
 
-    return types.none(), generate
+    return intrinsic(mark)
 
 
-@intrinsic
-def always_inline(context: Any) -> Any:
-    """Have the calling function inlined whatever its size: a loop of calls is no vector code."""
+def _conversion(method: str, target: Any, signature: Any) -> Any:
+    """An intrinsic that converts a number by one of LLVM's instructions."""
 
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        builder.function.attributes.add("alwaysinline")
-        return context.get_dummy_value()
+    def convert(context: Any, value: Any) -> Any:
+        def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            return getattr(builder, method)(args[0], target)
 
-    return types.none(), generate
+        return signature, generate
 
-
-@intrinsic
-def from_bits(context: Any, bits: Any) -> Any:
-    """The float whose 64 bits are those of an integer."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.bitcast(args[0], ir.DoubleType())
-
-    return types.float64(types.int64), generate
+    return intrinsic(convert)
 
 
-@intrinsic
-def to_bits(context: Any, value: Any) -> Any:
-    """The integer whose 64 bits are those of a float."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.bitcast(args[0], ir.IntType(64))
-
-    return types.int64(types.float64), generate
-
-
-@intrinsic
-def to_int32(context: Any, value: Any) -> Any:
-    """A float cut to a 32-bit integer, the conversion that vector units have."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.fptosi(args[0], ir.IntType(32))
-
-    return types.int32(types.float64), generate
+# Let the calling function use the widest vectors there are, and keep them aligned. Where the
+# processor has 512 bits LLVM keeps to 256 by itself, for code with few vectors in it; and what
+# does not fit the registers it would store across cache lines.
+wide_vectors = _mark('"prefer-vector-width"="512"', '"stackrealign"')
+# Have the calling function inlined whatever its size: a loop of calls is no vector code.
+always_inline = _mark("alwaysinline")
+# The float whose 64 bits are those of an integer, the reverse, and a float cut to a 32-bit
+# integer, the conversion that vector units have.
+from_bits = _conversion("bitcast", ir.DoubleType(), types.float64(types.int64))
+to_bits = _conversion("bitcast", ir.IntType(64), types.int64(types.float64))
+to_int32 = _conversion("fptosi", ir.IntType(32), types.int32(types.float64))
 
 
 @intrinsic

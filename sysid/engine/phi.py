@@ -19,7 +19,7 @@ from numba import njit
 
 from sysid.arrays import FloatArray, IntArray
 from sysid.engine.intrinsics import from_bits, multiply_add, to_bits, wide_vectors
-from sysid.engine.lanes import LANES
+from sysid.engine.scheme import LANES, work_area
 
 _SMALL = 0.5  # norm at which the series takes over
 _TERMS = 10  # leaves 0.5^10/13! = 2e-13
@@ -133,6 +133,9 @@ def _add(p: FloatArray, entries: IntArray, value: float) -> None:
                 p[k, lane] += value
 
 
+_aligned: Any = njit(work_area)
+
+
 @_kept
 def scheme_matrices(  # noqa: PLR0912  (a function's call copies its arrays' descriptions)
     a: FloatArray,
@@ -151,18 +154,10 @@ def scheme_matrices(  # noqa: PLR0912  (a function's call copies its arrays' des
     """
     wide_vectors()
     m, n = entries.shape[0], entries[-1, 0] + 1
-    raw = np.empty((5 * m + n + 3) * LANES + 8)
-    first = (-raw.ctypes.data % 64) // 8
-    work = raw[first : first + (5 * m + n + 3) * LANES].reshape((-1, LANES))
-    e, p1, p2, p3, w = (
-        work[:m],
-        work[m : 2 * m],
-        work[2 * m : 3 * m],
-        work[3 * m : 4 * m],
-        work[4 * m : 5 * m],
-    )
-    d = work[5 * m : 5 * m + n]
-    row, column, halvings = work[5 * m + n], work[5 * m + n + 1], work[5 * m + n + 2]
+    matrices = _aligned(5 * m * LANES).reshape((5, m, LANES))
+    e, p1, p2, p3, w = matrices[0], matrices[1], matrices[2], matrices[3], matrices[4]
+    d = _aligned(n * LANES).reshape((n, LANES))
+    row, column, halvings = np.empty(LANES), np.empty(LANES), np.empty(LANES)
     _balance(a, entries, d, row, column)
     most = _scale(a, h, entries, row, halvings)
     factorial = 1.0

@@ -6,7 +6,7 @@ import numpy as np
 
 from sysid.arrays import BoolArray, FloatArray, IntArray
 from sysid.engine.compiler import Kernels
-from sysid.engine.lanes import LANES, work_area
+from sysid.engine.scheme import LANES, work_area
 from sysid.problem.data import Dataset
 from sysid.problem.model import ProcessModel
 from sysid.threads import Workers
@@ -60,7 +60,6 @@ class RecordSimulator:
         kernels: Kernels,
         record: Dataset,
         scale: FloatArray | None,
-        *,
         accuracy: float,
         max_steps: int,
         workers: Workers,
@@ -91,8 +90,8 @@ class RecordSimulator:
         those fail too it is the model, not the scheme, that is unbounded.
         """
         n, limit = len(parameters), self._max_steps
-        rates = self._rates(parameters, starts)
-        steps = np.maximum(_rungs(rates * self.record.dt / _RATE_LIMIT), self._kernels.fewest_steps)
+        steps = _rungs(self._rates(parameters, starts) * self.record.dt / _RATE_LIMIT)
+        steps = np.maximum(steps, self._kernels.batch.fewest_steps)
         over, blown = steps > limit, np.zeros(n, dtype=bool)
         sse = np.full((n, self._measured.shape[1]), np.inf)
         population = Population(steps, over, sse, np.zeros(n, dtype=np.int64))
@@ -159,21 +158,13 @@ class RecordSimulator:
         padded = lanes.take(_ALL_LANES, mode="wrap")
         n_outputs = self._measured.shape[1]
         sums = np.empty((2 * n_outputs, LANES))
-        work = work_area(self._kernels.work_rows * LANES)
+        work = work_area(self._kernels.batch.work_rows * LANES)
+        record = (signal[:n_samples] for signal in (self._inputs, self._measured, self._weights))
+        start, p = self._initial(starts, padded), np.ascontiguousarray(parameters[padded].T)
         self._kernels.simulate(
-            work,
-            work.reshape(-1, LANES),
-            self._kernels.tables,
-            self._inputs[:n_samples],
-            self._measured[:n_samples],
-            self._weights[:n_samples],
-            self._initial(starts, padded),
-            np.ascontiguousarray(parameters[padded].T),
-            self.record.dt,
-            n_steps,
-            sums,
-            residuals,
-        )
+            work, work.reshape(-1, LANES), self._kernels.batch.tables, *record, start, p,
+            self.record.dt, n_steps, sums, residuals,
+        )  # fmt: skip
         return sums[:n_outputs].T[: len(lanes)], sums[n_outputs:].T[: len(lanes)]
 
     def _attempt(

@@ -10,8 +10,8 @@ import numpy as np
 
 from sysid.arrays import FloatArray, IntArray
 from sysid.engine.compiler import kernels
-from sysid.engine.lanes import LANES
 from sysid.engine.record_simulator import RecordSimulator
+from sysid.engine.scheme import LANES
 from sysid.problem.data import Dataset
 from sysid.problem.model import ModelError, ProcessModel
 from sysid.threads import Workers, available_cores
@@ -76,19 +76,13 @@ class BatchSimulator:
     sample; a chromosome that needs more is reported OVER_BUDGET. The result for a chromosome
     depends on neither the number of threads nor the rest of the population.
 
-    >>> import numpy as np
-    >>> from sysid import BatchSimulator, Dataset, Input, Output, Parameter, ProcessModel
-    >>> from sysid import State, Status
-    >>> lag = ProcessModel(
-    ...     "lag", [State("y", "1")], [Input("u", "V")], [Output("y", "1")],
-    ...     [Parameter("tau", "s", 0.05, 0.01, 1.0)], lambda x, u, p: ((u[0] - x[0]) / p[0],)
-    ... )
+    >>> from sysid.examples import lag
     >>> record = Dataset(np.ones(4), np.zeros(4), dt=0.05)  # a step, of which nothing was measured
-    >>> simulator = BatchSimulator(lag)
-    >>> y = simulator.trajectories(np.array([[0.05], [0.1]]), record)
+    >>> simulator = BatchSimulator(lag())
+    >>> y = simulator.trajectories(np.array([[1.0, 0.05], [1.0, 0.1]]), record)
     >>> y[:, :, 0].round(3).tolist()
     [[0.0, 0.632, 0.865, 0.95], [0.0, 0.393, 0.632, 0.777]]
-    >>> result = simulator.errors(np.array([[0.05], [-1e-4]]), [record])
+    >>> result = simulator.errors(np.array([[1.0, 0.05], [1.0, -1e-4]]), [record])
     >>> result.sse[:, 0, 0].round(2).tolist()
     [2.05, inf]
     >>> [Status(status).name for status in result.status]
@@ -117,12 +111,8 @@ class BatchSimulator:
 
     def finer(self, accuracy: float) -> BatchSimulator:
         """The same simulations at another accuracy, stiff ones given the steps."""
-        return BatchSimulator(
-            self.model,
-            accuracy=accuracy,
-            threads=self.threads,
-            max_steps=max(self.max_steps, _MOST_STEPS),
-        )
+        most = max(self.max_steps, _MOST_STEPS)
+        return BatchSimulator(self.model, accuracy=accuracy, threads=self.threads, max_steps=most)
 
     def errors(
         self,
@@ -168,32 +158,27 @@ class BatchSimulator:
         (n, n_states), initial states; default the record's own.
         """
         parameters = self._check(parameters, [record])
-        n_steps = n_steps or int(self._steps(parameters, record, starts).max())
-        outputs = np.empty((record.n_samples, len(self.model.outputs), len(parameters)))
-        on_record = self._on(record)
-
-        def run(task: tuple[slice, int]) -> None:
-            rows, steps = task
-            on_record.residuals(parameters, starts, rows, steps, outputs[..., rows])
-
-        self._workers.each(run, _runs(np.full(len(parameters), n_steps)))
+        n_steps = n_steps or int(self.steps_of_each(parameters, record, starts).max())
+        steps = np.full((len(parameters), 1), n_steps)
+        outputs = self.residuals(parameters, [record], [None], steps, [starts]).values
         return np.ascontiguousarray(np.moveaxis(outputs, 2, 0))
 
     def residuals(
         self,
         parameters: FloatArray,
         records: Sequence[Dataset],
-        scales: Sequence[FloatArray],
+        scales: Sequence[FloatArray | None],
         n_steps: IntArray,
-        starts: Sequence[FloatArray],
+        starts: Sequence[FloatArray | None],
         *,
         keep: bool = True,
     ) -> Residuals:
         """Residuals of every parameter vector on every record at given steps.
 
         n_steps: (n, n_records), integration steps per sample; rows of like steps had better be
-        neighbours, to share a block. scales, starts: as those of ``errors``. Without ``keep``
-        there are no values, only their sums of squares.
+        neighbours, to share a block. scales, starts: as those of ``errors``; without a scale
+        residuals are the outputs themselves. Without ``keep`` there are no values, only their
+        sums of squares.
         """
         parameters = self._check(parameters, records)
         n, q = len(parameters), len(self.model.outputs)
@@ -215,15 +200,12 @@ class BatchSimulator:
         self._workers.each(run, tasks)
         return Residuals(values, sse, excess)
 
-    def steps_of_each(self, parameters: FloatArray, record: Dataset) -> IntArray:
-        """Integration steps per sample that each parameter vector needs, (n,)."""
-        return self._steps(self._check(parameters, [record]), record)
-
-    def _steps(
+    def steps_of_each(
         self, parameters: FloatArray, record: Dataset, starts: FloatArray | None = None
     ) -> IntArray:
-        population = self._on(record).population(parameters, starts)
-        return np.minimum(population.n_steps, self.max_steps)
+        """Integration steps per sample that each parameter vector needs, (n,)."""
+        parameters = self._check(parameters, [record])
+        return np.minimum(self._on(record).population(parameters, starts).n_steps, self.max_steps)
 
     def _on(self, record: Dataset, scale: FloatArray | None = None) -> RecordSimulator:
         """What simulates a record; without a scale residuals are the outputs themselves."""
@@ -233,14 +215,9 @@ class BatchSimulator:
                 self._records.clear()
             # It holds the record, whose address stays its own as long.
             self._records[key] = RecordSimulator(
-                self.model,
-                self._kernels,
-                record,
-                scale,
-                accuracy=self.accuracy,
-                max_steps=self.max_steps,
-                workers=self._workers,
-            )
+                self.model, self._kernels, record, scale,
+                self.accuracy, self.max_steps, self._workers,
+            )  # fmt: skip
         return self._records[key]
 
     def _check(self, parameters: FloatArray, records: Sequence[Dataset]) -> FloatArray:

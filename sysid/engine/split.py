@@ -16,8 +16,6 @@ from sysid.engine.tape import Tape
 
 _NONE: frozenset[int] = frozenset()
 _WHOLE = 64  # whole powers up to this one are products
-_NO_SIDES: frozenset[str] = frozenset()
-_BOTH_SIDES = frozenset({"min", "max"})
 
 
 @dataclass(frozen=True)
@@ -121,9 +119,7 @@ class Splitter:
         """The same linear operation on a number and all its pieces."""
 
         def mapped(name: str) -> str:
-            if factor:
-                return self.tape.multiply(name, *factor)
-            return self.tape.emit(form, name)
+            return self.tape.multiply(name, *factor) if factor else self.tape.emit(form, name)
 
         return Split(
             mapped(number.total),
@@ -161,14 +157,14 @@ class Splitter:
         varying = [number for number in operands if not self.tape.fixed(number.total)]
         if len(varying) != 1:
             return limited
-        before = varying[0].clamp or Clamp(varying[0], _NO_SIDES, ())
+        before = varying[0].clamp or Clamp(varying[0], frozenset(), ())
         ends = [number.total for number in operands if self.tape.fixed(number.total)]
         clamp = Clamp(before.base, before.sides | {form[:3]}, (*before.limits, *ends))
         self.clamps.append(clamp)
         kink = {len(self.clamps) - 1: "1.0"}
         base = clamp.base
         straight = self.straight(base.linear)
-        if clamp.sides != _BOTH_SIDES or straight is None:
+        if clamp.sides != {"min", "max"} or straight is None:
             return replace(limited, kinks=kink, clamp=clamp)
         return replace(
             limited,

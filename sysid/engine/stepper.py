@@ -7,7 +7,7 @@ import numpy as np
 
 from sysid.arrays import FloatArray
 from sysid.engine.compiler import kernels
-from sysid.engine.lanes import work_area
+from sysid.engine.scheme import work_area
 from sysid.engine.trajectory_kernel import LEVELS
 from sysid.problem.model import ModelError, ProcessModel
 
@@ -24,14 +24,9 @@ class Stepper:
     keep. scale: (n_states,), magnitudes that matter; default the larger of 1 and the state's
     initial value. Raises ModelError for settings that do not fit the model.
 
-    >>> import numpy as np
-    >>> from sysid import Input, Output, Parameter, ProcessModel, State, Stepper
-    >>> lag = ProcessModel(
-    ...     "lag", [State("y", "1")], [Input("u", "V")], [Output("y", "1")],
-    ...     [Parameter("tau", "s", 0.05, 0.01, 1.0)], lambda x, u, p: ((u[0] - x[0]) / p[0],)
-    ... )
-    >>> stepper = Stepper(lag, np.array([0.05]), dt=0.05)
-    >>> x = lag.initial_state
+    >>> from sysid.examples import lag
+    >>> stepper = Stepper(lag(), np.array([1.0, 0.05]), dt=0.05)
+    >>> x = lag().initial_state
     >>> states, outputs = stepper.advance(x, np.ones((3, 1)))  # two intervals
     >>> outputs[:, 0].round(3).tolist(), x.round(3).tolist()
     ([0.0, 0.632], [0.865])
@@ -68,9 +63,9 @@ class Stepper:
         self._kernels = kernels(model)
         self._n_states, self._n_inputs = len(model.states), len(model.inputs)
         self._n_outputs = len(model.outputs)
-        self._base = dt / self.n_steps
+        self._base = dt / n_steps
         self._limit = (_ESTIMATE_LIMIT * accuracy) ** 2
-        self._work = work_area(self._kernels.levels_size)
+        self._work = work_area(self._kernels.trajectory.work_size)
         self._least = 0
         self._run: Callable[..., None] | None = None
 
@@ -100,15 +95,13 @@ class Stepper:
         """Fill the work area, once for all runs, and compile what advances."""
         n = len(x)
         a = np.zeros((n, n))
-        compiled, work = self._kernels, self._work
-        compiled.levels(work, compiled.levels_tables, self.parameters, self.scale, self._base, a)
-        if compiled.guarded and np.isfinite(a).all():
-            periods = np.abs(np.linalg.eigvals(a)).max() * self._base / (2.0 * math.pi)
+        compiled, work, base = self._kernels, self._work, self._base
+        compiled.levels(work, compiled.trajectory.tables, self.parameters, self.scale, base, a)
+        if compiled.trajectory.structure.guards and np.isfinite(a).all():
+            periods = np.abs(np.linalg.eigvals(a)).max() * base / (2.0 * math.pi)
             self._least = min(math.ceil(math.log2(max(periods, 1.0))), LEVELS)
         # A call over no interval, by which the compiler's complaints are explained.
         nothing = np.empty((0, n)), np.empty((0, self._n_outputs))
-        compiled.advance(
-            work, u[:1], x, self._base, self.n_steps, self._least, self._limit, *nothing
-        )
+        compiled.advance(work, u[:1], x, base, self.n_steps, self._least, self._limit, *nothing)
         self._run = compiled.advance.compiled
         return self._run

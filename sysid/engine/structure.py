@@ -8,16 +8,14 @@ while it is not at a limit; N is what is left, zero until then. Where the equati
 value nothing is claimed to be linear, and N is the user's function itself.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from sysid.engine.program import Followed, Program, Writer
+from sysid.engine.program import Writer
 from sysid.engine.split import Clamp, Split, Splitter
 from sysid.engine.tape import Tape
-from sysid.engine.trace import followed, operands, traces
+from sysid.engine.trace import followed, operand, traces
 from sysid.problem.model import Function, ProcessModel
-
-Entry = tuple[int, int]
 
 
 @dataclass(frozen=True)
@@ -38,63 +36,48 @@ class Structure:
     """What is linear in dx/dt = A x + N(x, u).
 
     coefficients: of the entries (i, j) of A that are not always zero, each as Python text in
-    terms of the constants ``c[..]`` of the program. driven: rows whose N changes within a
-    sample: nonlinear ones, and those with an input that is not held. nonlinear: whether any row
-    of N depends on a state. guards: limits that fast linear parts may run into. shown: states
-    that an output depends on directly, so that it shows when one of them is wrong.
+    terms of the constants ``c[..]`` of the program, n_constants of them. driven: rows whose N
+    changes within a sample: nonlinear ones, and those with an input that is not held. nonlinear:
+    whether any row of N depends on a state. guards: limits that fast linear parts may run into.
+    shown: states that an output depends on directly, so that it shows when one of them is wrong.
+    program: see ``program``. calls: which of ``derivative`` and ``output`` it refers to.
     """
 
-    coefficients: Mapping[Entry, str]
+    coefficients: Mapping[tuple[int, int], str]
     driven: tuple[int, ...]
     nonlinear: bool
     guards: tuple[Guard, ...]
     shown: frozenset[int]
-    program: Program
-
-    def closure(self, n_states: int) -> tuple[Entry, ...]:
-        """Entries of exp(A t) that can differ from zero for this pattern of A."""
-        reach = {(i, i) for i in range(n_states)} | set(self.coefficients)
-        for k in range(n_states):
-            via = [i for i in range(n_states) if (i, k) in reach]
-            to = [j for j in range(n_states) if (k, j) in reach]
-            reach |= {(i, j) for i in via for j in to}
-        return tuple(sorted(reach))
-
-    def products(self, n_states: int) -> tuple[tuple[int, int, int], ...]:
-        """Products in the square of such a matrix: two entries of the closure and their sum's."""
-        entries = self.closure(n_states)
-        place = {entry: k for k, entry in enumerate(entries)}
-        return tuple(
-            (place[i, k], place[k, j], place[i, j])
-            for i, k in entries
-            for row, j in entries
-            if row == k
-        )
+    program: str
+    n_constants: int
+    calls: frozenset[str]
 
 
 def analyse(model: ProcessModel, *, exact: bool = True) -> Structure:
     """Take a model's equations apart; without ``exact`` all of them are left in N."""
     splitter = Splitter()
     tape = splitter.tape
-    rows = _splits(splitter, model, model.derivative)
-    clamps = _clamps(splitter, rows or ())
-    parts = [_parts(splitter, row) if exact else ({}, row.total) for row in rows or ()]
+    slopes = _splits(splitter, model, model.derivative)
+    rows = slopes or []
+    # Limits on straight pieces that the rows are sums of, by their place among all.
+    places = sorted({k for row in rows for k in row.kinks})
+    clamps = {k: splitter.clamps[k] for k in places if splitter.clamps[k].base.linear}
+    parts = [_parts(splitter, row) if exact else ({}, row.total) for row in rows]
     linear = {(i, j): name for i, (piece, _) in enumerate(parts) for j, name in piece.items()}
-    gains = {
-        k: {i: row.kinks[k] for i, row in enumerate(rows or ()) if k in row.kinks} for k in clamps
-    }
-    functions: dict[str, Followed] = {
-        "remainder": ("derivative", None if rows is None else [rest for _, rest in parts])
-    }
+    gains = {k: {i: row.kinks[k] for i, row in enumerate(rows) if k in row.kinks} for k in clamps}
+    functions = {"remainder": [rest for _, rest in parts]}
     shown = frozenset(model.output_states or range(len(model.states)))
     if model.output is not None:
         outputs = _splits(splitter, model, model.output)
-        totals = None if outputs is None else [value.total for value in outputs]
-        functions["observe"] = ("output", totals)
+        functions["observe"] = [value.total for value in outputs or ()]
         if outputs is not None:
             shown = frozenset[int]().union(*(value.states for value in outputs))
     if clamps:
-        functions["margins"] = ("", _margins(tape, clamps.values()))
+        functions["margins"] = [
+            tape.emit("{} - {}", clamp.base.total, limit)
+            for clamp in clamps.values()
+            for limit in clamp.limits
+        ]
     names = {*linear.values()}
     for k, clamp in clamps.items():
         names |= {*clamp.base.linear.values(), *gains[k].values()}
@@ -103,15 +86,12 @@ def analyse(model: ProcessModel, *, exact: bool = True) -> Structure:
         Guard(len(clamp.limits), writer.placed(clamp.base.linear), writer.placed(gains[k]))
         for k, clamp in clamps.items()
     )
-    driven, nonlinear = _driven(model, rows if exact else None, clamps)
-    return Structure(writer.placed(linear), driven, nonlinear, guards, shown, writer.program())
-
-
-def _margins(tape: Tape, clamps: Iterable[Clamp]) -> list[str]:
-    """How far each limited number is above each of its limits."""
-    return [
-        tape.emit("{} - {}", clamp.base.total, limit) for clamp in clamps for limit in clamp.limits
-    ]
+    driven, nonlinear = _driven(model, slopes if exact else None, clamps)
+    program = writer.program()
+    return Structure(
+        writer.placed(linear), driven, nonlinear, guards, shown, program,
+        len(writer.constants), writer.calls,
+    )  # fmt: skip
 
 
 def _driven(
@@ -126,19 +106,13 @@ def _driven(
     return tuple(driven), any(bent)
 
 
-def _clamps(splitter: Splitter, rows: Sequence[Split]) -> dict[int, Clamp]:
-    """Limits on straight pieces that the rows are sums of, by their place among all."""
-    places = sorted({k for row in rows for k in row.kinks})
-    return {k: splitter.clamps[k] for k in places if splitter.clamps[k].base.linear}
-
-
 def _splits(splitter: Splitter, model: ProcessModel, function: Function) -> list[Split] | None:
     """A function's values, split; None where it cannot be followed."""
     equations = Tape()
     sides = zip("xup", (model.states, model.inputs, model.parameters), strict=True)
     try:
         values = followed(function)(*(traces(equations, name, len(of)) for name, of in sides))
-        return splitter.split(equations, operands(values))
+        return splitter.split(equations, map(operand, values))
     except Exception:
         # Whatever it does that a trace cannot follow, the compiler may well be able to.
         return None

@@ -72,13 +72,13 @@ def _tangent(tape: Tape, line: Line, moved: Sequence[Tangent]) -> Tangent:
 
 
 def _by_partials(tape: Tape, line: Line, moved: Sequence[Tangent]) -> Tangent:
-    total: Tangent = {}
+    total: dict[int, str] = {}
     for partial, tangent in zip(_PARTIALS[line.form], moved, strict=True):
         if tangent and partial != "0.0":
             factor = tape.emit(partial, *line.operands)
             # From a zero on, so that the sum is no negative one.
             begun = {k: total.get(k, "0.0") for k in tangent}
-            total = {**total, **tape.join_all("+", begun, _scaled(tape, tangent, factor))}
+            total |= tape.join_all("+", begun, _scaled(tape, tangent, factor))
     return total
 
 
@@ -98,8 +98,7 @@ def _of_product(tape: Tape, line: Line, first: Tangent, second: Tangent) -> Tang
 def _of_quotient(tape: Tape, line: Line, above: Tangent, below: Tangent) -> Tangent:
     quotient, b = line.name, line.operands[1]
     if not above:
-        factor = tape.emit("{} / {}", tape.emit("-{}", quotient), b)
-        return _scaled(tape, below, factor)
+        return _scaled(tape, below, tape.emit("{} / {}", tape.emit("-{}", quotient), b))
     difference = tape.join_all("-", above, _scaled(tape, below, quotient))
     return _each(lambda t: tape.emit("{} / {}", t, b), difference)
 
@@ -107,9 +106,8 @@ def _of_quotient(tape: Tape, line: Line, above: Tangent, below: Tangent) -> Tang
 def _of_power(tape: Tape, line: Line, of_base: Tangent, of_exponent: Tangent) -> Tangent:
     a, b = line.operands
     by_base = _each(lambda t: tape.emit("power_slope({}, {}, {})", a, b, t), of_base)
-    by_exponent = _each(
-        lambda t: tape.emit("exponent_slope({}, {}, {})", a, line.name, t), of_exponent
-    )
+    form = "exponent_slope({}, {}, {})"
+    by_exponent = _each(lambda t: tape.emit(form, a, line.name, t), of_exponent)
     return tape.join_all("+", by_base, by_exponent)
 
 

@@ -48,7 +48,8 @@ class Tape:
             line = Line(f"t{len(self._lines)}", form, operands, text, fixed)
             self._lines[text] = self._by_name[line.name] = line
             if self._values is not None:
-                evaluate(line, self._values)
+                result = operation(form, len(operands))(*map(self.value, operands))
+                self._values[line.name] = result
         return self._lines[text].name
 
     def decide(self, form: str, *operands: str) -> bool:
@@ -66,7 +67,7 @@ class Tape:
     def value(self, operand: str) -> Any:
         """What a name or a literal stands for at the tape's point."""
         assert self._values is not None
-        return looked_up(operand, self._values)
+        return self._values[operand] if operand in self._values else constant(operand)
 
     def fixed(self, operand: str) -> bool:
         """Whether a name or a literal depends on the parameters alone."""
@@ -103,14 +104,3 @@ class Tape:
         if "1.0" in (a, b):
             return a if b == "1.0" else b
         return self.emit("{} * {}", a, b)
-
-
-def evaluate(line: Line, values: dict[str, Any]) -> None:
-    """Work a line out and add its result to the values by name."""
-    arguments = [looked_up(operand, values) for operand in line.operands]
-    values[line.name] = operation(line.form, len(arguments))(*arguments)
-
-
-def looked_up(operand: str, values: Mapping[str, Any]) -> Any:
-    """The value of a name, or of a literal."""
-    return values[operand] if operand in values else constant(operand)

@@ -4,23 +4,22 @@ from __future__ import annotations
 
 import math
 import numbers
-from collections.abc import Callable, Sequence
+import types
+from collections.abc import Callable
 from typing import Any
 
-from sysid.engine.substitution import substituted
+from sysid.engine.substitution import Copier
 from sysid.engine.tape import Tape
 
 
-def _operation(form: str) -> Callable[[Trace, Any], Trace]:
-    return lambda a, b: a.result(form, a, b)
+def _operation(sign: str) -> tuple[Callable[[Trace, Any], Trace], Callable[[Trace, Any], Trace]]:
+    """The methods of an operation for its left and for its right operand."""
+    form = f"{{}} {sign} {{}}"
+    return lambda a, b: a.result(form, a, b), lambda a, b: a.result(form, b, a)
 
 
-def _reflected(form: str) -> Callable[[Trace, Any], Trace]:
-    return lambda a, b: a.result(form, b, a)
-
-
-def _condition(form: str) -> Callable[[Trace, Any], bool]:
-    return lambda a, b: a.tape.decide(form, a.name, operand(b))
+def _condition(sign: str) -> Callable[[Trace, Any], bool]:
+    return lambda a, b: a.tape.decide(f"{{}} {sign} {{}}", a.name, operand(b))
 
 
 class Trace:
@@ -43,17 +42,16 @@ class Trace:
         """The result of an operation on numbers, traced or not."""
         return Trace(self.tape, self.tape.emit(form, *map(operand, operands)))
 
-    __add__ = __radd__ = _operation("{} + {}")
-    __mul__ = __rmul__ = _operation("{} * {}")
-    __sub__, __rsub__ = _operation("{} - {}"), _reflected("{} - {}")
-    __truediv__, __rtruediv__ = _operation("{} / {}"), _reflected("{} / {}")
-    __pow__, __rpow__ = _operation("{} ** {}"), _reflected("{} ** {}")
-    __mod__, __rmod__ = _operation("{} % {}"), _reflected("{} % {}")
-    __floordiv__, __rfloordiv__ = _operation("{} // {}"), _reflected("{} // {}")
-    __lt__, __le__ = _condition("{} < {}"), _condition("{} <= {}")
-    __gt__, __ge__ = _condition("{} > {}"), _condition("{} >= {}")
-    __eq__ = _condition("{} == {}")
-    __ne__ = _condition("{} != {}")
+    __add__ = __radd__ = _operation("+")[0]
+    __mul__ = __rmul__ = _operation("*")[0]
+    __sub__, __rsub__ = _operation("-")
+    __truediv__, __rtruediv__ = _operation("/")
+    __pow__, __rpow__ = _operation("**")
+    __mod__, __rmod__ = _operation("%")
+    __floordiv__, __rfloordiv__ = _operation("//")
+    __lt__, __le__ = _condition("<"), _condition("<=")
+    __gt__, __ge__ = _condition(">"), _condition(">=")
+    __eq__, __ne__ = _condition("=="), _condition("!=")
     __hash__ = object.__hash__
 
     def __neg__(self) -> Trace:
@@ -71,7 +69,10 @@ class Trace:
 
 def followed(function: Any) -> Callable[..., tuple[Any, ...]]:
     """A copy of a model's function that takes traces."""
-    copy: Callable[..., tuple[Any, ...]] = substituted(function, _follow)
+    library = {name: _follow(f) if callable(f) else f for name, f in vars(math).items()}
+    builtins = {"min": _follow(min), "max": _follow(max)}
+    copier = Copier(types.SimpleNamespace(**library), lambda copy: copy, builtins, unwrap=True)
+    copy: Callable[..., tuple[Any, ...]] = copier.copied(function)
     return copy
 
 
@@ -87,18 +88,10 @@ def operand(value: Any) -> str:
     if isinstance(value, numbers.Integral):
         text = repr(int(value))
     elif isinstance(value, numbers.Real):
-        size = abs(float(value))
-        text = repr(float(value)) if math.isfinite(size) else f"math.{size}"
-        if value == -math.inf:
-            text = "-math.inf"
+        text = repr(float(value)).replace("inf", "math.inf").replace("nan", "math.nan")
     else:
         raise TypeError(f"{type(value).__name__} is no number that equations can be followed with")
     return f"({text})" if text.startswith("-") else text
-
-
-def operands(values: Sequence[Any]) -> list[str]:
-    """The same of several."""
-    return [operand(value) for value in values]
 
 
 def _follow(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -108,7 +101,7 @@ def _follow(function: Callable[..., Any]) -> Callable[..., Any]:
     def call(*args: Any) -> Any:
         first = next((a for a in args if isinstance(a, Trace)), None)
         # At a single point a comparison picks the least or largest, derivatives and all.
-        if first is None or (function in (min, max) and first.tape.single(operands(args))):
+        if first is None or (function in (min, max) and first.tape.single(map(operand, args))):
             return function(*args)
         places = ", ".join("{}" for _ in args)
         return first.result(f"{prefix}{function.__name__}({places})", *args)

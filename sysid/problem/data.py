@@ -37,8 +37,9 @@ class Dataset:
     input_noise: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "inputs", _matrix(self.inputs))
-        object.__setattr__(self, "outputs", _matrix(self.outputs))
+        for name in ("inputs", "outputs"):
+            table = np.ascontiguousarray(getattr(self, name), dtype=np.float64)
+            object.__setattr__(self, name, table.reshape(-1, 1) if table.ndim == 1 else table)
         if len(self.inputs) != len(self.outputs):
             raise ModelError(
                 f"{self.name}: {len(self.inputs)} rows of inputs, {len(self.outputs)} of outputs"
@@ -112,11 +113,6 @@ class Dataset:
         middle = float(self.initial_state(model)[state])
         span = (float(np.ptp(values)) if len(values) else 0.0) or 1.0
         return middle - span, middle + span
-
-
-def _matrix(values: FloatArray) -> FloatArray:
-    array: FloatArray = np.ascontiguousarray(values, dtype=np.float64)
-    return array.reshape(-1, 1) if array.ndim == 1 else array
 
 
 def output_scale(datasets: list[Dataset], per_log: bool = False) -> list[FloatArray]:

@@ -102,11 +102,8 @@ def guess_ranges(
             "leave guessing out"
         )
     space = SearchSpace.of(model, ranges, fixed, tied=tied)
-    low, high = space.full(space.lower).tolist(), space.full(space.upper).tolist()
-    assumed = {
-        name: (min(ends), max(ends))
-        for name, *ends in zip(model.parameter_names, low, high, strict=True)
-    }
+    ends = np.sort([space.full(space.lower), space.full(space.upper)], axis=0)
+    assumed = dict(zip(model.parameter_names, map(tuple, ends.T.tolist()), strict=True))
     for record in records:
         record.check(model)
     with one_thread():
@@ -151,12 +148,12 @@ def _within(parameter: Parameter, guess: Guess) -> tuple[float, float]:
     high = parameter.upper if guess.high is None else min(guess.high, parameter.upper)
     if low < high:
         return low, high
-    inside = tuple(
+    low_end, high_end = (
         None if end is None else min(max(end, parameter.minimum), parameter.maximum)
         for end in (guess.low, guess.high)
     )
     try:
-        elsewhere = with_search_range(parameter, (inside[0], inside[1]), "linear")
+        elsewhere = with_search_range(parameter, (low_end, high_end), "linear")
     except ModelError:
         return parameter.lower, parameter.upper  # nothing that is physically possible
     return elsewhere.lower, elsewhere.upper
@@ -201,7 +198,8 @@ def regression(
     if np.any(size == 0.0):
         return None
     q, triangle = np.linalg.qr(table / size)
-    if np.abs(np.diag(triangle)).min() < 1e-9 * np.abs(np.diag(triangle)).max():
+    diagonal = np.abs(np.diag(triangle))
+    if diagonal.min() < 1e-9 * diagonal.max():
         return None
     inverse = np.linalg.inv(triangle)
     coefficients = inverse @ (q.T @ target)

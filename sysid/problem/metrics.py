@@ -42,10 +42,10 @@ def fit_percent(measured: FloatArray, simulated: FloatArray) -> FloatArray:
     >>> fit_percent(y, y).tolist(), fit_percent(y, 0.0 * y + 2.0).tolist()
     ([100.0], [0.0])
     """
-    residual = np.sqrt(_mean((simulated - measured) ** 2, measured))
-    spread = np.sqrt(_mean((measured - _mean(measured, measured)) ** 2, measured))
+    spread = rmse(measured, _mean(measured, measured))
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(spread > 0.0, 100.0 * (1.0 - residual / spread), np.nan)
+        fit = 100.0 * (1.0 - rmse(measured, simulated) / spread)
+    return np.where(spread > 0.0, fit, np.nan)
 
 
 def mean_known(
@@ -90,9 +90,5 @@ def evaluate(measured: FloatArray, simulated: FloatArray) -> Metrics:
     """
     peak = np.max(np.where(np.isnan(measured), 0.0, np.abs(measured)), axis=0)
     scale = np.where(peak > 0.0, peak, 1.0)
-    return Metrics(
-        rmse=rmse(measured, simulated, scale),
-        msd=msd(measured, simulated, scale),
-        fit=fit_percent(measured, simulated),
-        scale=scale,
-    )
+    errors = rmse(measured, simulated, scale), msd(measured, simulated, scale)
+    return Metrics(*errors, fit_percent(measured, simulated), scale)

@@ -204,8 +204,12 @@ class ProcessModel:
             object.__setattr__(self, kind, _as_tuple(self.name, kind, getattr(self, kind)))
         for kind in ("states", "inputs", "outputs", "parameters"):
             _check_names(self.name, kind, [item.name for item in getattr(self, kind)])
-        if self.output is None:
-            self._check_outputs_are_states()
+        for name in self.output_names if self.output is None else ():
+            if name not in self.state_names:
+                raise ModelError(
+                    f"model {self.name}: output {name!r} is not a state; give the model an "
+                    f"output function, or name one of its states ({', '.join(self.state_names)})"
+                )
         self._try_functions()
 
     @property
@@ -303,17 +307,7 @@ class ProcessModel:
         inputs = tuple(replace(u, hold=holds.get(u.name, u.hold)) for u in self.inputs)
         return replace(self, inputs=inputs)
 
-    def evaluate_output(
-        self, x: Sequence[Any], u: Sequence[Any], p: Sequence[Any]
-    ) -> tuple[Any, ...]:
-        """Outputs at one point; arrays of equal shape may stand in place of floats."""
-        if self.output is not None:
-            return self.output(tuple(x), tuple(u), tuple(p))
-        assert self.output_states is not None
-        return tuple(x[i] for i in self.output_states)
-
     def _started(self, state: State, start: InitialValue) -> State:
-        """The state with another start."""
         where = f"state {state.name} of model {self.name}"
         measured = state.name in self.output_names
         if start == "first" and not measured:
@@ -344,14 +338,6 @@ class ProcessModel:
             if name not in existing:
                 raise ModelError(
                     f"model {self.name} has no {kind} {name!r}; it has {', '.join(existing)}"
-                )
-
-    def _check_outputs_are_states(self) -> None:
-        for name in self.output_names:
-            if name not in self.state_names:
-                raise ModelError(
-                    f"model {self.name}: output {name!r} is not a state; give the model an "
-                    f"output function, or name one of its states ({', '.join(self.state_names)})"
                 )
 
     def _try_functions(self) -> None:
@@ -392,7 +378,7 @@ def _as_tuple(model: str, kind: str, items: Any) -> tuple[Any, ...]:
 
 
 def _check_names(model: str, kind: str, names: list[str]) -> None:
-    if not names and kind in ("states", "outputs", "parameters"):
+    if not names and kind != "inputs":
         raise ModelError(f"model {model}: it has no {kind}")
     repeated = sorted({name for name in names if names.count(name) > 1})
     if repeated:

@@ -52,17 +52,10 @@ def with_search_range(parameter: Parameter, given: Range | None, scale: Scale | 
     # A range that touches zero cannot be searched by logarithm, unless that is asked for.
     chosen: Scale = scale or (parameter.scale if low > 0.0 else "linear")
     check_range(parameter.name, low, high, chosen)
-    nominal = min(max(parameter.nominal, minimum), maximum)
     return replace(
-        parameter,
-        nominal=nominal,
-        lower=low,
-        upper=high,
-        scale=chosen,
-        fixed=False,
-        minimum=minimum,
-        maximum=maximum,
-    )
+        parameter, nominal=min(max(parameter.nominal, minimum), maximum), lower=low, upper=high,
+        scale=chosen, fixed=False, minimum=minimum, maximum=maximum,
+    )  # fmt: skip
 
 
 def ties(model: ProcessModel, tied: Mapping[str, str]) -> tuple[Tie, ...]:

@@ -3,26 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from sysid.arrays import BoolArray, FloatArray, IntArray
+from sysid.arrays import BoolArray, FloatArray
 from sysid.problem.data import Dataset
 from sysid.problem.model import ModelError, Parameter, ProcessModel, Scale
 from sysid.problem.ranges import Range, Tie, ties, with_search_range
 
 # A search coordinate this close to an end of its range, in parts of the range, stands on it.
 _ON_BOUND = 1e-3
-
-
-@dataclass(frozen=True)
-class Start:
-    """An estimated initial state: index of its record and of the state in the model."""
-
-    record: int
-    state: int
 
 
 @dataclass(frozen=True)
@@ -33,9 +27,12 @@ class SearchSpace:
     initial states that are estimated, record by record. ``encode`` maps it to search coordinates
     (logarithm where the scale is log), ``decode`` back.
 
-    lower, upper: where the search starts. hard_lower, hard_upper: what it keeps within; for a
-    range with one end given these are that end and the physical limit, else lower and upper.
-    one_sided: names of the parameters with such a range. held: a search coordinate and the value
+    lower, upper: where the search starts. minimum, maximum: physical limits. hard_lower,
+    hard_upper: what the search keeps within; for a range with one end given these are that end
+    and the physical limit, else lower and upper. log: mask of the parameters searched by
+    logarithm. coded_lower, width: low ends and widths in search coordinates. All (n_free,).
+    estimated: record and state of each initial state that is estimated, by their places.
+    one_sided: names of the parameters with one end given. held: a search coordinate and the value
     that it keeps.
 
     >>> from sysid.examples import lag
@@ -48,10 +45,35 @@ class SearchSpace:
     parameters: tuple[Parameter, ...]
     base: FloatArray
     index: tuple[int, ...]
-    estimated: tuple[Start, ...] = ()
+    estimated: tuple[tuple[int, int], ...] = ()
     ties: tuple[Tie, ...] = ()
     one_sided: frozenset[str] = frozenset()
     held: tuple[int, float] | None = None
+    lower: FloatArray = field(init=False, repr=False, compare=False)
+    upper: FloatArray = field(init=False, repr=False, compare=False)
+    minimum: FloatArray = field(init=False, repr=False, compare=False)
+    maximum: FloatArray = field(init=False, repr=False, compare=False)
+    hard_lower: FloatArray = field(init=False, repr=False, compare=False)
+    hard_upper: FloatArray = field(init=False, repr=False, compare=False)
+    log: BoolArray = field(init=False, repr=False, compare=False)
+    coded_lower: FloatArray = field(init=False, repr=False, compare=False)
+    width: FloatArray = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        for name in ("lower", "upper", "minimum", "maximum"):
+            self._keep(name, np.array([getattr(p, name) for p in self.parameters], np.float64))
+        self._keep("log", np.array([p.scale == "log" for p in self.parameters], bool))
+        open_ended = np.array([p.name in self.one_sided for p in self.parameters], bool)
+        # A logarithm cannot pass zero, wherever the physical limit is.
+        least = np.where(self.log, np.maximum(self.minimum, 0.0), self.minimum)
+        self._keep("hard_lower", np.where(open_ended, least, self.lower))
+        self._keep("hard_upper", np.where(open_ended, self.maximum, self.upper))
+        self._keep("coded_lower", self.encode(self.lower))
+        self._keep("width", self.encode(self.upper) - self.coded_lower)
+
+    def _keep(self, name: str, values: npt.NDArray[Any]) -> None:
+        values.setflags(write=False)
+        object.__setattr__(self, name, values)
 
     @classmethod
     def of(
@@ -118,7 +140,7 @@ class SearchSpace:
                 parameters.append(
                     Parameter(name, state.unit, begin, *ends, minimum=-np.inf, description=about)
                 )
-                starts.append(Start(k, i))
+                starts.append((k, i))
         return replace(self, parameters=tuple(parameters), estimated=tuple(starts))
 
     def with_nominal_starts(self, chromosomes: FloatArray) -> FloatArray:
@@ -134,72 +156,24 @@ class SearchSpace:
         declared: (n_states,), initial states of those that are not estimated.
         """
         states = np.repeat(declared[None], len(chromosomes), axis=0)
-        for start, values in zip(self.estimated, chromosomes.T[len(self.index) :], strict=True):
-            if start.record == record:
-                states[:, start.state] = values
+        columns = chromosomes.T[len(self.index) :]
+        for (number, state), values in zip(self.estimated, columns, strict=True):
+            if number == record:
+                states[:, state] = values
         return states
 
     def named_starts(self, chromosome: FloatArray) -> list[dict[str, float]]:
         """The estimated initial states in a chromosome (n_free,), by state, for each record."""
-        last = max((start.record for start in self.estimated), default=-1)
+        last = max((record for record, _ in self.estimated), default=-1)
         named: list[dict[str, float]] = [{} for _ in range(last + 1)]
-        for start, value in zip(self.estimated, chromosome[len(self.index) :], strict=True):
-            named[start.record][self.model.states[start.state].name] = float(value)
+        for (record, i), value in zip(self.estimated, chromosome[len(self.index) :], strict=True):
+            named[record][self.model.states[i].name] = float(value)
         return named
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the free parameters, in order."""
         return tuple(parameter.name for parameter in self.parameters)
-
-    @cached_property
-    def lower(self) -> FloatArray:
-        """Low ends of the ranges, (n_free,)."""
-        return _constant([parameter.lower for parameter in self.parameters])
-
-    @cached_property
-    def upper(self) -> FloatArray:
-        """High ends of the ranges, (n_free,)."""
-        return _constant([parameter.upper for parameter in self.parameters])
-
-    @cached_property
-    def minimum(self) -> FloatArray:
-        """Physical minima, (n_free,)."""
-        return _constant([parameter.minimum for parameter in self.parameters])
-
-    @cached_property
-    def maximum(self) -> FloatArray:
-        """Physical maxima, (n_free,)."""
-        return _constant([parameter.maximum for parameter in self.parameters])
-
-    @cached_property
-    def log(self) -> BoolArray:
-        """Mask of the parameters searched by logarithm, (n_free,)."""
-        mask = np.array([parameter.scale == "log" for parameter in self.parameters], dtype=bool)
-        mask.setflags(write=False)
-        return mask
-
-    @cached_property
-    def coded_lower(self) -> FloatArray:
-        """Low ends of the ranges in search coordinates, (n_free,)."""
-        return _constant(self.encode(self.lower))
-
-    @cached_property
-    def width(self) -> FloatArray:
-        """Widths of the ranges in search coordinates, (n_free,)."""
-        return _constant(self.encode(self.upper) - self.encode(self.lower))
-
-    @property
-    def hard_lower(self) -> FloatArray:
-        """Low ends that the search keeps to, (n_free,); -inf where there is none."""
-        # A logarithm cannot pass zero, wherever the physical limit is.
-        least = np.where(self.log, np.maximum(self.minimum, 0.0), self.minimum)
-        return np.where(self._open_ended, least, self.lower)
-
-    @property
-    def hard_upper(self) -> FloatArray:
-        """High ends that the search keeps to, (n_free,); inf where there is none."""
-        return np.where(self._open_ended, self.maximum, self.upper)
 
     @cached_property
     def coded_bounds(self) -> tuple[FloatArray, FloatArray]:
@@ -209,7 +183,9 @@ class SearchSpace:
         if self.held is not None:
             place, value = self.held
             lower[place] = upper[place] = value
-        return _constant(lower), _constant(upper)
+        lower.setflags(write=False)
+        upper.setflags(write=False)
+        return lower, upper
 
     def holding(self, place: int, value: float) -> SearchSpace:
         """The space with a search coordinate held at a value."""
@@ -222,15 +198,6 @@ class SearchSpace:
         at = self.encode(chromosome)
         mask: BoolArray = (at < lower + near) | (at > upper - near)
         return mask
-
-    @cached_property
-    def _places(self) -> IntArray:
-        """Where the free parameters stand in a complete vector."""
-        return np.array(self.index, dtype=np.int64)
-
-    @property
-    def _open_ended(self) -> BoolArray:
-        return np.array([parameter.name in self.one_sided for parameter in self.parameters], bool)
 
     def encode(self, chromosomes: FloatArray) -> FloatArray:
         """Search coordinates of chromosomes, (..., n_free)."""
@@ -264,7 +231,7 @@ class SearchSpace:
         chromosomes = np.asarray(chromosomes)
         vectors = np.empty((*chromosomes.shape[:-1], len(self.base)))
         vectors[:] = self.base
-        vectors[..., self._places] = chromosomes[..., : len(self.index)]
+        vectors[..., list(self.index)] = chromosomes[..., : len(self.index)]
         for tie in self.ties:
             vectors[..., tie.index] = tie.factor * vectors[..., tie.source]
         return vectors
@@ -284,28 +251,21 @@ class SearchSpace:
         for tie in self.ties:
             parameter, values = self.model.parameters[tie.index], vectors[:, tie.index]
             rows.append(np.maximum(parameter.minimum - values, values - parameter.maximum)[:, None])
-        rows.append(self._constraints_of(vectors))
+        rows.append(self._constraints(vectors))
         violations = np.maximum(0.0, np.concatenate(rows, axis=1))
         # Not-a-number is no proof of feasibility.
         return np.where(np.isnan(violations), np.inf, violations)
 
     def constraint_values(self, chromosomes: FloatArray) -> FloatArray:
         """The model's constraints g, satisfied where not above 0, (n_chromosomes, n)."""
-        return self._constraints_of(self.full(chromosomes))
+        return self._constraints(self.full(chromosomes))
 
-    def _constraints_of(self, vectors: FloatArray) -> FloatArray:
+    def _constraints(self, vectors: FloatArray) -> FloatArray:
         columns = tuple(vectors.T)
         values = np.zeros((len(vectors), len(self.model.constraints)))
         for i, constraint in enumerate(self.model.constraints):
             values[:, i] = constraint.function(columns)
         return values
-
-
-def _constant(values: Sequence[float] | FloatArray) -> FloatArray:
-    """A read-only array, which caches may share."""
-    array = np.array(values, dtype=np.float64)
-    array.setflags(write=False)
-    return array
 
 
 def _check_conflicts(*settings: Mapping[str, object]) -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -60,10 +61,8 @@ def frequency_response(records: Sequence[Dataset]) -> FrequencyResponse:
     dt = records[0].dt
     if any(abs(record.dt - dt) > 1e-6 * dt for record in records):
         raise ModelError("records of different sample times have no common frequency response")
-    varied: BoolArray = np.array(
-        np.any([np.ptp(record.inputs, axis=0) > 0.0 for record in records], axis=0),
-        dtype=np.bool_,
-    )
+    changes = [np.ptp(record.inputs, axis=0) > 0.0 for record in records]
+    varied: BoolArray = np.array(np.any(changes, axis=0), dtype=np.bool_)
     m, length = int(varied.sum()), _segment_length(records)
     if not m:
         raise ModelError("no input changes, so there is no frequency response")
@@ -104,7 +103,7 @@ def sampled_response(
     return result
 
 
-def _solved(matrices: ComplexArray, columns: FloatArray) -> ComplexArray:
+def _solved(matrices: npt.NDArray[Any], columns: FloatArray) -> ComplexArray:
     right = np.broadcast_to(columns.astype(np.complex128), (len(matrices), *columns.shape))
     return np.linalg.solve(matrices, right).astype(np.complex128)
 

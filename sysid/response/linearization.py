@@ -1,8 +1,7 @@
 """Exact Jacobians of any process model, operating points, and linear models at them."""
 
 import functools
-from dataclasses import dataclass
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,8 +13,7 @@ from sysid.problem.model import ModelError, ProcessModel
 _NUDGES = (0.0, 0.1, -0.1, 1.0, -1.0)
 
 
-@dataclass(frozen=True)
-class LinearModel:
+class LinearModel(NamedTuple):
     """dx/dt = A x + B u, y = C x + D u for small deviations from an operating point.
 
     A: (n_states, n_states), B: (n_states, n_inputs), C: (n_outputs, n_states),
@@ -31,9 +29,6 @@ class LinearModel:
     C: FloatArray
     D: FloatArray
 
-    def __iter__(self) -> Any:
-        return iter((self.A, self.B, self.C, self.D))
-
 
 def linearize(
     model: ProcessModel, x: FloatArray, u: FloatArray, p: FloatArray | None = None
@@ -45,14 +40,10 @@ def linearize(
     taken as 0. The result's four matrices are what ``control.ss`` takes. Raises ModelError for
     wrong shapes or a function that has no known derivative.
 
-    >>> from sysid import Input, Output, Parameter, State
-    >>> lag = ProcessModel(
-    ...     "lag", [State("y", "1")], [Input("u", "V")], [Output("y", "1")],
-    ...     [Parameter("tau", "s", 0.05, 0.01, 1.0)], lambda x, u, p: ((u[0] - x[0]) / p[0],)
-    ... )
-    >>> linear = linearize(lag, np.zeros(1), np.zeros(1))
+    >>> from sysid.examples import lag
+    >>> linear = linearize(lag(), np.zeros(1), np.zeros(1))
     >>> linear.A.item(), linear.B.item(), linear.C.item(), linear.D.item()
-    (-20.0, 20.0, 1.0, 0.0)
+    (-20.0, 40.0, 1.0, 0.0)
     """
     x, u, p = _point(model, x, u, p)
     n, m = len(x), len(u)
@@ -134,7 +125,7 @@ def equilibrium(
             raise ModelError(f"model {model.name} has no state {name!r} to hold")
         x[model.state_names.index(name)] = value
     free = [i for i, name in enumerate(model.state_names) if name not in (hold or {})]
-    inputs, parameters = tuple(float(v) for v in u), tuple(float(v) for v in p)
+    inputs, parameters = tuple(u.tolist()), tuple(p.tolist())
 
     def complete(values: FloatArray) -> FloatArray:
         whole = x.copy()
@@ -142,7 +133,7 @@ def equilibrium(
         return whole
 
     def slopes(values: FloatArray) -> FloatArray:
-        at = tuple(float(v) for v in complete(values))
+        at = tuple(complete(values).tolist())
         return np.array(model.derivative(at, inputs, parameters))[free]
 
     def slopes_jacobian(values: FloatArray) -> FloatArray:
@@ -151,14 +142,9 @@ def equilibrium(
     def solve(nudge: float) -> tuple[FloatArray, FloatArray]:
         """A stationary point of the search, and its derivatives in parts of their terms."""
         fit = least_squares(
-            slopes,
-            x[free] + nudge,
-            jac=slopes_jacobian,
-            x_scale="jac",
-            xtol=1e-15,
-            ftol=1e-15,
-            gtol=1e-15,
-        )
+            slopes, x[free] + nudge, jac=slopes_jacobian, x_scale="jac",
+            xtol=1e-15, ftol=1e-15, gtol=1e-15,
+        )  # fmt: skip
         terms = np.abs(slopes_jacobian(fit.x)) @ np.maximum(np.abs(fit.x), 1e-6)
         return fit.x, np.abs(fit.fun) / np.maximum(terms, 1e-12)
 
@@ -192,11 +178,8 @@ def _point(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     p = model.nominal if p is None else np.asarray(p, dtype=np.float64)
     x, u = np.array(x, dtype=np.float64), np.asarray(u, dtype=np.float64)
-    for what, values, expected in (
-        ("states", x, len(model.states)),
-        ("inputs", u, len(model.inputs)),
-        ("parameters", p, len(model.parameters)),
-    ):
+    for what, values in (("states", x), ("inputs", u), ("parameters", p)):
+        expected = len(getattr(model, what))
         if values.shape != (expected,):
             raise ModelError(
                 f"model {model.name} has {expected} {what}; shape {values.shape} was given"

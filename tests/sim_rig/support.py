@@ -12,6 +12,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from sim_rig.actuator import actuator
+from tests.sysid.support import outputs_of
 
 HYSTERESES = (
     ("bouc-wen", 1.0),
@@ -186,7 +187,7 @@ class Trajectory:
     def output(self, name, row=-1):
         """An output at one of the instants."""
         x = tuple(self.y[: len(self.model.states), row])
-        values = self.model.evaluate_output(x, self.inputs(self.t[row]), self.p)
+        values = outputs_of(self.model, x, self.inputs(self.t[row]), self.p)
         return values[self.model.output_names.index(name)]
 
 

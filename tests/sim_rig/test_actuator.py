@@ -13,6 +13,7 @@ from sim_rig.actuator import actuator
 from sysid import ModelError, SearchSpace, equilibrium
 from tests.sim_rig import equations
 from tests.sim_rig.support import HYSTERESES, LOADS, Parts, constant, follow, random_point
+from tests.sysid.support import outputs_of
 
 ALL_OUTPUTS = ("current_motor", "current_brake", "torque", "theta", "omega")
 
@@ -45,13 +46,13 @@ def test_outputs_may_be_chosen_in_any_order(load):
     rng = random.Random(2)
     whole = Parts(load=load).build()
     point = random_point(whole, rng).of(whole)
-    values = dict(zip(whole.output_names, whole.evaluate_output(*point), strict=True))
+    values = dict(zip(whole.output_names, outputs_of(whole, *point), strict=True))
     values["theta"] = point[0][whole.state_names.index("theta")]
     for count in (1, 2, 3, len(values)):
         names = tuple(rng.sample(list(values), count))
         model = Parts(load=load).build(outputs=names)
         assert model.output_names == names
-        assert model.evaluate_output(*point) == tuple(values[name] for name in names)
+        assert outputs_of(model, *point) == tuple(values[name] for name in names)
         assert model.derivative(*point) == whole.derivative(*point)
 
 
@@ -139,7 +140,7 @@ def test_a_gear_of_two_is_a_motor_of_half_the_constant_and_a_quarter_of_the_iner
             geared["J_m"] = point.q["J_m"] / 4
             q = tuple(geared[name] for name in model.parameter_names)
             assert model.derivative(x, u, p) == model.derivative(x, u, q)
-            assert model.evaluate_output(x, u, p) == model.evaluate_output(x, u, q)
+            assert outputs_of(model, x, u, p) == outputs_of(model, x, u, q)
 
 
 def test_the_sign_of_the_transmission_is_the_sign_of_the_motors_current():
@@ -155,7 +156,7 @@ def test_the_sign_of_the_transmission_is_the_sign_of_the_motors_current():
         one, other = (model.derivative(*at.of(model)) for at in (point, turned))
         signs = [-1.0 if "motor" in name else 1.0 for name in model.state_names]
         assert other == pytest.approx([s * v for s, v in zip(signs, one, strict=True)], rel=1e-12)
-        torque = [model.evaluate_output(*at.of(model))[2] for at in (point, turned)]
+        torque = [outputs_of(model, *at.of(model))[2] for at in (point, turned)]
         assert torque[0] == pytest.approx(torque[1], rel=1e-12)
 
 
@@ -197,7 +198,7 @@ def test_between_motor_and_brake_it_reads_motor_less_its_inertia_which_is_what_i
         for _ in range(20):
             x, u, q = point = random_point(model, rng)
             slopes = dict(zip(model.state_names, model.derivative(*point.of(model)), strict=True))
-            reading = model.evaluate_output(*point.of(model))[2]
+            reading = outputs_of(model, *point.of(model))[2]
             motor = equations.motor_torque(q, x)
             own = q["n_c"] ** 2 * q["J_m"] * slopes["omega"]
             beyond = equations.sensor_reading(parts, q, x, u, slopes["omega"])
@@ -214,7 +215,7 @@ def test_at_the_load_it_reads_what_the_load_gives_less_the_pulleys_inertia():
         x, u, q = point = random_point(model, rng)
         slopes = dict(zip(model.state_names, model.derivative(*point.of(model)), strict=True))
         terms = [*equations.load_torque(parts, q, x, u), -q["J_p"] * slopes["omega"]]
-        reading = model.evaluate_output(*point.of(model))[2]
+        reading = outputs_of(model, *point.of(model))[2]
         assert reading == pytest.approx(sum(terms), abs=1e-12 * sum(map(abs, terms)))
 
 
@@ -236,7 +237,7 @@ def test_brush_friction_is_seen_between_motor_and_brake_and_not_at_the_load(dire
         a, b = steady(0.0)[0], steady(1.0)[0]
         rest, x, u = steady(-a / (b - a))
         assert abs(rest) < 1e-6
-        output = model.evaluate_output(x, u, model.nominal)
+        output = outputs_of(model, x, u, model.nominal)
         readings[sensor, friction] = output[model.output_names.index("torque")]
     assert readings["load", "none"] == readings["load", "stribeck"] == 0.0
     brake = p["alpha0"] * 60.0 / 48.0 + p["c0"] * 4.0

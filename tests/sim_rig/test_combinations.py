@@ -13,6 +13,7 @@ from sysid import BatchSimulator, Dataset, ModelError, SearchSpace
 from tests.sim_rig import equations
 from tests.sim_rig.support import ALL, HYSTERESES, LOADS, PLANTS, Parts, combinations, random_point
 from tests.sysid.reference import simulate as reference
+from tests.sysid.support import outputs_of
 
 
 @pytest.mark.parametrize("load", LOADS)
@@ -30,7 +31,7 @@ def test_every_combination_is_its_equations(hysteresis, smooth, load):
             assert set(found) == set(terms)
             for name, value in found.items():
                 assert_sum(value, terms[name], f"{parts}: d{name}/dt")
-            outputs = dict(zip(model.output_names, model.evaluate_output(x, u, p), strict=True))
+            outputs = dict(zip(model.output_names, outputs_of(model, x, u, p), strict=True))
             for name in set(outputs) - {"torque"}:
                 assert outputs[name] == point.x[name]
             assert ("torque" in outputs) == (load != "measured")

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from sysid import ModelError, equilibrium, linearize
 from tests.sim_rig.support import ALL, HYSTERESES, Parts, random_point
+from tests.sysid.support import outputs_of
 
 # --- finite differences ---------------------------------------------------------------------
 
@@ -50,8 +51,8 @@ def test_every_combinations_matrices_are_its_slopes(parts, seed):
     for name, function, point, steps in (
         ("A", lambda v: model.derivative(v, u, p), x, x_steps),
         ("B", lambda v: model.derivative(x, v, p), u, u_steps),
-        ("C", lambda v: model.evaluate_output(v, u, p), x, x_steps),
-        ("D", lambda v: model.evaluate_output(x, v, p), u, u_steps),
+        ("C", lambda v: outputs_of(model, v, u, p), x, x_steps),
+        ("D", lambda v: outputs_of(model, x, v, p), u, u_steps),
     ):
         expected, rounding = differences(function, point, steps)
         matrix = getattr(found, name)
@@ -319,7 +320,7 @@ def test_the_linear_models_response_to_a_small_step_is_the_nonlinear_ones():
     u = np.array([inputs.get(name, 0.0) for name in model.input_names])
     x = equilibrium(model, u, hold=hold)
     p = tuple(model.nominal)
-    y0 = np.array(model.evaluate_output(tuple(x), tuple(u), p))
+    y0 = np.array(outputs_of(model, tuple(x), tuple(u), p))
     offset = np.array(model.derivative(tuple(x), tuple(u), p))  # the held states drift
     times = np.linspace(0.0, 0.02, 201)
     size = 1e-5
@@ -335,7 +336,7 @@ def test_the_linear_models_response_to_a_small_step_is_the_nonlinear_ones():
     solved = solve_ivp(
         rhs, (0.0, times[-1]), x, method="LSODA", rtol=1e-11, atol=1e-13, t_eval=times
     )
-    found = np.array([model.evaluate_output(tuple(v), tuple(u), p) for v in solved.y.T]) - y0
+    found = np.array([outputs_of(model, tuple(v), tuple(u), p) for v in solved.y.T]) - y0
     for name in ("current_motor", "omega", "theta"):
         i = model.output_names.index(name)
         scale = np.abs(linear.outputs[i]).max()

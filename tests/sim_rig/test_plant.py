@@ -13,6 +13,7 @@ from pydantic import ValidationError
 from sim_rig.plant import Plant, state_sizes
 from sysid import ModelError
 from tests.sim_rig.support import HYSTERESES, constant, follow, random_point
+from tests.sysid.support import outputs_of
 
 # --- ratings --------------------------------------------------------------------------------
 
@@ -229,7 +230,7 @@ def test_the_model_that_is_identified_is_the_actuator_inside_the_plant(settings)
         u = point.u | {"applied_voltage_motor": -2.0, "applied_voltage_brake": 0.3}
         q = dict(zip(whole.parameter_names, whole.nominal, strict=True))
         at = point._replace(x=x, u=u, q=q).of(whole)
-        torque = whole.evaluate_output(*at)[2]
+        torque = outputs_of(whole, *at)[2]
         expected = whole.derivative(*at)[:7]
         known = point._replace(x=x, u=u | {"torque": torque}, q=q)
         found = inner.derivative(*known.of(inner))
@@ -254,7 +255,7 @@ def test_without_the_loads_torque_in_the_log_the_model_has_the_load_itself(load)
         expected, found = whole.derivative(*at.of(whole)), inner.derivative(*at.of(inner))
         np.testing.assert_allclose(found, expected[: len(found)], rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(
-            inner.evaluate_output(*at.of(inner)), whole.evaluate_output(*at.of(whole)), rtol=1e-9
+            outputs_of(inner, *at.of(inner)), outputs_of(whole, *at.of(whole)), rtol=1e-9
         )
 
 

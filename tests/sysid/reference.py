@@ -11,6 +11,7 @@ from sysid.arrays import FloatArray
 from sysid.problem.data import Dataset
 from sysid.problem.model import ModelError, ProcessModel
 from sysid.response.linearization import jacobian
+from tests.sysid.support import outputs_of
 
 Method = Literal["DOP853", "RK45", "Radau", "BDF", "LSODA"]
 _IMPLICIT = ("Radau", "BDF", "LSODA")
@@ -40,7 +41,7 @@ def simulate(
     outputs = np.empty((record.n_samples, len(model.outputs)))
     for k in range(record.n_samples):
         u0 = record.inputs[k]
-        outputs[k] = model.evaluate_output(tuple(x), tuple(u0), p)
+        outputs[k] = outputs_of(model, tuple(x), tuple(u0), p)
         if k == record.n_samples - 1:
             break
 

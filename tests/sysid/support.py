@@ -10,6 +10,13 @@ from sysid import Constraint, Dataset, Input, Output, Parameter, ProcessModel, S
 from sysid.engine.simulation import BatchResult, Residuals
 
 
+def outputs_of(model, x, u, p):
+    """Outputs at one point; arrays of equal shape may stand in place of floats."""
+    if model.output is not None:
+        return model.output(tuple(x), tuple(u), tuple(p))
+    return tuple(x[i] for i in model.output_states)
+
+
 def lag_derivative(x, u, p):
     return ((p[0] * u[0] - x[0]) / p[1],)
 

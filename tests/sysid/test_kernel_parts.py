@@ -9,8 +9,8 @@ import pytest
 from scipy.linalg import expm
 
 from sysid.engine import vector_math as _vector_math
-from sysid.engine.lanes import LANES
 from sysid.engine.phi import scheme_matrices
+from sysid.engine.scheme import LANES
 
 
 def tables(pattern):

@@ -21,7 +21,7 @@ from sysid import (
     linearize,
 )
 from sysid.response.linearization import jacobians
-from tests.sysid.support import motor, motor_matrices
+from tests.sysid.support import motor, motor_matrices, outputs_of
 
 MODELS = {
     "motor": motor(),
@@ -56,8 +56,8 @@ def test_jacobians_agree_with_finite_differences(name, seed):
     for matrix, function, point in (
         (found.A, lambda v: model.derivative(tuple(v), tuple(u), p), x),
         (found.B, lambda v: model.derivative(tuple(x), tuple(v), p), u),
-        (found.C, lambda v: model.evaluate_output(tuple(v), tuple(u), p), x),
-        (found.D, lambda v: model.evaluate_output(tuple(x), tuple(v), p), u),
+        (found.C, lambda v: outputs_of(model, tuple(v), tuple(u), p), x),
+        (found.D, lambda v: outputs_of(model, tuple(x), tuple(v), p), u),
     ):
         expected = central_differences(function, point, 1e-6)
         size = np.abs(expected).max(axis=1, keepdims=True) + 1e-9
@@ -157,6 +157,70 @@ def test_jacobians_of_many_differentiate_and_branch_as_one(derivative):
     for x in np.array([[0.7, 0.9], [1.4, 0.3]]):
         expected = [jacobian(model, x, np.zeros(0), row) for row in p]
         np.testing.assert_allclose(jacobians(model, x, np.zeros(0), p), expected, rtol=1e-9)
+
+
+def counting(x, u, p):
+    """What parameters alone decide may be anything Python can do: a count, a NumPy function."""
+    return (sum(x[1] * np.tanh(p[0]) for _ in range(int(p[1]))), -x[0] % 1.5 + x[0] // 2.0)
+
+
+def iterated(x, u, p):
+    """The root of y^3 + y = a by Newton's method: as many rounds as the point needs."""
+    a, y = x
+    while abs(y * y * y + y - a) > 1e-12:
+        y = y - (y * y * y + y - a) / (3.0 * y * y + 1.0)
+    return (y, p[0] * a if a else x[1])
+
+
+def both_sides(x, u, p):
+    a, b = x
+    return (math.sqrt(max(a, 0.0)) + u[0] * (b > 0.0), min(a, b, p[0]) if a != b else p[1] * a)
+
+
+@pytest.mark.parametrize("derivative", [branching, counting, iterated, both_sides])
+def test_each_point_is_differentiated_along_its_own_way(derivative):
+    """One way after another, and again, on one model that remembers them."""
+    model = ProcessModel(
+        name="ways",
+        states=(State("a", "1", 0.4), State("b", "1", 0.3)),
+        inputs=(Input("u", "1"),),
+        outputs=(Output("a", "1"),),
+        parameters=(Parameter("k", "1", 1.1, 0.5, 2.0), Parameter("n", "1", 2.2, 1.0, 4.0)),
+        derivative=derivative,
+    )
+    rng = np.random.default_rng(4)
+    points = rng.uniform(-2.0, 2.0, (12, 2))
+    for x in (*points, *points):
+        p = rng.uniform([0.5, 1.0], [2.0, 4.0])
+        A, B, _, _ = linearize(model, x, np.array([0.7]), p)
+        by_x = central_differences(lambda v, p=p: derivative(tuple(v), (0.7,), p), x, 1e-6)
+        by_u = central_differences(
+            lambda v, x=x, p=p: derivative(tuple(x), tuple(v), p), np.array([0.7]), 1e-6
+        )
+        np.testing.assert_allclose(A, by_x, rtol=1e-6, atol=1e-8)
+        np.testing.assert_allclose(B, by_u, rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("derivative", "message"),
+    [
+        (lambda x, u, p: (math.gamma(2.0 + x[0]), x[1]), "the derivative of gamma is not known"),
+        (lambda x, u, p: (float(x[0]), x[1]), r"float\(\) argument must be"),
+    ],
+)
+def test_what_cannot_be_differentiated_says_so(derivative, message):
+    model = ProcessModel(
+        name="odd",
+        states=(State("a", "1"), State("b", "1")),
+        inputs=(),
+        outputs=(Output("a", "1"),),
+        parameters=(Parameter("k", "1", 1.0, 0.5, 2.0),),
+        derivative=derivative,
+    )
+    with pytest.raises(ModelError, match=f"model odd cannot be differentiated: {message}"):
+        jacobian(model, np.ones(2), np.zeros(0))
+    with pytest.raises(ModelError, match=f"model odd cannot be differentiated: {message}"):
+        jacobians(model, np.ones(2), np.zeros(0), np.array([[1.0], [1.5]]))
 
 
 # --- operating points -----------------------------------------------------------------------

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sysid import Constraint, Input, ModelError, Output, Parameter, ProcessModel, State
-from tests.sysid.support import lag
+from tests.sysid.support import lag, outputs_of
 
 
 def build(**changes):
@@ -46,7 +46,7 @@ def test_an_output_that_is_no_state_needs_an_output_function():
         build(outputs=(Output("speed", "1"),))
     model = build(outputs=(Output("speed", "1"),), output=lambda x, u, p: (2.0 * x[0],))
     assert model.output_states is None
-    assert model.evaluate_output((3.0,), (0.0,), (1.0, 1.0)) == (6.0,)
+    assert outputs_of(model, (3.0,), (0.0,), (1.0, 1.0)) == (6.0,)
 
 
 @pytest.mark.parametrize("values", [(), (0.0, 0.0)])

@@ -11,7 +11,7 @@ import pytest
 from sim_rig.actuator import actuator
 from sysid import Input, ModelError, Output, Parameter, ProcessModel, State, Stepper
 from tests.sysid.reference import simulate as reference
-from tests.sysid.support import blank, lag, motor, motor_inputs, prbs
+from tests.sysid.support import blank, lag, motor, motor_inputs, outputs_of, prbs
 
 DT = 1.0 / 800.0
 
@@ -100,7 +100,7 @@ def test_it_follows_scipy_as_closely_as_asked(name, accuracy):
     assert error.max() < 10.0 * accuracy
     assert np.sqrt(np.mean(error**2)) < 2.0 * accuracy
     # Outputs are latched at the start of each interval, the state is left at the end.
-    last = np.array(model.evaluate_output(x, inputs[-1], model.nominal))
+    last = np.array(outputs_of(model, x, inputs[-1], model.nominal))
     assert np.all(np.abs(last - exact[-1]) < 10.0 * accuracy * np.abs(exact).max(axis=0))
 
 

@@ -28,9 +28,9 @@ def taken_apart(model, p, exact=True):
     """A at some parameters, and N(x, u)."""
     found = analyse(model, exact=exact)
     scope = {"math": math, "always_inline": lambda: None, "derivative": model.derivative}
-    exec(found.program.text, scope)
+    exec(found.program, scope)
     c = scope["constants"](p)
-    assert len(c) == found.program.n_constants
+    assert len(c) == found.n_constants
     A = np.zeros((len(model.states), len(model.states)))
     for (i, j), text in found.coefficients.items():
         A[i, j] = eval(text, {"c": c})
@@ -177,7 +177,7 @@ def test_what_parameters_fix_is_worked_out_once():
         gain = math.exp(p[0]) / (p[0] + p[1])
         return gain * abs(x[0]) + gain * u[0] - x[1] / (p[0] + p[1]), -gain * x[1]
 
-    text = analyse(model_of(derivative)).program.text
+    text = analyse(model_of(derivative)).program
     once, each_time = text.split("def remainder")
     assert once.count("exp") == once.count("1.0 /") == 1
     assert "exp" not in each_time
@@ -190,7 +190,7 @@ def test_an_output_that_branches_leaves_the_equations_as_they_are():
     )
     found = analyse(model)
     assert tuple(sorted(found.coefficients)) == ((0, 0), (1, 1))
-    assert found.program.calls == {"output"}
+    assert found.calls == {"output"}
 
 
 def test_the_actuator_is_linear_but_for_its_mechanics():
