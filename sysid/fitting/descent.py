@@ -1,10 +1,8 @@
 """The state of a descent between two iterations."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -39,32 +37,23 @@ class Point:
 
 
 @dataclass(frozen=True)
-class Integration:
-    """Integration steps per sample for each record, and the coordinates they were chosen at.
-
-    steps_at: None where they are yet to be chosen. braced: how often they have been raised since
-    for the neighbours' sake.
-    """
-
-    steps: tuple[int, ...] = ()
-    steps_at: FloatArray | None = None
-    braced: int = 0
-
-
-@dataclass(frozen=True)
 class Descent:
     """A descent at a point; ``refinement.advance`` returns it one iteration further.
 
-    safe: coordinates at which integration steps were last chosen and a simulation with them
-    succeeded, and the error there; beyond, the steps may not do. gain: share of the error that
-    the last iteration took away. failures: iterations in a row that gained nothing, or hardly any
-    of what was promised. level: of ``PERTURBATIONS``. error_of_round: the error where the present
-    round of levels began. smoothing: which of ``FLOORS``.
+    safe: where integration steps were last chosen and a simulation with them succeeded; beyond,
+    the steps may not do. steps: per sample, for each record; steps_at: the coordinates they were
+    chosen at, None where they are yet to be; braced: how often they have been raised since for
+    the neighbours' sake. gain: share of the error that the last iteration took away. failures:
+    iterations in a row that gained nothing, or hardly any of what was promised. level: of
+    ``PERTURBATIONS``. error_of_round: the error where the present round of levels began.
+    smoothing: which of ``FLOORS``.
     """
 
     point: Point
     safe: Point | None = None
-    integration: Integration = Integration()
+    steps: tuple[int, ...] = ()
+    steps_at: FloatArray | None = None
+    braced: int = 0
     damping: float = FIRST_DAMPING
     gain: float = 0.0
     failures: int = 0
@@ -81,20 +70,15 @@ class Descent:
 
     def state(self) -> dict[str, Any]:
         """The state in plain values and arrays."""
-        state = vars(self) | vars(self.point) | vars(self.integration)
-        for part in ("point", "integration", "safe"):
-            del state[part]
-        safe = (None, np.inf) if self.safe is None else (self.safe.at, self.safe.error)
-        return state | dict(zip(("sure", "sure_error"), safe, strict=True))
+        at, error = (None, np.inf) if self.safe is None else (self.safe.at, self.safe.error)
+        state = vars(self) | vars(self.point) | {"sure": at, "sure_error": error}
+        del state["point"], state["safe"]
+        return state
 
     @classmethod
-    def of(cls, state: Mapping[str, Any]) -> Descent:
+    def of(cls, state: Mapping[str, Any]) -> Self:
         """The descent of a ``state``."""
         rest = dict(state)
         at, error = rest.pop("sure"), rest.pop("sure_error")
-        safe = None if at is None else Point(at, error)
-        point = Point(**{field.name: rest.pop(field.name) for field in fields(Point)})
-        integration = Integration(
-            **{field.name: rest.pop(field.name) for field in fields(Integration)}
-        )
-        return cls(point, safe, integration, **rest)
+        point = Point(*(rest.pop(field.name) for field in fields(Point)))
+        return cls(point, None if at is None else Point(at, error), **rest)

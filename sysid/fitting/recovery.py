@@ -1,7 +1,7 @@
 """Strategies of a descent that stalls.
 
 A strategy returns a stalled descent as it goes on, or None where it gives up. Those for a kind of
-stall, which stand at the end, are tried in turn; a descent that they all give up has finished.
+stall, at the end, are tried in turn; a descent that they all give up has finished.
 """
 
 import math
@@ -23,10 +23,9 @@ Strategies = tuple[Callable[[Objective, Descent], Descent | None], ...]
 
 
 def retreat(_: Objective, descent: Descent) -> Descent | None:
-    """Back to the safe point, to try more damping.
+    """Back to the safe point, to try more damping, until patience ends.
 
-    Steps chosen anew show that the simulation of the point fails, which those chosen further back
-    did not see. Gives up where there is no safe point; ends on it when patience does.
+    Integration steps chosen anew have shown that the simulation of the point fails.
     """
     if descent.safe is None:
         return None
@@ -34,7 +33,7 @@ def retreat(_: Objective, descent: Descent) -> Descent | None:
     return replace(
         descent,
         point=descent.safe,
-        integration=replace(descent.integration, steps_at=None),
+        steps_at=None,
         damping=heavier(descent.damping),
         gain=0.0,
         failures=failures,
@@ -44,24 +43,21 @@ def retreat(_: Objective, descent: Descent) -> Descent | None:
 
 
 def brace(_: Objective, descent: Descent) -> Descent | None:
-    """Half as many integration steps more.
+    """Half as many integration steps more, which at the edge of stability the neighbours need.
 
-    At the edge of stability the steps that the point needs serve its own simulation and not its
-    neighbours'. Gives up after three times: then it is the model that is unbounded there.
+    Gives up after three times: then it is the model that is unbounded there.
     """
-    integration = descent.integration
-    if integration.braced == _BRACINGS:
+    if descent.braced == _BRACINGS:
         return None
-    more = tuple(math.ceil(_STEADIER * steps) for steps in integration.steps)
-    braced = replace(integration, steps=more, braced=integration.braced + 1)
-    return replace(descent, integration=braced)
+    more = tuple(math.ceil(_STEADIER * steps) for steps in descent.steps)
+    return replace(descent, steps=more, braced=descent.braced + 1)
 
 
 def coarsen(_: Objective, descent: Descent) -> Descent | None:
     """The next larger perturbations.
 
     More damping has not helped, so it is the slopes that are wrong: to small perturbations
-    equations that switch, as dry friction, are steps and plateaus. Gives up at the largest.
+    equations that switch, as dry friction, are steps and plateaus.
     """
     if descent.level + 1 == len(PERTURBATIONS):
         return None
@@ -72,7 +68,7 @@ def sharpen(objective: Objective, descent: Descent) -> Descent | None:
     """The next lower floor, where an output's error is below the present one.
 
     Descents stop on the crease that the error has where an output is explained exactly, so they
-    approach it smoothed. Gives up where no output is that well explained, and at the lowest floor.
+    approach it smoothed.
     """
     rms = descent.point.rms
     assert rms is not None
@@ -83,46 +79,29 @@ def sharpen(objective: Objective, descent: Descent) -> Descent | None:
 
 
 def resolve(objective: Objective, descent: Descent) -> Descent | None:
-    """More integration steps, where the point needs more of them than it has.
-
-    They were chosen some way back. Gives up where they do, or were chosen nearby.
-    """
-    at, chosen = descent.point.at, descent.integration
-    space = objective.space
-    if chosen.steps_at is not None and np.all(np.abs(at - chosen.steps_at) <= _NEAR * space.width):
+    """More integration steps, where the point needs more than were chosen some way back."""
+    at, steps_at, space = descent.point.at, descent.steps_at, objective.space
+    if steps_at is not None and np.all(np.abs(at - steps_at) <= _NEAR * space.width):
         return None
     needed = objective.steps_needed(space.decode(at[None]))[0].tolist()
-    steps = tuple(max(pair) for pair in zip(needed, chosen.steps, strict=True))
-    if steps == chosen.steps:
+    steps = tuple(max(pair) for pair in zip(needed, descent.steps, strict=True))
+    if steps == descent.steps:
         return None
-    return replace(descent, integration=replace(chosen, steps=steps, steps_at=at), failures=0)
+    return replace(descent, steps=steps, steps_at=at, failures=0)
 
 
 def refocus(_: Objective, descent: Descent) -> Descent | None:
-    """The smallest perturbations once more, which may go on from where larger ones have led.
-
-    Gives up where there were no larger ones, or where the round of them has gained nothing.
-    """
-    error = descent.point.error
+    """The smallest perturbations once more, where larger ones have gained something."""
+    at, error = descent.point.at, descent.point.error
     if descent.level == 0 or error > (1.0 - NOTHING) * descent.error_of_round:
         return None
-    return replace(
-        descent,
-        integration=replace(descent.integration, steps_at=descent.point.at),
-        level=0,
-        failures=0,
-        error_of_round=error,
-    )
+    return replace(descent, steps_at=at, level=0, failures=0, error_of_round=error)
 
 
-FAILED: Strategies = (retreat,)
-"""The simulation of the point fails."""
-BURST: Strategies = (brace,)
-"""The simulations of neighbours leave that of the point by far."""
-ARRIVED: Strategies = (sharpen, resolve, refocus)
-"""The quadratic promises hardly anything, or hardly anything was gained."""
-MISLED: Strategies = (coarsen, *ARRIVED)
-"""Gains stay far behind what the quadratic promises, whatever the damping."""
+FAILED: Strategies = (retreat,)  # the simulation of the point fails
+BURST: Strategies = (brace,)  # those of neighbours leave that of the point by far
+ARRIVED: Strategies = (sharpen, resolve, refocus)  # hardly anything was promised, or gained
+MISLED: Strategies = (coarsen, *ARRIVED)  # gains stay far behind promises, whatever the damping
 
 
 def resumed(objective: Objective, descent: Descent, strategies: Strategies) -> Descent:

@@ -25,7 +25,7 @@ import numpy as np
 
 from sysid.arrays import FloatArray
 from sysid.fitting import recovery
-from sysid.fitting.descent import FLOORS, PERTURBATIONS, Descent, Integration, Point
+from sysid.fitting.descent import FLOORS, PERTURBATIONS, Descent, Point
 from sysid.fitting.objective import Objective, Responses
 from sysid.fitting.quadratic import (
     CANDIDATES,
@@ -48,10 +48,10 @@ _BATCH_BYTES = 2**28  # residuals held at once, unless one descent needs more
 
 @dataclass(frozen=True)
 class Refinement:
-    """Refined chromosome (n_free,), its error, the outputs' errors, and iterations taken.
+    """Refined chromosome (n_free,), its error, and iterations taken.
 
-    rms: (n_outputs,), by a simulation with the steps that the chromosome needs; infinite where
-    it needs more than it is allowed.
+    rms: (n_outputs,), the outputs' errors by a simulation with the steps that the chromosome
+    needs; infinite where it needs more than it is allowed.
     """
 
     chromosome: FloatArray
@@ -66,20 +66,18 @@ def refine(
     *,
     max_iterations: int = 50,
     tolerance: float = 1e-7,
-    on_iteration: Callable[[Refinement], None] | None = None,
+    on_iteration: Callable[[Point], None] | None = None,
 ) -> Refinement:
     """Minimise the objective from ``chromosome`` (n_free,) within the ranges and constraints.
 
-    tolerance: share of the error, of a promise or a gain no larger than which a descent has
-    arrived.
+    tolerance: share of the error; a descent that is promised or gains no more has arrived.
     """
     descent = begin(objective, chromosome)
     while not descent.finished and descent.iterations < max_iterations:
         (descent,) = advance(objective, [descent], tolerance)
         point = descent.point
         if on_iteration is not None and point.rms is not None and np.isfinite(point.error):
-            at = objective.space.decode(point.at)
-            on_iteration(Refinement(at, point.error, point.rms, descent.iterations))
+            on_iteration(point)
     return _refinements(objective, [descent])[0]
 
 
@@ -170,12 +168,14 @@ def _iterated(objective: Objective, descents: list[Descent], tolerance: float) -
     quadratics = {i: quadratic for i, (_, quadratic) in enumerate(surveys) if quadratic}
     at = np.array([onward[i].point.at for i in quadratics])
     damping = np.array([onward[i].damping for i in quadratics])
-    offers = dict(
-        zip(quadratics, candidates(space, at, damping, list(quadratics.values())), strict=True)
-    )
-    for i in [i for i, offer in offers.items() if not offer.worth(tolerance)]:
-        onward[i] = resumed(objective, onward[i], recovery.ARRIVED)
-        del offers[i]
+    offers = {}
+    for i, offer in zip(
+        quadratics, candidates(space, at, damping, list(quadratics.values())), strict=True
+    ):
+        if len(offer.coordinates) and not offer.promise <= tolerance:
+            offers[i] = offer
+        else:
+            onward[i] = resumed(objective, onward[i], recovery.ARRIVED)
     rows = [offer.coordinates for offer in offers.values()]
     ends = _responses(objective, [onward[i] for i in offers], rows, keep=False)
     for (i, offer), responses in zip(offers.items(), ends, strict=True):
@@ -194,8 +194,7 @@ def _surveyed(
     at, error = descent.point.at, float(errors[0])
     if not np.isfinite(error):
         return resumed(objective, descent, recovery.FAILED), None
-    steps_at = descent.integration.steps_at
-    safe = steps_at is not None and np.array_equal(at, steps_at)
+    safe = descent.steps_at is not None and np.array_equal(at, descent.steps_at)
     descent = replace(
         descent,
         point=Point(at, error, around.rms[0], float(around.excess[0])),
@@ -225,8 +224,7 @@ def _judged(
     objective: Objective, descent: Descent, offer: Candidates, ends: Responses, tolerance: float
 ) -> Descent:
     """The descent after its candidates have been simulated, at the best of them if it gains."""
-    integration = descent.integration
-    assert descent.point.rms is not None and integration.steps_at is not None
+    assert descent.point.rms is not None and descent.steps_at is not None
     rms = np.stack([descent.point.rms, *ends.rms])
     before, *errors = objective.smoothed_error_of(rms, descent.floor).tolist()
     best = int(np.argmin(errors))
@@ -236,9 +234,9 @@ def _judged(
         at, damping = offer.coordinates[best], lighter(float(offer.damping[best]))
         error = float(objective.error_of(ends.rms[best : best + 1])[0])
         point = Point(at, error, ends.rms[best], float(ends.excess[best]))
-        if np.any(np.abs(at - integration.steps_at) > _FAR * objective.space.width):
-            integration = replace(integration, steps_at=None)
-        descent = replace(descent, point=point, integration=integration, gain=gain)
+        far = np.any(np.abs(at - descent.steps_at) > _FAR * objective.space.width)
+        steps_at = None if far else descent.steps_at
+        descent = replace(descent, point=point, steps_at=steps_at, gain=gain)
     promising = offer.promise > NOTHING
     failed = gain <= 0.0 or (promising and gain < _KEPT * offer.promise)
     failures = descent.failures + 1 if failed else 0
@@ -252,15 +250,16 @@ def _judged(
 
 def _with_steps(objective: Objective, descents: list[Descent]) -> list[Descent]:
     """The descents with integration steps chosen where they lack them."""
-    lacking = [i for i, descent in enumerate(descents) if descent.integration.steps_at is None]
-    if not lacking:
+    points = [descent.point.at for descent in descents if descent.steps_at is None]
+    if not points:
         return descents
-    at = np.stack([descents[i].point.at for i in lacking])
-    ready = list(descents)
-    needed = objective.steps_needed(objective.space.decode(at)).tolist()
-    for i, steps in zip(lacking, needed, strict=True):
-        ready[i] = replace(ready[i], integration=Integration(tuple(steps), ready[i].point.at))
-    return ready
+    needed = iter(objective.steps_needed(objective.space.decode(np.stack(points))).tolist())
+    return [
+        replace(descent, steps=tuple(next(needed)), steps_at=descent.point.at, braced=0)
+        if descent.steps_at is None
+        else descent
+        for descent in descents
+    ]
 
 
 def _distance(space: SearchSpace, descent: Descent) -> FloatArray:
@@ -277,22 +276,19 @@ def _neighbourhood(space: SearchSpace, descent: Descent) -> FloatArray:
 
 
 def _responses(
-    objective: Objective,
-    descents: list[Descent],
-    coordinates: list[FloatArray],
-    *,
-    keep: bool = True,
+    objective: Objective, descents: list[Descent], rows: list[FloatArray], *, keep: bool = True
 ) -> list[Responses]:
     """Responses of each descent's rows of coordinates, by its steps, all in one batch."""
     if not descents:
         return []
     # Descents of like steps are neighbours, so that they share blocks of the simulation.
-    order = sorted(range(len(descents)), key=lambda i: descents[i].integration.steps)
-    counts = [len(coordinates[i]) for i in order]
-    steps = np.repeat([descents[i].integration.steps for i in order], counts, axis=0)
-    chromosomes = objective.space.decode(np.concatenate([coordinates[i] for i in order]))
-    together = objective.residuals(chromosomes, steps, keep=keep)
+    order = sorted(range(len(descents)), key=lambda i: descents[i].steps)
+    counts = [len(rows[i]) for i in order]
+    steps = np.repeat([descents[i].steps for i in order], counts, axis=0)
+    chromosomes = objective.space.decode(np.concatenate([rows[i] for i in order]))
+    batch = objective.residuals(chromosomes, steps, keep=keep)
     parts: dict[int, Responses] = {}
-    for i, count, end in zip(order, counts, np.cumsum(counts).tolist(), strict=True):
-        parts[i] = together.part(slice(end - count, end))
+    for i, end in zip(order, np.cumsum(counts), strict=True):
+        part = slice(end - len(rows[i]), end)
+        parts[i] = Responses(batch.values[..., part], batch.rms[part], batch.excess[part])
     return [parts[i] for i in range(len(descents))]

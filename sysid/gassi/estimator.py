@@ -1,21 +1,19 @@
 """GASSI as a scikit-learn estimator over any process model."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, Self, get_args
 
 import numpy as np
 from sklearn.utils.validation import check_is_fitted
 
 from sysid.arrays import FloatArray
 from sysid.engine.simulation import BatchSimulator
+from sysid.fitting.descent import Point
 from sysid.fitting.free_run import free_run
 from sysid.fitting.objective import Balance, Objective
-from sysid.fitting.refinement import Refinement
 from sysid.gassi.checkpoint import Checkpoint, load, origin
 from sysid.gassi.genetic_search import PRESETS, GeneticSearch, Preset, PresetName
 from sysid.gassi.likelihood import fit_likelihood
@@ -50,6 +48,7 @@ class Progress:
     error: float
 
 
+@dataclass(repr=False, eq=False)
 class GASSI(RecordEstimator):
     """Identify a process model's parameters with a genetic algorithm.
 
@@ -120,52 +119,28 @@ class GASSI(RecordEstimator):
     0.2
     """
 
-    def __init__(
-        self,
-        model: ProcessModel | None = None,
-        *,
-        preset: PresetName = "default",
-        population: int = 300,
-        generations: int = 40,
-        ranges: Mapping[str, Range] | None = None,
-        fixed: Mapping[str, float] | None = None,
-        tied: Mapping[str, str] | None = None,
-        scale: Mapping[str, Scale] | None = None,
-        guess: bool = False,
-        elite_percent: float = 0.5,
-        minimum_generations: int = 0,
-        termination_ratio: float = 0.0,
-        weights: Mapping[str, float] | None = None,
-        per_log: bool = False,
-        balance: Balance = "samples",
-        criterion: Criterion = "likelihood",
-        accuracy: float = 1e-3,
-        max_steps: int = 512,
-        threads: int | None = None,
-        random_state: int = 0,
-        dt: float | None = None,
-    ) -> None:
-        self.model = model
-        self.preset = preset
-        self.population = population
-        self.generations = generations
-        self.ranges = ranges
-        self.fixed = fixed
-        self.tied = tied
-        self.scale = scale
-        self.guess = guess
-        self.elite_percent = elite_percent
-        self.minimum_generations = minimum_generations
-        self.termination_ratio = termination_ratio
-        self.weights = weights
-        self.per_log = per_log
-        self.balance = balance
-        self.criterion = criterion
-        self.accuracy = accuracy
-        self.max_steps = max_steps
-        self.threads = threads
-        self.random_state = random_state
-        self.dt = dt
+    model: ProcessModel | None = None
+    _: KW_ONLY
+    preset: PresetName = "default"
+    population: int = 300
+    generations: int = 40
+    ranges: Mapping[str, Range] | None = None
+    fixed: Mapping[str, float] | None = None
+    tied: Mapping[str, str] | None = None
+    scale: Mapping[str, Scale] | None = None
+    guess: bool = False
+    elite_percent: float = 0.5
+    minimum_generations: int = 0
+    termination_ratio: float = 0.0
+    weights: Mapping[str, float] | None = None
+    per_log: bool = False
+    balance: Balance = "samples"
+    criterion: Criterion = "likelihood"
+    accuracy: float = 1e-3
+    max_steps: int = 512
+    threads: int | None = None
+    random_state: int = 0
+    dt: float | None = None
 
     @one_thread()
     def fit(
@@ -177,7 +152,7 @@ class GASSI(RecordEstimator):
         on_progress: Callable[[Progress], None] | None = None,
         checkpoint: Path | None = None,
         resume: Path | None = None,
-    ) -> GASSI:
+    ) -> Self:
         """Search the parameters that make the model follow the records.
 
         X: one Dataset, several of any lengths and rates, or an (n_samples, n_inputs) array
@@ -226,8 +201,9 @@ class GASSI(RecordEstimator):
                 if keeper is not None:
                     keeper.save(run.state())
                 self._take(run)
+                stage = "search" if run.local is None else "refine"
                 generation = min(len(run.history), self.generations)
-                notify(Progress(run.stage, generation, self.generations, self.error_))
+                notify(Progress(stage, generation, self.generations, self.error_))
         except KeyboardInterrupt:
             if run.best is None:
                 raise
@@ -241,21 +217,20 @@ class GASSI(RecordEstimator):
         """End with the likelihood instead of the mean RMSE."""
         iterations = itertools.count(1)
 
-        def watch(_: Refinement) -> None:
+        def watch(_: Point) -> None:
             done = next(iterations)
             notify(Progress("weigh", done, done, self.error_))
 
         try:
-            likeliest = fit_likelihood(run.objective, run.minima(), watch)
+            likeliest, self._rivals = fit_likelihood(run.objective, run.minima(), watch)
         except KeyboardInterrupt:
             self.stopped_ = "interrupted"
             return
         self._final_accuracy = likeliest.objective.simulator.accuracy
         objective, chromosome = self._finally_accurate(run.objective), likeliest.chromosome
         error = float(objective.evaluate(chromosome[None])[0][0])
-        self._set(Best(objective.space, chromosome, error, objective.space.feasible(chromosome)))
+        self._set(Best(objective.space, chromosome, error, likeliest.feasible))
         self.output_weights_ = likeliest.objective.weights
-        self._rivals = likeliest.rivals
         self.n_simulations_ = objective.simulations
 
     def predict(self, X: Dataset | FloatArray, *, records: Any = None) -> FloatArray:
@@ -269,13 +244,11 @@ class GASSI(RecordEstimator):
         simulator = self._simulator()
         if isinstance(X, Dataset):
             return free_run(simulator, self.vector_, X)
-        inputs = self._inputs(X, reset=False)
-        q = len(self._model().outputs)
-        parts = []
+        inputs, parts = self._inputs(X, reset=False), []
         for rows in split(len(inputs), records):
             # A simulation needs two rows; of a single one only the start is wanted.
             driven = np.concatenate([inputs[rows], inputs[rows][-1:]])
-            unknown = np.full((len(driven), q), np.nan)
+            unknown = np.full((len(driven), len(simulator.model.outputs)), np.nan)
             record = Dataset(driven, unknown, self._step(None))
             parts.append(free_run(simulator, self.vector_, record)[:-1])
         return self._shaped(np.concatenate(parts))
@@ -326,9 +299,8 @@ class GASSI(RecordEstimator):
 
     def _finally_accurate(self, objective: Objective) -> Objective:
         """The objective by simulations of the accuracy that ``fit`` ended with."""
-        if self._final_accuracy < self.accuracy:
-            return objective.finer(self._final_accuracy)
-        return objective
+        accuracy = self._final_accuracy
+        return objective.finer(accuracy) if accuracy < self.accuracy else objective
 
     def _step(self, dt: float | None) -> float:
         if self.dt is None:
@@ -369,18 +341,18 @@ class GASSI(RecordEstimator):
         return PRESETS[self.preset]
 
     def _weights(self) -> FloatArray | None:
-        model = self._model()
         if self.weights is None:
             return None
+        model = self._model()
+        names = model.output_names
         for name, weight in self.weights.items():
-            if name not in model.output_names:
+            if name not in names:
                 raise ModelError(
-                    f"weight for unknown output {name!r}; model {model.name} has "
-                    + ", ".join(model.output_names)
+                    f"weight for unknown output {name!r}; model {model.name} has {', '.join(names)}"
                 )
             if not (np.isfinite(weight) and weight >= 0.0):
                 raise ModelError(f"weight of {name} is {weight}; it must be 0 or more")
-        weights = np.array([float(self.weights.get(name, 1.0)) for name in model.output_names])
+        weights = np.array([float(self.weights.get(name, 1.0)) for name in names])
         if weights.sum() == 0.0:
             raise ModelError("every output has weight 0; at least one must count")
         return weights
@@ -390,16 +362,9 @@ class GASSI(RecordEstimator):
         generations = self.generations
         if preset.refine and generations > 0:
             generations = max(1, round((1.0 - preset.local_share) * generations))
-        search = GeneticSearch(
-            self.space_,
-            preset,
-            self.population,
-            generations,
-            np.random.default_rng(self.random_state),
-            self.elite_percent,
-            self.minimum_generations,
-            self.termination_ratio,
-        )
+        rng = np.random.default_rng(self.random_state)
+        rule = self.elite_percent, self.minimum_generations, self.termination_ratio
+        search = GeneticSearch(self.space_, preset, self.population, generations, rng, *rule)
         return SearchRun(objective, search, self.generations, self.criterion == "likelihood")
 
     def _keeper(
@@ -432,8 +397,7 @@ class GASSI(RecordEstimator):
         self.vector_ = best.space.full(best.chromosome)
         self.parameters_ = self._named(self.vector_)
         self.initial_states_ = best.space.named_starts(best.chromosome)
-        self.error_: float = best.error
-        self.feasible_ = best.feasible
+        self.error_, self.feasible_ = best.error, best.feasible
 
     def _named(self, vector: FloatArray) -> dict[str, float]:
         return dict(zip(self._model().parameter_names, vector.tolist(), strict=True))

@@ -38,9 +38,9 @@ _PLAIN_STATE = ("reserve", "polishing", "polished", "best", "error", "feasible")
 
 @dataclass(frozen=True)
 class Minimum:
-    """End of a descent: search coordinates (n_free,), error, how often it has been varied.
+    """End of a descent: search coordinates (n_free,), error, the outputs' errors (n_outputs,).
 
-    rms: (n_outputs,), the outputs' errors.
+    varied: how often new starts have been sought around it.
     """
 
     at: FloatArray
@@ -75,9 +75,8 @@ class LocalSearch:
         self.points = int(np.clip(points // self.n_varied, _FEWEST_POINTS, _MOST_POINTS))
         self.iteration_cost = refinement.simulations_per_iteration(objective)
         affordable = max(1, self.left // (_ITERATIONS_EACH * self.iteration_cost))
-        self.descents = [
-            refinement.begin(objective, start) for start in starts[: min(AT_ONCE, affordable)]
-        ]
+        starts = starts[: min(AT_ONCE, affordable)]
+        self.descents = [refinement.begin(objective, start) for start in starts]
         self.reserve = min(_POLISHING * self.iteration_cost, self.left // 3)
         self.polishing = self.polished = False
         self.dips: list[Point] = []
@@ -97,7 +96,7 @@ class LocalSearch:
         Feasible before infeasible, then by the mean logarithm of the outputs' errors, which is
         the likelihood.
         """
-        rms = self.objective.rms(self.objective.space.decode(self.best[None]))[0]
+        rms = self._rms(self.best)
         near = [
             minimum
             for minimum in self.minima
@@ -161,51 +160,50 @@ class LocalSearch:
     def _descend(self) -> None:
         affordable = (self.left - self.reserve) // self.iteration_cost
         moved = refinement.advance(self.objective, self.descents[:affordable], _ARRIVED)
-        self.descents = []
+        live = []
         for descent in moved:
             self._take(descent)
             # What remains to be smoothed matters to the last digits only.
             ended = descent.finished or descent.iterations >= _MOST_ITERATIONS
             if ended or descent.smoothing > 0:
-                point = descent.point
-                self._add(point.at, point.error, point.accurate_rms)
+                self._add(descent.point)
             else:
-                self.descents.append(descent)
-        least = min([self.error, *(descent.point.error for descent in self.descents)])
-        self.descents = [descent for descent in self.descents if not _hopeless(descent, least)]
+                live.append(descent)
+        least = min([self.error, *(descent.point.error for descent in live)])
+        self.descents = [descent for descent in live if not _hopeless(descent, least)]
         if not (self.descents or self.minima):
-            self._add(self.best, self.error)
+            self._add(Point(self.best, self.error))
 
     def _take(self, descent: Descent) -> None:
         """Offer the point that a descent has reached for sure."""
         point = descent.point if descent.finished else descent.safe
         if point is not None:
-            self._offer(point.at, point.error)
+            self._offer(point)
 
-    def _offer(self, at: FloatArray, error: float) -> None:
+    def _offer(self, point: Point) -> None:
         """Keep a point if it is the best yet."""
-        feasible = self._feasible(at)
-        if (not feasible, error) < (not self.feasible, self.error):
-            self.best, self.error, self.feasible = at, error, feasible
+        feasible = self._feasible(point.at)
+        if (not feasible, point.error) < (not self.feasible, self.error):
+            self.best, self.error, self.feasible = point.at, point.error, feasible
 
     def _feasible(self, at: FloatArray) -> bool:
         space = self.objective.space
         return space.feasible(space.decode(at))
 
-    def _add(self, at: FloatArray, error: float, rms: FloatArray | None = None) -> None:
-        """Add a minimum, unless the outputs err as in another; flat directions tell nothing.
+    def _rms(self, at: FloatArray) -> FloatArray:
+        rms: FloatArray = self.objective.rms(self.objective.space.decode(at[None]))[0]
+        return rms
 
-        rms: the outputs' errors, simulated where they are not given.
-        """
-        if rms is None:
-            rms = self.objective.rms(self.objective.space.decode(at[None]))[0]
+    def _add(self, point: Point) -> None:
+        """Add a minimum, unless the outputs err as in another; flat directions tell nothing."""
+        at, error, rms = point.at, point.error, point.accurate_rms
+        rms = self._rms(at) if rms is None else rms
         if not (np.isfinite(error) and np.all(np.isfinite(rms))):
             return
-        self._offer(at, error)
-        for minimum in self.minima:
-            if np.allclose(rms, minimum.rms, rtol=_SAME, atol=_SAME * error):
-                return
-        self.minima.append(Minimum(at, error, rms))
+        self._offer(point)
+        tolerance = {"rtol": _SAME, "atol": _SAME * error}
+        if not any(np.allclose(rms, minimum.rms, **tolerance) for minimum in self.minima):
+            self.minima.append(Minimum(at, error, rms))
 
     def _vary(self) -> None:
         """New starts around the best of the minima that have been varied least."""
@@ -234,8 +232,7 @@ class LocalSearch:
     def _valleys(self, centre: Minimum) -> list[Point]:
         """A point either way along each parameter's valley.
 
-        A valley is the way on which the outputs change least as one parameter is changed, the
-        others following, by the sensitivities at the minimum.
+        On it the outputs change least as one parameter is changed, the others following.
         """
         lower, width = self.objective.space.coded_lower, self.objective.space.width
         hessian = refinement.curvature(self.objective, centre.at)
@@ -258,12 +255,10 @@ class LocalSearch:
 
 def _hopeless(descent: Descent, least: float) -> bool:
     """Whether a descent will not come near the least error of all."""
+    if descent.iterations < _BEFORE_GIVING_UP or descent.failures == 1:
+        return False  # at its beginning, or about to try again with more damping
     enough, error = (1.0 + _NEAR) * least, descent.point.error
-    if error <= enough or descent.iterations < _BEFORE_GIVING_UP:
-        return False
-    if descent.failures == 1:
-        return False  # about to try again with more damping
-    return error * (1.0 - descent.gain) ** _HORIZON > enough
+    return error > enough and error * (1.0 - descent.gain) ** _HORIZON > enough
 
 
 def _dips(moves: FloatArray, errors: FloatArray, error: float) -> list[int]:

@@ -18,7 +18,7 @@ from sysid import (
     State,
 )
 from sysid.fitting import recovery
-from sysid.fitting.descent import FLOORS, PERTURBATIONS, Descent, Integration, Point
+from sysid.fitting.descent import FLOORS, PERTURBATIONS, Descent, Point
 from sysid.fitting.objective import Objective
 from sysid.fitting.refinement import refine
 from tests.sysid.support import MOTOR, Formula, draw, lag, motor, motor_record
@@ -447,12 +447,12 @@ HERE = Point(np.array([math.log(1.8)]), 0.1, np.array([0.1]))
     ("strategy", "state"),
     [
         (recovery.retreat, {}),
-        (recovery.brace, {"integration": Integration((1,), HERE.at, braced=3)}),
+        (recovery.brace, {"steps": (1,), "steps_at": HERE.at, "braced": 3}),
         (recovery.coarsen, {"level": len(PERTURBATIONS) - 1}),
         (recovery.sharpen, {}),
         (recovery.sharpen, {"point": Point(HERE.at, 0.1, np.zeros(1)), "smoothing": 2}),
-        (recovery.resolve, {"integration": Integration((1,), HERE.at + 1e-3)}),
-        (recovery.resolve, {"integration": Integration((3,), HERE.at + 1.0)}),
+        (recovery.resolve, {"steps": (1,), "steps_at": HERE.at + 1e-3}),
+        (recovery.resolve, {"steps": (3,), "steps_at": HERE.at + 1.0}),
         (recovery.refocus, {"level": 0, "error_of_round": 1.0}),
         (recovery.refocus, {"level": 2, "error_of_round": 0.10001}),
     ],
