@@ -34,8 +34,7 @@ class Responses:
     """Residuals of n chromosomes in parts of the outputs' scales.
 
     values: (n_residuals, n_outputs, n), 0 where a sample was lost, not finite where a simulation
-    failed. rms: (n, n_outputs). excess: (n,), the simulations' error estimates in parts of what
-    the accuracy allows.
+    failed. rms: (n, n_outputs). excess: (n,), as of ``Point``.
     """
 
     values: FloatArray
@@ -46,9 +45,8 @@ class Responses:
 def smoothed(rms: FloatArray, floor: float) -> FloatArray:
     """Root mean squares, those below the floor f by the parabola (r^2 / f + f) / 2.
 
-    It meets the root at f with its slope, so that no crease is left where an output is explained
-    exactly (Huber, "Robust estimation of a location parameter", Annals of Mathematical
-    Statistics 35, 1964).
+    No crease is left then where an output is explained exactly (Huber, "Robust estimation of a
+    location parameter", Annals of Mathematical Statistics 35, 1964).
     """
     return np.where(rms > floor, rms, 0.5 * (rms**2 / floor + floor))
 
@@ -125,8 +123,7 @@ class Objective:
     ) -> Responses:
         """Residuals at given integration steps per sample, records one after another.
 
-        n_steps: (n_records,), or of each chromosome (n, n_records). Without ``keep`` only their
-        root mean squares, and no values.
+        n_steps: (n_records,), or of each chromosome (n, n_records). Without ``keep`` no values.
         """
         steps = np.broadcast_to(n_steps, (len(chromosomes), len(self.records)))
         vectors, starts = self.space.full(chromosomes), self._starts(chromosomes)
@@ -161,11 +158,7 @@ class Objective:
         return int(sum(record.outputs.size for record in self.records))
 
     def least_squares_weights(self, residual: FloatArray) -> FloatArray:
-        """Weights of squared residuals whose mean is least where the error is, (n_outputs,).
-
-        residual: (n_residuals, n_outputs), at that minimum. Half the second derivative of the
-        error is that of the weighted mean square.
-        """
+        """Weights (n_outputs,) of squares whose mean is least where the error is, by residuals."""
         counts, rms = np.maximum(self.counts, 1), self._roots(np.sum(residual**2, axis=0))
         weights: FloatArray = self.weights * len(residual) / counts / np.maximum(rms, 1e-12)
         return weights
@@ -188,10 +181,7 @@ class Objective:
 
 
 def _balanced(scales: list[FloatArray], counts: IntArray, balance: Balance) -> list[FloatArray]:
-    """Divisors of the residuals under which the mean over all samples is the balanced one.
-
-    counts: (n_records, n_outputs), measured samples.
-    """
+    """Divisors of the residuals under which the mean over all samples is the balanced one."""
     if balance == "samples":
         return scales
     if balance != "logs":

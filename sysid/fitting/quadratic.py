@@ -54,31 +54,28 @@ class Quadratic:
     gradient: FloatArray
     error: float
 
+    @classmethod
+    def at(
+        cls, objective: Objective, around: Responses, distance: FloatArray, floor: float
+    ) -> Self:
+        """At a point, by the responses there and at distances (n_free,) from it."""
+        rms, weights = around.rms[0], objective.weights
+        c = weights / (np.maximum(rms, floor) * np.maximum(objective.counts, 1))
+        counted = np.flatnonzero(weights > 0.0)
+        with np.errstate(over="ignore", invalid="ignore"):
+            changes = around.values[..., 1:] - around.values[..., :1]
+            hessian, gradient = _summed(changes, around.values[..., 0], c, counted)
+            if not np.all(np.isfinite(gradient)):
+                changes = np.where(np.isfinite(changes), changes, 0.0)
+                hessian, gradient = _summed(changes, around.values[..., 0], c, counted)
+            hessian, gradient = hessian / np.outer(distance, distance), gradient / distance
+        return cls(hessian, gradient, float(smoothed(rms, floor) @ weights))
+
     @property
     def leads_somewhere(self) -> bool:
         """Whether it is finite and not flat; slopes at the edge of stability may overflow."""
         finite = np.isfinite(self.hessian).all() and np.isfinite(self.gradient).all()
         return bool(finite and np.diag(self.hessian).max() > 0.0)
-
-
-def quadratic_at(
-    objective: Objective, around: Responses, distance: FloatArray, floor: float
-) -> Quadratic:
-    """The quadratic around a point, with outputs' errors smoothed below ``floor``.
-
-    around: responses of the point and its neighbours, which are at distances (n_free,) from it.
-    """
-    rms, weights = around.rms[0], objective.weights
-    c = weights / (np.maximum(rms, floor) * np.maximum(objective.counts, 1))
-    counted = np.flatnonzero(weights > 0.0)
-    with np.errstate(over="ignore", invalid="ignore"):
-        changes = around.values[..., 1:] - around.values[..., :1]
-        hessian, gradient = _summed(changes, around.values[..., 0], c, counted)
-        if not np.all(np.isfinite(gradient)):
-            changes = np.where(np.isfinite(changes), changes, 0.0)
-            hessian, gradient = _summed(changes, around.values[..., 0], c, counted)
-        hessian, gradient = hessian / np.outer(distance, distance), gradient / distance
-    return Quadratic(hessian, gradient, float(smoothed(rms, floor) @ weights))
 
 
 def _summed(
@@ -96,7 +93,7 @@ def _summed(
 
 @dataclass(frozen=True)
 class Candidates:
-    """Coordinates that may follow a point, (n, n_free), and the damping of the steps there, (n,).
+    """Coordinates that may follow a point, (n, n_free), and the middle lambda then, (n,).
 
     promise: share of the error that the quadratic's own minimum would take away.
     """
@@ -141,16 +138,12 @@ def candidates(
     coordinates = np.clip(at + steps * width, lower, upper)
     gained = -(steps @ gradient)[..., 0] - 0.5 * np.sum((steps @ hessian) * steps, axis=2)
     promises = gained / np.array([quadratic.error for quadratic in quadratics])[:, None]
-    kept = ~beyond & (promises > 0.0)
+    kept = (~beyond & (promises > 0.0))[:, :-1]
+    lighter = np.clip(lambdas / np.sqrt(_FACTORS[-1]), _LEAST_DAMPING, _MOST_DAMPING)
     return [
-        Candidates(coordinates[k, :-1][kept[k, :-1]], lambdas[k, :-1][kept[k, :-1]], promise)
+        Candidates(coordinates[k, :-1][kept[k]], lighter[k, :-1][kept[k]], promise)
         for k, promise in enumerate(promises.max(axis=1).tolist())
     ]
-
-
-def lighter(damping: float) -> float:
-    """The next middle lambda after a gain by the given one."""
-    return float(np.clip(damping / np.sqrt(_FACTORS[-1]), _LEAST_DAMPING, _MOST_DAMPING))
 
 
 def heavier(damping: float) -> float:
@@ -243,9 +236,9 @@ class Constraints:
     def nearest(self, move: FloatArray, inverse: FloatArray) -> FloatArray:
         """Minimum within the constraints of a quadratic whose free minimum is a move (n_free,).
 
-        inverse: of the quadratic's Hessian, (n_free, n_free). Dual active-set method for few
-        constraints (Nocedal & Wright, "Numerical optimization", section 16.5): the most violated
-        constraint joins, those that would pull leave.
+        inverse: of its Hessian, (n_free, n_free). Dual active-set method (Nocedal & Wright,
+        "Numerical optimization", section 16.5): the most violated constraint joins, those that
+        would pull leave.
         """
         size = np.linalg.norm(self.slope, axis=1)
         limit = -self.value - _MARGIN * size

@@ -31,11 +31,11 @@ def origin(
     model: ProcessModel, records: Sequence[Dataset], settings: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Origin of a search: its model, records and settings."""
-    signals = (model.states, model.inputs, model.outputs, model.parameters)
+    signals = repr((model.states, model.inputs, model.outputs, model.parameters))
     origin = {
         "model": {
             "name": model.name,
-            "signals and parameters": _hash(repr(signals).encode()),
+            "signals and parameters": _hash(signals.encode()),
             "equations": fingerprint(model),
         },
         "records": [
@@ -97,10 +97,7 @@ class Checkpoint:
 
 
 def load(path: Path, begun_with: Mapping[str, Any]) -> State:
-    """The state in a checkpoint of a search of the same origin.
-
-    Raises ModelError when there is none, or when it belongs to other data, settings or model.
-    """
+    """The state in a checkpoint; ModelError if there is none, or of a search of another origin."""
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             content = json.loads(str(archive["json"]))

@@ -38,8 +38,8 @@ _NOT_DECIDING = ("model", "threads", "dt")
 class Progress:
     """Progress of a search: generation ``done`` of ``total``, the best error.
 
-    stage: ``search``; ``refine`` while the local refinement spends the rest of them; ``weigh``
-    in the last step by the likelihood, where ``done`` and ``total`` are the iterations so far.
+    stage: ``search``; ``refine``, by the local refinement; ``weigh``, by the likelihood at the
+    end, where ``done`` and ``total`` are the iterations so far.
     """
 
     stage: str
@@ -72,8 +72,7 @@ class GASSI(RecordEstimator):
     weights : {output: weight}, relative importance of the outputs.
     per_log : normalise each record by its own max|y| instead of the maximum over all.
     criterion : what the default preset ends with: ``likelihood`` weighs every output by its own
-        error, so that a noisy one does not decide what a clean one tells better; ``error`` stays
-        with the mean RMSE that the search minimises.
+        error; ``error`` stays with the mean RMSE that the search minimises.
     balance : ``samples``, several records count as one long one; ``logs``, each alike.
     accuracy : normalised RMS error that a simulation aims at.
     max_steps : integration steps a sample may take before a chromosome is flagged.
@@ -94,8 +93,7 @@ class GASSI(RecordEstimator):
     error_ : mean over outputs of the RMSE normalised by max|y| (see ``Objective``).
     search_error_ : the lowest error before local refinement.
     feasible_ : whether all constraints hold.
-    history_ : (n_generations,), the best error after each generation; in the local refinement
-        one is ``population`` simulations.
+    history_ : (n_generations,), the best error after each ``population`` simulations.
     stopped_ : ``generations``, ``converged`` or ``interrupted``.
     flagged_ : {status name: count} of simulations that failed during the search.
     n_simulations_ : simulations of one chromosome on all records.
@@ -160,9 +158,9 @@ class GASSI(RecordEstimator):
         (n_samples,), which record each row of the arrays belongs to, default one record. Ctrl-C
         stops the search and keeps the best so far.
 
-        checkpoint: file that the search's whole state is written to as it goes, at most twice a
-        second. resume: such a file to go on from, with the same result as if the search had
-        never stopped; further checkpoints go to the same file unless another is named.
+        checkpoint: file that the search's whole state is written to, at most twice a second.
+        resume: such a file to go on from, to the same result; further checkpoints go to the same
+        file unless another is named.
 
         Raises ModelError when every simulation of the first generation fails, for settings that
         make no sense, or for a checkpoint of other data, settings or model.
@@ -264,10 +262,9 @@ class GASSI(RecordEstimator):
     def uncertainty(
         self, X: Data, y: FloatArray | None = None, *, records: Any = None
     ) -> Uncertainty:
-        """Intervals of the parameters, and what the records cannot tell of them.
+        """Intervals of the parameters, and what the records, those of ``fit``, cannot tell.
 
-        X, y, records: those of ``fit``. Raises ModelError where the local refinement did not run
-        to its end: only at a minimum of the error do its sensitivities tell.
+        Raises ModelError where the local refinement did not run to its end, in a minimum.
         """
         return uncertainty(self._final_objective(X, y, records), self.chromosome_, self._rivals)
 
@@ -332,10 +329,8 @@ class GASSI(RecordEstimator):
         )
 
     def _preset(self) -> Preset:
-        for kind, choice, choices in (
-            ("criterion", self.criterion, get_args(Criterion)),
-            ("preset", self.preset, PRESETS),
-        ):
+        for kind, choices in (("criterion", get_args(Criterion)), ("preset", PRESETS)):
+            choice = getattr(self, kind)
             if choice not in choices:
                 raise ModelError(f"unknown {kind} {choice!r}; choose from {', '.join(choices)}")
         return PRESETS[self.preset]
@@ -392,12 +387,10 @@ class GASSI(RecordEstimator):
         self.n_simulations_ = run.objective.simulations
 
     def _set(self, best: Best) -> None:
-        self.space_ = best.space
-        self.chromosome_: FloatArray = best.chromosome
-        self.vector_ = best.space.full(best.chromosome)
+        self.space_, self.chromosome_, self.error_, self.feasible_ = best
+        self.vector_ = self.space_.full(self.chromosome_)
         self.parameters_ = self._named(self.vector_)
-        self.initial_states_ = best.space.named_starts(best.chromosome)
-        self.error_, self.feasible_ = best.error, best.feasible
+        self.initial_states_ = self.space_.named_starts(self.chromosome_)
 
     def _named(self, vector: FloatArray) -> dict[str, float]:
         return dict(zip(self._model().parameter_names, vector.tolist(), strict=True))

@@ -76,12 +76,9 @@ _UNRANKED = (True, np.inf)  # behind every chromosome that was simulated
 class GeneticSearch:
     """One run of a genetic algorithm over a search space.
 
-    population: chromosomes per generation. generations: how many are evaluated (i_max).
-    elite_percent: r_elite. minimum_generations, termination_ratio: i_min and r_termination of
-    (4.11); a ratio of 0 leaves only the count of generations.
-
-    After each ``tell``: ``elite`` (n_free,), ``elite_error``, ``elite_feasible``, and
-    ``history``, the elite's error per generation.
+    generations: how many are evaluated, i_max. elite_percent: r_elite. minimum_generations,
+    termination_ratio: i_min and r_termination of (4.11); with 0 only the generations count. After
+    each ``tell``: ``elite`` (n_free,), its error and feasibility, and its ``history`` of errors.
     """
 
     space: SearchSpace
@@ -207,8 +204,7 @@ class GeneticSearch:
     def _check_termination(self) -> None:
         """Running mean of the elite's error since it first changed, (4.10) and (4.11).
 
-        The mean divides by the number of its terms; (4.10) prints one less, which would be
-        undefined in the first generation it applies to.
+        It divides by the number of terms; (4.10) prints one less, undefined for the first.
         """
         i = len(self.history) - 1
         if not np.isfinite(self._first_error):

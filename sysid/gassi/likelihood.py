@@ -1,12 +1,12 @@
 """The last step of an identification: which minimum, by which weights.
 
-The mean of the outputs' RMSEs serves the search. Statistically it is not the figure to end with:
-it lets an output that is noisy, or whose errors wander slowly, decide what another with small
-white errors could tell better. The likelihood of independent normal errors whose variances are
-unknown has its maximum where the product of the RMSEs is least (Ljung, "System Identification",
-section 7.4, with a diagonal covariance): every output then weighs by the inverse of its own error.
-Among minima the likelihood chooses once more, each output counted by as many independent samples
-as the colour of its errors leaves; those that it cannot tell apart are rivals.
+The mean of the outputs' RMSEs serves the search. It is not the figure to end with: it lets an
+output that is noisy, or whose errors wander slowly, decide what another with small white errors
+could tell better. The likelihood of independent normal errors whose variances are unknown has its
+maximum where the product of the RMSEs is least (Ljung, "System Identification", section 7.4, with
+a diagonal covariance): every output then weighs by the inverse of its own error. Among minima the
+likelihood chooses once more, each output counted by as many independent samples as the colour of
+its errors leaves; those that it cannot tell apart are rivals.
 """
 
 from collections.abc import Callable, Sequence
@@ -79,7 +79,7 @@ def fit_likelihood(
             lookalikes(best.objective, best.chromosome),
             max_iterations=_QUICKLY,
             tolerance=_ROUGHLY,
-            enough=lambda chromosome: not optima.new(chromosome),
+            enough=lambda point: not optima.new(objective.space.decode(point.at)),
         ):
             # By the best one's weights, until it turns out to matter.
             rough = _optimum(best.objective, end.chromosome, end.rms)
@@ -152,8 +152,7 @@ class _Optima:
 def _resolved(objective: Objective, chromosome: FloatArray) -> Objective:
     """The objective with simulations as accurate as they are meant to be, at a chromosome.
 
-    The steps are chosen by what each of them errs. Where little is damped, as in a pendulum that
-    swings freely, such errors add up along the record; twice the steps show by how much.
+    The errors of single steps add up where little is damped; twice the steps show by how much.
     """
     accuracy = objective.simulator.accuracy
     while objective.simulator.accuracy >= FINEST:

@@ -28,10 +28,7 @@ _REACHED = 0.02  # part of the frequency by which the end may miss the alias
 
 
 def lookalikes(objective: Objective, chromosome: FloatArray) -> list[FloatArray]:
-    """Chromosomes (n_free,) within the ranges whose fastest mode is this one's or an alias of it.
-
-    The model is linearised where the first record starts.
-    """
+    """Chromosomes (n_free,) in the ranges whose fastest mode is this one's or an alias of it."""
     modes = _Modes(objective, chromosome)
     dt = objective.records[0].dt
     return [*_swaps(objective, chromosome), *_twins(modes), *_aliases(modes, dt)]
@@ -99,11 +96,11 @@ def _aliased(frequency: float, dt: float) -> FloatArray:
 
 
 class _Modes:
-    """Eigenvalues of the linearised model over the search coordinates.
+    """Eigenvalues of the model linearised at the first record's start, by search coordinates.
 
-    start: search coordinates (n_free,) of the minimum. fastest: the eigenvalue there of largest
-    imaginary part, or of largest size where nothing oscillates. acting: places of the parameters
-    that act on it, the strongest first; differences of the rest are not taken.
+    start: those of the minimum, (n_free,). fastest: the eigenvalue there of largest imaginary
+    part, or of largest size where nothing oscillates. acting: places of the parameters that act
+    on it, the strongest first; differences of the rest are not taken.
     """
 
     def __init__(self, objective: Objective, chromosome: FloatArray) -> None:
@@ -134,11 +131,7 @@ class _Modes:
         moving: BoolArray,
         iterations: int = _ITERATIONS,
     ) -> tuple[FloatArray, ComplexArray]:
-        """Coordinates and modes after Newton steps that bring modes to targets.
-
-        Of all such steps the least, in parts of the ranges. at, moving: (n, n_free); values,
-        targets: (n,).
-        """
+        """Coordinates (n, n_free) and modes (n,) after the least Newton steps to the targets."""
         for _ in range(iterations):
             slopes = np.where(moving[:, None], self.slopes(at, values), 0.0)
             miss = np.stack([(targets - values).real, (targets - values).imag], axis=1)

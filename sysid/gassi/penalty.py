@@ -14,8 +14,7 @@ from sysid.arrays import FloatArray
 def infeasibility(violations: FloatArray) -> FloatArray:
     """Infeasibility score (4.16) in [0, 1] of each chromosome, (n,).
 
-    violations: (n, n_constraints), c_k of (4.15). Each constraint counts relative to its
-    largest violation in the population.
+    violations: (n, n_constraints), c_k of (4.15), each relative to its largest in the population.
     """
     if violations.shape[1] == 0:
         return np.zeros(len(violations))
@@ -33,8 +32,7 @@ def infeasibility(violations: FloatArray) -> FloatArray:
 def find_indicators(errors: FloatArray, scores: FloatArray) -> tuple[int, int, int]:
     """Rows of the best, worst infeasible and highest-error chromosome, section 4.1.3.3.
 
-    errors: (n,), finite where simulated; scores: (n,), infeasibility. At least one error must
-    be finite and one score positive.
+    At least one error must be finite and one infeasibility score positive.
     """
     rows = np.flatnonzero(np.isfinite(errors))
     infeasible = rows[scores[rows] > 0.0]
@@ -51,8 +49,7 @@ def find_indicators(errors: FloatArray, scores: FloatArray) -> tuple[int, int, i
 def penalise(errors: FloatArray, violations: FloatArray) -> FloatArray:
     """Errors with the penalties (4.18) and (4.19) added to infeasible chromosomes, (n,).
 
-    Errors that are not finite (flagged simulations) pass through and take no part in the
-    scale, so that one NaN does not switch the penalty off.
+    Errors that are not finite (flagged simulations) pass through and take no part in the scale.
     """
     scores = infeasibility(violations)
     infeasible = np.isfinite(errors) & (scores > 0.0)
@@ -62,8 +59,7 @@ def penalise(errors: FloatArray, violations: FloatArray) -> FloatArray:
     (best, worst, highest), (least, most, _) = errors[indicators], scores[indicators]
     span = most - least
     # (4.17); with every chromosome equally infeasible there is nothing to grade. What is more
-    # infeasible than the worst, which need not be the most infeasible, gets the full penalty:
-    # the exponential of (4.19) would else grow without bound.
+    # infeasible than the worst gets the full penalty, lest the exponential of (4.19) overflow.
     graded = (scores - least) / span if span > 0.0 else np.zeros_like(scores)
     graded = np.minimum(graded, 1.0)
     growth = (np.exp(2.0 * graded) - 1.0) / (np.exp(2.0) - 1.0)

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,8 +20,7 @@ from sysid.problem.space import SearchSpace
 _MOST_RIVALS, _ITERATIONS_EACH = 2, 20
 
 
-@dataclass(frozen=True)
-class Best:
+class Best(NamedTuple):
     """The best chromosome (n_free,) of a space, its error, and whether constraints hold."""
 
     space: SearchSpace
