@@ -158,7 +158,7 @@ class PolynomialModel(RecordEstimator):
             self.theta_[~estimated] = self.A_.transpose(1, 2, 0)[moved]
             self.theta_[estimated] = np.concatenate([np.append(fit.theta, fit.c) for fit in fits])
         _, self.B_, self.C_, self.offset_ = layout.polynomials(self.theta_)
-        self._set_precision(layout, fits, estimated)
+        self._set_precision(layout, fits, estimated, len(stack.age))
         self.n_lags_, self.names_, self.poles_ = layout.lag, layout.names, poles(self.A_)
         self.radius_ = float(np.abs(self.poles_).max(initial=0.0))
         self.stable_ = self.radius_ < 1.0
@@ -167,11 +167,12 @@ class PolynomialModel(RecordEstimator):
         self.input_mean_ = self.offset * np.vstack([r.inputs for r in data]).mean(axis=0)
         self.output_mean_ = self.offset * np.nanmean(stack.outputs, axis=0)
 
-    def _set_precision(self, layout: Layout, fits: list[EquationFit], estimated: BoolArray) -> None:
+    def _set_precision(
+        self, layout: Layout, fits: list[EquationFit], estimated: BoolArray, n: int
+    ) -> None:
         """Of the estimated coefficients; Ljung, System Identification, sections 9.2 and 9.3."""
         row, q, p = np.nonzero(layout.free)[0], len(fits), len(estimated)
-        n = 1 + max(int(fit.position[-1]) for fit in fits)
-        # Errors of several outputs at one instant may be correlated; zero where none was fitted.
+        # Over all n instants, for errors of several outputs at one may be correlated.
         present, residual, gain = np.zeros((q, n)), np.zeros((q, n)), np.zeros((p, n))
         used, determined = np.zeros(q), estimated.copy()
         for i, fit in enumerate(fits):

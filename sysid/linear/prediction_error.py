@@ -223,8 +223,7 @@ def fit_equation(equation: Equation, nc: int, starts: list[FloatArray], limit: i
             if damping > _MOST_DAMPING:
                 # On the rim of the stable region no step helps: that is the minimum there.
                 return fit
-            scale = np.diag(curvature) + 1e-12 * curvature.trace()
-            damped = curvature + damping * np.diag(scale)
+            damped = curvature + damping * np.diag(np.diag(curvature) + 1e-12 * curvature.trace())
             # Only downhill: where what was learnt spoils that, it is left out.
             convex = np.linalg.eigvalsh(damped + learnt)[0] > 0.0
             step = np.linalg.solve(damped + learnt if convex else damped, downhill)
