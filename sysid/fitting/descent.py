@@ -1,15 +1,19 @@
-"""The state of a descent between two iterations."""
+"""The state of a descent between two iterations, and its strategies where it stalls.
 
-from __future__ import annotations
+A strategy returns a stalled descent as it goes on, or None where it gives up. Those for a kind of
+stall are tried in turn; a descent that they all give up has finished.
+"""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from typing import Any
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any, Self
 
 import numpy as np
 
 from sysid.arrays import FloatArray
-from sysid.fitting.quadratic import FIRST_DAMPING
+from sysid.fitting.objective import Objective
+from sysid.fitting.quadratic import FIRST_DAMPING, heavier
 
 # Sizes of the perturbations, in parts of the ranges. The first is for what is smooth. Where
 # something switches (dry friction, an overflow) the instant of switching moves in steps of the
@@ -17,6 +21,10 @@ from sysid.fitting.quadratic import FIRST_DAMPING
 PERTURBATIONS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
 # Floors below which outputs' errors are smoothed, in parts of the error.
 FLOORS = (1e-1, 1e-2, 1e-3)
+PATIENCE = 3  # failures in a row, the later ones with more damping
+NOTHING = 1e-3  # share of the error that is not worth a change of perturbations
+_STEADIER, _BRACINGS = 1.5, 3
+_NEAR = 1e-3  # parts of the ranges within which integration steps need not be chosen anew
 
 
 @dataclass(frozen=True)
@@ -39,32 +47,23 @@ class Point:
 
 
 @dataclass(frozen=True)
-class Integration:
-    """Integration steps per sample for each record, and the coordinates they were chosen at.
-
-    steps_at: None where they are yet to be chosen. braced: how often they have been raised since
-    for the neighbours' sake.
-    """
-
-    steps: tuple[int, ...] = ()
-    steps_at: FloatArray | None = None
-    braced: int = 0
-
-
-@dataclass(frozen=True)
 class Descent:
     """A descent at a point; ``refinement.advance`` returns it one iteration further.
 
-    safe: coordinates at which integration steps were last chosen and a simulation with them
-    succeeded, and the error there; beyond, the steps may not do. gain: share of the error that
-    the last iteration took away. failures: iterations in a row that gained nothing, or hardly any
-    of what was promised. level: of ``PERTURBATIONS``. error_of_round: the error where the present
-    round of levels began. smoothing: which of ``FLOORS``.
+    safe: where integration steps were last chosen and a simulation with them succeeded; beyond,
+    the steps may not do. steps: per sample, for each record; steps_at: the coordinates they were
+    chosen at, None where they are yet to be; braced: how often they have been raised since for
+    the neighbours' sake. gain: share of the error that the last iteration took away. failures:
+    iterations in a row that gained nothing, or hardly any of what was promised. level: of
+    ``PERTURBATIONS``. error_of_round: the error where the present round of levels began.
+    smoothing: which of ``FLOORS``.
     """
 
     point: Point
     safe: Point | None = None
-    integration: Integration = Integration()
+    steps: tuple[int, ...] = ()
+    steps_at: FloatArray | None = None
+    braced: int = 0
     damping: float = FIRST_DAMPING
     gain: float = 0.0
     failures: int = 0
@@ -81,20 +80,106 @@ class Descent:
 
     def state(self) -> dict[str, Any]:
         """The state in plain values and arrays."""
-        state = vars(self) | vars(self.point) | vars(self.integration)
-        for part in ("point", "integration", "safe"):
-            del state[part]
-        safe = (None, np.inf) if self.safe is None else (self.safe.at, self.safe.error)
-        return state | dict(zip(("sure", "sure_error"), safe, strict=True))
+        at, error = (None, np.inf) if self.safe is None else (self.safe.at, self.safe.error)
+        state = vars(self) | vars(self.point) | {"sure": at, "sure_error": error}
+        del state["point"], state["safe"]
+        return state
 
     @classmethod
-    def of(cls, state: Mapping[str, Any]) -> Descent:
+    def of(cls, state: Mapping[str, Any]) -> Self:
         """The descent of a ``state``."""
         rest = dict(state)
         at, error = rest.pop("sure"), rest.pop("sure_error")
-        safe = None if at is None else Point(at, error)
-        point = Point(**{field.name: rest.pop(field.name) for field in fields(Point)})
-        integration = Integration(
-            **{field.name: rest.pop(field.name) for field in fields(Integration)}
-        )
-        return cls(point, safe, integration, **rest)
+        point = Point(*(rest.pop(field.name) for field in fields(Point)))
+        return cls(point, None if at is None else Point(at, error), **rest)
+
+
+def retreat(_: Objective, descent: Descent) -> Descent | None:
+    """Back to the safe point, to try more damping, until patience ends."""
+    if descent.safe is None:
+        return None
+    failures = descent.failures + 1
+    return replace(
+        descent,
+        point=descent.safe,
+        steps_at=None,
+        damping=heavier(descent.damping),
+        gain=0.0,
+        failures=failures,
+        iterations=descent.iterations + 1,
+        finished=failures >= PATIENCE,
+    )
+
+
+def brace(_: Objective, descent: Descent) -> Descent | None:
+    """Half as many integration steps more, which at the edge of stability the neighbours need.
+
+    Gives up after three times: then it is the model that is unbounded there.
+    """
+    if descent.braced == _BRACINGS:
+        return None
+    more = tuple(math.ceil(_STEADIER * steps) for steps in descent.steps)
+    return replace(descent, steps=more, braced=descent.braced + 1)
+
+
+def coarsen(_: Objective, descent: Descent) -> Descent | None:
+    """The next larger perturbations.
+
+    More damping has not helped, so it is the slopes that are wrong: to small perturbations
+    equations that switch, as dry friction, are steps and plateaus.
+    """
+    if descent.level + 1 == len(PERTURBATIONS):
+        return None
+    return replace(descent, level=descent.level + 1, failures=0, damping=FIRST_DAMPING)
+
+
+def sharpen(objective: Objective, descent: Descent) -> Descent | None:
+    """The next lower floor, where an output's error is below the present one.
+
+    Descents stop on the crease that the error has where an output is explained exactly, so they
+    approach it smoothed.
+    """
+    rms = descent.point.rms
+    assert rms is not None
+    below = np.any(rms[objective.weights > 0.0] < descent.floor)
+    if not below or descent.smoothing + 1 == len(FLOORS):
+        return None
+    return replace(descent, smoothing=descent.smoothing + 1, failures=0)
+
+
+def resolve(objective: Objective, descent: Descent) -> Descent | None:
+    """More integration steps, where the point needs more than were chosen some way back."""
+    at, steps_at, space = descent.point.at, descent.steps_at, objective.space
+    if steps_at is not None and np.all(np.abs(at - steps_at) <= _NEAR * space.width):
+        return None
+    needed = objective.steps_needed(space.decode(at[None]))[0].tolist()
+    steps = tuple(max(pair) for pair in zip(needed, descent.steps, strict=True))
+    if steps == descent.steps:
+        return None
+    return replace(descent, steps=steps, steps_at=at, failures=0)
+
+
+def refocus(_: Objective, descent: Descent) -> Descent | None:
+    """The smallest perturbations once more, where larger ones have gained something."""
+    at, error = descent.point.at, descent.point.error
+    if descent.level == 0 or error > (1.0 - NOTHING) * descent.error_of_round:
+        return None
+    return replace(descent, steps_at=at, level=0, failures=0, error_of_round=error)
+
+
+_ARRIVED = (sharpen, resolve, refocus)
+STRATEGIES: dict[str, tuple[Callable[[Objective, Descent], Descent | None], ...]] = {
+    "failed": (retreat,),  # the simulation of the point fails
+    "burst": (brace,),  # those of neighbours leave that of the point by far
+    "arrived": _ARRIVED,  # hardly anything was promised, or gained
+    "misled": (coarsen, *_ARRIVED),  # gains stay far behind promises, whatever the damping
+}
+
+
+def resumed(objective: Objective, descent: Descent, stall: str) -> Descent:
+    """The descent as the first strategy that does not give up lets it go on, or else finished."""
+    for strategy in STRATEGIES[stall]:
+        onward = strategy(objective, descent)
+        if onward is not None:
+            return onward
+    return replace(descent, finished=True)

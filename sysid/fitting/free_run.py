@@ -46,10 +46,9 @@ def free_run(simulator: BatchSimulator, vector: FloatArray, record: Dataset) -> 
 
 
 def estimate_start(simulator: BatchSimulator, vector: FloatArray, record: Dataset) -> FloatArray:
-    """Initial states of a record under parameters (n_parameters,), (n_states,).
+    """Initial states (n_states,) of a record under parameters (n_parameters,).
 
-    States with an ``initial_range`` are fitted to the record's measured outputs by least squares;
-    the rest come from the first sample or as declared.
+    States with an ``initial_range`` are fitted to the measured outputs by least squares.
     """
     model = simulator.model
     declared = record.initial_state(model)

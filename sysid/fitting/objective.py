@@ -34,25 +34,19 @@ class Responses:
     """Residuals of n chromosomes in parts of the outputs' scales.
 
     values: (n_residuals, n_outputs, n), 0 where a sample was lost, not finite where a simulation
-    failed. rms: (n, n_outputs). excess: (n,), the simulations' error estimates in parts of what
-    the accuracy allows.
+    failed. rms: (n, n_outputs). excess: (n,), as of ``Point``.
     """
 
     values: FloatArray
     rms: FloatArray
     excess: FloatArray
 
-    def part(self, rows: slice) -> Responses:
-        """The responses of consecutive chromosomes."""
-        return Responses(self.values[..., rows], self.rms[rows], self.excess[rows])
-
 
 def smoothed(rms: FloatArray, floor: float) -> FloatArray:
     """Root mean squares, those below the floor f by the parabola (r^2 / f + f) / 2.
 
-    It meets the root at f with its slope, so that no crease is left where an output is explained
-    exactly (Huber, "Robust estimation of a location parameter", Annals of Mathematical
-    Statistics 35, 1964).
+    No crease is left then where an output is explained exactly (Huber, "Robust estimation of a
+    location parameter", Annals of Mathematical Statistics 35, 1964).
     """
     return np.where(rms > floor, rms, 0.5 * (rms**2 / floor + floor))
 
@@ -60,10 +54,10 @@ def smoothed(rms: FloatArray, floor: float) -> FloatArray:
 class Objective:
     """Mean over outputs of the RMSE on outputs normalised by max|y|, the E above.
 
-    Several records count as one long one, or with ``balance`` "logs" each alike whatever its
-    length: the mean under the root is then one of the records' means. ``weights``: (n_outputs,),
-    relative importance of the outputs, default equal. ``scales``: divisors of the residuals, per
-    record (n_outputs,): max|y|, times a factor that balances the records.
+    Several records count as one long one, or with ``balance`` "logs" each alike: the mean under
+    the root is then one of the records' means. ``weights``: (n_outputs,), relative importance of
+    the outputs, default equal. ``scales``: divisors of the residuals, per record (n_outputs,):
+    max|y|, times a factor that balances the records.
     """
 
     def __init__(
@@ -129,25 +123,23 @@ class Objective:
     ) -> Responses:
         """Residuals at given integration steps per sample, records one after another.
 
-        n_steps: (n_records,), or of each chromosome (n, n_records). Without ``keep`` only their
-        root mean squares, and no values.
+        n_steps: (n_records,), or of each chromosome (n, n_records). Without ``keep`` no values.
         """
         steps = np.broadcast_to(n_steps, (len(chromosomes), len(self.records)))
         vectors, starts = self.space.full(chromosomes), self._starts(chromosomes)
-        residuals = self.simulator.residuals(
+        simulated = self.simulator.residuals(
             vectors, self.records, self.scales, steps, starts, keep=keep
         )
         self._counter[0] += len(chromosomes)
-        rms = self._roots(residuals.sse.sum(axis=1))
-        return Responses(residuals.values, rms, residuals.excess.max(axis=1))
+        rms = self._roots(simulated.sse.sum(axis=1))
+        return Responses(simulated.values, rms, simulated.excess.max(axis=1))
 
     def steps_needed(self, chromosomes: FloatArray) -> IntArray:
         """Integration steps per sample that each chromosome needs, (n, n_records)."""
         vectors = self.space.full(chromosomes)
         self._counter[0] += len(vectors)
-        return np.stack(
-            [self.simulator.steps_of_each(vectors, record) for record in self.records], axis=1
-        )
+        steps = [self.simulator.steps_of_each(vectors, record) for record in self.records]
+        return np.stack(steps, axis=1)
 
     def error_of(self, rms: FloatArray) -> FloatArray:
         """The error E of outputs' errors r (n, n_outputs), (n,), infinite where one failed."""
@@ -166,11 +158,7 @@ class Objective:
         return int(sum(record.outputs.size for record in self.records))
 
     def least_squares_weights(self, residual: FloatArray) -> FloatArray:
-        """Weights of squared residuals whose mean is least where the error is, (n_outputs,).
-
-        residual: (n_residuals, n_outputs), at that minimum. Half the second derivative of the
-        error is that of the weighted mean square.
-        """
+        """Weights (n_outputs,) of squares whose mean is least where the error is, by residuals."""
         counts, rms = np.maximum(self.counts, 1), self._roots(np.sum(residual**2, axis=0))
         weights: FloatArray = self.weights * len(residual) / counts / np.maximum(rms, 1e-12)
         return weights
@@ -183,10 +171,8 @@ class Objective:
     def _starts(self, chromosomes: FloatArray) -> list[FloatArray]:
         """Initial states of every chromosome for each record."""
         model = self.simulator.model
-        return [
-            self.space.starts(chromosomes, k, record.initial_state(model))
-            for k, record in enumerate(self.records)
-        ]
+        declared = [record.initial_state(model) for record in self.records]
+        return [self.space.starts(chromosomes, k, start) for k, start in enumerate(declared)]
 
     def _roots(self, sse: FloatArray) -> FloatArray:
         """Root mean squares of sums of squares, (n, n_outputs)."""
@@ -195,16 +181,12 @@ class Objective:
 
 
 def _balanced(scales: list[FloatArray], counts: IntArray, balance: Balance) -> list[FloatArray]:
-    """Divisors of the residuals under which the mean over all samples is the balanced one.
-
-    counts: (n_records, n_outputs), measured samples.
-    """
+    """Divisors of the residuals under which the mean over all samples is the balanced one."""
     if balance == "samples":
         return scales
     if balance != "logs":
         raise ModelError(f"unknown balance {balance!r}; choose samples or logs")
     # A record's share of the samples over its share of the records that saw the output.
     share = counts * np.sum(counts > 0, axis=0) / np.maximum(counts.sum(axis=0), 1)
-    return [
-        scale * np.sqrt(np.where(n > 0.0, n, 1.0)) for scale, n in zip(scales, share, strict=True)
-    ]
+    factors = np.sqrt(np.where(share > 0.0, share, 1.0))
+    return [scale * factor for scale, factor in zip(scales, factors, strict=True)]

@@ -24,12 +24,12 @@ the ranges.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
 from sysid.arrays import BoolArray, FloatArray, IntArray
-from sysid.fitting.constraints import Constraints
 from sysid.fitting.objective import Objective, Responses, smoothed
 from sysid.problem.space import SearchSpace
 
@@ -39,6 +39,9 @@ CANDIDATES = len(_FACTORS)
 FIRST_DAMPING = 1e-2
 _LEAST_DAMPING, _MOST_DAMPING = 1e-14, 1e6
 _HOLDING_ROUNDS = 4  # in which the coordinates that hit a bound are held there
+_PERTURBATION = 1e-6  # of constraints, in parts of the ranges
+# A slide ends this far inside, in parts of the constraint's slope: on it rounding would decide.
+_MARGIN = 1e-6
 # A step that ends where a limit is violated is shortened so often, each time to this part.
 _SHORTENINGS, _SHORTER = 6, 0.4
 
@@ -51,31 +54,28 @@ class Quadratic:
     gradient: FloatArray
     error: float
 
+    @classmethod
+    def at(
+        cls, objective: Objective, around: Responses, distance: FloatArray, floor: float
+    ) -> Self:
+        """At a point, by the responses there and at distances (n_free,) from it."""
+        rms, weights = around.rms[0], objective.weights
+        c = weights / (np.maximum(rms, floor) * np.maximum(objective.counts, 1))
+        counted = np.flatnonzero(weights > 0.0)
+        with np.errstate(over="ignore", invalid="ignore"):
+            changes = around.values[..., 1:] - around.values[..., :1]
+            hessian, gradient = _summed(changes, around.values[..., 0], c, counted)
+            if not np.all(np.isfinite(gradient)):
+                changes = np.where(np.isfinite(changes), changes, 0.0)
+                hessian, gradient = _summed(changes, around.values[..., 0], c, counted)
+            hessian, gradient = hessian / np.outer(distance, distance), gradient / distance
+        return cls(hessian, gradient, float(smoothed(rms, floor) @ weights))
+
     @property
     def leads_somewhere(self) -> bool:
         """Whether it is finite and not flat; slopes at the edge of stability may overflow."""
         finite = np.isfinite(self.hessian).all() and np.isfinite(self.gradient).all()
         return bool(finite and np.diag(self.hessian).max() > 0.0)
-
-
-def quadratic_at(
-    objective: Objective, around: Responses, distance: FloatArray, floor: float
-) -> Quadratic:
-    """The quadratic around a point, with outputs' errors smoothed below ``floor``.
-
-    around: responses of the point and its neighbours, which are at distances (n_free,) from it.
-    """
-    rms, weights = around.rms[0], objective.weights
-    c = weights / (np.maximum(rms, floor) * np.maximum(objective.counts, 1))
-    counted = np.flatnonzero(weights > 0.0)
-    with np.errstate(over="ignore", invalid="ignore"):
-        changes = around.values[..., 1:] - around.values[..., :1]
-        hessian, gradient = _summed(changes, around.values[..., 0], c, counted)
-        if not np.all(np.isfinite(gradient)):
-            changes = np.where(np.isfinite(changes), changes, 0.0)
-            hessian, gradient = _summed(changes, around.values[..., 0], c, counted)
-        hessian, gradient = hessian / np.outer(distance, distance), gradient / distance
-    return Quadratic(hessian, gradient, float(smoothed(rms, floor) @ weights))
 
 
 def _summed(
@@ -93,7 +93,7 @@ def _summed(
 
 @dataclass(frozen=True)
 class Candidates:
-    """Coordinates that may follow a point, (n, n_free), and the damping of the steps there, (n,).
+    """Coordinates that may follow a point, (n, n_free), and the middle lambda then, (n,).
 
     promise: share of the error that the quadratic's own minimum would take away.
     """
@@ -101,10 +101,6 @@ class Candidates:
     coordinates: FloatArray
     damping: FloatArray
     promise: float
-
-    def worth(self, tolerance: float) -> bool:
-        """Whether they promise more than a share of the error."""
-        return len(self.coordinates) > 0 and not self.promise <= tolerance
 
 
 def candidates(
@@ -133,7 +129,7 @@ def candidates(
             limits = Constraints.at(space, at[k, 0], width)
             for j in np.flatnonzero(beyond[k]).tolist():
                 curvature = hessian[k] + np.diag(added[k, j])
-                steps[k, j] = _slid(limits, steps[k, j], curvature, low[k, 0], high[k, 0])
+                steps[k, j] = limits.slid(steps[k, j], curvature, low[k, 0], high[k, 0])
     for _ in range(_SHORTENINGS):
         if not beyond.any():
             break
@@ -142,32 +138,24 @@ def candidates(
     coordinates = np.clip(at + steps * width, lower, upper)
     gained = -(steps @ gradient)[..., 0] - 0.5 * np.sum((steps @ hessian) * steps, axis=2)
     promises = gained / np.array([quadratic.error for quadratic in quadratics])[:, None]
-    kept = ~beyond & (promises > 0.0)
+    kept = (~beyond & (promises > 0.0))[:, :-1]
+    lighter = np.clip(lambdas / np.sqrt(_FACTORS[-1]), _LEAST_DAMPING, _MOST_DAMPING)
     return [
-        Candidates(coordinates[k, :-1][kept[k, :-1]], lambdas[k, :-1][kept[k, :-1]], promise)
+        Candidates(coordinates[k, :-1][kept[k]], lighter[k, :-1][kept[k]], promise)
         for k, promise in enumerate(promises.max(axis=1).tolist())
     ]
 
 
-def lighter(damping: float) -> float:
-    """The next middle lambda after a gain by the given one."""
-    return _limited(damping / np.sqrt(_FACTORS[-1]))
-
-
 def heavier(damping: float) -> float:
     """The next middle lambda after no gain around the given one."""
-    return _limited(damping * _FACTORS[-1] / _FACTORS[0])
-
-
-def _limited(damping: float) -> float:
-    return float(min(max(damping, _LEAST_DAMPING), _MOST_DAMPING))
+    return float(np.clip(damping * _FACTORS[-1] / _FACTORS[0], _LEAST_DAMPING, _MOST_DAMPING))
 
 
 def _infeasible(space: SearchSpace, coordinates: FloatArray) -> BoolArray:
     """Which coordinates (..., n_free) violate a constraint or a physical limit, (...)."""
     violations = space.violations(space.decode(coordinates.reshape(-1, coordinates.shape[-1])))
-    mask: BoolArray = np.any(violations > 0.0, axis=1).reshape(coordinates.shape[:-1])
-    return mask
+    infeasible: BoolArray = np.any(violations > 0.0, axis=1).reshape(coordinates.shape[:-1])
+    return infeasible
 
 
 def _damped(
@@ -186,7 +174,7 @@ def _damped(
     diagonal = np.arange(added.shape[2])
     live = np.arange(len(hessian))
     for _ in range(_HOLDING_ROUNDS):
-        if len(live) == 0:
+        if not len(live):
             break
         stay = held[live]
         # A held coordinate's row says that it moves as far as it does.
@@ -212,14 +200,63 @@ def _solved(systems: FloatArray, right: FloatArray) -> FloatArray:
     return np.concatenate([_solved(system, side) for system, side in pairs])
 
 
-def _slid(
-    limits: Constraints, step: FloatArray, curvature: FloatArray, low: FloatArray, high: FloatArray
-) -> FloatArray:
-    """A step that slides along the constraints it would cross, bounds kept."""
-    between = (step > low) & (step < high)
-    free, held = np.flatnonzero(between), ~between
-    rest = Constraints(limits.value + limits.slope[:, held] @ step[held], limits.slope)
-    inverse: FloatArray = np.linalg.inv(curvature[np.ix_(free, free)]).astype(np.float64)
-    slid = step.copy()
-    slid[free] = rest.among(free).nearest(step[free], inverse)
-    return np.clip(slid, low, high)
+@dataclass(frozen=True)
+class Constraints:
+    """Linearised constraints g <= 0: value g at a point, (n,), and slope by moves, (n, n_free)."""
+
+    value: FloatArray
+    slope: FloatArray
+
+    @classmethod
+    def at(cls, space: SearchSpace, coded: FloatArray, width: FloatArray) -> Self:
+        """At search coordinates (n_free,), by central differences; moves in units of ``width``."""
+        shift = _PERTURBATION * np.diag(width)
+        points = space.decode(np.concatenate([coded[None], coded + shift, coded - shift]))
+        values, n = space.constraint_values(points), len(coded)
+        return cls(values[0], (values[1 : n + 1] - values[n + 1 :]).T / (2.0 * _PERTURBATION))
+
+    def among(self, free: IntArray) -> Self:
+        """Constraints that moves of the free parameters alone can reach."""
+        slope = self.slope[:, free]
+        reached = np.isfinite(slope).all(axis=1) & np.any(slope != 0.0, axis=1)
+        return type(self)(self.value[reached], slope[reached])
+
+    def slid(
+        self, step: FloatArray, curvature: FloatArray, low: FloatArray, high: FloatArray
+    ) -> FloatArray:
+        """A step that slides along the constraints it would cross, bounds kept."""
+        between = (step > low) & (step < high)
+        free, held = np.flatnonzero(between), ~between
+        rest = replace(self, value=self.value + self.slope[:, held] @ step[held])
+        inverse: FloatArray = np.linalg.inv(curvature[np.ix_(free, free)]).astype(np.float64)
+        slid = step.copy()
+        slid[free] = rest.among(free).nearest(step[free], inverse)
+        return np.clip(slid, low, high)
+
+    def nearest(self, move: FloatArray, inverse: FloatArray) -> FloatArray:
+        """Minimum within the constraints of a quadratic whose free minimum is a move (n_free,).
+
+        inverse: of its Hessian, (n_free, n_free). Dual active-set method (Nocedal & Wright,
+        "Numerical optimization", section 16.5): the most violated constraint joins, those that
+        would pull leave.
+        """
+        size = np.linalg.norm(self.slope, axis=1)
+        limit = -self.value - _MARGIN * size
+        active: list[int] = []
+        moved = move
+        for _ in range(3 * len(limit)):
+            over = (self.slope @ moved - limit) / size
+            over[active] = -np.inf
+            worst = int(np.argmax(over))
+            if over[worst] <= 0.0:
+                break
+            active.append(worst)
+            while active:
+                rows = self.slope[active]
+                system, excess = rows @ inverse @ rows.T, rows @ move - limit[active]
+                push = np.linalg.lstsq(system, excess, rcond=1e-12)[0]
+                if push.min() >= 0.0:
+                    break
+                active.pop(int(np.argmin(push)))
+            moved = move - inverse @ self.slope[active].T @ push if active else move
+        return moved

@@ -11,7 +11,7 @@ An iteration of a descent at x, in search coordinates, takes two batches of simu
 Integration steps are chosen for x, are the same for all that is simulated around it, so that
 differences are those of the parameters alone, and are chosen anew when x has moved far. A descent
 has arrived when the quadratic promises no more than a tolerance, or no more is gained; what it
-does then, and where it stalls otherwise, are the strategies of ``recovery``.
+does then, and where it stalls otherwise, are the ``STRATEGIES`` of ``descent``.
 
 The method is Levenberg's ("A method for the solution of certain non-linear problems in least
 squares", Quarterly of Applied Mathematics 2, 1944) as scaled by Marquardt (1963). A descent's
@@ -24,19 +24,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sysid.arrays import FloatArray
-from sysid.fitting import recovery
-from sysid.fitting.descent import FLOORS, PERTURBATIONS, Descent, Integration, Point
+from sysid.fitting.descent import FLOORS, NOTHING, PATIENCE, PERTURBATIONS, Descent, Point, resumed
 from sysid.fitting.objective import Objective, Responses
-from sysid.fitting.quadratic import (
-    CANDIDATES,
-    Candidates,
-    Quadratic,
-    candidates,
-    heavier,
-    lighter,
-    quadratic_at,
-)
-from sysid.fitting.recovery import NOTHING, PATIENCE, resumed
+from sysid.fitting.quadratic import CANDIDATES, Candidates, Quadratic, candidates, heavier
 from sysid.problem.space import SearchSpace
 
 ROUNDING = 1e-12  # errors below it are those of the arithmetic
@@ -48,10 +38,9 @@ _BATCH_BYTES = 2**28  # residuals held at once, unless one descent needs more
 
 @dataclass(frozen=True)
 class Refinement:
-    """Refined chromosome (n_free,), its error, the outputs' errors, and iterations taken.
+    """Refined chromosome (n_free,), its error, and iterations taken.
 
-    rms: (n_outputs,), by a simulation with the steps that the chromosome needs; infinite where
-    it needs more than it is allowed.
+    rms: (n_outputs,), the outputs' errors, infinite where it needs more steps than are allowed.
     """
 
     chromosome: FloatArray
@@ -66,58 +55,50 @@ def refine(
     *,
     max_iterations: int = 50,
     tolerance: float = 1e-7,
-    on_iteration: Callable[[Refinement], None] | None = None,
+    on_iteration: Callable[[Point], None] | None = None,
 ) -> Refinement:
     """Minimise the objective from ``chromosome`` (n_free,) within the ranges and constraints.
 
-    tolerance: share of the error, of a promise or a gain no larger than which a descent has
-    arrived.
+    tolerance: share of the error; a descent that is promised or gains no more has arrived.
     """
-    descent = begin(objective, chromosome)
-    while not descent.finished and descent.iterations < max_iterations:
-        (descent,) = advance(objective, [descent], tolerance)
-        point = descent.point
+
+    def watch(point: Point) -> bool:
         if on_iteration is not None and point.rms is not None and np.isfinite(point.error):
-            at = objective.space.decode(point.at)
-            on_iteration(Refinement(at, point.error, point.rms, descent.iterations))
-    return _refinements(objective, [descent])[0]
+            on_iteration(point)
+        return False
+
+    return refine_each(objective, [chromosome], max_iterations, tolerance, watch)[0]
 
 
 def refine_each(
     objective: Objective,
     chromosomes: Sequence[FloatArray],
-    *,
     max_iterations: int = 50,
     tolerance: float = 1e-7,
-    enough: Callable[[FloatArray], bool] = lambda chromosome: False,
+    enough: Callable[[Point], bool] = lambda point: False,
 ) -> list[Refinement]:
     """The same from each of several chromosomes (n_free,), side by side in the same batches.
 
-    enough: whether a descent that has come to a chromosome (n_free,) need not go on.
+    enough: whether a descent that has come to a point need not go on.
     """
     descents = [begin(objective, chromosome) for chromosome in chromosomes]
     for _ in range(max_iterations):
-        if all(descent.finished for descent in descents):
+        live = [i for i, descent in enumerate(descents) if not descent.finished]
+        if not live:
             break
         descents = advance(objective, descents, tolerance)
-        for i, descent in enumerate(descents):
-            if not descent.finished and enough(objective.space.decode(descent.point.at)):
-                descents[i] = replace(descent, finished=True)
-    return _refinements(objective, descents)
-
-
-def _refinements(objective: Objective, descents: list[Descent]) -> list[Refinement]:
-    """The descents' ends, simulated once more where their integration steps may not have done."""
-    if not descents:
-        return []
+        for i in live:
+            if enough(descents[i].point):
+                descents[i] = replace(descents[i], finished=True)
     points = [descent.point for descent in descents]
-    chromosomes = objective.space.decode(np.stack([point.at for point in points]))
-    lacking = [i for i, point in enumerate(points) if point.accurate_rms is None]
-    anew = iter(objective.rms(chromosomes[lacking]) if lacking else ())
-    errors = [next(anew) if p.accurate_rms is None else p.accurate_rms for p in points]
+    ends = [objective.space.decode(point.at) for point in points]
+    # Simulated once more where their integration steps may not have done.
+    lacking = [end for end, point in zip(ends, points, strict=True) if point.accurate_rms is None]
+    anew = iter(objective.rms(np.stack(lacking)) if lacking else ())
+    rms = [next(anew) if p.accurate_rms is None else p.accurate_rms for p in points]
     return [
-        Refinement(chromosome, descent.point.error, rms, descent.iterations)
-        for chromosome, descent, rms in zip(chromosomes, descents, errors, strict=True)
+        Refinement(end, descent.point.error, errors, descent.iterations)
+        for end, descent, errors in zip(ends, descents, rms, strict=True)
     ]
 
 
@@ -133,14 +114,11 @@ def simulations_per_iteration(objective: Objective) -> int:
 
 
 def curvature(objective: Objective, at: FloatArray) -> FloatArray:
-    """Gauss-Newton Hessian of the error at search coordinates (n_free,), (n_free, n_free).
-
-    Coordinates in parts of the ranges.
-    """
+    """Gauss-Newton Hessian of the error at coordinates (n_free,), in parts of the ranges."""
     (descent,) = _with_steps(objective, [Descent(Point(at))])
     (around,) = _responses(objective, [descent], [_neighbourhood(objective.space, descent)])
     floor = FLOORS[0] * float(objective.error_of(around.rms[:1])[0])
-    return quadratic_at(objective, around, _distance(objective.space, descent), floor).hessian
+    return Quadratic.at(objective, around, _distance(objective.space, descent), floor).hessian
 
 
 def advance(
@@ -170,12 +148,14 @@ def _iterated(objective: Objective, descents: list[Descent], tolerance: float) -
     quadratics = {i: quadratic for i, (_, quadratic) in enumerate(surveys) if quadratic}
     at = np.array([onward[i].point.at for i in quadratics])
     damping = np.array([onward[i].damping for i in quadratics])
-    offers = dict(
-        zip(quadratics, candidates(space, at, damping, list(quadratics.values())), strict=True)
-    )
-    for i in [i for i, offer in offers.items() if not offer.worth(tolerance)]:
-        onward[i] = resumed(objective, onward[i], recovery.ARRIVED)
-        del offers[i]
+    offers = {}
+    for i, offer in zip(
+        quadratics, candidates(space, at, damping, list(quadratics.values())), strict=True
+    ):
+        if len(offer.coordinates) and not offer.promise <= tolerance:
+            offers[i] = offer
+        else:
+            onward[i] = resumed(objective, onward[i], "arrived")
     rows = [offer.coordinates for offer in offers.values()]
     ends = _responses(objective, [onward[i] for i in offers], rows, keep=False)
     for (i, offer), responses in zip(offers.items(), ends, strict=True):
@@ -186,16 +166,12 @@ def _iterated(objective: Objective, descents: list[Descent], tolerance: float) -
 def _surveyed(
     objective: Objective, descent: Descent, around: Responses
 ) -> tuple[Descent, Quadratic | None]:
-    """The descent with its point's error, and the quadratic there unless it stalls or ends.
-
-    around: responses of the point and its neighbours.
-    """
+    """The descent with its point's error, and the quadratic there unless it stalls or ends."""
     errors = objective.error_of(around.rms)
     at, error = descent.point.at, float(errors[0])
     if not np.isfinite(error):
-        return resumed(objective, descent, recovery.FAILED), None
-    steps_at = descent.integration.steps_at
-    safe = steps_at is not None and np.array_equal(at, steps_at)
+        return resumed(objective, descent, "failed"), None
+    safe = descent.steps_at is not None and np.array_equal(at, descent.steps_at)
     descent = replace(
         descent,
         point=Point(at, error, around.rms[0], float(around.excess[0])),
@@ -207,7 +183,7 @@ def _surveyed(
         return replace(descent, finished=True), None
     burst = ~(errors[1:] <= _BURST + error)
     if burst.any():
-        braced = resumed(objective, descent, recovery.BURST)
+        braced = resumed(objective, descent, "burst")
         if not braced.finished:
             return braced, None
         # The rest of the parameters go on alone.
@@ -215,9 +191,9 @@ def _surveyed(
     if not np.isfinite(descent.error_of_round):
         descent = replace(descent, error_of_round=error)
     distance = _distance(objective.space, descent)
-    quadratic = quadratic_at(objective, around, distance, descent.floor)
+    quadratic = Quadratic.at(objective, around, distance, descent.floor)
     if not quadratic.leads_somewhere:
-        return resumed(objective, descent, recovery.ARRIVED), None
+        return resumed(objective, descent, "arrived"), None
     return descent, quadratic
 
 
@@ -225,42 +201,42 @@ def _judged(
     objective: Objective, descent: Descent, offer: Candidates, ends: Responses, tolerance: float
 ) -> Descent:
     """The descent after its candidates have been simulated, at the best of them if it gains."""
-    integration = descent.integration
-    assert descent.point.rms is not None and integration.steps_at is not None
+    assert descent.point.rms is not None and descent.steps_at is not None
     rms = np.stack([descent.point.rms, *ends.rms])
     before, *errors = objective.smoothed_error_of(rms, descent.floor).tolist()
     best = int(np.argmin(errors))
     gain = (before - errors[best]) / before
     damping = heavier(descent.damping)
     if gain > 0.0:
-        at, damping = offer.coordinates[best], lighter(float(offer.damping[best]))
+        at, damping = offer.coordinates[best], float(offer.damping[best])
         error = float(objective.error_of(ends.rms[best : best + 1])[0])
         point = Point(at, error, ends.rms[best], float(ends.excess[best]))
-        if np.any(np.abs(at - integration.steps_at) > _FAR * objective.space.width):
-            integration = replace(integration, steps_at=None)
-        descent = replace(descent, point=point, integration=integration, gain=gain)
+        far = np.any(np.abs(at - descent.steps_at) > _FAR * objective.space.width)
+        steps_at = None if far else descent.steps_at
+        descent = replace(descent, point=point, steps_at=steps_at, gain=gain)
     promising = offer.promise > NOTHING
     failed = gain <= 0.0 or (promising and gain < _KEPT * offer.promise)
     failures = descent.failures + 1 if failed else 0
     descent = replace(descent, damping=damping, failures=failures)
     if failures >= PATIENCE and promising:
-        return resumed(objective, descent, recovery.MISLED)
+        return resumed(objective, descent, "misled")
     if failures >= PATIENCE or 0.0 < gain <= tolerance:
-        return resumed(objective, descent, recovery.ARRIVED)
+        return resumed(objective, descent, "arrived")
     return descent
 
 
 def _with_steps(objective: Objective, descents: list[Descent]) -> list[Descent]:
     """The descents with integration steps chosen where they lack them."""
-    lacking = [i for i, descent in enumerate(descents) if descent.integration.steps_at is None]
-    if not lacking:
+    points = [descent.point.at for descent in descents if descent.steps_at is None]
+    if not points:
         return descents
-    at = np.stack([descents[i].point.at for i in lacking])
-    ready = list(descents)
-    needed = objective.steps_needed(objective.space.decode(at)).tolist()
-    for i, steps in zip(lacking, needed, strict=True):
-        ready[i] = replace(ready[i], integration=Integration(tuple(steps), ready[i].point.at))
-    return ready
+    needed = iter(objective.steps_needed(objective.space.decode(np.stack(points))).tolist())
+    return [
+        replace(descent, steps=tuple(next(needed)), steps_at=descent.point.at, braced=0)
+        if descent.steps_at is None
+        else descent
+        for descent in descents
+    ]
 
 
 def _distance(space: SearchSpace, descent: Descent) -> FloatArray:
@@ -277,22 +253,19 @@ def _neighbourhood(space: SearchSpace, descent: Descent) -> FloatArray:
 
 
 def _responses(
-    objective: Objective,
-    descents: list[Descent],
-    coordinates: list[FloatArray],
-    *,
-    keep: bool = True,
+    objective: Objective, descents: list[Descent], rows: list[FloatArray], *, keep: bool = True
 ) -> list[Responses]:
     """Responses of each descent's rows of coordinates, by its steps, all in one batch."""
     if not descents:
         return []
     # Descents of like steps are neighbours, so that they share blocks of the simulation.
-    order = sorted(range(len(descents)), key=lambda i: descents[i].integration.steps)
-    counts = [len(coordinates[i]) for i in order]
-    steps = np.repeat([descents[i].integration.steps for i in order], counts, axis=0)
-    chromosomes = objective.space.decode(np.concatenate([coordinates[i] for i in order]))
-    together = objective.residuals(chromosomes, steps, keep=keep)
+    order = sorted(range(len(descents)), key=lambda i: descents[i].steps)
+    counts = [len(rows[i]) for i in order]
+    steps = np.repeat([descents[i].steps for i in order], counts, axis=0)
+    chromosomes = objective.space.decode(np.concatenate([rows[i] for i in order]))
+    batch = objective.residuals(chromosomes, steps, keep=keep)
     parts: dict[int, Responses] = {}
-    for i, count, end in zip(order, counts, np.cumsum(counts).tolist(), strict=True):
-        parts[i] = together.part(slice(end - count, end))
+    for i, end in zip(order, np.cumsum(counts), strict=True):
+        part = slice(end - len(rows[i]), end)
+        parts[i] = Responses(batch.values[..., part], batch.rms[part], batch.excess[part])
     return [parts[i] for i in range(len(descents))]

@@ -31,11 +31,11 @@ def origin(
     model: ProcessModel, records: Sequence[Dataset], settings: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Origin of a search: its model, records and settings."""
-    signals = (model.states, model.inputs, model.outputs, model.parameters)
+    signals = repr((model.states, model.inputs, model.outputs, model.parameters))
     origin = {
         "model": {
             "name": model.name,
-            "signals and parameters": _hash(repr(signals).encode()),
+            "signals and parameters": _hash(signals.encode()),
             "equations": fingerprint(model),
         },
         "records": [
@@ -43,7 +43,7 @@ def origin(
                 "name": record.name,
                 "samples": record.n_samples,
                 "sample time": record.dt,
-                "values": _hash(record.inputs.tobytes(), record.outputs.tobytes()),
+                "values": _hash(record.inputs.tobytes() + record.outputs.tobytes()),
             }
             for record in records
         ],
@@ -56,8 +56,7 @@ def origin(
 class Checkpoint:
     """Writes states to a file, whole or not at all, and not more often than makes sense.
 
-    A first writing that fails raises ModelError; later on a full disk is no reason to lose what
-    the search may still find, and is a warning.
+    A first writing that fails raises ModelError; later ones only warn, lest the search be lost.
     """
 
     def __init__(self, path: Path, begun_with: Mapping[str, Any]) -> None:
@@ -77,11 +76,8 @@ class Checkpoint:
         if self._pending is None:
             return
         arrays: dict[str, Any] = {}
-        content = {
-            "format": FORMAT,
-            "begun with": self.begun_with,
-            "state": _packed(self._pending, arrays),
-        }
+        state = _packed(self._pending, arrays)
+        content = {"format": FORMAT, "begun with": self.begun_with, "state": state}
         arrays["json"] = np.array(json.dumps(content))
         temporary = self.path.with_name(f"{self.path.name}.{os.getpid()}.tmp")
         try:
@@ -101,10 +97,7 @@ class Checkpoint:
 
 
 def load(path: Path, begun_with: Mapping[str, Any]) -> State:
-    """The state in a checkpoint of a search of the same origin.
-
-    Raises ModelError when there is none, or when it belongs to other data, settings or model.
-    """
+    """The state in a checkpoint; ModelError if there is none, or of a search of another origin."""
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             content = json.loads(str(archive["json"]))
@@ -123,9 +116,9 @@ def load(path: Path, begun_with: Mapping[str, Any]) -> State:
             return state
     except FileNotFoundError:
         raise ModelError(f"{path}: there is no checkpoint to continue from") from None
+    except ModelError:
+        raise
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
-        if isinstance(error, ModelError):
-            raise
         raise ModelError(f"{path}: not a checkpoint of a search: {error}") from None
 
 
@@ -134,11 +127,9 @@ def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[str]:
     model, name = there["model"], here["model"]["name"]
     if model["name"] != name:
         return [f"it searches model {model['name']}, this is {name}"]
-    lines = [
-        f"the {part} of model {name} have changed"
-        for part in ("equations", "signals and parameters")
-        if model.get(part) != here["model"].get(part)
-    ]
+    parts = ("equations", "signals and parameters")
+    changed = [part for part in parts if model.get(part) != here["model"].get(part)]
+    lines = [f"the {part} of model {name} have changed" for part in changed]
     if len(there["records"]) != len(here["records"]):
         lines.append(f"it has {len(there['records'])} record(s), here are {len(here['records'])}")
     for k, (old, new) in enumerate(zip(there["records"], here["records"], strict=False), 1):
@@ -156,11 +147,8 @@ def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def _hash(*parts: bytes) -> str:
-    key = hashlib.sha256()
-    for part in parts:
-        key.update(part)
-    return key.hexdigest()
+def _hash(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
 
 
 def _packed(value: Any, arrays: dict[str, Any]) -> Any:

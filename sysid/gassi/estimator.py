@@ -1,21 +1,19 @@
 """GASSI as a scikit-learn estimator over any process model."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, Self, get_args
 
 import numpy as np
 from sklearn.utils.validation import check_is_fitted
 
 from sysid.arrays import FloatArray
 from sysid.engine.simulation import BatchSimulator
+from sysid.fitting.descent import Point
 from sysid.fitting.free_run import free_run
 from sysid.fitting.objective import Balance, Objective
-from sysid.fitting.refinement import Refinement
 from sysid.gassi.checkpoint import Checkpoint, load, origin
 from sysid.gassi.genetic_search import PRESETS, GeneticSearch, Preset, PresetName
 from sysid.gassi.likelihood import fit_likelihood
@@ -40,8 +38,8 @@ _NOT_DECIDING = ("model", "threads", "dt")
 class Progress:
     """Progress of a search: generation ``done`` of ``total``, the best error.
 
-    stage: ``search``; ``refine`` while the local refinement spends the rest of them; ``weigh``
-    in the last step by the likelihood, where ``done`` and ``total`` are the iterations so far.
+    stage: ``search``; ``refine``, by the local refinement; ``weigh``, by the likelihood at the
+    end, where ``done`` and ``total`` are the iterations so far.
     """
 
     stage: str
@@ -50,6 +48,7 @@ class Progress:
     error: float
 
 
+@dataclass(repr=False, eq=False)
 class GASSI(RecordEstimator):
     """Identify a process model's parameters with a genetic algorithm.
 
@@ -73,8 +72,7 @@ class GASSI(RecordEstimator):
     weights : {output: weight}, relative importance of the outputs.
     per_log : normalise each record by its own max|y| instead of the maximum over all.
     criterion : what the default preset ends with: ``likelihood`` weighs every output by its own
-        error, so that a noisy one does not decide what a clean one tells better; ``error`` stays
-        with the mean RMSE that the search minimises.
+        error; ``error`` stays with the mean RMSE that the search minimises.
     balance : ``samples``, several records count as one long one; ``logs``, each alike.
     accuracy : normalised RMS error that a simulation aims at.
     max_steps : integration steps a sample may take before a chromosome is flagged.
@@ -95,8 +93,7 @@ class GASSI(RecordEstimator):
     error_ : mean over outputs of the RMSE normalised by max|y| (see ``Objective``).
     search_error_ : the lowest error before local refinement.
     feasible_ : whether all constraints hold.
-    history_ : (n_generations,), the best error after each generation; in the local refinement
-        one is ``population`` simulations.
+    history_ : (n_generations,), the best error after each ``population`` simulations.
     stopped_ : ``generations``, ``converged`` or ``interrupted``.
     flagged_ : {status name: count} of simulations that failed during the search.
     n_simulations_ : simulations of one chromosome on all records.
@@ -120,52 +117,28 @@ class GASSI(RecordEstimator):
     0.2
     """
 
-    def __init__(
-        self,
-        model: ProcessModel | None = None,
-        *,
-        preset: PresetName = "default",
-        population: int = 300,
-        generations: int = 40,
-        ranges: Mapping[str, Range] | None = None,
-        fixed: Mapping[str, float] | None = None,
-        tied: Mapping[str, str] | None = None,
-        scale: Mapping[str, Scale] | None = None,
-        guess: bool = False,
-        elite_percent: float = 0.5,
-        minimum_generations: int = 0,
-        termination_ratio: float = 0.0,
-        weights: Mapping[str, float] | None = None,
-        per_log: bool = False,
-        balance: Balance = "samples",
-        criterion: Criterion = "likelihood",
-        accuracy: float = 1e-3,
-        max_steps: int = 512,
-        threads: int | None = None,
-        random_state: int = 0,
-        dt: float | None = None,
-    ) -> None:
-        self.model = model
-        self.preset = preset
-        self.population = population
-        self.generations = generations
-        self.ranges = ranges
-        self.fixed = fixed
-        self.tied = tied
-        self.scale = scale
-        self.guess = guess
-        self.elite_percent = elite_percent
-        self.minimum_generations = minimum_generations
-        self.termination_ratio = termination_ratio
-        self.weights = weights
-        self.per_log = per_log
-        self.balance = balance
-        self.criterion = criterion
-        self.accuracy = accuracy
-        self.max_steps = max_steps
-        self.threads = threads
-        self.random_state = random_state
-        self.dt = dt
+    model: ProcessModel | None = None
+    _: KW_ONLY
+    preset: PresetName = "default"
+    population: int = 300
+    generations: int = 40
+    ranges: Mapping[str, Range] | None = None
+    fixed: Mapping[str, float] | None = None
+    tied: Mapping[str, str] | None = None
+    scale: Mapping[str, Scale] | None = None
+    guess: bool = False
+    elite_percent: float = 0.5
+    minimum_generations: int = 0
+    termination_ratio: float = 0.0
+    weights: Mapping[str, float] | None = None
+    per_log: bool = False
+    balance: Balance = "samples"
+    criterion: Criterion = "likelihood"
+    accuracy: float = 1e-3
+    max_steps: int = 512
+    threads: int | None = None
+    random_state: int = 0
+    dt: float | None = None
 
     @one_thread()
     def fit(
@@ -177,7 +150,7 @@ class GASSI(RecordEstimator):
         on_progress: Callable[[Progress], None] | None = None,
         checkpoint: Path | None = None,
         resume: Path | None = None,
-    ) -> GASSI:
+    ) -> Self:
         """Search the parameters that make the model follow the records.
 
         X: one Dataset, several of any lengths and rates, or an (n_samples, n_inputs) array
@@ -185,9 +158,9 @@ class GASSI(RecordEstimator):
         (n_samples,), which record each row of the arrays belongs to, default one record. Ctrl-C
         stops the search and keeps the best so far.
 
-        checkpoint: file that the search's whole state is written to as it goes, at most twice a
-        second. resume: such a file to go on from, with the same result as if the search had
-        never stopped; further checkpoints go to the same file unless another is named.
+        checkpoint: file that the search's whole state is written to, at most twice a second.
+        resume: such a file to go on from, to the same result; further checkpoints go to the same
+        file unless another is named.
 
         Raises ModelError when every simulation of the first generation fails, for settings that
         make no sense, or for a checkpoint of other data, settings or model.
@@ -226,8 +199,9 @@ class GASSI(RecordEstimator):
                 if keeper is not None:
                     keeper.save(run.state())
                 self._take(run)
+                stage = "search" if run.local is None else "refine"
                 generation = min(len(run.history), self.generations)
-                notify(Progress(run.stage, generation, self.generations, self.error_))
+                notify(Progress(stage, generation, self.generations, self.error_))
         except KeyboardInterrupt:
             if run.best is None:
                 raise
@@ -241,21 +215,20 @@ class GASSI(RecordEstimator):
         """End with the likelihood instead of the mean RMSE."""
         iterations = itertools.count(1)
 
-        def watch(_: Refinement) -> None:
+        def watch(_: Point) -> None:
             done = next(iterations)
             notify(Progress("weigh", done, done, self.error_))
 
         try:
-            likeliest = fit_likelihood(run.objective, run.minima(), watch)
+            likeliest, self._rivals = fit_likelihood(run.objective, run.minima(), watch)
         except KeyboardInterrupt:
             self.stopped_ = "interrupted"
             return
         self._final_accuracy = likeliest.objective.simulator.accuracy
         objective, chromosome = self._finally_accurate(run.objective), likeliest.chromosome
         error = float(objective.evaluate(chromosome[None])[0][0])
-        self._set(Best(objective.space, chromosome, error, objective.space.feasible(chromosome)))
+        self._set(Best(objective.space, chromosome, error, likeliest.feasible))
         self.output_weights_ = likeliest.objective.weights
-        self._rivals = likeliest.rivals
         self.n_simulations_ = objective.simulations
 
     def predict(self, X: Dataset | FloatArray, *, records: Any = None) -> FloatArray:
@@ -269,13 +242,11 @@ class GASSI(RecordEstimator):
         simulator = self._simulator()
         if isinstance(X, Dataset):
             return free_run(simulator, self.vector_, X)
-        inputs = self._inputs(X, reset=False)
-        q = len(self._model().outputs)
-        parts = []
+        inputs, parts = self._inputs(X, reset=False), []
         for rows in split(len(inputs), records):
             # A simulation needs two rows; of a single one only the start is wanted.
             driven = np.concatenate([inputs[rows], inputs[rows][-1:]])
-            unknown = np.full((len(driven), q), np.nan)
+            unknown = np.full((len(driven), len(simulator.model.outputs)), np.nan)
             record = Dataset(driven, unknown, self._step(None))
             parts.append(free_run(simulator, self.vector_, record)[:-1])
         return self._shaped(np.concatenate(parts))
@@ -291,10 +262,9 @@ class GASSI(RecordEstimator):
     def uncertainty(
         self, X: Data, y: FloatArray | None = None, *, records: Any = None
     ) -> Uncertainty:
-        """Intervals of the parameters, and what the records cannot tell of them.
+        """Intervals of the parameters, and what the records, those of ``fit``, cannot tell.
 
-        X, y, records: those of ``fit``. Raises ModelError where the local refinement did not run
-        to its end: only at a minimum of the error do its sensitivities tell.
+        Raises ModelError where the local refinement did not run to its end, in a minimum.
         """
         return uncertainty(self._final_objective(X, y, records), self.chromosome_, self._rivals)
 
@@ -326,9 +296,8 @@ class GASSI(RecordEstimator):
 
     def _finally_accurate(self, objective: Objective) -> Objective:
         """The objective by simulations of the accuracy that ``fit`` ended with."""
-        if self._final_accuracy < self.accuracy:
-            return objective.finer(self._final_accuracy)
-        return objective
+        accuracy = self._final_accuracy
+        return objective.finer(accuracy) if accuracy < self.accuracy else objective
 
     def _step(self, dt: float | None) -> float:
         if self.dt is None:
@@ -360,27 +329,25 @@ class GASSI(RecordEstimator):
         )
 
     def _preset(self) -> Preset:
-        for kind, choice, choices in (
-            ("criterion", self.criterion, get_args(Criterion)),
-            ("preset", self.preset, PRESETS),
-        ):
+        for kind, choices in (("criterion", get_args(Criterion)), ("preset", PRESETS)):
+            choice = getattr(self, kind)
             if choice not in choices:
                 raise ModelError(f"unknown {kind} {choice!r}; choose from {', '.join(choices)}")
         return PRESETS[self.preset]
 
     def _weights(self) -> FloatArray | None:
-        model = self._model()
         if self.weights is None:
             return None
+        model = self._model()
+        names = model.output_names
         for name, weight in self.weights.items():
-            if name not in model.output_names:
+            if name not in names:
                 raise ModelError(
-                    f"weight for unknown output {name!r}; model {model.name} has "
-                    + ", ".join(model.output_names)
+                    f"weight for unknown output {name!r}; model {model.name} has {', '.join(names)}"
                 )
             if not (np.isfinite(weight) and weight >= 0.0):
                 raise ModelError(f"weight of {name} is {weight}; it must be 0 or more")
-        weights = np.array([float(self.weights.get(name, 1.0)) for name in model.output_names])
+        weights = np.array([float(self.weights.get(name, 1.0)) for name in names])
         if weights.sum() == 0.0:
             raise ModelError("every output has weight 0; at least one must count")
         return weights
@@ -390,16 +357,9 @@ class GASSI(RecordEstimator):
         generations = self.generations
         if preset.refine and generations > 0:
             generations = max(1, round((1.0 - preset.local_share) * generations))
-        search = GeneticSearch(
-            self.space_,
-            preset,
-            self.population,
-            generations,
-            np.random.default_rng(self.random_state),
-            self.elite_percent,
-            self.minimum_generations,
-            self.termination_ratio,
-        )
+        rng = np.random.default_rng(self.random_state)
+        rule = self.elite_percent, self.minimum_generations, self.termination_ratio
+        search = GeneticSearch(self.space_, preset, self.population, generations, rng, *rule)
         return SearchRun(objective, search, self.generations, self.criterion == "likelihood")
 
     def _keeper(
@@ -427,13 +387,10 @@ class GASSI(RecordEstimator):
         self.n_simulations_ = run.objective.simulations
 
     def _set(self, best: Best) -> None:
-        self.space_ = best.space
-        self.chromosome_: FloatArray = best.chromosome
-        self.vector_ = best.space.full(best.chromosome)
+        self.space_, self.chromosome_, self.error_, self.feasible_ = best
+        self.vector_ = self.space_.full(self.chromosome_)
         self.parameters_ = self._named(self.vector_)
-        self.initial_states_ = best.space.named_starts(best.chromosome)
-        self.error_: float = best.error
-        self.feasible_ = best.feasible
+        self.initial_states_ = self.space_.named_starts(self.chromosome_)
 
     def _named(self, vector: FloatArray) -> dict[str, float]:
         return dict(zip(self._model().parameter_names, vector.tolist(), strict=True))

@@ -26,10 +26,9 @@ class Preset:
     operators: ``adaptive`` (Algorithms 2 to 5) or ``classic`` (Algorithm 1). penalty: whether
     infeasible chromosomes are penalised (4.13)-(4.20). log_scale: search parameters marked
     ``log`` by their logarithm. keep_in_range: clip to the ranges' bounds; else the search only
-    starts in the ranges. spread: mutation noise from the ``initial`` population, as written, or
-    from the ``current`` one. stratified: Latin-hypercube start. collapse: share of the initial
-    spread below which the population starts anew, away from the elite. local_share: share of the
-    simulations left to local refinement.
+    starts in the ranges. spread: population that the mutation noise is taken from. stratified:
+    Latin-hypercube start. collapse: share of the initial spread below which the population
+    starts anew, away from the elite. local_share: of the simulations, left to local refinement.
     """
 
     operators: Literal["adaptive", "classic"]
@@ -77,12 +76,9 @@ _UNRANKED = (True, np.inf)  # behind every chromosome that was simulated
 class GeneticSearch:
     """One run of a genetic algorithm over a search space.
 
-    population: chromosomes per generation. generations: how many are evaluated (i_max).
-    elite_percent: r_elite. minimum_generations, termination_ratio: i_min and r_termination of
-    (4.11); a ratio of 0 leaves only the count of generations.
-
-    After each ``tell``: ``elite`` (n_free,), ``elite_error``, ``elite_feasible``, and
-    ``history``, the elite's error per generation.
+    generations: how many are evaluated, i_max. elite_percent: r_elite. minimum_generations,
+    termination_ratio: i_min and r_termination of (4.11); with 0 only the generations count. After
+    each ``tell``: ``elite`` (n_free,), its error and feasibility, and its ``history`` of errors.
     """
 
     space: SearchSpace
@@ -107,8 +103,6 @@ class GeneticSearch:
         self.history: list[float] = []
         self.converged = False
         self._elite_rank = _UNRANKED
-        # The best since the population last started anew, by which it breeds.
-        self._leader: FloatArray | None = None
         self._start()
         self._initial_spread = self._coded.std(axis=0)
         self._kept = np.empty((0, len(self.space.parameters)))
@@ -121,7 +115,9 @@ class GeneticSearch:
         """Draw a population that is independent of the elite, which is kept."""
         draw = operators.stratified if self.preset.stratified else operators.uniform
         self._coded = draw(self.population, *self._box, self.rng)
-        self._leader, self._leader_rank = None, _UNRANKED
+        # The best since then, by which the population breeds.
+        self._leader: FloatArray | None = None
+        self._leader_rank = _UNRANKED
 
     @property
     def _box(self) -> tuple[FloatArray, FloatArray]:
@@ -160,10 +156,7 @@ class GeneticSearch:
             np.clip(self._coded, *self.space.coded_bounds, out=self._coded)
 
     def promising(self, count: int) -> FloatArray:
-        """The best chromosomes yet that lie apart, best first, (at most ``count``, n_free).
-
-        For a preset that goes on with local refinement.
-        """
+        """Of a preset with local refinement, the best that lie apart, (at most count, n_free)."""
         return self.space.decode(self._kept[:count])
 
     def state(self) -> dict[str, Any]:
@@ -186,12 +179,11 @@ class GeneticSearch:
         if len(usable):
             best = usable[np.lexsort((errors[usable], behind[usable]))[0]]
             rank = (bool(behind[best]), float(errors[best]))
-            if self._leader is None or rank < self._leader_rank:
+            if rank < self._leader_rank:
                 self._leader, self._leader_rank = chromosomes[best].copy(), rank
-            if self.elite is None or rank < self._elite_rank:
+            if rank < self._elite_rank:
                 self.elite, self._elite_rank = chromosomes[best].copy(), rank
-                self.elite_error = float(errors[best])
-                self.elite_feasible = bool(feasible[best])
+                self.elite_error, self.elite_feasible = rank[1], bool(feasible[best])
         self.history.append(self.elite_error)
 
     def _keep(self, errors: FloatArray, behind: BoolArray) -> None:
@@ -212,8 +204,7 @@ class GeneticSearch:
     def _check_termination(self) -> None:
         """Running mean of the elite's error since it first changed, (4.10) and (4.11).
 
-        The mean divides by the number of its terms; (4.10) prints one less, which would be
-        undefined in the first generation it applies to.
+        It divides by the number of terms; (4.10) prints one less, undefined for the first.
         """
         i = len(self.history) - 1
         if not np.isfinite(self._first_error):

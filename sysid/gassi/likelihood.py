@@ -1,12 +1,12 @@
 """The last step of an identification: which minimum, by which weights.
 
-The mean of the outputs' RMSEs serves the search. Statistically it is not the figure to end with:
-it lets an output that is noisy, or whose errors wander slowly, decide what another with small
-white errors could tell better. The likelihood of independent normal errors whose variances are
-unknown has its maximum where the product of the RMSEs is least (Ljung, "System Identification",
-section 7.4, with a diagonal covariance): every output then weighs by the inverse of its own error.
-Among minima the likelihood chooses once more, each output counted by as many independent samples
-as the colour of its errors leaves; those that it cannot tell apart are rivals.
+The mean of the outputs' RMSEs serves the search. It is not the figure to end with: it lets an
+output that is noisy, or whose errors wander slowly, decide what another with small white errors
+could tell better. The likelihood of independent normal errors whose variances are unknown has its
+maximum where the product of the RMSEs is least (Ljung, "System Identification", section 7.4, with
+a diagonal covariance): every output then weighs by the inverse of its own error. Among minima the
+likelihood chooses once more, each output counted by as many independent samples as the colour of
+its errors leaves; those that it cannot tell apart are rivals.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,17 +16,13 @@ from functools import cached_property
 import numpy as np
 
 from sysid.arrays import FloatArray
+from sysid.fitting.descent import Point
 from sysid.fitting.free_run import FINER, FINEST
 from sysid.fitting.objective import Objective
-from sysid.fitting.refinement import Refinement, refine, refine_each
+from sysid.fitting.refinement import refine, refine_each
 from sysid.gassi.lookalikes import lookalikes
 from sysid.uncertainty.colour import colour, longest_memory
-from sysid.uncertainty.sensitivity import (
-    Sensitivity,
-    common_steps,
-    coordinate_units,
-    sensitivity,
-)
+from sysid.uncertainty.sensitivity import Sensitivity, coordinate_units, sensitivity
 
 _ROUNDS = 6  # of weights and parameters in turn
 _STEADY = 1e-3  # share by which weights may still change
@@ -48,57 +44,11 @@ _EXPLORED = 2  # minima whose lookalikes are descended from
 # less than this.
 _ONE = 16.0
 
-Watch = Callable[[Refinement], None]
+Watch = Callable[[Point], None]
 
 
 @dataclass(frozen=True)
-class LikelihoodFit:
-    """Where an identification ends.
-
-    objective: with the weights of the likelihood. chromosome: (n_free,). rivals: chromosomes far
-    from it that the data do not tell from it.
-    """
-
-    objective: Objective
-    chromosome: FloatArray
-    rivals: tuple[FloatArray, ...] = ()
-
-
-def fit_likelihood(
-    objective: Objective, minima: Sequence[FloatArray], watch: Watch | None = None
-) -> LikelihoodFit:
-    """The likeliest of some minima (n_free,) of the mean RMSE and of their lookalikes."""
-    objective = _resolved(objective, minima[0])
-    optima = _Optima(objective)
-    for minimum in minima:
-        optima.add(_weighed(objective, minimum, watch))
-    explored: list[_Optimum] = []
-    while len(explored) < _EXPLORED:
-        best = optima.ranked()[0]
-        if any(best is optimum for optimum in explored):
-            break  # nothing better was found around it
-        explored.append(best)
-        for end in refine_each(
-            best.objective,
-            lookalikes(best.objective, best.chromosome),
-            max_iterations=_QUICKLY,
-            tolerance=_ROUGHLY,
-            enough=lambda chromosome: not optima.new(chromosome),
-        ):
-            # By the best one's weights, until it turns out to matter.
-            rough = _optimum(best.objective, end.chromosome, end.rms)
-            if optima.new(end.chromosome) and optima.deviance(rough, best) < _CONCEIVABLE:
-                optima.add(_weighed(objective, end.chromosome, watch))
-    best, *others = optima.ranked()
-    best = _exact(best)
-    rivals = [optimum for optimum in others if optima.deviance(optimum, best) < _TOLD_APART]
-    return LikelihoodFit(
-        best.objective, best.chromosome, tuple(rival.chromosome for rival in rivals)
-    )
-
-
-@dataclass(frozen=True)
-class _Optimum:
+class Optimum:
     """A minimum by its own weights: chromosome (n_free,), the outputs' errors (n_outputs,)."""
 
     objective: Objective
@@ -107,14 +57,48 @@ class _Optimum:
     feasible: bool
 
 
+def fit_likelihood(
+    objective: Objective, minima: Sequence[FloatArray], watch: Watch | None = None
+) -> tuple[Optimum, tuple[FloatArray, ...]]:
+    """The likeliest of some minima (n_free,) of the mean RMSE and of their lookalikes.
+
+    And its rivals: chromosomes far from it that the data do not tell from it.
+    """
+    objective = _resolved(objective, minima[0])
+    optima = _Optima(objective)
+    for minimum in minima:
+        optima.add(_weighed(objective, minimum, watch))
+    explored = None
+    for _ in range(_EXPLORED):
+        best = optima.ranked()[0]
+        if best is explored:
+            break  # nothing better was found around it
+        explored = best
+        for end in refine_each(
+            best.objective,
+            lookalikes(best.objective, best.chromosome),
+            max_iterations=_QUICKLY,
+            tolerance=_ROUGHLY,
+            enough=lambda point: not optima.new(objective.space.decode(point.at)),
+        ):
+            # By the best one's weights, until it turns out to matter.
+            rough = _optimum(best.objective, end.chromosome, end.rms)
+            if optima.new(end.chromosome) and optima.deviance(rough, best) < _CONCEIVABLE:
+                optima.add(_weighed(objective, end.chromosome, watch))
+    best, *others = optima.ranked()
+    best = _exact(best)
+    rivals = [optimum for optimum in others if optima.deviance(optimum, best) < _TOLD_APART]
+    return best, tuple(rival.chromosome for rival in rivals)
+
+
 class _Optima:
     """Minima far from each other, compared by what the data tell at the first."""
 
     def __init__(self, objective: Objective) -> None:
         self._objective = objective
-        self._optima: list[_Optimum] = []
+        self._optima: list[Optimum] = []
 
-    def add(self, optimum: _Optimum) -> None:
+    def add(self, optimum: Optimum) -> None:
         """Add a minimum if it is a new one."""
         if self.new(optimum.chromosome):
             self._optima.append(optimum)
@@ -129,12 +113,12 @@ class _Optima:
                 return False
         return True
 
-    def ranked(self) -> list[_Optimum]:
+    def ranked(self) -> list[Optimum]:
         """The likeliest first, feasible before infeasible."""
         first = self._optima[0]
         return sorted(self._optima, key=lambda o: (not o.feasible, self.deviance(o, first)))
 
-    def deviance(self, optimum: _Optimum, reference: _Optimum) -> float:
+    def deviance(self, optimum: Optimum, reference: Optimum) -> float:
         """Twice the logarithm of the likelihood ratio of the reference and the optimum."""
         floor = _LEAST_SHARE * max(optimum.rms.max(), reference.rms.max(), 1e-300)
         ratio = np.log(np.maximum(optimum.rms, floor) / np.maximum(reference.rms, floor))
@@ -162,16 +146,13 @@ class _Optima:
 
     @cached_property
     def _sensitivity(self) -> Sensitivity:
-        first = self._optima[0]
-        steps = common_steps(first.objective, first.chromosome)
-        return sensitivity(first.objective, first.chromosome, steps)
+        return sensitivity(self._optima[0].objective, self._optima[0].chromosome)
 
 
 def _resolved(objective: Objective, chromosome: FloatArray) -> Objective:
     """The objective with simulations as accurate as they are meant to be, at a chromosome.
 
-    The steps are chosen by what each of them errs. Where little is damped, as in a pendulum that
-    swings freely, such errors add up along the record; twice the steps show by how much.
+    The errors of single steps add up where little is damped; twice the steps show by how much.
     """
     accuracy = objective.simulator.accuracy
     while objective.simulator.accuracy >= FINEST:
@@ -184,7 +165,7 @@ def _resolved(objective: Objective, chromosome: FloatArray) -> Objective:
     return objective
 
 
-def _exact(optimum: _Optimum) -> _Optimum:
+def _exact(optimum: Optimum) -> Optimum:
     """A minimum whose errors are the simulation's, refined with finer simulations."""
     accuracy = optimum.objective.simulator.accuracy
     if optimum.rms.max() > _SIMULATION_SHARE * accuracy:
@@ -194,7 +175,7 @@ def _exact(optimum: _Optimum) -> _Optimum:
     return _optimum(objective, end.chromosome, end.rms)
 
 
-def _weighed(objective: Objective, chromosome: FloatArray, watch: Watch | None) -> _Optimum:
+def _weighed(objective: Objective, chromosome: FloatArray, watch: Watch | None) -> Optimum:
     """The minimum by the inverse of its errors: weights and parameters in turn."""
     given, accuracy = objective.weights, objective.simulator.accuracy
     rms = objective.rms(chromosome[None])[0]
@@ -212,6 +193,6 @@ def _weighed(objective: Objective, chromosome: FloatArray, watch: Watch | None) 
     return _optimum(objective, chromosome, rms)
 
 
-def _optimum(objective: Objective, chromosome: FloatArray, rms: FloatArray) -> _Optimum:
+def _optimum(objective: Objective, chromosome: FloatArray, rms: FloatArray) -> Optimum:
     finite = np.where(np.isfinite(rms), rms, np.finfo(np.float64).max)
-    return _Optimum(objective, chromosome, finite, objective.space.feasible(chromosome))
+    return Optimum(objective, chromosome, finite, objective.space.feasible(chromosome))

@@ -1,13 +1,13 @@
 """Local refinement with jumps: descents from several starts, then from variations of the best.
 
 A record may be explained nearly as well by parameters far apart: resonances that alias under the
-sampling, time constants that swap roles. Descents end in such minima, which lie one or two
-parameters away from one another. So the best minimum is varied, one parameter at a time over its
-whole range, and new descents start from the dips of the error along these lines.
+sampling, time constants that swap roles. Descents end in such minima, one or two parameters away
+from one another. So the best minimum is varied, one parameter at a time over its whole range, and
+new descents start from the dips of the error along these lines.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import InitVar, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,12 +18,10 @@ from sysid.fitting.descent import Descent, Point
 from sysid.fitting.objective import Objective
 
 AT_ONCE = 6  # descents under way together
-# A descent is hopeless when so many iterations more, each as good as its last, would not take it
-# below the best error yet.
-_HORIZON = 10
+_HORIZON = 10  # iterations as good as its last that take a descent with hope below the best error
 _ARRIVED = 3e-4  # share of the error that an iteration gains less than where a descent ends
-# Iterations that simulations are kept for, of the last descent, from the best; and its most. It
-# runs to its end even where the budget was too small for it: only a minimum means anything.
+# Iterations of the last descent that simulations are kept for; and its most, beyond the budget
+# if need be, for only a minimum means anything.
 _POLISHING, _MOST_ITERATIONS = 15, 50
 _SAME = 1e-3  # share by which an output's error differs between minima, or they are one
 _NEAR = 0.02  # share of the best error within which descents and minima count as near it
@@ -38,10 +36,7 @@ _PLAIN_STATE = ("reserve", "polishing", "polished", "best", "error", "feasible")
 
 @dataclass(frozen=True)
 class Minimum:
-    """End of a descent: search coordinates (n_free,), error, how often it has been varied.
-
-    rms: (n_outputs,), the outputs' errors.
-    """
+    """End of a descent, its error and the outputs' (n_outputs,), and how often it was varied."""
 
     at: FloatArray
     error: float
@@ -49,35 +44,29 @@ class Minimum:
     varied: int = 0
 
 
+@dataclass(eq=False)
 class LocalSearch:
     """Descents and jumps, step by step, within a budget of simulations.
 
     starts: (n, n_free) chromosomes, the most promising first. budget: simulations that the
     objective is to have counted in the end. points: of one round of variations, shared by all
-    parameters. rng: draws the variations.
-
-    After each ``step``: ``best`` (n_free,) in search coordinates and its ``error``, feasible
-    before infeasible; ``polished``, whether the search has ended.
+    parameters. After each ``step``: ``best`` (n_free,) in search coordinates and its ``error``,
+    feasible before infeasible; ``polished``, whether the search has ended.
     """
 
-    def __init__(
-        self,
-        objective: Objective,
-        starts: FloatArray,
-        budget: int,
-        points: int,
-        rng: np.random.Generator,
-    ) -> None:
-        self.objective = objective
-        self.budget = budget
-        self.rng = rng
-        self.n_varied = len(objective.space.index)
-        self.points = int(np.clip(points // self.n_varied, _FEWEST_POINTS, _MOST_POINTS))
-        self.iteration_cost = refinement.simulations_per_iteration(objective)
+    objective: Objective
+    starts: InitVar[FloatArray]
+    budget: int
+    points: int
+    rng: np.random.Generator
+
+    def __post_init__(self, starts: FloatArray) -> None:
+        self.n_varied = len(self.objective.space.index)
+        self.points = int(np.clip(self.points // self.n_varied, _FEWEST_POINTS, _MOST_POINTS))
+        self.iteration_cost = refinement.simulations_per_iteration(self.objective)
         affordable = max(1, self.left // (_ITERATIONS_EACH * self.iteration_cost))
-        self.descents = [
-            refinement.begin(objective, start) for start in starts[: min(AT_ONCE, affordable)]
-        ]
+        starts = starts[: min(AT_ONCE, affordable)]
+        self.descents = [refinement.begin(self.objective, start) for start in starts]
         self.reserve = min(_POLISHING * self.iteration_cost, self.left // 3)
         self.polishing = self.polished = False
         self.dips: list[Point] = []
@@ -94,10 +83,9 @@ class LocalSearch:
     def rivals(self, count: int) -> list[FloatArray]:
         """Search coordinates (n_free,) of the likeliest minima hardly worse than the best.
 
-        Feasible before infeasible, then by the mean logarithm of the outputs' errors, which is
-        the likelihood.
+        Feasible before infeasible, then by the likelihood, the mean logarithm of outputs' errors.
         """
-        rms = self.objective.rms(self.objective.space.decode(self.best[None]))[0]
+        rms = self._rms(self.best)
         near = [
             minimum
             for minimum in self.minima
@@ -161,51 +149,50 @@ class LocalSearch:
     def _descend(self) -> None:
         affordable = (self.left - self.reserve) // self.iteration_cost
         moved = refinement.advance(self.objective, self.descents[:affordable], _ARRIVED)
-        self.descents = []
+        live = []
         for descent in moved:
             self._take(descent)
             # What remains to be smoothed matters to the last digits only.
             ended = descent.finished or descent.iterations >= _MOST_ITERATIONS
             if ended or descent.smoothing > 0:
-                point = descent.point
-                self._add(point.at, point.error, point.accurate_rms)
+                self._add(descent.point)
             else:
-                self.descents.append(descent)
-        least = min([self.error, *(descent.point.error for descent in self.descents)])
-        self.descents = [descent for descent in self.descents if not _hopeless(descent, least)]
+                live.append(descent)
+        least = min([self.error, *(descent.point.error for descent in live)])
+        self.descents = [descent for descent in live if not _hopeless(descent, least)]
         if not (self.descents or self.minima):
-            self._add(self.best, self.error)
+            self._add(Point(self.best, self.error))
 
     def _take(self, descent: Descent) -> None:
         """Offer the point that a descent has reached for sure."""
         point = descent.point if descent.finished else descent.safe
         if point is not None:
-            self._offer(point.at, point.error)
+            self._offer(point)
 
-    def _offer(self, at: FloatArray, error: float) -> None:
+    def _offer(self, point: Point) -> None:
         """Keep a point if it is the best yet."""
-        feasible = self._feasible(at)
-        if (not feasible, error) < (not self.feasible, self.error):
-            self.best, self.error, self.feasible = at, error, feasible
+        feasible = self._feasible(point.at)
+        if (not feasible, point.error) < (not self.feasible, self.error):
+            self.best, self.error, self.feasible = point.at, point.error, feasible
 
     def _feasible(self, at: FloatArray) -> bool:
         space = self.objective.space
         return space.feasible(space.decode(at))
 
-    def _add(self, at: FloatArray, error: float, rms: FloatArray | None = None) -> None:
-        """Add a minimum, unless the outputs err as in another; flat directions tell nothing.
+    def _rms(self, at: FloatArray) -> FloatArray:
+        rms: FloatArray = self.objective.rms(self.objective.space.decode(at[None]))[0]
+        return rms
 
-        rms: the outputs' errors, simulated where they are not given.
-        """
-        if rms is None:
-            rms = self.objective.rms(self.objective.space.decode(at[None]))[0]
+    def _add(self, point: Point) -> None:
+        """Add a minimum, unless the outputs err as in another; flat directions tell nothing."""
+        at, error, rms = point.at, point.error, point.accurate_rms
+        rms = self._rms(at) if rms is None else rms
         if not (np.isfinite(error) and np.all(np.isfinite(rms))):
             return
-        self._offer(at, error)
-        for minimum in self.minima:
-            if np.allclose(rms, minimum.rms, rtol=_SAME, atol=_SAME * error):
-                return
-        self.minima.append(Minimum(at, error, rms))
+        self._offer(point)
+        alike = (np.allclose(rms, m.rms, rtol=_SAME, atol=_SAME * error) for m in self.minima)
+        if not any(alike):
+            self.minima.append(Minimum(at, error, rms))
 
     def _vary(self) -> None:
         """New starts around the best of the minima that have been varied least."""
@@ -232,11 +219,7 @@ class LocalSearch:
         ]
 
     def _valleys(self, centre: Minimum) -> list[Point]:
-        """A point either way along each parameter's valley.
-
-        A valley is the way on which the outputs change least as one parameter is changed, the
-        others following, by the sensitivities at the minimum.
-        """
+        """A point either way along each parameter's valley, where outputs change least."""
         lower, width = self.objective.space.coded_lower, self.objective.space.width
         hessian = refinement.curvature(self.objective, centre.at)
         loaded = hessian + _SLACK * np.diag(np.maximum(np.diag(hessian), 1e-300))
@@ -258,12 +241,10 @@ class LocalSearch:
 
 def _hopeless(descent: Descent, least: float) -> bool:
     """Whether a descent will not come near the least error of all."""
+    if descent.iterations < _BEFORE_GIVING_UP or descent.failures == 1:
+        return False  # at its beginning, or about to try again with more damping
     enough, error = (1.0 + _NEAR) * least, descent.point.error
-    if error <= enough or descent.iterations < _BEFORE_GIVING_UP:
-        return False
-    if descent.failures == 1:
-        return False  # about to try again with more damping
-    return error * (1.0 - descent.gain) ** _HORIZON > enough
+    return error > enough and error * (1.0 - descent.gain) ** _HORIZON > enough
 
 
 def _dips(moves: FloatArray, errors: FloatArray, error: float) -> list[int]:

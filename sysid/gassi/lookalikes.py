@@ -4,13 +4,10 @@ Through the sampling: a mode of rate -s +- jw, sampled every dt, has the multipl
 exp((-s +- jw) dt), and so do modes of w + 2 pi k / dt and of 2 pi k / dt - w. A model that rings
 faster than half the sample rate therefore has one minimum for each k, far apart in its parameters.
 And in itself: the mode of a driver and of what it drives stays as it is when their time constants
-swap roles. Such starts for descents need not be searched for, they follow from the eigenvalues of
-the linearised model.
+swap roles. Such starts for descents follow from the eigenvalues of the linearised model.
 """
 
 from __future__ import annotations
-
-import itertools
 
 import numpy as np
 
@@ -31,10 +28,7 @@ _REACHED = 0.02  # part of the frequency by which the end may miss the alias
 
 
 def lookalikes(objective: Objective, chromosome: FloatArray) -> list[FloatArray]:
-    """Chromosomes (n_free,) within the ranges whose fastest mode is this one's or an alias of it.
-
-    The model is linearised where the first record starts.
-    """
+    """Chromosomes (n_free,) in the ranges whose fastest mode is this one's or an alias of it."""
     modes = _Modes(objective, chromosome)
     dt = objective.records[0].dt
     return [*_swaps(objective, chromosome), *_twins(modes), *_aliases(modes, dt)]
@@ -43,20 +37,18 @@ def lookalikes(objective: Objective, chromosome: FloatArray) -> list[FloatArray]
 def _swaps(objective: Objective, chromosome: FloatArray) -> list[FloatArray]:
     """Chromosomes with two parameters of a unit swapped, where that does little harm."""
     space = objective.space
-    units = [parameter.unit for parameter in space.parameters[: len(space.index)]]
-    pairs = [
-        (i, j) for i, j in itertools.combinations(range(len(units)), 2) if units[i] == units[j]
-    ]
+    units = np.array([parameter.unit for parameter in space.parameters[: len(space.index)]])
+    pairs = np.argwhere(np.triu(units[:, None] == units, 1))
+    # The last one is the chromosome itself.
     swapped = np.repeat(chromosome[None], len(pairs) + 1, axis=0)
-    for row, (i, j) in zip(swapped, pairs, strict=False):
-        row[[i, j]] = row[[j, i]]
+    for row, pair in zip(swapped, pairs, strict=False):
+        row[pair] = row[pair[::-1]]
     coded = space.encode(np.maximum(swapped, np.finfo(np.float64).tiny * space.log))
     lower, upper = space.coded_bounds
     admitted = np.all((coded >= lower) & (coded <= upper), axis=1)
     errors, _ = objective.evaluate(np.where(admitted[:, None], swapped, chromosome))
-    # The last one is the chromosome itself.
     kept = admitted & (errors < _HARM * errors[-1])
-    return [swapped[k] for k in np.flatnonzero(kept[:-1])]
+    return list(swapped[:-1][kept[:-1]])
 
 
 def _aliases(modes: _Modes, dt: float) -> list[FloatArray]:
@@ -78,14 +70,13 @@ def _twins(modes: _Modes) -> list[FloatArray]:
     mode = modes.fastest
     places = np.repeat(modes.acting[:_TURNED], len(_TURNS))
     at, _ = modes.here(len(places))
-    rows = np.arange(len(places))
-    at[rows, places] += np.tile(_TURNS, len(places) // len(_TURNS)) * modes.width[places]
-    moved, (lower, upper) = at[rows, places], modes.bounds
+    turned = np.arange(at.shape[1]) == places[:, None]
+    at[turned] += np.tile(_TURNS, len(places) // len(_TURNS)) * modes.width[places]
+    moved, (lower, upper) = at[turned], modes.bounds
     inside = (moved >= lower[places]) & (moved <= upper[places])
-    at, places = at[inside], places[inside]
+    at, rest = at[inside], ~turned[inside]
     if not len(at):
         return []
-    rest = np.arange(at.shape[1]) != places[:, None]
     targets = np.full(len(at), mode)
     at, values = modes.towards(targets, at, modes.nearest(at, targets), rest, _STAGES * _ITERATIONS)
     return list(modes.space.decode(at[np.abs(values - mode) < _REACHED * abs(mode)]))
@@ -100,28 +91,25 @@ def _aliased(frequency: float, dt: float) -> FloatArray:
     apart = np.abs(aliases - frequency) > 1e-6 * frequency
     near = (aliases < _REACH * frequency) & (aliases > frequency / _REACH)
     aliases = np.unique(aliases[apart & near])
-    order = np.argsort(np.abs(np.log(aliases / frequency)))
-    nearest: FloatArray = aliases[order][:_MOST_ALIASES]
-    return nearest
+    nearest: FloatArray = aliases[np.argsort(np.abs(np.log(aliases / frequency)))]
+    return nearest[:_MOST_ALIASES]
 
 
 class _Modes:
-    """Eigenvalues of the linearised model over the search coordinates.
+    """Eigenvalues of the model linearised at the first record's start, by search coordinates.
 
-    start: search coordinates (n_free,) of the minimum. fastest: the eigenvalue there of largest
-    imaginary part, or of largest size where nothing oscillates. acting: places of the parameters
-    that act on it, the strongest first; differences of the rest are not taken.
+    start: those of the minimum, (n_free,). fastest: the eigenvalue there of largest imaginary
+    part, or of largest size where nothing oscillates. acting: places of the parameters that act
+    on it, the strongest first; differences of the rest are not taken.
     """
 
     def __init__(self, objective: Objective, chromosome: FloatArray) -> None:
         self.space, self.model = objective.space, objective.simulator.model
         record = objective.records[0]
-        initial_state = record.initial_state(self.model)
-        self.x = self.space.starts(chromosome[None], 0, initial_state)[0]
-        self.u = record.inputs[0]
-        self.start = self.space.encode(chromosome)
+        declared = record.initial_state(self.model)
+        self.x, self.u = self.space.starts(chromosome[None], 0, declared)[0], record.inputs[0]
+        self.start, self.width = self.space.encode(chromosome), self.space.width
         self.bounds = self.space.coded_bounds
-        self.width = self.space.width
         (values,) = self._eigenvalues(self.start[None])
         speeds = values.imag if values.imag.max() > 0.0 else np.abs(values)
         self.fastest = complex(values[np.argmax(speeds)])
@@ -143,11 +131,7 @@ class _Modes:
         moving: BoolArray,
         iterations: int = _ITERATIONS,
     ) -> tuple[FloatArray, ComplexArray]:
-        """Coordinates and modes after Newton steps that bring modes to targets.
-
-        Of all such steps the least, in parts of the ranges. at, moving: (n, n_free); values,
-        targets: (n,).
-        """
+        """Coordinates (n, n_free) and modes (n,) after the least Newton steps to the targets."""
         for _ in range(iterations):
             slopes = np.where(moving[:, None], self.slopes(at, values), 0.0)
             miss = np.stack([(targets - values).real, (targets - values).imag], axis=1)

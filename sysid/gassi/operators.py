@@ -1,9 +1,8 @@
 """Operators of the genetic algorithms: initialisation, fitness, crossover, mutation, elitism.
 
 A population is (n, n_free). The adaptive operators change it in place, chromosome after
-chromosome, as Algorithms 4 and 5 are written. (Their superscripts i and i+1 are the population
-before and after the step: taken literally, the mutation's right-hand side would undo the
-crossover.)
+chromosome. (The superscripts i and i+1 of Algorithms 4 and 5 are the population before and after
+the step: taken literally, the mutation's right-hand side would undo the crossover.)
 """
 
 import numpy as np
@@ -54,10 +53,7 @@ def adaptive_crossover(
 def adaptive_mutation(
     population: FloatArray, fitness: FloatArray, sigma: FloatArray, rng: np.random.Generator
 ) -> None:
-    """Algorithm 5: chromosomes less fit than a common threshold r get r times normal noise.
-
-    sigma: (n_free,), standard deviation of the noise of each parameter.
-    """
+    """Algorithm 5: those less fit than a common threshold r get r times normal noise of sigma."""
     n = len(population)
     threshold, fit = rng.random(), fitness.tolist()
     for a in rng.integers(n, size=n).tolist():

@@ -6,18 +6,15 @@ paper, the paper is followed: (4.15) uses max(0, |h| - delta), and the outer cas
 compare the worst infeasible error with the best and scale by the population's highest error.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from sysid.arrays import BoolArray, FloatArray
+from sysid.arrays import FloatArray
 
 
 def infeasibility(violations: FloatArray) -> FloatArray:
     """Infeasibility score (4.16) in [0, 1] of each chromosome, (n,).
 
-    violations: (n, n_constraints), c_k of (4.15). Each constraint counts relative to its
-    largest violation in the population.
+    violations: (n, n_constraints), c_k of (4.15), each relative to its largest in the population.
     """
     if violations.shape[1] == 0:
         return np.zeros(len(violations))
@@ -32,20 +29,10 @@ def infeasibility(violations: FloatArray) -> FloatArray:
     return score
 
 
-@dataclass(frozen=True)
-class Indicators:
-    """Rows of the chromosomes that set the penalty's scale."""
+def find_indicators(errors: FloatArray, scores: FloatArray) -> tuple[int, int, int]:
+    """Rows of the best, worst infeasible and highest-error chromosome, section 4.1.3.3.
 
-    best: int
-    worst_infeasible: int
-    highest_error: int
-
-
-def find_indicators(errors: FloatArray, scores: FloatArray) -> Indicators:
-    """Best, worst infeasible and highest-error chromosome, section 4.1.3.3.
-
-    errors: (n,), finite where simulated; scores: (n,), infeasibility. At least one error must
-    be finite and one score positive.
+    At least one error must be finite and one infeasibility score positive.
     """
     rows = np.flatnonzero(np.isfinite(errors))
     infeasible = rows[scores[rows] > 0.0]
@@ -56,37 +43,31 @@ def find_indicators(errors: FloatArray, scores: FloatArray) -> Indicators:
         worst = min(below, key=lambda j: (-scores[j], errors[j]))
     else:
         worst = min(infeasible, key=lambda j: (-scores[j], -errors[j]))
-    return Indicators(best, int(worst), int(rows[np.argmax(errors[rows])]))
+    return best, int(worst), int(rows[np.argmax(errors[rows])])
 
 
 def penalise(errors: FloatArray, violations: FloatArray) -> FloatArray:
     """Errors with the penalties (4.18) and (4.19) added to infeasible chromosomes, (n,).
 
-    Errors that are not finite (flagged simulations) pass through and take no part in the
-    scale, so that one NaN does not switch the penalty off.
+    Errors that are not finite (flagged simulations) pass through and take no part in the scale.
     """
     scores = infeasibility(violations)
-    infeasible: BoolArray = np.isfinite(errors) & (scores > 0.0)
+    infeasible = np.isfinite(errors) & (scores > 0.0)
     if not infeasible.any():
         return errors.copy()
-    at = find_indicators(errors, scores)
-    best, worst, highest = errors[at.best], errors[at.worst_infeasible], errors[at.highest_error]
-    span = scores[at.worst_infeasible] - scores[at.best]
+    indicators = list(find_indicators(errors, scores))
+    (best, worst, highest), (least, most, _) = errors[indicators], scores[indicators]
+    span = most - least
     # (4.17); with every chromosome equally infeasible there is nothing to grade. What is more
-    # infeasible than the worst, which need not be the most infeasible, gets the full penalty:
-    # the exponential of (4.19) would else grow without bound.
-    graded = (scores - scores[at.best]) / span if span > 0.0 else np.zeros_like(scores)
+    # infeasible than the worst gets the full penalty, lest the exponential of (4.19) overflow.
+    graded = (scores - least) / span if span > 0.0 else np.zeros_like(scores)
     graded = np.minimum(graded, 1.0)
     growth = (np.exp(2.0 * graded) - 1.0) / (np.exp(2.0) - 1.0)
-    penalised, severity = errors.copy(), _severity(best, worst, highest)
+    # gamma_penal of (4.20) brings the worst infeasible up to the highest error.
+    reference, severity = max(best, worst), 0.0
+    if worst != best and reference > 0.0:
+        severity = (highest - reference) / reference
+    penalised = errors.copy()
     first = errors[infeasible] + graded[infeasible] * max(best - worst, 0.0)  # (4.18)
     penalised[infeasible] = first + severity * np.abs(first) * growth[infeasible]  # (4.19)
     return penalised
-
-
-def _severity(best: float, worst: float, highest: float) -> float:
-    """gamma_penal of (4.20): brings the worst infeasible up to the highest error."""
-    if worst == best:
-        return 0.0
-    reference = best if worst <= best else worst
-    return (highest - reference) / reference if reference > 0.0 else 0.0

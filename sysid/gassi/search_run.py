@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,8 +20,7 @@ from sysid.problem.space import SearchSpace
 _MOST_RIVALS, _ITERATIONS_EACH = 2, 20
 
 
-@dataclass(frozen=True)
-class Best:
+class Best(NamedTuple):
     """The best chromosome (n_free,) of a space, its error, and whether constraints hold."""
 
     space: SearchSpace
@@ -35,9 +34,8 @@ class SearchRun:
     """A genetic search and the local search that follows it.
 
     likelihood: whether simulations are kept for telling minima apart by their likelihood.
-    history: the best error after each generation, one being as many simulations as the
-    population has chromosomes; the last with what exceeded the budget. flagged: simulations
-    that failed in the genetic search, by status.
+    history: the best error after each generation, of as many simulations as the population has
+    chromosomes; the last with what exceeded the budget. flagged: failures of the genetic search.
     """
 
     objective: Objective
@@ -56,37 +54,26 @@ class SearchRun:
         return self.local is not None and self.local.polished
 
     @property
-    def stage(self) -> str:
-        """``search`` or ``refine``."""
-        return "search" if self.local is None else "refine"
-
-    @property
     def best(self) -> Best | None:
         """The best yet, None before the first generation; starts are estimated only locally."""
-        search, space = self.search, self.objective.space
+        search, local, space = self.search, self.local, self.objective.space
         if search.elite is None:
             return None
+        if local is not None and self._locally_better(local):
+            return Best(space, space.decode(local.best), local.error, local.feasible)
         elite = space.with_nominal_starts(search.elite)
-        return self._local_best or Best(space, elite, search.elite_error, search.elite_feasible)
+        return Best(space, elite, search.elite_error, search.elite_feasible)
 
-    @property
-    def _local_best(self) -> Best | None:
-        """The best of the local search where it is better than that of the genetic search."""
-        search, local, space = self.search, self.local, self.objective.space
-        if local is None:
-            return None
-        elite_rank = not search.elite_feasible, search.elite_error
-        if not (not local.feasible, local.error) < elite_rank:
-            return None
-        return Best(space, space.decode(local.best), local.error, local.feasible)
+    def _locally_better(self, local: LocalSearch) -> bool:
+        elite_rank = not self.search.elite_feasible, self.search.elite_error
+        return (not local.feasible, local.error) < elite_rank
 
     def minima(self) -> list[FloatArray]:
         """The best chromosome (n_free,) and others far from it that are nearly as good."""
-        best = self.best
-        assert best is not None
-        if self.local is None or self._local_best is None:
-            return [best.chromosome]
-        return [best.space.decode(at) for at in self.local.rivals(_MOST_RIVALS)]
+        assert self.local is not None and self.best is not None
+        if not self._locally_better(self.local):
+            return [self.best.chromosome]
+        return [self.best.space.decode(at) for at in self.local.rivals(_MOST_RIVALS)]
 
     def step(self) -> None:
         """The next generation, or the next step of the local search."""

@@ -1,7 +1,7 @@
-"""What ARX and ARMAX share: identification, free runs and predictions of a linear model."""
+"""ARX and ARMAX models as scikit-learn regressors: identification, free runs, predictions."""
 
 import warnings
-from collections.abc import Sequence
+from dataclasses import KW_ONLY, dataclass
 from typing import Any, Self
 
 import numpy as np
@@ -9,36 +9,36 @@ from sklearn.utils.validation import check_is_fitted
 
 from sysid.arrays import BoolArray, FloatArray
 from sysid.linear.polynomials import Layout, Order, filtered, innovations, poles, reflect_poles
-from sysid.linear.prediction_error import EquationFit, Stack, first_guesses, fit_equation, influence
+from sysid.linear.prediction_error import EquationFit, Stack, fit_equation, influence
 from sysid.problem.data import Dataset
 from sysid.problem.metrics import evaluate
 from sysid.problem.model import ModelError
 from sysid.problem.records import Data, RecordEstimator, given_datasets, split
 from sysid.threads import one_thread
 
-# A response to a start beyond this many times the start is that of an unstable model.
-_GROWN = 1e6
+_GROWN = 1e6  # times its start: a larger response is that of an unstable model
 
 
+@dataclass(repr=False, eq=False)
 class PolynomialModel(RecordEstimator):
     """A(q) y = B(q) u + offset + C(q) e, resting at an operating point before each record."""
 
-    nc: Order = 0
-    offset: bool
-    stable: bool
-    max_iterations = 1
+    _: KW_ONLY
+    offset: bool = True
+    stable: bool = False
 
     def fit(
         self, X: Data, y: FloatArray | None = None, *, records: Any = None, dt: float | None = None
     ) -> Self:
         """Estimate the coefficients from one record or several; warns if the model is unstable.
 
-        X: one Dataset, several of any lengths, or an (n_samples, n_inputs) array with y
-        (n_samples,) or (n_samples, n_outputs), NaN where a sample was lost. records: (n_samples,),
-        which record each row of the arrays belongs to, default one. dt: sample time [s] of the
-        arrays, to refuse Datasets of another one. Raises ModelError for senseless orders or data.
+        X: one Dataset, several of any lengths, or an array (n_samples, n_inputs) with y
+        (n_samples,) or (n_samples, n_outputs), NaN where a sample was lost; then records
+        (n_samples,) tells which record a row belongs to, and dt [s] lets Datasets of another
+        sample time be refused. Raises ModelError for orders or data that make no sense.
         """
-        self._fit_rows(0, X, y, records, dt)
+        with one_thread():
+            self._fit_rows(0, X, y, records, dt)
         if not self.stable_:
             warnings.warn(
                 f"the {type(self).__name__} model is unstable (largest pole {self.radius_:.4g}): "
@@ -51,9 +51,8 @@ class PolynomialModel(RecordEstimator):
     def predict(self, X: Data, *, records: Any = None, dt: float | None = None) -> FloatArray:
         """Free-run outputs of the identified model, (n_samples, n_outputs).
 
-        A Dataset starts from the values of its first ``n_lags_`` rows that make the whole record
-        fit best, so that noise in those rows does no harm. An array X starts from rest like
-        ``simulate``, each of its ``records`` anew; (n_samples,) if the outputs of ``fit`` were.
+        A Dataset starts from the first ``n_lags_`` rows that make the whole record fit best, an
+        array from rest, each of its ``records`` anew; (n_samples,) if the outputs of ``fit`` were.
         """
         check_is_fitted(self)
         datasets = given_datasets(X)
@@ -66,9 +65,9 @@ class PolynomialModel(RecordEstimator):
     def simulate(self, X: FloatArray, initial: FloatArray | None = None) -> FloatArray:
         """Free run from the inputs alone, without noise; (n_samples, n_outputs).
 
-        X: (n_samples, n_inputs). initial: (k, n_outputs), outputs of the first k rows, returned
-        as they are; ``n_lags_`` of them define the start completely. Before the first row inputs
-        are at ``input_mean_`` and outputs at ``initial[0]``, by default ``output_mean_``.
+        initial: (k, n_outputs), outputs of the first k rows, returned as they are; ``n_lags_`` of
+        them define the start. Before the first row inputs are at ``input_mean_`` and outputs at
+        ``initial[0]``, by default ``output_mean_``.
         """
         check_is_fitted(self)
         inputs, q = self._inputs(X, reset=False), len(self.offset_)
@@ -91,18 +90,18 @@ class PolynomialModel(RecordEstimator):
     ) -> FloatArray:
         """Row t: outputs predicted from those up to row t-k and the inputs up to row t.
 
-        X, y: one Dataset, or arrays (n_samples, n_inputs) and (n_samples, n_outputs) of one
-        record. Lost outputs (NaN) are bridged by their prediction. The model starts from rest, so
-        that k >= n_samples gives ``simulate(X)``; no noise is read off the first ``n_lags_`` rows,
-        which have no complete past. Ljung, System Identification, section 3.2.
+        X, y: a Dataset, or the arrays of one record. Lost outputs (NaN) are bridged by their
+        prediction. The model starts from rest, so that k >= n_samples gives ``simulate(X)``; no
+        noise is read off the first ``n_lags_`` rows. Ljung, System Identification, section 3.2.
         """
         check_is_fitted(self)
         if isinstance(k, bool) or not isinstance(k, int | np.integer) or k < 1:
             raise ModelError(f"k is {k!r}; predict 1 or more whole samples ahead")
         datasets = given_datasets(X)
         record = self._single(datasets or self._arrays(X, y, None, None, reset=False))
-        first, drive, past = self.n_lags_, self._drive(record.inputs), self._rest(self.output_mean_)
-        y = np.vstack((past, self._held(record.outputs[:first])))
+        first, drive = self.n_lags_, self._drive(record.inputs)
+        y = self._rested(self.output_mean_, self._held(record.outputs[:first]))
+        past = y[: len(y) - first]
         outputs, errors = innovations(self.A_, self.C_, drive[first:], y, record.outputs[first:])
         y, e = np.vstack((y, outputs)), np.vstack((np.zeros_like(y), errors))
         steps: list[FloatArray] = []
@@ -123,32 +122,28 @@ class PolynomialModel(RecordEstimator):
         """Mean fit % / 100 of free runs like ``predict`` of a Dataset; 1 is perfect."""
         check_is_fitted(self)
         data = given_datasets(X) or self._arrays(X, y, records, dt, reset=False)
-        runs = [(record.outputs, self._follow(self._single([record]))) for record in data]
-        return float(np.nanmean([free_run_fit(*run)[0] for run in runs])) / 100.0
+        fits = [free_run_fit(r.outputs, self._follow(self._single([r])))[0] for r in data]
+        return float(np.nanmean(fits)) / 100.0
 
     def _layout(self, record: Dataset) -> Layout:
-        orders = {name: getattr(self, name) for name in ("offset", "na", "nb", "nc", "nk")}
-        return Layout(record.outputs.shape[1], record.inputs.shape[1], **orders)
+        orders = {name: getattr(self, name, 0) for name in ("na", "nb", "nc", "nk")}
+        return Layout(record.outputs.shape[1], record.inputs.shape[1], offset=self.offset, **orders)
 
-    @one_thread()
     def _fit_rows(
         self, lag: int, X: Data, y: Any = None, records: Any = None, dt: float | None = None
     ) -> None:
-        """Minimise each output's prediction errors over the coefficients of its equation.
-
-        lag: rows left out at the start of each record, to compare orders on the same rows.
-        """
+        """Fit all rows of the records but the first ``lag``, or those without a complete past."""
         self.dt_ = dt
         data = self._records(X, y, records, dt, reset=True)
         if given_datasets(X) is not None:
             check_alike(data)
             self.dt_ = data[0].dt
-        layout, stack = self._layout(data[0]), Stack.of(data)
-        if self.max_iterations < 1:
-            raise ModelError(f"max_iterations is {self.max_iterations}; it must be 1 or more")
-        lag, limit = max(lag, layout.lag), self.max_iterations
+        layout, stack = self._layout(data[0]), Stack(data)
+        lag, limit = max(lag, layout.lag), getattr(self, "max_iterations", 1)
+        if limit < 1:
+            raise ModelError(f"max_iterations is {limit}; it must be 1 or more")
         equations = stack.equations(layout, lag)
-        starts = first_guesses(stack, layout, equations)
+        starts = stack.first_guesses(layout, equations)
         fits = [fit_equation(*row, limit) for row in zip(equations, layout.nc, starts, strict=True)]
         self.theta_ = np.concatenate([np.append(fit.theta, fit.c) for fit in fits])
         A = layout.polynomials(self.theta_)[0]
@@ -164,8 +159,7 @@ class PolynomialModel(RecordEstimator):
             self.theta_[estimated] = np.concatenate([np.append(fit.theta, fit.c) for fit in fits])
         _, self.B_, self.C_, self.offset_ = layout.polynomials(self.theta_)
         self._set_precision(layout, fits, estimated, len(stack.age))
-        self.n_lags_, self.names_ = layout.lag, layout.names
-        self.poles_ = poles(self.A_)
+        self.n_lags_, self.names_, self.poles_ = layout.lag, layout.names, poles(self.A_)
         self.radius_ = float(np.abs(self.poles_).max(initial=0.0))
         self.stable_ = self.radius_ < 1.0
         self.iterations_ = tuple(fit.iterations for fit in fits)
@@ -174,15 +168,11 @@ class PolynomialModel(RecordEstimator):
         self.output_mean_ = self.offset * np.nanmean(stack.outputs, axis=0)
 
     def _set_precision(
-        self, layout: Layout, fits: Sequence[EquationFit], estimated: BoolArray, n: int
+        self, layout: Layout, fits: list[EquationFit], estimated: BoolArray, n: int
     ) -> None:
-        """Of fits of the estimated coefficients to rows among n instants.
-
-        Errors of several outputs at one instant may be correlated, although their equations are
-        estimated apart. Ljung, System Identification, sections 9.2 and 9.3.
-        """
+        """Of the estimated coefficients; Ljung, System Identification, sections 9.2 and 9.3."""
         row, q, p = np.nonzero(layout.free)[0], len(fits), len(estimated)
-        # Over all instants, zero at those that an equation was not fitted to.
+        # Over all n instants, for errors of several outputs at one may be correlated.
         present, residual, gain = np.zeros((q, n)), np.zeros((q, n)), np.zeros((p, n))
         used, determined = np.zeros(q), estimated.copy()
         for i, fit in enumerate(fits):
@@ -218,18 +208,17 @@ class PolynomialModel(RecordEstimator):
         """The record to predict, of the model's signals."""
         if len(records) > 1:
             raise ModelError("predictions take one Dataset at a time; call for each")
-        shape = len(self.input_mean_), len(self.offset_)
-        check_signals(records[0], shape, self.dt_, "the model")
+        check_signals(records[0], (len(self.input_mean_), len(self.offset_)), self.dt_, "the model")
         return records[0]
 
     def _drive(self, inputs: FloatArray) -> FloatArray:
         """What inputs and offset add to each row's equation, (n, q)."""
-        rest = self._rest(self.input_mean_)
-        return filtered(self.B_, np.vstack((rest, inputs)))[-len(inputs) :] + self.offset_
+        rested = self._rested(self.input_mean_, inputs)
+        return filtered(self.B_, rested)[-len(inputs) :] + self.offset_
 
-    def _rest(self, row: FloatArray) -> FloatArray:
-        """Rows before a record, all alike."""
-        return np.tile(row, (max(len(self.A_), len(self.B_), len(self.C_)), 1))
+    def _rested(self, rest: FloatArray, rows: FloatArray) -> FloatArray:
+        """Rows of a record after some at rest, as many as any lag needs."""
+        return np.vstack((np.tile(rest, (max(len(self.A_), len(self.B_), len(self.C_)), 1)), rows))
 
     def _held(self, outputs: FloatArray) -> FloatArray:
         """Lost samples replaced by the last one before, else the first after, else the mean."""
@@ -243,16 +232,12 @@ class PolynomialModel(RecordEstimator):
     def _free_run(self, inputs: FloatArray, initial: FloatArray | tuple[()] = ()) -> FloatArray:
         """Free run, (n, q). initial: (k, q) outputs of the first rows, kept as they are."""
         first = np.reshape(initial, (-1, len(self.offset_)))
-        past = np.vstack((self._rest(first[0] if len(first) else self.output_mean_), first))
-        drive = self._drive(inputs)[len(first) :]
-        return np.vstack((first, innovations(self.A_, self.C_, drive, past)[0]))
+        past = self._rested(first[0] if len(first) else self.output_mean_, first)
+        outputs, _ = innovations(self.A_, self.C_, self._drive(inputs)[len(first) :], past)
+        return np.vstack((first, outputs))
 
     def _follow(self, record: Dataset) -> FloatArray:
-        """Free run whose first ``n_lags_`` rows are those that explain the record best, (n, q).
-
-        By least squares on the response to them, each output in units of its residual; where
-        that grows out of proportion, the run starts where it was measured.
-        """
+        """Free run from the first ``n_lags_`` rows that explain the record best, (n, q)."""
         first, na, q = self.n_lags_, len(self.A_) - 1, len(self.offset_)
         plain = self._free_run(record.inputs, self._held(record.outputs[:first]))
         residual = record.outputs - plain
@@ -262,7 +247,7 @@ class PolynomialModel(RecordEstimator):
             unit = np.sqrt(squares.sum(axis=0) / max(len(squares), 1))
         if not first or not np.all((unit > 0.0) & (unit < np.inf)):
             return plain
-        # Free runs, in these units, from one in each value of those rows, without inputs.
+        # Free runs from one unit in each value of those rows, each output in its residual's unit.
         responses = np.zeros((na * q, len(plain), q))
         for run, start in zip(responses, np.eye(na * q), strict=True):
             run[first - na : first] = unit * start.reshape(na, q)
@@ -271,8 +256,7 @@ class PolynomialModel(RecordEstimator):
         if not np.all(np.abs(responses) < _GROWN):
             return plain
         start = np.linalg.lstsq(responses[:, seen].T, (residual / unit)[seen])[0]
-        corrected: FloatArray = plain + unit * np.tensordot(start, responses, axes=1)
-        return corrected
+        return np.asarray(plain + unit * np.tensordot(start, responses, axes=1), dtype=np.float64)
 
 
 def free_run_fit(measured: FloatArray, simulated: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -282,12 +266,11 @@ def free_run_fit(measured: FloatArray, simulated: FloatArray) -> tuple[FloatArra
     return np.where(np.isfinite(simulated).all(axis=0), metrics.fit, -np.inf), metrics.rmse
 
 
-def check_alike(records: Sequence[Dataset]) -> None:
+def check_alike(records: list[Dataset]) -> None:
     """Raise ModelError unless all have the same columns and sample time, and finite outputs."""
     first = records[0]
     for record in records:
-        shape = first.inputs.shape[1], first.outputs.shape[1]
-        check_signals(record, shape, first.dt, first.name)
+        check_signals(record, (first.inputs.shape[1], first.outputs.shape[1]), first.dt, first.name)
         for row in np.flatnonzero(np.isinf(record.outputs).any(axis=1)):
             raise ModelError(
                 f"{record.name}: an output is infinite in row {row}; mark lost samples with NaN"
@@ -307,3 +290,82 @@ def check_signals(record: Dataset, shape: tuple[int, int], dt: float | None, nam
             f"{record.name}: its sample time is {record.dt} s, that of {name} {dt} s; a "
             "difference equation holds for one sample time, so resample the record"
         )
+
+
+@dataclass(repr=False, eq=False)
+class ARX(PolynomialModel):
+    """Identify y(t) + A_1 y(t-1) + ... = B_nk u(t-nk) + ... + offset + e(t) by least squares.
+
+    A and B are full. Biased when the noise is not white; ``ARMAX`` models its colour. Ljung,
+    System Identification, sections 4.2 and 10.1.
+
+    Parameters
+    ----------
+    na : lags of the outputs: one number, or (n_outputs, n_outputs), a row for each equation.
+    nb : coefficients of the inputs: one number, or (n_outputs, n_inputs).
+    nk : samples before an input first acts, as nb. 1 where a row's outputs are latched before
+        its inputs are applied (see ``Dataset``); 0 lets an input act on its own row.
+    offset : estimate a constant for each equation, which carries the operating point.
+    stable : mirror unstable poles in the unit circle and estimate B and offset again.
+
+    Attributes
+    ----------
+    A_, B_ : (n_lags + 1, n_outputs, n_outputs) and (n_lags + 1, n_outputs, n_inputs), by lag.
+    C_, offset_ : (nc + 1, n_outputs), the diagonal of C by lag, and (n_outputs,).
+    A_std_, B_std_, C_std_, offset_std_ : standard errors; infinite if undetermined, NaN if moved.
+    theta_, names_, covariance_ : all coefficients (n,), their names (``a2[0,1]`` weighs
+        y_1(t-2) in the equation of y_0) and covariance (n, n).
+    residuals_, loss_ : per output, the estimate of e in each row fitted, and its mean square, e
+        before each record included. noise_covariance_: (n_outputs, n_outputs).
+    log_likelihood_, aic_, bic_ : Gaussian, over the n_rows_ instants known for every output.
+    poles_, radius_, stable_ : roots of det A, the largest one's size, whether that is below 1.
+    reflected_ : whether ``stable`` had to move poles.
+    input_mean_, output_mean_ : operating point of the start; zero with offset=False.
+    n_lags_, dt_ : rows of a record that have no complete past; sample time [s] or None.
+
+    >>> import numpy as np
+    >>> from scipy.signal import lfilter
+    >>> u = np.tile([1.0, 1.0, -1.0], 20)
+    >>> y = lfilter([0.0, 0.2], [1.0, -0.9], u)  # y(t) = 0.9 y(t-1) + 0.2 u(t-1)
+    >>> model = ARX(na=1, nb=1, offset=False).fit(u[:, None], y)
+    >>> dict(zip(model.names_, model.theta_.round(6).tolist()))
+    {'a1[0,0]': -0.9, 'b1[0,0]': 0.2}
+    """
+
+    na: Order = 2
+    nb: Order = 2
+    nk: Order = 1
+
+
+@dataclass(repr=False, eq=False)
+class ARMAX(PolynomialModel):
+    """Identify A(q) y = B(q) u + offset + C(q) e by minimising one-step prediction errors.
+
+    A and B are full, C is diagonal with its roots inside the unit circle. The noise before a
+    record, or after a gap, is as unknown as any other (``sysid.linear.prediction_error``).
+
+    Parameters
+    ----------
+    na, nb, nk, offset, stable : as of ``ARX``; with ``stable``, C is estimated again too.
+    nc : lags of the noise: one number, or (n_outputs,).
+    max_iterations : of the search for each output's C.
+
+    Attributes
+    ----------
+    iterations_, converged_ : for each output, and whether all were enough; the rest as of ``ARX``.
+
+    >>> import numpy as np
+    >>> from scipy.signal import lfilter
+    >>> u, e = np.random.default_rng(0).normal(size=(2, 500))
+    >>> y = lfilter([0.0, 0.2], [1.0, -0.9], u) + 0.1 * e  # measurement noise: C equals A
+    >>> model = ARMAX(na=1, nb=1, nc=1).fit(u[:, None], y)
+    >>> model.A_[1, 0].round(1), model.C_[1].round(1)
+    (array([-0.9]), array([-0.9]))
+    """
+
+    na: Order = 2
+    nb: Order = 2
+    nc: Order = 2
+    nk: Order = 1
+    _: KW_ONLY
+    max_iterations: int = 50

@@ -10,10 +10,10 @@ import numpy as np
 import scipy.linalg
 from scipy.linalg import blas, lapack
 
-from sysid.arrays import BoolArray, ComplexArray, FloatArray, IntArray
+from sysid.arrays import ComplexArray, FloatArray, IntArray
 from sysid.problem.model import ModelError
 
-# One number for all entries, or a table with one number for each.
+# A number for all entries, or a table with one for each.
 Order = int | Sequence[int] | Sequence[Sequence[int]] | IntArray
 
 _POLE_RADIUS = 0.9999  # largest of a reflected pole, so that one on the circle becomes stable
@@ -21,34 +21,29 @@ _CIRCLE = 1.0 - 1e-12  # from here on a pole is on the circle but for rounding
 
 
 class Layout:
-    """Which coefficients a model of q outputs and m inputs has.
+    """Which coefficients a model of q outputs and m inputs has, of the orders of ``ARMAX``.
 
-    na: (q, q) lags of each output in each equation; nb: (q, m) coefficients of each input;
-    nc: (q,) lags of the noise; nk: (q, m) samples before an input first acts. free: (q, q + m + 2,
-    n_lags + 1), true for a coefficient, by equation, signal that it weighs (minus the outputs,
-    inputs, 1, noise) and its lag; the parameter vector has this order. lag: rows of a record that
-    have no complete past. Raises ModelError for orders that make no sense.
+    free: (q, q + m + 2, n_lags + 1), true for a coefficient, by equation, signal that it weighs
+    (minus the outputs, inputs, 1, noise) and its lag; the parameter vector has this order. lag:
+    rows of a record that have no complete past. Raises ModelError for orders that make no sense.
     """
 
     def __init__(self, q: int, m: int, *, offset: bool, na: Order, nb: Order, nc: Order, nk: Order):
         self.na, self.nb = _table("na", na, (q, q)), _table("nb", nb, (q, m))
         self.nc, self.nk = _table("nc", nc, (q,)), _table("nk", nk, (q, m))
-        last = np.where(self.nb > 0, self.nk + self.nb - 1, -1)
-        self._reach = int(self.na.max()), int(last.max(initial=0)), int(self.nc.max())
-        self.offset, self.lag = bool(offset), max(self._reach[:2])
-        lag = np.arange(max(self._reach) + 1)
-        tables = (
-            (lag > 0) & (lag <= self.na[..., None]),
-            (lag >= self.nk[..., None]) & (lag <= last[..., None]),
-            np.broadcast_to((lag == 0) & self.offset, (q, 1, len(lag))),
-            (lag > 0) & (lag <= self.nc[:, None, None]),
-        )
-        self.free: BoolArray = np.concatenate(tables, axis=1)
-        for row in np.flatnonzero(~self.free.any(axis=(1, 2))):
+        self.offset = bool(offset)
+        first = np.column_stack((np.ones((q, q)), self.nk, np.zeros(q), np.ones(q)))
+        counts = np.column_stack((self.na, self.nb, np.full(q, self.offset), self.nc))
+        lag = np.arange(int((first + counts).max()))
+        self.free = (first[..., None] <= lag) & (lag < (first + counts)[..., None])
+        for row in np.flatnonzero(counts.sum(axis=1) == 0):
             raise ModelError(
                 f"the equation of output {row} has no coefficients: "
                 "give na, nb or nc above 0, or offset=True"
             )
+        reach = np.where(counts > 0, first + counts, 1).max(axis=0).astype(int)
+        self._sizes = int(reach[:q].max()), int(reach[q:-1].max()), int(reach[-1])
+        self.lag = max(self._sizes[:2]) - 1
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -64,7 +59,7 @@ class Layout:
         table[self.free] = theta
         table = table.transpose(2, 0, 1)
         table[0, :, :q], table[0, :, -1] = leading * np.eye(q), leading
-        a, b, c = (reach + 1 for reach in self._reach)
+        a, b, c = self._sizes
         return table[:a, :, :q], table[:b, :, q:-2], table[:c, :, -1], table[0, :, -2]
 
 
@@ -84,11 +79,10 @@ def _table(name: str, order: Order, shape: tuple[int, ...]) -> IntArray:
 
 
 def filtered(P: FloatArray, x: FloatArray) -> FloatArray:
-    """P(q) x from the first row with a complete past on, (n - n_lags, rows); x: (n, columns)."""
+    """P(q) x where its past is complete, (n - n_lags, rows); x: (n, columns)."""
     n = len(x) - len(P) + 1
     terms = [x[len(P) - 1 - lag :][:n] @ matrix.T for lag, matrix in enumerate(P)]
-    total: FloatArray = np.sum(terms, axis=0)
-    return total
+    return np.asarray(np.sum(terms, axis=0), dtype=np.float64)
 
 
 def innovations(
@@ -97,8 +91,8 @@ def innovations(
     """Outputs with lost samples (NaN) predicted, and one-step prediction errors, each (n, q).
 
     drive: (n, q), B(q) u + offset; past: outputs before the first row, n_lags or more, without
-    noise. Where an output is lost its error is zero. The recursion is a triangular banded system
-    of equations, solved by forward substitution: a loop over time at the speed of compiled code.
+    noise. Where an output is lost its error is zero. The recursion is a triangular banded system,
+    solved by forward substitution: a loop over time at the speed of compiled code.
     """
     if not len(drive):
         return drive, drive
@@ -126,10 +120,7 @@ def poles(A: FloatArray) -> ComplexArray:
 
 
 def reflect_poles(A: FloatArray) -> FloatArray:
-    """A(q) with its unstable poles mirrored in the unit circle, p to 1/conj(p).
-
-    The others keep their directions among the outputs too. Zeros in A may fill up.
-    """
+    """A(q) with its unstable poles p mirrored to 1/conj(p); the others keep their directions."""
     if not np.any(np.abs(poles(A)) >= 1.0):
         return A
     lags, q = len(A) - 1, A.shape[1]

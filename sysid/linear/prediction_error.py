@@ -1,31 +1,25 @@
 """Prediction-error minimisation of one output's equation, X theta + C(q) e = y.
 
-1/C(q) started at zero leaves r = e + K h of the noise, where h are the values of e at the nc
-instants before the first, as large as any others: taken for zero, as is common, they bias a C
-that forgets slowly. S = (I + K K')^-1/2 makes r white, S^2 r is the likeliest e, and the
-likelihood, for the best variance of the n values of e, is largest where
+1/C(q) started at zero leaves r = e + K h of the noise, where h are the nc values of e before a
+record, or within a gap: taken for zero, as is common, they bias a C that forgets slowly.
+S = (I + K K')^-1/2 makes r white, S^2 r is the likeliest e, and its likelihood is largest where
 
     loss(theta, c) = |S C^-1 (y - X theta)|^2 det(I + K K')^(1/n)
 
-is least. The first row of a record, or after a gap, has a past of its own (Box & Jenkins, Time
-Series Analysis, chapter 7). theta is eliminated by least squares, so that the search is over the
-few coefficients of C only (variable projection: Golub & Pereyra, Inverse Problems 19 (2003)
-R1-R26, with Kaufman's Jacobian J), by Levenberg and Marquardt's steps
+is least (Box & Jenkins, Time Series Analysis, chapter 7). Least squares eliminate theta (variable
+projection: Golub & Pereyra, Inverse Problems 19 (2003) R1-R26, with Kaufman's Jacobian J), so
+that Levenberg and Marquardt's steps search the few coefficients of C only,
 
     (J'J + D + damping diag(J'J)) step = -slope,    C(q) de/dc_l = -q^-l e,
 
-C's roots kept inside the unit circle. D is what Gauss and Newton's J'J leaves out, which matters
-for roots near the circle, learnt from how the slope changes (Dennis, Gay & Welsch, ACM
-Transactions on Mathematical Software 7 (1981) 348-368). Ljung, System Identification, sections
-7.2 to 7.4 and 10.1 to 10.4.
+C's roots kept inside the unit circle. D, which matters for roots near the circle, is what J'J
+leaves out, learnt from how the slope changes (Dennis, Gay & Welsch, ACM Transactions on
+Mathematical Software 7 (1981) 348-368). Ljung, System Identification, chapters 7 and 10.
 """
 
-from __future__ import annotations
-
-from collections.abc import Sequence
 from functools import cached_property
 from itertools import pairwise
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 import scipy.linalg
@@ -47,32 +41,23 @@ _NOISE_RADIUS = 0.999  # a C that forgets more slowly needs thousands of samples
 Equation = tuple[FloatArray, IntArray]
 
 
-class Stack(NamedTuple):
+class Stack:
     """Records one below the other, each followed by a row of NaN.
 
     outputs: (n, q); signals: (n, q + m + 1), what A, B and the offset weigh: minus the outputs,
     inputs, 1. age: (n,), number of a row in its record, -1 between records.
     """
 
-    outputs: FloatArray
-    signals: FloatArray
-    age: IntArray
-
-    @classmethod
-    def of(cls, records: Sequence[Dataset]) -> Stack:
-        """All rows of the records."""
+    def __init__(self, records: list[Dataset]) -> None:
         tables = [np.column_stack((r.outputs, -r.outputs, r.inputs)) for r in records]
         padded = [np.pad(table, ((0, 1), (0, 1)), constant_values=np.nan) for table in tables]
         table, q = np.vstack(padded), records[0].outputs.shape[1]
         table[:, -1] = 1.0
-        age = [np.append(np.arange(record.n_samples), -1) for record in records]
-        return cls(table[:, :q], table[:, q:], np.concatenate(age))
+        self.outputs, self.signals = table[:, :q], table[:, q:]
+        self.age = np.concatenate([np.append(np.arange(r.n_samples), -1) for r in records])
 
     def equations(self, layout: Layout, lag: int, A: FloatArray | None = None) -> list[Equation]:
-        """Of all outputs, on rows with a past of ``lag`` ones; for a given A, of the rest.
-
-        Raises ModelError when an output has too few rows for its coefficients.
-        """
+        """Of all outputs, on rows with a past of ``lag`` ones; for a given A, of the rest."""
         target, free, equations = self.outputs, layout.free.copy(), []
         if A is not None:
             free[:, : len(A[0])] = False
@@ -91,17 +76,37 @@ class Stack(NamedTuple):
         return equations
 
     def rows(self, free: BoolArray, target: FloatArray, lag: int) -> Equation:
-        """Those with a past of ``lag`` ones in their record and no lost sample.
-
-        free: (q + m + 1, n_lags + 1), signals and lags to weigh; target: (n, k).
-        """
-        weighed, rows = np.argwhere(free), np.flatnonzero(self.age >= lag)
-        columns = np.empty((len(rows), len(weighed) + target.shape[1]), order="F")
-        for i, (signal, delay) in enumerate(weighed):
-            columns[:, i] = self.signals[rows - delay, signal]
-        columns[:, len(weighed) :] = target[rows]
+        """Those with a past of ``lag`` ones and no lost sample; free: signals and lags to weigh."""
+        rows, (signals, lags) = np.flatnonzero(self.age >= lag), np.nonzero(free)
+        weighed = self.signals.T[signals[:, None], rows - lags[:, None]]
+        columns = np.vstack((weighed, target[rows].T)).T
         complete = np.isfinite(columns).all(axis=1)
         return columns[complete], rows[complete]
+
+    def first_guesses(self, layout: Layout, equations: list[Equation]) -> list[list[FloatArray]]:
+        """Of each output's C, none where data are too few: Hannan & Rissanen, Biometrika 69 (1982).
+
+        A long ARX model makes the noise visible, whose past then counts as more measured signals.
+        """
+        (q, m), n, nc = layout.nb.shape, int(np.sum(self.age >= 0)), int(layout.nc.max())
+        # The noise's past must fit into the ARX order, and the ARX model into the data.
+        length = min(max(layout.lag + nc, round(3.0 * np.log(max(n, 2)))), n // (4 * (q + m)))
+        if nc == 0 or length < 1:
+            return [[]] * q
+        nk, guesses, noise = np.minimum(layout.nk, length), [], np.full_like(self.outputs, np.nan)
+        long = Layout(q, m, na=length, nb=length + 1 - nk, nc=0, nk=nk, offset=layout.offset)
+        columns, rows = self.rows(long.free[0, :-1], self.outputs, long.lag)
+        p = columns.shape[1] - q
+        if len(rows) >= 2 * p:
+            noise[rows] = least_squares(columns, p)[1]
+        for nc, e, (columns, rows) in zip(layout.nc, noise.T, equations, strict=True):
+            seen, p, past = np.isfinite(e[rows]), columns.shape[1] - 1 + nc, np.zeros_like(e)
+            past[rows[seen]] = e[rows[seen]]
+            past = past[np.maximum(rows[seen, None] - np.arange(1, nc + 1), -1)]
+            signals = np.column_stack((columns[seen, :-1], past, columns[seen, -1]))
+            enough = nc and len(signals) > p
+            guesses.append([least_squares(signals, p)[0][p - nc :, 0]] if enough else [])
+        return guesses
 
 
 def least_squares(columns: FloatArray, p: int) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -111,8 +116,7 @@ def least_squares(columns: FloatArray, p: int) -> tuple[FloatArray, FloatArray, 
     """
     regressors, target = columns[:, :p], columns[:, p:]
     Q, R = scipy.linalg.qr(columns, mode="economic", check_finite=False)
-    basis: FloatArray = np.asarray(Q[:, :p], dtype=np.float64)
-    factor = R[:p, :p]
+    basis, factor = np.asarray(Q[:, :p], dtype=np.float64), R[:p, :p]
     least = len(columns) * np.finfo(float).eps * np.linalg.norm(factor, axis=0)
     if np.all(np.abs(np.diag(factor)) > least):
         solution = scipy.linalg.solve_triangular(factor, R[:p, p:])
@@ -123,10 +127,9 @@ def least_squares(columns: FloatArray, p: int) -> tuple[FloatArray, FloatArray, 
 
 
 def influence(sensitivity: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Of noise in n rows on parameters, from the rows' sensitivity to them, (n, p).
+    """Of noise in n rows on parameters (p, n), the pseudo-inverse of their sensitivity (n, p).
 
-    Change of each parameter per noise (p, n), the pseudo-inverse; orthonormal combinations of the
-    rows (n, rank) that move any; whether the data tell a parameter at all (p,).
+    And orthonormal directions of the rows (n, rank); whether the data tell a parameter (p,).
     """
     lengths = np.linalg.norm(sensitivity, axis=0)
     lengths[lengths == 0.0] = 1.0
@@ -173,9 +176,8 @@ class EquationFit:
 
     def _inverse(self, columns: FloatArray, trans: Literal["N", "T"] = "N") -> FloatArray:
         """1/C(q) of each column, (n, k), from zero at the start of each run; or its transpose."""
-        right = np.asfortranarray(columns)
-        inverse: FloatArray = lapack.dtbtrs(self._bands, right, uplo="L", trans=trans, diag="U")[0]
-        return inverse
+        inverse, _ = lapack.dtbtrs(self._bands, columns, uplo="L", trans=trans, diag="U")
+        return np.asarray(inverse, dtype=np.float64)
 
     def _whitened(self, columns: FloatArray) -> FloatArray:
         """S of each column, (n, k)."""
@@ -203,13 +205,8 @@ class EquationFit:
         return J.T @ self.residual / self._squares - volume, J.T @ J / self._squares
 
 
-def fit_equation(
-    equation: Equation, nc: int, starts: Sequence[FloatArray], limit: int
-) -> EquationFit:
-    """Maximise the Gaussian likelihood of an equation in so many iterations at most.
-
-    starts: coefficients of C to try beside C = 1.
-    """
+def fit_equation(equation: Equation, nc: int, starts: list[FloatArray], limit: int) -> EquationFit:
+    """Maximise the likelihood of an equation from C = 1 or ``starts``, in so many iterations."""
     n, fit = len(equation[0]), EquationFit(*equation, np.zeros(nc))
     if nc == 0 or fit.loss <= (_ROUNDING * np.linalg.norm(equation[0][:, -1])) ** 2:
         return fit
@@ -219,16 +216,14 @@ def fit_equation(
     for iteration in range(1, limit + 1):
         downhill, curvature = fit.descent
         # What the undamped step promises; the loss rises by 1/n of itself one standard error off.
-        promise = 0.5 * float(downhill @ np.linalg.lstsq(curvature, downhill)[0])
-        if promise <= 0.5 * _TOLERANCE**2 / n:
+        if downhill @ np.linalg.lstsq(curvature, downhill)[0] <= _TOLERANCE**2 / n:
             return fit
         trial = fit
         while trial.loss >= fit.loss:
             if damping > _MOST_DAMPING:
                 # On the rim of the stable region no step helps: that is the minimum there.
                 return fit
-            scale = np.diag(curvature) + 1e-12 * curvature.trace()
-            damped = curvature + damping * np.diag(scale)
+            damped = curvature + damping * np.diag(np.diag(curvature) + 1e-12 * curvature.trace())
             # Only downhill: where what was learnt spoils that, it is left out.
             convex = np.linalg.eigvalsh(damped + learnt)[0] > 0.0
             step = np.linalg.solve(damped + learnt if convex else damped, downhill)
@@ -257,35 +252,6 @@ def _secant(learnt: FloatArray, fit: EquationFit, trial: EquationFit) -> FloatAr
     return learnt + cross + cross.T - (miss @ step) * np.outer(change, change) / along**2
 
 
-def first_guesses(
-    stack: Stack, layout: Layout, equations: Sequence[Equation]
-) -> list[list[FloatArray]]:
-    """Of each output's C, none where data are too few: Hannan & Rissanen, Biometrika 69 (1982).
-
-    A long ARX model makes the noise visible, whose past then counts as more measured signals.
-    """
-    (q, m), n, nc = layout.nb.shape, int(np.sum(stack.age >= 0)), int(layout.nc.max())
-    # The noise's past must fit into the ARX order, and the ARX model into the data.
-    length = min(max(layout.lag + nc, round(3.0 * np.log(max(n, 2)))), n // (4 * (q + m)))
-    if nc == 0 or length < 1:
-        return [[]] * q
-    nk, guesses, noise = np.minimum(layout.nk, length), [], np.full_like(stack.outputs, np.nan)
-    long = Layout(q, m, na=length, nb=length + 1 - nk, nc=0, nk=nk, offset=layout.offset)
-    columns, position = stack.rows(long.free[0, :-1], stack.outputs, long.lag)
-    p = columns.shape[1] - q
-    if len(position) >= 2 * p:
-        noise[position] = least_squares(columns, p)[1]
-    for nc, e, (columns, position) in zip(layout.nc, noise.T, equations, strict=True):
-        seen, p, past = np.isfinite(e[position]), columns.shape[1] - 1 + nc, np.zeros_like(e)
-        rows = position[seen]
-        past[rows] = e[rows]
-        past = past[np.maximum(rows[:, None] - np.arange(1, nc + 1), -1)]
-        signals = np.column_stack((columns[seen, :-1], past, columns[seen, -1]))
-        enough = nc and len(rows) > p
-        guesses.append([least_squares(signals, p)[0][p - nc :, 0]] if enough else [])
-    return guesses
-
-
 def _earlier(before: FloatArray, values: FloatArray) -> FloatArray:
     """Values 1, 2, ... rows earlier, (n, ..., nc); before: (nc, ...), those before the first."""
     joined = np.concatenate((before[::-1], values))
@@ -293,15 +259,11 @@ def _earlier(before: FloatArray, values: FloatArray) -> FloatArray:
 
 
 def _inside(c: FloatArray, mirrored: bool = False) -> FloatArray:
-    """C(q) with roots beyond ``_NOISE_RADIUS`` moved back to it, as a stable predictor needs.
-
-    mirrored: those outside the unit circle become their mirror images; the spectrum stays.
-    """
+    """C(q) with roots beyond ``_NOISE_RADIUS`` moved back to it, or ``mirrored`` at the circle."""
     roots = np.roots(np.concatenate(([1.0], c)))
     size = np.maximum(np.abs(roots), np.finfo(float).tiny)
     if np.all(size <= _NOISE_RADIUS):
         return c
     limit = np.minimum(1.0 / size, _NOISE_RADIUS) if mirrored else _NOISE_RADIUS
     moved = np.where(size > _NOISE_RADIUS, roots / size * limit, roots)
-    coefficients: FloatArray = np.real(np.poly(moved))[1:]
-    return coefficients
+    return np.asarray(np.real(np.poly(moved))[1:], dtype=np.float64)

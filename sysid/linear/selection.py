@@ -20,20 +20,20 @@ from sysid.threads import one_thread
 
 Criterion = Literal["fit", "aic", "bic"]
 Orders = dict[str, Order]
+Grid = Iterable[Order]
+Records = Dataset | Sequence[Dataset]
 
 # Orders that ``tuned`` tries.
 TRIED: dict[str, Any] = {"na": range(1, 7), "nb": range(1, 5), "nc": range(4), "nk": (0, 1)}
-
-_OF_MODEL = ("aic", "bic", "radius", "reflected", "converged")
 
 
 @dataclass(frozen=True)
 class OrderCandidate:
     """One combination of orders and how well it did.
 
-    fit, rmse: (n_outputs,), free run over the validation records, in % and relative to max|y|,
-    NaN without any; score: mean fit / 100; aic, bic: of the training records; radius: size of
-    the largest pole; reflected: poles were moved inside; problem: why it failed, else empty.
+    fit, rmse: (n_outputs,), free run over the validation records, in % and relative to max|y|;
+    score: mean fit / 100; aic, bic: of the training records; radius: size of the largest pole;
+    reflected: poles were moved inside; problem: why it failed, else empty.
     """
 
     orders: Orders
@@ -75,25 +75,24 @@ class Selection:
 
 def select_orders(
     estimator: PolynomialModel,
-    training: Dataset | Sequence[Dataset],
-    validation: Dataset | Sequence[Dataset] | None = None,
+    training: Records,
+    validation: Records | None = None,
     *,
     criterion: Criterion = "fit",
-    na: Iterable[Order] | None = None,
-    nb: Iterable[Order] | None = None,
-    nc: Iterable[Order] | None = None,
-    nk: Iterable[Order] | None = None,
+    na: Grid | None = None,
+    nb: Grid | None = None,
+    nc: Grid | None = None,
+    nk: Grid | None = None,
     threads: int = 1,
 ) -> Selection:
     """Fit every combination of the orders given and choose the best stable one.
 
     estimator: ARX or ARMAX with the settings that stay; orders not given are its own. criterion:
-    ``fit``, the mean free-run fit % over outputs and validation records, as of ``score``, or
-    ``bic`` or ``aic`` of the training records. All candidates are trained and judged on the rows
-    that the longest of them has a past for. Unstable ones are listed last and never chosen;
-    estimators with stable=True mend theirs. threads: the result does not depend on it. Raises
-    ModelError without a validation record for ``fit``, or when no candidate is stable. Ljung,
-    System Identification, section 16.4.
+    ``fit``, the ``score`` over the validation records, or ``bic`` or ``aic`` of the training ones.
+    All candidates are trained and judged on the rows that the longest has a past for. Unstable
+    ones come last and are never chosen; stable=True mends them. The result does not depend on
+    threads. Raises ModelError without a validation record for ``fit``, or when no candidate is
+    stable. Ljung, System Identification, section 16.4.
 
     >>> import numpy as np
     >>> from scipy.signal import lfilter
@@ -119,29 +118,21 @@ def select_orders(
     judge = _Judge(estimator, train, test, lag)
     with one_thread(), ThreadPoolExecutor(threads) as pool:
         candidates = list(pool.map(judge.candidate, grid))
-        # Among equals the one with fewer coefficients.
         candidates.sort(key=lambda candidate: (candidate.cost(criterion), candidate.n_parameters))
         if not np.isfinite(candidates[0].cost(criterion)):
-            problems = [candidate.problem for candidate in candidates if candidate.problem]
-            problem = "is stable: give the estimator stable=True, or try lower na"
-            if problems:
-                problem = f"can be used; the first: {problems[0]}"
-            raise ModelError(f"none of the {len(candidates)} candidates {problem}")
+            problems = [f"can be used; the first: {c.problem}" for c in candidates if c.problem]
+            problems.append("is stable: give the estimator stable=True, or try lower na")
+            raise ModelError(f"none of the {len(candidates)} candidates {problems[0]}")
         return Selection(criterion, tuple(candidates), judge.fitted(candidates[0].orders))
 
 
 def tuned(
-    estimator: PolynomialModel,
-    records: Dataset | Sequence[Dataset],
-    *,
-    held_back: float = 0.3,
-    **orders: Iterable[Order],
+    estimator: PolynomialModel, records: Records, *, held_back: float = 0.3, **orders: Grid
 ) -> Selection:
     """Choose orders by free runs over the ends of the records, then fit them to the whole.
 
-    held_back: the part of each record that the candidates are judged by and not fitted to.
-    orders: as of ``select_orders``; default na to 6, nb to 4, nc to 3, nk 0 and 1. ``model`` of
-    the result is fitted to all of the records. Raises ModelError as ``select_orders``.
+    held_back: the part of each record that candidates are judged by and not fitted to. orders,
+    errors: as of ``select_orders``; default na to 6, nb to 4, nc to 3, nk 0 and 1.
     """
     first, last = [], []
     for record in (data := _datasets("records", records)):
@@ -150,8 +141,7 @@ def tuned(
         last.append(record.part(cut, record.n_samples, record.name))
     grid = {name: TRIED[name] for name in TRIED.keys() & estimator.get_params()}
     selection = select_orders(estimator, first, last, **grid | orders)
-    model = clone(estimator).set_params(**selection.best.orders).fit(data)
-    return replace(selection, model=model)
+    return replace(selection, model=clone(estimator).set_params(**selection.best.orders).fit(data))
 
 
 class _Judge(NamedTuple):
@@ -168,23 +158,22 @@ class _Judge(NamedTuple):
         return model
 
     def candidate(self, orders: Orders) -> OrderCandidate:
-        q = self.training[0].outputs.shape[1]
+        nothing = np.full(self.training[0].outputs.shape[1], np.nan)
         try:
             model = self.fitted(orders)
         except (ModelError, np.linalg.LinAlgError) as error:
-            nothing = np.full(q, np.nan)
             return OrderCandidate(orders, 0, nothing, nothing, problem=str(error))
-        measured = [record.outputs[self.lag :] for record in self.validation]
-        simulated = [model.predict(record)[self.lag :] for record in self.validation]
-        runs = [free_run_fit(*run) for run in zip(measured, simulated, strict=True)]
-        fits, errors = np.reshape(runs, (-1, 2, q)).swapaxes(0, 1)
+        pairs = [(record.outputs, model.predict(record)) for record in self.validation]
+        runs = [free_run_fit(outputs[self.lag :], run[self.lag :]) for outputs, run in pairs]
+        attributes = ("aic", "bic", "radius", "reflected", "converged")
+        fits, errors = np.reshape(runs, (-1, 2, len(nothing))).swapaxes(0, 1)
         return OrderCandidate(
             orders,
             len(model.theta_),
             mean_known(fits, axis=0),
             mean_known(errors, axis=0),
             float(mean_known(fits)) / 100.0,
-            **{name: getattr(model, f"{name}_") for name in _OF_MODEL},
+            **{name: getattr(model, f"{name}_") for name in attributes},
         )
 
 
@@ -198,7 +187,7 @@ def _datasets(name: str, records: Any) -> list[Dataset]:
     return data
 
 
-def _grid(estimator: PolynomialModel, orders: dict[str, Iterable[Order] | None]) -> list[Orders]:
+def _grid(estimator: PolynomialModel, orders: dict[str, Grid | None]) -> list[Orders]:
     settings, grid = estimator.get_params(), {}
     for name, values in orders.items():
         if name in settings:

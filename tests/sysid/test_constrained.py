@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import minimize
 
 from sysid import Constraint, Parameter, SearchSpace
-from sysid.fitting.constraints import Constraints
+from sysid.fitting.quadratic import Constraints
 from tests.sysid.support import lag
 
 

@@ -57,25 +57,22 @@ def test_indicators_when_an_infeasible_one_looks_better_than_the_best():
     # Feasible: 0 (3.0), 1 (2.0). Infeasible below 2.0: rows 2, 3, 4; most infeasible 3 and 4.
     errors = np.array([3.0, 2.0, 0.5, 1.5, 1.0, 9.0])
     scores = np.array([0.0, 0.0, 0.2, 0.6, 0.6, 1.0])
-    found = find_indicators(errors, scores)
     # Of equals the lower error; row 5 is more infeasible but does not look better.
-    assert (found.best, found.worst_infeasible, found.highest_error) == (1, 4, 5)
+    assert find_indicators(errors, scores) == (1, 4, 5)
 
 
 def test_indicators_when_every_infeasible_one_looks_worse():
     errors = np.array([1.0, 5.0, 7.0, 6.0, 8.0])
     scores = np.array([0.0, 1.0, 1.0, 0.5, 0.0])
-    found = find_indicators(errors, scores)
     # Most infeasible, of equals the higher error.
-    assert (found.best, found.worst_infeasible, found.highest_error) == (0, 2, 4)
+    assert find_indicators(errors, scores) == (0, 2, 4)
 
 
 def test_indicators_without_a_feasible_one():
     errors = np.array([5.0, 4.0, 3.0, 6.0])
     scores = np.array([0.2, 0.2, 0.9, 1.0])
-    found = find_indicators(errors, scores)
     # Least infeasible, of equals the lower error.
-    assert (found.best, found.worst_infeasible, found.highest_error) == (1, 2, 3)
+    assert find_indicators(errors, scores) == (1, 2, 3)
 
 
 # --- (4.17)-(4.20) --------------------------------------------------------------------------
@@ -166,11 +163,11 @@ def test_what_looked_better_than_the_best_while_most_infeasible_ends_at_the_high
     scores = infeasibility(violations[:, None])
     if not (violations > 0.0).any() or not (violations == 0.0).any():
         return
-    at = find_indicators(errors, scores)
+    best, worst, _ = find_indicators(errors, scores)
     found = penalise(errors, violations[:, None])
-    if errors[at.worst_infeasible] != errors[at.best]:
-        assert found[at.worst_infeasible] >= errors.max() * (1.0 - 1e-9)
+    if errors[worst] != errors[best]:
+        assert found[worst] >= errors.max() * (1.0 - 1e-9)
     # Nothing infeasible that looked better than the best feasible one still does, if it was
     # as infeasible as the worst.
-    level = (scores >= scores[at.worst_infeasible]) & (scores > 0.0)
-    assert np.all(found[level] >= errors[at.best] * (1.0 - 1e-9))
+    level = (scores >= scores[worst]) & (scores > 0.0)
+    assert np.all(found[level] >= errors[best] * (1.0 - 1e-9))

@@ -17,8 +17,8 @@ from sysid import (
     SearchSpace,
     State,
 )
-from sysid.fitting import recovery
-from sysid.fitting.descent import FLOORS, PERTURBATIONS, Descent, Integration, Point
+from sysid.fitting import descent as stalls
+from sysid.fitting.descent import FLOORS, PERTURBATIONS, Descent, Point
 from sysid.fitting.objective import Objective
 from sysid.fitting.refinement import refine
 from tests.sysid.support import MOTOR, Formula, draw, lag, motor, motor_record
@@ -271,9 +271,9 @@ def without(monkeypatch):
 
     def refine_without(strategy, *problem, **settings):
         with monkeypatch.context() as patch:
-            for stall in ("FAILED", "BURST", "ARRIVED", "MISLED"):
-                strategies = getattr(recovery, stall)
-                patch.setattr(recovery, stall, tuple(s for s in strategies if s is not strategy))
+            for stall, strategies in stalls.STRATEGIES.items():
+                rest = tuple(s for s in strategies if s is not strategy)
+                patch.setitem(stalls.STRATEGIES, stall, rest)
             return refine(*problem, **settings)
 
     return refine_without
@@ -316,7 +316,7 @@ def test_it_retreats_from_where_simulations_fail(without):
     # The error is that of the chromosome: half the record's peak is explained at a gain of 1.
     exact = (2.0 - refined.chromosome[0]) / 2.0 * np.sqrt(np.mean(SINE**2)) / np.abs(SINE).max()
     assert refined.error == pytest.approx(exact, rel=1e-6)
-    lost = without(recovery.retreat, target, np.array([0.3]))
+    lost = without(stalls.retreat, target, np.array([0.3]))
     assert lost.chromosome[0] > 1.5 and not np.isfinite(lost.rms).all()
 
 
@@ -358,7 +358,7 @@ def brink(unbounded=False):
 def test_it_braces_where_the_steps_of_the_descent_fail_beside_it(without):
     refined = refine(brink(), START)
     np.testing.assert_allclose(refined.chromosome, [2.0, 0.0], atol=1e-6)
-    np.testing.assert_array_equal(without(recovery.brace, brink(), START).chromosome, START)
+    np.testing.assert_array_equal(without(stalls.brace, brink(), START).chromosome, START)
 
 
 def test_the_rest_of_the_parameters_go_on_where_one_cannot_be_moved():
@@ -383,7 +383,7 @@ def test_it_coarsens_where_small_perturbations_see_stairs(without):
     )  # fmt: skip
     start = np.array([1.113])
     assert refine(target, start).chromosome[0] == pytest.approx(2.0, abs=2 * STAIR)
-    assert without(recovery.coarsen, target, start).chromosome[0] < 1.0 + 10 * STAIR
+    assert without(stalls.coarsen, target, start).chromosome[0] < 1.0 + 10 * STAIR
 
 
 def test_it_refocuses_after_larger_perturbations(without):
@@ -405,7 +405,7 @@ def test_it_refocuses_after_larger_perturbations(without):
     start = np.array([1.113])
     refined = refine(target, start, tolerance=1e-12)
     assert refined.chromosome[0] == pytest.approx(exact.x, abs=1e-6)
-    biased = without(recovery.refocus, target, start, tolerance=1e-12)
+    biased = without(stalls.refocus, target, start, tolerance=1e-12)
     assert 2e-5 < abs(biased.chromosome[0] - exact.x) < 0.1
 
 
@@ -416,7 +416,7 @@ def test_it_sharpens_the_crease_of_an_output_that_is_explained_exactly(without):
     target = gain_objective(Formula, lambda p, u: p["gain"] * np.column_stack([u, u]), outputs)
     start = np.array([1.0])
     assert refine(target, start).chromosome[0] == pytest.approx(2.0, abs=1e-3)
-    assert without(recovery.sharpen, target, start).chromosome[0] > 2.01
+    assert without(stalls.sharpen, target, start).chromosome[0] > 2.01
 
 
 class Sluggish(Formula):
@@ -436,7 +436,7 @@ def test_it_resolves_what_needs_more_steps_than_where_it_came_from(without):
     target = gain_objective(Sluggish, lambda p, u: p["gain"] * u, outputs[:, None])
     exact, start = SINE @ outputs / (SINE @ SINE), np.array([1.8])
     assert refine(target, start).chromosome[0] == pytest.approx(exact, rel=1e-6)
-    coarse = without(recovery.resolve, target, start)
+    coarse = without(stalls.resolve, target, start)
     assert coarse.chromosome[0] == pytest.approx(exact / 1.01, rel=1e-6)
 
 
@@ -446,15 +446,15 @@ HERE = Point(np.array([math.log(1.8)]), 0.1, np.array([0.1]))
 @pytest.mark.parametrize(
     ("strategy", "state"),
     [
-        (recovery.retreat, {}),
-        (recovery.brace, {"integration": Integration((1,), HERE.at, braced=3)}),
-        (recovery.coarsen, {"level": len(PERTURBATIONS) - 1}),
-        (recovery.sharpen, {}),
-        (recovery.sharpen, {"point": Point(HERE.at, 0.1, np.zeros(1)), "smoothing": 2}),
-        (recovery.resolve, {"integration": Integration((1,), HERE.at + 1e-3)}),
-        (recovery.resolve, {"integration": Integration((3,), HERE.at + 1.0)}),
-        (recovery.refocus, {"level": 0, "error_of_round": 1.0}),
-        (recovery.refocus, {"level": 2, "error_of_round": 0.10001}),
+        (stalls.retreat, {}),
+        (stalls.brace, {"steps": (1,), "steps_at": HERE.at, "braced": 3}),
+        (stalls.coarsen, {"level": len(PERTURBATIONS) - 1}),
+        (stalls.sharpen, {}),
+        (stalls.sharpen, {"point": Point(HERE.at, 0.1, np.zeros(1)), "smoothing": 2}),
+        (stalls.resolve, {"steps": (1,), "steps_at": HERE.at + 1e-3}),
+        (stalls.resolve, {"steps": (3,), "steps_at": HERE.at + 1.0}),
+        (stalls.refocus, {"level": 0, "error_of_round": 1.0}),
+        (stalls.refocus, {"level": 2, "error_of_round": 0.10001}),
     ],
 )
 def test_every_strategy_gives_up_once(strategy, state):
@@ -465,7 +465,7 @@ def test_every_strategy_gives_up_once(strategy, state):
 
 def test_a_descent_ends_on_its_safe_point_when_patience_does():
     safe = Point(np.zeros(1), 0.2)
-    descent = Descent(HERE, safe, failures=recovery.PATIENCE - 2)
-    once = recovery.retreat(None, descent)
+    descent = Descent(HERE, safe, failures=stalls.PATIENCE - 2)
+    once = stalls.retreat(None, descent)
     assert once.point is safe and not once.finished and once.damping > descent.damping
-    assert recovery.retreat(None, once).finished
+    assert stalls.retreat(None, once).finished

@@ -282,8 +282,8 @@ def test_what_acts_only_together_is_told_where_slopes_are_jagged(swinging):
     model, _, noisy = swinging
     space = SearchSpace.of(model).with_starts([noisy])
     objective = Objective(BatchSimulator(model), space, [noisy])
-    settled = fit_likelihood(objective, [np.array([*SWING * 1.3, 1.2, 0.0])])
-    found = uncertainty(settled.objective, settled.chromosome, settled.rivals)
+    settled, rivals = fit_likelihood(objective, [np.array([*SWING * 1.3, 1.2, 0.0])])
+    found = uncertainty(settled.objective, settled.chromosome, rivals)
     (ambiguity,) = found.ambiguities
     assert ambiguity.kind == "product"
     assert set(ambiguity.parameters) == {"inertia", "weight", "viscous", "dry"}
