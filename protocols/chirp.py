@@ -8,7 +8,7 @@ from pydantic import Field
 
 from daq.config.units import Hertz, Seconds
 from daq.hal import FloatArray
-from protocols.waveforms.excitation import Excitation, ExcitedChannel
+from protocols.waveforms import Excitation, ExcitedChannel
 
 
 class ChirpChannel(ExcitedChannel):

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from pydantic import Field
 
@@ -12,10 +12,8 @@ from daq.findings import Findings
 from daq.hal import FloatArray, Samples
 from protocols.analysis.plateau_findings import PlateauFindings
 from protocols.analysis.torque_curve import Motor, levels_of
-from protocols.control import staircase
-from protocols.control.bounds import command_bounds
-from protocols.control.staircase import Drive, Plateau, SettlingTest, Staircase
-from protocols.control.velocity_loop import VelocityLoop
+from protocols.control.loop import VelocityLoop, command_bounds
+from protocols.control.staircase import Plateau, SettlingTest, Staircase, longest, quickest
 
 _OVERSPEED = 1.5  # of the fastest velocity asked for: beyond it something is wrong
 _SPEED_MARGIN = 10.0  # rad/s, the same for slow velocities
@@ -24,7 +22,12 @@ _SPEED_MARGIN = 10.0  # rad/s, the same for slow velocities
 class ConstantVelocity(VelocityLoop):
     """Velocity loop on the motor; torque against velocity at each brake command."""
 
-    columns = staircase.COLUMNS
+    columns: ClassVar[Mapping[str, str]] = {
+        "omega_ref": "rad/s",
+        "omega_tracked": "rad/s",  # from the angle
+        "plateau": "1",  # from 0, -1 behind the last
+        "settled": "1",  # while the velocity is being measured
+    }
 
     velocities: list[RadiansPerSecond] = Field(
         min_length=1, max_length=200, description="visited in this order; negative turns backwards"
@@ -58,31 +61,20 @@ class ConstantVelocity(VelocityLoop):
             for v in self.velocities
         )
 
-    @property
-    def drive(self) -> Drive:
-        """Loop and bounds."""
-        return Drive(
-            gains=self.loop,
-            slope=self.slope,
-            limit=self.motor_limit,
-            fastest=_OVERSPEED * self._fastest + _SPEED_MARGIN,
-            bandwidth=self.speed_filter,
-        )
-
     def plan(self) -> Plan:
         """The longest that it can take, the bounds of its commands, and how far the shaft turns."""
         self._check()
-        visits = self.plateaus, self.drive, self.settling
-        longest = staircase.longest(*visits)
-        n_samples = self.samples_in(longest, "measure")
-        velocity, brake = staircase.quickest(*visits, self.sample_rate)
+        visits = self.plateaus, self.settling, self.slope
+        seconds = longest(*visits)
+        n_samples = self.samples_in(seconds, "measure")
+        velocity, brake = quickest(*visits, self.sample_rate)
         return Plan(
             n_samples,
             *command_bounds(self.motor_limit, self.brake_commands),
             references={"omega_ref": velocity, "cmd_voltage_brake": brake},
             remarks=(
                 f"It takes {len(velocity) / self.sample_rate:.4g} s if every velocity settles at "
-                f"once, {longest:.4g} s at most.",
+                f"once, {seconds:.4g} s at most.",
                 self._travel(),
                 self._strength(),
             ),
@@ -90,25 +82,23 @@ class ConstantVelocity(VelocityLoop):
 
     def controller(self) -> Controller:
         """The staircase's loop."""
-        return Staircase(self.plateaus, self.drive, self.settling)
+        fastest = _OVERSPEED * self._fastest + _SPEED_MARGIN
+        servo = self.servo(fastest, ", and look what drives the shaft if not")
+        return Staircase(self.plateaus, self.settling, servo, self.motor_limit, self.slope)
 
     def findings(self, samples: Samples, extra: Mapping[str, FloatArray]) -> Findings:
         """The torque on each settled plateau, c0 and c1, and what recurs with every turn."""
-        plateaus, motor = self.plateaus, self.motor
+        plateaus = self.plateaus
         levels = levels_of(samples, extra, plateaus)
         if not levels:
             raise ValueError(
                 "no plateau has settled: look at omega_tracked beside omega_ref in log.csv. A load "
                 "on the shaft ends its travel; a brake stronger than the motor holds it"
             )
+        motor = None
+        if self.torque_sensor == "load" and self.ratings.torque_constant is not None:
+            motor = Motor(self.ratings.torque_constant, self.ratings.motor_damping)
         return PlateauFindings(levels, plateaus, motor, self.fit_from, samples, extra).findings()
-
-    @property
-    def motor(self) -> Motor | None:
-        """The motor by its ratings, with the torque sensor at the load."""
-        if self.torque_sensor == "between" or self.ratings.torque_constant is None:
-            return None
-        return Motor(self.ratings.torque_constant, self.ratings.motor_damping)
 
     @property
     def _fastest(self) -> float:

@@ -3,7 +3,8 @@
 import itertools
 import math
 from collections.abc import Mapping
-from typing import Literal, NamedTuple
+from dataclasses import dataclass
+from typing import ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -11,39 +12,26 @@ from pydantic import Field
 from daq.config.units import RadiansPerSecond, Seconds, Volts
 from daq.experiment import Answer, Controller, Plan, Sample
 from daq.findings import Findings
-from daq.hal import FloatArray, IntArray, Samples
-from protocols.analysis.bouc_wen_loop import Cycles
-from protocols.analysis.loop_findings import LoopFindings
-from protocols.control.bounds import command_bounds
-from protocols.control.velocity_loop import VelocityLoop, VelocityServo
-from protocols.waveforms.samples import whole_samples
+from daq.hal import FloatArray, Samples
+from protocols.analysis.hysteresis import Cycles, loop_findings
+from protocols.control.loop import VelocityLoop, VelocityServo, command_bounds
+from protocols.waveforms import whole_samples
 
 _REST = 0.5  # s before and after the cycles of a level
 _BRAKE_SLOPE = 0.5  # V/s
 _OVERSPEED, _SPEED_MARGIN = 2.0, 10.0  # of the amplitude, and rad/s, beyond which a run is ended
 _THERE = 0.95  # of the samples of a cycle that must have arrived for it to count
 
-COLUMNS = {"omega_ref": "rad/s", "omega_tracked": "rad/s", "level": "1", "cycle": "1"}
-"""What is logged: reference, speed from the angle, index of the brake command and number of its
-cycle, both -1 between levels."""
-
-
-class _Schedule(NamedTuple):
-    """Reference [rad/s] and brake command [V] at every tick, and what they are of, (n,) each.
-
-    level: index of the brake command, -1 between levels. cycle: of that level, from 0.
-    """
-
-    velocity: FloatArray
-    brake: FloatArray
-    level: IntArray
-    cycle: IntArray
-
 
 class HysteresisLoop(VelocityLoop):
     """Torque over angle and velocity at each brake command, with the loops' energy and shape."""
 
-    columns = COLUMNS
+    columns: ClassVar[Mapping[str, str]] = {
+        "omega_ref": "rad/s",
+        "omega_tracked": "rad/s",  # from the angle
+        "level": "1",  # index of the brake command, -1 between levels
+        "cycle": "1",  # of the level, -1 between levels
+    }
 
     brake_commands: list[Volts] = Field(
         min_length=1, max_length=50, description="one after the other, the shaft swung at each"
@@ -59,20 +47,25 @@ class HysteresisLoop(VelocityLoop):
 
     def plan(self) -> Plan:
         """How long it takes, what the shaft is asked for, and how far it turns."""
-        schedule = self._schedule()
+        velocity, brake, *_ = self._schedule()
         self.require_torque_constant()
         self.require_strength(self.brake_commands)
-        swing = np.ptp(np.cumsum(schedule.velocity)) / self.sample_rate
+        swing = np.ptp(np.cumsum(velocity)) / self.sample_rate
         return Plan(
-            len(schedule.velocity),
+            len(velocity),
             *command_bounds(self.motor_limit, self.brake_commands),
-            references={"omega_ref": schedule.velocity, "cmd_voltage_brake": schedule.brake},
+            references={"omega_ref": velocity, "cmd_voltage_brake": brake},
             remarks=(f"The shaft swings by {swing:.3g} rad, {swing / (2 * math.pi):.2g} turns.",),
         )
 
     def controller(self) -> Controller:
         """The velocity loop along the schedule."""
-        return _Swing(self, self._schedule())
+        cure = (
+            ". If it ran away at once, the encoder counts the other way round: turn "
+            "sensors.encoder.sign in the rig's file"
+        )
+        servo = self.servo(_OVERSPEED * self.amplitude + _SPEED_MARGIN, cure)
+        return _Swing(servo, self._schedule().T.tolist())
 
     def findings(self, samples: Samples, extra: Mapping[str, FloatArray]) -> Findings:
         """Loops of each brake command, their energy, and what the hysteresis's parameters are."""
@@ -81,21 +74,20 @@ class HysteresisLoop(VelocityLoop):
             raise ValueError(
                 "no level has two cycles behind the first of which nearly all samples were logged"
             )
-        return LoopFindings(
-            levels, len(self.brake_commands), self.ratings.brake_constant, self.torque_sensor
-        ).findings()
+        missing = len(self.brake_commands) - len(levels)
+        return loop_findings(levels, missing, self.ratings.brake_constant, self.torque_sensor)
 
     @property
     def _period_samples(self) -> int:
         return whole_samples("period", self.period, self.sample_rate)
 
-    def _schedule(self) -> _Schedule:
-        """Rest, brake ramp and cycles of each level, and the brake's way back to zero."""
+    def _schedule(self) -> FloatArray:
+        """Velocity [rad/s], brake command [V], level and cycle at every tick, (4, n_samples)."""
         n = self._period_samples
         commands = [0.0, *self.brake_commands, 0.0]
         rests = [self._rest(a, b) for a, b in itertools.pairwise(commands)]
-        n_samples = sum(len(rest.velocity) for rest in rests)
-        n_samples += len(self.brake_commands) * self.cycles * n
+        length = len(self.brake_commands) * self.cycles * n
+        n_samples = length + sum(rest.shape[1] for rest in rests)
         self.samples_in(n_samples / self.sample_rate, "cycles")
         wave = np.sin(2.0 * np.pi * (np.arange(n) / n))
         if self.shape == "triangle":
@@ -104,24 +96,22 @@ class HysteresisLoop(VelocityLoop):
         numbers = np.repeat(np.arange(self.cycles), n)
         parts = [rests[0]]
         for level, (brake, rest) in enumerate(zip(self.brake_commands, rests[1:], strict=True)):
-            held = np.full(len(swing), brake)
-            parts += [_Schedule(swing, held, np.full(len(swing), level), numbers), rest]
-        return _Schedule(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+            parts += [np.stack(np.broadcast_arrays(swing, brake, level, numbers)), rest]
+        return np.concatenate(parts, axis=1)
 
-    def _rest(self, before: float, brake: float) -> _Schedule:
-        """The shaft at rest while the brake goes from one command to another."""
+    def _rest(self, before: float, brake: float) -> FloatArray:
+        """The shaft at rest while the brake goes from one command to another, (4, n)."""
         ramp = round(abs(brake - before) / _BRAKE_SLOPE * self.sample_rate)
         rest = round(_REST * self.sample_rate)
         commands = np.concatenate([np.linspace(before, brake, ramp), np.full(rest, brake)])
-        nowhere = np.full(len(commands), -1)
-        return _Schedule(np.zeros(len(commands)), commands, nowhere, nowhere)
+        return np.stack(np.broadcast_arrays(0.0, commands, -1.0, -1.0))
 
     def _counted_cycles(self, samples: Samples) -> list[Cycles]:
         """Counted cycles of each level; a few lost samples are filled in by straight lines."""
         n, dt = self._period_samples, 1.0 / self.sample_rate
-        schedule, torque, levels = self._schedule(), self._torque(samples), []
+        level, torque, levels = self._schedule()[2], self._torque(samples), []
         for index, command in enumerate(self.brake_commands):
-            first = np.flatnonzero(schedule.level == index)[0] + n * np.arange(1, self.cycles)
+            first = np.flatnonzero(level == index)[0] + n * np.arange(1, self.cycles)
             ticks = first[:, None] + np.arange(n)
             ticks = ticks[np.isin(ticks, samples.tick).mean(axis=1) >= _THERE]
             if len(ticks) < 2:
@@ -142,23 +132,15 @@ class HysteresisLoop(VelocityLoop):
         return constant * samples.current_motor + samples.torque - damped
 
 
+@dataclass(frozen=True)
 class _Swing:
-    """Controller: the velocity loop along a schedule."""
+    """Controller: the velocity loop along a schedule, a row for each tick."""
 
-    def __init__(self, settings: HysteresisLoop, schedule: _Schedule) -> None:
-        self._schedule = [column.tolist() for column in schedule]
-        self._servo = VelocityServo(
-            settings.loop,
-            settings.motor_limit,
-            _OVERSPEED * settings.amplitude + _SPEED_MARGIN,
-            settings.speed_filter,
-            ". If it ran away at once, the encoder counts the other way round: turn "
-            "sensors.encoder.sign in the rig's file",
-        )
+    servo: VelocityServo
+    schedule: list[list[float]]
 
     def answer(self, sample: Sample) -> Answer | None:
         """Commands for the tick's place in the schedule."""
-        velocity, brake, level, cycle = (column[sample.tick] for column in self._schedule)
-        speed = self._servo.track(sample)
-        volts = self._servo.volts(sample.time, velocity, speed)
-        return Answer(volts, brake, (velocity, speed, float(level), float(cycle)))
+        velocity, brake, level, cycle = self.schedule[sample.tick]
+        volts, speed = self.servo.drive(sample, velocity)
+        return Answer(volts, brake, (velocity, speed, level, cycle))

@@ -14,8 +14,7 @@ from pydantic import Field
 
 from daq.config.units import Hertz, Seconds
 from daq.hal import FloatArray, IntArray
-from protocols.waveforms.excitation import Excitation, ExcitedChannel
-from protocols.waveforms.samples import whole_samples
+from protocols.waveforms import Excitation, ExcitedChannel, whole_samples
 
 _GROUP = 4  # odd harmonics of which the odd-random grid leaves one out
 
@@ -108,8 +107,7 @@ class Multisine(Excitation[MultisineChannel]):
         n = self.samples_per_period
         lines = np.zeros(n // 2 + 1, dtype=np.complex128)
         lines[draw.harmonics] = 0.5 * n * np.exp(1j * draw.phases)
-        period: FloatArray = np.fft.irfft(lines, n)
-        return period
+        return np.fft.irfft(lines, n)
 
     def _draw(self, name: str, channel: MultisineChannel) -> Draw:
         """Harmonics, and of several draws of their phases the one with the lowest crest factor."""

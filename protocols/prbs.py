@@ -9,7 +9,7 @@ from daq.config.base import Section
 from daq.config.units import Seconds, Volts
 from daq.experiment import Timed
 from daq.hal import CHANNELS, FloatArray, IntArray
-from protocols.waveforms.samples import whole_samples
+from protocols.waveforms import whole_samples
 
 REGISTER_BITS = 16
 SEQUENCE_LENGTH = 2**REGISTER_BITS - 1
@@ -48,16 +48,17 @@ class Prbs(Timed):
 
     def remarks(self) -> tuple[str, ...]:
         """How evenly each channel is at its two levels."""
-        return tuple(self._evenness(name) for name in CHANNELS if getattr(self, name).amplitude)
-
-    def _evenness(self, name: str) -> str:
-        bits, hold = self._bits(name)
-        ends = np.flatnonzero(np.diff(bits, prepend=-1, append=-1))
-        longest = float(np.diff(ends).max()) * hold / self.sample_rate
-        return (
-            f"{name}: {len(bits)} bits, {100.0 * bits.mean():.0f} % of them high; at one level for "
-            f"{longest:.3g} s at most"
-        )
+        lines = []
+        for name in CHANNELS:
+            if getattr(self, name).amplitude:
+                bits, hold = self._bits(name)
+                ends = np.flatnonzero(np.diff(bits, prepend=-1, append=-1))
+                longest = float(np.diff(ends).max()) * hold / self.sample_rate
+                lines.append(
+                    f"{name}: {len(bits)} bits, {100.0 * bits.mean():.0f} % of them high; at one "
+                    f"level for {longest:.3g} s at most"
+                )
+        return tuple(lines)
 
     def _bits(self, name: str) -> tuple[IntArray, int]:
         """The bits of a channel, and for how many samples each is held."""

@@ -5,7 +5,7 @@ from pydantic import Field
 
 from daq.config.units import Hertz, Radians, Seconds
 from daq.hal import FloatArray
-from protocols.waveforms.excitation import Excitation, ExcitedChannel
+from protocols.waveforms import Excitation, ExcitedChannel
 
 
 class SineChannel(ExcitedChannel):

@@ -1,7 +1,5 @@
 """Levels held for some time, or staircases up and down."""
 
-from typing import NamedTuple
-
 import numpy as np
 from pydantic import Field
 
@@ -9,8 +7,7 @@ from daq.config.base import Section
 from daq.config.units import Seconds, Volts
 from daq.experiment import OpenLoop
 from daq.hal import CHANNELS, FloatArray, IntArray
-from protocols.waveforms.excitation import HeldChannel
-from protocols.waveforms.samples import smooth_rise, whole_samples
+from protocols.waveforms import HeldChannel, smooth_rise, whole_samples
 
 
 class StaircaseLevels(Section):
@@ -39,13 +36,6 @@ class StepsChannel(HeldChannel):
     )
 
 
-class _Sequence(NamedTuple):
-    """Levels (m,) [V] and how many samples each is held (m,)."""
-
-    levels: FloatArray
-    samples: IntArray
-
-
 class Steps(OpenLoop):
     """Steps on each channel; the shorter sequence starts again until the longer is through."""
 
@@ -58,18 +48,18 @@ class Steps(OpenLoop):
     def waveform(self) -> FloatArray:
         """Both channels' levels, (n_samples, 2) [V]; with a ramp the last change is to zero."""
         sequences = self._sequences()
-        n_samples = max(int(sequence.samples.sum()) for sequence in sequences)
+        n_samples = max(int(lengths.sum()) for _, lengths in sequences)
         if n_samples == 0:
             raise ValueError(
                 "motor.levels: neither channel has levels; give levels or a staircase to one"
             )
         self.samples_in(n_samples / self.sample_rate, "motor.hold")
         change = round(self.ramp * self.sample_rate)
-        return np.stack([_played(sequence, n_samples, change) for sequence in sequences], axis=1)
+        return np.stack([_played(*sequence, n_samples, change) for sequence in sequences], axis=1)
 
     def remarks(self) -> tuple[str, ...]:
         """Which channel's sequence is cut, and where."""
-        totals = [int(sequence.samples.sum()) for sequence in self._sequences()]
+        totals = [int(lengths.sum()) for _, lengths in self._sequences()]
         short, long = sorted(totals)
         if not short or long % short == 0:
             return ()
@@ -79,15 +69,16 @@ class Steps(OpenLoop):
             "and is cut at the end",
         )
 
-    def _sequences(self) -> tuple[_Sequence, _Sequence]:
-        return self._sequence("motor", self.motor), self._sequence("brake", self.brake)
+    def _sequences(self) -> list[tuple[FloatArray, IntArray]]:
+        return [self._sequence(name, getattr(self, name)) for name in CHANNELS]
 
-    def _sequence(self, name: str, channel: StepsChannel) -> _Sequence:
+    def _sequence(self, name: str, channel: StepsChannel) -> tuple[FloatArray, IntArray]:
+        """Levels [V] and how many samples each is held, (m,) each."""
         if channel.levels is not None and channel.staircase is not None:
             raise ValueError(f"{name}.staircase: give levels or a staircase, not both")
         levels = channel.staircase.levels if channel.staircase else channel.levels
         if levels is None:
-            return _Sequence(np.array([channel.offset]), np.zeros(1, dtype=np.int64))
+            return np.array([channel.offset]), np.zeros(1, dtype=np.int64)
         if not levels:
             raise ValueError(f"{name}.levels: the list is empty; give at least one level")
         key = f"{name}.hold"
@@ -100,7 +91,7 @@ class Steps(OpenLoop):
                 "number for all"
             )
         samples = [self._held(key, seconds) for seconds in holds]
-        return _Sequence(channel.offset + np.array(levels), np.array(samples))
+        return channel.offset + np.array(levels), np.array(samples)
 
     def _held(self, key: str, seconds: float) -> int:
         """Samples that a level is held."""
@@ -114,12 +105,12 @@ class Steps(OpenLoop):
         return whole_samples(key, seconds, self.sample_rate)
 
 
-def _played(sequence: _Sequence, n_samples: int, change: int) -> FloatArray:
+def _played(levels: FloatArray, lengths: IntArray, n_samples: int, change: int) -> FloatArray:
     """A sequence again and again for n_samples, then ``change`` samples down to zero."""
-    # A held channel has one level for the whole run.
-    lengths = sequence.samples if sequence.samples.any() else np.array([n_samples])
+    if not lengths.any():  # a held channel has one level for the whole run
+        lengths = np.array([n_samples])
     rounds = -(-n_samples // int(lengths.sum()))
-    levels, lengths = np.tile(sequence.levels, rounds), np.tile(lengths, rounds)
+    levels, lengths = np.tile(levels, rounds), np.tile(lengths, rounds)
     starts = np.cumsum(lengths) - lengths
     rise = smooth_rise(change)
     commands = np.zeros(n_samples + change)

@@ -7,9 +7,8 @@ import numpy as np
 from daq.experiment import Controller, Plan
 from daq.findings import Axis, Chart, Findings, Series
 from daq.hal import FloatArray, Samples
-from protocols.analysis.passivity import WallTheory
-from protocols.analysis.wall_findings import WallFindings, visited
-from protocols.control.bounds import command_bounds
+from protocols.analysis.walls import WallFindings, WallTheory, visited
+from protocols.control.loop import command_bounds
 from protocols.control.wall import WallRenderer, WallSettings
 
 
@@ -19,7 +18,7 @@ class VirtualWall(WallSettings):
     @property
     def theory(self) -> WallTheory:
         """What is to be expected of the walls."""
-        return WallTheory(self.body, 1.0 / self.sample_rate, self.ahead, self.speed_filter)
+        return WallTheory(self)
 
     def plan(self) -> Plan:
         """The longest that it can take, and what (1.1) says of the grid."""
@@ -44,7 +43,7 @@ class VirtualWall(WallSettings):
             f"Walls to be tried, and theory with the brake at {brake:g} V",
             Axis("damping", "N*m*s/rad"),
             Axis("stiffness", "N*m/rad"),
-            (walls, *self.theory.bounds(brake, self.dampings, self.stiffnesses[-1])),
+            (walls, *self.theory.bounds(brake)),
         )
 
     def controller(self) -> Controller:

@@ -10,9 +10,9 @@ from typing import Any
 
 from sim_rig.guesses import guesses
 from sim_rig.physics import electrical, options, values
-from sim_rig.physics.friction import friction as friction_model
+from sim_rig.physics.friction import FRICTIONS
 from sim_rig.physics.hysteresis import hysteresis as hysteresis_model
-from sim_rig.physics.loads import load as load_model
+from sim_rig.physics.loads import LOADS
 from sim_rig.physics.options import Design
 from sim_rig.physics.parameters import Layout, fixed, log_range
 from sim_rig.plots import operating_points, plots
@@ -101,8 +101,8 @@ class _Assembly:
     def __init__(self, design: Design) -> None:
         self._design, self._locked = design, design.load == "locked"
         self._hysteresis = hysteresis_model(design.hysteresis, design.smooth, design.exponent)
-        self._friction = friction_model(design.friction)
-        self._load = load_model(design.load)
+        self._friction = FRICTIONS[design.friction]
+        self._load = LOADS[design.load]
         self._layout = Layout(
             driver_motor=electrical.MOTOR_DRIVERS[design.driver_motor],
             driver_brake=electrical.BRAKE_DRIVERS[design.driver_brake],

@@ -8,25 +8,13 @@ import time
 from typing import Annotated, Literal
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import Field, field_validator, model_validator
 
+from daq import hal
 from daq.config.base import Section
 from daq.config.units import Part, Radians, Seconds, Unit, Volts
 from daq.errors import DeviceError
-from daq.hal import (
-    ANALOG_INPUTS,
-    CHANNELS,
-    DeviceInfo,
-    Electronics,
-    Flag,
-    FloatArray,
-    Guard,
-    IntArray,
-    Mode,
-    Phase,
-    RawSamples,
-)
+from daq.hal import ANALOG_INPUTS, CHANNELS, FloatArray, Guard, IntArray, Mode, Phase, RawSamples
 from sim_rig.device import command_queue, converters
 from sim_rig.device.command_queue import CommandQueue
 from sim_rig.device.converters import Converters, Interlock
@@ -39,7 +27,7 @@ _BLOCK = 256  # ticks simulated at once in open loop
 _REAL_TIME_BLOCK = 0.02  # s between deliveries of a device in real time
 _THETA = 6  # the plant's state
 _ACCURACY = 1e-4  # of the plant's states in parts of what matters: a tenth of the noise and below
-_INTERLOCK = int(Flag.INTERLOCK)
+_INTERLOCK = int(hal.Flag.INTERLOCK)
 _OUTPUT_BITS, _IDEAL_BITS = 16, 24  # of the converters that a board would have
 
 
@@ -130,7 +118,13 @@ class SimulatedDevice:
         self._plant = options.plant.build()
         self._user = SimulatedUser(options.plant.load == "hand", options.hand)
         self._rng = np.random.default_rng(options.seed)
-        self._converters = self._make_converters()
+        worst = 0.0 if options.ideal else options.imperfections.offset
+        self._converters = Converters(
+            np.array([options.current_sense, options.current_sense, options.torque_sense]),
+            self._rng.uniform(-worst, worst, len(ANALOG_INPUTS)),
+            options.imperfections.noise,
+            0.0 if options.ideal else 2.0 * converters.RANGE / 2**options.imperfections.bits,
+        )
         self._noise, self._noise_used = np.empty((0, len(ANALOG_INPUTS))), 0
         self._n_inputs = len(self._plant.inputs)
         self._single = np.zeros((2, self._n_inputs))
@@ -144,12 +138,12 @@ class SimulatedDevice:
         self._open = False
         self._running = False
 
-    def open(self) -> DeviceInfo:
+    def open(self) -> hal.DeviceInfo:
         """Switch on, the load let down since the last time; sampling starts with ``start``."""
         self._open = True
         self._x = self._plant.initial_state
         self._encoder = EncoderCounter(4 * self.options.encoder_cycles)
-        return DeviceInfo(
+        return hal.DeviceInfo(
             name="simulated rig",
             max_rate=20_000.0,
             queue=command_queue.SIZE,
@@ -216,7 +210,7 @@ class SimulatedDevice:
                 return raw
             kept = self._chance.random(len(raw.tick)) >= self.options.faults.lost
             if kept.any():
-                return _rows(raw, kept)
+                return RawSamples(**{name: values[kept] for name, values in vars(raw).items()})
 
     def stop(self) -> None:
         """End sampling."""
@@ -236,13 +230,13 @@ class SimulatedDevice:
         """The plant's process model, with its values as nominal ones; may raise ModelError."""
         return self.options.plant.process_model()
 
-    def board(self) -> Electronics:
+    def board(self) -> hal.Electronics:
         """The same rig anew, in virtual time and without faults of its connection."""
         options = self.options.model_copy(update={"time": "virtual", "faults": Faults()})
         bits = _IDEAL_BITS if options.ideal else options.imperfections.bits
         volts = (-converters.RANGE, converters.RANGE)
         step_in, step_out = (2.0 * converters.RANGE / 2**n for n in (bits, _OUTPUT_BITS))
-        return Electronics(SimulatedDevice(options), volts, step_in, step_out)
+        return hal.Electronics(SimulatedDevice(options), volts, step_in, step_out)
 
     def _require_running(self) -> None:
         if not self._running:
@@ -254,16 +248,6 @@ class SimulatedDevice:
         if share == 0.0 or self._waits_for_commands or tick == 0:
             return False
         return bool(self._chance.random() < share)
-
-    def _make_converters(self) -> Converters:
-        options, flaws = self.options, self.options.imperfections
-        worst = 0.0 if options.ideal else flaws.offset
-        return Converters(
-            np.array([options.current_sense, options.current_sense, options.torque_sense]),
-            self._rng.uniform(-worst, worst, len(ANALOG_INPUTS)),
-            flaws.noise,
-            0.0 if options.ideal else 2.0 * converters.RANGE / 2**flaws.bits,
-        )
 
     def _due(self) -> int:
         """How many ticks to play now; waits for them in real time."""
@@ -343,8 +327,3 @@ class SimulatedDevice:
         first = self._noise_used
         self._noise_used += n
         return self._noise[first : self._noise_used]
-
-
-def _rows(raw: RawSamples, kept: npt.NDArray[np.bool_]) -> RawSamples:
-    """Some rows of a block of samples."""
-    return RawSamples(**{name: values[kept] for name, values in vars(raw).items()})

@@ -71,9 +71,9 @@ class Plant(Section):
         values that no such plant can have.
         """
         # A handle is always there, whether or not somebody holds it, unless the shaft is locked.
-        loads: dict[str, options.LoadKind] = {"locked": "locked", "pulley": "pulley+hand"}
-        load = loads.get(self.load, "hand")
-        return _with_values(self._actuator(load, self.sensor, limits=True), self.parameters)
+        loads: dict[str, options.Load] = {"locked": "locked", "pulley": "pulley+hand"}
+        model = self._actuator(loads.get(self.load, "hand"), limits=True)
+        return _with_values(model, self.parameters)
 
     def process_model(self) -> ProcessModel:
         """What identification fits to such a plant's logs, at the plant's own values.
@@ -86,25 +86,13 @@ class Plant(Section):
                 "a hand moves as it will, and with the torque sensor between motor and brake its "
                 "torque is not measured: no model can follow such a log; put the sensor at the load"
             )
-        model = self._actuator("measured" if self.sensor == "load" else self.load, self.sensor)
+        model = self._actuator("measured" if self.sensor == "load" else self.load)
         names = set(model.parameter_names)
         return _with_values(model, {k: v for k, v in self.parameters.items() if k in names})
 
-    def _actuator(
-        self, load: options.LoadKind, sensor: options.SensorPlace, limits: bool = False
-    ) -> ProcessModel:
-        return actuator(
-            driver_motor=self.driver_motor,
-            driver_brake=self.driver_brake,
-            hysteresis=self.hysteresis,
-            exponent=self.exponent,
-            smooth=self.smooth,
-            friction=self.friction,
-            load=load,
-            sensor=sensor,
-            limits=limits,
-            parameters=self.parameter_set,
-        )
+    def _actuator(self, load: options.Load, limits: bool = False) -> ProcessModel:
+        parts = self.model_dump(exclude={"load", "parameter_set", "parameters"})
+        return actuator(**parts, load=load, limits=limits, parameters=self.parameter_set)
 
 
 def state_sizes(plant: ProcessModel) -> FloatArray:

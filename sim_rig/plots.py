@@ -24,29 +24,24 @@ _TORQUE = Quantity("torque", "N*m")
 
 def plots(model: ProcessModel, evidence: Evidence) -> Iterator[Plot]:
     """Hysteresis loops of the identified model, and the torque as it was measured."""
-    loops = _hysteresis_loops(model, evidence)
-    if loops:
-        yield Plot(
+    for name, text, curves, points in (
+        (
             "hysteresis",
-            "torque",
             "Torque that resists the shaft in the identified model, driven at a sinusoidal speed "
             "with the brake's current held: over the angle, and over the speed.",
-            _AXES,
-            _TORQUE,
-            loops,
-        )
-    measured = _measured_torque(evidence.log)
-    if measured:
-        yield Plot(
+            _hysteresis_loops(model, evidence),
+            False,
+        ),
+        (
             "torque-velocity",
-            "torque",
             "Torque at the sensor as measured in the training log, over the angle and over the "
             "speed.",
-            _AXES,
-            _TORQUE,
-            measured,
-            points=True,
-        )
+            _measured_torque(evidence.log),
+            True,
+        ),
+    ):
+        if curves:
+            yield Plot(name, "torque", text, _AXES, _TORQUE, curves, points=points)
 
 
 def operating_points(

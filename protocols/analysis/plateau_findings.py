@@ -9,13 +9,68 @@ import numpy as np
 
 from daq.findings import Chart, Findings, Number, Series, Table
 from daq.hal import FloatArray, Samples
-from protocols.analysis.results import ANGLE, TIME, TORQUE, VELOCITY, model_line, table_of_rows
-from protocols.analysis.ripple import Ripple, ripple
+from protocols.analysis import results
 from protocols.analysis.torque_curve import Level, Line, Motor, fit
 from protocols.control.staircase import Plateau
 
 _DRAWN = 4000  # points of a trace in a figure
 _SURE = 5.0  # standard errors from which a part of the torque counts as there
+_HARMONICS = 12  # in a turn
+_PARTS = 72  # of a turn
+_TURN = 2.0 * math.pi
+
+
+@dataclass(frozen=True)
+class Ripple:
+    """The strongest harmonic of a torque along a turn.
+
+    amplitude and its standard error [N*m], periods in a turn; angle, torque, errors: means over
+    parts of a turn and their standard errors, (n,).
+    """
+
+    amplitude: float
+    error: float
+    periods: int
+    angle: FloatArray
+    torque: FloatArray
+    errors: FloatArray
+
+    @property
+    def is_seen(self) -> bool:
+        """Whether it is above the noise; the strongest of a dozen harmonics is never zero."""
+        return self.amplitude > _SURE * self.error
+
+    def number(self) -> Number:
+        """The amplitude as a result; one within the noise only bounds what there may be."""
+        reach = 1.96 * self.error
+        if not self.is_seen:
+            meaning = "torque that recurs with every turn, amplitude: none seen above the noise"
+            return Number("cyclic", 0.0, "N*m", 0.0, self.amplitude + reach, meaning)
+        ends = self.amplitude - reach, self.amplitude + reach
+        meaning = f"torque that recurs {self.periods} times a turn, amplitude"
+        return Number("cyclic", self.amplitude, "N*m", *ends, meaning)
+
+
+def ripple(theta: FloatArray, torque: FloatArray) -> Ripple:
+    """How a torque (n,) [N*m] goes with the angle (n,) [rad] over whole turns."""
+    waves = np.exp(-1j * np.outer(theta, np.arange(1, _HARMONICS + 1)))
+    matrix = np.column_stack([np.ones(len(theta)), waves.real, waves.imag])
+    weights, *_ = np.linalg.lstsq(matrix, torque, rcond=None)
+    amplitudes = np.hypot(weights[1 : _HARMONICS + 1], weights[_HARMONICS + 1 :])
+    noise = (torque - matrix @ weights).std()
+    strongest = int(np.argmax(amplitudes))
+    part = np.floor(theta % _TURN / _TURN * _PARTS).astype(int) % _PARTS
+    counts = np.bincount(part, minlength=_PARTS)
+    sums = np.bincount(part, torque, minlength=_PARTS)
+    seen = counts > 0
+    return Ripple(
+        amplitude=float(amplitudes[strongest]),
+        error=float(noise * math.sqrt(2.0 / len(theta))),
+        periods=strongest + 1,
+        angle=(np.flatnonzero(seen) + 0.5) * 2.0 * math.pi / _PARTS,
+        torque=sums[seen] / counts[seen],
+        errors=noise / np.sqrt(counts[seen]),
+    )
 
 
 @dataclass(frozen=True)
@@ -36,43 +91,47 @@ class PlateauFindings:
     def findings(self) -> Findings:
         """The brake by command, every plateau, and what was drawn and read of them."""
         tables, figures = [self._plateau_table()], [self._curve(), self._trace()]
-        line, _ = self._fit
+        numbers, (line, _) = list(self._numbers()), self._fit
         if line is not None:
             tables.insert(0, self._brake_table(line))
         if self._ripple is not None:
-            figures.append(self._turn(*self._ripple))
+            level, along = self._ripple
+            numbers.append(along.number())
+            label = f"{level.omega:.3g} rad/s, brake at {level.brake:g} V"
+            series = (Series(label, along.angle, along.torque, along.errors),)
+            title = "Torque along a turn"
+            figures.append(Chart("torque_angle", title, results.ANGLE, results.TORQUE, series))
         remarks = tuple(filter(None, self._remarks()))
-        return Findings(self._numbers(), tuple(tables), tuple(figures), self._ranges(), remarks)
+        return Findings(tuple(numbers), tuple(tables), tuple(figures), self._ranges(), remarks)
 
     @cached_property
     def _fit(self) -> tuple[Line | None, str]:
         """The line through the plateaus, or why there is none."""
         counting = [level for level in self.levels if abs(level.omega) >= self.fit_from]
         try:
-            return fit(counting, self.plateaus, self.motor), ""
+            return fit(counting, self.motor), ""
         except ValueError as error:
             return None, f"No c0 and c1: {error}."
 
     @cached_property
     def _ripple(self) -> tuple[Level, Ripple] | None:
         """What recurs with every turn where it is seen best: slow and with little brake."""
-        turned = [x for x in self.levels if abs(x.theta[-1] - x.theta[0]) > 0.99 * 2.0 * math.pi]
+        turned = [x for x in self.levels if abs(x.theta[-1] - x.theta[0]) > 0.99 * _TURN]
         if not turned:
             return None
-        level = min(turned, key=lambda x: (self._command(x), abs(x.omega)))
+        level = min(turned, key=lambda x: (x.brake, abs(x.omega)))
         return level, ripple(level.theta, self._brake_torque(level))
+
+    @cached_property
+    def _points(self) -> FloatArray:
+        """Brake command, velocity, and mean and spread of the torque of each level, (4, n)."""
+        pairs = [(level, self._brake_torque(level)) for level in self.levels]
+        return np.array([(x.brake, x.omega, y.mean(), y.std()) for x, y in pairs]).T
 
     @property
     def _with_motor(self) -> bool:
         """Whether c0 has the motor's damping in it."""
         return self.motor is not None and self.motor.damping == 0.0
-
-    def _command(self, level: Level) -> float:
-        return self.plateaus[level.index].brake
-
-    def _at(self, command: float) -> list[Level]:
-        """The levels at a brake command [V]."""
-        return [level for level in self.levels if self._command(level) == command]
 
     def _brake_torque(self, level: Level) -> FloatArray:
         """The brake's torque in every sample of a plateau, (n,) [N*m]."""
@@ -80,35 +139,29 @@ class PlateauFindings:
             return level.torque
         return self.motor.constant * level.current_motor - self.motor.damping * level.omega
 
-    def _numbers(self) -> tuple[Number, ...]:
-        numbers, (line, _) = [], self._fit
-        if line is not None:
-            of_motor = " and of the motor" if self._with_motor else ""
-            for name, estimate, unit, meaning in (
-                ("c0", line.c0, "N*m*s/rad", f"viscous damping at zero current{of_motor}"),
-                ("c1", line.c1, "N*m*s/(rad*A)", "the same per ampere of brake current"),
-                ("K_m", line.constant, "N*m/A", "motor constant"),
-                ("B_m", line.damping, "N*m*s/rad", "viscous damping of the motor"),
-            ):
-                if estimate is not None:
-                    numbers.append(estimate.number(name, unit, meaning))
-        if self._ripple is not None:
-            numbers.append(self._ripple[1].number(_SURE))
-        return tuple(numbers)
+    def _numbers(self) -> Iterator[Number]:
+        line, _ = self._fit
+        if line is None:
+            return iter(())
+        of_motor = " and of the motor" if self._with_motor else ""
+        return results.estimated(
+            ("c0", line.c0, "N*m*s/rad", f"viscous damping at zero current{of_motor}"),
+            ("c1", line.c1, "N*m*s/(rad*A)", "the same per ampere of brake current"),
+            ("K_m", line.constant, "N*m/A", "motor constant"),
+            ("B_m", line.damping, "N*m*s/rad", "viscous damping of the motor"),
+        )
 
     def _brake_table(self, line: Line) -> Table:
         """The line at each brake command, and (4.5) across both directions of motion."""
-        across = []
-        for command in line.commands:
-            levels = self._at(command)
-            torque = np.array([self._brake_torque(level).mean() for level in levels])
-            across.append(np.ptp(torque) / np.ptp([level.omega for level in levels]))
+        brake, omega, torque, _ = self._points
+        across = [np.ptp(torque[brake == x]) / np.ptp(omega[brake == x]) for x in line.commands]
         columns = (line.commands, line.currents, line.kappa, line.kappa_errors, line.slopes, across)
+        rows = list(zip(*columns, strict=True))
         heading = (
             "brake_command [V], brake_current [A], hysteretic_torque [N*m], "
             "hysteretic_error [N*m], slope [N*m*s/rad], slope_across [N*m*s/rad]"
         )
-        return table_of_rows("brake", "Brake by command", heading, list(zip(*columns, strict=True)))
+        return results.table_of_rows("brake", "Brake by command", heading, rows)
 
     def _plateau_table(self) -> Table:
         """Every plateau, in order; those that did not settle have no means."""
@@ -122,7 +175,7 @@ class PlateauFindings:
             "omega_spread [rad/s], brake_current [A], torque [N*m], torque_spread [N*m], "
             "torque_error [N*m], current_motor [A], samples"
         )
-        return table_of_rows("torque_velocity", "Plateaus", heading, rows, printed=False)
+        return results.table_of_rows("torque_velocity", "Plateaus", heading, rows, printed=False)
 
     def _row(self, level: Level | None) -> tuple[float, ...]:
         if level is None:
@@ -135,29 +188,29 @@ class PlateauFindings:
 
     def _curve(self) -> Chart:
         """Torque against velocity, a series for each brake command, with its line."""
-        series, (line, _) = [], self._fit
-        for command in dict.fromkeys(plateau.brake for plateau in self.plateaus):
-            if levels := self._at(command):
-                torques = [self._brake_torque(level) for level in levels]
-                omega = np.array([level.omega for level in levels])
-                means = np.array([torque.mean() for torque in torques])
-                spread = np.array([torque.std() for torque in torques])
-                series.append(Series(f"brake at {command:g} V", omega, means, spread))
+        brake, *rest = self._points
+        commands = dict.fromkeys(plateau.brake for plateau in self.plateaus)
+        series = [
+            Series(f"brake at {command:g} V", *(values[brake == command] for values in rest))
+            for command in commands
+            if command in brake
+        ]
+        line, _ = self._fit
         if line is not None:
             series.append(self._fitted(line))
         title = "Torque at constant velocity"
-        return Chart("torque_velocity", title, VELOCITY, TORQUE, tuple(series))
+        return Chart("torque_velocity", title, results.VELOCITY, results.TORQUE, tuple(series))
 
     def _fitted(self, line: Line) -> Series:
         """The fitted line of each brake command in both directions of motion."""
-        parts = []
+        parts, (brake, velocity, *_) = [], self._points
         for place, command in enumerate(line.commands):
             for sign in (-1.0, 1.0):
-                fastest = max(sign * level.omega for level in self._at(command))
+                fastest = max(sign * velocity[brake == command])
                 if fastest > 0.0:
                     omega = sign * np.array([1e-9, fastest])
                     parts.append((omega, line.torque(place, omega)))
-        return model_line("line by c0 and c1", parts)
+        return results.model_line("line by c0 and c1", parts)
 
     def _trace(self) -> Chart:
         """The tracked speed beside its reference."""
@@ -166,13 +219,7 @@ class PlateauFindings:
             Series(label, self.samples.time[shown], self.extra[column][shown])
             for label, column in (("reference", "omega_ref"), ("measured", "omega_tracked"))
         )
-        return Chart("velocity", "The velocity loop", TIME, VELOCITY, series)
-
-    def _turn(self, level: Level, along: Ripple) -> Chart:
-        """Torque against the angle."""
-        label = f"{level.omega:.3g} rad/s, brake at {self._command(level):g} V"
-        series = (Series(label, along.angle, along.torque, along.errors),)
-        return Chart("torque_angle", "Torque along a turn", ANGLE, TORQUE, series)
+        return Chart("velocity", "The velocity loop", results.TIME, results.VELOCITY, series)
 
     def _ranges(self) -> dict[str, tuple[float, float]]:
         """Where an identification may search: twice the intervals, and never below zero."""
@@ -200,7 +247,7 @@ class PlateauFindings:
                 f"{line.misfit:.1f} times what noise explains. See torque_velocity, and "
                 "leave out slow plateaus by fit_from."
             )
-        if self._ripple is not None and self._ripple[1].exceeds(_SURE):
+        if self._ripple is not None and self._ripple[1].is_seen:
             along = self._ripple[1]
             yield (
                 f"The torque follows the shaft's angle by ±{along.amplitude:.2g} N*m, "

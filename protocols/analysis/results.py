@@ -1,7 +1,7 @@
 """What findings are made of: estimates with their intervals, axes, model lines, tables by rows."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,16 +31,22 @@ class Estimate:
         """Upper end of the interval."""
         return self.value + self.quantile * self.error
 
-    def number(self, name: str, unit: str, meaning: str) -> Number:
-        """The estimate as a result of a run."""
-        return Number(name, self.value, unit, self.low, self.high, meaning)
+
+def estimated(*rows: tuple[str, Estimate | None, str, str]) -> Iterator[Number]:
+    """Results by name, estimate, unit and meaning; those without an estimate are left out."""
+    for name, x, unit, meaning in rows:
+        if x is not None:
+            yield Number(name, x.value, unit, x.low, x.high, meaning)
 
 
-def student(freedom: int) -> float:
-    """Half the 95 % interval by Student's distribution, in standard errors."""
+def estimates(
+    values: Sequence[float] | FloatArray, errors: FloatArray, freedom: int
+) -> list[Estimate]:
+    """Estimates of values by their standard errors and degrees of freedom."""
     from scipy.stats import t
 
-    return float(t.ppf(0.975, freedom))
+    quantile = float(t.ppf(0.975, freedom))
+    return [Estimate(float(v), float(e), quantile) for v, e in zip(values, errors, strict=True)]
 
 
 def model_line(label: str, parts: Sequence[tuple[FloatArray, FloatArray]]) -> Series:

@@ -14,12 +14,13 @@ tells K_m and the motor's losses (B_m, T_m), and the current, by far the quieter
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from daq.hal import FloatArray, Samples
-from protocols.analysis.results import Estimate, student
+from protocols.analysis.results import Estimate, estimates
 from protocols.control.staircase import Plateau
 
 _BATCHES = 16  # of a plateau, whose means tell how far its mean may be trusted
@@ -32,11 +33,12 @@ Rows = npt.NDArray[np.intp]
 class Level:
     """What was measured on one plateau, over whole turns where it has made one.
 
-    index: of the plateau. theta, torque, current_motor: settled samples, (n,). *_error: standard
-    errors of the means.
+    index, brake: number and brake command [V] of the plateau. theta, torque, current_motor:
+    settled samples, (n,). *_error: standard errors of the means.
     """
 
     index: int
+    brake: float
     start: float
     omega: float
     omega_spread: float
@@ -60,20 +62,17 @@ def levels_of(
     settled = extra["settled"] == 1.0
     levels = []
     for index, plateau in enumerate(plateaus):
-        rows = _last_stretch(np.flatnonzero(settled & (extra["plateau"] == index)))
+        rows = np.flatnonzero(settled & (extra["plateau"] == index))
+        # The last rows without a gap: a departure from the band began the plateau anew.
+        rows = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)[-1]
         if len(rows) < 2:
             continue
         time = samples.time[rows]
         # A sample short of the time is whole: times are a row's, not a row's end.
         if time[-1] - time[0] >= plateau.measure - 1.5 * float(np.median(np.diff(time))):
-            levels.append(_level(samples, extra, index, rows[_whole_turns(samples.theta[rows])]))
+            whole = rows[_whole_turns(samples.theta[rows])]
+            levels.append(_level(samples, extra, index, plateau.brake, whole))
     return levels
-
-
-def _last_stretch(rows: Rows) -> Rows:
-    """The last rows without a gap: a departure from the band began the plateau anew."""
-    breaks = np.flatnonzero(np.diff(rows) > 1)
-    return rows[breaks[-1] + 1 :] if len(breaks) else rows
 
 
 def _whole_turns(theta: FloatArray) -> slice:
@@ -83,11 +82,14 @@ def _whole_turns(theta: FloatArray) -> slice:
     return slice(int(np.searchsorted(travel, 2.0 * math.pi * turns)) if turns else len(theta))
 
 
-def _level(samples: Samples, extra: Mapping[str, FloatArray], index: int, rows: Rows) -> Level:
+def _level(
+    samples: Samples, extra: Mapping[str, FloatArray], index: int, brake: float, rows: Rows
+) -> Level:
     time, theta = samples.time[rows], samples.theta[rows]
     torque, current = samples.torque[rows], samples.current_motor[rows]
     return Level(
         index=index,
+        brake=brake,
         start=float(time[0]),
         omega=float((theta[-1] - theta[0]) / (time[-1] - time[0])),
         omega_spread=float(np.std(extra["omega_tracked"][rows])),
@@ -107,8 +109,7 @@ def _error_of_mean(values: FloatArray) -> float:
     return float(means.std(ddof=1) / math.sqrt(batches))
 
 
-@dataclass(frozen=True)
-class Motor:
+class Motor(NamedTuple):
     """Constant [N*m/A] and viscous damping [N*m*s/rad] of the motor, by its ratings.
 
     Needed where the torque sensor is at the load; elsewhere the run tells both.
@@ -148,14 +149,15 @@ class Line:
         return float(self.kappa[place]) * np.sign(omega) + float(self.slopes[place]) * omega
 
 
-def fit(levels: Sequence[Level], plateaus: Sequence[Plateau], motor: Motor | None) -> Line:
+def fit(levels: Sequence[Level], motor: Motor | None) -> Line:
     """The line through settled plateaus; ``motor`` where the sensor is at the load, else None.
 
     Raises ValueError where no brake command has two of them in a direction.
     """
-    command = np.array([plateaus[level.index].brake for level in levels])
+    command = np.array([level.brake for level in levels])
     omega = np.array([level.omega for level in levels])
-    if not _has_slope(command, omega):
+    sign = np.sign(omega)
+    if len(np.unique(np.column_stack([command, sign]), axis=0)) == len(levels):
         raise ValueError(
             "no brake command has two settled velocities in the same direction, which a slope takes"
         )
@@ -164,7 +166,6 @@ def fit(levels: Sequence[Level], plateaus: Sequence[Plateau], motor: Motor | Non
     measured = np.array([level.brake_current for level in levels])
     currents = np.array([measured[place == i].mean() for i in range(m)])
     currents *= -1.0 if currents.sum() < 0.0 else 1.0  # the brake cares for its size alone
-    sign = np.sign(omega)
     kappa = sign[:, None] * (place[:, None] == np.arange(m))
     brake = np.column_stack([kappa, omega, currents[place] * omega])
     torque = np.array([level.torque.mean() for level in levels])
@@ -174,39 +175,33 @@ def fit(levels: Sequence[Level], plateaus: Sequence[Plateau], motor: Motor | Non
     # What the zero of a sensor may still be off is told by the other direction alone.
     offset = np.full((len(levels), 1), float(np.ptp(sign) > 0.0))
     if motor is not None:
+        matrix, errors = np.hstack([brake, offset]), motor.constant * current_errors
         sides = motor.constant * current - motor.damping * omega
-        solution = _solve(np.hstack([brake, offset]), sides, motor.constant * current_errors)
     else:
         constant = _constant(torque, current)
         losses = np.column_stack([offset, -current, omega, sign])
         matrix = np.block([[brake, offset, np.zeros_like(losses)], [brake, 0.0 * offset, losses]])
         sides = np.concatenate([torque, 0.0 * torque])
-        solution = _solve(matrix, sides, np.concatenate([errors, constant * current_errors]))
+        errors = np.concatenate([errors, constant * current_errors])
+    solution, misfit = _solve(matrix, sides, errors)
     return Line(
-        c0=solution.estimate(m),
-        c1=solution.estimate(m + 1) if m > 1 else None,
+        c0=solution[m],
+        c1=solution[m + 1] if m > 1 else None,
         commands=commands,
         currents=currents,
-        kappa=solution.values[:m],
-        kappa_errors=solution.errors[:m],
-        misfit=solution.misfit,
-        constant=None if motor else solution.determined(m + 4),
-        damping=None if motor else solution.determined(m + 5),
+        kappa=np.array([estimate.value for estimate in solution[:m]]),
+        kappa_errors=np.array([estimate.error for estimate in solution[:m]]),
+        misfit=misfit,
+        constant=None if motor else _determined(solution[m + 4]),
+        damping=None if motor else _determined(solution[m + 5]),
     )
-
-
-def _has_slope(commands: FloatArray, omega: FloatArray) -> bool:
-    """Whether somewhere two velocities of one direction stand at one brake command."""
-    groups = np.column_stack([commands, np.sign(omega)])
-    return len(np.unique(groups, axis=0)) < len(groups)
 
 
 def _pooled(levels: Sequence[Level], errors: Sequence[float]) -> FloatArray:
     """Standard errors of the plateaus' means from the noise that they have in common."""
     counts = np.array([level.samples for level in levels], dtype=np.float64)
     common = math.sqrt(float(np.mean(np.square(errors) * counts)))
-    means: FloatArray = common / np.sqrt(counts) + _LEAST_ERROR
-    return means
+    return common / np.sqrt(counts) + _LEAST_ERROR
 
 
 def _constant(torque: FloatArray, current: FloatArray) -> float:
@@ -224,31 +219,22 @@ def _constant(torque: FloatArray, current: FloatArray) -> float:
     return float(np.polyfit(current, torque, 1)[0])
 
 
-@dataclass(frozen=True)
-class _Solution:
-    """Values and their standard errors, (n,); misfit as of ``Line``; degrees of freedom."""
-
-    values: FloatArray
-    errors: FloatArray
-    misfit: float
-    freedom: int
-
-    def estimate(self, place: int) -> Estimate:
-        value, error = float(self.values[place]), float(self.errors[place])
-        return Estimate(value, error, student(self.freedom))
-
-    def determined(self, place: int) -> Estimate | None:
-        """The estimate where the rows determine it to a half, None elsewhere."""
-        estimate = self.estimate(place)
-        return estimate if estimate.high - estimate.value < 0.5 * estimate.value else None
+def _determined(estimate: Estimate) -> Estimate | None:
+    """The estimate where the rows determine it to a half, None elsewhere."""
+    return estimate if estimate.high - estimate.value < 0.5 * estimate.value else None
 
 
-def _solve(matrix: FloatArray, sides: FloatArray, errors: FloatArray) -> _Solution:
-    """Weighted least squares; what the rows cannot tell apart does not spoil what they can."""
+def _solve(
+    matrix: FloatArray, sides: FloatArray, errors: FloatArray
+) -> tuple[list[Estimate], float]:
+    """Weighted least squares, and its misfit as of ``Line``.
+
+    What the rows cannot tell apart does not spoil what they can.
+    """
     weighted, target = matrix / errors[:, None], sides / errors
     inverse = np.linalg.pinv(weighted, rcond=1e-10)
     values = inverse @ target
     freedom = max(len(sides) - int(np.linalg.matrix_rank(weighted)), 1)
     misfit = float(np.linalg.norm(weighted @ values - target) / math.sqrt(freedom))
     spread = np.sqrt(np.sum(inverse**2, axis=1)) * max(misfit, 1.0)
-    return _Solution(values, spread, misfit, freedom)
+    return estimates(values, spread, freedom), misfit

@@ -15,12 +15,7 @@ from daq.config.units import Percent, RadiansPerSecond, Seconds
 from daq.errors import RunError
 from daq.experiment import Answer, Sample
 from daq.hal import FloatArray
-from protocols.control.pid import Ramp, VelocityGains
-from protocols.control.velocity_loop import VelocityServo
-
-COLUMNS = {"omega_ref": "rad/s", "omega_tracked": "rad/s", "plateau": "1", "settled": "1"}
-"""What ``Staircase`` logs: reference, speed from the angle, number of the plateau from 0 (-1
-behind the last), and 1 while the settled velocity is being measured."""
+from protocols.control.loop import Ramp, VelocityServo
 
 # How much faster a shaft may turn that the motor brakes with all its might.
 _RUNAWAY = 10.0  # rad/s
@@ -65,53 +60,41 @@ class Plateau:
     measure: float
 
 
-@dataclass(frozen=True)
-class Drive:
-    """How the velocities are reached: the loop and what bounds it.
-
-    slope: of the reference [rad/s^2]. limit: largest motor command, either way [V]. fastest:
-    speed beyond which the run is ended [rad/s]. bandwidth: of the speed that the loop sees [Hz].
-    """
-
-    gains: VelocityGains
-    slope: float
-    limit: float
-    fastest: float
-    bandwidth: float
-
-
 class Staircase:
     """Controller of the motor that visits plateaus in order, and ends at rest.
 
     A plateau begins with a ramp to its velocity. Once the tracked speed has been in its band
     for the settling time, it is measured; a departure from the band starts that anew. What has
-    not been measured whole by its timeout is left unsettled.
+    not been measured whole by its timeout is left unsettled. limit: of the servo's command [V].
+    slope: of the reference [rad/s^2].
     """
 
-    def __init__(self, plateaus: tuple[Plateau, ...], drive: Drive, settling: SettlingTest) -> None:
-        self._plateaus, self._settling, self._limit = plateaus, settling, drive.limit
-        cure = ", and look what drives the shaft if not"
-        self._servo = VelocityServo(drive.gains, drive.limit, drive.fastest, drive.bandwidth, cure)
-        self._velocity_ramp, self._brake_ramp = Ramp(drive.slope), Ramp(_BRAKE_SLOPE)
-        self._time = 0.0
-        self._braked_from = math.inf
+    def __init__(
+        self,
+        plateaus: tuple[Plateau, ...],
+        settling: SettlingTest,
+        servo: VelocityServo,
+        limit: float,
+        slope: float,
+    ) -> None:
+        self._plateaus, self._settling = plateaus, settling
+        self._servo, self._limit = servo, limit
+        self._velocity_ramp, self._brake_ramp = Ramp(slope), Ramp(_BRAKE_SLOPE)
+        self._time, self._braked_from = 0.0, math.inf
         self._plateau, self._index = Plateau(0.0, 0.0, 0.0), -1
         self._next(0.0)
 
     def answer(self, sample: Sample) -> Answer | None:
         """Commands that drive the shaft to the plateau's velocity."""
-        now = sample.time
-        speed = self._servo.track(sample)
-        reference = self._velocity_ramp.towards(self._plateau.velocity, now - self._time)
-        brake = self._brake_ramp.towards(self._plateau.brake, now - self._time)
+        now, elapsed = sample.time, sample.time - self._time
+        reference = self._velocity_ramp.towards(self._plateau.velocity, elapsed)
+        brake = self._brake_ramp.towards(self._plateau.brake, elapsed)
         self._time = now
+        volts, speed = self._servo.drive(sample, reference)
         settled = self._is_settled(now, reference, speed)
         logged = (reference, speed, float(self._index), float(settled))
-        volts = self._servo.volts(now, reference, speed)
         self._check_sign(volts, speed)
-        if self._is_over(now):
-            return None
-        return Answer(volts, brake, logged)
+        return None if self._is_over(now) else Answer(volts, brake, logged)
 
     def _check_sign(self, volts: float, speed: float) -> None:
         """RunError for a shaft that gains speed against the motor."""
@@ -142,12 +125,11 @@ class Staircase:
         """Whether the run is over; goes on to the next plateau once this one is done with."""
         measure = self._plateau.measure
         measured = now - self._inside >= self._settling.time + measure
-        given_up = now - self._arrived > self._settling.timeout + measure
-        if self._index < 0:
-            return measured or given_up
-        if measured or given_up:
+        done = measured or now - self._arrived > self._settling.timeout + measure
+        if done and self._index >= 0:
             self._next(now)
-        return False
+            return False
+        return done
 
     def _next(self, now: float) -> None:
         """To the next plateau; behind the last to rest."""
@@ -160,25 +142,25 @@ class Staircase:
         self._inside, self._arrived = math.inf, now
 
 
-def longest(plateaus: Sequence[Plateau], drive: Drive, settling: SettlingTest) -> float:
+def longest(plateaus: Sequence[Plateau], settling: SettlingTest, slope: float) -> float:
     """The longest that a staircase can take [s]."""
     velocities = [0.0, *(plateau.velocity for plateau in plateaus), 0.0]
-    ramps = sum(abs(b - a) for a, b in itertools.pairwise(velocities)) / drive.slope
+    ramps = sum(abs(b - a) for a, b in itertools.pairwise(velocities)) / slope
     brakes = sum(abs(b.brake - a.brake) for a, b in itertools.pairwise(plateaus)) / _BRAKE_SLOPE
     held = sum(plateau.measure + settling.timeout for plateau in plateaus)
     return ramps + brakes + held + settling.timeout
 
 
 def quickest(
-    plateaus: Sequence[Plateau], drive: Drive, settling: SettlingTest, rate: float
+    plateaus: Sequence[Plateau], settling: SettlingTest, slope: float, rate: float
 ) -> tuple[FloatArray, FloatArray]:
     """Reference [rad/s] and brake command [V], (m,) each, where every velocity settles at once."""
     velocities, brakes, before = [], [], Plateau(0.0, 0.0, 0.0)
     for plateau in (*plateaus, Plateau(0.0, plateaus[-1].brake, 0.0)):
         turn, pull = plateau.velocity - before.velocity, plateau.brake - before.brake
-        ramps = max(abs(turn) / drive.slope, abs(pull) / _BRAKE_SLOPE)
+        ramps = max(abs(turn) / slope, abs(pull) / _BRAKE_SLOPE)
         time = np.arange(1, round((ramps + settling.time + plateau.measure) * rate) + 1) / rate
-        velocities.append(before.velocity + _ramp(turn, drive.slope, time))
+        velocities.append(before.velocity + _ramp(turn, slope, time))
         brakes.append(before.brake + _ramp(pull, _BRAKE_SLOPE, time))
         before = plateau
     return np.concatenate(velocities), np.concatenate(brakes)

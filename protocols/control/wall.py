@@ -2,8 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -13,8 +12,7 @@ from daq.config.units import NewtonMetres, Radians, RadiansPerSecond, Seconds, U
 from daq.errors import RunError
 from daq.experiment import Answer, ClosedLoop, Sample
 from daq.hal import FloatArray
-from protocols.control.bounds import MOTOR_LIMIT, MotorLimit
-from protocols.control.speed_tracker import TRACKER_BANDWIDTH, SpeedTracker, TrackerBandwidth
+from protocols.control import loop
 
 Stiffness = Annotated[float, Unit("N*m/rad")]
 Damping = Annotated[float, Unit("N*m*s/rad")]
@@ -69,8 +67,7 @@ class Body(Section):
     hand_damping: Damping = Field(0.0, ge=0.0, description="of the hand, where it is known")
 
 
-@dataclass(frozen=True)
-class Cell:
+class Cell(NamedTuple):
     """One wall of the grid: stiffness [N*m/rad], damping [N*m*s/rad], brake in contact [V]."""
 
     stiffness: float
@@ -102,13 +99,13 @@ class WallSettings(ClosedLoop):
     rest: Rest = Field(Rest(), description="the soft wall between two cells")
     tap: Tap = Field(Tap(), description="what sets each wall swinging")
     ringing: RingingTest = Field(RingingTest(), description="when a wall counts as unstable")
-    speed_filter: TrackerBandwidth = Field(
-        TRACKER_BANDWIDTH, description="bandwidth of the speed that the damping sees"
+    speed_filter: loop.TrackerBandwidth = Field(
+        loop.TRACKER_BANDWIDTH, description="bandwidth of the speed that the damping sees"
     )
     motor_gain: Annotated[float, Unit("N*m/V")] = Field(
         gt=0.0, description="motor torque per volt of command"
     )
-    motor_limit: MotorLimit = MOTOR_LIMIT
+    motor_limit: loop.MotorLimit = loop.MOTOR_LIMIT
     patience: Seconds = Field(
         20.0, gt=0.0, le=3600.0, description="time allowed for a hand to lean against the wall"
     )
@@ -130,7 +127,7 @@ class WallRenderer:
 
     def __init__(self, settings: WallSettings) -> None:
         self._settings, self._cells = settings, settings.cells
-        self._tracker = SpeedTracker(settings.speed_filter)
+        self._tracker = loop.SpeedTracker(settings.speed_filter)
         self._wall: float | None = None
         self._touched = math.nan
         self._index, self._began = -1, 0.0
@@ -143,20 +140,21 @@ class WallRenderer:
         if self._wall is None:
             self._wall = sample.theta + settings.position
         depth = sample.theta - self._wall
-        if self._index < 0:
+        index, state = self._index, RESTING
+        if index < 0:
             self._wait(now, depth)
-            index, state = -1, RESTING
-        elif self._index == len(self._cells):
+        elif index == len(self._cells):
+            index = -1
             if now - self._began > settings.rest.time:
                 return None
-            index, state = -1, RESTING
         else:
-            index, state = self._index, self._state(now, speed)
+            state = self._state(now, speed)
         if state == ABORTED:
             self._leave(now, unstable=True)
         stiffness, damping, brake = self._rendered(now)
         torque = -(stiffness * depth + damping * speed) if depth > 0.0 else 0.0
-        if state in (RAMPING, WATCHED) and self._is_tapped(now):
+        tapped = now - self._began - 2.0 * settings.rest.time
+        if state in (RAMPING, WATCHED) and 0.0 <= tapped < settings.tap.time:
             torque += settings.tap.torque
         if state == WATCHED:
             self._watch(now, depth)
@@ -223,10 +221,6 @@ class WallRenderer:
             rest.damping + share * (cell.damping - rest.damping),
             cell.brake,
         )
-
-    def _is_tapped(self, now: float) -> bool:
-        begun = now - self._began - 2.0 * self._settings.rest.time
-        return 0.0 <= begun < self._settings.tap.time
 
 
 def oscillation(time: FloatArray, depth: FloatArray) -> float:

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 
 from sim_rig.guesses import damping, electrical
-from sim_rig.guesses.current_response import current_response
 from sim_rig.guesses.ranges import Ranges
 from sim_rig.physics.options import Design
 from sysid import Guess
@@ -18,13 +17,10 @@ def guesses(design: Design) -> Guesses:
 
     def guess(records: Sequence[Measured], assumed: Known) -> dict[str, Guess]:
         ranges = Ranges(assumed)
-        motor, brake = (current_response(records, channel) for channel in ("motor", "brake"))
-        if motor is not None:
-            electrical.narrow(ranges, "motor", design.driver_motor, motor)
-        if brake is not None:
-            electrical.narrow(ranges, "brake", design.driver_brake, brake)
+        electrical.narrow(ranges, records, "motor", design.driver_motor)
+        brake_delay = electrical.narrow(ranges, records, "brake", design.driver_brake)
         if design.friction == "none" and design.load in ("measured", "free"):
-            damping.narrow(ranges, records, brake_delay=brake.delay[1] if brake else 0.0)
+            damping.narrow(ranges, records, brake_delay)
         return ranges.guesses
 
     return guess

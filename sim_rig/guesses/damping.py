@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim_rig.guesses.current_response import SIGMAS, speed_of
+from sim_rig.guesses.electrical import SIGMAS, speed_of
 from sim_rig.guesses.ranges import Interval, Ranges
 from sysid.arrays import BoolArray, FloatArray
 from sysid.problem.guesses import Measured, regression
@@ -105,8 +105,7 @@ def _steady(omega: FloatArray, command: FloatArray, dt: float, settling: float) 
     changed = np.concatenate([[False], np.diff(command) != 0.0])
     last = np.maximum.accumulate(np.where(changed, rows, -len(command)))
     quiet = (rows - last)[2 * _HALF :] >= 2 * _HALF + settling / dt
-    steady: BoolArray = peaks & sliding & quiet & np.isfinite(omega)
-    return steady
+    return peaks & sliding & quiet & np.isfinite(omega)
 
 
 def _at_least(values: FloatArray) -> float:

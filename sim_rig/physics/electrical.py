@@ -91,10 +91,7 @@ _MOTOR_CUTOFF = log_range("omega_dm", "rad/s", 1000.0, 100.0, 5000.0, "motor dri
 
 # Gain and cutoff of the amplifiers.
 MOTOR_DRIVERS: dict[DriverKind, tuple[Parameter, ...]] = {
-    "closed": (
-        log_range("K_dm", "V/A", 100.0, 10.0, 500.0, "motor driver gain"),
-        _MOTOR_CUTOFF,
-    ),
+    "closed": (log_range("K_dm", "V/A", 100.0, 10.0, 500.0, "motor driver gain"), _MOTOR_CUTOFF),
     "open": (log_range("G_dm", "V/V", 1.0, 0.1, 10.0, "motor driver gain"), _MOTOR_CUTOFF),
 }
 BRAKE_DRIVERS: dict[DriverKind, tuple[Parameter, ...]] = {
@@ -115,7 +112,4 @@ WINDINGS = (
     log_range("R_b", "ohm", 120.0, 40.0, 200.0, "brake coil resistance"),
     log_range("L_b", "H", 0.15, 0.05, 1.0, "brake coil inductance"),
 )
-WINDING_EQUATIONS = (
-    "L_m di_m/dt = v_m - R_m*i_m + n_c*K_m*omega",
-    "L_b di_b/dt = v_b - R_b*i_b",
-)
+WINDING_EQUATIONS = ("L_m di_m/dt = v_m - R_m*i_m + n_c*K_m*omega", "L_b di_b/dt = v_b - R_b*i_b")

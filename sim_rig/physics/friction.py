@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from sim_rig.physics.options import FrictionKind
+from sim_rig.physics.options import Friction
 from sim_rig.physics.parameters import PartConstraint, fixed, log_range
 from sysid import Parameter
 
@@ -29,22 +29,6 @@ class FrictionModel:
     torque: Callable[[Any, Any, Any], Any]
     constraints: tuple[PartConstraint, ...] = ()
     equation: str = ""
-
-
-def friction(kind: FrictionKind) -> FrictionModel:
-    """A friction model by name."""
-    if kind == "none":
-        return FrictionModel((), lambda theta, omega, p: 0.0)
-    if kind == "stribeck":
-        return FrictionModel(_STRIBECK, stribeck_torque, _CONSTRAINTS, _equation(_LEVEL))
-    around = f"{_LEVEL} + F_cos*cos(cycles*theta) + F_sin*sin(cycles*theta)"
-    return FrictionModel(
-        _STRIBECK + _CYCLIC, cyclic_torque, (*_CONSTRAINTS, _PRESSED), _equation(around)
-    )
-
-
-def _equation(level: str) -> str:
-    return f"tau_f = ({level})*tanh(omega/omega_r) + B_f*omega"
 
 
 def stribeck_torque(theta: Any, omega: Any, p: Any) -> Any:
@@ -65,8 +49,6 @@ def _level(omega: Any, F_c: Any, F_s: Any, omega_s: Any) -> Any:
     share = omega / omega_s
     return F_c + (F_s - F_c) * math.exp(-share * share)
 
-
-_LEVEL = "F_c + (F_s - F_c)*exp(-(omega/omega_s)^2)"
 
 _STRIBECK = (
     log_range("F_c", "N*m", 0.02, 1e-3, 0.2, "Coulomb friction"),
@@ -89,8 +71,21 @@ _CYCLIC = (
     fixed("cycles", "1", 2.0, "periods of the cyclic friction in a turn"),
 )
 
-_CONSTRAINTS = (("F_s >= F_c (friction falls with speed)", lambda p: p[0] - p[1]),)
+_RISING = ("F_s >= F_c (friction falls with speed)", lambda p: p[0] - p[1])
 _PRESSED = (
     "F_c >= (F_cos^2 + F_sin^2)^(1/2) (friction resists everywhere)",
     lambda p: (p[5] ** 2 + p[6] ** 2) ** 0.5 - p[0],
 )
+_LEVEL = "F_c + (F_s - F_c)*exp(-(omega/omega_s)^2)"
+_TEXT = "tau_f = ({})*tanh(omega/omega_r) + B_f*omega"
+
+FRICTIONS: dict[Friction, FrictionModel] = {
+    "none": FrictionModel((), lambda theta, omega, p: 0.0),
+    "stribeck": FrictionModel(_STRIBECK, stribeck_torque, (_RISING,), _TEXT.format(_LEVEL)),
+    "cyclic": FrictionModel(
+        _STRIBECK + _CYCLIC,
+        cyclic_torque,
+        (_RISING, _PRESSED),
+        _TEXT.format(f"{_LEVEL} + F_cos*cos(cycles*theta) + F_sin*sin(cycles*theta)"),
+    ),
+}

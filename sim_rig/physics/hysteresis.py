@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from sim_rig.physics.options import HysteresisKind
+from sim_rig.physics.options import Hysteresis
 from sim_rig.physics.parameters import PartConstraint, fixed, log_range
 from sysid import ModelError, Parameter
 
@@ -30,22 +30,20 @@ class HysteresisModel:
     """Parameters and equations of one hysteresis model.
 
     constraints: section 3.4.2; that all parameters are positive is in their physical minimum.
-    z_unit: of the hysteresis variable. z_range: where it may stand when a record begins; a load
-    that friction holds leaves it away from zero. equations: rate and torque as text.
+    z_range: where the hysteresis variable may stand when a record begins; a load that friction
+    holds leaves it away from zero. equations: rate and torque as text.
     """
 
     parameters: tuple[Parameter, ...]
     rate: Rate
     torque: Torque
-    z_unit: str
-    z_range: tuple[float, float]
     constraints: tuple[PartConstraint, ...]
     equations: tuple[str, str]
+    z_range: tuple[float, float]
+    z_unit: str = "1"
 
 
-def hysteresis(
-    kind: HysteresisKind, smooth: bool = False, exponent: float = 1.0
-) -> HysteresisModel:
+def hysteresis(kind: Hysteresis, smooth: bool = False, exponent: float = 1.0) -> HysteresisModel:
     """A hysteresis model by name; ``exponent`` is n of (3.14), for Bouc-Wen alone.
 
     Raises ModelError for an exponent below 1, at which dz/dt is not defined at z = 0.
@@ -57,11 +55,17 @@ def hysteresis(
     return _dahl(smooth) if kind == "dahl" else _lugre(smooth)
 
 
-def brake_torque(current: Any, omega: Any, z: Any, coefficients: Any) -> Any:
+def _brake_torque(current: Any, omega: Any, z: Any, coefficients: Any) -> Any:
     """alpha(i) z + c(i) omega (3.15), (3.17) [N*m]; coefficients alpha0, alpha1, c0, c1."""
     alpha0, alpha1, c0, c1 = coefficients
     size = abs(current)
     return (alpha0 + alpha1 * size) * z + (c0 + c1 * size) * omega
+
+
+def _torque_from(first: int) -> Torque:
+    """The torque, its coefficients standing from ``first`` on."""
+    place = slice(first, first + 4)
+    return lambda current, omega, z, z_rate, p: _brake_torque(current, omega, z, p[place])
 
 
 _TORQUE_EQUATION = "tau_b = (alpha0 + alpha1*|i_b|)*z + (c0 + c1*|i_b|)*omega"
@@ -84,28 +88,23 @@ def _bouc_wen(smooth: bool, exponent: float) -> HysteresisModel:
         size = power(math.tanh(rho * z) * z)
         return omega * (A - size * (beta + gamma * math.tanh(rho * omega * z)))
 
-    def torque(current: Any, omega: Any, z: Any, z_rate: Any, p: Any) -> Any:
-        return brake_torque(current, omega, z, p[3:7])
-
     return HysteresisModel(
         (
             log_range("gamma", "1/rad", 40.0, 5.0, 500.0, "hysteresis shape"),
             log_range("beta", "1/rad", 30.0, 5.0, 500.0, "hysteresis shape"),
             log_range("A", "1/rad", 100.0, 10.0, 1000.0, "hysteresis stiffness"),
-            *_ALPHA,
-            *_VISCOUS,
-            *_sharpness(smooth),
+            *_BRAKE,
+            *_SHARPNESS[smooth],
         ),
         smooth_rate if smooth else exact_rate,
-        torque,
-        "1",
-        (-10.0, 10.0),
+        _torque_from(3),
         (
             ("gamma - beta >= 0 (Bouc-Wen class 1)", lambda p: p[1] - p[0]),
             ("gamma + beta >= 0 (Bouc-Wen class 1)", lambda p: -p[1] - p[0]),
             *_positive_torque(3),
         ),
         (_bouc_wen_equation(smooth, exponent), _TORQUE_EQUATION),
+        (-10.0, 10.0),
     )
 
 
@@ -138,23 +137,15 @@ def _dahl(smooth: bool) -> HysteresisModel:
     def smooth_rate(omega: Any, z: Any, p: Any) -> Any:
         return p[0] * omega * (1.0 - z * math.tanh(p[5] * omega))  # (3.27)
 
-    def torque(current: Any, omega: Any, z: Any, z_rate: Any, p: Any) -> Any:
-        return brake_torque(current, omega, z, p[1:5])
-
-    smooth_equation = "dz/dt = sigma*omega*(1 - z*tanh(rho*omega))"
+    equation = "sigma*omega*(1 - z*tanh(rho*omega))" if smooth else "sigma*(omega - |omega|*z)"
+    shape = log_range("sigma", "1/rad", 50.0, 5.0, 500.0, "hysteresis shape")
     return HysteresisModel(
-        (
-            log_range("sigma", "1/rad", 50.0, 5.0, 500.0, "hysteresis shape"),
-            *_ALPHA,
-            *_VISCOUS,
-            *_sharpness(smooth),
-        ),
+        (shape, *_BRAKE, *_SHARPNESS[smooth]),
         smooth_rate if smooth else exact_rate,
-        torque,
-        "1",
-        (-1.0, 1.0),
+        _torque_from(1),
         _positive_torque(1),
-        (smooth_equation if smooth else "dz/dt = sigma*(omega - |omega|*z)", _TORQUE_EQUATION),
+        (f"dz/dt = {equation}", _TORQUE_EQUATION),
+        (-1.0, 1.0),
     )
 
 
@@ -167,7 +158,7 @@ def _lugre(smooth: bool) -> HysteresisModel:
 
     def torque(current: Any, omega: Any, z: Any, z_rate: Any, p: Any) -> Any:
         # (3.19)
-        return brake_torque(current, omega, z, p[1:5]) + (p[5] + p[6] * abs(current)) * z_rate
+        return _brake_torque(current, omega, z, p[1:5]) + (p[5] + p[6] * abs(current)) * z_rate
 
     sign = "omega*tanh(rho*omega)" if smooth else "|omega|"
     return HysteresisModel(
@@ -178,12 +169,10 @@ def _lugre(smooth: bool) -> HysteresisModel:
             *_VISCOUS,
             log_range("epsilon0", "N*m*s/rad", 2e-4, 1e-5, 1e-2, "damping of the deflection"),
             log_range("epsilon1", "N*m*s/(rad*A)", 2e-3, 1e-4, 5e-2, "the same per ampere"),
-            *_sharpness(smooth),
+            *_SHARPNESS[smooth],
         ),
         smooth_rate if smooth else exact_rate,
         torque,
-        "rad",
-        (-0.2, 0.2),
         (
             *_positive_torque(1),
             ("epsilon(i_b) >= 0 for every current", lambda p: _lowest(p[5], p[6])),
@@ -192,23 +181,26 @@ def _lugre(smooth: bool) -> HysteresisModel:
             f"dz/dt = omega - zeta*{sign}*z",
             f"{_TORQUE_EQUATION} + (epsilon0 + epsilon1*|i_b|)*(dz/dt)",
         ),
+        (-0.2, 0.2),
+        "rad",
     )
 
 
-_ALPHA = (
-    log_range("alpha0", "N*m", 0.02, 2e-3, 0.5, "hysteretic torque at zero current"),
-    log_range("alpha1", "N*m/A", 4.0, 0.5, 50.0, "hysteretic torque per ampere"),
-)
 _VISCOUS = (
     log_range("c0", "N*m*s/rad", 2e-4, 1e-5, 1e-2, "brake viscous damping at zero current"),
     log_range("c1", "N*m*s/(rad*A)", 2e-3, 1e-4, 5e-2, "brake viscous damping per ampere"),
 )
 
 
-def _sharpness(smooth: bool) -> tuple[Parameter, ...]:
-    if not smooth:
-        return ()
-    return (fixed("rho", "1", 100.0, "sharpness of the smooth sign, tanh(rho x)"),)
+_BRAKE = (
+    log_range("alpha0", "N*m", 0.02, 2e-3, 0.5, "hysteretic torque at zero current"),
+    log_range("alpha1", "N*m/A", 4.0, 0.5, 50.0, "hysteretic torque per ampere"),
+    *_VISCOUS,
+)
+_SHARPNESS: dict[bool, tuple[Parameter, ...]] = {
+    False: (),
+    True: (fixed("rho", "1", 100.0, "sharpness of the smooth sign, tanh(rho x)"),),
+}
 
 
 def _lowest(constant: Any, per_ampere: Any) -> Any:

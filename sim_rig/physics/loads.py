@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from sim_rig.physics.options import LoadKind
+from sim_rig.physics.options import Load
 from sim_rig.physics.parameters import fixed
 from sysid import Input, Parameter, State
 
@@ -15,9 +15,12 @@ GRAVITY = 9.80665  # m/s^2
 # about the angle in which a cable leaves a small drum.
 _CROSSOVER = 0.1  # rad
 
-_RESPONSE_TIME = 0.237  # s, of a hand (A.2)
-_HAND_INERTIA = 1e-3  # kg*m^2, an order of magnitude above the rotors, as (A.2) asks
-_HAND_DAMPING = 0.707  # of critical (A.2)
+# A hand (A.2): it responds in 0.237 s, with 0.707 of critical damping, and has an inertia an order
+# of magnitude above the rotors.
+_HAND_FREQUENCY = 3.0 / 0.237  # rad/s
+_HAND_INERTIA = 1e-3  # kg*m^2
+HAND_STIFFNESS = _HAND_FREQUENCY**2 * _HAND_INERTIA  # N*m/rad
+HAND_DAMPING = 2.0 * 0.707 * _HAND_FREQUENCY * _HAND_INERTIA  # N*m*s/rad
 
 _MASS = 0.25  # kg, the lab's 250 g
 _CABLE = 5000.0  # N/m, assumed: thin braided cable, half a metre
@@ -38,19 +41,7 @@ class LoadModel:
     inertia: Callable[[Any], Any] = lambda p: 0.0
 
 
-def load(kind: LoadKind) -> LoadModel:
-    """A load by name; a locked shaft carries nothing but what holds it."""
-    return {
-        "measured": _MEASURED,
-        "free": _FREE,
-        "locked": _FREE,
-        "pulley": _PULLEY,
-        "hand": _HAND,
-        "pulley+hand": combined(_PULLEY, _HAND),
-    }[kind]
-
-
-def combined(first: LoadModel, second: LoadModel) -> LoadModel:
+def _combined(first: LoadModel, second: LoadModel) -> LoadModel:
     """Two loads on one shaft."""
     n, m, q = len(first.states), len(first.inputs), len(first.parameters)
     first_torque, second_torque = first.torque, second.torque
@@ -98,16 +89,6 @@ def hand_torque(theta: Any, omega: Any, x: Any, u: Any, p: Any) -> tuple[Any]:
     return (grip * (B_u * (hand_omega - omega) + K_u * (hand_theta - theta)),)
 
 
-def hand_impedance(
-    inertia: float = _HAND_INERTIA,
-    damping: float = _HAND_DAMPING,
-    response_time: float = _RESPONSE_TIME,
-) -> tuple[float, float]:
-    """Stiffness [N*m/rad] and damping [N*m*s/rad] of a hand (A.2)."""
-    omega_n = 3.0 / response_time
-    return omega_n**2 * inertia, 2.0 * damping * omega_n * inertia
-
-
 _FREE = LoadModel(lambda theta, omega, x, u, p: (0.0,))
 
 _MEASURED = LoadModel(
@@ -142,7 +123,16 @@ _HAND = LoadModel(
         Input("hand_omega", "rad/s", "foh", "speed of the wrist"),
     ),
     (
-        fixed("K_u", "N*m/rad", hand_impedance()[0], "stiffness of the hand (A.2)"),
-        fixed("B_u", "N*m*s/rad", hand_impedance()[1], "damping of the hand (A.2)"),
+        fixed("K_u", "N*m/rad", HAND_STIFFNESS, "stiffness of the hand (A.2)"),
+        fixed("B_u", "N*m*s/rad", HAND_DAMPING, "damping of the hand (A.2)"),
     ),
 )
+
+LOADS: dict[Load, LoadModel] = {
+    "measured": _MEASURED,
+    "free": _FREE,
+    "locked": _FREE,  # carries nothing but what holds it
+    "pulley": _PULLEY,
+    "hand": _HAND,
+    "pulley+hand": _combined(_PULLEY, _HAND),
+}

@@ -11,38 +11,36 @@ from pydantic import Field
 from daq.config.units import Part
 
 DriverKind = Literal["closed", "open"]
-HysteresisKind = Literal["bouc-wen", "dahl", "lugre"]
-FrictionKind = Literal["none", "stribeck", "cyclic"]
-LoadKind = Literal["measured", "free", "locked", "pulley", "hand", "pulley+hand"]
-SensorPlace = Literal["load", "between"]
-SetName = Literal["nominal", "rig", "A", "B", "C", "D"]
-
 MotorDriver = Annotated[
     DriverKind,
     Field(description="motor amplifier: closed controls its current, open gives a voltage"),
 ]
 BrakeDriver = Annotated[DriverKind, Field(description="brake amplifier: likewise")]
-Hysteresis = Annotated[HysteresisKind, Field(description="hysteresis model of the brake")]
+Hysteresis = Annotated[
+    Literal["bouc-wen", "dahl", "lugre"], Field(description="hysteresis model of the brake")
+]
 Exponent = Annotated[Part, Field(ge=1.0, le=50.0, description="n of the Bouc-Wen hysteresis")]
 Smooth = Annotated[
     bool, Field(description="tanh(rho x) in place of the hysteresis's signs: differentiable")
 ]
 Friction = Annotated[
-    FrictionKind,
+    Literal["none", "stribeck", "cyclic"],
     Field(description="brushes of the torque sensor; cyclic: unevenly worn along a turn"),
 ]
 Load = Annotated[
-    LoadKind, Field(description="what is on the shaft; measured: a torque known from a sensor")
+    Literal["measured", "free", "locked", "pulley", "hand", "pulley+hand"],
+    Field(description="what is on the shaft; measured: a torque known from a sensor"),
 ]
 PlantLoad = Annotated[
     Literal["free", "locked", "pulley", "hand"], Field(description="what is on the shaft")
 ]
 Sensor = Annotated[
-    SensorPlace, Field(description="torque sensor at the load, or between motor and brake")
+    Literal["load", "between"],
+    Field(description="torque sensor at the load, or between motor and brake"),
 ]
 Limits = Annotated[bool, Field(description="ends of the amplifiers' range: 24 V, 2.5 A")]
 ParameterSet = Annotated[
-    SetName,
+    Literal["nominal", "rig", "A", "B", "C", "D"],
     Field(
         description="values: nominal for a search, of the simulated rig, or of a row of the "
         "thesis's table 4.1"
@@ -54,12 +52,12 @@ ParameterSet = Annotated[
 class Design:
     """The choices of one actuator, as ``actuator`` takes them."""
 
-    driver_motor: DriverKind = "closed"
-    driver_brake: DriverKind = "closed"
-    hysteresis: HysteresisKind = "bouc-wen"
-    exponent: float = 1.0
-    smooth: bool = False
-    friction: FrictionKind = "none"
-    load: LoadKind = "measured"
-    sensor: SensorPlace = "load"
-    limits: bool = False
+    driver_motor: MotorDriver = "closed"
+    driver_brake: BrakeDriver = "closed"
+    hysteresis: Hysteresis = "bouc-wen"
+    exponent: Exponent = 1.0
+    smooth: Smooth = False
+    friction: Friction = "none"
+    load: Load = "measured"
+    sensor: Sensor = "load"
+    limits: Limits = False

@@ -4,7 +4,7 @@ Each value of the rig has the reason for it beside it. "Assumed" ones stand in n
 Identification models have none of them unless a set is named.
 """
 
-from sim_rig.physics.options import Design, SetName
+from sim_rig.physics.options import Design, ParameterSet
 
 # Motor and its driver; what a row does not name stays as the rig has it.
 TABLE_4_1 = {
@@ -89,7 +89,7 @@ _BRAKES = {
 _DEFAULT = Design()
 
 
-def named(name: SetName, design: Design = _DEFAULT) -> dict[str, float]:
+def named(name: ParameterSet, design: Design = _DEFAULT) -> dict[str, float]:
     """Values of a named set for a design's parts, by parameter; "nominal" changes none."""
     if name == "nominal":
         return {}

@@ -11,11 +11,11 @@ from daq.errors import ConfigError, RunError
 from daq.experiment import Sample
 from daq.hal import Samples
 from daq.run.plan import plan
-from protocols.analysis.ripple import ripple
+from protocols.analysis.plateau_findings import ripple
 from protocols.analysis.torque_curve import Level, Motor, fit, levels_of
 from protocols.constant_velocity import ConstantVelocity
-from protocols.control.pid import VelocityGains
-from protocols.control.staircase import Drive, Plateau, SettlingTest, Staircase, longest
+from protocols.control.loop import Pid, SpeedTracker, VelocityGains, VelocityServo
+from protocols.control.staircase import Plateau, SettlingTest, Staircase, longest
 from tests.protocols.closed_loop import logged, numbers, run, shipped
 
 C0, C1, K_M, B_M = 1.2e-4, 6e-4, 0.353 / 2.5, 8e-5  # sim_rig/physics/values.py
@@ -181,13 +181,15 @@ def test_a_sensor_said_to_be_elsewhere_is_noticed(tmp_path):
 # The staircase by itself, fed with angles of known motions.
 
 RATE = 1000.0
-DRIVE = Drive(VelocityGains(proportional=0.1, integral=1.0), 1e4, 4.5, 100.0, 200.0)
+GAINS = VelocityGains(proportional=0.1, integral=1.0)
+SLOPE, LIMIT = 1e4, 4.5
 SETTLING = SettlingTest(tolerance=5.0, least=0.5, time=0.1, timeout=1.0)
 
 
 def visit(speeds, plateaus, brake_current=0.0):
     """The controller's answers to a shaft that turns with given speeds, whatever it commands."""
-    controller = Staircase(plateaus, DRIVE, SETTLING)
+    servo = VelocityServo(Pid(GAINS, -LIMIT, LIMIT), SpeedTracker(200.0), 100.0, "")
+    controller = Staircase(plateaus, SETTLING, servo, LIMIT, SLOPE)
     theta = np.concatenate([[0.0], np.cumsum(speeds)]) / RATE
     answers = []
     for k in range(len(speeds)):
@@ -229,7 +231,7 @@ def test_a_plateau_that_never_settles_is_given_up_at_its_timeout():
     assert plateau[-1] == -1.0 and len(answers) < 4000
     assert (
         len(answers)
-        <= longest((Plateau(20.0, 0.1, 0.5), Plateau(-20.0, 0.1, 0.5)), DRIVE, SETTLING) * RATE + 20
+        <= longest((Plateau(20.0, 0.1, 0.5), Plateau(-20.0, 0.1, 0.5)), SETTLING, SLOPE) * RATE + 20
     )
 
 
@@ -285,16 +287,16 @@ def synthetic(rng, noise, sensor_offset=0.0, dry=0.0):
         amperes = motor + 0.005 * noise * rng.standard_normal(n)
         error = noise / math.sqrt(n)
         levels.append(
-            Level(index, 0.0, step.velocity, 0.0, current, np.zeros(n), torque, amperes,
+            Level(index, step.brake, 0.0, step.velocity, 0.0, current, np.zeros(n), torque, amperes,
                   0.007 * error, 0.005 * error)
         )  # fmt: skip
-    return plateaus, levels
+    return levels
 
 
 @pytest.mark.parametrize("motor", [None, Motor(K_M, B_M)])
 def test_without_noise_the_line_is_exact(motor):
-    plateaus, levels = synthetic(np.random.default_rng(0), 0.0, sensor_offset=0.003)
-    line = fit(levels, plateaus, motor)
+    levels = synthetic(np.random.default_rng(0), 0.0, sensor_offset=0.003)
+    line = fit(levels, motor)
     assert line.c0.value == pytest.approx(C0, rel=1e-6)
     assert line.c1.value == pytest.approx(C1, rel=1e-6)
     np.testing.assert_allclose(line.kappa, RESIDUAL + PER_AMPERE * line.currents, rtol=1e-6)
@@ -304,22 +306,22 @@ def test_without_noise_the_line_is_exact(motor):
 
 
 def test_the_motors_dry_friction_is_not_taken_for_the_brakes():
-    plateaus, levels = synthetic(np.random.default_rng(0), 0.0, dry=0.004)
-    line = fit(levels, plateaus, None)
+    levels = synthetic(np.random.default_rng(0), 0.0, dry=0.004)
+    line = fit(levels, None)
     assert line.c0.value == pytest.approx(C0, rel=1e-6)
     np.testing.assert_allclose(line.kappa, RESIDUAL + PER_AMPERE * line.currents, rtol=1e-6)
 
 
 @pytest.mark.parametrize("offset", [-3e-4, 3e-4])
 def test_what_the_brake_sensors_zero_is_off_stays_out_of_c1(offset):
-    plateaus, levels = synthetic(np.random.default_rng(0), 0.0)
+    levels = synthetic(np.random.default_rng(0), 0.0)
     shifted = [dataclasses.replace(x, brake_current=x.brake_current + offset) for x in levels]
-    assert fit(shifted, plateaus, Motor(K_M, B_M)).c1.value == pytest.approx(C1, rel=1e-6)
+    assert fit(shifted, Motor(K_M, B_M)).c1.value == pytest.approx(C1, rel=1e-6)
 
 
 def test_with_one_brake_command_nothing_is_said_of_the_motor():
-    plateaus, levels = synthetic(np.random.default_rng(3), 1.0)
-    line = fit([level for level in levels if level.brake_current == 0.0], plateaus, None)
+    levels = synthetic(np.random.default_rng(3), 1.0)
+    line = fit([level for level in levels if level.brake_current == 0.0], None)
     assert line.constant is None and line.damping is None and line.c1 is None
     assert line.c0.low < C0 < line.c0.high
 
@@ -329,16 +331,16 @@ def test_intervals_hold_the_truth_at_least_as_often_as_they_say(motor):
     rng = np.random.default_rng(5)
     held = np.zeros(2)
     for _ in range(150):
-        plateaus, levels = synthetic(rng, 1.0)
-        line = fit(levels, plateaus, motor)
+        levels = synthetic(rng, 1.0)
+        line = fit(levels, motor)
         held += [line.c0.low < C0 < line.c0.high, line.c1.low < C1 < line.c1.high]
     assert (held >= 135).all(), "95 % of 150 are 142, give or take three"
 
 
 def test_one_velocity_makes_no_slope():
-    plateaus, levels = synthetic(np.random.default_rng(0), 1.0)
+    levels = synthetic(np.random.default_rng(0), 1.0)
     with pytest.raises(ValueError, match="two settled velocities"):
-        fit([level for level in levels if abs(level.omega) < 30.0], plateaus, None)
+        fit([level for level in levels if abs(level.omega) < 30.0], None)
 
 
 def test_a_ripple_is_told_from_noise():

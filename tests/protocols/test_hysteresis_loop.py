@@ -11,7 +11,7 @@ from scipy.integrate import quad, solve_ivp
 from daq.config.rig import RigConfig
 from daq.errors import ConfigError, RunError
 from daq.run.plan import plan
-from protocols.analysis.bouc_wen_loop import Cycles, fit, hysteresis
+from protocols.analysis.hysteresis import Cycles, fit, hysteresis
 from protocols.hysteresis_loop import HysteresisLoop
 from sim_rig.physics.hysteresis import hysteresis as brake_model
 from sim_rig.physics.values import named

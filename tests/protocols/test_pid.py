@@ -6,16 +6,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
-from protocols.control.pid import Pid, PidGains, Ramp
-from protocols.control.speed_tracker import SpeedTracker
+from protocols.control.loop import Pid, PidGains, Ramp, SpeedTracker
 
 STEP = 1.0 / 800.0  # s
 numbers = st.floats(-100.0, 100.0)
 
 
-def pid(p=0.0, i=0.0, d=0.0, filter_time=0.0, limit=1e9, start=0.0):
+def pid(p=0.0, i=0.0, d=0.0, filter_time=0.0, limit=1e9):
     gains = PidGains(proportional=p, integral=i, derivative=d, derivative_filter=filter_time)
-    return Pid(gains, -limit, limit, start)
+    return Pid(gains, -limit, limit)
 
 
 def outputs(controller, references, measured, step=STEP):
@@ -40,8 +39,8 @@ def test_the_derivative_of_a_ramp_ends_at_its_slope_and_ignores_the_reference():
 
 
 def test_the_integral_of_a_constant_error_rises_in_a_line():
-    got = outputs(pid(p=2.0, i=30.0, start=1.0), 0.5, np.zeros(100))
-    np.testing.assert_allclose(got, 1.0 + 30.0 * 0.5 * STEP * np.arange(100), atol=1e-12)
+    got = outputs(pid(p=2.0, i=30.0), 0.5, np.zeros(100))
+    np.testing.assert_allclose(got, 30.0 * 0.5 * STEP * np.arange(100), atol=1e-12)
 
 
 def test_a_lost_sample_is_made_up_for():
@@ -53,24 +52,24 @@ def test_a_lost_sample_is_made_up_for():
     assert after_loss == pytest.approx(last)
 
 
-@given(start=st.floats(-5, 5), reference=numbers, measured=numbers, p=st.floats(0, 10))
-def test_it_starts_without_a_bump(start, reference, measured, p):
-    controller = pid(p=p, i=1.0, limit=5.0, start=start)
-    assert controller.output(0.0, reference, measured) == pytest.approx(start, abs=1e-9)
+@given(reference=numbers, measured=numbers, p=st.floats(0, 10))
+def test_it_starts_without_a_bump(reference, measured, p):
+    controller = pid(p=p, i=1.0, limit=5.0)
+    assert controller.output(0.0, reference, measured) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_without_an_integral_the_first_output_is_proportional():
-    assert pid(p=2.0, start=3.0).output(0.0, 1.5, 1.0) == 1.0
+    assert pid(p=2.0).output(0.0, 1.5, 1.0) == 1.0
 
 
 @given(
-    st.lists(st.tuples(numbers, numbers, numbers), min_size=1, max_size=50),
+    st.lists(st.tuples(numbers, numbers), min_size=1, max_size=50),
     st.floats(0, 10), st.floats(0, 1000), st.floats(0, 0.1),
 )  # fmt: skip
 def test_the_output_never_passes_its_limits(rows, p, i, d):
     controller = pid(p, i, d, 0.01, limit=4.5)
-    for k, (reference, measured, ahead) in enumerate(rows):
-        assert abs(controller.output(k * STEP, reference, measured, ahead)) <= 4.5
+    for k, (reference, measured) in enumerate(rows):
+        assert abs(controller.output(k * STEP, reference, measured)) <= 4.5
 
 
 def test_the_output_leaves_its_limit_in_the_sample_in_which_the_error_turns():
@@ -93,12 +92,6 @@ def test_an_integral_at_the_limit_gives_way_to_an_error_that_leads_back():
     outputs(controller, 1.0, np.zeros(100))
     got = [controller.output((100 + k) * STEP, -1.0, 0.0) for k in range(3)]
     np.testing.assert_allclose(np.diff(got), -100.0 * STEP)
-
-
-def test_feedforward_is_added_and_counts_against_the_limit():
-    controller = pid(p=1.0, limit=2.0)
-    assert controller.output(0.0, 1.0, 0.5, 1.0) == 1.5
-    assert controller.output(STEP, 1.0, 0.5, 3.0) == 2.0
 
 
 def closed_loop(controller, reference, seconds, disturbance):

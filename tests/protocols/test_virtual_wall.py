@@ -9,16 +9,14 @@ from daq.config.rig import RigConfig
 from daq.errors import ConfigError, RunError
 from daq.experiment import Sample
 from daq.run.plan import plan
-from protocols.analysis.passivity import SampledWall, passive_stiffness
-from protocols.control.speed_tracker import SpeedTracker
+from protocols.analysis.walls import SampledWall, passive_stiffness
+from protocols.control.loop import SpeedTracker
 from protocols.virtual_wall import VirtualWall
 from sim_rig.backend import Simulation
 from sim_rig.device.user import SimulatedUser
-from sim_rig.physics.loads import hand_impedance
 from tests.protocols.closed_loop import logged, numbers, run, shipped
 
 PERIOD = 1.0 / 800.0
-HAND_STIFFNESS, HAND_DAMPING = hand_impedance()
 HELD = {"load": "hand"}
 LEANS = [[0.5, 1.0]]
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim_rig.physics.friction import friction
+from sim_rig.physics.friction import FRICTIONS
 from tests.sim_rig.support import Parts
 
 STRIBECK = {"F_c": 0.02, "F_s": 0.03, "omega_s": 2.0, "B_f": 1e-3, "omega_r": 0.01}
@@ -19,7 +19,7 @@ VALUES = {"stribeck": STRIBECK, "cyclic": CYCLIC}
 
 
 def torque(kind, theta, omega, **changes):
-    rubbing = friction(kind)
+    rubbing = FRICTIONS[kind]
     values = VALUES[kind] | changes
     assert [parameter.name for parameter in rubbing.parameters] == list(values)
     return rubbing.torque(theta, omega, tuple(values.values()))
@@ -33,8 +33,8 @@ def test_friction_by_hand():
     around = 0.008 * math.cos(3.6) - 0.006 * math.sin(3.6)
     expected += around * math.tanh(2.0)
     assert torque("cyclic", 1.2, omega) == pytest.approx(expected, rel=1e-12)
-    assert friction("none").parameters == ()
-    assert friction("none").torque(1.2, omega, ()) == 0.0
+    assert FRICTIONS["none"].parameters == ()
+    assert FRICTIONS["none"].torque(1.2, omega, ()) == 0.0
 
 
 @pytest.mark.parametrize("direction", [1.0, -1.0])

@@ -12,19 +12,24 @@ with kappa = alpha A / (beta + gamma), so that of z and alpha only their product
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from daq.findings import Chart, Findings, Number, Series, Table
 from daq.hal import FloatArray
-from protocols.analysis.results import Estimate, student
+from protocols.analysis import results
+from protocols.analysis.results import Estimate
 
 _POINTS = 400  # of a cycle that are fitted
 _RATES = (2.0, 2000.0)  # 1/rad, of all brakes that there may be
 _PARTS = (0.5, 0.999)  # of Bouc-Wen models of class 1
 _STEP = 1e-4  # relative, of numerical derivatives
+_LITTLE = 0.8  # of the torque's variance explained, below which a loop is no brake's
+_UNLIKE = 1.6  # times a rated value, or a part of it, beyond which something is mixed up
+_GUESS = 2.0  # either side of an estimate, where an identification may search
+_NEAR_ZERO = 0.05  # of the rate: a share of beta that cannot be told from less
 
 
 @dataclass(frozen=True)
@@ -48,29 +53,22 @@ class Cycles:
         return energy
 
 
-class Motion(NamedTuple):
-    """Mean motion over a cycle, (n,) each: angle [rad], speed [rad/s], acceleration [rad/s^2]."""
-
-    angle: FloatArray
-    speed: FloatArray
-    acceleration: FloatArray
-
-
 @dataclass(frozen=True)
 class LoopFit:
     """Parameters of the steady loops; errors by the scatter between cycles.
 
     kappa: half the height of the loop at each level [N*m]. kappa0, kappa1: their line over the
-    current, None with a single level. explained: part of the torque's variance. torque: fitted,
-    (n_levels, n) [N*m], at every sample of the period.
+    current, None with a single level. explained: part of the torque's variance. motions: of each
+    level, as of ``motion``. torque: fitted, (n_levels, n) [N*m], at every sample of the period.
     """
 
     rate: Estimate
     part: Estimate
-    kappa: tuple[Estimate, ...]
+    kappa: list[Estimate]
     kappa0: Estimate | None
     kappa1: Estimate | None
     explained: float
+    motions: list[FloatArray]
     torque: FloatArray
 
     @property
@@ -85,8 +83,11 @@ class LoopFit:
         return 2.0 * self.part.value * self.rate.value
 
 
-def motion(cycles: Cycles) -> Motion:
-    """Mean motion of a level's cycles, smoothed over a few samples; no way is left at its end."""
+def motion(cycles: Cycles) -> FloatArray:
+    """Mean angle [rad], speed and acceleration of a level's cycles, smoothed, (3, n).
+
+    No way is left at the end of the angle.
+    """
     from scipy.signal import savgol_filter
 
     n = cycles.angle.shape[1]
@@ -96,11 +97,9 @@ def motion(cycles: Cycles) -> Motion:
     angle = angle - drift * np.arange(n)
     window = min(max(5, 2 * round(0.008 / cycles.dt) + 1), n - 1 + n % 2)
 
-    def smooth(order: int) -> FloatArray:
-        smoothed: FloatArray = savgol_filter(angle, window, 3, order, cycles.dt, mode="wrap")
-        return smoothed
-
-    return Motion(smooth(0), smooth(1) + drift / cycles.dt, smooth(2))
+    smooth = [savgol_filter(angle, window, 3, k, cycles.dt, mode="wrap") for k in range(3)]
+    smooth[1] = smooth[1] + drift / cycles.dt
+    return np.stack(smooth)
 
 
 def hysteresis(angle: FloatArray, rate: float, part: float) -> FloatArray:
@@ -158,7 +157,7 @@ class _Problem:
 
     def __init__(self, levels: list[Cycles]) -> None:
         self._motions = [motion(level) for level in levels]
-        if any(np.ptp(m.angle) < 0.02 for m in self._motions):
+        if any(np.ptp(angle) < 0.02 for angle, *_ in self._motions):
             raise ValueError(
                 "the shaft has hardly moved: raise the amplitude or lower brake_commands; a brake "
                 "stronger than the motor holds it"
@@ -170,10 +169,8 @@ class _Problem:
     def columns(self, rate: float, part: float, stride: int | None = None) -> FloatArray:
         """What enters linearly, (n_levels * points, n_columns); stride: from point to point."""
         n = len(self._levels)
-        angle, speed, acceleration = (
-            np.stack(column)[:, :: stride or self._stride]
-            for column in zip(*self._motions, strict=True)
-        )
+        motions = np.stack(self._motions, axis=1)[:, :, :: stride or self._stride]
+        angle, speed, acceleration = motions
         w = hysteresis(angle, rate, part)
         of_level = np.eye(n)[:, :, None]
         columns = [*(of_level * w[:, None, :]).swapaxes(0, 1), speed, acceleration]
@@ -195,33 +192,144 @@ class _Problem:
         by_rate = (self.columns(rate * (1.0 + _STEP), part) - columns) @ weights / _STEP
         by_part = (self.columns(rate, part - _STEP) - columns) @ weights / -_STEP
         jacobian = np.column_stack([by_rate / rate, by_part, columns])
-        changes = self._cycle_deviations() @ np.linalg.pinv(jacobian).T
+        cycles = [level.torque[:, :: self._stride] for level in self._levels]
+        deviations = np.concatenate([x - x.mean(axis=0) for x in cycles], axis=1)
+        changes = deviations @ np.linalg.pinv(jacobian).T
         of_rate, of_part, *kappa = _estimates([rate, part, *weights[:n]], changes[:, : 2 + n])
         # kappa0 + kappa1 |i| through the levels.
         sizes = np.abs(self._currents)
         inverse = np.linalg.pinv(np.column_stack([np.ones_like(sizes), sizes]))
         line = _estimates(inverse @ np.asarray(weights[:n]), changes[:, 2 : 2 + n] @ inverse.T)
+        kappa0, kappa1 = line if n > 1 else (None, None)
         misfit = np.sum((columns @ weights - torque) ** 2)
         return LoopFit(
             rate=of_rate,
             part=of_part,
-            kappa=tuple(kappa),
-            kappa0=line[0] if n > 1 else None,
-            kappa1=line[1] if n > 1 else None,
+            kappa=kappa,
+            kappa0=kappa0,
+            kappa1=kappa1,
             explained=float(1.0 - misfit / np.sum((torque - torque.mean()) ** 2)),
+            motions=self._motions,
             torque=(self.columns(rate, part, stride=1) @ weights).reshape(n, -1),
         )
-
-    def _cycle_deviations(self) -> FloatArray:
-        """Torque of each cycle less the mean one, (n_cycles, n_levels * points)."""
-        cycles = [level.torque[:, :: self._stride] for level in self._levels]
-        return np.concatenate([x - x.mean(axis=0) for x in cycles], axis=1)
 
 
 def _estimates(values: Sequence[float] | FloatArray, changes: FloatArray) -> list[Estimate]:
     """Estimates of m values by what each cycle alone changes in them, (n_cycles, m)."""
     n = len(changes)
     errors = np.sqrt(np.sum(changes**2, axis=0) / (n * (n - 1)))
-    return [
-        Estimate(float(v), float(e), student(n - 1)) for v, e in zip(values, errors, strict=True)
-    ]
+    return results.estimates(values, errors, n - 1)
+
+
+def loop_findings(
+    levels: list[Cycles], missing: int, brake_constant: float | None, torque_sensor: str
+) -> Findings:
+    """Parameters, a row for each level, loops over angle and velocity, ranges.
+
+    levels: their counted cycles. missing: how many brake commands have none. brake_constant: by
+    the brake's ratings [N*m/A], if given. torque_sensor: where the settings say that it is.
+    """
+    # One matrix of cycles: of a run with losses as many of each level as all have.
+    n = min(len(level.angle) for level in levels)
+    levels = [replace(x, angle=x.angle[:n], torque=x.torque[:n]) for x in levels]
+    loop = fit(levels)
+    return Findings(
+        _numbers(loop),
+        (_table(levels, loop),),
+        _charts(levels, loop),
+        _ranges(loop),
+        tuple(_remarks(loop, missing, brake_constant, torque_sensor)),
+    )
+
+
+def _numbers(loop: LoopFit) -> tuple[Number, ...]:
+    at_zero = "hysteretic torque at zero current"
+    back = "way from a reversal to zero hysteretic torque"
+    return (
+        *results.estimated(
+            ("rate", loop.rate, "1/rad", "beta + gamma: how fast it turns over"),
+            ("part", loop.part, "1", "gamma / (beta + gamma): shape at the reversal"),
+            ("kappa0", loop.kappa0, "N*m", f"{at_zero}, alpha0 A / (beta + gamma)"),
+            ("kappa1", loop.kappa1, "N*m/A", "the same per ampere of brake current"),
+        ),
+        Number("intercept", loop.intercept, "rad", meaning=back),
+    )
+
+
+def _table(levels: list[Cycles], loop: LoopFit) -> Table:
+    rows = []
+    for level, kappa in zip(levels, loop.kappa, strict=True):
+        energy = level.energy
+        loss = energy.mean(), energy.std(ddof=1) / math.sqrt(len(energy))
+        height = kappa.value, kappa.error, kappa.value * loop.reversal
+        rows.append((level.brake_command, level.current, *loss, *height))
+    heading = (
+        "brake_command [V], brake_current [A], energy [J], energy_error [J], "
+        "hysteretic_torque [N*m], hysteretic_error [N*m], reversal_slope [N*m/rad]"
+    )
+    return results.table_of_rows("loops", "Loops, energy for each cycle", heading, rows)
+
+
+def _charts(levels: list[Cycles], loop: LoopFit) -> tuple[Chart, ...]:
+    """Measured means over angle and velocity, and the fitted loops over the angle."""
+    over_angle, over_speed, fitted = [], [], []
+    for level, (angle, speed, _), torque in zip(levels, loop.motions, loop.torque, strict=True):
+        label, measured = f"{level.brake_command:g} V", _closed(level.torque.mean(axis=0))
+        over_angle.append(Series(label, _closed(angle), measured))
+        over_speed.append(Series(label, _closed(speed), measured))
+        fitted.append((_closed(angle), _closed(torque)))
+    over_angle.append(results.model_line("fitted", fitted))
+    title = "Torque over the {} at each brake command, mean of cycles"
+    return tuple(
+        Chart(f"torque_{name}", title.format(name), axis, results.TORQUE, tuple(series))
+        for name, axis, series in (
+            ("angle", results.ANGLE, over_angle),
+            ("velocity", results.VELOCITY, over_speed),
+        )
+    )
+
+
+def _ranges(loop: LoopFit) -> dict[str, tuple[float, float]]:
+    """Where an identification may search, with z scaled to saturate near 1."""
+    if loop.explained < _LITTLE:
+        return {}
+    rate, part = loop.rate.value, loop.part.value
+    guesses = {"gamma": rate * part, "beta": rate * max(1.0 - part, _NEAR_ZERO), "A": rate}
+    if loop.kappa0 is not None and loop.kappa1 is not None:
+        guesses |= {"alpha0": loop.kappa0.value, "alpha1": loop.kappa1.value}
+    return {name: (x / _GUESS, x * _GUESS) for name, x in guesses.items() if x > 0.0}
+
+
+def _remarks(loop: LoopFit, missing: int, rated: float | None, torque_sensor: str) -> Iterator[str]:
+    yield (
+        f"The Bouc-Wen loop explains {100.0 * loop.explained:.1f} % of the torque's variance. "
+        "Intervals are by the scatter between cycles alone."
+    )
+    if loop.explained < _LITTLE:
+        elsewhere = "load" if torque_sensor == "between" else "between"
+        yield (
+            "That is too little for ranges. Is the torque sensor where 'torque_sensor' says? "
+            f"Else write 'torque_sensor: {elsewhere}'. With the brake off little else than "
+            "noise may be left."
+        )
+    if rated and loop.kappa1 and not rated / _UNLIKE < loop.kappa1.value < _UNLIKE * rated:
+        yield (
+            f"kappa1 is {loop.kappa1.value:.3g} N*m/A where ratings.brake_constant says "
+            f"{rated:g}: look at 'torque_sensor', ratings.torque_constant and the scales in "
+            "the rig's file."
+        )
+    if missing:
+        yield f"{missing} brake command(s) without two whole cycles are left out."
+    if loop.kappa0 is None:
+        yield "With a second brake command alpha0 and alpha1 could be told apart."
+    swing = min(float(np.ptp(angle)) for angle, *_ in loop.motions)
+    if swing < 4.0 * loop.intercept:
+        yield (
+            f"The shaft swung by {swing:.2g} rad only, less than four times the intercept of "
+            f"{loop.intercept:.2g} rad: the loops do not saturate. Raise the amplitude or the "
+            "period."
+        )
+
+
+def _closed(values: FloatArray) -> FloatArray:
+    return np.append(values, values[0])

@@ -1,0 +1,256 @@
+"""When a rendered wall is stable, by passivity and by eigenvalues; findings of a run of walls."""
+
+import functools
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from daq.findings import Axis, Findings, Heatmap, Number, Series, Table
+from daq.hal import FloatArray, Samples
+from protocols.analysis.results import table_of_rows
+from protocols.control.loop import tracker_gains
+from protocols.control.wall import ABORTED, WATCHED, Cell, WallSettings, oscillation
+
+_STIFFEST = 1e4  # N*m/rad, beyond what any motor renders
+_HALVINGS = 32
+_DRAWN = 60  # dampings of a bound in a figure
+_WHOLE = 0.9  # of the time watched: samples may be lost at its ends
+_IN_CONTACT = 0.5  # of the time watched, at most, of a wall that does not count
+
+
+def passive_stiffness(physical: float, damping: float, period: float) -> float:
+    """Largest stiffness that (1.1), (1.2) call passive, b > K T / 2 + |B| [N*m/rad].
+
+    Colgate & Schenkel, "Passivity of a class of sampled-data systems", 1997. physical: b, with
+    what a brake adds [N*m*s/rad]; damping: B that is rendered; period: T [s]. Not positive where
+    the damping alone is more than b.
+    """
+    return 2.0 * (physical - abs(damping)) / period
+
+
+@dataclass(frozen=True)
+class SampledWall:
+    """A wall touched by a shaft: inertia [kg*m^2], damping [N*m*s/rad] and stiffness [N*m/rad] of
+    all that is physical, hand included; rendered every ``period`` [s], ``ahead`` ticks late, with
+    the speed tracked at a bandwidth [Hz].
+    """
+
+    inertia: float
+    damping: float
+    stiffness: float
+    period: float
+    ahead: int
+    bandwidth: float
+
+    def spectral_radius(self, stiffness: float, damping: float) -> float:
+        """Size of the sampled loop's largest eigenvalue with this wall; below 1 it is stable.
+
+        The shaft is discretised exactly between samples. States: angle and speed of the shaft,
+        the tracker's, and the torques on their way.
+        """
+        n = 4 + self.ahead
+        plant, push = self._shaft
+        alpha, beta = tracker_gains(self.bandwidth, self.period)
+        # The tracker as it stands after the sample k, from its state after k - 1 and theta_k.
+        track = np.array(
+            [[1.0 - alpha, (1.0 - alpha) * self.period], [-beta / self.period, 1.0 - beta]]
+        )
+        gain = np.array([alpha, beta / self.period])
+        loop = np.zeros((n, n))
+        loop[:2, :2] = plant
+        loop[:2, -1] = push
+        loop[2:4, 0], loop[2:4, 2:4] = gain, track
+        loop[4] = -damping * loop[3]
+        loop[4, 0] -= stiffness
+        for late in range(1, self.ahead):
+            loop[4 + late, 3 + late] = 1.0
+        # The torque that acts from a sample on is the one computed ``ahead`` samples before.
+        return float(np.abs(np.linalg.eigvals(loop)).max())
+
+    def critical_stiffness(self, damping: float) -> float:
+        """The stiffness at which a wall of this damping begins to ring [N*m/rad]; 0 if all do."""
+        low, high = 0.0, _STIFFEST
+        if self.spectral_radius(1e-9, damping) >= 1.0:
+            return 0.0
+        for _ in range(_HALVINGS):
+            middle = 0.5 * (low + high)
+            if self.spectral_radius(middle, damping) < 1.0:
+                low = middle
+            else:
+                high = middle
+        return low
+
+    @functools.cached_property
+    def _shaft(self) -> tuple[FloatArray, FloatArray]:
+        """Exact discretisation of J dω/dt = torque - b ω - k θ with the torque held."""
+        from scipy.linalg import expm
+
+        whole = np.zeros((3, 3))
+        whole[0, 1] = 1.0
+        whole[1] = np.array([-self.stiffness, -self.damping, 1.0]) / self.inertia
+        step = expm(whole * self.period)
+        return step[:2, :2], step[:2, 2]
+
+
+@dataclass(frozen=True)
+class WallTheory:
+    """Stability and passivity of a grid of walls, by the brake's command [V]."""
+
+    settings: WallSettings
+
+    def damping(self, brake: float) -> float:
+        """b + b_passive of (1.2) [N*m*s/rad]."""
+        return self.settings.body.damping + self.settings.body.brake_damping * abs(brake)
+
+    def loop(self, brake: float, hand: bool) -> SampledWall:
+        """The sampled loop around the shaft, with the hand or without."""
+        settings, body = self.settings, self.settings.body
+        return SampledWall(
+            body.inertia,
+            self.damping(brake) + (body.hand_damping if hand else 0.0),
+            body.hand_stiffness if hand else 0.0,
+            1.0 / settings.sample_rate,
+            settings.ahead,
+            settings.speed_filter,
+        )
+
+    def passive_stiffness(self, brake: float, damping: float) -> float:
+        """Largest passive stiffness of a wall of this damping [N*m/rad]."""
+        return passive_stiffness(self.damping(brake), damping, 1.0 / self.settings.sample_rate)
+
+    def bounds(self, brake: float) -> tuple[Series, ...]:
+        """Bounds of stability, handle held and free, and of passivity over the damping."""
+        dampings, stiffest = self.settings.dampings, self.settings.stiffnesses[-1]
+        drawn = np.linspace(min(dampings), max(dampings), _DRAWN)
+        series = []
+        for label, hand in (("stable, handle held", True), ("stable, handle free", False)):
+            loop = self.loop(brake, hand)
+            bound = np.array([loop.critical_stiffness(damping) for damping in drawn])
+            series.append(Series(label, drawn, np.where(bound <= stiffest, bound, math.nan)))
+        passive = Series(
+            "passive by (1.1)" if brake == 0.0 else "passive by (1.2)",
+            np.array([0.0, self.damping(brake)]),
+            np.array([self.passive_stiffness(brake, 0.0), 0.0]),
+        )
+        return (*series, passive)
+
+
+@dataclass(frozen=True)
+class Visit:
+    """A cell, its oscillation [rad], infinite where it was left at once, and time in contact."""
+
+    cell: Cell
+    amplitude: float
+    contact: float
+
+
+def visited(
+    settings: WallSettings, samples: Samples, extra: Mapping[str, FloatArray]
+) -> list[Visit]:
+    """The cells that were watched to their end or left at once."""
+    visits = []
+    for index, cell in enumerate(settings.cells):
+        state = np.where(extra["cell"] == index, extra["state"], math.nan)
+        watched = state == WATCHED
+        time, depth = samples.time[watched], extra["penetration"][watched]
+        if (state == ABORTED).any():
+            visits.append(Visit(cell, math.inf, math.nan))
+        elif watched.any() and np.ptp(time) > _WHOLE * 0.5 * settings.ringing.watch:
+            visits.append(Visit(cell, oscillation(time, depth), float(np.mean(depth > 0.0))))
+    return visits
+
+
+@dataclass(frozen=True)
+class WallFindings:
+    """Which walls are stable; visits: at least one."""
+
+    settings: WallSettings
+    theory: WallTheory
+    visits: list[Visit]
+
+    def findings(self) -> Findings:
+        """The stiffest walls, tables of them and of all, and a map for each brake command."""
+        numbers, maps = [], []
+        for place, brake in enumerate(self.settings.brake_commands, start=1):
+            suffix = "" if place == 1 else f"_{place}"
+            stiffest = max(self._stiffest(brake, damping) for damping in self.settings.dampings)
+            meaning = f"stiffest wall that was stable, brake at {brake:g} V"
+            numbers.append(Number(f"stiffest{suffix}", stiffest, "N*m/rad", meaning=meaning))
+            maps.append(self._map(f"z_width{suffix}", brake))
+        tables = self._boundary_table(), self._wall_table()
+        return Findings(tuple(numbers), tables, tuple(maps), {}, self._remarks())
+
+    def _is_stable(self, visit: Visit) -> bool:
+        return visit.amplitude <= self.settings.ringing.amplitude and visit.contact > _IN_CONTACT
+
+    def _stiffest(self, brake: float, damping: float) -> float:
+        """The stiffest wall below the first that rang [N*m/rad]; 0 where the softest rang."""
+        stiffest = 0.0
+        for visit in self.visits:
+            if (visit.cell.brake, visit.cell.damping) == (brake, damping):
+                if not self._is_stable(visit):
+                    break
+                stiffest = visit.cell.stiffness
+        return stiffest
+
+    def _boundary_table(self) -> Table:
+        """By brake command and damping: the stiffest stable wall, and what theory says."""
+        rows = []
+        for brake in self.settings.brake_commands:
+            held, free = (self.theory.loop(brake, hand) for hand in (True, False))
+            for damping in self.settings.dampings:
+                stable = (held.critical_stiffness(damping), free.critical_stiffness(damping))
+                passive = max(self.theory.passive_stiffness(brake, damping), 0.0)
+                rows.append((brake, damping, self._stiffest(brake, damping), *stable, passive))
+        heading = (
+            "brake_command [V], damping [N*m*s/rad], stiffest [N*m/rad], theory_held [N*m/rad], "
+            "theory_free [N*m/rad], passive [N*m/rad]"
+        )
+        return table_of_rows("boundary", "Stiffest stable wall", heading, rows)
+
+    def _wall_table(self) -> Table:
+        """Every wall that was visited."""
+        rows = [
+            (v.cell.brake, v.cell.stiffness, v.cell.damping, v.amplitude, float(self._is_stable(v)))
+            for v in self.visits
+        ]
+        heading = (
+            "brake_command [V], stiffness [N*m/rad], damping [N*m*s/rad], amplitude [rad], stable"
+        )
+        return table_of_rows("walls", "Walls", heading, rows, printed=False)
+
+    def _map(self, name: str, brake: float) -> Heatmap:
+        """Oscillation over damping and stiffness, with the bounds of theory."""
+        stiffnesses, dampings = self.settings.stiffnesses, self.settings.dampings
+        values = np.full((len(stiffnesses), len(dampings)), math.nan)
+        for visit in self.visits:
+            if visit.cell.brake == brake:
+                row = stiffnesses.index(visit.cell.stiffness)
+                shown = min(visit.amplitude, 2.0 * self.settings.ringing.amplitude)
+                values[row, dampings.index(visit.cell.damping)] = 1e3 * shown
+        return Heatmap(
+            name,
+            f"Oscillation of the wall, brake at {brake:g} V; it rings above "
+            f"{1e3 * self.settings.ringing.amplitude:.3g} mrad",
+            Axis("damping", "N*m*s/rad"),
+            Axis("stiffness", "N*m/rad"),
+            Axis("amplitude", "mrad"),
+            np.array(dampings),
+            np.array(stiffnesses),
+            values,
+            self.theory.bounds(brake),
+        )
+
+    def _remarks(self) -> tuple[str, ...]:
+        left = sum(math.isinf(visit.amplitude) for visit in self.visits)
+        skipped = len(self.settings.cells) - len(self.visits)
+        loose = sum(visit.contact <= _IN_CONTACT for visit in self.visits)
+        speed = self.settings.ringing.speed
+        remarks = (
+            (left, f"Walls left at once, at {speed:g} rad/s"),
+            (skipped, "Walls not visited, stiffer than one that rang at the same damping"),
+            (loose, "Walls without contact while watched, which do not count as stable"),
+        )
+        return tuple(f"{walls}: {count}." for count, walls in remarks if count)

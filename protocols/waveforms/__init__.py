@@ -1,1 +1,0 @@
-"""Commands known beforehand: channels around an offset, smooth ends, whole samples."""
