@@ -6,18 +6,17 @@ time.
 """
 
 import contextlib
-import dataclasses
 from collections.abc import Iterator
 
 from daq.config.rig import RigConfig, UserLimit
 from daq.errors import USER_CODE_ERRORS, ConfigError, RigError, RunError, raised_in
-from daq.hal import CHANNELS, Flag, Phase, Samples
+from daq.hal import CHANNELS, Phase, Samples
 from daq.limits.base import Limit, Trip
 from daq.limits.load import DeviceFound, I2t, Magnitude
 from daq.limits.sensors import Frozen, Jump, Silence, Stalled
 from daq.limits.shaft import Travel, Winding
 
-__all__ = ["Limit", "Limits", "Trip", "mark_interlock"]
+__all__ = ["Limit", "Limits", "Trip"]
 
 
 class Limits:
@@ -86,13 +85,6 @@ def _built_in(config: RigConfig) -> list[Limit]:
         limits.append(Frozen("torque", settings.frozen, None))
     limits.append(DeviceFound())  # last, for the others know more of what it found
     return limits
-
-
-def mark_interlock(samples: Samples, row: int) -> Samples:
-    """The samples with the tripping row flagged."""
-    flags = samples.flags.copy()
-    flags[row] |= int(Flag.INTERLOCK)
-    return dataclasses.replace(samples, flags=flags)
 
 
 class _UserCode(Limit):
