@@ -38,6 +38,8 @@ class Rig:
     def __init__(self, device: Device, config: RigConfig) -> None:
         self.config = config
         self.offsets = np.zeros(len(ANALOG_INPUTS))
+        inputs = [getattr(config.sensors, name) for name in ANALOG_INPUTS]
+        self._scale = np.array([item.sign * item.scale for item in inputs])
         self._device = device
         self._info: DeviceInfo | None = None
         self._radians = 0.0  # per count
@@ -55,7 +57,6 @@ class Rig:
         self._low, self._high = np.array(limits).T.copy()
         self._step = self._largest_step()  # V from tick to tick
         self._last_command = np.zeros(len(CHANNELS))  # V
-        self._scale = self._scales()
 
     def __enter__(self) -> Rig:
         self.open()
@@ -124,7 +125,7 @@ class Rig:
     def take_offsets(self, means: Mapping[str, float]) -> None:
         """Make what the inputs read now, in SI units by name, their zero."""
         read = np.array([means[name] for name in ANALOG_INPUTS])
-        self.offsets = self.offsets + read / self._scales()
+        self.offsets = self.offsets + read / self._scale
 
     def room(self) -> int:
         """How many more commands the device can take now."""
@@ -180,7 +181,7 @@ class Rig:
         limits = self.config.limits
         torque = math.inf if limits.torque is None else limits.torque
         bounds = np.array([limits.current.motor, limits.current.brake, torque])
-        volts = bounds / np.abs(self._scales())
+        volts = bounds / np.abs(self._scale)
         counts_low, counts_high = sorted(angle / self._radians for angle in window)
         speed = math.inf if limits.speed is None else limits.speed
         return Guard(
@@ -193,10 +194,6 @@ class Rig:
             speed / abs(self._radians),
             limits.encoder.fastest / self._rate / abs(self._radians),
         )
-
-    def _scales(self) -> FloatArray:
-        inputs = [getattr(self.config.sensors, name) for name in ANALOG_INPUTS]
-        return np.array([item.sign * item.scale for item in inputs])
 
     def _places(self, tick: int, n: int) -> slice | IntArray:
         """Where the commands of n ticks are kept."""

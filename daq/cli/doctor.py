@@ -11,7 +11,7 @@ from daq.cli import terminal
 from daq.cli.options import AsJson, RunsFolder
 
 if TYPE_CHECKING:
-    from daq.diagnose.computer import Check, Diagnosis
+    from daq.diagnose.computer import Check
 
 
 def doctor(
@@ -30,17 +30,15 @@ def doctor(
     from daq.errors import RunError
     from daq.serial.ports import ports_of
 
-    diagnosis = diagnose(ports_of(names or []), out)
+    checks = diagnose(ports_of(names or []), out)
+    bad = [check.subject for check in checks if check.verdict == "bad"]
     if json:
-        checks = [_document(check) for check in diagnosis.checks]
-        terminal.print_json({"checks": checks, "good": not diagnosis.bad})
+        terminal.print_json({"checks": [_document(check) for check in checks], "good": not bad})
     else:
-        _show(diagnosis)
-    if diagnosis.bad:
-        raise RunError(
-            f"not fit for a rig in real time: {', '.join(diagnosis.bad)}",
-            cure="the cures stand above",
-        )
+        _show(checks)
+    if bad:
+        problem = f"not fit for a rig in real time: {', '.join(bad)}"
+        raise RunError(problem, cure="the cures stand above")
 
 
 def _document(check: Check) -> dict[str, str]:
@@ -52,13 +50,13 @@ def _document(check: Check) -> dict[str, str]:
     }
 
 
-def _show(diagnosis: Diagnosis) -> None:
+def _show(checks: list[Check]) -> None:
     terminal.print_table(
         "This computer",
         ["what", "verdict", "found"],
-        [[check.subject, check.verdict, check.observation] for check in diagnosis.checks],
+        [[check.subject, check.verdict, check.observation] for check in checks],
         text=["verdict", "found"],
     )
-    for check in diagnosis.checks:
+    for check in checks:
         if check.cure:
             terminal.print_line(f"{check.subject}: {check.cure}")

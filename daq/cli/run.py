@@ -86,16 +86,15 @@ def _identify(problem: Problem, result: SessionResult, report: bool, json: bool)
 
 
 def _document(result: SessionResult) -> dict[str, Any]:
-    from daq.diagnose import punctuality
-    from daq.recording.analysis import findings_document
+    from daq.recording.analysis import Analysis
 
     runs = {"run": result.run, "validation": result.validation}
     document: dict[str, Any] = {
-        name: None if run is None else punctuality.as_document(run) for name, run in runs.items()
+        name: None if run is None else run.document for name, run in runs.items()
     }
     document["warnings"] = result.doubts
     if result.findings is not None:
-        document["findings"] = findings_document(result.findings, result.run.folder)
+        document["findings"] = Analysis(result.run.folder, result.findings).document
     return document
 
 

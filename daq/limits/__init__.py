@@ -95,12 +95,10 @@ class _UserCode(Limit):
         self._name = f"the limit {type(limit).__name__}"
 
     def begin(self, phase: Phase, sample_rate: float) -> None:
-        """Pass it on."""
         with self._blamed():
             self._limit.begin(phase, sample_rate)
 
     def window(self) -> tuple[float, float]:
-        """Pass it on, and see that it is one."""
         with self._blamed():
             low, high = self._limit.window()
             if not low <= high:
@@ -108,7 +106,6 @@ class _UserCode(Limit):
             return float(low), float(high)
 
     def check(self, samples: Samples) -> Trip | None:
-        """Pass it on, and see that the answer is one."""
         with self._blamed():
             trip = self._limit.check(samples)
         if trip is None:

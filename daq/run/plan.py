@@ -74,17 +74,16 @@ def _check_slew(volts: FloatArray, rate: float, rig: RigConfig, name: str) -> No
     if limit is None:
         return
     slopes = np.abs(np.diff(volts, prepend=0.0)) * rate
-    if (slopes <= limit * _ROUNDING).all():
-        return
     row = int(np.argmax(slopes))
-    raise ConfigError(
-        f"the plan changes the command at {slopes[row]:.6g} V/s in sample {row} (from "
-        f"{volts[row - 1] if row else 0.0:.6g} V to {volts[row]:.6g} V), faster than the rig's "
-        f"limit of {limit:g} V/s",
-        cure=f"make smaller or slower steps, or change limits.slew.{name} in the rig's file if "
-        "the hardware allows it",
-        key=name,
-    )
+    if not slopes[row] <= limit * _ROUNDING:
+        raise ConfigError(
+            f"the plan changes the command at {slopes[row]:.6g} V/s in sample {row} (from "
+            f"{volts[row - 1] if row else 0.0:.6g} V to {volts[row]:.6g} V), faster than the rig's "
+            f"limit of {limit:g} V/s",
+            cure=f"make smaller or slower steps, or change limits.slew.{name} in the rig's file if "
+            "the hardware allows it",
+            key=name,
+        )
 
 
 def _check_current(volts: FloatArray, rate: float, rig: RigConfig, name: str) -> None:

@@ -144,10 +144,10 @@ class Dialogue:
         return RunError(f"{text}; outputs were set to zero")
 
 
-def preview_of(experiment: ClosedLoop) -> Chart | Heatmap | None:
-    """What a protocol draws beforehand. Raises ConfigError."""
+def preview_of(experiment: Experiment) -> Chart | Heatmap | None:
+    """What a protocol draws beforehand, if it has a closed loop. Raises ConfigError."""
     with _before_the_run(experiment, "in preview()"):
-        return experiment.preview()
+        return experiment.preview() if isinstance(experiment, ClosedLoop) else None
 
 
 @contextlib.contextmanager

@@ -30,6 +30,12 @@ class RunResult:
     timing: dict[str, Any]
     realtime: dict[str, Any]
 
+    @property
+    def document(self) -> dict[str, Any]:
+        """The same for machines."""
+        facts = {"timing": self.timing, "realtime": self.realtime}
+        return {"folder": str(self.folder), "samples": self.n_samples, **facts}
+
 
 def run_experiment(
     experiment: Experiment,
