@@ -131,10 +131,9 @@ def _parsed(source: IO[Any], layout: Layout, dtype: type, **options: Any) -> pd.
 
 
 def _plain_numbers(path: Path, layout: Layout) -> tuple[pd.DataFrame, bool] | None:
-    """The table where it is nothing but finite numbers, as a rig writes it, and whether it is torn.
+    """A table of nothing but finite numbers, and whether it is torn; None of any other.
 
-    Many times faster than the long way, and rounded as ``float`` does it. None for any other table:
-    the long way says what it is or what is wrong with it.
+    Many times faster than by way of its cells, and rounded as ``float`` does it.
     """
     import pandas as pd
 
