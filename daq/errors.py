@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import difflib
 import inspect
+import traceback
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -168,12 +169,9 @@ def suggestion(name: str, candidates: Sequence[str]) -> str:
 
 def line_in(error: BaseException, file: Path) -> int | None:
     """The last line of a file that an error passed through; None where it did not."""
-    line, trace = None, error.__traceback__
-    while trace is not None:
-        if same_file(trace.tb_frame.f_code.co_filename, file):
-            line = trace.tb_lineno
-        trace = trace.tb_next
-    return line
+    steps = traceback.walk_tb(error.__traceback__)
+    lines = [line for frame, line in steps if same_file(frame.f_code.co_filename, file)]
+    return lines[-1] if lines else None
 
 
 def same_file(name: str | None, path: Path) -> bool:

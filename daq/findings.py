@@ -45,10 +45,7 @@ class Table:
     def __post_init__(self) -> None:
         """Raises ValueError for columns that make no table."""
         _require_file_name(self.name)
-        of = f"table {self.name!r}"
-        columns = {name: _numbers(f"{of}: {name}", values) for name, values in self.columns.items()}
-        _require_alike(of, columns)
-        object.__setattr__(self, "columns", columns)
+        object.__setattr__(self, "columns", _columns(f"table {self.name!r}", self.columns))
 
 
 @dataclass(frozen=True)
@@ -74,11 +71,10 @@ class Series:
 
     def __post_init__(self) -> None:
         """Raises ValueError for points that are none."""
-        of = f"series {self.label!r}"
-        given = {"x": self.x, "y": self.y, "spread": self.spread}
-        points = {n: _numbers(f"{of}: {n}", v) for n, v in given.items() if v is not None}
-        _require_alike(of, points)
-        for name, values in points.items():
+        points = {"x": self.x, "y": self.y}
+        if self.spread is not None:
+            points["spread"] = self.spread
+        for name, values in _columns(f"series {self.label!r}", points).items():
             object.__setattr__(self, name, values)
 
 
@@ -146,17 +142,17 @@ class Findings:
                 raise ValueError(f"ranges: {name}: {low:g} is not below {high:g}")
 
 
-def _numbers(what: str, values: Any) -> FloatArray:
-    array = np.asarray(values, dtype=np.float64)
-    if array.ndim != 1:
-        raise ValueError(f"{what} is of shape {array.shape}; expected (n,)")
-    return array
-
-
-def _require_alike(what: str, columns: Mapping[str, FloatArray]) -> None:
+def _columns(what: str, values: Mapping[str, Any]) -> dict[str, FloatArray]:
+    """Arrays of numbers, (n,) each."""
+    columns = {}
+    for name, column in values.items():
+        columns[name] = array = np.asarray(column, dtype=np.float64)
+        if array.ndim != 1:
+            raise ValueError(f"{what}: {name} is of shape {array.shape}; expected (n,)")
     if len({len(values) for values in columns.values()}) > 1:
         lengths = ", ".join(f"{name} has {len(values)}" for name, values in columns.items())
         raise ValueError(f"{what}: its columns must be of one length; {lengths} values")
+    return columns
 
 
 def _require_file_name(name: str) -> None:

@@ -26,18 +26,12 @@ ANALOG_INPUTS = ("current_motor", "current_brake", "torque")
 class Flag(enum.IntFlag):
     """What else is to be known of a sample; bits of the log's ``flags`` column."""
 
-    CLAMPED = 1
-    """The command asked for was outside its range; the range's end was applied."""
-    HELD = 2
-    """No command had arrived for this tick; the device held the one before."""
-    LOST = 4
-    """Samples are missing between the row before and this one."""
-    INTERLOCK = 8
-    """A limit was passed in this sample; from it on the outputs are zero."""
-    UNDERFLOW = 16
-    """The preloaded waveform ran dry; the outputs are zero."""
-    SATURATED = 32
-    """An analog input stood at the end of its converter's range."""
+    CLAMPED = 1  #: The command asked for was outside its range; the range's end was applied.
+    HELD = 2  #: No command had arrived for this tick; the device held the one before.
+    LOST = 4  #: Samples are missing between the row before and this one.
+    INTERLOCK = 8  #: A limit was passed in this sample; from it on the outputs are zero.
+    UNDERFLOW = 16  #: The preloaded waveform ran dry; the outputs are zero.
+    SATURATED = 32  #: An analog input stood at the end of its converter's range.
 
 
 class Mode(enum.Enum):

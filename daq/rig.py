@@ -5,8 +5,6 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -30,28 +28,18 @@ from daq.hal import (
 )
 
 
-@dataclass(frozen=True)
-class Offsets:
-    """Volts that each analog input reads at zero, (3,) in ``ANALOG_INPUTS`` order."""
-
-    volts: FloatArray
-
-    @classmethod
-    def zero(cls) -> Offsets:
-        """No offsets."""
-        return cls(np.zeros(len(ANALOG_INPUTS)))
-
-
 class Rig:
     """A rig to command and sample in SI units.
 
-    Use as a context manager: leaving it, by whatever way, zeroes the outputs and closes the
-    device.
+    offsets: volts that each analog input reads at zero, (3,) in ``ANALOG_INPUTS`` order. Use as a
+    context manager: leaving it, by whatever way, zeroes the outputs and closes the device.
     """
 
     def __init__(self, device: Device, config: RigConfig) -> None:
         self.config = config
-        self.offsets = Offsets.zero()
+        self.offsets = np.zeros(len(ANALOG_INPUTS))
+        inputs = [getattr(config.sensors, name) for name in ANALOG_INPUTS]
+        self._scale = np.array([item.sign * item.scale for item in inputs])
         self._device = device
         self._info: DeviceInfo | None = None
         self._radians = 0.0  # per count
@@ -65,21 +53,16 @@ class Rig:
         self._clamped = np.zeros(n_commands, dtype=bool)
         self._next_command = 0  # tick
         self._last_tick = -1
-        self._low, self._high = self._command_limits()
+        limits = [getattr(self.config.limits.command, name) for name in CHANNELS]
+        self._low, self._high = np.array(limits).T.copy()
         self._step = self._largest_step()  # V from tick to tick
         self._last_command = np.zeros(len(CHANNELS))  # V
-        self._scale = self._scales()
 
     def __enter__(self) -> Rig:
         self.open()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *exception: object) -> None:
         self.close()
 
     @property
@@ -99,10 +82,7 @@ class Rig:
         self._device.announce(phase, turns)
 
     def start(
-        self,
-        sample_rate: float,
-        mode: Mode,
-        window: tuple[float, float] = (-math.inf, math.inf),
+        self, sample_rate: float, mode: Mode, window: tuple[float, float] = (-math.inf, math.inf)
     ) -> None:
         """Begin sampling at ``sample_rate`` [Hz]; tick 0 is the first sample.
 
@@ -145,7 +125,7 @@ class Rig:
     def take_offsets(self, means: Mapping[str, float]) -> None:
         """Make what the inputs read now, in SI units by name, their zero."""
         read = np.array([means[name] for name in ANALOG_INPUTS])
-        self.offsets = Offsets(self.offsets.volts + read / self._scales())
+        self.offsets = self.offsets + read / self._scale
 
     def room(self) -> int:
         """How many more commands the device can take now."""
@@ -174,10 +154,6 @@ class Rig:
         self.safe()
         self._device.close()
 
-    def _command_limits(self) -> tuple[FloatArray, FloatArray]:
-        limits = [getattr(self.config.limits.command, name) for name in CHANNELS]
-        return np.array([low for low, _ in limits]), np.array([high for _, high in limits])
-
     def _largest_step(self) -> FloatArray | None:
         """Largest change of each command from tick to tick, (2,) [V]; None without a slew limit."""
         slew = [getattr(self.config.limits.slew, name) for name in CHANNELS]
@@ -202,27 +178,22 @@ class Rig:
 
     def _guard(self, window: tuple[float, float]) -> Guard:
         """Limits in volts and counts, so that the device can watch them itself."""
-        command_low, command_high = self._command_limits()
         limits = self.config.limits
         torque = math.inf if limits.torque is None else limits.torque
         bounds = np.array([limits.current.motor, limits.current.brake, torque])
-        volts = bounds / np.abs(self._scales())
+        volts = bounds / np.abs(self._scale)
         counts_low, counts_high = sorted(angle / self._radians for angle in window)
         speed = math.inf if limits.speed is None else limits.speed
         return Guard(
-            command_low,
-            command_high,
-            self.offsets.volts - volts,
-            self.offsets.volts + volts,
+            self._low,
+            self._high,
+            self.offsets - volts,
+            self.offsets + volts,
             counts_low,
             counts_high,
             speed / abs(self._radians),
             limits.encoder.fastest / self._rate / abs(self._radians),
         )
-
-    def _scales(self) -> FloatArray:
-        inputs = [getattr(self.config.sensors, name) for name in ANALOG_INPUTS]
-        return np.array([item.sign * item.scale for item in inputs])
 
     def _places(self, tick: int, n: int) -> slice | IntArray:
         """Where the commands of n ticks are kept."""
@@ -232,7 +203,7 @@ class Rig:
         return np.arange(tick, tick + n) % len(self._commands)
 
     def _to_si(self, raw: RawSamples) -> Samples:
-        analog = (raw.analog - self.offsets.volts) * self._scale
+        analog = (raw.analog - self.offsets) * self._scale
         first, last, n = int(raw.tick[0]), int(raw.tick[-1]), len(raw.tick)
         if last - first == n - 1 and last < self._next_command:
             places = self._places(first, n)

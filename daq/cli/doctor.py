@@ -24,20 +24,21 @@ def doctor(
     from daq.diagnose.computer import diagnose
     from daq.serial.ports import ports_of
 
-    diagnosis = diagnose(ports_of(names or []), out)
+    checks = diagnose(ports_of(names or []), out)
+    bad = [check.subject for check in checks if check.verdict == "bad"]
     if json:
-        checks = [
+        rows = [
             {"what": c.subject, "verdict": c.verdict, "found": c.observation, "cure": c.cure}
-            for c in diagnosis.checks
+            for c in checks
         ]
-        terminal.print_json({"checks": checks, "good": not diagnosis.bad})
+        terminal.print_json({"checks": rows, "good": not bad})
     else:
-        rows = [[check.subject, check.verdict, check.observation] for check in diagnosis.checks]
+        cells = [[check.subject, check.verdict, check.observation] for check in checks]
         head = ["what", "verdict", "found"]
-        terminal.print_table("This computer", head, rows, text=["verdict", "found"])
-        for check in diagnosis.checks:
+        terminal.print_table("This computer", head, cells, text=["verdict", "found"])
+        for check in checks:
             if check.cure:
                 print(f"{check.subject}: {check.cure}")
-    if diagnosis.bad:
-        problem = f"not fit for a rig in real time: {', '.join(diagnosis.bad)}"
+    if bad:
+        problem = f"not fit for a rig in real time: {', '.join(bad)}"
         raise RunError(problem, cure="the cures stand above")

@@ -72,16 +72,15 @@ def _identify(problem: Problem, result: SessionResult, report: bool, json: bool)
 
 
 def _document(result: SessionResult) -> dict[str, Any]:
-    from daq.diagnose.punctuality import as_document
-    from daq.recording.analysis import findings_document
+    from daq.recording.analysis import Analysis
 
     document: dict[str, Any] = {
-        "run": as_document(result.run),
-        "validation": None if result.validation is None else as_document(result.validation),
+        "run": result.run.document,
+        "validation": None if result.validation is None else result.validation.document,
         "warnings": result.doubts,
     }
     if result.findings is not None:
-        document["findings"] = findings_document(result.findings, result.run.folder)
+        document["findings"] = Analysis(result.run.folder, result.findings).document
     return document
 
 

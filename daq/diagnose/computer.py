@@ -34,24 +34,12 @@ class Check:
     cure: str = ""
 
 
-@dataclass(frozen=True)
-class Diagnosis:
-    """Everything that was checked."""
-
-    checks: list[Check]
-
-    @property
-    def bad(self) -> list[str]:
-        """Subjects with which no run is safe."""
-        return [check.subject for check in self.checks if check.verdict == "bad"]
-
-
-def diagnose(ports: Sequence[PortFacts], out: Path) -> Diagnosis:
+def diagnose(ports: Sequence[PortFacts], out: Path) -> list[Check]:
     """Check these ports, scheduling and memory, and the disk of the folder for logs."""
     checks = [check for port in ports for check in _port(port)]
     if not ports:
         checks = [Check("ports", "could be better", "there are none", "plug the device in")]
-    return Diagnosis([*checks, *_real_time(), _disk(out)])
+    return [*checks, *_real_time(), _disk(out)]
 
 
 def _port(port: PortFacts) -> list[Check]:
@@ -65,18 +53,20 @@ def _port(port: PortFacts) -> list[Check]:
     checks = [Check(access, "good", "may be read and written")]
     timer = latency_timer(port.name)
     if timer is not None:
-        checks.append(_latency(f"latency timer of {port.name}", *timer))
+        file, milliseconds = timer
+        cure = (
+            f"as root: echo 1 > {file}; for good, a udev rule: "
+            'ACTION=="add", SUBSYSTEM=="usb-serial", ATTR{latency_timer}="1"'
+        )
+        subject, good = f"latency timer of {port.name}", milliseconds <= _TIMER
+        checks.append(_graded(subject, f"{milliseconds} ms", cure, good))
     return checks
 
 
-def _latency(subject: str, file: Path, milliseconds: int) -> Check:
-    if milliseconds <= _TIMER:
-        return Check(subject, "good", f"{milliseconds} ms")
-    cure = (
-        f"as root: echo 1 > {file}; for good, a udev rule: "
-        'ACTION=="add", SUBSYSTEM=="usb-serial", ATTR{latency_timer}="1"'
-    )
-    return Check(subject, "could be better", f"{milliseconds} ms", cure)
+def _graded(subject: str, observation: str, cure: str, good: bool, bad: bool = False) -> Check:
+    if good:
+        return Check(subject, "good", observation)
+    return Check(subject, "bad" if bad else "could be better", observation, cure)
 
 
 def _real_time() -> list[Check]:
@@ -92,7 +82,13 @@ def _real_time() -> list[Check]:
     return [
         _granted(run, "scheduler", "real-time scheduling", "@GROUP - rtprio 50"),
         _granted(run, "memory", "memory lock", "@GROUP - memlock unlimited"),
-        _wake_ups(worst),
+        _graded(
+            "wake-ups",
+            f"{1e3 * worst:.1f} ms late at worst, of {_NAPS}",
+            "end other programs; on a laptop, plug in the supply and switch energy saving off",
+            good=worst <= _LATE,
+            bad=worst > _TOO_LATE,
+        ),
     ]
 
 
@@ -108,15 +104,6 @@ def _granted(run: RealTime, name: str, subject: str, line: str) -> Check:
     return Check(subject, "could be better", f"not allowed ({run.refused[name]})", cure)
 
 
-def _wake_ups(worst: float) -> Check:
-    observation = f"{1e3 * worst:.1f} ms late at worst, of {_NAPS}"
-    if worst <= _LATE:
-        return Check("wake-ups", "good", observation)
-    verdict: Verdict = "bad" if worst > _TOO_LATE else "could be better"
-    cure = "end other programs; on a laptop, plug in the supply and switch energy saving off"
-    return Check("wake-ups", verdict, observation, cure)
-
-
 def _disk(out: Path) -> Check:
     """Time of flushes as a fast log makes them, in the folder for logs."""
     subject, made = f"disk of {out}", not out.exists()
@@ -125,20 +112,17 @@ def _disk(out: Path) -> Check:
     try:
         speed, slowest = _flush(file)
     except OSError as error:
-        return Check(
-            subject, "bad", f"cannot be written: {error.strerror}", "choose another: --out"
-        )
+        problem = f"cannot be written: {error.strerror}"
+        return Check(subject, "bad", problem, "choose another: --out")
     finally:
         file.unlink(missing_ok=True)
         if made:
             out.rmdir()
     observation = f"{speed / 1e6:.0f} MB/s, {1e3 * slowest:.0f} ms for the slowest flush"
-    if speed >= _SLOW_DISK and slowest <= _LONG_FLUSH:
-        return Check(subject, "good", observation)
-    too_slow = speed < _SLOWEST_DISK or slowest > _LONGEST_FLUSH
-    verdict: Verdict = "bad" if too_slow else "could be better"
+    good = speed >= _SLOW_DISK and slowest <= _LONG_FLUSH
+    bad = speed < _SLOWEST_DISK or slowest > _LONGEST_FLUSH
     cure = "write logs to a disk of this computer, not to a stick or the network: rig run --out DIR"
-    return Check(subject, verdict, observation, cure)
+    return _graded(subject, observation, cure, good, bad)
 
 
 def _flush(file: Path) -> tuple[float, float]:

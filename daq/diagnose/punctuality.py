@@ -1,7 +1,5 @@
 """Texts on how punctual a run was."""
 
-from typing import Any
-
 from daq.run.runner import RunResult
 
 _SHOWN = 5  # ticks named in a note
@@ -73,13 +71,3 @@ def _many(count: int, noun: str) -> str:
 
 def _short(seconds: float) -> str:
     return f"{seconds * 1e3:.3g} ms" if seconds >= 1e-4 else f"{seconds * 1e6:.3g} us"
-
-
-def as_document(run: RunResult) -> dict[str, Any]:
-    """The run's timing for machines."""
-    return {
-        "folder": str(run.folder),
-        "samples": run.n_samples,
-        "timing": run.timing,
-        "realtime": run.realtime,
-    }

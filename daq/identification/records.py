@@ -155,8 +155,8 @@ def check_mapping(
             raise file.error(key, "an output must be measured, not constant")
     for group, given, signals in groups:
         for signal in signals:
-            key = ("columns", group, signal.name, "unit")
-            unit_factor(file, key, given[signal.name].unit, signal.unit)
+            unit_key = ("columns", group, signal.name, "unit")
+            unit_factor(file, unit_key, given[signal.name].unit, signal.unit)
 
 
 def _groups(model: ProcessModel, columns: Columns) -> list[SignalGroup]:

@@ -6,18 +6,17 @@ time.
 """
 
 import contextlib
-import dataclasses
 from collections.abc import Iterator
 
 from daq.config.rig import RigConfig, UserLimit
 from daq.errors import USER_CODE_ERRORS, ConfigError, RigError, RunError, raised_in
-from daq.hal import CHANNELS, Flag, Phase, Samples
+from daq.hal import CHANNELS, Phase, Samples
 from daq.limits.base import Limit, Trip
 from daq.limits.load import DeviceFound, I2t, Magnitude
 from daq.limits.sensors import Frozen, Jump, Silence, Stalled
 from daq.limits.shaft import Travel, Winding
 
-__all__ = ["Limit", "Limits", "Trip", "mark_interlock"]
+__all__ = ["Limit", "Limits", "Trip"]
 
 
 class Limits:
@@ -88,13 +87,6 @@ def _built_in(config: RigConfig) -> list[Limit]:
     return limits
 
 
-def mark_interlock(samples: Samples, row: int) -> Samples:
-    """The samples with the tripping row flagged."""
-    flags = samples.flags.copy()
-    flags[row] |= int(Flag.INTERLOCK)
-    return dataclasses.replace(samples, flags=flags)
-
-
 class _UserCode(Limit):
     """A limit of a user's own: what is wrong with it names its class."""
 
@@ -103,12 +95,10 @@ class _UserCode(Limit):
         self._name = f"the limit {type(limit).__name__}"
 
     def begin(self, phase: Phase, sample_rate: float) -> None:
-        """Pass it on."""
         with self._blamed():
             self._limit.begin(phase, sample_rate)
 
     def window(self) -> tuple[float, float]:
-        """Pass it on, and see that it is one."""
         with self._blamed():
             low, high = self._limit.window()
             if not low <= high:
@@ -116,7 +106,6 @@ class _UserCode(Limit):
             return float(low), float(high)
 
     def check(self, samples: Samples) -> Trip | None:
-        """Pass it on, and see that the answer is one."""
         with self._blamed():
             trip = self._limit.check(samples)
         if trip is None:

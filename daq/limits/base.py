@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from daq.config.base import Section
-from daq.hal import FloatArray, Phase, Samples
+from daq.hal import Phase, Samples
 
 Trip = tuple[int, str]
 """Row of a block of samples that is beyond a limit, and the reason in words."""
@@ -46,17 +46,3 @@ class Limit(abc.ABC):
 def first_row(beyond: npt.NDArray[np.bool_]) -> int | None:
     """The first row of those that are beyond a limit; None without any."""
     return int(np.argmax(beyond)) if beyond.any() else None
-
-
-def within(values: FloatArray, limit: float) -> bool:
-    """Whether all are numbers within plus or minus a limit."""
-    if len(values) == 1:
-        return -limit <= values.item() <= limit
-    return bool((np.abs(values) <= limit).all())
-
-
-def changes(values: FloatArray, last: float) -> bool:
-    """Whether each differs from the one before, the first from the last."""
-    if len(values) == 1:
-        return values.item() != last
-    return bool(values[0] != last and (values[1:] != values[:-1]).all())

@@ -4,7 +4,7 @@ import numpy as np
 
 from daq.config.rig import Overload
 from daq.hal import Flag, FloatArray, Phase, Samples
-from daq.limits.base import Limit, Trip, first_row, within
+from daq.limits.base import Limit, Trip, first_row
 
 _LARGEST = float(np.finfo(np.float64).max)  # any finite number is within it
 _INTERLOCK = int(Flag.INTERLOCK)
@@ -20,9 +20,11 @@ class Magnitude(Limit):
     def check(self, samples: Samples) -> Trip | None:
         """Compare every sample; what is no number compares as beyond."""
         values: FloatArray = getattr(samples, self._name)
-        if within(values, self._limit):
+        if len(values) == 1 and -self._limit <= values.item() <= self._limit:
             return None
-        row = int(np.argmax(~(np.abs(values) <= self._limit)))
+        row = first_row(~(np.abs(values) <= self._limit))
+        if row is None:
+            return None
         value = values[row]
         if not np.isfinite(value):
             return row, f"{self._name} is {value}, which is no measurement; check its sensor"

@@ -7,7 +7,7 @@ import numpy as np
 
 from daq.config.rig import Stall
 from daq.hal import FloatArray, Phase, Samples
-from daq.limits.base import TURN, Limit, Trip, changes, first_row
+from daq.limits.base import TURN, Limit, Trip, first_row
 
 _FOLLOWS = 0.1  # V of change of a command that must show in its current
 _RARER = 10  # times the longest standstill of the calibration that an input may stand still
@@ -55,16 +55,23 @@ class _Standstill(Limit):
     def __init__(self, name: str) -> None:
         self._name = name
         self._value = math.nan
+        self._rate = 1.0
+        self._standing = 0.0  # how much speaks against it since it stands still
 
     def begin(self, phase: Phase, sample_rate: float) -> None:
         """Start anew."""
         self._value = math.nan
+        self._rate = sample_rate
         self._changed(0)
 
     def check(self, samples: Samples) -> Trip | None:
         """Judge every sample that reads what the one before did."""
         values: FloatArray = getattr(samples, self._name)
-        if changes(values, self._value):
+        if len(values) == 1:
+            changes = values.item() != self._value
+        else:
+            changes = values[0] != self._value and (values[1:] != values[:-1]).all()
+        if changes:
             self._value = values.item(-1)
             self._changed(len(values))
             return None
@@ -78,9 +85,9 @@ class _Standstill(Limit):
                 return row, reason
         return None
 
-    @abc.abstractmethod
     def _changed(self, n_samples: int) -> None:
         """So many samples, none of which reads what the one before did."""
+        self._standing = 0.0
 
     @abc.abstractmethod
     def _stood(self, samples: Samples, row: int) -> str | None:
@@ -93,23 +100,13 @@ class Silence(_Standstill):
     def __init__(self, turns: float) -> None:
         super().__init__("theta")
         self._most = turns * TURN
-        self._dt = 1.0
-        self._turned = 0.0  # rad, by the speed estimate
-
-    def begin(self, phase: Phase, sample_rate: float) -> None:
-        """Start anew."""
-        super().begin(phase, sample_rate)
-        self._dt = 1.0 / sample_rate
-
-    def _changed(self, n_samples: int) -> None:
-        self._turned = 0.0
 
     def _stood(self, samples: Samples, row: int) -> str | None:
-        self._turned += abs(samples.omega.item(row)) * self._dt
-        if not self._turned > self._most:
+        self._standing += abs(samples.omega.item(row)) * (1.0 / self._rate)  # rad
+        if not self._standing > self._most:
             return None
         return (
-            f"the speed estimate says that the shaft turned by {self._turned / TURN:.3g} "
+            f"the speed estimate says that the shaft turned by {self._standing / TURN:.3g} "
             "turns, and the encoder's count stands still; check the encoder"
         )
 
@@ -120,21 +117,12 @@ class Stalled(_Standstill):
     def __init__(self, stall: Stall) -> None:
         super().__init__("theta")
         self._stall = stall
-        self._most = self._standing = 0  # samples
-
-    def begin(self, phase: Phase, sample_rate: float) -> None:
-        """Start anew."""
-        super().begin(phase, sample_rate)
-        self._most = max(1, round(self._stall.time * sample_rate))
-
-    def _changed(self, n_samples: int) -> None:
-        self._standing = 0
 
     def _stood(self, samples: Samples, row: int) -> str | None:
         motor, brake = samples.current_motor.item(row), samples.current_brake.item(row)
         pulls = abs(motor) >= self._stall.motor and abs(brake) <= self._stall.brake
-        self._standing = self._standing + 1 if pulls else 0
-        if not pulls or self._standing < self._most:
+        self._standing = self._standing + 1.0 if pulls else 0.0  # samples
+        if not pulls or self._standing < round(self._stall.time * self._rate):
             return None
         return (
             f"the encoder has stood still for {self._stall.time:g} s at a motor current of "
@@ -154,7 +142,6 @@ class Frozen(_Standstill):
         super().__init__(name)
         self._seconds = seconds
         self._command = f"applied_voltage_{command}" if command else None
-        self._rate = 1.0
         self._longest = self._seen = 0  # samples of the calibration
         self._learning = False
         self._most = math.inf  # samples it may stand still
@@ -165,7 +152,6 @@ class Frozen(_Standstill):
     def begin(self, phase: Phase, sample_rate: float) -> None:
         """Learn from the calibration, watch from then on."""
         self._learning = phase is Phase.CALIBRATION
-        self._rate = sample_rate
         self._least = max(2, round(self._seconds * sample_rate))
         has_noise = self._seen > 0 and _RARER * self._longest <= self._seen
         self._most = max(self._least, _RARER * self._longest) if has_noise else math.inf

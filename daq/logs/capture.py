@@ -6,7 +6,7 @@ import datetime
 import hashlib
 import json
 import platform
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,27 +29,24 @@ class Capture:
     """A folder being written by a run; ``record`` is what run.json holds."""
 
     folder: Path
-    record: dict[str, Any] = field(default_factory=dict)
+    record: dict[str, Any]
 
     @classmethod
     def create(cls, root: Path, name: str, record: dict[str, Any]) -> Capture:
         """Make ``<root>/<UTC time>-<name>/`` and note in it that the run has begun."""
         now = datetime.datetime.now(datetime.UTC)
-        stem = f"{now:%Y%m%dT%H%M%SZ}-{_file_name(name)}"
-        folder = _new_folder(root, stem)
-        capture = cls(
-            folder,
-            {
-                "status": RUNNING,
-                "reason": None,
-                "started": now.isoformat(timespec="milliseconds"),
-                **record,
-                "software": software_versions(),
-                "host": {"system": platform.platform(), "node": platform.node()},
-            },
-        )
-        capture.save()
-        capture.reserve()
+        facts = {
+            "status": RUNNING,
+            "reason": None,
+            "started": now.isoformat(timespec="milliseconds"),
+            **record,
+            "software": software_versions(),
+            "host": {"system": platform.platform(), "node": platform.node()},
+        }
+        folder = _new_folder(root, f"{now:%Y%m%dT%H%M%SZ}-{_file_name(name)}")
+        capture = cls(folder, facts)
+        capture._save()
+        capture._reserve()
         return capture
 
     @property
@@ -57,11 +54,10 @@ class Capture:
         """Where the samples go."""
         return self.folder / LOG_NAME
 
-    def save(self) -> None:
-        """Write run.json so that a reader sees the old or the new one, never half of it."""
+    def _save(self) -> None:
         write_whole(self.folder / RUN_NAME, json.dumps(self.record, indent=2) + "\n")
 
-    def reserve(self) -> None:
+    def _reserve(self) -> None:
         """Take the room on the disk that ``finish`` will need. Raises RunError without any."""
         path = self.folder / _RESERVE
         try:
@@ -78,12 +74,12 @@ class Capture:
         """
         self.record.update(status=status, reason=reason, **facts)
         (self.folder / _RESERVE).unlink(missing_ok=True)
-        self.save()
+        self._save()
         if self.log_path.exists():
             with self.log_path.open("rb") as log:
                 digest = hashlib.file_digest(log, "sha256").hexdigest()
             self.record["log"] = {"file": LOG_NAME, "sha256": digest}
-            self.save()
+            self._save()
 
 
 def _new_folder(root: Path, stem: str) -> Path:
@@ -91,11 +87,10 @@ def _new_folder(root: Path, stem: str) -> Path:
         folder = root / (stem if attempt == 1 else f"{stem}-{attempt}")
         try:
             make_folder(folder, exist_ok=False)
+            return folder
         except FileExistsError:
             if root.exists() and not root.is_dir():
                 break
-            continue
-        return folder
     problem = "no capture folder can be made here"
     raise ConfigError(problem, cure="choose another with --out", file=root)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import warnings
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
@@ -41,16 +41,11 @@ class Layout:
 
 def column_names(path: Path) -> list[str]:
     """Names in a table's header; raises ConfigError for a file without one."""
-    layout = layout_of(_complete_lines(path, _HEAD)[0])
-    _check_header(path, layout, ())
-    return layout.names
+    return _layout_with(path, ()).names
 
 
 def read_table(
-    path: Path,
-    columns: Sequence[str] = (),
-    cure: str = _CURE,
-    gaps: Collection[str] = (),
+    path: Path, columns: Sequence[str] = (), cure: str = _CURE, gaps: Collection[str] = ()
 ) -> tuple[pd.DataFrame, int, bool]:
     """Read a CSV of numbers with a header line.
 
@@ -67,8 +62,7 @@ def read_table(
     """
     import pandas as pd
 
-    layout = layout_of(_complete_lines(path, _HEAD)[0])
-    _check_header(path, layout, columns)
+    layout = _layout_with(path, columns)
     names = list(columns) or [name for name in layout.names if name]
     first_line = layout.line + 1
     plain = _plain_numbers(path, layout)
@@ -137,10 +131,9 @@ def _parsed(source: IO[Any], layout: Layout, dtype: type, **options: Any) -> pd.
 
 
 def _plain_numbers(path: Path, layout: Layout) -> tuple[pd.DataFrame, bool] | None:
-    """The table where it is nothing but finite numbers, as a rig writes it, and whether it is torn.
+    """A table of nothing but finite numbers, and whether it is torn; None of any other.
 
-    Many times faster than the long way, and rounded as ``float`` does it. None for any other table:
-    the long way says what it is or what is wrong with it.
+    Many times faster than by way of its cells, and rounded as ``float`` does it.
     """
     import pandas as pd
 
@@ -157,47 +150,31 @@ def _plain_numbers(path: Path, layout: Layout) -> tuple[pd.DataFrame, bool] | No
                 if len(piece) < _PIECE:
                     rows = rows.rstrip(b"\r\n")  # the file's end: empty lines there are no rows
                 if rows:
-                    parts.append(_finite_rows(rows, layout))
+                    part = _parsed(io.BytesIO(rows), layout, dtype=np.float64, low_memory=False)
+                    if b"\0" in rows or not np.isfinite(part.to_numpy()).all():
+                        return None
+                    parts.append(part)
     except (OSError, ValueError, pd.errors.ParserWarning):
         return None
     return (pd.concat(parts, ignore_index=True), torn) if parts else None
 
 
-def _finite_rows(rows: bytes, layout: Layout) -> pd.DataFrame:
-    """Lines of finite numbers, one for each name; raises ValueError or a warning for others."""
-    frame = _parsed(io.BytesIO(rows), layout, dtype=np.float64, low_memory=False)
-    if b"\0" in rows or not np.isfinite(frame.to_numpy()).all():
-        raise ValueError
-    return frame
-
-
 def layout_of(text: str) -> Layout:
     """Where the header of a table's text stands, the names in it and what is between them."""
-    leading, header = [], None
-    for line in _lines(text):
-        if line.strip() and not line.lstrip().startswith(COMMENTS):
-            header = line
-            break
-        leading.append(line)
-    at = len(leading)
-    if header is None:
-        return Layout(1, leading[:1] or [""], ",")
+    lines = text.split("\n")
+    at = 0
+    while at < len(lines) and (not lines[at].strip() or lines[at].lstrip().startswith(COMMENTS)):
+        at += 1
+    if at == len(lines):
+        return Layout(1, lines[:1], ",")
+    header = lines[at]
     numbers = _names(header, _separator(header))
-    if leading and all(map(_is_number, numbers)):
-        comment = leading[-1].strip().lstrip("#%/").strip()
+    if at > 0 and all(map(_is_number, numbers)):
+        comment = lines[at - 1].strip().lstrip("#%/").strip()
         if len(_names(comment, _separator(header))) == len(numbers):
             at, header = at - 1, comment
     separator = _separator(header)
     return Layout(at + 1, _names(header, separator), separator)
-
-
-def _lines(text: str) -> Iterator[str]:
-    """The lines one after the other: a long table has its header in front."""
-    begin = 0
-    while (end := text.find("\n", begin)) >= 0:
-        yield text[begin:end]
-        begin = end + 1
-    yield text[begin:]
 
 
 def _separator(line: str) -> str:
@@ -226,22 +203,17 @@ def _complete_lines(path: Path, n_bytes: int = -1) -> tuple[str, bool]:
     if len(data) == n_bytes:
         # Not in the middle of a character.
         data = data[: data.rfind(b"\n") + 1] or data
-    text = _decoded(path, data)
-    if "\r" in text:
-        text = text.replace("\r\n", "\n")
+    text = _decoded(path, data).replace("\r\n", "\n")
     if not text or text.isspace():
         cure = "it must start with a line of column names"
         raise ConfigError("the log is empty", cure=cure, file=path)
-    cut = text.rfind("\n") + 1
-    tail = text[cut:]
     # A last line without its newline may lack digits even where it has every column.
-    complete = text[:cut] if cut else text
+    cut = text.rfind("\n") + 1
+    complete = text[:cut] or text
     if "\0" in complete:
         line = complete[: complete.index("\0")].count("\n") + 1
         raise ConfigError("not a text file: it holds bytes of zero", file=path, line=line)
-    if complete.endswith("\n\n") or not complete.endswith("\n"):
-        complete = complete.rstrip("\n") + "\n"
-    return complete, bool(tail.strip())
+    return complete.rstrip("\n") + "\n", bool(text[cut:].strip())
 
 
 def _decoded(path: Path, data: bytes) -> str:
@@ -257,7 +229,9 @@ def _decoded(path: Path, data: bytes) -> str:
         return data.decode("cp1252", errors="replace")
 
 
-def _check_header(path: Path, layout: Layout, columns: Sequence[str]) -> None:
+def _layout_with(path: Path, columns: Sequence[str]) -> Layout:
+    """How a file's table is written; ConfigError unless its header names each column once."""
+    layout = layout_of(_complete_lines(path, _HEAD)[0])
     line, header = layout.line, layout.names
     if all(_is_number(name) for name in header):
         cure = "it must hold the column names"
@@ -275,15 +249,11 @@ def _check_header(path: Path, layout: Layout, columns: Sequence[str]) -> None:
                 file=path,
                 line=line,
             )
+    return layout
 
 
 def _numbers(
-    path: Path,
-    column: pd.Series,
-    first_line: int,
-    decimal_comma: bool,
-    cure: str,
-    with_gaps: bool,
+    path: Path, column: pd.Series, first_line: int, decimal_comma: bool, cure: str, with_gaps: bool
 ) -> FloatArray:
     """A column's cells as numbers; ConfigError at the first that is none."""
     import pandas as pd

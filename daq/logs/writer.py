@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from types import TracebackType
 
 from daq.errors import RunError
 from daq.hal import FloatArray, Samples
@@ -36,12 +36,7 @@ class LogWriter:
     def __enter__(self) -> LogWriter:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *exception: object) -> None:
         self.close()
 
     def append(self, samples: Samples, extra: Sequence[FloatArray] = ()) -> None:
@@ -68,12 +63,9 @@ class LogWriter:
         """Have the log on the disk itself, then let go of it."""
         if self._file.closed:
             return
-        try:
+        # The rows are written; a disk that cannot sync must not hide the run's end.
+        with self._file, contextlib.suppress(OSError):
             os.fsync(self._file.fileno())
-        except OSError:
-            pass  # the rows are written; a disk that cannot sync must not hide the run's end
-        finally:
-            self._file.close()
 
     def _write(self, text: str, counts: bool = False) -> None:
         data = text.encode("ascii")

@@ -35,7 +35,8 @@ class Analysis:
     @property
     def document(self) -> dict[str, Any]:
         """The same for machines."""
-        return findings_document(self.findings, self.folder)
+        written = [str(path) for path in sorted((self.folder / RESULTS).iterdir())]
+        return {**_contents(self.findings), "files": written}
 
 
 def analyse(folder: str | Path, *, watch: Watch = ignore) -> Analysis:
@@ -119,12 +120,6 @@ def conclude(experiment: Experiment, folder: Path) -> Findings | None:
     if findings is not None:
         _write(findings, folder / RESULTS)
     return findings
-
-
-def findings_document(findings: Findings, folder: Path) -> dict[str, Any]:
-    """Findings for machines, and the files that they were written to."""
-    written = [str(path) for path in sorted((folder / RESULTS).iterdir())]
-    return {**_contents(findings), "files": written}
 
 
 def _contents(findings: Findings) -> dict[str, Any]:

@@ -10,7 +10,6 @@ from daq.config.rig import RigConfig
 from daq.errors import ConfigError, RunError
 from daq.experiment import ClosedLoop, Experiment, Plan
 from daq.files import write_whole
-from daq.findings import Chart, Heatmap
 from daq.hal import CHANNELS, FloatArray
 from daq.logs.columns import UNITS
 from daq.progress import Watch, ignore
@@ -182,7 +181,7 @@ def draw_preview(preview: Preview, path: Path) -> None:
     elif plan.references:
         m = max(map(len, plan.references.values()))
         figure = planned_references(time[:m], plan.references, preview.units)
-    elif (chart := _chart(experiment)) is not None:
+    elif (chart := preview_of(experiment)) is not None:
         figure = draw(chart)
     else:
         raise ConfigError(
@@ -196,7 +195,3 @@ def draw_preview(preview: Preview, path: Path) -> None:
         write_whole(path, style.render(figure, kind))
     except RunError as error:
         raise ConfigError(str(error), cure="or choose another place with --plot FILE.png") from None
-
-
-def _chart(experiment: Experiment) -> Chart | Heatmap | None:
-    return preview_of(experiment) if isinstance(experiment, ClosedLoop) else None

@@ -78,17 +78,16 @@ def open_session(
     rig: str | None = None,
     port: str | None = None,
     realtime: bool = False,
-    options: Mapping[str, Any] | None = None,
     watch: Watch = ignore,
 ) -> Session:
     """Read and check an experiment, its validation run and a rig; ConfigError with all mistakes.
 
-    rig: default what the experiment's file says it is for. port, realtime, options: settings of
-    its backend over those of its file.
+    rig: default what the experiment's file says it is for. port, realtime: settings of its backend
+    over those of its file.
     """
     loaded, (config, device) = together(
         lambda: load_experiment(experiment, watch),
-        lambda: _rig_on(rig or rig_for(experiment, watch), port, realtime, options or {}, watch),
+        lambda: _rig_on(rig or rig_for(experiment, watch), port, realtime, watch),
     )
     # Checked even where it will not run: a mistake in the file is best heard of early.
     validation = loaded.validation()
@@ -130,24 +129,21 @@ def record(
     return load(_run(loaded, config, device, Path(out), watch).folder)
 
 
-def _rig_on(
-    rig: str, port: str | None, realtime: bool, options: Mapping[str, Any], watch: Watch
-) -> tuple[RigConfig, Device]:
+def _rig_on(rig: str, port: str | None, realtime: bool, watch: Watch) -> tuple[RigConfig, Device]:
     """A rig on a port in place of its file's, or simulated at the pace of the clock."""
-    config, device = load_rig(rig, options, watch)
+    config, device = load_rig(rig, watch=watch)
     fields = type(config.options).model_fields
     if port is not None and "port" not in fields:
         raise ConfigError(
             f"--port {port}: the backend {config.backend!r} of {rig} has no port",
             cure="name the rig file of one that has, such as --rig serial.yaml",
         )
-    if realtime and "time" not in fields:
-        text = f"{rig}: its own clock paces it; --realtime changes nothing"
-        watch(Note("note", text))
-        realtime = False
-    choices = {"port": port, "time": "real" if realtime else None}
-    changes = {key: value for key, value in choices.items() if value is not None}
-    return load_rig(rig, {**options, **changes}, watch) if changes else (config, device)
+    changes = {} if port is None else {"port": port}
+    if realtime and "time" in fields:
+        changes["time"] = "real"
+    elif realtime:
+        watch(Note("note", f"{rig}: its own clock paces it; --realtime changes nothing"))
+    return load_rig(rig, changes, watch) if changes else (config, device)
 
 
 def _run(

@@ -15,9 +15,8 @@ _ROUNDING = 1.0 + 1e-9
 def plan(experiment: Experiment, rig: RigConfig) -> Plan:
     """What a run will do.
 
-    Raises ConfigError, naming the key, for settings that make no run, and for a
-    plan that breaks one of the rig's limits: the sample and the value, as far as they are known
-    beforehand.
+    Raises ConfigError, naming the key, for settings that make no run, and for a plan that breaks
+    one of the rig's limits: the sample and the value, as far as they are known beforehand.
     """
     planned = plan_of(experiment)
     description_of(experiment)
@@ -32,7 +31,8 @@ def plan(experiment: Experiment, rig: RigConfig) -> Plan:
             _check_current(volts, experiment.sample_rate, rig, name)
     if isinstance(experiment, ClosedLoop) and rig.limits.speed is not None:
         for name, values in planned.references.items():
-            _check_speed(name, values, experiment, rig.limits.speed)
+            if experiment.columns.get(name) == "rad/s":
+                _check_speed(values, rig.limits.speed, name)
     return planned
 
 
@@ -74,17 +74,16 @@ def _check_slew(volts: FloatArray, rate: float, rig: RigConfig, name: str) -> No
     if limit is None:
         return
     slopes = np.abs(np.diff(volts, prepend=0.0)) * rate
-    if (slopes <= limit * _ROUNDING).all():
-        return
     row = int(np.argmax(slopes))
-    raise ConfigError(
-        f"the plan changes the command at {slopes[row]:.6g} V/s in sample {row} (from "
-        f"{volts[row - 1] if row else 0.0:.6g} V to {volts[row]:.6g} V), faster than the rig's "
-        f"limit of {limit:g} V/s",
-        cure=f"make smaller or slower steps, or change limits.slew.{name} in the rig's file if "
-        "the hardware allows it",
-        key=name,
-    )
+    if not slopes[row] <= limit * _ROUNDING:
+        raise ConfigError(
+            f"the plan changes the command at {slopes[row]:.6g} V/s in sample {row} (from "
+            f"{volts[row - 1] if row else 0.0:.6g} V to {volts[row]:.6g} V), faster than the rig's "
+            f"limit of {limit:g} V/s",
+            cure=f"make smaller or slower steps, or change limits.slew.{name} in the rig's file if "
+            "the hardware allows it",
+            key=name,
+        )
 
 
 def _check_current(volts: FloatArray, rate: float, rig: RigConfig, name: str) -> None:
@@ -117,9 +116,7 @@ def _check_current(volts: FloatArray, rate: float, rig: RigConfig, name: str) ->
         )
 
 
-def _check_speed(name: str, values: FloatArray, experiment: ClosedLoop, limit: float) -> None:
-    if experiment.columns.get(name) != "rad/s":
-        return
+def _check_speed(values: FloatArray, limit: float, name: str) -> None:
     row = int(np.argmax(np.abs(values)))
     if not abs(values[row]) <= limit * _ROUNDING:
         raise ConfigError(

@@ -9,19 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from daq.errors import USER_CODE_ERRORS, ConfigError, RigError, raised_in
-from daq.experiment import (
-    MOST_SAMPLES,
-    Answer,
-    ClosedLoop,
-    Controller,
-    Experiment,
-    Plan,
-    Sample,
-    SettingError,
-)
+from daq.errors import USER_CODE_ERRORS, ConfigError, RigError, RunError, raised_in
+from daq.experiment import MOST_SAMPLES, Answer, ClosedLoop, Experiment, Plan, Sample, SettingError
 from daq.findings import Chart, Heatmap
-from daq.hal import CHANNELS
+from daq.hal import CHANNELS, FloatArray, Samples
 
 _ROUNDING = 1e-9  # of a plan's bounds
 
@@ -63,41 +54,73 @@ def description_of(experiment: Experiment) -> dict[str, Any]:
     return described
 
 
-def controller_of(experiment: ClosedLoop) -> Controller:
-    """A new controller. Raises ConfigError."""
-    with _before_the_run(experiment, "in controller()"):
-        controller = experiment.controller()
-        if not callable(getattr(controller, "answer", None)):
-            raise TypeError(
-                f"it returned {controller!r}; return an object with a method answer(sample)"
-            )
-    return controller
-
-
 def rehearse(experiment: ClosedLoop, planned: Plan) -> None:
     """Ask a controller of its own for its first answer, to a shaft at rest.
 
     Most mistakes in one show there. Raises ConfigError.
     """
-    controller = controller_of(experiment)
+    dialogue = Dialogue(experiment, planned)
     with _before_the_run(experiment, "when asked for its first answer, at rest"):
-        answer = controller.answer(Sample(0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0))
-        if answer is not None:
-            AnswerCheck(experiment, planned)(answer)
+        dialogue.answer(Sample(0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0))
 
 
-class AnswerCheck:
-    """Whether an answer is one, and within the plan; made once for a run, as it is asked often."""
+class Dialogue:
+    """A protocol's new controller, asked for one sample after the other.
+
+    ahead: ticks from a sample to its command. ended: whether it has given its last answer. Raises
+    ConfigError where no controller can be made.
+    """
 
     def __init__(self, experiment: ClosedLoop, planned: Plan) -> None:
+        self.ahead = experiment.ahead
+        self.ended = False
+        self._experiment = experiment
         self._plan = planned
         self._columns = tuple(experiment.columns)
+        self._logged = (0.0,) * len(self._columns)  # with the last answer
         reach = _ROUNDING * np.max(np.abs([planned.lowest, planned.highest]), axis=0)
         ends = np.stack([planned.lowest - reach, planned.highest + reach], axis=1)
         self._bounds: list[list[float]] = ends.tolist()
+        with _before_the_run(experiment, "in controller()"):
+            self._controller = experiment.controller()
+            if not callable(getattr(self._controller, "answer", None)):
+                raise TypeError(
+                    f"it returned {self._controller!r}; return an object with a method "
+                    "answer(sample)"
+                )
 
-    def __call__(self, answer: Answer) -> None:
-        """Raises TypeError or ValueError."""
+    def answers(self, samples: Samples) -> tuple[FloatArray, list[FloatArray]]:
+        """Commands (n, 2) [V] that answer a block of samples, and the columns it logs, (n,) each.
+
+        Zero commands are the last where it ends. Raises RunError for the protocol's mistakes.
+        """
+        rows: list[Answer] = []
+        columns = [getattr(samples, name).tolist() for name in Sample._fields]
+        for values in zip(*columns, strict=True):
+            sample = Sample(*values)
+            try:
+                answer = self.answer(sample)
+            except RigError:
+                raise
+            except USER_CODE_ERRORS as error:
+                raise self._failed(sample.tick, error) from error
+            self.ended = answer is None
+            rows.append(answer or Answer(0.0, 0.0, self._logged))
+            if self.ended:
+                break
+            self._logged = rows[-1].logged
+        try:
+            commands = np.array([(row.motor, row.brake) for row in rows], dtype=np.float64)
+            logged = np.array([row.logged for row in rows], dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise self._failed(samples.tick.item(0), error) from error
+        return commands, list(logged.reshape(len(rows), len(self._columns)).T)
+
+    def answer(self, sample: Sample) -> Answer | None:
+        """The answer to a sample. Raises TypeError or ValueError for one beyond the plan."""
+        answer = self._controller.answer(sample)
+        if answer is None:
+            return None
         if not isinstance(answer, Answer):
             raise TypeError(f"it answered {answer!r}; answer with a daq.experiment.Answer or None")
         (motor_low, motor_high), (brake_low, brake_high) = self._bounds
@@ -114,12 +137,17 @@ class AnswerCheck:
                 f"it logged {answer.logged!r}; a finite number for each of its columns is "
                 f"expected: {', '.join(self._columns) or 'none'}"
             )
+        return answer
+
+    def _failed(self, tick: int, error: BaseException) -> RunError:
+        text = failure(self._experiment, f"at sample {tick}", error)
+        return RunError(f"{text}; outputs were set to zero")
 
 
-def preview_of(experiment: ClosedLoop) -> Chart | Heatmap | None:
-    """What a protocol draws beforehand. Raises ConfigError."""
+def preview_of(experiment: Experiment) -> Chart | Heatmap | None:
+    """What a protocol draws beforehand, if it has a closed loop. Raises ConfigError."""
     with _before_the_run(experiment, "in preview()"):
-        return experiment.preview()
+        return experiment.preview() if isinstance(experiment, ClosedLoop) else None
 
 
 @contextlib.contextmanager

@@ -5,7 +5,6 @@ import ctypes
 import gc
 import os
 import sys
-from collections.abc import Callable
 from typing import Any
 
 from daq.config.rig import Realtime
@@ -31,7 +30,7 @@ class RealTime:
     def __init__(self) -> None:
         self.granted: dict[str, Any] = {}
         self.refused: dict[str, str] = {}
-        self._undo: list[Callable[[], object]] = []
+        self._undo = contextlib.ExitStack()
 
     def begin(self, wanted: Realtime) -> None:
         """Obtain what there is. Raises ConfigError, with the cure, when it is required."""
@@ -50,9 +49,8 @@ class RealTime:
 
     def undo(self) -> None:
         """Back to ordinary scheduling, in reverse order; never raises."""
-        while self._undo:
-            with contextlib.suppress(OSError):
-                self._undo.pop()()
+        with contextlib.suppress(OSError):
+            self._undo.close()
 
     def _quiet_collector(self) -> None:
         """No garbage collection in the middle of a tick; what there is by now is left aside."""
@@ -60,15 +58,20 @@ class RealTime:
             gc.collect()
             gc.freeze()
             gc.disable()
-            self._undo += [gc.unfreeze, gc.enable]
+            self._undo.callback(gc.unfreeze)
+            self._undo.callback(gc.enable)
         self.granted["garbage_collector"] = "off"
 
     def _raise_scheduler(self) -> None:
         if sys.platform != "linux":
             self.refused["scheduler"] = f"{sys.platform} has no real-time scheduler for processes"
             return
+        import resource
+
         before, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
-        priority = min(_PRIORITY, _highest_priority())
+        # The limit of this user; a privileged one is not bound by it.
+        limit, _ = resource.getrlimit(resource.RLIMIT_RTPRIO)
+        priority = limit if 0 < limit < _PRIORITY else _PRIORITY
         try:
             # Threads and processes that this one starts are to be ordinary ones.
             kind = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
@@ -78,7 +81,7 @@ class RealTime:
             return
         # Only the privileged may take that mark away again, and to an ordinary one it is nothing.
         ordinary = before | os.SCHED_RESET_ON_FORK
-        self._undo.append(lambda: os.sched_setscheduler(0, ordinary, parameters))
+        self._undo.callback(os.sched_setscheduler, 0, ordinary, parameters)
         self.granted.update(scheduler="SCHED_FIFO", priority=priority)
 
     def _lock_memory(self) -> None:
@@ -86,7 +89,7 @@ class RealTime:
         if not hasattr(library, "mlockall") or library.mlockall(_LOCK) != 0:
             self.refused["memory"] = f"mlockall: {os.strerror(ctypes.get_errno())}"
             return
-        self._undo.append(library.munlockall)
+        self._undo.callback(library.munlockall)
         self.granted["memory"] = "locked"
 
     def _raise_class(self) -> None:
@@ -96,15 +99,5 @@ class RealTime:
             if not kernel.SetPriorityClass(process, _HIGH_PRIORITY_CLASS):
                 self.refused["scheduler"] = "SetPriorityClass: refused"
                 return
-            self._undo.append(lambda: kernel.SetPriorityClass(process, _NORMAL_PRIORITY_CLASS))
+            self._undo.callback(kernel.SetPriorityClass, process, _NORMAL_PRIORITY_CLASS)
             self.granted["scheduler"] = "HIGH_PRIORITY_CLASS"
-
-
-def _highest_priority() -> int:
-    """What the limit of this user allows; a privileged one is not bound by it."""
-    import resource
-
-    if sys.platform != "linux":
-        return _PRIORITY
-    soft, _ = resource.getrlimit(resource.RLIMIT_RTPRIO)
-    return soft if 0 < soft < _PRIORITY else _PRIORITY

@@ -1,13 +1,13 @@
 """Samples of a run, each shown to the limits before anything else is done with it."""
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from daq.errors import InterlockError
-from daq.hal import CHANNELS, FloatArray, Mode, Phase, Samples
-from daq.limits import Limits, mark_interlock
+from daq.hal import CHANNELS, Flag, FloatArray, Mode, Phase, Samples
+from daq.limits import Limits
 from daq.logs.writer import LogWriter
 from daq.rig import Rig
 from daq.run.timing import Timing
@@ -29,7 +29,7 @@ Watcher = Callable[[PhaseProgress], None]
 
 
 def nobody(progress: PhaseProgress) -> None:
-    """Who watches when nobody does."""
+    """Watch nothing."""
 
 
 class Sampling:
@@ -49,8 +49,7 @@ class Sampling:
     def enter(self, phase: Phase, turns: float = 0.0) -> None:
         """A phase begins, homing with the ``turns`` to wind."""
         self.phase = phase
-        if phase is not Phase.OPEN:
-            self.rig.announce(phase, turns)
+        self.rig.announce(phase, turns)
 
     def begin(self, mode: Mode) -> None:
         """Sample from tick 0 on, outputs at zero."""
@@ -92,7 +91,10 @@ class Sampling:
             return samples, None
         self.rig.safe()
         row, reason = trip
-        return mark_interlock(before(samples, samples.tick.item(row) + 1), row), reason
+        samples = before(samples, samples.tick.item(row) + 1)
+        flags = samples.flags.copy()
+        flags[row] |= int(Flag.INTERLOCK)
+        return replace(samples, flags=flags), reason
 
     def keep(
         self,
@@ -129,4 +131,4 @@ def before(samples: Samples, end: int) -> Samples:
     if samples.tick.item(-1) < end:
         return samples
     kept = samples.tick < end
-    return Samples(**{field.name: getattr(samples, field.name)[kept] for field in fields(samples)})
+    return Samples(**{name: column[kept] for name, column in vars(samples).items()})

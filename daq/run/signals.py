@@ -8,7 +8,7 @@ import signal
 import threading
 import time
 from collections.abc import Iterator
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import Any
 
 from daq.errors import Terminated
@@ -42,12 +42,7 @@ class SignalHandling:
             self._before = [(number, signal.signal(number, self._handle)) for number in heard]
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         for number, handler in self._before:
             signal.signal(number, handler)
         if error is None and self._pending is not None:
@@ -68,7 +63,8 @@ class SignalHandling:
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         now = time.monotonic()
-        error = _as_error(number)
+        name = signal.Signals(number).name
+        error = KeyboardInterrupt() if number == signal.SIGINT else Terminated(name)
         if not self._shielded or self._breakable:
             self._first = self._first or now
             self._shielded, self._breakable = True, False
@@ -78,9 +74,3 @@ class SignalHandling:
             os._exit(1)
         self._first = self._first or now
         self._pending = error
-
-
-def _as_error(number: int) -> BaseException:
-    if number == signal.SIGINT:
-        return KeyboardInterrupt()
-    return Terminated(signal.Signals(number).name)

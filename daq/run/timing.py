@@ -40,18 +40,13 @@ class Histogram:
         """How many were counted."""
         return sum(self._counts)
 
-    @property
-    def worst(self) -> float:
-        """The longest [s]."""
-        return self._worst * _NANO
-
     def quantile(self, share: float) -> float:
         """Upper end of the bin that a share of all durations does not exceed [s]."""
         wanted, seen = share * self.count, 0
         for index, count in enumerate(self._counts):
             seen += count
             if count and seen >= wanted:
-                return min(_upper(index), self.worst)
+                return min(_upper(index), self._worst * _NANO)
         return 0.0
 
     def summary(self) -> dict[str, Any]:
@@ -62,7 +57,7 @@ class Histogram:
             "mean_seconds": self._total * _NANO / max(self.count, 1),
             "median_seconds": self.quantile(0.5),
             "p99_seconds": self.quantile(0.99),
-            "worst_seconds": self.worst,
+            "worst_seconds": self._worst * _NANO,
             "worst_tick": self._worst_tick,
             "histogram": {
                 "up_to_seconds": [_upper(index) for index in filled],

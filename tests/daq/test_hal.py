@@ -6,7 +6,7 @@ from scipy.linalg import expm
 
 from daq.config.rig import RigConfig
 from daq.hal import Mode
-from daq.rig import Offsets, Rig
+from daq.rig import Rig
 from sim_rig.actuator import actuator
 from sim_rig.backend import SimulatedDevice, Simulation
 from tests.daq.hal_contract import RATE, Bench, HalContract, free_currents, levels, plan, play
@@ -141,7 +141,7 @@ def test_offsets_do_not_move_the_current_limit(sign):
     )
     device = Guarded(Simulation())
     with Rig(device, config) as rig:
-        rig.offsets = Offsets(np.array([3.0, 0.0, 0.0]))
+        rig.offsets = np.array([3.0, 0.0, 0.0])
         rig.start(800.0, Mode.OPEN_LOOP)
     guard = device.guard
     np.testing.assert_allclose([guard.analog_low[0], guard.analog_high[0]], [2.4, 3.6])

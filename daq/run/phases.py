@@ -1,13 +1,15 @@
-"""Phases at zero command before a run: offsets of the inputs, winding of the load."""
+"""Phases of a run: offsets of the inputs, winding of the load, the run in open or closed loop."""
 
 from typing import Any
 
 import numpy as np
 
-from daq.errors import RunError
+from daq.errors import DeviceError, RunError
 from daq.experiment import Homing, OffsetCalibration
-from daq.hal import ANALOG_INPUTS, Samples
-from daq.run.sampling import Sampling
+from daq.hal import ANALOG_INPUTS, CHANNELS, Flag, FloatArray, Mode, Samples
+from daq.logs.writer import LogWriter
+from daq.run.protocol import Dialogue
+from daq.run.sampling import Sampling, before
 
 _REST_TIME = 1.0  # s that the shaft must stand still to end homing
 _REST_TURNS = 0.01  # turns it may creep meanwhile
@@ -35,14 +37,11 @@ def calibrate(sampling: Sampling, calibration: OffsetCalibration, record: dict[s
     }
     means = {name: float(values.mean()) for name, values in inputs.items()}
     # How far the offsets, and every later sample, may be trusted.
-    record["calibration"] = {
-        "samples": n_samples,
-        "noise": {name: float(values.std()) for name, values in inputs.items()},
-        "turns": turns,
-    }
+    noise = {name: float(values.std()) for name, values in inputs.items()}
+    record["calibration"] = {"samples": n_samples, "noise": noise, "turns": turns}
     _require_rest(calibration, turns, means)
     sampling.rig.take_offsets(means)
-    record["offsets"] = {**means, "volts": sampling.rig.offsets.volts.tolist()}
+    record["offsets"] = {**means, "volts": sampling.rig.offsets.tolist()}
 
 
 def _require_rest(calibration: OffsetCalibration, turns: float, means: dict[str, float]) -> None:
@@ -93,3 +92,53 @@ def home(sampling: Sampling, homing: Homing, record: dict[str, Any]) -> None:
             )
     sampling.rig.stop()
     record["homing"] = {"turns": rest_turns - (start or 0.0), "rate": sampling.sample_rate}
+
+
+def play(sampling: Sampling, log: LogWriter, commands: FloatArray) -> None:
+    """Play commands (n_samples, 2) [V] and log every sample. Raises DeviceError, InterlockError."""
+    rig, n_samples = sampling.rig, len(commands)
+    sampling.begin(Mode.OPEN_LOOP)
+    sent = done = 0
+    while done < n_samples:
+        room = rig.room()
+        if sent < n_samples and room > 0:
+            chunk = commands[sent : sent + room]
+            rig.send(sent, chunk)
+            sent += len(chunk)
+            if done:
+                sampling.timing.answered(done - 1)
+        samples, trip = sampling.receive(n_samples)
+        if len(samples) == 0:
+            break
+        done = sampling.keep(log, samples, (), trip, n_samples)
+        if np.any(samples.flags & int(Flag.UNDERFLOW)):
+            raise DeviceError(
+                f"the device ran out of commands by sample {done - 1} and made itself safe; "
+                "the host was too slow to refill it"
+            )
+    rig.stop()
+
+
+def control(sampling: Sampling, log: LogWriter, dialogue: Dialogue, n_samples: int) -> None:
+    """Answer and log every sample until the controller has ended, ``n_samples`` at the most."""
+    rig, ahead = sampling.rig, dialogue.ahead
+    sampling.begin(Mode.CLOSED_LOOP)
+    rig.send(0, np.zeros((ahead, len(CHANNELS))))
+    sent, done = ahead, 0
+    while done < n_samples and not dialogue.ended:
+        samples, trip = sampling.receive(n_samples)
+        if len(samples) == 0:
+            break
+        commands, logged = dialogue.answers(samples)
+        end = samples.tick.item(len(commands) - 1) + 1
+        if trip is None and not dialogue.ended:
+            until = end + ahead
+            if until - sent != len(commands):
+                # A lost sample has no answer: the one after it serves its tick too.
+                ticks = np.arange(sent, until)
+                commands = commands[np.searchsorted(samples.tick + ahead, ticks)]
+            rig.send(sent, commands)
+            sampling.timing.answered(end - 1)
+            sent = until
+        done = sampling.keep(log, before(samples, end), logged, trip, n_samples)
+    rig.stop()
