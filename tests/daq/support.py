@@ -1,7 +1,10 @@
 """Helpers of the daq tests: the ``rig`` command as a process, and the files it reads."""
 
+import atexit
+import functools
 import json
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -60,17 +63,22 @@ def _words(args, report):
     return [*words, "--no-report"] if identifies and not report else words
 
 
-def rig(*args, cwd, env=None, timeout=120, report=False, **options):
-    """Run ``rig`` to its end; a CompletedProcess with text output."""
+def rig(*args, cwd, env=None, timeout=120, report=False):
+    """Run ``rig`` to its end; a CompletedProcess with text output.
+
+    env: further variables, which cost the seconds of a new interpreter.
+    """
+    words = _words(args, report)
+    if env is None and hasattr(os, "fork"):
+        return _shared_server().run(words, cwd, timeout)
     return subprocess.run(
-        [*RIG, *_words(args, report)],
+        [*RIG, *words],
         cwd=cwd,
         env=environment(**(env or {})),
         capture_output=True,
         text=True,
         timeout=timeout,
         check=False,
-        **options,
     )
 
 
@@ -90,8 +98,9 @@ def start_rig(*args, cwd, env=None, **options):
 # Imports what the commands import, then becomes a ``rig`` process per line of standard input.
 _FORKING = """
 import json, os, signal, sys, traceback
-import daq.cli, daq.cli.app, daq.identification.comparison, daq.identification.replay
-import daq.recording.preview, pandas, pint, protocols.prbs, sim_rig.actuator, sim_rig.backend
+import daq.cli, daq.cli.app, daq.identification.comparison, daq.identification.fit
+import daq.identification.replay, daq.recording.preview, numba, pandas, pint, protocols.prbs
+import sim_rig.actuator, sim_rig.backend
 
 for line in sys.stdin:
     job = json.loads(line)
@@ -100,8 +109,10 @@ for line in sys.stdin:
         # As in a terminal, whatever the tests themselves were started from.
         signal.signal(signal.SIGINT, signal.default_int_handler)
         for name in ("SIGTERM", "SIGHUP"):
-            if hasattr(signal, name):
-                signal.signal(getattr(signal, name), signal.SIG_DFL)
+            signal.signal(getattr(signal, name), signal.SIG_DFL)
+        signal.alarm(job["timeout"])
+        os.environ.clear()
+        os.environ.update(job["env"])
         os.chdir(job["cwd"])
         for number, name in ((0, os.devnull), (1, job["out"]), (2, job["err"])):
             os.dup2(os.open(name, os.O_RDWR | os.O_CREAT), number)
@@ -121,31 +132,55 @@ for line in sys.stdin:
 """
 
 
-@contextmanager
-def forked_rig(**env):
-    """``rig`` processes without the second that each needs for its imports.
+class _Server:
+    """``rig`` processes without the seconds that each needs for its imports, one at a time."""
 
-    env: of these processes. Gives a function of arguments and folder that returns a
-    CompletedProcess.
-    """
-    with tempfile.TemporaryDirectory() as folder:
-        out, err = Path(folder) / "out", Path(folder) / "err"
-        parent = subprocess.Popen(
+    def __init__(self, **env):
+        self._env = env
+        self._folder = tempfile.TemporaryDirectory()
+        self._process = subprocess.Popen(
             [sys.executable, "-c", _FORKING],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment(**env),
         )  # fmt: skip
 
-        def run(args, cwd, report=False):
-            out.unlink(missing_ok=True)
-            err.unlink(missing_ok=True)
-            job = {"args": _words(args, report), "cwd": str(cwd), "out": str(out), "err": str(err)}
-            parent.stdin.write(json.dumps(job) + "\n")
-            parent.stdin.flush()
-            status = int(parent.stdout.readline())
-            return subprocess.CompletedProcess(args, status, out.read_text(), err.read_text())
+    def run(self, words, cwd, timeout=120):
+        out, err = Path(self._folder.name) / "out", Path(self._folder.name) / "err"
+        out.unlink(missing_ok=True)
+        err.unlink(missing_ok=True)
+        job = {"args": words, "cwd": str(cwd), "out": str(out), "err": str(err)}
+        job |= {"env": environment(**self._env), "timeout": timeout}
+        self._process.stdin.write(json.dumps(job) + "\n")
+        self._process.stdin.flush()
+        status = int(self._process.stdout.readline())
+        assert status != -signal.SIGALRM, f"rig {words} has not ended within {timeout} s"
+        return subprocess.CompletedProcess(words, status, out.read_text(), err.read_text())
 
-        with parent:
-            yield run
+    def close(self):
+        self._process.stdin.close()
+        self._process.wait()
+        self._process.stdout.close()
+        self._folder.cleanup()
+
+
+@functools.cache
+def _shared_server():
+    server = _Server()
+    atexit.register(server.close)
+    return server
+
+
+@contextmanager
+def forked_rig(**env):
+    """A function of arguments and folder that runs ``rig``; env: what its interpreter starts with.
+
+    Its result is a CompletedProcess.
+    """
+    server = _Server(**env) if env else _shared_server()
+    try:
+        yield lambda args, cwd, report=False: server.run(_words(args, report), cwd)
+    finally:
+        if env:
+            server.close()
 
 
 def until(condition, what, seconds=60.0):
