@@ -77,6 +77,7 @@ def settled(document):
     return [{k: v for k, v in row.items() if k != "seconds"} for row in document["runs"]]
 
 
+@pytest.mark.soak
 def test_every_log_with_every_model_and_seed(folder):
     document = campaign(folder, "--jobs", 2, "--out", "found")
     rows = document["runs"]

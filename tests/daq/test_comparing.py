@@ -78,6 +78,7 @@ def short(name):
     return name.rpartition("/")[2]
 
 
+@pytest.mark.soak
 def test_structures_and_a_linear_model_are_ranked_on_validation(folder):
     models = ("--model", DOUBLE, "--model", TWOFOLD, "--model", LAG)
     report = document(folder, "--validate", "validation.csv", *models, "--armax", "--out", "found")

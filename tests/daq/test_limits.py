@@ -17,6 +17,7 @@ from daq.limits.load import i2t_levels
 from daq.lookup.rigs import load_rig
 from daq.rig import Rig
 from sim_rig.backend import SimulatedDevice, Simulation
+from tests.soak import mostly_soak
 
 RATE = 800.0
 TURN = 2.0 * math.pi
@@ -213,7 +214,7 @@ QUIET = [
 ]
 
 
-@pytest.mark.parametrize(("options", "load", "driver"), QUIET, ids=str)
+@pytest.mark.parametrize(("options", "load", "driver"), mostly_soak(QUIET, 4), ids=str)
 def test_nothing_trips_on_a_simulated_rig_that_rests_works_and_rests(options, load, driver):
     plant = {"load": load, "driver_motor": driver, "driver_brake": driver}
     config = RigConfig(limits=EVERYTHING | {"current": {"motor": 10.0, "brake": 10.0}})

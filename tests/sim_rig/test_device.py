@@ -13,6 +13,7 @@ from sim_rig.backend import Imperfections, SimulatedDevice, Simulation
 from sim_rig.plant import Plant
 from sysid import Dataset, ModelError
 from tests.sim_rig.support import PLANTS
+from tests.soak import mostly_soak
 from tests.sysid.reference import simulate as reference
 
 OPEN_GUARD = Guard(
@@ -265,7 +266,7 @@ def test_room_shrinks_by_what_is_queued():
 # --- other plants ---------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", PLANTS)
+@pytest.mark.parametrize("name", mostly_soak(list(PLANTS)))
 def test_every_plant_runs_and_shows_what_scipy_computes(name):
     plant = Plant(**PLANTS[name])
     n, compared = 200, 60

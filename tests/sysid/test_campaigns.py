@@ -129,6 +129,7 @@ def test_a_dask_cluster_gives_the_serial_result_to_the_bit(serial):
     assert list(workers.values()) == [True, True]
 
 
+@pytest.mark.soak
 def test_workers_find_the_kernels_that_are_already_compiled(serial, tmp_path, monkeypatch):
     todo, _ = serial
     cache = shutil.copytree(os.environ["RIG_CACHE_DIR"], tmp_path / "kernels")

@@ -15,6 +15,7 @@ import pytest
 
 from sysid import GASSI, Dataset, ModelError
 from sysid.gassi import checkpoint
+from tests.soak import mostly_soak
 from tests.sysid.support import lag, motor, motor_record
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -28,6 +29,7 @@ from sysid import GASSI, Dataset
 from sysid.gassi import checkpoint
 from tests.sysid.test_checkpoint import SETTINGS, noisy
 from tests.sysid.support import motor
+from tests.soak import mostly_soak
 
 checkpoint.INTERVAL = 0.0
 steps = 0
@@ -73,7 +75,7 @@ def assert_same(found, expected):
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no SIGKILL here")
-@pytest.mark.parametrize("share", [0.02, 0.3, 0.6, 0.97])
+@pytest.mark.parametrize("share", mostly_soak([0.3, 0.02, 0.6, 0.97]))
 def test_a_killed_search_goes_on_to_the_bit(tmp_path, whole, share):
     expected, steps = whole
     steps = searching(steps)

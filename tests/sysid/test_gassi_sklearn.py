@@ -49,6 +49,7 @@ def expected_failures(model):
     return {"check_regressor_multioutput": "a model has the outputs that its equations have"}
 
 
+@pytest.mark.soak
 @parametrize_with_checks(
     [AnyWidth(population=8, generations=2, dt=1.0)], expected_failed_checks=expected_failures
 )

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from sysid import BatchSimulator, Dataset, Input, Output, Parameter, ProcessModel, State, Stepper
+from tests.soak import mostly_soak
 from tests.sysid.reference import simulate as reference
 from tests.sysid.support import blank, linear_response, prbs
 
@@ -100,7 +101,7 @@ def test_the_stepper_keeps_its_accuracy(derivative, limit, scale, accuracy, n_st
     assert np.sqrt(np.mean(error**2)) < accuracy
 
 
-@pytest.mark.parametrize(("derivative", "limit", "scale"), CASES)
+@pytest.mark.parametrize(("derivative", "limit", "scale"), mostly_soak(CASES))
 def test_the_batch_simulator_keeps_its_accuracy(derivative, limit, scale):
     chosen, inputs, exact = solved(derivative, limit)
     simulator = BatchSimulator(chosen, accuracy=1e-3)

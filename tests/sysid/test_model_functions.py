@@ -17,6 +17,7 @@ from sysid import (
     ProcessModel,
     State,
 )
+from tests.soak import mostly_soak
 from tests.sysid.reference import simulate as reference
 from tests.sysid.support import blank, normalised_rms, prbs
 
@@ -114,7 +115,7 @@ def build(name, derivative, states=2, inputs=1, output=None, outputs=None):
     )
 
 
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("name", mostly_soak(list(MODELS), 2))
 def test_it_compiles_and_follows_scipy(name):
     model = build(name, **MODELS[name])
     rng = np.random.default_rng(1)
