@@ -7,8 +7,7 @@
 import html as _html
 import math
 import re
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 
 _GREEK = {
     "alpha": "α", "beta": "β", "gamma": "γ", "delta": "δ", "epsilon": "ε", "zeta": "ζ",
@@ -16,31 +15,21 @@ _GREEK = {
     "rho": "ρ", "sigma": "σ", "tau": "τ", "phi": "φ", "chi": "χ", "psi": "ψ", "omega": "ω",
 }  # fmt: skip
 _SYMBOL = re.compile(rf"({'|'.join(_GREEK)}|[A-Za-z])(\d*)(?:_([A-Za-z0-9]+))?(\(0\))?")
-_ATOM = re.compile(r"[^\W\d]\w*(?:\(0\))?")
-_TEX = {
+_ATOM = re.compile(r"([^\W\d]\w*(?:\(0\))?)")
+_TEX = str.maketrans({
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_",
     "{": r"\{", "}": r"\}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
     "<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}",
-}  # fmt: skip
-_TEX_GREEK = {
     "Ω": r"\ensuremath{\Omega}", "μ": r"\ensuremath{\mu}", "µ": r"\ensuremath{\mu}",
     "°": r"\ensuremath{^\circ}", "·": r"\ensuremath{\cdot}", "²": r"\ensuremath{^2}",
     "³": r"\ensuremath{^3}", "ω": r"\ensuremath{\omega}",
-}  # fmt: skip
-
+})  # fmt: skip
+_TEX_OPERATORS = {" - ": " $-$ ", " + ": " $+$ "}
+_TEX_UNITS = {"*": r"\,", "ohm": r"\ensuremath{\Omega}"}
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _PREFIXES = {-9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M"}
 # A power would be of the prefix as well: mm^2 is no thousandth of m^2.
 _PREFIXABLE = re.compile(r"(V|A|ohm|H|F|N|W|J|s|Hz|Pa|T|Wb|m|rad)(?![\w^])")
-_PLAIN = (0.1, 1000.0)
-
-
-@dataclass(frozen=True)
-class _Symbol:
-    """A letter with its index; ``start`` where its value at time 0 is meant."""
-
-    letter: str
-    index: str
-    start: bool
 
 
 def html(expression: str) -> str:
@@ -50,27 +39,26 @@ def html(expression: str) -> str:
 
 def equation(text: str) -> str:
     """An equation in names (``L_m di_m/dt = v_m - R_m*i_m``) as HTML."""
-    parts = re.split(r"(\bd[A-Za-z]\w*/dt)", text)
-    return "".join(
-        f"d{_html_atom(part[1:-3])}/d<i>t</i>" if k % 2 else _spaced(html(part))
-        for k, part in enumerate(parts)
-    )
-
-
-def _spaced(text: str) -> str:
-    """Products without their signs, and a minus that is one."""
-    text = re.sub(r"(?<![\w;])-(?=[\s<\w(])", "−", text)
-    return text.replace("*", "\u2009")
+    parts = re.split(r"\bd([A-Za-z]\w*)/dt", text)
+    parts[1::2] = [f"d{_html_atom(name)}/d<i>t</i>" for name in parts[1::2]]
+    # Products without their signs, and a minus that is one.
+    signs = [re.sub(r"(?<![\w;])-(?=[\s<\w(])", "−", html(part)) for part in parts[::2]]
+    parts[::2] = [part.replace("*", "\u2009") for part in signs]
+    return "".join(parts)
 
 
 def tex(expression: str) -> str:
     """The same as LaTeX, to stand in text."""
-    return _translated(expression, _tex_atom, _tex_rest)
+    return _translated(
+        expression,
+        lambda name: _math(name) or escape_tex(name),
+        lambda text: _tex_pieces(text, r"(\^-?[\d.]+| - | \+ )", _TEX_OPERATORS),
+    )
 
 
 def label(expression: str) -> str:
     """The same as a label of a figure, in matplotlib's mathematical text."""
-    return _translated(expression, _label_atom, _label_rest)
+    return _translated(expression, lambda name: _math(name) or words(name), _label_rest)
 
 
 def words(name: str) -> str:
@@ -83,15 +71,12 @@ def unit_text(unit: str) -> str:
     if unit in ("", "1"):
         return ""
     text = re.sub(r"\bohm\b", "Ω", unit).replace("*", "·")
-    return re.sub(r"\^(-?\d+)", lambda m: m[1].translate(RAISED), text)
+    return re.sub(r"\^(-?\d+)", lambda power: raised(power[1]), text)
 
 
 def unit_tex(unit: str) -> str:
     """The same as LaTeX."""
-    if unit in ("", "1"):
-        return ""
-    pieces = re.split(r"(\^-?\d+|\*|\bohm\b)", unit)
-    return "".join(_tex_unit_piece(piece) for piece in pieces)
+    return "" if unit == "1" else _tex_pieces(unit, r"(\^-?\d+|\*|\bohm\b)", _TEX_UNITS)
 
 
 def bracketed(unit: str) -> str:
@@ -130,7 +115,7 @@ def engineering(value: float, unit: str) -> tuple[float, str]:
     The factor is 1 from a tenth to a thousand, and for units that take no prefix (kg, 1/s, m^2).
     """
     size = abs(value)
-    if not _PREFIXABLE.match(unit) or not math.isfinite(value) or _PLAIN[0] <= size < _PLAIN[1]:
+    if not _PREFIXABLE.match(unit) or not math.isfinite(value) or 0.1 <= size < 1000.0:
         return 1.0, unit
     power = 3 * math.floor(math.log10(size) / 3) if size else 0
     prefix = _PREFIXES.get(power)
@@ -152,85 +137,61 @@ def number_tex(text: str) -> str:
 
 def escape_tex(text: str) -> str:
     """Any text, as LaTeX prints it."""
-    signs = _TEX | _TEX_GREEK
-    return "".join(signs.get(sign, sign) for sign in text)
+    return text.translate(_TEX)
 
 
-# Digits and minus as superscripts.
-RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+def raised(digits: str) -> str:
+    """A whole number as superscripts."""
+    return digits.translate(_RAISED)
 
 
 def _translated(expression: str, atom: Callable[[str], str], rest: Callable[[str], str]) -> str:
-    parts, end = [], 0
-    for name in _ATOM.finditer(expression):
-        parts += [rest(expression[end : name.start()]), atom(name[0])]
-        end = name.end()
-    return "".join([*parts, rest(expression[end:])])
+    parts = _ATOM.split(expression)
+    return "".join(atom(part) if k % 2 else rest(part) for k, part in enumerate(parts))
 
 
-def _symbol(name: str) -> _Symbol | None:
+def _symbol(name: str) -> tuple[str, str, str] | None:
+    """A letter, its index, and ``(0)`` where its value at time 0 is meant; None for a word."""
     match = _SYMBOL.fullmatch(name)
     if match is None:
         return None
-    letter, digits, index, start = match.groups()
-    both = ",".join(part for part in (digits, index) if part)
-    return _Symbol(letter, both, start is not None)
+    letter, digits, index, start = match.groups(default="")
+    return letter, ",".join(part for part in (digits, index) if part), start
 
 
 def _html_atom(name: str) -> str:
     symbol = _symbol(name)
     if symbol is None:
         return _html.escape(name)
-    index = f"<sub>{symbol.index}</sub>" if symbol.index else ""
-    start = "(0)" if symbol.start else ""
-    return f"<i>{_GREEK.get(symbol.letter, symbol.letter)}</i>{index}{start}"
+    letter, index, start = symbol
+    return f"<i>{_GREEK.get(letter, letter)}</i>{f'<sub>{index}</sub>' if index else ''}{start}"
 
 
 def _html_rest(text: str) -> str:
-    raised = re.sub(r"\^(-?[\d.]+)", r"<sup>\1</sup>", _html.escape(text))
-    return raised.replace(" - ", " − ")
+    powers = re.sub(r"\^(-?[\d.]+)", r"<sup>\1</sup>", _html.escape(text))
+    return powers.replace(" - ", " − ")
 
 
-def _tex_atom(name: str) -> str:
-    return f"${body}$" if (body := _math_body(name)) is not None else escape_tex(name)
-
-
-def _math_body(name: str) -> str | None:
+def _math(name: str) -> str | None:
+    """A symbol as LaTeX and matplotlib set it; None for a word."""
     symbol = _symbol(name)
     if symbol is None:
         return None
-    letter = f"\\{symbol.letter}" if symbol.letter in _GREEK else symbol.letter
-    index = f"_{{\\mathrm{{{symbol.index}}}}}" if symbol.index else ""
-    return f"{letter}{index}{'(0)' if symbol.start else ''}"
+    letter, index, start = symbol
+    command = f"\\{letter}" if letter in _GREEK else letter
+    below = f"_{{\\mathrm{{{index}}}}}" if index else ""
+    return f"${command}{below}{start}$"
 
 
-def _tex_rest(text: str) -> str:
-    pieces = re.split(r"(\^-?[\d.]+| - | \+ )", text)
-    return "".join(_tex_rest_piece(piece) for piece in pieces)
-
-
-def _tex_rest_piece(piece: str) -> str:
-    if piece.startswith("^") and len(piece) > 1:
-        return f"$^{{{piece[1:]}}}$"
-    if piece in (" - ", " + "):
-        return f" ${piece.strip()}$ "
-    return escape_tex(piece)
-
-
-def _label_atom(name: str) -> str:
-    return f"${body}$" if (body := _math_body(name)) is not None else words(name)
+def _tex_pieces(text: str, pattern: str, signs: Mapping[str, str]) -> str:
+    """A text as LaTeX, split at powers and signs."""
+    pieces = re.split(pattern, text)
+    for k, piece in enumerate(pieces):
+        is_power = piece.startswith("^") and len(piece) > 1
+        pieces[k] = f"$^{{{piece[1:]}}}$" if is_power else signs.get(piece) or escape_tex(piece)
+    return "".join(pieces)
 
 
 def _label_rest(text: str) -> str:
-    raised = re.sub(r"\^(-?[\d.]+)", r"$^{\1}$", text.replace("$", r"\$"))
-    return raised.replace(" - ", " − ")
-
-
-def _tex_unit_piece(piece: str) -> str:
-    if piece == "*":
-        return r"\,"
-    if piece == "ohm":
-        return r"\ensuremath{\Omega}"
-    if piece.startswith("^") and len(piece) > 1:
-        return f"$^{{{piece[1:]}}}$"
-    return escape_tex(piece)
+    powers = re.sub(r"\^(-?[\d.]+)", r"$^{\1}$", text.replace("$", r"\$"))
+    return powers.replace(" - ", " − ")

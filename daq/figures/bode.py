@@ -1,20 +1,14 @@
 """Frequency responses: measured, of a model treated likewise, and of linear models."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
+from matplotlib.figure import Figure
 
 from daq import notation
 from daq.figures import style
-from daq.figures.style import FloatArray
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from daq.hal import FloatArray
 
 ComplexArray = npt.NDArray[np.complex128]
 _MEASURED = "measured, 95 %"
@@ -22,36 +16,30 @@ _Z95 = 1.959963984540054
 _SEEN = 0.3  # coherence below which a measured point is drawn faintly
 
 
-@dataclass(frozen=True)
-class Measured:
-    """An estimated response, (n,) complex, its coherence and standard deviation of a magnitude."""
-
-    response: ComplexArray
-    coherence: FloatArray
-    deviation: FloatArray
-
-
 @style.styled
 def bode(
     frequency: FloatArray,
-    measured: Measured,
+    response: ComplexArray,
+    coherence: FloatArray,
+    deviation: FloatArray,
     curves: Mapping[str, ComplexArray],
     units: tuple[str, str],
 ) -> Figure:
     """Magnitude, phase and coherence over frequencies [Hz], (n,).
 
+    response, coherence, deviation: as estimated, (n,), with a magnitude's standard deviation.
     curves: responses at the same frequencies by name. units: of output and input. Measured
     magnitudes carry 95 % bars; points of low coherence are faint.
     """
     figure, (size, angle, seen) = style.stack(
         [1.1, 0.8, 0.45], 0.1, top=style.legend_room([_MEASURED, *curves])
     )
-    magnitude = np.abs(measured.response)
-    good = measured.coherence >= _SEEN
+    magnitude = np.abs(response)
+    good = coherence >= _SEEN
     for chosen, colour in ((~good, style.FAINT), (good, style.MEASURED)):
         if not chosen.any():
             continue
-        bars = _Z95 * measured.deviation[chosen]
+        bars = _Z95 * deviation[chosen]
         lower = np.minimum(bars, 0.98 * magnitude[chosen])
         size.errorbar(
             frequency[chosen], magnitude[chosen], yerr=[lower, bars], fmt="none",
@@ -59,18 +47,18 @@ def bode(
         )  # fmt: skip
         size.plot(frequency[chosen], magnitude[chosen], ".", ms=2.5, color=colour,
                   label=_MEASURED if colour == style.MEASURED else None)  # fmt: skip
-        angle.plot(frequency[chosen], _degrees(measured.response[chosen]), ".", ms=2.5,
-                   color=colour)  # fmt: skip
-    for k, (name, response) in enumerate(curves.items()):
+        degrees = np.angle(response[chosen], deg=True)
+        angle.plot(frequency[chosen], degrees, ".", ms=2.5, color=colour)
+    for k, (name, curve) in enumerate(curves.items()):
         look = {"color": style.CYCLE[(1, 0, 2, 3)[k % 4]], "ls": style.DASHES[k % 4]}
-        size.plot(frequency, np.abs(response), label=name, **look)  # type: ignore[arg-type]
-        angle.plot(frequency, _degrees(response), **look)  # type: ignore[arg-type]
+        size.plot(frequency, np.abs(curve), label=name, **look)  # type: ignore[arg-type]
+        angle.plot(frequency, np.angle(curve, deg=True), **look)  # type: ignore[arg-type]
     limits = _limits(magnitude, good, curves)
     size.set_ylim(*limits)
     style.logarithmic(size.yaxis, np.array(limits))
     angle.set_ylim(-190, 190)
     angle.set_yticks([-180, -90, 0, 90, 180])
-    seen.plot(frequency, measured.coherence, color=style.MEASURED, lw=0.8)
+    seen.plot(frequency, coherence, color=style.MEASURED, lw=0.8)
     seen.set_ylim(-0.05, 1.05)
     style.logarithmic(seen.xaxis, frequency)
     seen.set_xlabel("frequency [Hz]")
@@ -91,11 +79,6 @@ def _limits(
     if not len(every):
         return 0.1, 1.0
     return 0.4 * float(every.min()), 2.5 * float(every.max())
-
-
-def _degrees(response: ComplexArray) -> FloatArray:
-    degrees: FloatArray = np.degrees(np.angle(response))
-    return degrees
 
 
 def _ratio(output: str, given: str) -> str:

@@ -1,27 +1,29 @@
-"""Figures of what a protocol concludes."""
+"""Figures of quantities over others: what a protocol concludes, what a model brings."""
 
-from __future__ import annotations
+import textwrap
+from collections.abc import Mapping
+from typing import Any
 
-from typing import TYPE_CHECKING, Any
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 
 from daq import notation
 from daq.figures import style
 from daq.findings import Axis, Chart, Heatmap, Series
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from daq.hal import FloatArray
 
 _LETTERS_A_LINE = 62  # of a title across a column of print
 _LEFT, _SHORT = 0.6, 34  # in, left of a panel, and letters of a label on one line
 _SCALE = 0.12  # in, for a power of ten above the panel
 _EDGE = 0.16  # in, where the legend's room begins
+_POINTS = 700  # of a cloud, beyond which a part looks the same
 
 
 @style.styled
 def draw(figure: Chart | Heatmap) -> Figure:
     """A figure of a chart or of a value over a plane."""
-    title = style.wrapped(figure.title, _LETTERS_A_LINE)
+    title = "\n".join(textwrap.wrap(figure.title, _LETTERS_A_LINE)).replace("$", r"\$")
     heading = 0.05 + 0.13 * (title.count("\n") + 1)
     named = [series.label for series in figure.series if series.label]
     shown = named if len(named) > 1 or isinstance(figure, Heatmap) else []
@@ -58,8 +60,6 @@ def _plane(drawn: Figure, panel: Axes, figure: Heatmap) -> None:
 
 def _add(panel: Axes, series: Series, k: int, over: bool) -> None:
     """One series; over: a plane, on which black with a white edge is seen everywhere."""
-    from matplotlib.patheffects import withStroke
-
     look: dict[str, Any] = {
         "color": "black" if over else style.CYCLE[k % len(style.CYCLE)],
         "label": notation.words(series.label) or None,
@@ -81,3 +81,32 @@ def _add(panel: Axes, series: Series, k: int, over: bool) -> None:
 
 def _label(axis: Axis) -> str:
     return f"{notation.words(axis.label)} {notation.bracketed(axis.unit)}"
+
+
+@style.styled
+def plot(
+    over: Mapping[str, str],
+    quantity: Axis,
+    curves: Mapping[str, Mapping[str, FloatArray]],
+    points: bool = False,
+) -> Figure:
+    """A panel over each of several quantities, such as a torque over angle and over speed.
+
+    over: their units by name. curves: by label, values by the quantities' names, (n,). points:
+    curves are clouds of measured samples.
+    """
+    figure, panels = style.stack(
+        [1.45] * len(over), 0.42, top=style.legend_room(list(curves)), share_x=False
+    )
+    for panel, (name, unit) in zip(panels, over.items(), strict=True):
+        for k, (label, values) in enumerate(curves.items()):
+            stride = 1 + len(values[name]) // _POINTS if points else 1
+            x, y = values[name][::stride], values[quantity.label][::stride]
+            look: dict[str, Any] = {"ls": style.DASHES[k % len(style.DASHES)]}
+            if points:
+                look = {"ls": "", "marker": "ox^s"[k % 4], "ms": 1.4, "mew": 0.3, "mfc": "none"}
+            panel.plot(x, y, label=label, color=style.CYCLE[k % len(style.CYCLE)], **look)
+        panel.set_xlabel(f"{name} {notation.bracketed(unit)}", labelpad=1.5)
+        style.name_y(panel, quantity.label, notation.bracketed(quantity.unit))
+    style.legend(figure, panels[0])
+    return figure

@@ -1,106 +1,82 @@
-"""What a search tells of parameters: intervals in their ranges, and correlations."""
-
-from __future__ import annotations
+"""What a search says: its convergence, parameters in their ranges, and models in their ranking."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from daq.figures import style
-from daq.figures.style import FloatArray
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from daq.hal import FloatArray
 
 _NUMBERED = 0.27  # in, width of a cell from which its correlation is written into it
-
 _WIDEST = 8.0  # times the median width to which intervals are drawn
-
 _SHORT = 9  # letters up to which names stand beside each other
-
-
-@dataclass(frozen=True)
-class Searched:
-    """A parameter in the range that it was searched in; without interval where there is none."""
-
-    name: str
-    unit: str
-    value: float
-    lower: float
-    upper: float
-    log: bool
-    interval: tuple[float, float] | None
-    note: str = ""
-
-
-@dataclass(frozen=True)
-class Determined:
-    """A quantity that has an interval."""
-
-    name: str
-    value: float
-    low: float
-    high: float
+_NAME = 52  # letters of a model's name above its row
 
 
 @style.styled
-def ranges(parameters: Sequence[Searched]) -> Figure:
-    """Each parameter's value and interval inside its range, from one end to the other."""
-    names, left = style.row_names([parameter.name for parameter in parameters])
-    figure, (panel,) = style.stack([0.155 * len(parameters) + 0.1], left=left, top=0.24,
-                                   right=0.95)  # fmt: skip
-    for row, quantity in enumerate(parameters):
-        panel.plot([0.0, 1.0], [row, row], color=style.FAINT, lw=3.0, solid_capstyle="butt",
-                   zorder=1)  # fmt: skip
-        determined = quantity.interval is not None
-        if quantity.interval is not None:
-            ends = [_place(quantity, end) for end in quantity.interval]
-            panel.plot(ends, [row, row], color=style.BASELINE, lw=3.0, solid_capstyle="butt",
-                       zorder=2)  # fmt: skip
-        panel.plot(
-            _place(quantity, quantity.value), row, "o", ms=3.2, zorder=3,
-            mfc=style.IDENTIFIED if determined else "white", mec=style.IDENTIFIED, mew=0.8,
-        )  # fmt: skip
-        if quantity.note:
-            panel.text(1.07, row, quantity.note, va="center", fontsize=6.0)
-    _legend_of_ranges(figure, panel)
-    panel.set_yticks(range(len(parameters)), names)
-    panel.set_ylim(len(parameters) - 0.4, -0.6)
-    panel.set_xlim(-0.04, 1.04)
-    panel.set_xticks([0.0, 0.5, 1.0], ["low end", "middle", "high end"])
-    panel.set_xlabel("place in the range searched [1]")
-    panel.grid(visible=False, axis="y")
-    panel.tick_params(axis="y", length=0)
+def convergence(
+    errors: FloatArray, simulations_each: int, before_refinement: float | None = None
+) -> Figure:
+    """The best error after each generation, (n_generations,), over the simulations until then.
+
+    before_refinement: the lowest error of the genetic search, where local least squares followed.
+    """
+    figure, (panel,) = style.stack([1.5], top=0.24)
+    spent = simulations_each * np.arange(1, len(errors) + 1)
+    panel.plot(spent, errors, color=style.IDENTIFIED, marker=".", ms=3.0, lw=0.9,
+               label="best error")  # fmt: skip
+    if before_refinement is not None and np.isfinite(before_refinement):
+        panel.axhline(before_refinement, color=style.MEASURED, lw=0.7, ls="--",
+                      label="genetic search alone")  # fmt: skip
+    style.logarithmic(panel.yaxis, errors)
+    panel.ticklabel_format(axis="x", style="plain")
+    panel.set_xlabel("parameter sets simulated [1]")
+    style.name_y(panel, "mean RMSE / max|y|", "[1]")
+    style.legend(figure, panel)
     return figure
 
 
-def _legend_of_ranges(figure: Figure, panel: Axes) -> None:
+@style.styled
+def ranges(names: Sequence[str], places: FloatArray, notes: Sequence[str]) -> Figure:
+    """Each parameter's value and interval inside its range, from one end to the other.
+
+    places: (n, 3) of the value and the interval's ends, from 0 at the range's low end to 1 at its
+    high end; NaN where there is no interval. notes: what stands behind each row.
+    """
+    labels, left = style.row_names(names)
+    figure, (panel,) = style.stack([0.155 * len(names) + 0.1], left=left, top=0.24, right=0.95)
+    bar: dict[str, Any] = {"lw": 3.0, "solid_capstyle": "butt"}
+    for row, (value, *ends) in enumerate(places.tolist()):
+        panel.plot([0.0, 1.0], [row, row], color=style.FAINT, zorder=1, **bar)
+        determined = np.isfinite(ends).all()
+        if determined:
+            panel.plot(ends, [row, row], color=style.BASELINE, zorder=2, **bar)
+        panel.plot(value, row, "o", ms=3.2, zorder=3, mec=style.IDENTIFIED, mew=0.8,
+                   mfc=style.IDENTIFIED if determined else "white")  # fmt: skip
+        if notes[row]:
+            panel.text(1.07, row, notes[row], va="center", fontsize=6.0)
     panel.plot([], [], color=style.FAINT, lw=3.0, label="range")
     panel.plot([], [], color=style.BASELINE, lw=3.0, label="95 % interval")
     panel.plot([], [], "o", ms=3.2, mfc=style.IDENTIFIED, mec=style.IDENTIFIED, label="value")
     panel.plot([], [], "o", ms=3.2, mfc="white", mec=style.IDENTIFIED, label="no interval")
     style.legend(figure, panel, left=0.2)
-
-
-def _place(quantity: Searched, value: float) -> float:
-    """From 0 at the low end to 1 at the high end, on the scale of the search."""
-    values = np.array([value, quantity.lower, quantity.upper])
-    if quantity.log:
-        values = np.log(np.maximum(values, np.finfo(float).tiny))
-    place = float((values[0] - values[1]) / (values[2] - values[1]))
-    # An interval may be wider than the range.
-    return min(max(place, -0.04), 1.04)
+    _name_rows(panel, labels)
+    panel.set_xlim(-0.04, 1.04)
+    panel.set_xticks([0.0, 0.5, 1.0], ["low end", "middle", "high end"])
+    panel.set_xlabel("place in the range searched [1]")
+    return figure
 
 
 @style.styled
-def intervals(quantities: Sequence[Determined]) -> Figure:
-    """The 95 % interval of every determined quantity, in per cent of its value."""
-    names, left = style.row_names([quantity.name for quantity in quantities])
-    figure, (panel,) = style.stack([0.17 * len(quantities) + 0.1], left=left, top=0.1)
-    ends = np.array([_relative(quantity) for quantity in quantities])
+def intervals(names: Sequence[str], values: FloatArray) -> Figure:
+    """95 % intervals in per cent of the values; values: (n, 3), each with its interval's ends."""
+    labels, left = style.row_names(names)
+    figure, (panel,) = style.stack([0.17 * len(names) + 0.1], left=left, top=0.1)
+    sizes = np.where(values[:, :1] == 0.0, 1.0, np.abs(values[:, :1]))
+    ends = 100.0 * (values[:, 1:] - values[:, :1]) / sizes
     widths = np.abs(ends).max(axis=1)
     # One that is hardly known must not flatten the others: it leaves the panel, with its width.
     limit = min(float(widths.max()), _WIDEST * float(np.median(widths)))
@@ -113,21 +89,18 @@ def intervals(quantities: Sequence[Determined]) -> Figure:
             shown = f"{below:.0f} .. +{above:.0f} %".replace("-", "−")
             panel.text(limit, row - 0.1, shown, ha="right", va="bottom", fontsize=6.0)
     panel.axvline(0.0, color="black", lw=0.4, zorder=1)
-    panel.set_yticks(range(len(quantities)), names)
-    panel.set_ylim(len(quantities) - 0.4, -0.6)
+    _name_rows(panel, labels)
     panel.set_xlim(-1.1 * limit, 1.1 * limit) if limit > 0.0 else None
     panel.set_xlabel("95 % interval, distance from the value [%]")
-    panel.grid(visible=False, axis="y")
-    panel.tick_params(axis="y", length=0)
     return figure
 
 
-def _relative(quantity: Determined) -> tuple[float, float]:
-    """Ends of an interval, in per cent of the value away from it."""
-    size = abs(quantity.value) or 1.0
-    return 100.0 * (quantity.low - quantity.value) / size, 100.0 * (
-        quantity.high - quantity.value
-    ) / size
+def _name_rows(panel: Axes, labels: Sequence[str]) -> None:
+    """Names beside rows, the first at the top."""
+    panel.set_yticks(range(len(labels)), labels)
+    panel.set_ylim(len(labels) - 0.4, -0.6)
+    panel.grid(visible=False, axis="y")
+    panel.tick_params(axis="y", length=0)
 
 
 @style.styled
@@ -147,8 +120,7 @@ def correlation(names: Sequence[str], matrix: FloatArray) -> Figure:
     panel.set_yticks(range(n), labels)
     panel.grid(visible=False)
     panel.tick_params(length=0)
-    for spine in panel.spines.values():
-        spine.set_visible(False)
+    panel.spines[:].set_visible(False)
     if side / n >= _NUMBERED:
         for i, j in np.argwhere(np.isfinite(matrix)).tolist():
             dark = abs(matrix[i, j]) > 0.6
@@ -161,4 +133,30 @@ def correlation(names: Sequence[str], matrix: FloatArray) -> Figure:
     bar = figure.colorbar(image, cax=beside, ticks=[-1.0, -0.5, 0.0, 0.5, 1.0])
     bar.set_label("correlation coefficient [1]", labelpad=2.0)
     bar.outline.set_linewidth(0.4)
+    return figure
+
+
+@style.styled
+def ratios(names: Sequence[str], values: FloatArray) -> Figure:
+    """Models' squared errors in parts of the best one's; an interval around 1 is no difference.
+
+    values: (n, 3), each with the ends of its 95 % interval, the best model's first.
+    """
+    figure, (panel,) = style.stack([0.3 * len(names)], left=0.15, top=0.1)
+    panel.axvline(1.0, color="black", lw=0.4, zorder=1)
+    for place, (name, (value, low, high)) in enumerate(zip(names, values.tolist(), strict=True)):
+        panel.errorbar(value, place, xerr=[[value - low], [high - value]], fmt="o", ms=3.0,
+                       capsize=2.0, color=style.IDENTIFIED, ecolor=style.BASELINE,
+                       elinewidth=1.2)  # fmt: skip
+        shown = name if len(name) <= _NAME else f"{name[: _NAME - 1]}…"
+        panel.text(0.01, place - 0.28, shown.replace("$", r"\$"), fontsize=6.0, va="center",
+                   bbox={"fc": "white", "ec": "none", "pad": 0.3},
+                   transform=panel.get_yaxis_transform())  # fmt: skip
+    ends = values[:, 1:]
+    panel.set_ylim(len(names) - 0.5, -0.55)
+    panel.set_xlim(0.9 * ends.min(), 1.1 * ends.max())
+    style.logarithmic(panel.xaxis, ends)
+    panel.set_yticks([])
+    panel.spines["left"].set_visible(False)
+    panel.set_xlabel("squared errors in validation, best model = 1 [1]")
     return figure

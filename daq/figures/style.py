@@ -4,29 +4,33 @@ Colours are those of Okabe and Ito (jfly.uni-koeln.de/color, 2008), and lines di
 dash or weight as well, so that figures survive a black-and-white printer.
 """
 
-from __future__ import annotations
-
-import functools
 import io
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, ParamSpec, get_args
+from typing import Any
 
+import matplotlib as mpl
 import numpy as np
-import numpy.typing as npt
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties
+from matplotlib.textpath import text_to_path
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator, StrMethodFormatter
 
 from daq import notation
 from daq.errors import ConfigError
+from daq.hal import FloatArray
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.axis import Axis
-    from matplotlib.figure import Figure
-
-FloatArray = npt.NDArray[np.float64]
-Format = Literal["svg", "pdf", "png"]
-PRINTED: tuple[Format, ...] = ("pdf", "png")  # of figures that stand by themselves
+FORMATS = ("svg", "pdf", "png")
+PRINTED = ("pdf", "png")  # of figures that stand by themselves
+# Dates and versions would make every file another.
+_NAMELESS: dict[str, dict[str, Any]] = {
+    "svg": {"Date": None, "Creator": None, "Format": None, "Type": None},
+    "pdf": {"CreationDate": None, "Creator": None, "Producer": None},
+    "png": {"Software": None},
+}
 
 WIDTH = 3.5  # in, one column
 LEFT = 0.72  # in, left of the panels
@@ -56,56 +60,26 @@ _PLAIN = 30.0  # span of a logarithmic axis below which it needs more marks than
 _COLUMNS = 1400
 
 _SETTINGS: dict[str, Any] = {
-    "font.family": "DejaVu Sans",
-    "font.size": 7.0,
-    "axes.labelsize": 7.0,
-    "axes.titlesize": 7.0,
-    "xtick.labelsize": 6.5,
-    "ytick.labelsize": 6.5,
-    "legend.fontsize": 6.5,
-    "legend.frameon": False,
-    "legend.handlelength": 1.6,
-    "legend.handletextpad": 0.8,
-    "legend.columnspacing": 1.2,
-    "axes.linewidth": 0.6,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": "#e4e4e4",
-    "grid.linewidth": 0.4,
-    "lines.linewidth": 0.9,
-    "lines.solid_joinstyle": "round",
-    "xtick.major.width": 0.6,
-    "ytick.major.width": 0.6,
-    "xtick.major.size": 2.5,
-    "ytick.major.size": 2.5,
+    "font.family": "DejaVu Sans", "font.size": 7.0, "axes.labelsize": 7.0, "axes.titlesize": 7.0,
+    "xtick.labelsize": 6.5, "ytick.labelsize": 6.5,
+    "legend.fontsize": 6.5, "legend.frameon": False, "legend.handlelength": 1.6,
+    "legend.handletextpad": 0.8, "legend.columnspacing": 1.2,
+    "axes.linewidth": 0.6, "axes.spines.top": False, "axes.spines.right": False,
+    "axes.grid": True, "axes.axisbelow": True, "grid.color": "#e4e4e4", "grid.linewidth": 0.4,
+    "lines.linewidth": 0.9, "lines.solid_joinstyle": "round",
+    "xtick.major.width": 0.6, "ytick.major.width": 0.6,
+    "xtick.major.size": 2.5, "ytick.major.size": 2.5,
     # Mathematical text is parsed, at ten times the price of plain text.
-    "axes.formatter.use_mathtext": False,
-    "axes.formatter.limits": (-3, 4),
-    "axes.unicode_minus": True,
-    "mathtext.fontset": "dejavusans",
+    "axes.formatter.use_mathtext": False, "mathtext.fontset": "dejavusans",
+    "axes.formatter.limits": (-3, 4), "axes.unicode_minus": True,
     # Outlines look alike everywhere; what they spell is in the caption.
-    "svg.fonttype": "path",
-    "svg.hashsalt": "rig",
+    "svg.fonttype": "path", "svg.hashsalt": "rig",
     # Fonts that journals' checkers take.
     "pdf.fonttype": 42,
-}
+}  # fmt: skip
 
-P = ParamSpec("P")
-
-
-def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
-    """A drawing function under the shared settings, which are put back behind it."""
-
-    @functools.wraps(draw)
-    def drawn(*args: P.args, **kwargs: P.kwargs) -> Figure:
-        import matplotlib as mpl
-
-        with mpl.rc_context(_SETTINGS):  # type: ignore[arg-type]
-            return draw(*args, **kwargs)
-
-    return drawn
+# A drawing function under the shared settings, which are put back behind it.
+styled = mpl.rc_context(_SETTINGS)  # type: ignore[arg-type]
 
 
 def stack(
@@ -116,7 +90,6 @@ def stack(
     right: float = 0.1,
     top: float = 0.28,
     bottom: float = 0.4,
-    width: float = WIDTH,
     share_x: bool = True,
 ) -> tuple[Figure, list[Axes]]:
     """A figure of panels under one another; all lengths in inches.
@@ -124,15 +97,13 @@ def stack(
     gaps: below each panel but the last, or one for all. Places are given rather than found by a
     layout engine, which would draw everything twice.
     """
-    from matplotlib.figure import Figure
-
     between = [gaps] * (len(heights) - 1) if isinstance(gaps, float | int) else list(gaps)
     tall = top + bottom + sum(heights) + sum(between)
-    figure = Figure(figsize=(width, tall), dpi=DPI)
+    figure = Figure(figsize=(WIDTH, tall), dpi=DPI)
     panels: list[Any] = []
     above = top
     for height, gap in zip(heights, [*between, 0.0], strict=True):
-        box = (left / width, 1 - (above + height) / tall, (width - left - right) / width,
+        box = (left / WIDTH, 1 - (above + height) / tall, (WIDTH - left - right) / WIDTH,
                height / tall)  # fmt: skip
         first = panels[0] if panels and share_x else None
         panels.append(figure.add_axes(box, sharex=first))
@@ -174,14 +145,13 @@ def logarithmic(axis: Axis, values: FloatArray) -> None:
 
     Powers of ten alone leave an axis of less than a few decades unmarked.
     """
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
-
     axis._set_axes_scale("log")  # type: ignore[attr-defined]
     positive = values[np.isfinite(values) & (values > 0.0)]
     low, high = (float(positive.min()), float(positive.max())) if len(positive) else (1.0, 10.0)
     if high < _PLAIN * low:
         axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axis.set_major_formatter(FuncFormatter(_plain if low >= 1e-3 and high < 1e5 else _power))
+    plain = low >= 1e-3 and high < 1e5
+    axis.set_major_formatter(StrMethodFormatter("{x:g}") if plain else FuncFormatter(_power))
     axis.set_minor_locator(NullLocator())
     _mark_digits(axis)
 
@@ -204,20 +174,11 @@ def _mark_digits(axis: Axis) -> None:
     )  # fmt: skip
 
 
-def _plain(value: float, _place: int | None = None) -> str:
-    return f"{value:g}"
-
-
 def _power(value: float, _place: int | None = None) -> str:
     """A power of ten, or a multiple of one."""
     mantissa, power = f"{value:.0e}".split("e")
     times = "" if mantissa == "1" else f"{mantissa}·"
-    return f"{times}10{str(int(power)).translate(notation.RAISED)}"
-
-
-def wrapped(text: str, letters: int) -> str:
-    """Text on several lines of at most so many letters; a dollar sign is no mathematics."""
-    return "\n".join(textwrap.wrap(text, letters)).replace("$", r"\$")
+    return f"{times}10{notation.raised(str(int(power)))}"
 
 
 def row_names(names: Sequence[str]) -> tuple[list[str], float]:
@@ -225,11 +186,6 @@ def row_names(names: Sequence[str]) -> tuple[list[str], float]:
     shown = [name if len(name) <= _LONGEST else f"{name[: _LONGEST - 1]}…" for name in names]
     longest = max((len(name) for name in shown), default=0)
     return [notation.label(name) for name in shown], max(_LETTER * longest + 0.16, 0.5)
-
-
-def note(panel: Axes, text: str) -> None:
-    """A remark above a panel's right end."""
-    panel.set_title(text, loc="right", fontsize=6.5, pad=2.0)
 
 
 def legend_room(labels: Sequence[str], left: float = LEFT) -> float:
@@ -274,9 +230,6 @@ def _folded(label: str, room: float) -> str:
 
 def _text_width(text: str) -> float:
     """Inches that a legend's text takes."""
-    from matplotlib.font_manager import FontProperties
-    from matplotlib.textpath import text_to_path
-
     font = FontProperties(size=_SETTINGS["legend.fontsize"])
     plain = text.replace(r"\$", "$")
     return float(text_to_path.get_text_width_height_descent(plain, font, False)[0]) / _POINTS
@@ -300,32 +253,23 @@ def thinned(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     return x[kept], y[kept]
 
 
-def format_of(path: Path) -> Format:
+def format_of(path: Path) -> str:
     """The format that a file's name asks for; ConfigError for one that there is not."""
     kind = path.suffix.removeprefix(".").lower()
-    for written in get_args(Format):
-        if kind == written:
-            return written  # type: ignore[no-any-return]
-    raise ConfigError(
-        f"figures are written as {', '.join(get_args(Format))}",
-        cure=f"for example {path.with_suffix('.png')}",
-        file=path,
-    )
+    if kind not in FORMATS:
+        raise ConfigError(
+            f"figures are written as {', '.join(FORMATS)}",
+            cure=f"for example {path.with_suffix('.png')}",
+            file=path,
+        )
+    return kind
 
 
-def render(figure: Figure, kind: Format) -> bytes:
-    """A figure as a file of a format; the same figure gives the same bytes."""
-    import matplotlib as mpl
-
-    # Dates and versions would make every file another.
-    nameless: dict[str, dict[str, Any]] = {
-        "svg": {"Date": None, "Creator": None, "Format": None, "Type": None},
-        "pdf": {"CreationDate": None, "Creator": None, "Producer": None},
-        "png": {"Software": None},
-    }
+@styled
+def render(figure: Figure, kind: str) -> bytes:
+    """A figure as a file of one of ``FORMATS``; the same figure gives the same bytes."""
     # SVG goes as text, which is encoded once rather than piece by piece.
     target = io.StringIO() if kind == "svg" else io.BytesIO()
-    with mpl.rc_context(_SETTINGS):  # type: ignore[arg-type]
-        figure.savefig(target, format=kind, dpi=DPI, metadata=nameless[kind])
+    figure.savefig(target, format=kind, dpi=DPI, metadata=_NAMELESS[kind])
     content = target.getvalue()
     return content.encode() if isinstance(content, str) else content

@@ -168,16 +168,16 @@ def draw_preview(preview: Preview, path: Path) -> None:
     """
     from daq.figures import style
     from daq.figures.findings import draw
-    from daq.figures.plans import Waveform, planned_commands, planned_references
+    from daq.figures.signals import planned_commands, planned_references
 
     kind = style.format_of(path)
     plan, experiment = preview.plan, preview.experiment
     time = np.arange(plan.n_samples) / experiment.sample_rate
     if plan.commands is not None:
-        channels = []
+        channels = {}
         for name, column in zip(CHANNELS, plan.commands.T, strict=True):
             frequency, sizes = spectral_lines(column[plan.steady], experiment.sample_rate)
-            channels.append(Waveform(name, column, sizes))
+            channels[name] = column, sizes
         figure = planned_commands(time, frequency, channels)
     elif plan.references:
         m = max(map(len, plan.references.values()))

@@ -5,15 +5,15 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from daq.documents import plain
-from daq.figures import style
-from daq.figures.picture import Picture
-from daq.figures.rankings import Ratio, ratios
-from daq.figures.responses import Response, responses
-from daq.files import make_folder, write_whole
+from daq.figures.parameters import ratios
+from daq.figures.signals import Panel, responses
+from daq.files import write_whole
 from daq.identification.comparison import ComparisonResult
-from daq.report.page import Drawing, comparison_page
-from daq.report.publication import FIGURES, command_of, fingerprints
+from daq.report.page import Picture, rendered
+from daq.report.publication import FIGURES, command_of, draw, fingerprints
 
 _PAGE = "comparison.html"
 
@@ -23,13 +23,12 @@ def publish_comparison(result: ComparisonResult) -> str:
 
     Raises RunError where the disk refuses.
     """
-    document, folder, group = plain(_with_files(result)), result.folder, result.group
-    make_folder(folder / FIGURES)
-    drawings = []
-    for picture in _pictures(document, result):
-        content = style.render(picture.figure, "svg")
-        write_whole(folder / FIGURES / f"{picture.name}.svg", content)
-        drawings.append(Drawing(picture.name, picture.topic, picture.caption, content.decode()))
+    folder, group = result.folder, result.group
+    document = plain({**result.document, "files": {"comparison": str(result.file)}})
+    drawings = [
+        (picture, files["svg"])
+        for picture, files in draw(_pictures(document, result), folder / FIGURES, ["svg"])
+    ]
     now = datetime.datetime.now(datetime.UTC)
     preferred = next(row for row in document["structures"] if row["name"] == document["preferred"])
     fitted = {row["name"] for row in document["structures"] if "parameters_file" in row}
@@ -45,28 +44,25 @@ def publish_comparison(result: ComparisonResult) -> str:
             "logs": fingerprints(*logs),
         },
     }
-    write_whole(folder / _PAGE, comparison_page(document, variables, drawings))
+    text = rendered("comparison.html.j2", document, variables, drawings)
+    write_whole(folder / _PAGE, text)
     return str(folder / _PAGE)
-
-
-def _with_files(result: ComparisonResult) -> dict[str, Any]:
-    return {**result.document, "files": {"comparison": str(result.file)}}
 
 
 def _pictures(document: Mapping[str, Any], result: ComparisonResult) -> Iterator[Picture]:
     rows = document["structures"]
-    others = [
-        Ratio(row["name"], ratio["value"], *ratio["interval_95"])
+    others = {
+        row["name"]: (ratio["value"], *ratio["interval_95"])
         for row in rows
         if (ratio := row.get("squared_errors_relative")) is not None
-    ]
+    }
     if others:
         yield Picture(
             "ratios",
             "comparison",
             "Squared errors of the free runs in validation, in parts of the best model's, with "
             "95 % intervals.",
-            ratios(rows[0]["name"], others),
+            ratios([rows[0]["name"], *others], np.array([(1.0, 1.0, 1.0), *others.values()])),
         )
     if result.group.validation:
         yield _first_log(document, result)
@@ -78,13 +74,9 @@ def _first_log(document: Mapping[str, Any], result: ComparisonResult) -> Picture
     ranked = [row["name"] for row in document["structures"] if row["name"] in runs]
     names = [document["preferred"], *(n for n in ranked if n != document["preferred"])][:2]
     log = result.group.validation[0].dataset
+    shown = {"measured": log.outputs} | {name: runs[name] for name in names}
     panels = [
-        Response(
-            output.name,
-            output.unit,
-            log.outputs[:, j],
-            {name: runs[name][:, j] for name in names},
-        )
+        Panel(output.name, output.unit, {name: lines[:, j] for name, lines in shown.items()})
         for j, output in enumerate(result.group.problem.model.outputs)
     ]
     return Picture(

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from daq.identification.rows import ParameterRow, QuantityRow, Rows, logs_of, mean_errors
+from daq.identification.rows import Rows, logs_of, mean_errors
 from sysid import ProcessModel
 
 _ENDED = {
@@ -26,13 +26,18 @@ class Step:
 
 def view(model: ProcessModel, document: Mapping[str, Any], rows: Rows) -> dict[str, Any]:
     """Variables of the page's template, beside the document and its rows."""
-    comparison = document["comparison"]
+    comparison, search = document["comparison"], document["search"]
     baseline = comparison if "metrics" in comparison else None
+    logs = rows.logs["training"]
+    quantities = [*rows.determined, *rows.combinations]
+    names = " ".join(row.name for row in quantities)
+    unrefined = f"the preset {search['preset']} does not refine to a minimum"
+    interrupted = search["stopped"] == "interrupted"
     return {
-        "title": _title(rows),
+        "title": logs[0].name if len(logs) == 1 else f"{len(logs)} logs, the first {logs[0].name}",
         "recorded": _recorded(document["reproduction"]["runs"]),
         "model": model,
-        "quantities": _quantities(rows),
+        "quantities": quantities,
         "determined": _determined(document, rows),
         "data_sentence": _data_sentence(document["reproduction"]["logs"]),
         "tables": {part: _errors(rows, baseline, part) for part in ("training", "validation")},
@@ -40,17 +45,13 @@ def view(model: ProcessModel, document: Mapping[str, Any], rows: Rows) -> dict[s
         "baseline_sentence": _baseline_sentence(comparison),
         "meanings": {p.name: p.description for p in model.parameters},
         "described": any(p.description for p in model.parameters),
-        "no_intervals": _no_intervals(document["search"]),
+        "no_intervals": "the search was interrupted" if interrupted else unrefined,
         "rival": next(iter(rows.ambiguities_of("rival")), None),
-        "starts": _starts(model, rows),
+        # States that a combination holds the start of.
+        "starts": {name: f"{name}(0)" for name in model.state_names if f"{name}(0)" in names},
         "steps": _steps(document, rows),
-        "ended": _ENDED[document["search"]["stopped"]],
+        "ended": _ENDED[search["stopped"]],
     }
-
-
-def _title(rows: Rows) -> str:
-    names = [log.name for log in rows.logs["training"]]
-    return names[0] if len(names) == 1 else f"{len(names)} logs, the first {names[0]}"
 
 
 def _recorded(runs: Sequence[Mapping[str, Any]]) -> str:
@@ -58,12 +59,6 @@ def _recorded(runs: Sequence[Mapping[str, Any]]) -> str:
     origins = {(run["experiment"], run["rig"]) for run in runs}
     experiment, rig = origins.pop() if len(origins) == 1 else ("", "")
     return f"{experiment} on {rig}" if experiment and rig else ""
-
-
-def _quantities(rows: Rows) -> list[QuantityRow]:
-    """Parameters that have an interval, then combinations."""
-    alone: list[ParameterRow] = [row for row in rows.parameters if row.interval is not None]
-    return [*alone, *rows.combinations]
 
 
 def _determined(document: Mapping[str, Any], rows: Rows) -> str:
@@ -99,10 +94,9 @@ def _data_sentence(logs: Sequence[Mapping[str, Any]]) -> str:
                 f"{verb} {_count(len(used), 'log')} of {samples} samples ({seconds:.3g} s at "
                 f"{rate} Hz)"
             )
-    end = (
-        ", which took no part in the fit" if len(parts) > 1 else "; none was held back to judge it"
-    )
-    return ", ".join(parts) + f"{end}."
+    if len(parts) == 1:
+        return f"{parts[0]}; none was held back to judge it."
+    return f"{', '.join(parts)}, which took no part in the fit."
 
 
 def _errors(rows: Rows, baseline: Mapping[str, Any] | None, part: str) -> list[dict[str, Any]]:
@@ -124,18 +118,6 @@ def _baseline_sentence(comparison: Mapping[str, Any]) -> str:
     )
 
 
-def _no_intervals(search: Mapping[str, Any]) -> str:
-    if search["stopped"] == "interrupted":
-        return "the search was interrupted"
-    return f"the preset {search['preset']} does not refine to a minimum"
-
-
-def _starts(model: ProcessModel, rows: Rows) -> dict[str, str]:
-    """States that a combination holds the start of: the start's name by the state's."""
-    names = " ".join(row.name for row in _quantities(rows))
-    return {name: f"{name}(0)" for name in model.state_names if f"{name}(0)" in names}
-
-
 def _steps(document: Mapping[str, Any], rows: Rows) -> list[Step]:
     """What a reader may do with the result, or to better it: the most useful first."""
     steps = _cures(rows)
@@ -144,7 +126,9 @@ def _steps(document: Mapping[str, Any], rows: Rows) -> list[Step]:
             "Use the model for inputs like those of the logs; it is proven for no others. To "
             "simulate it on another log of the rig:"
         )
-        steps.insert(0, Step(use, command=_replay(document)))
+        columns = document["reproduction"]["columns"]
+        command = "rig replay LOG --parameters parameters.yaml"
+        steps.insert(0, Step(use, command=f"{command} --config {columns}" if columns else command))
     elif not steps:
         steps.append(Step("See in the residuals below when and where the model errs."))
     if not rows.logs["validation"]:
@@ -160,30 +144,13 @@ def _cures(rows: Rows) -> list[Step]:
     rival = [a.measure[0] for a in rows.ambiguities_of("rival")]
     held = [row.name for row in rows.parameters if row.on_bound]
     cures = (
-        Step(
-            "Give ",
-            held,
-            " more room under `ranges`, or a value under `fixed`: an end of the range decides now.",
-        ),
+        Step("Give ", held, " more room under `ranges`, or a value under `fixed`: an end of the "
+             "range decides now."),
         Step("Measure ", rival, ", to tell which of the sets of parameters below it is."),
-        Step(
-            "Measure ",
-            list(dict.fromkeys(measure)),
-            " by other means (an ohmmeter, a scale, a data sheet) and give the values under "
-            "`fixed` in a file for `--config`: then those that act together get intervals of "
-            "their own. To simulate, this is not needed.",
-        ),
-        Step(
-            "Record an experiment that makes ",
-            list(dict.fromkeys(vague)),
-            " matter, larger or slower or faster than this one: these data hardly feel them.",
-        ),
-    )
+        Step("Measure ", list(dict.fromkeys(measure)), " by other means (an ohmmeter, a scale, a "
+             "data sheet) and give the values under `fixed` in a file for `--config`: then those "
+             "that act together get intervals of their own. To simulate, this is not needed."),
+        Step("Record an experiment that makes ", list(dict.fromkeys(vague)), " matter, larger or "
+             "slower or faster than this one: these data hardly feel them."),
+    )  # fmt: skip
     return [step for step in cures if step.names]
-
-
-def _replay(document: Mapping[str, Any]) -> str:
-    columns = document["reproduction"]["columns"]
-    return "rig replay LOG --parameters parameters.yaml" + (
-        f" --config {columns}" if columns else ""
-    )

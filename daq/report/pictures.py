@@ -1,34 +1,30 @@
 """Figures of an identification's report: which are drawn, of which arrays."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from daq.figures import style
-from daq.figures.bode import ComplexArray, Measured, bode
-from daq.figures.convergence import convergence
-from daq.figures.parameters import Determined, Searched, correlation, intervals, ranges
-from daq.figures.picture import Picture
-from daq.figures.plots import plot
-from daq.figures.residuals import Remainder, residual_correlations
-from daq.figures.responses import Response, responses
-from daq.figures.signals import Panel, signals
-from daq.figures.spectra import Spectrum, spectra
+from daq.figures.bode import ComplexArray, bode
+from daq.figures.findings import plot
+from daq.figures.parameters import convergence, correlation, intervals, ranges
+from daq.figures.signals import Panel, residual_correlations, responses, signals, spectra
 from daq.files import write_whole
 from daq.findings import Axis
+from daq.identification.baseline import Baseline
 from daq.identification.records import LoggedRecord
 from daq.identification.replay import Replay
 from daq.identification.rows import ParameterRow, Rows
 from daq.logs.columns import UNITS
 from daq.logs.recording import load
-from sysid import Dataset, ModelError, equilibrium, evaluate, linearize
+from daq.report.page import Picture
+from sysid import Dataset, ModelError, Output, equilibrium, evaluate, linearize
 from sysid.arrays import FloatArray
 from sysid.judging.residual_tests import residual_test
 from sysid.problem.metrics import mean_known
@@ -36,51 +32,53 @@ from sysid.problem.model import ProcessModel
 from sysid.problem.plots import Evidence
 from sysid.response.frequency import FrequencyResponse, frequency_response, sampled_response
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 _OUTPUTS_A_FIGURE = 4
 _LOGS_A_PART = 3  # of more logs the worst, the middle and the best are shown
 _FELT, _FEWEST = 0.5, 4  # an input is seen in an output where so many coherences exceed this
 
-Run = FloatArray
-"""Outputs of a free run, (n_samples, n_outputs)."""
+FreeRun = tuple[LoggedRecord, FloatArray]
+"""A log and the identified model's outputs in a free run over it, (n_samples, n_outputs)."""
 
 
 @dataclass(frozen=True)
 class Subject:
     """What is reported on: a finished identification as its document tells it, and its logs.
 
-    document: what ``report.json`` holds. training_runs, validation_runs: the identified model's
-    free run for each log. foreign: the logs are not the program's own captures. baselines: by
-    name, a free run for each validation log of what it is compared with.
+    document: what ``report.json`` holds. baseline: what the free runs in validation are compared
+    with, if anything.
     """
 
     model: ProcessModel
     document: Mapping[str, Any]
-    training: Sequence[LoggedRecord]
-    validation: Sequence[LoggedRecord]
-    training_runs: Sequence[Run]
-    validation_runs: Sequence[Run]
-    foreign: bool
-    baselines: Mapping[str, Sequence[Run]]
-
-    @property
-    def vector(self) -> FloatArray:
-        """All parameters, in the model's order."""
-        values = {row.name: row.value for row in self.rows.parameters}
-        return np.array([float(values[name]) for name in self.model.parameter_names])
+    training: Sequence[FreeRun]
+    validation: Sequence[FreeRun]
+    baseline: Baseline | None
 
     @cached_property
     def rows(self) -> Rows:
         """The document's tables."""
         return Rows.of(self.document)
 
+    @property
+    def vector(self) -> FloatArray:
+        """All parameters, in the model's order."""
+        return self.model.vector({row.name: float(row.value) for row in self.rows.parameters})
+
+    @property
+    def records(self) -> list[Dataset]:
+        """The data of all logs."""
+        return [log.dataset for log, _ in (*self.training, *self.validation)]
+
+    @property
+    def foreign(self) -> bool:
+        """Whether the logs are not the program's own captures."""
+        return bool(self.document["reproduction"]["columns"])
+
 
 def pictures(subject: Subject) -> Iterator[Picture]:
     """One figure after the other, as they are drawn."""
-    yield from _validation(subject)
-    yield from _training(subject)
+    yield from _responses(subject, "validation", subject.validation, subject.baseline)
+    yield from _responses(subject, "training", subject.training, None)
     yield from _excitation(subject)
     yield from _residuals(subject)
     yield from _search(subject.document)
@@ -89,62 +87,38 @@ def pictures(subject: Subject) -> Iterator[Picture]:
     yield from _plots_of_model(subject)
 
 
-def _validation(subject: Subject) -> Iterator[Picture]:
-    runs, logs = subject.validation_runs, subject.validation
-    against = "".join(f" and {name}" for name in subject.baselines)
-    for place, word in _chosen(subject.model, logs, runs):
-        simulated = {"identified": runs[place]}
-        simulated |= {name: free_runs[place] for name, free_runs in subject.baselines.items()}
-        yield from _responses(
-            subject.model, logs[place].dataset, simulated, "validation", word,
-            f"Validation: data not used in the fit ({{log}}). Measured outputs, the identified "
-            f"model{against} simulated freely from the inputs alone, and below each the residual, "
-            "measured minus simulated.",
-        )  # fmt: skip
-
-
-def _training(subject: Subject) -> Iterator[Picture]:
-    runs, logs = subject.training_runs, subject.training
-    for place, word in _chosen(subject.model, logs, runs):
-        yield from _responses(
-            subject.model, logs[place].dataset, {"identified": runs[place]}, "training", word,
-            "Training: data used in the fit ({log}). Measured outputs, the identified model "
-            "simulated freely from the inputs alone, and below each the residual.",
-        )  # fmt: skip
-
-
 def _responses(
-    model: ProcessModel,
-    log: Dataset,
-    simulated: Mapping[str, Run],
-    part: str,
-    word: str,
-    caption: str,
+    subject: Subject, part: str, logs: Sequence[FreeRun], baseline: Baseline | None
 ) -> Iterator[Picture]:
-    which = f"{log.name}, {word}" if word else log.name
-    for first in range(0, len(model.outputs), _OUTPUTS_A_FIGURE):
-        shown = range(first, min(first + _OUTPUTS_A_FIGURE, len(model.outputs)))
-        more = f"from-{model.outputs[first].name}" if first else ""
-        yield Picture(
-            _stem(part, word, more),
-            "responses",
-            caption.format(log=which),
-            responses(log.time, [_response(model, log, simulated, j) for j in shown]),
-        )
+    """Measured and simulated outputs of a part's logs."""
+    outputs, validation = subject.model.outputs, part == "validation"
+    data = "Validation: data not used" if validation else "Training: data used"
+    against = f" and {baseline.name}" if baseline is not None else ""
+    for place, word in _chosen(logs):
+        log, run = logs[place][0].dataset, logs[place][1]
+        simulated = {"identified": run}
+        if baseline is not None:
+            simulated[baseline.name] = baseline.runs[place]
+        which = f"{log.name}, {word}" if word else log.name
+        for first in range(0, len(outputs), _OUTPUTS_A_FIGURE):
+            shown = range(first, min(first + _OUTPUTS_A_FIGURE, len(outputs)))
+            more = f"from-{outputs[first].name}" if first else ""
+            yield Picture(
+                _stem(part, word, more), "responses",
+                f"{data} in the fit ({which}). Measured outputs, the identified model{against} "
+                "simulated freely from the inputs alone, and below each the residual"
+                f"{', measured minus simulated' if validation else ''}.",
+                responses(log.time, [_response(outputs[j], log, simulated, j) for j in shown]),
+            )  # fmt: skip
 
 
-def _response(model: ProcessModel, log: Dataset, simulated: Mapping[str, Run], j: int) -> Response:
-    output = model.outputs[j]
+def _response(output: Output, log: Dataset, simulated: Mapping[str, FloatArray], j: int) -> Panel:
+    """The output j of a log, with how well each model fits."""
     fits = {name: float(evaluate(log.outputs, run).fit[j]) for name, run in simulated.items()}
     several = len(fits) > 1
     shown = ", ".join(f"{name} " * several + f"{_percent(fit)} %" for name, fit in fits.items())
-    return Response(
-        output.name,
-        output.unit,
-        log.outputs[:, j],
-        {name: run[:, j] for name, run in simulated.items()},
-        f"fit{':' * several} {shown}",
-    )
+    lines = {"measured": log.outputs[:, j]} | {name: run[:, j] for name, run in simulated.items()}
+    return Panel(output.name, output.unit, lines, note=f"fit{':' * several} {shown}")
 
 
 def _percent(fit: float) -> str:
@@ -152,7 +126,7 @@ def _percent(fit: float) -> str:
 
 
 def _excitation(subject: Subject) -> Iterator[Picture]:
-    log = subject.training[0]
+    log = subject.training[0][0]
     yield Picture(
         "signals", "excitation",
         f"What was commanded and measured in the training log {log.dataset.name}.",
@@ -161,27 +135,22 @@ def _excitation(subject: Subject) -> Iterator[Picture]:
 
 
 def _residuals(subject: Subject) -> Iterator[Picture]:
-    part = (subject.validation, subject.validation_runs)
-    if not subject.validation:
-        part = (subject.training, subject.training_runs)
-    data, run = part[0][0].dataset, part[1][0]
+    log, run = (subject.validation or subject.training)[0]
+    data = log.dataset
     if not np.isfinite(run).all():
         return
     test = residual_test(data.outputs - run, data.inputs, data.input_noise)
-    names = subject.model.input_names
-    remainders = [
-        Remainder(
-            output.name, test.auto[:, j], float(test.auto_band[j]),
-            {names[i]: (test.cross[:, j, i], float(test.cross_band[j, i]))
-             for i in range(len(names)) if test.tested[i]},
-        )
-        for j, output in enumerate(subject.model.outputs)
-    ]  # fmt: skip
+    lines = {}
+    for j, output in enumerate(subject.model.outputs):
+        lines[output.name] = {"with its past": test.auto[:, j] / float(test.auto_band[j])}
+        for i in np.flatnonzero(test.tested):
+            correlation = test.cross[:, j, i] / float(test.cross_band[j, i])
+            lines[output.name][f"with {subject.model.input_names[i]}"] = correlation
     yield Picture(
         "residuals", "residuals",
         f"Correlation of the residuals ({data.name}) with their own past and with past inputs, in "
         "parts of the 95 % band (grey): a model that explains all but white noise stays inside.",
-        residual_correlations(np.asarray(test.lags * data.dt), remainders),
+        residual_correlations(np.asarray(test.lags * data.dt), lines),
     )  # fmt: skip
 
 
@@ -195,52 +164,57 @@ def _search(document: Mapping[str, Any]) -> Iterator[Picture]:
         "points then."
     )
     yield Picture(
-        "convergence",
-        "search",
+        "convergence", "search",
         "Convergence of the search: the best error against simulations spent"
         + (stages if refined else "."),
         convergence(history, int(search["population"]), before if refined else None),
-    )
+    )  # fmt: skip
 
 
 def _parameters(rows: Rows) -> Iterator[Picture]:
     if rows.free:
         yield Picture(
-            "ranges",
-            "parameters",
+            "ranges", "parameters",
             "Every free parameter in the range that it was searched in. Open circles have no "
             "interval: the data do not determine these by themselves.",
-            ranges([_searched(row) for row in rows.free]),
-        )
-    quantities = [
-        Determined(row.name, row.value, *row.interval)
+            ranges(
+                [row.name for row in rows.free],
+                np.array([_places(row) for row in rows.free]),
+                [row.label for row in rows.free],
+            ),
+        )  # fmt: skip
+    quantities = {
+        row.name: (row.value, *row.interval)
         for row in (*rows.determined, *rows.combinations)
         if row.interval is not None
-    ]
+    }
     if quantities:
         yield Picture(
-            "intervals",
-            "parameters",
+            "intervals", "parameters",
             "95 % intervals of all that the data determine: parameters by themselves, and "
             "combinations of those that act only together.",
-            intervals(quantities),
-        )
+            intervals(list(quantities), np.array(list(quantities.values()))),
+        )  # fmt: skip
     names = [row.name for row in rows.determined]
     if len(names) > 1:
         yield Picture(
-            "correlation",
-            "parameters",
+            "correlation", "parameters",
             "Correlation of the estimates that have an interval of their own. ±1 means that one "
             "is known only as well as the other.",
             correlation(names, _correlations(names, rows)),
-        )
+        )  # fmt: skip
 
 
-def _searched(row: ParameterRow) -> Searched:
+def _places(row: ParameterRow) -> FloatArray:
+    """Value and interval's ends on the scale of the search: 0 at the low end, 1 at the high."""
     assert row.range is not None
-    return Searched(
-        row.name, row.unit, row.value, *row.range, row.logarithmic, row.interval, row.label
-    )
+    values = np.array([row.value, *(row.interval or (np.nan, np.nan)), *row.range])
+    if row.logarithmic:
+        values = np.log(np.maximum(values, np.finfo(float).tiny))
+    value_and_ends, low, high = values[:3], values[3], values[4]
+    # An interval may be wider than the range.
+    places: FloatArray = np.clip((value_and_ends - low) / (high - low), -0.04, 1.04)
+    return places
 
 
 def _correlations(names: Sequence[str], rows: Rows) -> FloatArray:
@@ -254,54 +228,40 @@ def _correlations(names: Sequence[str], rows: Rows) -> FloatArray:
 
 
 def _frequency(subject: Subject) -> Iterator[Picture]:
-    records = [log.dataset for log in (*subject.training, *subject.validation)]
     try:
-        measured = frequency_response(records)
+        measured = frequency_response(subject.records)
     except ModelError:
         return  # too short, or of several sample rates: there is no estimate to show
-    inputs = [
-        Spectrum(signal.name, signal.unit, measured.input_density[:, i])
-        for i, signal in enumerate(subject.model.inputs)
-        if measured.varied[i]
-    ]
+    inputs = subject.model.inputs
+    densities = {
+        inputs[i].name: measured.input_density[:, i] for i in np.flatnonzero(measured.varied)
+    }
     yield Picture(
         "spectra", "excitation",
         "Spectra of the excitation: power spectral density of the inputs, Welch's estimate from "
         f"{measured.n_segments} segments.",
-        spectra(measured.frequency, inputs),
+        spectra(measured.frequency, densities, {signal.name: signal.unit for signal in inputs}),
     )  # fmt: skip
-    yield from _bode(subject, records, measured)
-
-
-def _bode(
-    subject: Subject, records: list[Dataset], measured: FrequencyResponse
-) -> Iterator[Picture]:
-    model = subject.model
-    curves = _model_responses(subject, records, measured.frequency)
+    curves = _model_responses(subject, measured.frequency)
     for j, i in _pairs(measured):
-        output, given = model.outputs[j], model.inputs[i]
+        output, given = subject.model.outputs[j], inputs[i]
         yield Picture(
             _stem("bode", output.name), "frequency",
             f"Frequency response from {given.name} to {output.name}, estimated from "
             f"{measured.n_segments} segments of the logs.",
             bode(
-                measured.frequency,
-                Measured(
-                    measured.response[:, j, i],
-                    measured.coherence[:, j, i],
-                    measured.deviation[:, j, i] / np.sqrt(2.0),
-                ),
+                measured.frequency, measured.response[:, j, i], measured.coherence[:, j, i],
+                measured.deviation[:, j, i] / np.sqrt(2.0),
                 {name: response[:, j, i] for name, response in curves.items()},
                 (output.unit, given.unit),
             ),
         )  # fmt: skip
 
 
-def _model_responses(
-    subject: Subject, records: list[Dataset], frequency: FloatArray
-) -> dict[str, ComplexArray]:
+def _model_responses(subject: Subject, frequency: FloatArray) -> dict[str, ComplexArray]:
     """What the identified model does: through the estimate of the logs, and linearised."""
-    runs = [*subject.training_runs, *subject.validation_runs]
+    model, records = subject.model, subject.records
+    runs = [run for _, run in (*subject.training, *subject.validation)]
     curves = {}
     if all(np.isfinite(run).all() for run in runs):
         simulated = [
@@ -310,7 +270,8 @@ def _model_responses(
         ]
         curves["identified"] = frequency_response(simulated).response
     u = np.concatenate([record.inputs for record in records]).mean(axis=0)
-    for name, held in _operating_points(subject.model, records).items():
+    points = model.operating_points(model, records) if model.operating_points else {}
+    for name, held in (points or {"linear, mean inputs": {}}).items():
         response = _linear_response(subject, u, held, frequency, records[0].dt)
         if response is not None:
             curves[name] = response
@@ -330,45 +291,29 @@ def _linear_response(
     return response if np.isfinite(response).all() else None
 
 
-def _operating_points(
-    model: ProcessModel, records: Sequence[Dataset]
-) -> Mapping[str, Mapping[str, float]]:
-    """States to hold, by the label of an operating point."""
-    brought = model.operating_points(model, records) if model.operating_points else {}
-    return brought or {"linear, mean inputs": {}}
-
-
 def _plots_of_model(subject: Subject) -> Iterator[Picture]:
     """What the model itself brings."""
     if subject.model.plots is None:
         return
-    log = {} if subject.foreign else _columns(subject.training[0])
-    records = [logged.dataset for logged in subject.training]
+    log = {} if subject.foreign else _columns(subject.training[0][0])
+    records = [logged.dataset for logged, _ in subject.training]
     for item in subject.model.plots(subject.model, Evidence(subject.vector, records, log)):
         yield Picture(
-            item.name,
-            item.topic,
-            item.caption,
+            item.name, item.topic, item.caption,
             plot(
-                [Axis(axis.name, axis.unit) for axis in item.over],
+                {axis.name: axis.unit for axis in item.over},
                 Axis(item.quantity.name, item.quantity.unit),
-                {curve.label: curve.values for curve in item.curves},
-                item.points,
+                {curve.label: curve.values for curve in item.curves}, item.points,
             ),
-        )
+        )  # fmt: skip
 
 
-def _chosen(
-    model: ProcessModel, logs: Sequence[LoggedRecord], runs: Sequence[Run]
-) -> list[tuple[int, str]]:
+def _chosen(logs: Sequence[FreeRun]) -> list[tuple[int, str]]:
     """Which logs are shown, and as what: all of a few, else the middle, the worst, the best."""
     n = len(logs)
     if n <= _LOGS_A_PART:
         return [(k, f"log {k + 1} of {n}" if n > 1 else "") for k in range(n)]
-    fits = [
-        float(mean_known(evaluate(log.dataset.outputs, run).fit))
-        for log, run in zip(logs, runs, strict=True)
-    ]
+    fits = [float(mean_known(evaluate(log.dataset.outputs, run).fit)) for log, run in logs]
     order = [int(k) for k in np.argsort(fits)]
     chosen = zip((n // 2, 0, n - 1), ("middle", "worst", "best"), strict=True)
     return [(order[place], f"{word} of {n} logs") for place, word in chosen]
@@ -388,35 +333,33 @@ def _pairs(measured: FrequencyResponse) -> list[tuple[int, int]]:
 
 def _foreign_signals(model: ProcessModel, data: Dataset) -> Figure:
     """The model's signals."""
-    inputs = [
-        Panel(signal.name, signal.unit, {"": data.inputs[:, i]}, steps=signal.hold == "zoh")
-        for i, signal in enumerate(model.inputs)
+    panels = [
+        Panel(signal.name, signal.unit, {"": values}, steps=signal.hold == "zoh")
+        for signal, values in zip(model.inputs, data.inputs.T, strict=True)
     ]
-    outputs = [
-        Panel(signal.name, signal.unit, {"": data.outputs[:, j]})
-        for j, signal in enumerate(model.outputs)
-    ]
-    return signals(data.time, [*inputs, *outputs])
+    measured = zip(model.outputs, data.outputs.T, strict=True)
+    panels += [Panel(signal.name, signal.unit, {"": values}) for signal, values in measured]
+    return signals(data.time, panels)
 
 
 def _capture_signals(log: LoggedRecord) -> Figure:
     """All channels: commands with what was applied of them, then the sensors."""
     columns = _columns(log)
-    time = columns.pop("t")
-    panels = []
-    for name in [name for name in columns if name.startswith("cmd_")]:
-        applied = columns.get(name.replace("cmd_", "applied_"))
-        lines = {"asked": columns[name]} | ({} if applied is None else {"applied": applied})
-        panels.append(Panel(name.removeprefix("cmd_"), UNITS[name], lines, steps=True))
-    sensors = [name for name in columns if not name.startswith(("cmd_", "applied_"))]
-    panels += [Panel(name, UNITS[name], {"": columns[name]}) for name in sensors]
-    return signals(time, panels)
+    panels: list[Panel] = []
+    for name, unit in UNITS.items():
+        channel = name.removeprefix("cmd_")
+        if channel != name:
+            lines = {"asked": columns[name], "applied": columns[f"applied_{channel}"]}
+            panels.append(Panel(channel, unit, lines, steps=True))
+        elif name != "t" and not name.startswith("applied_"):
+            panels.append(Panel(name, unit, {"": columns[name]}))
+    return signals(columns["t"], panels)
 
 
 def _columns(log: LoggedRecord) -> dict[str, FloatArray]:
     """Columns of a capture's log by name."""
     frame = load(log.path).frame
-    return {name: frame[name].to_numpy(dtype=np.float64) for name in UNITS if name in frame}
+    return {name: frame[name].to_numpy(dtype=np.float64) for name in UNITS}
 
 
 def draw_replay(replay: Replay, path: Path) -> None:
@@ -425,12 +368,11 @@ def draw_replay(replay: Replay, path: Path) -> None:
     Raises ConfigError for a format that there is not, RunError where the disk refuses.
     """
     outputs = [
-        Response(
+        Panel(
             output.name,
             output.unit,
-            replay.measured[:, j],
-            {"simulated": replay.simulated[:, j]},
-            f"fit {replay.metrics.fit[j]:.1f} %",
+            {"measured": replay.measured[:, j], "simulated": replay.simulated[:, j]},
+            note=f"fit {replay.metrics.fit[j]:.1f} %",
         )
         for j, output in enumerate(replay.model.outputs)
     ]

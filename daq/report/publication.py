@@ -4,14 +4,12 @@ import datetime
 import hashlib
 import json
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from daq.documents import plain
 from daq.figures import style
-from daq.figures.picture import Picture
-from daq.figures.style import Format
 from daq.files import make_folder, write_whole
 from daq.identification.baseline import Baseline, baseline_of
 from daq.identification.records import LoggedRecord
@@ -21,9 +19,8 @@ from daq.logs.recording import read_record
 from daq.lookup.models import DEFAULT_MODEL
 from daq.progress import Progress, Watch, ignore
 from daq.report.latex import latex
-from daq.report.page import Drawing, page
+from daq.report.page import Drawing, Picture, page
 from daq.report.pictures import Subject, pictures
-from sysid import Metrics
 
 DATA, FIGURES = "report.json", "figures"
 _PAGE, _TABLE = "report.html", "parameters.tex"
@@ -42,20 +39,15 @@ def publish(result: Identification, folder: Path, watch: Watch = ignore) -> dict
     linear = baseline_of(result.model, training, validation)
     document = plain(_document(result, linear))
     subject = Subject(
-        model=result.model,
-        document=document,
-        training=training,
-        validation=validation,
-        training_runs=[fitted.run for fitted in result.training],
-        validation_runs=[fitted.run for fitted in result.validation],
-        foreign=result.problem.mapping is not None,
-        baselines={linear.name: linear.runs} if isinstance(linear, Baseline) else {},
+        result.model,
+        document,
+        [(fitted.log, fitted.run) for fitted in result.training],
+        [(fitted.log, fitted.run) for fitted in result.validation],
+        linear if isinstance(linear, Baseline) else None,
     )
     drawings: list[Drawing] = []
-    for picture, files in draw(subject, folder / FIGURES, ["svg"]):
-        drawings.append(
-            Drawing(picture.name, picture.topic, picture.caption, files["svg"].decode())
-        )
+    for picture, files in draw(pictures(subject), folder / FIGURES, ["svg"]):
+        drawings.append((picture, files["svg"]))
         count = len(drawings)
         watch(Progress("Report", min(count, _STEPS - 1), _STEPS, f"{count} figures"))
     pages = {
@@ -70,11 +62,11 @@ def publish(result: Identification, folder: Path, watch: Watch = ignore) -> dict
 
 
 def draw(
-    subject: Subject, folder: Path, formats: Sequence[Format]
-) -> Iterator[tuple[Picture, dict[Format, bytes]]]:
-    """Every figure, written to files of the formats; with what is in them."""
+    figures: Iterable[Picture], folder: Path, formats: Sequence[str]
+) -> Iterator[tuple[Picture, dict[str, bytes]]]:
+    """Figures, each written to files of the formats; with what is in them."""
     make_folder(folder)
-    for picture in pictures(subject):
+    for picture in figures:
         contents = {kind: style.render(picture.figure, kind) for kind in formats}
         for kind, content in contents.items():
             write_whole(folder / f"{picture.name}.{kind}", content)
@@ -91,27 +83,30 @@ def command_of(
     """What to type to identify the same again; more: words behind the options."""
     paths = _paths(training)
     words = ["rig", "identify", *map(str, paths)]
-    for path in _paths(validation):
-        if path not in paths:
-            words += ["--validate", str(path)]
-    if request.config is not None:
-        words += ["--config", request.config]
-    words += _option("model", list(models))
+    words += _option("validate", [path for path in _paths(validation) if path not in paths])
+    words += _option("config", request.config) + _option("model", list(models))
     for name, value in (request.options or {}).items():
         if name not in ("seed", "model"):
             words += _option(name, value)
-    words += more
-    for setting in request.settings:
-        words += ["--set", setting]
-    return shlex.join(words)
+    return shlex.join([*words, *more, *_option("set", list(request.settings))])
 
 
 def fingerprints(
     training: Sequence[LoggedRecord], validation: Sequence[LoggedRecord]
 ) -> list[dict[str, Any]]:
     """Size and hash of each log, so that it is known again."""
-    uses = (("training", training), ("validation", validation))
-    return [_fingerprint(log, use) for use, logs in uses for log in logs]
+    return [
+        {
+            "log": str(log.path),
+            "name": log.dataset.name,
+            "use": use,
+            "samples": log.dataset.n_samples,
+            "sample_rate": 1.0 / log.dataset.dt,
+            "sha256": hashlib.sha256(log.path.read_bytes()).hexdigest(),
+        }
+        for use, logs in (("training", training), ("validation", validation))
+        for log in logs
+    ]
 
 
 def _document(result: Identification, linear: Baseline | str) -> dict[str, Any]:
@@ -135,15 +130,11 @@ def _document(result: Identification, linear: Baseline | str) -> dict[str, Any]:
 def _comparison(result: Identification, linear: Baseline | str) -> dict[str, Any]:
     if isinstance(linear, str):
         return {"left_out": linear}
-
-    def logs(metrics: Sequence[Metrics]) -> list[dict[str, Any]]:
-        return [{"outputs": errors_document(result.model, errors)} for errors in metrics]
-
-    return {
-        "name": linear.name,
-        "orders": linear.orders,
-        "metrics": {"training": logs(linear.training), "validation": logs(linear.validation)},
+    metrics = {
+        part: [{"outputs": errors_document(result.model, errors)} for errors in logs]
+        for part, logs in (("training", linear.training), ("validation", linear.validation))
     }
+    return {"name": linear.name, "orders": linear.orders, "metrics": metrics}
 
 
 def _reproduction(result: Identification) -> dict[str, Any]:
@@ -183,20 +174,10 @@ def _option(name: str, value: Any) -> list[str]:
     return [word for item in values for word in (flag, str(item))]
 
 
-def _fingerprint(log: LoggedRecord, use: str) -> dict[str, Any]:
-    return {
-        "log": str(log.path),
-        "name": log.dataset.name,
-        "use": use,
-        "samples": log.dataset.n_samples,
-        "sample_rate": 1.0 / log.dataset.dt,
-        "sha256": hashlib.sha256(log.path.read_bytes()).hexdigest(),
-    }
-
-
 def _run(record: Mapping[str, Any]) -> dict[str, Any]:
     """What is known of a capture's run; a record of another program may lack any of it."""
-    experiment, rig = (_section(record, key) for key in ("experiment", "rig"))
+    sections = [record.get(key) for key in ("experiment", "rig")]
+    experiment, rig = (section if isinstance(section, dict) else {} for section in sections)
     seeds = {
         name: part["seed"]
         for name, part in experiment.items()
@@ -208,8 +189,3 @@ def _run(record: Mapping[str, Any]) -> dict[str, Any]:
         "rig": str(rig.get("name", "")),
         "seeds": ", ".join(f"{name} {seed}" for name, seed in seeds.items()),
     }
-
-
-def _section(record: Mapping[str, Any], key: str) -> Mapping[str, Any]:
-    section = record.get(key)
-    return section if isinstance(section, dict) else {}

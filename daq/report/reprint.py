@@ -4,17 +4,17 @@ import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 from daq.errors import ConfigError
-from daq.figures.style import Format
+from daq.figures.style import FORMATS
 from daq.identification import records
 from daq.identification.baseline import Baseline, baseline_of
 from daq.identification.parameters import read_parameters
 from daq.identification.records import LoggedRecord
 from daq.identification.settings import columns_of
 from daq.progress import Progress, Watch, ignore
-from daq.report.pictures import Subject
+from daq.report.pictures import Subject, pictures
 from daq.report.publication import DATA, FIGURES, draw
 from sysid import BatchSimulator, ProcessModel, free_run
 
@@ -29,22 +29,19 @@ def redraw(
     folder: of an identification, or of the run that it was made from. kinds: formats by name. out:
     default beside the report. Raises ConfigError.
     """
-    formats = [_format(kind) for kind in kinds]
+    for kind in kinds:
+        if kind.lower() not in FORMATS:
+            written = ", ".join(FORMATS)
+            raise ConfigError(f"--format {kind}: figures are written as {written}")
+    formats = [kind.lower() for kind in kinds]
     source = _report_in(folder)
     subject = _subject(source)
     target = out or source.parent / FIGURES
     files: list[Path] = []
-    for picture, _ in draw(subject, target, formats):
+    for picture, _ in draw(pictures(subject), target, formats):
         files += [target / f"{picture.name}.{kind}" for kind in formats]
         watch(Progress("Figures", len(files), len(files) + 1, f"{len(files)} files"))
     return files
-
-
-def _format(kind: str) -> Format:
-    for written in get_args(Format):
-        if kind.lower() == written:
-            return written  # type: ignore[no-any-return]
-    raise ConfigError(f"--format {kind}: figures are written as {', '.join(get_args(Format))}")
 
 
 def _report_in(folder: Path) -> Path:
@@ -64,8 +61,7 @@ def _report_in(folder: Path) -> Path:
 
 def _subject(source: Path) -> Subject:
     try:
-        document = json.loads(source.read_text(encoding="utf-8"))
-        return _restored(document, source)
+        return _restored(json.loads(source.read_text(encoding="utf-8")), source)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ConfigError(
             f"not a readable report ({type(error).__name__}: {error})", cure=_AGAIN, file=source
@@ -75,25 +71,14 @@ def _subject(source: Path) -> Subject:
 def _restored(document: Mapping[str, Any], source: Path) -> Subject:
     """A report's subject, its free runs simulated again."""
     model, values = read_parameters(source.with_name("parameters.yaml"))
-    training, validation = _logs(document["reproduction"], model)
+    parts = _logs(document["reproduction"], model)
     simulator, vector = BatchSimulator(model), model.vector(values)
-    runs = [
-        [free_run(simulator, vector, log.dataset) for log in logs]
-        for logs in (training, validation)
-    ]
-    linear = None
-    if "metrics" in document["comparison"]:
-        linear = baseline_of(model, training, validation)
-    return Subject(
-        model=model,
-        document=document,
-        training=training,
-        validation=validation,
-        training_runs=runs[0],
-        validation_runs=runs[1],
-        foreign=bool(document["reproduction"]["columns"]),
-        baselines={linear.name: linear.runs} if isinstance(linear, Baseline) else {},
+    training, validation = (
+        [(log, free_run(simulator, vector, log.dataset)) for log in logs] for logs in parts
     )
+    linear = baseline_of(model, *parts) if "metrics" in document["comparison"] else None
+    baseline = linear if isinstance(linear, Baseline) else None
+    return Subject(model, document, training, validation, baseline)
 
 
 def _logs(
@@ -102,19 +87,15 @@ def _logs(
     """The logs as they were used; ConfigError for one that is gone or another now."""
     columns = columns_of(Path(reproduction["columns"]) if reproduction["columns"] else None, model)
     root = Path(reproduction["folder"])
-    logs: dict[Path, LoggedRecord] = {}
-    uses: dict[str, list[Path]] = {"training": [], "validation": []}
+    logs: dict[str, dict[Path, LoggedRecord]] = {"training": {}, "validation": {}}
     for entry in reproduction["logs"]:
         path = root / entry["log"]
         if not path.exists():
             raise ConfigError("this log of the report is gone", cure=_AGAIN, file=path)
         if hashlib.sha256(path.read_bytes()).hexdigest() != entry["sha256"]:
             raise ConfigError("this log is another than the report's", cure=_AGAIN, file=path)
-        logs[path] = records.load(path, model, columns)
-        uses[entry["use"]].append(path)
-    training, ends = records.hold_back(
-        [logs[path] for path in uses["training"]], reproduction["hold_back"]
-    )
+        logs[entry["use"]][path] = records.load(path, model, columns)
+    training, ends = records.hold_back(list(logs["training"].values()), reproduction["hold_back"])
     # Of a log that is in both, the end was held back.
-    held_out = [logs[path] for path in uses["validation"] if path not in uses["training"]]
-    return training, [*ends, *held_out]
+    others = [log for path, log in logs["validation"].items() if path not in logs["training"]]
+    return training, [*ends, *others]

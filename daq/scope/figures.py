@@ -3,7 +3,6 @@
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,29 +19,13 @@ from daq.scope.history import View
 BLUE, ORANGE, GREEN, RED = "#0072B2", "#E69F00", "#009E73", "#D55E00"
 PURPLE, GREY = "#CC79A7", "#666666"
 _FLAG_COLORS = {
-    Flag.CLAMPED: ORANGE,
-    Flag.HELD: BLUE,
-    Flag.LOST: RED,
-    Flag.INTERLOCK: RED,
-    Flag.UNDERFLOW: RED,
-    Flag.SATURATED: PURPLE,
-}
+    Flag.CLAMPED: ORANGE, Flag.HELD: BLUE, Flag.LOST: RED, Flag.INTERLOCK: RED,
+    Flag.UNDERFLOW: RED, Flag.SATURATED: PURPLE,
+}  # fmt: skip
 _CALM = 0.03  # of a column's span that a stretch may cover and still be drawn as broad: 3 pixels
 _MARGIN, _FILLED = 0.06, 0.7  # parts of a figure's height: free at each end, filled at least
+_UNDRAWN = ("t", "tick", "flags")  # columns without a curve
 _GRAVE = ("lost", "interlock", "underflow")  # marked across all figures
-
-
-@dataclass(frozen=True)
-class Curve:
-    """A column and how it is drawn.
-
-    held: it keeps its value between samples. wanted: what was asked for, behind what came of it.
-    """
-
-    name: str
-    color: str
-    held: bool
-    wanted: bool
 
 
 class Sources:
@@ -54,18 +37,26 @@ class Sources:
         self.lines = ColumnDataSource({"time": [], "color": [], "dash": []}, name="lines")
 
 
-def curves_of(columns: Sequence[str]) -> list[list[Curve]]:
-    """Curves that share a figure: a command asked and applied, a quantity and its reference."""
-    groups: dict[str, list[Curve]] = {}
+def groups_of(columns: Sequence[str]) -> list[list[str]]:
+    """Columns that share a figure: a command asked and applied, a quantity and its reference."""
+    groups: dict[str, list[str]] = {}
     for name in columns:
-        if name in ("t", "tick", "flags"):
-            continue
-        held = name.startswith(("cmd_", "applied_"))
-        wanted = name.startswith("cmd_") or name.endswith("_ref")
-        curve = Curve(name, ORANGE if wanted else BLUE, held, wanted)
-        group = groups.setdefault(_quantity(name), [])
-        group.insert(0 if wanted else len(group), curve)
+        if name not in _UNDRAWN:
+            group = groups.setdefault(_quantity(name), [])
+            group.insert(0 if is_wanted(name) else len(group), name)
     return list(groups.values())
+
+
+def is_wanted(column: str) -> bool:
+    """Whether a column was asked for, and is drawn behind what came of it."""
+    return column.startswith("cmd_") or column.endswith("_ref")
+
+
+def color_of(column: str) -> str:
+    """Color of a column's curve; none of one that has no curve."""
+    if column in _UNDRAWN:
+        return "transparent"
+    return ORANGE if is_wanted(column) else BLUE
 
 
 def make_figures(
@@ -73,7 +64,7 @@ def make_figures(
 ) -> tuple[Any, list[figure]]:
     """The figures in a grid with one toolbar, and each by itself."""
     cursor = Span(dimension="height", line_color=GREY, line_dash="dotted")
-    plots = [_curve_figure(curves, sources, time, cursor) for curves in curves_of(columns)]
+    plots = [_curve_figure(group, sources, time, cursor) for group in groups_of(columns)]
     if "flags" in columns:
         plots.append(_flag_strip(sources, time, cursor))
     last = plots[-1]
@@ -86,11 +77,9 @@ def make_figures(
             x="time", source=sources.lines, line_color="color", line_dash="dash", line_alpha=0.7
         )
     grid = gridplot(
-        [[plot] for plot in plots],
-        toolbar_location="above",
-        sizing_mode="stretch_width",
+        [[plot] for plot in plots], toolbar_location="above", sizing_mode="stretch_width",
         toolbar_options={"logo": None},
-    )
+    )  # fmt: skip
     return grid, plots
 
 
@@ -149,17 +138,14 @@ def as_data(columns: Sequence[str], view: View, span: FloatArray) -> dict[str, A
     lowest to the highest value of all there is.
     """
     each = points_of(view)
-    values = np.stack([view.low, view.high], axis=1)[:, :each].reshape(
-        each * len(view.time), len(columns)
-    )
     data: dict[str, Any] = {"t": np.repeat(view.time, each)}
-    for curve in itertools.chain.from_iterable(curves_of(columns)):
-        place = columns.index(curve.name)
-        data[curve.name] = values[:, place]
-        if curve.wanted:
-            low, high = view.low[:, place], view.high[:, place]
+    for name in itertools.chain.from_iterable(groups_of(columns)):
+        place = columns.index(name)
+        low, high = view.low[:, place], view.high[:, place]
+        data[name] = np.stack([low, high], axis=1)[:, :each].ravel()
+        if is_wanted(name):
             calm = high - low <= _CALM * span[place]
-            data[broad_name(curve.name)] = np.repeat(np.where(calm, low, np.nan), each)
+            data[broad_name(name)] = np.repeat(np.where(calm, low, np.nan), each)
     return data
 
 
@@ -171,8 +157,6 @@ def flag_name(flag: Flag) -> str:
 def flag_marks(view: View) -> dict[str, list[Any]]:
     """Times, names and colors of a view's flags."""
     marks: dict[str, list[Any]] = {"time": [], "flag": [], "color": []}
-    if not view.flags.any():
-        return marks
     for flag, color in _FLAG_COLORS.items():
         at = view.time[(view.flags & int(flag)) != 0].tolist()
         marks["time"] += at
@@ -197,24 +181,24 @@ def _quantity(name: str) -> str:
     return name.removeprefix("cmd_").removeprefix("applied_").removesuffix("_ref")
 
 
-def _curve_figure(curves: Sequence[Curve], sources: Sources, time: Range1d, cursor: Span) -> figure:
+def _curve_figure(group: Sequence[str], sources: Sources, time: Range1d, cursor: Span) -> figure:
     plot = _empty(time, cursor, 108, Range1d(start=0.0, end=0.0))
-    unit = UNITS.get(curves[-1].name)
-    label = _quantity(curves[-1].name).replace("_", " ")
+    unit = UNITS.get(group[-1])
+    label = _quantity(group[-1]).replace("_", " ")
     plot.yaxis.axis_label = label + (f"\n[{unit}]" if unit else "")
     plot.yaxis.ticker = BasicTicker(desired_num_ticks=4)  # with three there may be but one
-    for curve in curves:
-        if curve.wanted:
-            _draw(plot, sources, curve, broad_name(curve.name), 3.0)
+    for column in group:
+        if is_wanted(column):
+            _draw(plot, sources, column, broad_name(column), 3.0)
         # A line of one pixel costs a browser without a graphics card a tenth of one of 1.2 pixels.
-        _draw(plot, sources, curve, curve.name, 1.0)
-    plot.name, plot.tags = f"figure of {label}", [curve.name for curve in curves]
+        _draw(plot, sources, column, column, 1.0)
+    plot.name, plot.tags = f"figure of {label}", list(group)
     return plot
 
 
-def _draw(plot: figure, sources: Sources, curve: Curve, name: str, width: float) -> None:
-    look: dict[str, Any] = {"line_color": curve.color, "line_width": width}
-    if curve.held:
+def _draw(plot: figure, sources: Sources, column: str, name: str, width: float) -> None:
+    look: dict[str, Any] = {"line_color": color_of(column), "line_width": width}
+    if column.startswith(("cmd_", "applied_")):  # held from a sample to the next
         plot.step("t", name, mode="after", source=sources.samples, **look)
     else:
         plot.line("t", name, source=sources.samples, **look)
@@ -230,14 +214,10 @@ def _flag_strip(sources: Sources, time: Range1d, cursor: Span) -> figure:
 
 def _empty(time: Range1d, cursor: Span, height: int, y_range: Any) -> figure:
     plot = figure(
-        title=None,
-        height=height,
-        x_range=time,
-        y_range=y_range,
-        tools="xbox_zoom,xpan,xwheel_zoom,reset,save",
-        active_scroll="xwheel_zoom",
+        title=None, height=height, x_range=time, y_range=y_range,
+        tools="xbox_zoom,xpan,xwheel_zoom,reset,save", active_scroll="xwheel_zoom",
         active_drag="xbox_zoom",
-    )
+    )  # fmt: skip
     plot.update(min_border_left=95, min_border_bottom=6)
     plot.add_tools(CrosshairTool(overlay=cursor))
     plot.yaxis.axis_label_text_font_style = "normal"

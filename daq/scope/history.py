@@ -50,7 +50,7 @@ class History:
         self._recent = np.empty((2 * _RECENT, n))
         self._recent_end = 0
         self._n_buckets = 0
-        self._low, self._high = np.empty((_BUCKETS, n)), np.empty((_BUCKETS, n))
+        self._buckets = np.empty((_BUCKETS, 2, n))  # the lowest and the highest of each
         self._starts = np.zeros(_BUCKETS, dtype=np.int64)
         self._pending = np.empty((0, n))  # rows of the bucket that is not full yet
         self._pending_starts = np.empty(0, dtype=np.int64)
@@ -62,7 +62,7 @@ class History:
         """Time of the first and of the last row [s]; zeros without any."""
         if not self.n_rows:
             return 0.0, 0.0
-        first = self._low[0] if self._n_buckets else self._pending[0]
+        first = self._buckets[0, 0] if self._n_buckets else self._pending[0]
         return float(first[self._time]), float(self._recent_rows()[-1, self._time])
 
     @property
@@ -112,29 +112,27 @@ class History:
             times = recent[:, self._time]
             first = max(int(np.searchsorted(times, start)) - 1, 0)
             rows = recent[first : int(np.searchsorted(times, end, side="right")) + 1]
-            step = step_for(len(rows), points)
-            return self._drawn(rows, rows, step, self.n_rows - len(recent) + first, to_the_end)
+            step, first = step_for(len(rows), points), self.n_rows - len(recent) + first
+            return self._drawn(_extremes(rows), step, first, to_the_end)
         first, last = self._bucket_range(start, end)
         n_rows = (last - first) * self.bucket
         step = step_for(n_rows, points)
         if step < self.bucket and n_rows <= _READ:
             rows = self._from_file(first, last)
             step = step_for(len(rows), points)
-            return self._drawn(rows, rows, step, first * self.bucket, to_the_end)
-        whole = slice(first, min(last, self._n_buckets))
-        low, high = self._low[whole], self._high[whole]
+            return self._drawn(_extremes(rows), step, first * self.bucket, to_the_end)
+        buckets = self._buckets[first : min(last, self._n_buckets)]
         if to_the_end and last > self._n_buckets and len(self._pending):
-            rest = self._united(self._pending, self._pending, len(self._pending))
-            low, high = np.concatenate([low, rest[0]]), np.concatenate([high, rest[1]])
-        return self._drawn(low, high, step, first * self.bucket, to_the_end, self.bucket)
+            rest = self._united(_extremes(self._pending), len(self._pending))
+            buckets = np.concatenate([buckets, rest])
+        return self._drawn(buckets, step, first * self.bucket, to_the_end, self.bucket)
 
     def since(self, row: int, step: int) -> View:
         """The full stretches of ``step`` rows from ``row`` on, or from the oldest row kept."""
         recent = self._recent_rows()
         kept = self.n_rows - len(recent)
         first = max(row, kept)
-        rows = recent[first - kept :]
-        return self._drawn(rows, rows, step, first, to_the_end=False)
+        return self._drawn(_extremes(recent[first - kept :]), step, first, to_the_end=False)
 
     def _recent_rows(self) -> FloatArray:
         first = max(self._recent_end - _RECENT, 0)
@@ -160,8 +158,7 @@ class History:
             n = min(full, _BUCKETS - self._n_buckets)
             rows = slice(done, done + n * self.bucket)
             into = slice(self._n_buckets, self._n_buckets + n)
-            low, high = self._united(values[rows], values[rows], self.bucket)
-            self._low[into], self._high[into] = low, high
+            self._buckets[into] = self._united(_extremes(values[rows]), self.bucket)
             self._starts[into] = starts[rows][:: self.bucket]
             self._n_buckets += n
             done = rows.stop
@@ -170,13 +167,13 @@ class History:
     def _merge(self) -> None:
         """Buckets of twice the rows."""
         half = _BUCKETS // 2
-        self._low[:half], self._high[:half] = self._united(self._low, self._high, 2)
+        self._buckets[:half] = self._united(self._buckets, 2)
         self._starts[:half] = self._starts[0::2]
         self._n_buckets, self.bucket = half, 2 * self.bucket
 
     def _bucket_range(self, start: float, end: float) -> tuple[int, int]:
         """Buckets that hold the times, one more on each side; the last may be the pending rows."""
-        times = self._low[: self._n_buckets, self._time]
+        times = self._buckets[: self._n_buckets, 0, self._time]
         first = max(int(np.searchsorted(times, start, side="right")) - 2, 0)
         last = int(np.searchsorted(times, end, side="right")) + 1
         return first, min(last, self._n_buckets + 1)
@@ -187,44 +184,39 @@ class History:
             return self._pending
         return self._read(int(self._starts[first]), end)
 
-    def _united(
-        self, low: FloatArray, high: FloatArray, together: int
-    ) -> tuple[FloatArray, FloatArray]:
-        """Lows and highs (m, n_columns) of stretches of so many rows or buckets."""
-        shape = -1, together, low.shape[1]
-        low = np.fmin.reduce(low.reshape(shape), axis=1)
-        highs: FloatArray = np.fmax.reduce(high.reshape(shape), axis=1)
+    def _united(self, extremes: FloatArray, together: int) -> FloatArray:
+        """Extremes (m, 2, n_columns) of stretches of so many rows or buckets."""
+        parts = extremes.reshape(-1, together, *extremes.shape[1:])
+        low, high = np.fmin.reduce(parts[:, :, 0], axis=1), np.fmax.reduce(parts[:, :, 1], axis=1)
         if self._flags is not None and together > 1:
-            flags = self._flags_of(high).reshape(-1, together)
-            highs[:, self._flags] = np.bitwise_or.reduce(flags, axis=1)
-        return low, highs
+            flags = self._flags_of(extremes).reshape(-1, together)
+            high[:, self._flags] = np.bitwise_or.reduce(flags, axis=1)
+        return np.stack([low, high], axis=1)
 
-    def _flags_of(self, rows: FloatArray) -> IntArray:
+    def _flags_of(self, extremes: FloatArray) -> IntArray:
         if self._flags is None:
-            return np.zeros(len(rows), dtype=np.int64)
-        return np.fmax(rows[:, self._flags], 0.0).astype(np.int64)  # none where it is unreadable
+            return np.zeros(len(extremes), dtype=np.int64)
+        # None where it is unreadable.
+        return np.fmax(extremes[:, 1, self._flags], 0.0).astype(np.int64)
 
     def _drawn(
-        self,
-        low: FloatArray,
-        high: FloatArray,
-        step: int,
-        first: int,
-        to_the_end: bool,
-        bucket: int = 1,
+        self, extremes: FloatArray, step: int, first: int, to_the_end: bool, bucket: int = 1
     ) -> View:
         """Rows, or buckets of rows, from row ``first`` on, in stretches of ``step`` rows."""
         together = max(1, step // bucket)
-        n = len(low) // together * together
-        lows, highs = self._united(low[:n], high[:n], together)
-        end = first + n * bucket
-        if to_the_end and n < len(low):
-            rest = self._united(low[n:], high[n:], len(low) - n)
-            lows, highs = np.concatenate([lows, rest[0]]), np.concatenate([highs, rest[1]])
-            end = first + len(low) * bucket
-        flags = self._flags_of(highs)
+        n = len(extremes) // together * together
+        drawn, end = self._united(extremes[:n], together), first + n * bucket
+        if to_the_end and n < len(extremes):
+            drawn = np.concatenate([drawn, self._united(extremes[n:], len(extremes) - n)])
+            end = first + len(extremes) * bucket
+        low, high = drawn[:, 0], drawn[:, 1]
         end = min(end, self.n_rows)  # the last bucket may not be full
-        return View(lows[:, self._time], lows, highs, flags, together * bucket, end)
+        return View(low[:, self._time], low, high, self._flags_of(drawn), together * bucket, end)
+
+
+def _extremes(rows: FloatArray) -> FloatArray:
+    """Rows (m, n_columns) as stretches of one, (m, 2, n_columns): lowest and highest are alike."""
+    return np.broadcast_to(rows[:, np.newaxis], (len(rows), 2, rows.shape[1]))
 
 
 def nothing(n_columns: int) -> View:

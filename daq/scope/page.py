@@ -2,7 +2,7 @@
 
 import time
 from html import escape
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from bokeh.document import Document
@@ -13,17 +13,8 @@ from bokeh.models.widgets import Button, Div, RadioButtonGroup
 from bokeh.plotting import figure
 
 from daq.hal import FloatArray
-from daq.scope.figures import (
-    GREY,
-    Sources,
-    as_data,
-    fit,
-    flag_marks,
-    lines_at,
-    make_figures,
-    make_value_table,
-    points_of,
-)
+from daq.scope import figures
+from daq.scope.figures import Sources
 from daq.scope.history import History, View, nothing, step_for
 from daq.scope.texts import FAILED, HELP, VALUE_FIELDS, heading, readout
 from daq.scope.watch import FollowedLog, Watch
@@ -61,12 +52,10 @@ class Page:
         # The browser copies the number of an update when it has come to it.
         self._sent, self._seen = Range1d(start=0, name="sent"), Range1d(start=0, name="seen")
         self._sent.js_link("start", self._seen, "start")
-        self._seen.on_change("start", self._came)
         self._sent_at = 0.0
-        self._last_seen = 0
         self._button = Button(label="Pause", width=90, name="pause", button_type="primary")
         self._window = RadioButtonGroup(labels=list(_WINDOWS), active=_USUAL, name="window")
-        self._button.on_click(self._toggle)
+        self._button.on_click(lambda: self._hold() if self._live else self._follow())
         self._window.on_change("active", lambda attr, old, new: self._follow())
         self._figures = column(sizing_mode="stretch_width", name="figures")
         controls = row(self._button, self._window)
@@ -87,9 +76,7 @@ class Page:
             self._advance()
         except Exception as error:  # would else stop the page without a word
             self._document.remove_periodic_callback(self._timer)
-            self._head.text = (
-                f"<b>{escape(FAILED)} {escape(f'{type(error).__name__}: {error}')}</b>"
-            )
+            self._head.text = f"<b>{escape(f'{FAILED} {type(error).__name__}: {error}')}</b>"
 
     def _advance(self) -> None:
         self._watch.poll()
@@ -113,11 +100,8 @@ class Page:
 
     def _browser_is_behind(self) -> bool:
         """Whether the last updates have not been drawn yet: more of them would only queue up."""
-        waiting = time.monotonic() - self._sent_at < _LOST
-        return waiting and self._tick - self._last_seen > _AHEAD
-
-    def _came(self, attribute: str, old: int, new: int) -> None:
-        self._last_seen = new
+        waiting, seen = time.monotonic() - self._sent_at < _LOST, cast(int, self._seen.start)
+        return waiting and self._tick - seen > _AHEAD
 
     def _show(self, log: FollowedLog | None) -> None:
         self._log = log
@@ -166,17 +150,17 @@ class Page:
 
     def _replace(self, view: View, spread: FloatArray) -> None:
         self._drawn_end = view.end
-        self._sources.samples.data = as_data(self._columns, view, spread)
+        self._sources.samples.data = figures.as_data(self._columns, view, spread)
         self._fit()
-        self._mark_flags(flag_marks(view))
+        self._mark_flags(figures.flag_marks(view))
 
     def _append(self, view: View, spread: FloatArray, rows: int | None, start: float) -> None:
         """Add to what is drawn; of the samples keep ``rows``, of the flags those from ``start``."""
         self._drawn_end = view.end
-        keep = None if rows is None else points_of(view) * (rows // view.step + 2)
-        self._sources.samples.stream(as_data(self._columns, view, spread), rollover=keep)
+        keep = None if rows is None else figures.points_of(view) * (rows // view.step + 2)
+        self._sources.samples.stream(figures.as_data(self._columns, view, spread), rollover=keep)
         self._fit()
-        drawn, new = self._sources.flags.data, flag_marks(view)
+        drawn, new = self._sources.flags.data, figures.flag_marks(view)
         kept = np.asarray(drawn["time"]) >= start
         if new["time"] or not kept.all():
             self._mark_flags({k: [*np.asarray(drawn[k])[kept].tolist(), *new[k]] for k in new})
@@ -187,11 +171,11 @@ class Page:
 
     def _draw_lines(self) -> None:
         flags: Any = self._sources.flags.data
-        self._sources.lines.data = {**lines_at(flags, self._mark)}
+        self._sources.lines.data = {**figures.lines_at(flags, self._mark)}
 
     def _fit(self) -> None:
         for plot in self._plots:
-            fit(plot, self._sources)
+            figures.fit(plot, self._sources)
 
     def _clear(self) -> None:
         self._drawn_step = 0
@@ -201,17 +185,17 @@ class Page:
     def _make_figures(self, columns: tuple[str, ...]) -> None:
         self._columns, self._plots = columns, []
         self._clear()
-        grid, self._plots = make_figures(columns, self._sources, self._time)
+        grid, self._plots = figures.make_figures(columns, self._sources, self._time)
         for plot in self._plots:
             plot.on_event(RangesUpdate, self._zoom)
             plot.on_event(Reset, lambda event: self._follow())
-            plot.on_event(MouseMove, self._move)
-            plot.on_event(MouseLeave, self._leave)
+            plot.on_event(MouseMove, self._point)
+            plot.on_event(MouseLeave, self._point)
             plot.on_event(Tap, lambda event: self._set_mark(event.x))
             plot.on_event(DoubleTap, lambda event: self._set_mark(None))
         self._figures.children = [grid]
-        words = Div(text=HELP, width=380, styles={"color": GREY})
-        self._side.children = [make_value_table(self._values, len(columns) + 1), words]
+        words = Div(text=HELP, width=380, styles={"color": figures.GREY})
+        self._side.children = [figures.make_value_table(self._values, len(columns) + 1), words]
 
     def _show_head(self) -> None:
         newer = self._log is not self._watch.followed
@@ -231,12 +215,6 @@ class Page:
 
     # --- what the user does -------------------------------------------------------------------
 
-    def _toggle(self) -> None:
-        if self._live:
-            self._hold()
-        else:
-            self._follow()
-
     def _follow(self) -> None:
         """Show the end of the run as it grows, or all of it."""
         self._live, self._zoomed_to = True, None
@@ -254,11 +232,8 @@ class Page:
         self._zoomed_to = float(event.x0), float(event.x1)
         self._hold()
 
-    def _move(self, event: Any) -> None:
-        self._cursor = event.x
-
-    def _leave(self, event: Any) -> None:
-        self._cursor = None
+    def _point(self, event: Any) -> None:
+        self._cursor = None if isinstance(event, MouseLeave) else event.x
 
     def _set_mark(self, at: float | None) -> None:
         self._mark = at

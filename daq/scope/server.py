@@ -28,7 +28,13 @@ def serve(watch: Watch, port: int | None, ready: Callable[[str], None]) -> None:
     port: None for the usual one or, where that is taken, any. Raises ConfigError for a port that
     is taken.
     """
-    port = _free(USUAL_PORT, or_any=True) if port is None else _free(port, or_any=False)
+    if port is not None:
+        port = _free(port)
+    else:
+        try:
+            port = _free(USUAL_PORT)
+        except ConfigError:
+            port = _free(0)
     # A tab that is closed while it is written to is no error; what goes wrong in a page it says.
     for name in ("bokeh", "tornado"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
@@ -45,12 +51,9 @@ async def _serve(watch: Watch, port: int, ready: Callable[[str], None]) -> None:
     def make_page(document: Document) -> None:
         Page(document, watch)
 
-    server = Server(
-        {"/": Application(FunctionHandler(make_page))},
-        port=port,
-        address=HOST,
-        allow_websocket_origin=[f"{HOST}:{port}", f"localhost:{port}"],
-    )
+    origins = [f"{HOST}:{port}", f"localhost:{port}"]
+    pages = {"/": Application(FunctionHandler(make_page))}
+    server = Server(pages, port=port, address=HOST, allow_websocket_origin=origins)
     before = [(number, signal.signal(number, end)) for number in (signal.SIGINT, signal.SIGTERM)]
     try:
         server.start()
@@ -62,8 +65,8 @@ async def _serve(watch: Watch, port: int, ready: Callable[[str], None]) -> None:
             signal.signal(number, handler)
 
 
-def _free(port: int, or_any: bool) -> int:
-    """The port, if nobody listens on it; else another, or ConfigError."""
+def _free(port: int) -> int:
+    """The port, 0 for any; ConfigError where somebody listens on it."""
     with socket.socket() as tried:
         if sys.platform != "win32":
             # As the server does: connections that have just ended do not count as a listener.
@@ -71,11 +74,8 @@ def _free(port: int, or_any: bool) -> int:
         try:
             tried.bind((HOST, port))
         except OSError as error:
-            if not or_any:
-                raise ConfigError(
-                    f"--port {port}: cannot be used: {error.strerror}; another rig scope may be "
-                    "using it. Choose another, or 0 for any that is free"
-                ) from None
-        else:
-            return int(tried.getsockname()[1])
-    return _free(0, or_any=False)
+            raise ConfigError(
+                f"--port {port}: cannot be used: {error.strerror}; another rig scope may be "
+                "using it. Choose another, or 0 for any that is free"
+            ) from None
+        return int(tried.getsockname()[1])

@@ -232,17 +232,11 @@ def _parse_bulk(data: bytes, layout: Layout, places: list[int]) -> FloatArray | 
         with warnings.catch_warnings():
             warnings.simplefilter("error", pd.errors.ParserWarning)
             frame = pd.read_csv(
-                io.BytesIO(data),
-                sep=layout.separator,
-                decimal="." if layout.separator == "," else ",",
-                header=None,
-                names=list(range(len(layout.names))),
-                usecols=places,
-                index_col=False,
-                dtype=np.float64,
-                skipinitialspace=True,
+                io.BytesIO(data), sep=layout.separator, header=None, index_col=False,
+                names=list(range(len(layout.names))), usecols=places, dtype=np.float64,
+                decimal="." if layout.separator == "," else ",", skipinitialspace=True,
                 skip_blank_lines=False,
-            )
+            )  # fmt: skip
     except (ValueError, pd.errors.ParserWarning, pd.errors.ParserError):
         return None
     values: FloatArray = frame.to_numpy(dtype=np.float64)

@@ -8,7 +8,7 @@ from typing import Any
 
 from daq.hal import Flag, FloatArray
 from daq.logs.columns import UNITS
-from daq.scope.figures import BLUE, GREEN, GREY, ORANGE, RED, curves_of, flag_name
+from daq.scope.figures import BLUE, GREEN, GREY, ORANGE, RED, color_of, flag_name
 from daq.scope.watch import FollowedLog
 
 _STATES = {
@@ -56,15 +56,13 @@ def readout(
     where = "at the cursor" if at_cursor else "newest sample"
     from_mark = "" if marked is None else "from the mark"
     rows: list[tuple[Any, ...]] = [(0, "transparent", "", where, "", from_mark, "bold")]
-    colors = {curve.name: curve.color for group in curves_of(columns) for curve in group}
     for place, name in enumerate(columns):
         value, unit, difference = _figures(name, values[place], 6), UNITS.get(name, ""), ""
         if name == "flags":
             value = _flags(values[place])
         elif marked is not None:
             difference = _figures(name, values[place] - marked[place], 5, "+")
-        color = colors.get(name, "transparent")
-        rows.append((place + 1, color, name, value, unit, difference, "normal"))
+        rows.append((place + 1, color_of(name), name, value, unit, difference, "normal"))
     return {
         field: list(cells)
         for field, cells in zip(VALUE_FIELDS, zip(*rows, strict=True), strict=True)

@@ -3,7 +3,7 @@
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 from daq.errors import ConfigError
 from daq.logs.capture import LOG_NAME, RUN_NAME, RUNNING
@@ -45,7 +45,8 @@ class RunState:
             return cls(problem=str(error))
         if record is None:
             return cls()
-        experiment, rig = _section(record, "experiment"), _section(record, "rig")
+        sections = [record.get(key) for key in ("experiment", "rig")]
+        experiment, rig = (section if isinstance(section, dict) else {} for section in sections)
         rate, duration = experiment.get("sample_rate"), experiment.get("duration")
         details = {
             "rig": rig.get("name"),
@@ -95,11 +96,6 @@ class FollowedLog:
         size = self.tail.size()
         return self.tail.offset / size if size - self.tail.offset > _MUCH else None
 
-    @property
-    def quiet_for(self) -> float:
-        """Time since the last sample came [s]."""
-        return time.monotonic() - self._grew
-
     def read(self) -> None:
         """Read the rows written since the last call."""
         if self.tail.size() < self.tail.offset:
@@ -132,9 +128,10 @@ class FollowedLog:
         texts += [f"{file}: {text}" for text in problems.first]
         if problems.count > len(problems.first):
             texts.append(f"{file}: and {problems.count - len(problems.first)} more like these")
-        if self.state.running and self.quiet_for > _QUIET and self.n_rows:
+        quiet = time.monotonic() - self._grew
+        if self.state.running and quiet > _QUIET and self.n_rows:
             texts.append(
-                f"no new sample for {self.quiet_for:.0f} s although the run has not ended: "
+                f"no new sample for {quiet:.0f} s although the run has not ended: "
                 "it was killed, or it stalls"
             )
         elif not self.state.running and self.loading is None and self.tail.torn():
@@ -165,16 +162,13 @@ class Watch:
         self._polled = now
         if now - self._looked > _LOOK:
             self._looked = now
-            self._look()
+            newest = None if self._stays else self._newest()
+            if newest is not None and (self.followed is None or self.followed.path != newest):
+                self.followed = FollowedLog(newest)
+            if self.followed is not None:
+                self.followed.look()
         if self.followed is not None:
             self.followed.read()
-
-    def _look(self) -> None:
-        newest = None if self._stays else self._newest()
-        if newest is not None and (self.followed is None or self.followed.path != newest):
-            self.followed = FollowedLog(newest)
-        if self.followed is not None:
-            self.followed.look()
 
     def _newest(self) -> Path | None:
         """Log of the run that began last."""
@@ -214,8 +208,3 @@ def _began(folder: Path) -> str | None:
     # Without a record the folder's name, which begins with the time, has to do.
     name = folder.name
     return started or f"{name[:4]}-{name[4:6]}-{name[6:11]}:{name[11:13]}:{name[13:15]}"
-
-
-def _section(record: dict[str, Any], name: str) -> dict[str, Any]:
-    section = record.get(name)
-    return section if isinstance(section, dict) else {}

@@ -8,15 +8,10 @@ import numpy as np
 import pytest
 
 from daq.figures import style
-from daq.figures.bode import Measured, bode
-from daq.figures.convergence import convergence
-from daq.figures.findings import draw
-from daq.figures.parameters import Determined, Searched, correlation, intervals, ranges
-from daq.figures.plots import plot
-from daq.figures.rankings import Ratio, ratios
-from daq.figures.responses import Response, responses
-from daq.figures.signals import Panel, signals
-from daq.figures.spectra import Spectrum, spectra
+from daq.figures.bode import bode
+from daq.figures.findings import draw, plot
+from daq.figures.parameters import convergence, correlation, intervals, ranges, ratios
+from daq.figures.signals import Panel, responses, signals, spectra
 from daq.findings import Axis, Chart, Heatmap, Series
 
 TIME = np.linspace(0.0, 1.0, 400)
@@ -44,11 +39,9 @@ def charts():
 def drawn():
     lost = np.where(TIME > 0.9, np.nan, WAVE)
     loop = {"angle": TIME, "speed": WAVE, "torque": np.cos(20.0 * TIME)}
-    over, torque = (Axis("angle", "rad"), Axis("speed", "rad/s")), Axis("torque", "N*m")
-    searched = [
-        Searched("K_m", "N*m/A", 0.1, 0.01, 1.0, True, (0.09, 0.12)),
-        Searched(NASTY, "1", 2.0, 1.0, 5.0, False, None, "only with others"),
-    ]
+    over, torque = {"angle": "rad", "speed": "rad/s"}, Axis("torque", "N*m")
+    places = np.array([[0.5, 0.47, 0.54], [0.25, np.nan, np.nan]])
+    ends = np.array([[2.0, 1.5, 2.9], [-1.0, -2.0, 0.0]])
     chart, plane, crowd = charts()
     return {
         "signals": signals(TIME, [
@@ -56,20 +49,22 @@ def drawn():
             Panel(NASTY, "rad/s", {"": lost}),
         ]),
         "responses": responses(TIME, [
-            Response("omega", "rad/s", lost, {"identified": WAVE, "ARMAX": 1e9 * WAVE}, "fit 9 %"),
-            Response(NASTY, "1", WAVE, {"identified": WAVE}),
+            Panel("omega", "rad/s", {"measured": lost, "identified": WAVE, "ARMAX": 1e9 * WAVE},
+                  note="fit 9 %"),
+            Panel(NASTY, "1", {"measured": WAVE, "identified": WAVE}),
         ]),
         "convergence": convergence(np.array([0.5, 0.2, 0.11]), 300, 0.2),
-        "ranges": ranges(searched),
-        "intervals": intervals([Determined("A alpha0", 2.0, 1.5, 2.9), Determined("k", -1, -2, 0)]),
+        "ranges": ranges(["K_m", NASTY], places, ["", "only with others"]),
+        "intervals": intervals(["A alpha0", "k"], ends),
         "correlation": correlation(["K_m", NASTY], np.array([[1.0, -0.9], [-0.9, 1.0]])),
-        "spectra": spectra(FREQUENCY, [Spectrum("torque", "N*m", np.abs(LAG) ** 2)]),
-        "bode": bode(FREQUENCY, Measured(LAG, np.abs(LAG), 0.1 * np.abs(LAG)),
+        "spectra": spectra(FREQUENCY, {"torque": np.abs(LAG) ** 2}, {"torque": "N*m"}),
+        "bode": bode(FREQUENCY, LAG, np.abs(LAG), 0.1 * np.abs(LAG),
                      {"identified": LAG, "linear, ω = 0": LAG, "linear, ω = 4.12 rad/s": 1.1 * LAG},
                      ("rad/s", "V")),
         "loops": plot(over, torque, {"brake 0.1 A": loop, "brake 0.2 A": loop}),
         "points": plot(over, torque, {"brake 0.1 A": loop}, points=True),
-        "ratios": ratios("lag", [Ratio(NASTY * 4, 1.1, 0.9, 1.3), Ratio("ARX", 80, 52, 136)]),
+        "ratios": ratios(["lag", NASTY * 4, "ARX"],
+                         np.array([[1.0, 1.0, 1.0], [1.1, 0.9, 1.3], [80.0, 52.0, 136.0]])),
         "chart": draw(chart),
         "plane": draw(plane),
         "crowd": draw(crowd),
