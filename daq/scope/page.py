@@ -2,7 +2,7 @@
 
 import time
 from html import escape
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from bokeh.document import Document
@@ -100,8 +100,8 @@ class Page:
 
     def _browser_is_behind(self) -> bool:
         """Whether the last updates have not been drawn yet: more of them would only queue up."""
-        waiting = time.monotonic() - self._sent_at < _LOST
-        return waiting and self._tick - self._seen.start > _AHEAD
+        waiting, seen = time.monotonic() - self._sent_at < _LOST, cast(int, self._seen.start)
+        return waiting and self._tick - seen > _AHEAD
 
     def _show(self, log: FollowedLog | None) -> None:
         self._log = log

@@ -29,7 +29,6 @@ from sysid import GASSI, Dataset
 from sysid.gassi import checkpoint
 from tests.sysid.test_checkpoint import SETTINGS, noisy
 from tests.sysid.support import motor
-from tests.soak import mostly_soak
 
 checkpoint.INTERVAL = 0.0
 steps = 0
