@@ -54,12 +54,14 @@ class RunState:
             "started": str(record.get("started", ""))[:19].replace("T", " ") + " UTC",
             "sample rate": f"{rate:g} Hz" if isinstance(rate, int | float) else None,
         }
-        timed = isinstance(rate, int | float) and isinstance(duration, int | float)
+        rows = None
+        if isinstance(rate, int | float) and isinstance(duration, int | float):
+            rows = round(rate * duration)
         return cls(
             status=str(record.get("status")),
             reason=str(record["reason"]) if record.get("reason") else None,
             details={name: str(value) for name, value in details.items() if value},
-            expected_rows=round(rate * duration) if timed else None,
+            expected_rows=rows,
         )
 
 
