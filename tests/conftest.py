@@ -1,30 +1,21 @@
 """What holds for every test."""
 
 import os
-import shutil
 import signal
-import tempfile
 
-import pytest
 from hypothesis import settings
 
 settings.register_profile("repeatable", derandomize=True, deadline=None, database=None)
 settings.load_profile("repeatable")
 
-_KERNELS = pytest.StashKey[str]()
-
 
 def pytest_configure(config):
     _hear_signals()
     if not hasattr(config, "workerinput"):
-        # Compiled kernels are this session's own, and shared by all its processes: those of
-        # pytest-xdist and the programs that tests start find the cache by the environment.
-        config.stash[_KERNELS] = os.environ["RIG_CACHE_DIR"] = tempfile.mkdtemp(prefix="kernels-")
-
-
-def pytest_unconfigure(config):
-    if _KERNELS in config.stash:
-        shutil.rmtree(config.stash[_KERNELS], ignore_errors=True)
+        # Compiled kernels are kept for the next session, as pytest's own cache is, and shared by
+        # all processes: those of pytest-xdist and programs that tests start find the folder by
+        # the environment. Their names are fingerprints of all that they are made of.
+        os.environ["RIG_CACHE_DIR"] = str(config.cache.mkdir("kernels"))
 
 
 def _hear_signals():

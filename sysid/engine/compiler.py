@@ -116,7 +116,7 @@ def _key(text: str, called: Mapping[str, Any]) -> str:
     """Fingerprint of all that decides what the kernels do."""
     import numba
 
-    key = hashlib.sha256(f"{numba.__version__}\n{text}".encode())
+    key = hashlib.sha256(f"{numba.__version__}\n{sorted(_OPTIONS['fastmath'])}\n{text}".encode())
     for library in ("intrinsics.py", "phi.py", "vector_math.py"):
         key.update(Path(__file__).with_name(library).read_bytes())
     for function in called.values():
