@@ -47,15 +47,17 @@ class LoggedRecord:
     warning: str | None
 
 
+Split = tuple[list[LoggedRecord], list[LoggedRecord]]  # for training, for validation
+
+
 def expand(path: Path) -> list[Path]:
     """Logs named on the command line: a folder without a log.csv stands for the CSVs in it."""
     if not path.is_dir() or (path / LOG_NAME).exists():
         return [path]
     if logs := sorted(path.glob("*.csv")):
         return logs
-    raise ConfigError(
-        "neither a capture folder (with log.csv) nor a folder of CSV files", file=path
-    )
+    problem = "neither a capture folder (with log.csv) nor a folder of CSV files"
+    raise ConfigError(problem, file=path)
 
 
 def load(path: Path, model: ProcessModel, mapping: ColumnMapping | None) -> LoggedRecord:
@@ -96,9 +98,7 @@ def from_frame(frame: pd.DataFrame, name: str, model: ProcessModel) -> LoggedRec
     return LoggedRecord(_from_log(log, model, name), path, None)
 
 
-def hold_back(
-    logs: list[LoggedRecord], part: float
-) -> tuple[list[LoggedRecord], list[LoggedRecord]]:
+def hold_back(logs: list[LoggedRecord], part: float) -> Split:
     """The beginnings of logs, to train on, and the last ``part`` of each, to validate by.
 
     An end starts where every output was measured, so that its first sample tells where it
