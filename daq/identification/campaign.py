@@ -180,7 +180,8 @@ def run_all(
     on_outcome: Callable[[Outcome], None],
 ) -> Campaign:
     """Run all groups with all seeds, warn of their logs; ConfigError when no run succeeds."""
-    warn(watch, *dict.fromkeys(log.warning for g in groups for log in (*g.training, *g.validation)))
+    warnings = [log.warning for group in groups for log in (*group.training, *group.validation)]
+    warn(watch, *dict.fromkeys(warnings))
     runs = [run for group in groups for run in group.runs(seeds)]
     finished = 0
 

@@ -205,12 +205,9 @@ def _searched(
     checkpoint = folder / request.CHECKPOINT if folder is not None else None
     try:
         estimator = GASSI(problem.model, **gassi_settings(problem.settings))
-        return estimator.fit(
-            [log.dataset for log in train],
-            on_progress=report,
-            checkpoint=checkpoint,
-            resume=checkpoint if resume else None,
-        )
+        datasets = [log.dataset for log in train]
+        start = checkpoint if resume else None
+        return estimator.fit(datasets, on_progress=report, checkpoint=checkpoint, resume=start)
     except ModelError as error:
         if folder is not None and not resume:
             request.forget(folder)

@@ -183,12 +183,9 @@ def _load_foreign(path: Path, model: ProcessModel, mapping: ColumnMapping) -> Lo
     gapless = {columns.time.column, *(columns.inputs[name].column for name in model.input_names)}
     outputs_from = {columns.outputs[name].column for name in model.output_names}
     used = sorted(name for name in gapless | outputs_from if name is not None)
-    frame, first_line, torn = read_table(
-        path,
-        used,
-        "mend these cells or remove their lines (removed lines count as lost samples)",
-        gaps=[name for name in used if name not in gapless],
-    )
+    gaps = [name for name in used if name not in gapless]
+    cure = "mend these cells or remove their lines (removed lines count as lost samples)"
+    frame, first_line, torn = read_table(path, used, cure, gaps)
     require_rows(path, len(frame))
     tick, dt = _foreign_time(path, frame, first_line, mapping)
 

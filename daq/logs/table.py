@@ -179,7 +179,7 @@ def _names(line: str, separator: str) -> list[str]:
 
 
 def _complete_lines(path: Path, n_bytes: int = -1) -> tuple[str, bool]:
-    """A file's text, or of its first bytes, up to the last whole line; whether more was cut off."""
+    """Text of a file's first bytes, -1 for all, to its last whole line; whether any was cut off."""
     try:
         with path.open("rb") as file:
             data = file.read(n_bytes)

@@ -60,7 +60,7 @@ class Session:
 
 @dataclass(frozen=True)
 class SessionResult:
-    """Runs that were recorded, the first's findings, and its doubts about sensors, with cures."""
+    """Runs that were recorded; of the first its findings, and doubts on sensors with the cures."""
 
     run: RunResult
     validation: RunResult | None

@@ -37,13 +37,10 @@ def publish(result: Identification, folder: Path, watch: Watch = ignore) -> dict
     logs = [fitted.log for fitted in result.training], [fitted.log for fitted in result.validation]
     linear = baseline_of(result.model, *logs)
     document = plain(_document(result, logs, linear))
-    subject = Subject(
-        result.model,
-        document,
-        [(fitted.log, fitted.run) for fitted in result.training],
-        [(fitted.log, fitted.run) for fitted in result.validation],
-        linear if isinstance(linear, Baseline) else None,
-    )
+    parts = result.training, result.validation
+    runs = [[(fitted.log, fitted.run) for fitted in part] for part in parts]
+    baseline = linear if isinstance(linear, Baseline) else None
+    subject = Subject(result.model, document, *runs, baseline)
     drawings: list[Drawing] = []
     for picture, files in draw(pictures(subject), folder / FIGURES, ["svg"]):
         drawings.append((picture, files["svg"]))

@@ -98,8 +98,8 @@ class Page:
 
     def _browser_is_behind(self) -> bool:
         """Whether the last updates have not been drawn yet: more of them would only queue up."""
-        waiting, seen = time.monotonic() - self._sent_at < _LOST, cast("int", self._seen.start)
-        return waiting and self._tick - seen > _AHEAD
+        waiting = time.monotonic() - self._sent_at < _LOST
+        return waiting and self._tick - cast("int", self._seen.start) > _AHEAD
 
     def _show(self, log: FollowedLog | None) -> None:
         self._log = log

@@ -57,7 +57,8 @@ def parse(text: str) -> Fault:
         near = suggestion(phase_name, list(phases))
         raise ConfigError(f"--fault {text}: unknown phase {phase_name!r}; {near}")
     size = _number(value, text) if value else default or 0.0
-    return Fault(name, size, phases.get(phase_name), _number(after, text) if after else 0.0)
+    seconds = _number(after, text) if after else 0.0
+    return Fault(name, size, phases.get(phase_name), seconds)
 
 
 def _number(text: str, whole: str) -> float:
