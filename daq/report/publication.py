@@ -38,9 +38,9 @@ def publish(result: Identification, folder: Path, watch: Watch = ignore) -> dict
     linear = baseline_of(result.model, *logs)
     document = plain(_document(result, logs, linear))
     parts = result.training, result.validation
-    runs = [[(fitted.log, fitted.run) for fitted in part] for part in parts]
+    training, validation = ([(fitted.log, fitted.run) for fitted in part] for part in parts)
     baseline = linear if isinstance(linear, Baseline) else None
-    subject = Subject(result.model, document, *runs, baseline)
+    subject = Subject(result.model, document, training, validation, baseline)
     drawings: list[Drawing] = []
     for picture, files in draw(pictures(subject), folder / FIGURES, ["svg"]):
         drawings.append((picture, files["svg"]))

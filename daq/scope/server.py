@@ -11,6 +11,7 @@ from types import FrameType
 
 from bokeh.application import Application
 from bokeh.application.handlers.function import FunctionHandler
+from bokeh.document import Document
 from bokeh.server.server import Server
 
 from daq.errors import ConfigError
@@ -47,8 +48,11 @@ async def _serve(watch: Watch, port: int, ready: Callable[[str], None]) -> None:
     def end(number: int, frame: FrameType | None) -> None:
         loop.call_soon_threadsafe(ended.set)
 
+    def make_page(document: Document) -> None:
+        Page(document, watch)
+
     origins = [f"{HOST}:{port}", f"localhost:{port}"]
-    pages = {"/": Application(FunctionHandler(lambda document: Page(document, watch)))}
+    pages = {"/": Application(FunctionHandler(make_page))}
     server = Server(pages, port=port, address=HOST, allow_websocket_origin=origins)
     before = [(number, signal.signal(number, end)) for number in (signal.SIGINT, signal.SIGTERM)]
     try:
