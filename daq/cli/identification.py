@@ -189,13 +189,15 @@ def _show_profiles(profiles: Sequence[Profile]) -> None:
 
 
 def _show_errors(rows: Rows) -> None:
+    from daq.identification.rows import mean_errors
+
     training, validation = rows.logs["training"], rows.logs["validation"]
     if len(training) == 1 and len(validation) <= 1:
         print_errors(training[0].outputs, [log.outputs for log in validation])
         return
     for part, logs in rows.logs.items():
         if logs:
-            _print_logs(f"{part.capitalize()} logs", logs, rows.mean_errors(part))
+            _print_logs(f"{part.capitalize()} logs", logs, mean_errors(logs))
 
 
 def _show_residuals(rows: Rows) -> None:

@@ -76,7 +76,8 @@ class Group:
         assert outcome.estimator is not None
         settings = self.problem.settings.model_copy(update={"seed": outcome.run.seed})
         problem = dataclasses.replace(self.problem, settings=settings)
-        return assemble(problem, outcome.estimator, self.training, self.validation)
+        logs = self.training, self.validation
+        return assemble(problem, outcome.estimator, logs, None, ignore)
 
 
 @dataclass(frozen=True)
@@ -149,8 +150,6 @@ def campaign(wanted: CampaignRequest, watch: Watch = ignore) -> CampaignResult:
     groups = []
     for problem in problems:
         groups += groups_of(problem, wanted.logs, wanted.validate, wanted.together)
-    warn_of_logs(groups, watch)
-    runs = [run for group in groups for run in group.runs(seeds)]
     outcomes: list[Outcome] = []
     written = -math.inf
 
@@ -163,7 +162,7 @@ def campaign(wanted: CampaignRequest, watch: Watch = ignore) -> CampaignResult:
             _write_table(folder, Campaign(tuple(outcomes)))
             written = time.monotonic()
 
-    result = run_all(runs, wanted.workers, watch, keep)
+    result = run_all(groups, seeds, wanted.workers, watch, keep)
     table = _write_table(folder, result)
     by_key = {(group.problem.model_name, group.name): group for group in groups}
     files = {
@@ -174,9 +173,16 @@ def campaign(wanted: CampaignRequest, watch: Watch = ignore) -> CampaignResult:
 
 
 def run_all(
-    runs: Sequence[Run], workers: Workers, watch: Watch, on_outcome: Callable[[Outcome], None]
+    groups: Sequence[Group],
+    seeds: Sequence[int],
+    workers: Workers,
+    watch: Watch,
+    on_outcome: Callable[[Outcome], None],
 ) -> Campaign:
-    """All runs with their progress; ConfigError when none of them succeeds."""
+    """Run all groups with all seeds, warn of their logs; ConfigError when no run succeeds."""
+    warnings = [log.warning for group in groups for log in (*group.training, *group.validation)]
+    warn(watch, *dict.fromkeys(warnings))
+    runs = [run for group in groups for run in group.runs(seeds)]
     finished = 0
 
     def report(outcome: Outcome) -> None:
@@ -212,12 +218,6 @@ def groups_of(
         begins, ends = records.hold_back(train, problem.settings.hold_back)
         groups.append(Group(problem, name, begins, [*ends, *validation]))
     return groups
-
-
-def warn_of_logs(groups: Sequence[Group], watch: Watch) -> None:
-    """Say once of each log that its run did not complete."""
-    warnings = [log.warning for group in groups for log in (*group.training, *group.validation)]
-    warn(watch, *dict.fromkeys(warnings))
 
 
 def parse_seeds(text: str | None) -> list[int]:

@@ -19,7 +19,6 @@ from daq.identification.campaign import (
     groups_of,
     parse_seeds,
     run_all,
-    warn_of_logs,
 )
 from daq.identification.fit import check_writable, default_folder
 from daq.identification.request import SettingsRequest
@@ -139,22 +138,19 @@ def compare(wanted: ComparisonRequest, watch: Watch = ignore) -> ComparisonResul
     Traceback (most recent call last):
     daq.errors.ConfigError: --seed and --seeds: give one of them
     """
-    if wanted.seeds is not None and wanted.settings.option("seed") is not None:
+    if wanted.seeds is not None and wanted.settings.options.get("seed") is not None:
         raise ConfigError("--seed and --seeds: give one of them")
     problems = problems_of(wanted.settings, distinct(wanted.models), watch)
     seeds = parse_seeds(wanted.seeds) or [problems[0].settings.seed]
     alone = len(problems) == 1 and not wanted.baselines
-    folder = wanted.out or default_folder(
-        wanted.logs, problems[0].model.name if alone else "comparison"
-    )
+    name = problems[0].model.name if alone else "comparison"
+    folder = wanted.out or default_folder(wanted.logs, name)
     if wanted.out is None and not alone:
         folder = folder.with_name("comparison")
     check_writable(folder)
     groups = [groups_of(p, wanted.logs, wanted.validate, together=True)[0] for p in problems]
     _require_same_outputs(groups)
-    warn_of_logs(groups, watch)
-    runs = [run for group in groups for run in group.runs(seeds)]
-    campaign = run_all(runs, wanted.workers, watch, lambda outcome: None)
+    campaign = run_all(groups, seeds, wanted.workers, watch, lambda outcome: None)
     best = {name: outcome for (name, _), outcome in campaign.best().items()}
     fitted = [g for g in groups if g.problem.model_name in best]
     if alone:

@@ -10,15 +10,11 @@ from daq.errors import suggestion
 from daq.identification.records import unit_factor
 from sysid import ModelError, ProcessModel, SearchSpace
 
-Entries = dict[str, tuple[YamlFile, DatasheetEntry]]
-"""Checked entries by parameter, each with the file that it stands in."""
+Entries = dict[str, tuple[YamlFile, DatasheetEntry]]  # by parameter, with the file they stand in
 
 
 def load(paths: Sequence[Path], models: Sequence[ProcessModel]) -> Entries:
-    """Read data sheets; ConfigError names line, key and cure.
-
-    An entry that no model has a parameter for, or that stands twice, is a mistake.
-    """
+    """Read data sheets; ConfigError where an entry is wrong, stands twice or is no parameter's."""
     sheets = [(file, _checked(file)) for file in map(yaml_file.load, paths)]
     parameters = list(dict.fromkeys(name for model in models for name in model.parameter_names))
     entries: Entries = {}

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from daq.errors import ConfigError
 from daq.identification import records, request
-from daq.identification.records import ColumnMapping, LoggedRecord
+from daq.identification.records import ColumnMapping, LoggedRecord, Split
 from daq.identification.request import SettingsRequest
 from daq.identification.result import FittedLog, Identification
 from daq.identification.settings import Problem, gassi_settings, problem_of
@@ -113,7 +113,7 @@ def fit(
     if folder is not None and not resume:
         request.remember(folder, problem.request, _paths(training), _paths(validation))
     estimator = _searched(problem, train, folder, watch, resume)
-    result = assemble(problem, estimator, train, [*ends, *check], folder, watch)
+    result = assemble(problem, estimator, (train, [*ends, *check]), folder, watch)
     if folder is not None:
         result.save(folder)
         if not result.interrupted:
@@ -121,9 +121,7 @@ def fit(
     return result
 
 
-def load_logs(
-    problem: Problem, training: Sequence[Source], validation: Sequence[Source]
-) -> tuple[list[LoggedRecord], list[LoggedRecord]]:
+def load_logs(problem: Problem, training: Sequence[Source], validation: Sequence[Source]) -> Split:
     """Records for training and for validation; ConfigError when a log is given for both."""
     train = _records(training, "training", problem)
     check = _records(validation, "validation", problem)
@@ -156,15 +154,10 @@ def check_writable(folder: Path) -> None:
 
 
 def assemble(
-    problem: Problem,
-    estimator: GASSI,
-    train: Sequence[LoggedRecord],
-    check: Sequence[LoggedRecord],
-    folder: Path | None = None,
-    watch: Watch = ignore,
+    problem: Problem, estimator: GASSI, logs: Split, folder: Path | None, watch: Watch
 ) -> Identification:
     """A fitted estimator with its intervals and profiles, and how it does on every log."""
-    datasets = [log.dataset for log in train]
+    datasets = [log.dataset for log in logs[0]]
     refined = PRESETS[estimator.preset].refine and estimator.stopped_ != "interrupted"
     uncertainty = estimator.uncertainty(datasets) if refined else None
     profiles, names = [], problem.settings.profile if refined else []
@@ -172,7 +165,7 @@ def assemble(
         watch(Progress("Profiles", k, len(names), f"of {name}"))
         profiles.append(estimator.profile(name, datasets))
         watch(Progress("Profiles", k + 1, len(names), f"of {name}"))
-    training, validation = ([_fitted(log, estimator) for log in part] for part in (train, check))
+    training, validation = ([_fitted(log, estimator) for log in part] for part in logs)
     return Identification(problem, estimator, uncertainty, profiles, training, validation, folder)
 
 
@@ -212,12 +205,9 @@ def _searched(
     checkpoint = folder / request.CHECKPOINT if folder is not None else None
     try:
         estimator = GASSI(problem.model, **gassi_settings(problem.settings))
-        return estimator.fit(
-            [log.dataset for log in train],
-            on_progress=report,
-            checkpoint=checkpoint,
-            resume=checkpoint if resume else None,
-        )
+        datasets = [log.dataset for log in train]
+        start = checkpoint if resume else None
+        return estimator.fit(datasets, on_progress=report, checkpoint=checkpoint, resume=start)
     except ModelError as error:
         if folder is not None and not resume:
             request.forget(folder)

@@ -47,15 +47,17 @@ class LoggedRecord:
     warning: str | None
 
 
+Split = tuple[list[LoggedRecord], list[LoggedRecord]]  # for training, for validation
+
+
 def expand(path: Path) -> list[Path]:
     """Logs named on the command line: a folder without a log.csv stands for the CSVs in it."""
     if not path.is_dir() or (path / LOG_NAME).exists():
         return [path]
     if logs := sorted(path.glob("*.csv")):
         return logs
-    raise ConfigError(
-        "neither a capture folder (with log.csv) nor a folder of CSV files", file=path
-    )
+    problem = "neither a capture folder (with log.csv) nor a folder of CSV files"
+    raise ConfigError(problem, file=path)
 
 
 def load(path: Path, model: ProcessModel, mapping: ColumnMapping | None) -> LoggedRecord:
@@ -96,9 +98,7 @@ def from_frame(frame: pd.DataFrame, name: str, model: ProcessModel) -> LoggedRec
     return LoggedRecord(_from_log(log, model, name), path, None)
 
 
-def hold_back(
-    logs: list[LoggedRecord], part: float
-) -> tuple[list[LoggedRecord], list[LoggedRecord]]:
+def hold_back(logs: list[LoggedRecord], part: float) -> Split:
     """The beginnings of logs, to train on, and the last ``part`` of each, to validate by.
 
     An end starts where every output was measured, so that its first sample tells where it
@@ -183,12 +183,9 @@ def _load_foreign(path: Path, model: ProcessModel, mapping: ColumnMapping) -> Lo
     gapless = {columns.time.column, *(columns.inputs[name].column for name in model.input_names)}
     outputs_from = {columns.outputs[name].column for name in model.output_names}
     used = sorted(name for name in gapless | outputs_from if name is not None)
-    frame, first_line, torn = read_table(
-        path,
-        used,
-        "mend these cells or remove their lines (removed lines count as lost samples)",
-        gaps=[name for name in used if name not in gapless],
-    )
+    gaps = [name for name in used if name not in gapless]
+    cure = "mend these cells or remove their lines (removed lines count as lost samples)"
+    frame, first_line, torn = read_table(path, used, cure, gaps)
     require_rows(path, len(frame))
     tick, dt = _foreign_time(path, frame, first_line, mapping)
 

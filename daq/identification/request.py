@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from daq.errors import ConfigError
 from daq.files import make_folder, write_whole
 
-CHECKPOINT = "search.ckpt"
-"""Where the search of an identification keeps its state, in the folder of its results."""
+CHECKPOINT = "search.ckpt"  # the search's state, in the folder of its results
 _REQUEST = "search.json"
 
 
@@ -25,21 +24,12 @@ class SettingsRequest:
     """
 
     config: str | None = None
-    options: Mapping[str, Any] | None = None
+    options: Mapping[str, Any] = field(default_factory=dict)
     settings: Sequence[str] = ()
-
-    @property
-    def config_file(self) -> Path | None:
-        """The YAML file's path."""
-        return None if self.config is None else Path(self.config)
-
-    def option(self, name: str) -> Any:
-        """The value of an option; None where it was not given."""
-        return (self.options or {}).get(name)
 
     def absolute(self, model: str) -> SettingsRequest:
         """The same from any folder; model: whole name of the one that was looked up."""
-        options = {**(self.options or {}), "model": model}
+        options = {**self.options, "model": model}
         if options.get("datasheet"):
             options["datasheet"] = _absolute(options["datasheet"])
         config = None if self.config is None else _absolute([self.config])[0]

@@ -72,13 +72,9 @@ class Identification:
     @cached_property
     def verdict(self) -> Verdict:
         """How far to trust it, and why."""
-        return judge(
-            self.model,
-            [log.result for log in self.training],
-            [log.result for log in self.validation],
-            self.uncertainty,
-            self.estimator.feasible_,
-        )
+        parts = self.training, self.validation
+        training, validation = ([log.result for log in part] for part in parts)
+        return judge(self.model, training, validation, self.uncertainty, self.estimator.feasible_)
 
     @property
     def trust(self) -> str:

@@ -14,14 +14,13 @@ from typing import Any
 
 from daq import notation
 
-LABELS = {
+LABELS = {  # of undetermined reasons
     "tied": "only with others",
     "vague": "hardly felt",
     "bound": "at its end",
     "rival": "two answers",
     "": "",
 }
-"""Labels of undetermined reasons."""
 
 
 @dataclass(frozen=True)
@@ -207,15 +206,11 @@ class Rows:
         """Ambiguities of some kinds: ``product`` and ``sum`` are exact; ``vague``; ``rival``."""
         return tuple(ambiguity for ambiguity in self.ambiguities if ambiguity.kind in kinds)
 
-    def mean_errors(self, part: str) -> dict[str, OutputErrors]:
-        """Errors by output, mean over the logs of a part; empty without any."""
-        return mean_errors(self.logs[part])
-
     @cached_property
     def residuals(self) -> ResidualTable:
         """Residual tests on the validation logs, or else on the training logs."""
         part = "validation" if self.logs["validation"] else "training"
-        outputs = self.mean_errors(part)
+        outputs = mean_errors(self.logs[part])
         inputs = tuple(next(iter(outputs.values())).independence)
         shares = {
             name: (errors.whiteness, *(errors.independence[signal] for signal in inputs))
@@ -233,12 +228,9 @@ def logs_of(metrics: Mapping[str, Any], part: str) -> tuple[LogErrors, ...]:
 
 
 def mean_errors(logs: Sequence[LogErrors]) -> dict[str, OutputErrors]:
-    """Errors by output, mean over logs."""
-    if not logs:
-        return {}
-    return {
-        name: OutputErrors.mean([log.outputs[name] for log in logs]) for name in logs[0].outputs
-    }
+    """Errors by output, mean over logs; empty without any."""
+    outputs = logs[0].outputs if logs else ()
+    return {name: OutputErrors.mean([log.outputs[name] for log in logs]) for name in outputs}
 
 
 def _parameter(name: str, entry: Mapping[str, Any]) -> ParameterRow:
@@ -267,9 +259,8 @@ def _quantity(name: str, entry: Mapping[str, Any]) -> dict[str, Any]:
 
 def _ambiguity(entry: Mapping[str, Any]) -> AmbiguityRow:
     determined = tuple(QuantityRow(**_quantity(q["name"], q)) for q in entry["determined"])
-    return AmbiguityRow(
-        entry["kind"], tuple(entry["parameters"]), determined, tuple(entry["measure"])
-    )
+    parameters, measure = tuple(entry["parameters"]), tuple(entry["measure"])
+    return AmbiguityRow(entry["kind"], parameters, determined, measure)
 
 
 def _ends(values: Sequence[float] | None) -> tuple[float, float] | None:

@@ -22,10 +22,7 @@ File = TypeVar("File", bound=YamlFile)
 
 # Settings with a key for each of a model's names, by what these are names of.
 _KEYED_BY = {
-    "ranges": "parameter_names",
-    "fixed": "parameter_names",
-    "tied": "parameter_names",
-    "scale": "parameter_names",
+    **dict.fromkeys(("ranges", "fixed", "tied", "scale"), "parameter_names"),
     "weights": "output_names",
     "initial": "state_names",
     "hold": "input_names",
@@ -50,7 +47,7 @@ class Problem:
 
 def problem_of(request: SettingsRequest, watch: Watch = ignore) -> Problem:
     """Read and check settings and model; ConfigError names file, line, key and cure."""
-    return problems_of(request, [request.option("model")], watch)[0]
+    return problems_of(request, [request.options.get("model")], watch)[0]
 
 
 def problems_of(
@@ -61,8 +58,8 @@ def problems_of(
     Each takes the ranges, fixed values and the like that it has a name for; names that no model
     has are mistakes.
     """
-    config = request.config_file
-    options = {k: value for k, value in (request.options or {}).items() if value is not None}
+    config = None if request.config is None else Path(request.config)
+    options = {k: value for k, value in request.options.items() if value is not None}
     written = yaml_file.load(config) if config is not None else None
     if written is not None:
         check.refuse_other_kind(written, "an identification's settings")
@@ -113,17 +110,14 @@ def in_model_units(file: File, models: Sequence[ProcessModel]) -> tuple[File, li
             if name not in units:
                 continue
             try:
-                numbers[name] = _in_unit(value, units[name])
+                if isinstance(value, list):
+                    numbers[name] = [converted(end, units[name]) for end in value]
+                else:
+                    numbers[name] = converted(value, units[name])
             except ValueError as error:
                 mistakes.append(file.mistake((group, name), f"{error}; found {value!r}"))
                 del numbers[name]  # said once
     return dataclasses.replace(file, content=content), mistakes
-
-
-def _in_unit(value: Any, unit: str) -> Any:
-    return (
-        [converted(e, unit) for e in value] if isinstance(value, list) else converted(value, unit)
-    )
 
 
 def with_signals(file: YamlFile, signals: Signals, model: ProcessModel) -> ProcessModel:

@@ -7,6 +7,7 @@ time.
 
 import contextlib
 from collections.abc import Iterator
+from operator import itemgetter
 
 from daq.config.rig import RigConfig, UserLimit
 from daq.errors import USER_CODE_ERRORS, ConfigError, RigError, RunError, raised_in
@@ -23,7 +24,7 @@ class Limits:
     """All limits of a rig, asked together."""
 
     def __init__(self, config: RigConfig) -> None:
-        users = [_UserCode(_made(settings)) for settings in config.limits.own]
+        users = [_UserCode(settings) for settings in config.limits.own]
         self._limits: list[Limit] = [*_built_in(config), *users]
 
     def begin(self, phase: Phase, sample_rate: float) -> None:
@@ -38,24 +39,8 @@ class Limits:
 
     def check(self, samples: Samples) -> Trip | None:
         """The first row beyond any limit, and why; the earlier limit of two in one row."""
-        first: Trip | None = None
-        for limit in self._limits:
-            trip = limit.check(samples)
-            if trip is not None and (first is None or trip[0] < first[0]):
-                first = trip
-        return first
-
-
-def _made(settings: UserLimit) -> Limit:
-    """A limit of a user's own. Raises ConfigError for a mistake in its constructor."""
-    try:
-        limit: Limit = settings.make()
-    except RigError:
-        raise
-    except USER_CODE_ERRORS as error:
-        problem = f"{settings.use} cannot be made: {type(error).__name__}: {error}"
-        raise ConfigError(problem, key="limits.own") from error
-    return limit
+        trips = [limit.check(samples) for limit in self._limits]
+        return min(filter(None, trips), key=itemgetter(0), default=None)
 
 
 def _built_in(config: RigConfig) -> list[Limit]:
@@ -88,11 +73,17 @@ def _built_in(config: RigConfig) -> list[Limit]:
 
 
 class _UserCode(Limit):
-    """A limit of a user's own: what is wrong with it names its class."""
+    """A limit of a user's own: errors in its constructor or its methods name its class."""
 
-    def __init__(self, limit: Limit) -> None:
-        self._limit = limit
-        self._name = f"the limit {type(limit).__name__}"
+    def __init__(self, settings: UserLimit) -> None:
+        try:
+            self._limit: Limit = settings.make()
+        except RigError:
+            raise
+        except USER_CODE_ERRORS as error:
+            problem = f"{settings.use} cannot be made: {type(error).__name__}: {error}"
+            raise ConfigError(problem, key="limits.own") from error
+        self._name = f"the limit {type(self._limit).__name__}"
 
     def begin(self, phase: Phase, sample_rate: float) -> None:
         with self._blamed():

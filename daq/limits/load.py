@@ -68,7 +68,6 @@ class I2t(Limit):
         self._name, self._continuous, self._budget = name, load.continuous, load.budget
         self._square = load.continuous**2
         self._level = 0.0
-        self._dt, self._tick = 1.0, -1
 
     def begin(self, phase: Phase, sample_rate: float) -> None:
         """The heat stays; only time begins anew."""

@@ -18,12 +18,10 @@ class Jump(Limit):
 
     def __init__(self, fastest: float) -> None:
         self._fastest = fastest
-        self._most = math.inf  # rad per tick
-        self._theta, self._tick = math.nan, -1
 
     def begin(self, phase: Phase, sample_rate: float) -> None:
         """The first angle of a phase follows none."""
-        self._most = self._fastest / sample_rate
+        self._most = self._fastest / sample_rate  # rad per tick
         self._theta, self._tick = math.nan, -1
 
     def check(self, samples: Samples) -> Trip | None:
@@ -54,9 +52,6 @@ class _Standstill(Limit):
 
     def __init__(self, name: str) -> None:
         self._name = name
-        self._value = math.nan
-        self._rate = 1.0
-        self._standing = 0.0  # how much speaks against it since it stands still
 
     def begin(self, phase: Phase, sample_rate: float) -> None:
         """Start anew."""
@@ -87,7 +82,7 @@ class _Standstill(Limit):
 
     def _changed(self, n_samples: int) -> None:
         """So many samples, none of which reads what the one before did."""
-        self._standing = 0.0
+        self._standing = 0.0  # how much speaks against it since it stands still
 
     @abc.abstractmethod
     def _stood(self, samples: Samples, row: int) -> str | None:
@@ -143,22 +138,19 @@ class Frozen(_Standstill):
         self._seconds = seconds
         self._command = f"applied_voltage_{command}" if command else None
         self._longest = self._seen = 0  # samples of the calibration
-        self._learning = False
-        self._most = math.inf  # samples it may stand still
-        self._least = 1  # samples that any verdict takes
-        self._unchanged = self._disobeyed = 0  # samples, those under another command than at first
-        self._first_command = math.nan  # V, since it stands still
 
     def begin(self, phase: Phase, sample_rate: float) -> None:
         """Learn from the calibration, watch from then on."""
         self._learning = phase is Phase.CALIBRATION
-        self._least = max(2, round(self._seconds * sample_rate))
+        self._least = max(2, round(self._seconds * sample_rate))  # samples that any verdict takes
         has_noise = self._seen > 0 and _RARER * self._longest <= self._seen
+        # Samples it may stand still.
         self._most = max(self._least, _RARER * self._longest) if has_noise else math.inf
         super().begin(phase, sample_rate)
 
     def _changed(self, n_samples: int) -> None:
-        self._unchanged, self._disobeyed, self._first_command = 0, 0, math.nan
+        self._unchanged = self._disobeyed = 0  # samples, those under another command than at first
+        self._first_command = math.nan  # V, since it stands still
         if self._learning and n_samples:
             self._seen += n_samples
             self._longest = max(self._longest, 1)

@@ -46,7 +46,6 @@ class Travel(Limit):
     def __init__(self, low: float, high: float) -> None:
         self._low, self._high = low, high
         self._position = _Position()
-        self._least, self._most = -math.inf, math.inf  # rad
 
     def begin(self, phase: Phase, sample_rate: float) -> None:
         """Turns are counted on."""
@@ -60,7 +59,7 @@ class Travel(Limit):
         """Compare the angle with the two ends."""
         theta = samples.theta
         if self._position.see(theta):
-            self._least, self._most = map(self._position.angle, (self._low, self._high))
+            self._least, self._most = map(self._position.angle, (self._low, self._high))  # rad
         if len(theta) == 1 and self._least <= theta.item() <= self._most:
             return None
         row = first_row((theta < self._least) | (theta > self._most))

@@ -43,7 +43,8 @@ class Capture:
             "software": software_versions(),
             "host": {"system": platform.platform(), "node": platform.node()},
         }
-        folder = _new_folder(root, f"{now:%Y%m%dT%H%M%SZ}-{_file_name(name)}")
+        kept = "".join(c if c.isalnum() or c in "-_." else "-" for c in name).strip("-.")
+        folder = _new_folder(root, f"{now:%Y%m%dT%H%M%SZ}-{kept or 'run'}")
         capture = cls(folder, facts)
         capture._save()
         capture._reserve()
@@ -93,8 +94,3 @@ def _new_folder(root: Path, stem: str) -> Path:
                 break
     problem = "no capture folder can be made here"
     raise ConfigError(problem, cure="choose another with --out", file=root)
-
-
-def _file_name(name: str) -> str:
-    kept = "".join(c if c.isalnum() or c in "-_." else "-" for c in name).strip("-.")
-    return kept or "run"

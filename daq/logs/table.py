@@ -29,10 +29,7 @@ _TEXT_CONTROLS = b"\t\n\r\f"
 
 @dataclass(frozen=True)
 class Layout:
-    """How a table is written.
-
-    line: of its header, counted from 1. names: in the header. separator: between cells.
-    """
+    """How a table is written: the line of its header, from 1, the names in it, the separator."""
 
     line: int
     names: list[str]
@@ -87,9 +84,8 @@ def _cells(path: Path, text: str, layout: Layout) -> pd.DataFrame:
     import pandas as pd
 
     try:
-        return _parsed(
-            io.StringIO(text), layout, dtype=str, sep=layout.separator, skiprows=layout.line
-        )
+        source, separator = io.StringIO(text), layout.separator
+        return _parsed(source, layout, dtype=str, sep=separator, skiprows=layout.line)
     except pd.errors.ParserWarning:
         lines = text.splitlines()
         n_columns = len(layout.names)
@@ -131,10 +127,7 @@ def _parsed(source: IO[Any], layout: Layout, dtype: type, **options: Any) -> pd.
 
 
 def _plain_numbers(path: Path, layout: Layout) -> tuple[pd.DataFrame, bool] | None:
-    """A table of nothing but finite numbers, and whether it is torn; None of any other.
-
-    Many times faster than by way of its cells, and rounded as ``float`` does it.
-    """
+    """A table of nothing but finite numbers, read quickly, and whether it is torn; else None."""
     import pandas as pd
 
     if layout.separator != ",":
@@ -186,10 +179,7 @@ def _names(line: str, separator: str) -> list[str]:
 
 
 def _complete_lines(path: Path, n_bytes: int = -1) -> tuple[str, bool]:
-    """The file's text up to its last complete line, and whether something was cut off.
-
-    n_bytes: how much to read, -1 for all.
-    """
+    """Text of a file's first bytes, -1 for all, to its last whole line; whether any was cut off."""
     try:
         with path.open("rb") as file:
             data = file.read(n_bytes)

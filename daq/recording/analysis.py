@@ -84,9 +84,7 @@ def recorded_experiment(folder: Path) -> Experiment:
         raise ConfigError(f"experiment: {error}", file=path) from None
 
 
-def conclude_or_warn(
-    experiment: Experiment, folder: Path, watch: Watch = ignore
-) -> Findings | None:
+def conclude_or_warn(experiment: Experiment, folder: Path, watch: Watch) -> Findings | None:
     """What follows from a run that has just ended; a warning says why nothing does."""
     try:
         return conclude(experiment, folder)
@@ -114,9 +112,8 @@ def conclude(experiment: Experiment, folder: Path) -> Findings | None:
         at = raised_in(type(experiment), error)
         raise RunError(f"no result: {error}{at}", file=folder) from None
     except USER_CODE_ERRORS as error:
-        raise RunError(
-            f"no result: {failure(experiment, 'in findings()', error)}", file=folder
-        ) from error
+        problem = failure(experiment, "in findings()", error)
+        raise RunError(f"no result: {problem}", file=folder) from error
     if findings is not None:
         _write(findings, folder / RESULTS)
     return findings

@@ -187,9 +187,8 @@ def draw_preview(preview: Preview, path: Path) -> None:
         raise ConfigError(
             f"--plot {path}: {experiment.protocol} says nothing beforehand "
             "of what its controller will ask for, so there is nothing to draw",
-            cure=(
-                "leave --plot out, or give the plan 'references' or the protocol a method 'preview'"
-            ),
+            cure="leave --plot out, or give the plan 'references' or the protocol a method "
+            "'preview'",
         )
     try:
         write_whole(path, style.render(figure, kind))

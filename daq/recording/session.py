@@ -43,9 +43,7 @@ class Session:
     device: Device
     plan: Plan
 
-    def record(
-        self, out: Path, *, validation: bool = False, watch: Watch = ignore
-    ) -> SessionResult:
+    def record(self, out: Path, *, validation: bool, watch: Watch) -> SessionResult:
         """Run the experiment, and then its validation run where there is one and it is wanted.
 
         Raises DeviceError, InterlockError, RunError, KeyboardInterrupt or Terminated; outputs are
@@ -62,10 +60,7 @@ class Session:
 
 @dataclass(frozen=True)
 class SessionResult:
-    """Runs that were recorded, and what follows from the first.
-
-    doubts: what is wrong with sensors or amplifiers by its log, with the cure.
-    """
+    """Runs that were recorded; of the first its findings, and doubts on sensors with the cures."""
 
     run: RunResult
     validation: RunResult | None
@@ -120,9 +115,8 @@ def record(
     if validation:
         changed = loaded.validation()
         if changed is None:
-            raise ConfigError(
-                "it has no 'validation' section", cure="add one", file=loaded.file.path
-            )
+            problem = "it has no 'validation' section"
+            raise ConfigError(problem, cure="add one", file=loaded.file.path)
         loaded = changed
     config, device = load_rig(str(rig or rig_for(str(experiment), watch)), options, watch)
     loaded.plan(config)

@@ -39,9 +39,9 @@ def publish_comparison(result: ComparisonResult) -> str:
         "outputs": result.outputs,
         "preferred_file": preferred.get("parameters_file"),
         "reproduction": {
-            "command": command_of(group.problem.request, *logs, models, result.request_words),
+            "command": command_of(group.problem.request, logs, models, result.request_words),
             "folder": str(Path.cwd()),
-            "logs": fingerprints(*logs),
+            "logs": fingerprints(logs),
         },
     }
     text = rendered("comparison.html.j2", document, variables, drawings)

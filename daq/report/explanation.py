@@ -101,7 +101,7 @@ def _data_sentence(logs: Sequence[Mapping[str, Any]]) -> str:
 
 def _errors(rows: Rows, baseline: Mapping[str, Any] | None, part: str) -> list[dict[str, Any]]:
     """A row for each output: errors of the model, then of the baseline, mean over the logs."""
-    columns = [rows.mean_errors(part)]
+    columns = [mean_errors(rows.logs[part])]
     if baseline is not None:
         columns.append(mean_errors(logs_of(baseline["metrics"], part)))
     return [{"name": name, "cells": [column[name] for column in columns]} for name in columns[0]]

@@ -35,8 +35,7 @@ class Picture:
     figure: Figure
 
 
-Drawing = tuple[Picture, bytes]
-"""A figure and its SVG."""
+Drawing = tuple[Picture, bytes]  # a figure and its SVG
 
 
 def page(

@@ -36,8 +36,7 @@ _OUTPUTS_A_FIGURE = 4
 _LOGS_A_PART = 3  # of more logs the worst, the middle and the best are shown
 _FELT, _FEWEST = 0.5, 4  # an input is seen in an output where so many coherences exceed this
 
-FreeRun = tuple[LoggedRecord, FloatArray]
-"""A log and the identified model's outputs in a free run over it, (n_samples, n_outputs)."""
+FreeRun = tuple[LoggedRecord, FloatArray]  # a log and the model's outputs, (n_samples, n_outputs)
 
 
 @dataclass(frozen=True)
@@ -233,9 +232,8 @@ def _frequency(subject: Subject) -> Iterator[Picture]:
     except ModelError:
         return  # too short, or of several sample rates: there is no estimate to show
     inputs = subject.model.inputs
-    densities = {
-        inputs[i].name: measured.input_density[:, i] for i in np.flatnonzero(measured.varied)
-    }
+    varied = np.flatnonzero(measured.varied)
+    densities = {inputs[i].name: measured.input_density[:, i] for i in varied}
     yield Picture(
         "spectra", "excitation",
         "Spectra of the excitation: power spectral density of the inputs, Welch's estimate from "

@@ -12,7 +12,7 @@ from daq.documents import plain
 from daq.figures import style
 from daq.files import make_folder, write_whole
 from daq.identification.baseline import Baseline, baseline_of
-from daq.identification.records import LoggedRecord
+from daq.identification.records import LoggedRecord, Split
 from daq.identification.request import SettingsRequest
 from daq.identification.result import Identification, errors_document
 from daq.logs.recording import read_record
@@ -34,17 +34,13 @@ def publish(result: Identification, folder: Path, watch: Watch = ignore) -> dict
     Raises RunError where the disk refuses.
     """
     watch(Progress("Report", 0, _STEPS, "linear baseline"))
-    training = [fitted.log for fitted in result.training]
-    validation = [fitted.log for fitted in result.validation]
-    linear = baseline_of(result.model, training, validation)
-    document = plain(_document(result, linear))
-    subject = Subject(
-        result.model,
-        document,
-        [(fitted.log, fitted.run) for fitted in result.training],
-        [(fitted.log, fitted.run) for fitted in result.validation],
-        linear if isinstance(linear, Baseline) else None,
-    )
+    logs = [fitted.log for fitted in result.training], [fitted.log for fitted in result.validation]
+    linear = baseline_of(result.model, *logs)
+    document = plain(_document(result, logs, linear))
+    parts = result.training, result.validation
+    training, validation = ([(fitted.log, fitted.run) for fitted in part] for part in parts)
+    baseline = linear if isinstance(linear, Baseline) else None
+    subject = Subject(result.model, document, training, validation, baseline)
     drawings: list[Drawing] = []
     for picture, files in draw(pictures(subject), folder / FIGURES, ["svg"]):
         drawings.append((picture, files["svg"]))
@@ -74,26 +70,20 @@ def draw(
 
 
 def command_of(
-    request: SettingsRequest,
-    training: Sequence[LoggedRecord],
-    validation: Sequence[LoggedRecord],
-    models: Sequence[str],
-    more: Sequence[str],
+    request: SettingsRequest, logs: Split, models: Sequence[str], more: Sequence[str]
 ) -> str:
     """What to type to identify the same again; more: words behind the options."""
-    paths = _paths(training)
-    words = ["rig", "identify", *map(str, paths)]
-    words += _option("validate", [path for path in _paths(validation) if path not in paths])
+    training, validation = map(_paths, logs)
+    words = ["rig", "identify", *map(str, training)]
+    words += _option("validate", [path for path in validation if path not in training])
     words += _option("config", request.config) + _option("model", list(models))
-    for name, value in (request.options or {}).items():
+    for name, value in request.options.items():
         if name not in ("seed", "model"):
             words += _option(name, value)
     return shlex.join([*words, *more, *_option("set", list(request.settings))])
 
 
-def fingerprints(
-    training: Sequence[LoggedRecord], validation: Sequence[LoggedRecord]
-) -> list[dict[str, Any]]:
+def fingerprints(logs: Split) -> list[dict[str, Any]]:
     """Size and hash of each log, so that it is known again."""
     return [
         {
@@ -104,12 +94,12 @@ def fingerprints(
             "sample_rate": 1.0 / log.dataset.dt,
             "sha256": hashlib.sha256(log.path.read_bytes()).hexdigest(),
         }
-        for use, logs in (("training", training), ("validation", validation))
-        for log in logs
+        for use, part in zip(("training", "validation"), logs, strict=True)
+        for log in part
     ]
 
 
-def _document(result: Identification, linear: Baseline | str) -> dict[str, Any]:
+def _document(result: Identification, logs: Split, linear: Baseline | str) -> dict[str, Any]:
     """The identification's document with what only the report says."""
     now = datetime.datetime.now(datetime.UTC)
     meanings = {p.name: p.description for p in result.model.parameters}
@@ -123,7 +113,7 @@ def _document(result: Identification, linear: Baseline | str) -> dict[str, Any]:
         },
         "search": {**result.document["search"], "history": history},
         "comparison": _comparison(result, linear),
-        "reproduction": _reproduction(result),
+        "reproduction": _reproduction(result, logs),
     }
 
 
@@ -137,23 +127,21 @@ def _comparison(result: Identification, linear: Baseline | str) -> dict[str, Any
     return {"name": linear.name, "orders": linear.orders, "metrics": metrics}
 
 
-def _reproduction(result: Identification) -> dict[str, Any]:
+def _reproduction(result: Identification, logs: Split) -> dict[str, Any]:
     """How to do it again: command, logs with their fingerprints, runs they came from."""
     problem = result.problem
-    model = problem.request.option("model")
+    model = problem.request.options.get("model")
     models = [] if model in (None, DEFAULT_MODEL) else [model]
     seed = ["--seed", str(problem.settings.seed)]
-    training = [fitted.log for fitted in result.training]
-    validation = [fitted.log for fitted in result.validation]
     return {
-        "command": command_of(problem.request, training, validation, models, seed),
+        "command": command_of(problem.request, logs, models, seed),
         "folder": str(Path.cwd()),
         "columns": problem.request.config if problem.mapping is not None else None,
         "hold_back": problem.settings.hold_back,
-        "logs": fingerprints(training, validation),
+        "logs": fingerprints(logs),
         "runs": [
             _run(record)
-            for path in _paths([*training, *validation])
+            for path in _paths([*logs[0], *logs[1]])
             if (record := read_record(path)) is not None
         ],
     }

@@ -10,7 +10,7 @@ from daq.errors import ConfigError
 from daq.figures.style import FORMATS
 from daq.identification import records
 from daq.identification.baseline import Baseline, baseline_of
-from daq.identification.records import LoggedRecord
+from daq.identification.records import LoggedRecord, Split
 from daq.identification.replay import read_parameters
 from daq.identification.settings import columns_of
 from daq.progress import Progress, Watch, ignore
@@ -51,10 +51,8 @@ def _report_in(folder: Path) -> Path:
             return place
     raise ConfigError(
         f"no {DATA} there",
-        cure=(
-            "name the folder of an identification, or of the run that it was "
-            "made from (rig identify writes it unless --no-report is given)"
-        ),
+        cure="name the folder of an identification, or of the run that it was made from (rig "
+        "identify writes it unless --no-report is given)",
         file=folder,
     )
 
@@ -81,9 +79,7 @@ def _restored(document: Mapping[str, Any], source: Path) -> Subject:
     return Subject(model, document, training, validation, baseline)
 
 
-def _logs(
-    reproduction: Mapping[str, Any], model: ProcessModel
-) -> tuple[list[LoggedRecord], list[LoggedRecord]]:
+def _logs(reproduction: Mapping[str, Any], model: ProcessModel) -> Split:
     """The logs as they were used; ConfigError for one that is gone or another now."""
     columns = columns_of(Path(reproduction["columns"]) if reproduction["columns"] else None, model)
     root = Path(reproduction["folder"])

@@ -39,9 +39,8 @@ def plan(experiment: Experiment, rig: RigConfig) -> Plan:
 def _check_homing(turns: float, rig: RigConfig) -> None:
     least, travel = rig.limits.winding, rig.limits.travel
     if turns > 0.0 and least is not None and turns <= least:
-        problem = (
-            f"{turns:g} turns are wound, and limits.winding of the rig's file wants {least:g} left"
-        )
+        limit = f"limits.winding of the rig's file wants {least:g} left"
+        problem = f"{turns:g} turns are wound, and {limit}"
         raise ConfigError(problem, cure="wind more", key="homing.turns")
     if travel is not None and turns > max(-travel[0], travel[1]):
         raise ConfigError(

@@ -55,10 +55,7 @@ def description_of(experiment: Experiment) -> dict[str, Any]:
 
 
 def rehearse(experiment: ClosedLoop, planned: Plan) -> None:
-    """Ask a controller of its own for its first answer, to a shaft at rest.
-
-    Most mistakes in one show there. Raises ConfigError.
-    """
+    """Ask a new controller for its first answer, where most mistakes show. Raises ConfigError."""
     dialogue = Dialogue(experiment, planned)
     with _before_the_run(experiment, "when asked for its first answer, at rest"):
         dialogue.answer(Sample(0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0))

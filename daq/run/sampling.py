@@ -69,9 +69,8 @@ class Sampling:
             trip = self._limits.check(samples)
             if trip is not None:
                 self.rig.safe()
-                raise InterlockError(
-                    f"interlock during {self.phase.value}: {trip[1]}; outputs are zero"
-                )
+                where = f"interlock during {self.phase.value}"
+                raise InterlockError(f"{where}: {trip[1]}; outputs are zero")
             yield samples
             missing = int(samples.tick[-1]) + 1 + ahead - sent
             if missing > 0:

@@ -92,10 +92,9 @@ def fit(plot: figure, sources: Sources) -> None:
     if not high - low > 0.0:
         low, high = low - 1.0, high + 1.0
     shown: Any = plot.y_range
-    fits = shown.start <= low and high <= shown.end
-    if math.isfinite(high - low) and not (
-        fits and high - low > _FILLED * (shown.end - shown.start)
-    ):
+    inside = shown.start <= low and high <= shown.end
+    fits = inside and high - low > _FILLED * (shown.end - shown.start)
+    if math.isfinite(high - low) and not fits:
         margin = _MARGIN * (high - low)
         shown.update(start=low - margin, end=high + margin)
 
@@ -104,9 +103,8 @@ def make_value_table(values: ColumnDataSource, n_rows: int) -> figure:
     """The values at one time, drawn: new cells in a page's text would have it laid out anew."""
     x_range, y_range = Range1d(start=0, end=390), Range1d(start=n_rows - 0.5, end=-0.5)
     table = figure(width=390, height=24 * n_rows, x_range=x_range, y_range=y_range, tools="")
-    table.update(
-        title=None, toolbar_location=None, outline_line_color=None, min_border=0, name="table"
-    )
+    table.name = "table"
+    table.update(title=None, toolbar_location=None, outline_line_color=None, min_border=0)
     table.axis.visible = False
     table.grid.visible = False
     table.scatter(x=10, y="row", source=values, marker="square", size=10, color="color")

@@ -69,8 +69,6 @@ class Page:
         self._timer = document.add_periodic_callback(self._update, _PERIOD)
         self._update()
 
-    # --- 30 times a second --------------------------------------------------------------------
-
     def _update(self) -> None:
         try:
             self._advance()
@@ -100,8 +98,8 @@ class Page:
 
     def _browser_is_behind(self) -> bool:
         """Whether the last updates have not been drawn yet: more of them would only queue up."""
-        waiting, seen = time.monotonic() - self._sent_at < _LOST, cast(int, self._seen.start)
-        return waiting and self._tick - seen > _AHEAD
+        waiting = time.monotonic() - self._sent_at < _LOST
+        return waiting and self._tick - cast("int", self._seen.start) > _AHEAD
 
     def _show(self, log: FollowedLog | None) -> None:
         self._log = log
@@ -212,8 +210,6 @@ class Page:
         if values is None:
             return
         self._values.data = {**readout(self._columns, values, marked, self._cursor is not None)}
-
-    # --- what the user does -------------------------------------------------------------------
 
     def _follow(self) -> None:
         """Show the end of the run as it grows, or all of it."""

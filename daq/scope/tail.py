@@ -18,16 +18,9 @@ _BULK = 50_000  # bytes from which pandas is quicker than going by line
 _KEPT = 5  # problems described; further ones are counted
 
 
-@dataclass(frozen=True)
-class TailRows:
-    """Samples in the order of the file.
-
-    values: (n, n_columns), NaN where a cell holds no finite number. starts: (n + 1,), byte at
-    which each row's line begins, and the one after the last line.
-    """
-
-    values: FloatArray
-    starts: IntArray
+TailRows = tuple[FloatArray, IntArray]
+"""Samples in the order of the file, (n, n_columns), NaN where a cell holds no finite number; and
+the bytes at which their lines begin, and the one after the last, (n + 1,)."""
 
 
 @dataclass
@@ -70,16 +63,16 @@ class LogTail:
             return 0
 
     def poll(self) -> TailRows:
-        """Rows written since the last call, in up to ``CHUNK`` bytes."""
+        """TailRows written since the last call, in up to ``CHUNK`` bytes."""
         data = self._whole_lines()
         if data and self._layout is None:
             data = self._take_header(data)
         if not data or not self.columns:
-            return TailRows(np.empty((0, len(self.columns))), np.array([self.offset]))
-        rows = self._parse(data, self.problems)
+            return np.empty((0, len(self.columns))), np.array([self.offset])
+        values, starts = self._parse(data, self.problems)
         self._line += data.count(b"\n")
         self.offset += len(data)
-        return self._advancing(rows)
+        return self._advancing(values, starts)
 
     def read_between(self, start: int, end: int) -> FloatArray:
         """The rows whose lines stand in these bytes, once more, (n, n_columns)."""
@@ -89,10 +82,9 @@ class LogTail:
                 data = file.read(end - start)
         except OSError:
             data = b""
-        rows = self._parse(data[: data.rfind(b"\n") + 1], Problems()).values
+        values, _ = self._parse(data[: data.rfind(b"\n") + 1], Problems())
         # What was left out the first time is left out again.
-        time = rows[:, self.columns.index("t")]
-        return rows[_forward(time, -math.inf)]
+        return values[_forward(values[:, self.columns.index("t")], -math.inf)]
 
     def torn(self) -> bool:
         """Whether the file ends in a line without its end."""
@@ -130,13 +122,12 @@ class LogTail:
         self._layout = layout
         self._places = sorted(first.values())
         self.columns = tuple(layout.names[place] for place in self._places)
+        at = f"line {layout.line}"
         for name in sorted({name for name, _ in named if layout.names.count(name) > 1}):
-            self.problems.note(
-                f"line {layout.line}: column {name!r} stands twice; the first counts"
-            )
+            self.problems.note(f"{at}: column {name!r} stands twice; the first counts")
         missing = [name for name in ORIGINAL_COLUMNS if name not in first]
         if missing:
-            self.problems.note(f"line {layout.line}: without column {', '.join(missing)}")
+            self.problems.note(f"{at}: without column {', '.join(missing)}")
         self._line = layout.line
         self.offset = _line_starts(data)[layout.line]
         return data[self.offset :]
@@ -147,11 +138,11 @@ class LogTail:
         if len(data) > _BULK:
             values = _parse_bulk(data, self._layout, self._places)
             if values is not None and len(values) == len(starts) - 1:
-                return TailRows(values, starts)
+                return values, starts
         return self._parse_lines(data, starts, problems)
 
     def _parse_lines(self, data: bytes, starts: IntArray, problems: Problems) -> TailRows:
-        """Rows by line; other lines are left out, other cells become NaN."""
+        """TailRows by line; other lines are left out, other cells become NaN."""
         assert self._layout is not None
         names, separator = self._layout.names, self._layout.separator
         kept: list[int] = []
@@ -168,17 +159,16 @@ class LogTail:
             for place in self._places:
                 row.append(_number(cells[place], separator))
                 if math.isnan(row[-1]):
-                    problems.note(
-                        f"{at}: {names[place]}: {cells[place].strip()[:20]!r} is no number"
-                    )
+                    cell = cells[place].strip()[:20]
+                    problems.note(f"{at}: {names[place]}: {cell!r} is no number")
             kept.append(index)
             values.append(row)
         table = np.array(values, dtype=np.float64).reshape(len(values), len(self.columns))
-        return TailRows(table, np.append(starts[kept], starts[-1]))
+        return table, np.append(starts[kept], starts[-1])
 
-    def _advancing(self, rows: TailRows) -> TailRows:
+    def _advancing(self, values: FloatArray, starts: IntArray) -> TailRows:
         """The rows in which time advances."""
-        time = rows.values[:, self.columns.index("t")]
+        time = values[:, self.columns.index("t")]
         good = _forward(time, self._last_time)
         if not good.all():
             wrong = int(np.count_nonzero(~good))
@@ -188,7 +178,7 @@ class LogTail:
             )
         if good.any():
             self._last_time = float(time[good][-1])
-        return TailRows(rows.values[good], np.append(rows.starts[:-1][good], rows.starts[-1]))
+        return values[good], np.append(starts[:-1][good], starts[-1])
 
 
 def _forward(time: FloatArray, last: float) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
@@ -211,9 +201,8 @@ def _header_fault(layout: Layout) -> str | None:
         return None
     if names and all(not math.isnan(_number(name, layout.separator)) for name in names):
         return f"line {layout.line}: numbers where the column names should be"
-    return (
-        f"line {layout.line}: column 't' (time in s) is missing; there are {', '.join(names)[:200]}"
-    )
+    listed = ", ".join(names)[:200]
+    return f"line {layout.line}: column 't' (time in s) is missing; there are {listed}"
 
 
 def _number(cell: str, separator: str) -> float:

@@ -63,10 +63,8 @@ def readout(
         elif marked is not None:
             difference = _figures(name, values[place] - marked[place], 5, "+")
         rows.append((place + 1, color_of(name), name, value, unit, difference, "normal"))
-    return {
-        field: list(cells)
-        for field, cells in zip(VALUE_FIELDS, zip(*rows, strict=True), strict=True)
-    }
+    cells = map(list, zip(*rows, strict=True))
+    return dict(zip(VALUE_FIELDS, cells, strict=True))
 
 
 def _title(log: FollowedLog) -> str:

@@ -47,21 +47,21 @@ class RunState:
             return cls()
         sections = [record.get(key) for key in ("experiment", "rig")]
         experiment, rig = (section if isinstance(section, dict) else {} for section in sections)
-        rate, duration = experiment.get("sample_rate"), experiment.get("duration")
+        rate, duration = (experiment.get(key) for key in ("sample_rate", "duration"))
+        expected_rows = None
+        if isinstance(rate, int | float) and isinstance(duration, int | float):
+            expected_rows = round(rate * duration)
         details = {
             "rig": rig.get("name"),
             "protocol": experiment.get("protocol"),
             "started": str(record.get("started", ""))[:19].replace("T", " ") + " UTC",
             "sample rate": f"{rate:g} Hz" if isinstance(rate, int | float) else None,
         }
-        rows = None
-        if isinstance(rate, int | float) and isinstance(duration, int | float):
-            rows = round(rate * duration)
         return cls(
             status=str(record.get("status")),
             reason=str(record["reason"]) if record.get("reason") else None,
             details={name: str(value) for name, value in details.items() if value},
-            expected_rows=rows,
+            expected_rows=expected_rows,
         )
 
 
@@ -101,11 +101,11 @@ class FollowedLog:
         if self.tail.size() < self.tail.offset:
             # Another file under the same name.
             self.tail, self.history = LogTail(self.path), None
-        rows = self.tail.poll()
+        values, starts = self.tail.poll()
         if self.history is None and self.tail.columns:
             self.history = History(self.tail.columns, self.tail.read_between)
-        if self.history is not None and len(rows.values):
-            self.history.add(rows.values, rows.starts)
+        if self.history is not None and len(values):
+            self.history.add(values, starts)
             self._grew = time.monotonic()
 
     def look(self) -> None:

@@ -13,9 +13,7 @@ from typing import NamedTuple
 
 from cobs import cobs
 
-MAX_PAYLOAD = 4096
-"""Bytes of payload that no frame exceeds, in either direction."""
-
+MAX_PAYLOAD = 4096  # bytes that no frame's payload exceeds, in either direction
 _HEADER = struct.Struct("<BBHHH")
 _CRC = struct.Struct("<I")
 _SMALLEST = _HEADER.size + _CRC.size

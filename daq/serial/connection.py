@@ -137,11 +137,9 @@ class Connection:
                 f"{1e3 * _PING_PATIENCE:.0f} ms; check cable, connectors and baud rate",
                 file=self._port,
             )
-        slow = (
-            f"took {1e3 * clock.quickest:.0f} ms to answer"
-            if clock.round_trips
-            else f"does not answer within {1e3 * _PING_PATIENCE:.0f} ms"
-        )
+        slow = f"does not answer within {1e3 * _PING_PATIENCE:.0f} ms"
+        if clock.round_trips:
+            slow = f"took {1e3 * clock.quickest:.0f} ms to answer"
         raise DeviceError(
             f"the device {slow}, too slow for its watchdog of {1e3 * self._watchdog:.0f} ms. Look "
             "at the adapter's latency timer ('rig doctor'), at a hub in between, or raise "
@@ -246,17 +244,17 @@ class Inquiry:
 
 def inquire(ports: Sequence[PortFacts], baud: int) -> list[Inquiry]:
     """Ask all ports at once who is there; takes as long as the slowest answer."""
+
+    def ask(port: PortFacts) -> Inquiry:
+        try:
+            connection = Connection(port.name, baud)
+        except DeviceError as error:
+            return Inquiry(port, problem=error.mistakes[0].problem)
+        connection.close()
+        return Inquiry(port, connection.welcome)
+
     with ThreadPoolExecutor(max(1, len(ports))) as pool:
-        return list(pool.map(lambda port: _inquire(port, baud), ports))
-
-
-def _inquire(port: PortFacts, baud: int) -> Inquiry:
-    try:
-        connection = Connection(port.name, baud)
-    except DeviceError as error:
-        return Inquiry(port, problem=error.mistakes[0].problem)
-    connection.close()
-    return Inquiry(port, connection.welcome)
+        return list(pool.map(ask, ports))
 
 
 def _user() -> str:

@@ -53,8 +53,7 @@ class Counters:
     malformed: int = 0
     retries: int = 0
     resent_commands: int = 0
-    longest_pause: float = 0.0
-    """Longest time in which the device's watchdog was not fed [s]."""
+    longest_pause: float = 0.0  # s in which the device's watchdog was not fed
 
 
 class HostMachine:

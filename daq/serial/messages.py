@@ -16,15 +16,12 @@ import numpy.typing as npt
 
 from daq.hal import ANALOG_INPUTS, CHANNELS, Mode
 
-MALFORMED = (struct.error, ValueError, IndexError)
-"""What unpacking raises for a payload that is not of its type."""
+MALFORMED = (struct.error, ValueError, IndexError)  # raised by a payload that is not of its type
 
 VERSION = 1
 MAGIC = b"HRIG"
 
-COMMAND_DTYPE = np.dtype("<i2")
-"""Commands on the wire: converter codes, one per channel and tick."""
-
+COMMAND_DTYPE = np.dtype("<i2")  # a command on the wire: a converter code per channel and tick
 SAMPLE_DTYPE = np.dtype(
     [
         ("analog", "<i4", (len(ANALOG_INPUTS),)),
@@ -39,8 +36,7 @@ SAMPLE_DTYPE = np.dtype(
 Records = npt.NDArray[np.void]
 Codes = npt.NDArray[np.int16]
 
-CHANNEL_NAMES = (*ANALOG_INPUTS, *CHANNELS, "encoder")
-"""Order of the channel table."""
+CHANNEL_NAMES = (*ANALOG_INPUTS, *CHANNELS, "encoder")  # in the order of the channel table
 
 
 class Type(enum.IntEnum):
@@ -94,15 +90,9 @@ class Result(enum.IntEnum):
 # By their numbers on the wire; quicker than the enums.
 _STATES, _LATCHES, _MODES = tuple(State), tuple(Latch), tuple(Mode)
 
-RUN = struct.Struct("<H")
-"""Payload of GO and STOP: the run."""
-
-ANNOUNCE = struct.Struct("<B3xf")
-"""Payload of ANNOUNCE: the phase's number in the order of ``daq.hal.Phase``, and turns."""
-
-PING = struct.Struct("<Q")
-"""Payload of PING: the host's own time, which the device only returns."""
-
+RUN = struct.Struct("<H")  # payload of GO and STOP: the run
+ANNOUNCE = struct.Struct("<B3xf")  # the phase's number in the order of daq.hal.Phase, and turns
+PING = struct.Struct("<Q")  # the host's own time, which the device only returns
 _VERSIONED = struct.Struct("<4sH")
 _HELLO = struct.Struct("<4sH2x32s")
 _WELCOME = struct.Struct("<4sHBBIfIHHH2x32s32s32s")

@@ -39,25 +39,20 @@ class PortFacts:
 
 def ports_of(names: Sequence[str]) -> list[PortFacts]:
     """Ports of these device names or URLs; without any, all that have hardware behind them."""
-    ports = _system_ports()
-    by_name = {port.name: port for port in ports}
-    return [by_name.get(name, PortFacts(name, "")) for name in names] or ports
-
-
-def _system_ports() -> list[PortFacts]:
     from serial.tools import list_ports
 
     links = _BY_ID.iterdir() if _BY_ID.is_dir() else ()
     lasting_names = {os.path.realpath(link): str(link) for link in links}
     # The system names serial ports of mainboards that have none; those say nothing of hardware.
-    ports = [port for port in list_ports.comports() if port.hwid not in {None, "n/a"}]
-    facts = []
-    for port in sorted(ports, key=lambda port: port.device):
+    hardware = [port for port in list_ports.comports() if port.hwid not in {None, "n/a"}]
+    ports = {}
+    for port in sorted(hardware, key=lambda port: port.device):
         lasting_name = lasting_names.get(os.path.realpath(port.device))
         usb = f"{port.vid:04x}:{port.pid:04x}" if port.vid is not None else None
         _, timer = latency_timer(port.device) or (None, None)
-        facts.append(PortFacts(port.device, port.description or "", lasting_name, usb, timer))
-    return facts
+        description = port.description or ""
+        ports[port.device] = PortFacts(port.device, description, lasting_name, usb, timer)
+    return [ports.get(name, PortFacts(name, "")) for name in names] or list(ports.values())
 
 
 def _gone(port: str, error: Exception | None = None) -> DeviceError:
@@ -209,8 +204,7 @@ class SocketLink:
         )
 
 
-Link = SerialLink | SocketLink
-"""An open connection. Its methods raise DeviceError when it is gone, but for ``close``."""
+Link = SerialLink | SocketLink  # its methods raise DeviceError when it is gone, but for close
 
 
 def open_link(port: str, baud: int) -> Link:

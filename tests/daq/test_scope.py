@@ -44,10 +44,10 @@ def write_log(folder, n, **columns):
 
 def all_rows(tail):
     """Everything that can be read now."""
-    blocks, before = [tail.poll().values], 0
+    blocks, before = [tail.poll()[0]], 0
     while tail.offset > before:
         before = tail.offset
-        blocks.append(tail.poll().values)
+        blocks.append(tail.poll()[0])
     return np.concatenate(blocks)
 
 
@@ -61,11 +61,11 @@ def test_a_log_read_as_it_grows_is_the_log_read_at_its_end(tmp_path_factory, cut
     data = write_log(folder / "whole", n).read_bytes()
     growing = folder / "log.csv"
     tail = LogTail(growing)
-    assert len(tail.poll().values) == 0  # before there is a file
+    assert len(tail.poll()[0]) == 0  # before there is a file
     rows = []
     for cut in [*sorted(cut % len(data) for cut in cuts), len(data)]:
         growing.write_bytes(data[:cut])
-        rows += tail.poll().values.tolist()
+        rows += tail.poll()[0].tolist()
         assert not tail.problems.count and tail.fault is None
     expected = load(folder / "whole" / "log.csv").frame[list(COLUMNS)].to_numpy()
     assert tail.columns == COLUMNS

@@ -61,13 +61,9 @@ class SimulatedBoard:
     def start(self, rate: float, guard: CodedGuard) -> None:
         """Sampling from tick 0 on."""
         counts = (guard.counts_low, guard.counts_high, guard.count_rate, guard.count_step)
-        volts = Guard(
-            np.array(guard.command_low) * self._step_out,
-            np.array(guard.command_high) * self._step_out,
-            np.array(guard.analog_low) * self._step_in,
-            np.array(guard.analog_high) * self._step_in,
-            *(counts if self._watched else ()),
-        )
+        commands = np.array([guard.command_low, guard.command_high]) * self._step_out
+        analog = np.array([guard.analog_low, guard.analog_high]) * self._step_in
+        volts = Guard(*commands, *analog, *(counts if self._watched else ()))
         # Each tick comes with its command: missing ones are the machine's matter.
         self._device.start(rate, Mode.CLOSED_LOOP, volts)
         self._tick = 0

@@ -149,8 +149,7 @@ class TcpPort:
             self._host = None
 
 
-Port = PtyPort | TcpPort
-"""Where a host connects. Reading and writing never wait."""
+Port = PtyPort | TcpPort  # where a host connects; reading and writing never wait
 
 
 def port_of(link: Path | None, tcp: int | None) -> Port:

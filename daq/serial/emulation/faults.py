@@ -27,9 +27,7 @@ KINDS: dict[str, tuple[float | None, str]] = {
     "garbage": (1.0, "the device answers with random bytes"),
     "stuck-encoder": (1.0, "the counter stands still"),
 }
-EVENTS = frozenset({"stall", "disconnect", "reboot", "overflow"})
-"""Faults that happen at an instant, and not from then on."""
-
+EVENTS = frozenset({"stall", "disconnect", "reboot", "overflow"})  # at an instant, not from then on
 _PIECE_SECONDS = 1e-4  # between the pieces of a frame that arrives split
 
 
@@ -48,24 +46,19 @@ def parse(text: str) -> Fault:
     what, _, when = text.partition("@")
     name, _, value = what.partition("=")
     if name not in KINDS:
-        raise ConfigError(
-            f"--fault {text}: unknown fault {name!r}; {suggestion(name, list(KINDS))}"
-        )
+        near = suggestion(name, list(KINDS))
+        raise ConfigError(f"--fault {text}: unknown fault {name!r}; {near}")
     default = KINDS[name][0]
     if not value and default is None:
         raise ConfigError(f"--fault {text}: give a value, {name}=NUMBER: {KINDS[name][1]}")
     phase_name, _, after = when.partition("+")
     phases = {phase.value: phase for phase in Phase}
     if when and phase_name not in phases:
-        raise ConfigError(
-            f"--fault {text}: unknown phase {phase_name!r}; {suggestion(phase_name, list(phases))}"
-        )
-    return Fault(
-        name,
-        _number(value, text) if value else default or 0.0,
-        phases.get(phase_name),
-        _number(after, text) if after else 0.0,
-    )
+        near = suggestion(phase_name, list(phases))
+        raise ConfigError(f"--fault {text}: unknown phase {phase_name!r}; {near}")
+    size = _number(value, text) if value else default or 0.0
+    seconds = _number(after, text) if after else 0.0
+    return Fault(name, size, phases.get(phase_name), seconds)
 
 
 def _number(text: str, whole: str) -> float:

@@ -20,15 +20,9 @@ from daq.serial.codec import Decoder, Frame
 from daq.serial.commands import CommandRing
 from daq.serial.messages import Block, Latch, Pong, Reply, Result, Start, State, Status, Type
 
-BLOCK_SECONDS = 0.02
-"""Samples that nobody waits for are sent in blocks of this length."""
-
-LINGER_SECONDS = 2.0
-"""Without a frame from the host for so long, a device stops sampling as well."""
-
-TRANSMIT_BUFFER = 65_536
-"""Bytes that may wait for the line; samples that would not fit are dropped and counted."""
-
+BLOCK_SECONDS = 0.02  # length of the blocks in which samples are sent that nobody waits for
+LINGER_SECONDS = 2.0  # without a frame from the host for so long, a device stops sampling as well
+TRANSMIT_BUFFER = 65_536  # bytes that may wait; samples beyond are dropped and counted
 _LARGEST_BLOCK = (codec.MAX_PAYLOAD - messages.SAMPLES_OVERHEAD) // messages.SAMPLE_DTYPE.itemsize
 _NEWER = 0x8000  # half of the sequence numbers are newer than a given one, half older
 
