@@ -68,17 +68,14 @@ class ConstantVelocity(VelocityLoop):
         seconds = longest(*visits)
         n_samples = self.samples_in(seconds, "measure")
         velocity, brake = quickest(*visits, self.sample_rate)
-        return Plan(
-            n_samples,
-            *command_bounds(self.motor_limit, self.brake_commands),
-            references={"omega_ref": velocity, "cmd_voltage_brake": brake},
-            remarks=(
-                f"It takes {len(velocity) / self.sample_rate:.4g} s if every velocity settles at "
-                f"once, {seconds:.4g} s at most.",
-                self._travel(),
-                self._strength(),
-            ),
+        bounds = command_bounds(self.motor_limit, self.brake_commands)
+        references = {"omega_ref": velocity, "cmd_voltage_brake": brake}
+        duration = (
+            f"It takes {len(velocity) / self.sample_rate:.4g} s if every velocity settles at once, "
+            f"{seconds:.4g} s at most."
         )
+        remarks = (duration, self._travel(), self._strength())
+        return Plan(n_samples, *bounds, references=references, remarks=remarks)
 
     def controller(self) -> Controller:
         """The staircase's loop."""

@@ -51,12 +51,10 @@ class HysteresisLoop(VelocityLoop):
         self.require_torque_constant()
         self.require_strength(self.brake_commands)
         swing = np.ptp(np.cumsum(velocity)) / self.sample_rate
-        return Plan(
-            len(velocity),
-            *command_bounds(self.motor_limit, self.brake_commands),
-            references={"omega_ref": velocity, "cmd_voltage_brake": brake},
-            remarks=(f"The shaft swings by {swing:.3g} rad, {swing / (2 * math.pi):.2g} turns.",),
-        )
+        bounds = command_bounds(self.motor_limit, self.brake_commands)
+        references = {"omega_ref": velocity, "cmd_voltage_brake": brake}
+        remark = f"The shaft swings by {swing:.3g} rad, {swing / (2 * math.pi):.2g} turns."
+        return Plan(len(velocity), *bounds, references=references, remarks=(remark,))
 
     def controller(self) -> Controller:
         """The velocity loop along the schedule."""

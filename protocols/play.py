@@ -56,11 +56,8 @@ class Play(OpenLoop):
     def describe(self) -> dict[str, Any]:
         """The experiment as resolved, and which file was played."""
         rows = self._read()
-        played = {
-            "file": str(rows.path.resolve()),
-            "sha256": hashlib.sha256(rows.path.read_bytes()).hexdigest(),
-            "rows": len(rows.time),
-        }
+        digest = hashlib.sha256(rows.path.read_bytes()).hexdigest()
+        played = {"file": str(rows.path.resolve()), "sha256": digest, "rows": len(rows.time)}
         return {**super().describe(), "excitation": played}
 
     def remarks(self) -> tuple[str, ...]:

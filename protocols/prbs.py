@@ -13,9 +13,7 @@ from protocols.waveforms import whole_samples
 
 REGISTER_BITS = 16
 SEQUENCE_LENGTH = 2**REGISTER_BITS - 1
-
-# Taps 16, 14, 13, 11 of a register whose bit 16 leaves first: as shifts of its value.
-_TAP_SHIFTS = (0, 2, 3, 5)
+_TAP_SHIFTS = (0, 2, 3, 5)  # taps 16, 14, 13, 11 of a register whose bit 16 leaves first
 
 
 class PrbsChannel(Section):
@@ -37,13 +35,12 @@ class Prbs(Timed):
 
     def waveform(self) -> FloatArray:
         """Both channels' sequences, (n_samples, 2) [V]."""
-        n_samples = self.n_samples
         columns = []
         for name in CHANNELS:
             channel: PrbsChannel = getattr(self, name)
             bits, hold = self._bits(name)
             levels = channel.offset + channel.amplitude * (2.0 * bits - 1.0)
-            columns.append(np.repeat(levels, hold)[:n_samples])
+            columns.append(np.repeat(levels, hold)[: self.n_samples])
         return np.stack(columns, axis=1)
 
     def remarks(self) -> tuple[str, ...]:
@@ -63,8 +60,7 @@ class Prbs(Timed):
     def _bits(self, name: str) -> tuple[IntArray, int]:
         """The bits of a channel, and for how many samples each is held."""
         channel: PrbsChannel = getattr(self, name)
-        period = channel.minimum_period
-        hold = whole_samples(f"{name}.minimum_period", period, self.sample_rate)
+        hold = whole_samples(f"{name}.minimum_period", channel.minimum_period, self.sample_rate)
         return lfsr_bits(channel.seed, math.ceil(self.n_samples / hold)), hold
 
 

@@ -5,8 +5,9 @@ from collections.abc import Mapping
 import numpy as np
 
 from daq.experiment import Controller, Plan
-from daq.findings import Axis, Chart, Findings, Series
+from daq.findings import Chart, Findings, Series
 from daq.hal import FloatArray, Samples
+from protocols.analysis.results import DAMPING, STIFFNESS
 from protocols.analysis.walls import WallFindings, WallTheory, visited
 from protocols.control.loop import command_bounds
 from protocols.control.wall import WallRenderer, WallSettings
@@ -27,24 +28,19 @@ class VirtualWall(WallSettings):
         self._check_times()
         cell = 2.0 * self.rest.time + self.tap.time + self.ringing.watch
         seconds = self.patience + len(self.cells) * cell + self.rest.time
-        return Plan(
-            self.samples_in(seconds, "stiffnesses"),
-            *command_bounds(self.motor_limit, self.brake_commands),
-            remarks=tuple(self._passivity(brake) for brake in self.brake_commands),
-        )
+        n_samples = self.samples_in(seconds, "stiffnesses")
+        bounds = command_bounds(self.motor_limit, self.brake_commands)
+        remarks = tuple(self._passivity(brake) for brake in self.brake_commands)
+        return Plan(n_samples, *bounds, remarks=remarks)
 
     def preview(self) -> Chart:
         """The walls that will be tried, beside what theory says of them."""
         stiff, damped = np.meshgrid(self.stiffnesses, self.dampings)
         walls = Series("walls to be tried", damped.ravel(), stiff.ravel(), style="points")
         brake = self.brake_commands[0]
-        return Chart(
-            "walls",
-            f"Walls to be tried, and theory with the brake at {brake:g} V",
-            Axis("damping", "N*m*s/rad"),
-            Axis("stiffness", "N*m/rad"),
-            (walls, *self.theory.bounds(brake)),
-        )
+        title = f"Walls to be tried, and theory with the brake at {brake:g} V"
+        series = (walls, *self.theory.bounds(brake))
+        return Chart("walls", title, DAMPING, STIFFNESS, series)
 
     def controller(self) -> Controller:
         """The renderer of the walls."""
@@ -73,17 +69,13 @@ class VirtualWall(WallSettings):
     def _passivity(self, brake: float) -> str:
         """Which of the walls are passive."""
         theory = self.theory
-        passive = [
-            cell
-            for cell in self.cells
-            if cell.brake == brake
-            and cell.stiffness < theory.passive_stiffness(brake, cell.damping)
-        ]
+        cells = [cell for cell in self.cells if cell.brake == brake]
+        passive = sum(x.stiffness < theory.passive_stiffness(brake, x.damping) for x in cells)
         name, with_brake = ("(1.2)", f", brake at {brake:g} V") if brake else ("(1.1)", "")
         total = len(self.cells) // len(self.brake_commands)
         return (
             f"Passive by {name}{with_brake}: b = {theory.damping(brake):.3g} N*m*s/rad > K T / 2 + "
             f"|B| holds up to K = {theory.passive_stiffness(brake, 0.0):.3g} N*m/rad without "
-            f"damping; {len(passive)} of the {total} walls are. "
+            f"damping; {passive} of the {total} walls are. "
             "The others are tried all the same: hold the handle firmly, and be ready to let go."
         )

@@ -43,9 +43,6 @@ _CONSTANTS = (
     fixed("n_c", "1", -1.0, "transmission ratio of the motor; -1 is a direct coupling", -100.0),
 )
 
-# Where each measured signal stands among the shaft's states.
-_OMEGA, _THETA = 4, 6
-
 # (x, u, p) -> angular acceleration, torque at the sensor, rates of the load's states
 _Shaft = Callable[[Any, Any, Any], tuple[Any, Any, tuple[Any, ...]]]
 
@@ -261,19 +258,17 @@ def _output(names: tuple[str, ...], shaft: _Shaft) -> Callable[..., tuple[Any, .
     pick = picker([order.index(name) for name in names])
 
     def output(x: Any, u: Any, p: Any) -> tuple[Any, ...]:
-        torque = shaft(x, u, p)[1]
-        return pick((x[2], x[3], torque, x[_THETA], x[_OMEGA]))
+        i_m, i_b, omega, _z, theta = x[2:7]
+        return pick((i_m, i_b, shaft(x, u, p)[1], theta, omega))
 
     return output
 
 
 def _description(design: Design) -> str:
     motor, brake = design.driver_motor, design.driver_brake
-    drivers = (
-        f"{motor}-loop drivers"
-        if motor == brake
-        else f"{motor}-loop motor and {brake}-loop brake driver"
-    )
+    drivers = f"{motor}-loop drivers"
+    if motor != brake:
+        drivers = f"{motor}-loop motor and {brake}-loop brake driver"
     kind = {"bouc-wen": "Bouc-Wen", "dahl": "Dahl", "lugre": "LuGre"}[design.hysteresis]
     brushes = {"none": "", "stribeck": ", brush friction", "cyclic": ", cyclic brush friction"}
     return (

@@ -1,11 +1,9 @@
 """The simulated rig: plant, sensing chain and a user at the handle, behind the HAL."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import time
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
@@ -95,7 +93,7 @@ class Simulation(Section):
         return path
 
     @model_validator(mode="after")
-    def _has_a_hand(self) -> Simulation:
+    def _has_a_hand(self) -> Self:
         if self.hand and self.plant.load != "hand":
             raise ValueError(
                 f"hand: moves load 'hand', but the load is {self.plant.load!r}; "
@@ -119,12 +117,10 @@ class SimulatedDevice:
         self._user = SimulatedUser(options.plant.load == "hand", options.hand)
         self._rng = np.random.default_rng(options.seed)
         worst = 0.0 if options.ideal else options.imperfections.offset
-        self._converters = Converters(
-            np.array([options.current_sense, options.current_sense, options.torque_sense]),
-            self._rng.uniform(-worst, worst, len(ANALOG_INPUTS)),
-            options.imperfections.noise,
-            0.0 if options.ideal else 2.0 * converters.RANGE / 2**options.imperfections.bits,
-        )
+        senses = np.array([options.current_sense, options.current_sense, options.torque_sense])
+        offsets = self._rng.uniform(-worst, worst, len(ANALOG_INPUTS))
+        step = 0.0 if options.ideal else 2.0 * converters.RANGE / 2**options.imperfections.bits
+        self._converters = Converters(senses, offsets, options.imperfections.noise, step)
         self._noise, self._noise_used = np.empty((0, len(ANALOG_INPUTS))), 0
         self._n_inputs = len(self._plant.inputs)
         self._single = np.zeros((2, self._n_inputs))
@@ -164,12 +160,9 @@ class SimulatedDevice:
         if not self._open:
             raise DeviceError("the simulated rig is not open; open it before starting")
         if sample_rate not in self._steppers:
+            plant, scale = self._plant, state_sizes(self._plant)
             self._steppers[sample_rate] = Stepper(
-                self._plant,
-                self._plant.nominal,
-                1.0 / sample_rate,
-                scale=state_sizes(self._plant),
-                accuracy=_ACCURACY,
+                plant, plant.nominal, 1.0 / sample_rate, scale=scale, accuracy=_ACCURACY
             )
         self._stepper = self._steppers[sample_rate]
         self._rate, self._guard, self._interlock = sample_rate, guard, Interlock(guard)
@@ -289,14 +282,8 @@ class SimulatedDevice:
         """Latch, apply, advance: the samples of n ticks, and the plant's trace."""
         n, tick, per_tick = len(applied), self._queue.tick, self._stepper.n_steps
         trace, true = self._stepper.advance(self._x, self._inputs(applied))
-        counts, rates = self._encoder.latch(
-            trace[:, _THETA],
-            self._x[_THETA],
-            self._origin,
-            tick * per_tick,
-            1.0 / (self._rate * per_tick),
-            per_tick,
-        )
+        times = self._origin, tick * per_tick, 1.0 / (self._rate * per_tick), per_tick
+        counts, rates = self._encoder.latch(trace[:, _THETA], self._x[_THETA], *times)
         if self.options.ideal:
             per_radian = self._encoder.counts_per_turn / (2.0 * math.pi)
             counts, rates = true[:, 3] * per_radian, true[:, 4] * per_radian

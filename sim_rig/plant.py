@@ -1,9 +1,7 @@
 """The plant behind the simulated rig: which parts it has, and their values."""
 
-from __future__ import annotations
-
 import math
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from pydantic import Field, ValidationInfo, field_validator, model_validator
@@ -60,7 +58,7 @@ class Plant(Section):
         }
 
     @model_validator(mode="after")
-    def _can_be_built(self) -> Plant:
+    def _can_be_built(self) -> Self:
         self.build()
         return self
 

@@ -24,24 +24,19 @@ _TORQUE = Quantity("torque", "N*m")
 
 def plots(model: ProcessModel, evidence: Evidence) -> Iterator[Plot]:
     """Hysteresis loops of the identified model, and the torque as it was measured."""
-    for name, text, curves, points in (
-        (
-            "hysteresis",
+    loops, measured = _hysteresis_loops(model, evidence), _measured_torque(evidence.log)
+    if loops:
+        text = (
             "Torque that resists the shaft in the identified model, driven at a sinusoidal speed "
-            "with the brake's current held: over the angle, and over the speed.",
-            _hysteresis_loops(model, evidence),
-            False,
-        ),
-        (
-            "torque-velocity",
+            "with the brake's current held: over the angle, and over the speed."
+        )
+        yield Plot("hysteresis", "torque", text, _AXES, _TORQUE, loops)
+    if measured:
+        text = (
             "Torque at the sensor as measured in the training log, over the angle and over the "
-            "speed.",
-            _measured_torque(evidence.log),
-            True,
-        ),
-    ):
-        if curves:
-            yield Plot(name, "torque", text, _AXES, _TORQUE, curves, points=points)
+            "speed."
+        )
+        yield Plot("torque-velocity", "torque", text, _AXES, _TORQUE, measured, points=True)
 
 
 def operating_points(
@@ -61,12 +56,7 @@ def operating_points(
 
 
 def _hysteresis_loops(model: ProcessModel, evidence: Evidence) -> tuple[Curve, ...]:
-    """One loop for each brake current; none of a model without such a brake and shaft.
-
-    The speed is given and the motor's current zero, so that only the hysteresis moves. The
-    resisting torque is the one that the load would have to apply to keep the speed's derivative
-    zero, read from the model's own equation of the shaft.
-    """
+    """One loop for each brake current; none of a model without such a brake and shaft."""
     needed = {"omega", "current_brake", "z"}
     if not needed <= set(model.state_names) or "torque" not in model.input_names:
         return ()
@@ -104,7 +94,7 @@ def _measured_torque(log: Mapping[str, FloatArray]) -> tuple[Curve, ...]:
 
 @dataclass(frozen=True)
 class _DrivenShaft:
-    """A shaft at a prescribed speed."""
+    """A shaft at a prescribed speed, without motor current."""
 
     model: ProcessModel
     parameters: tuple[float, ...]
@@ -134,12 +124,9 @@ class _DrivenShaft:
 
     def _state(self, t: float, z: float, current: float) -> tuple[float, ...]:
         rate = 2.0 * np.pi * _FREQUENCY
-        given = {
-            "omega": self.amplitude * float(np.sin(rate * t)),
-            "theta": -self.amplitude / rate * float(np.cos(rate * t)),
-            "z": z,
-            "current_brake": current,
-        }
+        omega = self.amplitude * float(np.sin(rate * t))
+        theta = -self.amplitude / rate * float(np.cos(rate * t))
+        given = {"omega": omega, "theta": theta, "z": z, "current_brake": current}
         return tuple(given.get(name, 0.0) for name in self.model.state_names)
 
     def _slopes(self, x: tuple[float, ...], load: float = 0.0) -> tuple[float, ...]:
@@ -147,6 +134,7 @@ class _DrivenShaft:
         return self.model.derivative(x, u, self.parameters)
 
     def _torque(self, x: tuple[float, ...]) -> float:
+        """The torque that the load has to apply to keep the speed's derivative zero."""
         omega = self.model.state_names.index("omega")
         free, loaded = self._slopes(x)[omega], self._slopes(x, 1.0)[omega]
         return float(-free / (loaded - free))

@@ -55,12 +55,9 @@ def show_findings(findings: Findings, folder: Path) -> None:
     from daq.recording.analysis import RESULTS
 
     if findings.numbers:
-        terminal.print_table(
-            "Results",
-            ["quantity", "value", "95 % interval", "unit", "meaning"],
-            [_number_row(number) for number in findings.numbers],
-            text=["unit", "meaning"],
-        )
+        head = ["quantity", "value", "95 % interval", "unit", "meaning"]
+        numbers = [_number_row(number) for number in findings.numbers]
+        terminal.print_table("Results", head, numbers, text=["unit", "meaning"])
     for table in filter(lambda table: table.printed, findings.tables):
         units = {name: f" [{unit}]" for name, unit in table.units.items()}
         heads = [f"{name}{units.get(name, '')}" for name in table.columns]

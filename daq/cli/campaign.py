@@ -67,12 +67,10 @@ def campaign(
 def _show(result: CampaignResult) -> None:
     runs = result.campaign
     print()
-    terminal.print_table(
-        "Error over seeds: mean over outputs of the RMSE in parts of max|y|",
-        ["model", "log", "runs", "best", "median", "worst", "within 1 %", "fit [%]", "failed"],
-        [_spread_row(spread, result) for spread in runs.spread()],
-        text=["log"],
-    )
+    title = "Error over seeds: mean over outputs of the RMSE in parts of max|y|"
+    head = ["model", "log", "runs", "best", "median", "worst", "within 1 %", "fit [%]", "failed"]
+    rows = [_spread_row(spread, result) for spread in runs.spread()]
+    terminal.print_table(title, head, rows, text=["log"])
     for problem in dict.fromkeys(f"{o.run.name}: {o.problem}" for o in runs.failed):
         print(f"Failed: {problem}")
     if runs.interrupted:

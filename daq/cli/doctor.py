@@ -35,7 +35,7 @@ def doctor(
     else:
         cells = [[check.subject, check.verdict, check.observation] for check in checks]
         head = ["what", "verdict", "found"]
-        terminal.print_table("This computer", head, cells, text=["verdict", "found"])
+        terminal.print_table("This computer", head, cells, text=head)
         for check in checks:
             if check.cure:
                 print(f"{check.subject}: {check.cure}")

@@ -83,12 +83,10 @@ def _list_faults(json: bool) -> None:
     if json:
         terminal.print_json({name: {"default": value, "does": text} for name, value, text in kinds})
         return
-    terminal.print_table(
-        "Faults for --fault NAME[=VALUE][@PHASE[+SECONDS]]",
-        ["name", "default", "what it does"],
-        [[name, "-" if value is None else f"{value:g}", text] for name, value, text in kinds],
-        text=["what it does"],
-    )
+    title = "Faults for --fault NAME[=VALUE][@PHASE[+SECONDS]]"
+    head = ["name", "default", "what it does"]
+    rows = [[name, "-" if value is None else f"{value:g}", text] for name, value, text in kinds]
+    terminal.print_table(title, head, rows, text=["what it does"])
     print(
         "Phases: open, calibration, homing, run, safe. Without one a fault is there from the start."
     )

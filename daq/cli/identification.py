@@ -1,4 +1,4 @@
-"""What an identification says: tables and sentences on a terminal, a document for machines."""
+"""What identifications say: tables and sentences on a terminal, a document for machines."""
 
 from __future__ import annotations
 
@@ -10,8 +10,11 @@ from daq import notation
 from daq.cli import terminal
 
 if TYPE_CHECKING:
+    from daq.identification.comparison import ComparisonResult, SeedsResult
     from daq.identification.result import Identification
     from daq.identification.rows import LogErrors, OutputErrors, ParameterRow, QuantityRow, Rows
+    from sysid import Campaign
+    from sysid.judging.comparison import Row
     from sysid.uncertainty import Profile
 
 _STRONG = 0.95  # correlation above which two parameters are named together
@@ -127,13 +130,9 @@ def _show_open_questions(rows: Rows) -> None:
     if vague:
         names = "; ".join(" with ".join(a.parameters) for a in vague)
         terminal.print_text(f"Hardly felt by these data: {names}.")
-    close = [
-        f"{first} and {second}"
-        for (first, second), coefficient in rows.correlations.items()
-        if abs(coefficient) > _STRONG
-    ]
+    close = [pair for pair, value in rows.correlations.items() if abs(value) > _STRONG]
     if close:
-        pairs = "; ".join(close)
+        pairs = "; ".join(" and ".join(pair) for pair in close)
         terminal.print_text(f"Known mostly together (correlation above {_STRONG:g}): {pairs}.")
     if rows.ambiguities_of("product", "sum", "vague") or close:
         print()
@@ -260,3 +259,82 @@ def _print_logs(title: str, logs: Sequence[LogErrors], mean: Mapping[str, Output
         fits = [f"{errors.fit_percent:.1f}" for errors in outputs.values()]
         rows.append([name, *fits, *(terminal.number(e.rmse, 3) for e in outputs.values())])
     terminal.print_table(title, head, rows)
+
+
+def show_comparison(
+    result: ComparisonResult | SeedsResult, report: bool, json: bool
+) -> dict[str, Any]:
+    """Print a comparison and write its page; the document for machines."""
+    from daq.identification.comparison import ComparisonResult
+
+    if not isinstance(result, ComparisonResult):
+        return show_identification(result.best, report, json, _runs_lines(result.campaign))
+    files: dict[str, Any] = {"comparison": str(result.file)}
+    if not json:
+        _show_comparison(result)
+    if report:
+        from daq.report.comparison import publish_comparison  # matplotlib, as for reports
+
+        files["page"] = publish_comparison(result)
+        if not json:
+            print(f"Page: {files['page']}")
+    preferred = result.files.get(result.comparison.preferred)
+    if not json and preferred is not None:
+        terminal.print_next(f"rig replay LOG --parameters {preferred}")
+    return {**result.document, "files": files}
+
+
+def _show_comparison(result: ComparisonResult) -> None:
+    comparison = result.comparison
+    print()
+    if comparison.validated:
+        title = "Validation, free run: RMSE in parts of max|y| (fit in %)"
+        head = ["structure", *result.outputs, "squared errors", "95 % interval", ""]
+        rows = [_validation_row(row) for row in comparison.rows]
+        terminal.print_table(title, head, rows, text=[""])
+    head = ["structure", "free parameters", "effective", "mean RMSE", "dAIC", "dBIC"]
+    terminal.print_table("Training", head, [_training_row(row) for row in comparison.rows])
+    terminal.print_text(
+        f"AIC and BIC count {comparison.n_samples} training samples as "
+        f"{comparison.n_independent:.0f} independent ones."
+    )
+    terminal.print_text(comparison.verdict)
+    for line in _runs_lines(result.campaign):
+        terminal.print_text(line)
+    for name, path in result.files.items():
+        print(f"Parameters of {name}: {path}")
+    print(f"Comparison: {result.file}")
+
+
+def _runs_lines(campaign: Campaign) -> list[str]:
+    """Spread over seeds, what failed, and whether Ctrl-C ended it."""
+    number = terminal.number
+    lines = [
+        f"{spread.model}: error of {spread.runs} seeds {number(spread.best)} to "
+        f"{number(spread.worst)}, {spread.agreeing} within 1 % of the best."
+        for spread in campaign.spread()
+        if spread.runs > 1
+    ]
+    problems = dict.fromkeys(f"{o.run.name}: {o.problem}" for o in campaign.failed)
+    lines += [f"Failed: {problem}" for problem in problems]
+    if campaign.interrupted:
+        lines.append(f"Stopped by Ctrl-C after {len(campaign.outcomes)} runs.")
+    return lines
+
+
+def _validation_row(row: Row) -> list[str]:
+    cells = [
+        f"{terminal.number(float(rmse), 3)} ({fit:.1f})"
+        for rmse, fit in zip(row.rmse, row.fit, strict=True)
+    ]
+    ratio = row.ratio
+    if ratio is None:
+        return [row.name, *cells, "", "", row.verdict]
+    interval = f"{ratio.low:.3g} .. {ratio.high:.3g}"
+    return [row.name, *cells, f"x {ratio.value:.3g}", interval, row.verdict]
+
+
+def _training_row(row: Row) -> list[str]:
+    error = terminal.number(row.training_error, 3)
+    counts = [str(row.n_free), str(row.n_effective)]
+    return [row.name, *counts, error, f"{row.daic:.1f}", f"{row.dbic:.1f}"]

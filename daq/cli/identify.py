@@ -7,7 +7,7 @@ from typing import Annotated, Any
 from typer import BadParameter, Context, Option
 
 from daq.cli import options, terminal
-from daq.cli.identification import show_identification
+from daq.cli.identification import show_comparison, show_identification
 
 _WITH_RESUME = {"resume", "report", "json", "quiet", "verbose"}
 
@@ -83,7 +83,6 @@ def identify(
     request = SettingsRequest(None if config is None else str(config), chosen, settings or [])
     baselines = [name for name, wanted in (("ARX", arx), ("ARMAX", armax)) if wanted]
     if len(model or []) > 1 or baselines or seeds is not None:
-        from daq.cli.compare import show_comparison
         from daq.identification.campaign import Workers
         from daq.identification.comparison import ComparisonRequest, compare
 

@@ -46,18 +46,15 @@ def models(
 
 
 def _show_list(models: dict[str, ProcessModel]) -> None:
-    terminal.print_table(
-        "Process models",
-        ["name", "states", "inputs", "outputs", "free parameters", "what it is"],
-        [[key, *map(str, _sizes(model)), model.description] for key, model in models.items()],
-        text=["what it is"],
-    )
+    head = ["name", "states", "inputs", "outputs", "free parameters", "what it is"]
+    rows = [[name, *_sizes(model), model.description] for name, model in models.items()]
+    terminal.print_table("Process models", head, rows, text=["what it is"])
     terminal.print_next("rig models NAME, or rig models my_model.py:model for one of your own")
 
 
-def _sizes(model: ProcessModel) -> tuple[int, int, int, int]:
-    free = sum(not parameter.fixed for parameter in model.parameters)
-    return len(model.states), len(model.inputs), len(model.outputs), free
+def _sizes(model: ProcessModel) -> list[str]:
+    free = [parameter for parameter in model.parameters if not parameter.fixed]
+    return [str(len(parts)) for parts in (model.states, model.inputs, model.outputs, free)]
 
 
 def _show(name: str, model: ProcessModel, options: list[dict[str, Any]]) -> None:
@@ -69,16 +66,14 @@ def _show(name: str, model: ProcessModel, options: list[dict[str, Any]]) -> None
     rows = [["state", s.name, s.unit, _start(s)] for s in model.states]
     rows += [["input", s.name, s.unit, s.hold] for s in model.inputs]
     rows += [["output", s.name, s.unit, s.description] for s in model.outputs]
-    terminal.print_table(
-        "Signals", ["kind", "name", "unit", "note"], rows, text=["name", "unit", "note"]
-    )
+    head = ["kind", "name", "unit", "note"]
+    terminal.print_table("Signals", head, rows, text=head)
     number = terminal.number
-    terminal.print_table(
-        "Parameters",
-        ["name", "unit", "nominal", "range", "scale", "what it is"],
-        [[p.name, p.unit, number(p.nominal), *_range(p), p.description] for p in model.parameters],
-        text=["unit", "scale", "what it is"],
-    )
+    head = ["name", "unit", "nominal", "range", "scale", "what it is"]
+    rows = [
+        [p.name, p.unit, number(p.nominal), *_range(p), p.description] for p in model.parameters
+    ]
+    terminal.print_table("Parameters", head, rows, text=["unit", "scale", "what it is"])
     for constraint in model.constraints:
         print(f"Constraint: {constraint.text}")
     if options:
@@ -88,15 +83,12 @@ def _show(name: str, model: ProcessModel, options: list[dict[str, Any]]) -> None
 def _show_options(name: str, options: list[dict[str, Any]]) -> None:
     from daq.lookup.models import name_parts
 
-    terminal.print_table(
-        "Options",
-        ["name", "default", "choices", "what it is"],
-        [
-            [o["name"], _as_text(o["default"]), ", ".join(o["choices"]), o["description"]]
-            for o in options
-        ],
-        text=["default", "choices", "what it is"],
-    )
+    head = ["name", "default", "choices", "what it is"]
+    rows = [
+        [o["name"], _as_text(o["default"]), ", ".join(o["choices"]), o["description"]]
+        for o in options
+    ]
+    terminal.print_table("Options", head, rows, text=head)
     last = options[-1]
     print(
         f"Another combination: rig models {name_parts(name)[0]}:{last['name']}="

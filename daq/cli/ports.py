@@ -44,15 +44,12 @@ def _show(inquiries: list[Inquiry], unasked: bool) -> None:
             "and name the port that it prints:  rig ports PORT"
         )
         return
-    terminal.print_table(
-        "Serial ports",
-        ["port", "what it is", "who answers"],
-        [
-            [i.port.lasting_name or i.port.name, _description(i.port), _answer(i, unasked)]
-            for i in inquiries
-        ],
-        text=["what it is", "who answers"],
-    )
+    head = ["port", "what it is", "who answers"]
+    rows = [
+        [i.port.lasting_name or i.port.name, _description(i.port), _answer(i, unasked)]
+        for i in inquiries
+    ]
+    terminal.print_table("Serial ports", head, rows, text=head)
     answered = [inquiry.port for inquiry in inquiries if inquiry.welcome is not None]
     if answered:
         port = answered[0].lasting_name or answered[0].name

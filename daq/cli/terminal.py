@@ -131,15 +131,12 @@ def print_table(
 
 
 def _narrowed(columns: Sequence[Sequence[str]], words: Sequence[bool], room: int) -> list[int]:
-    """Widths of columns, heads first, that together take no more than the room, if they can.
-
-    Numbers stay whole, and words of text: what is left goes to text first, which takes a line for
-    each row it is wrapped in, heads only one in all.
-    """
+    """Widths of columns, heads first, within the room: numbers and words stay whole."""
     widths = []
     for cells, is_text in zip(columns, words, strict=True):
         parts = " ".join(cells[1:]).split() if is_text else list(cells[1:])
         widths.append(max(map(len, [*parts, *_parts(cells[0])]), default=0))
+    # What is left goes to text first, which is wrapped in every row.
     for index in sorted(range(len(columns)), key=lambda i: not words[i]):
         spare = max(room - sum(widths), 0)
         widths[index] += min(spare, max(map(len, columns[index])) - widths[index])

@@ -1,9 +1,7 @@
 """How logs are turned into parameters: model, search settings, foreign columns, data sheets."""
 
-from __future__ import annotations
-
 import math
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
     AfterValidator,
@@ -81,7 +79,7 @@ class TimeColumn(Section):
     )
 
     @model_validator(mode="after")
-    def _one_source(self) -> TimeColumn:
+    def _one_source(self) -> Self:
         if (self.column is None) == (self.sample_rate is None):
             raise ValueError(
                 "give either 'column' (a name in the CSV) or 'sample_rate' (rows per second)"
@@ -110,7 +108,7 @@ class Column(Section):
         return {**given, "constant": quantity[0], "unit": quantity[1]}
 
     @model_validator(mode="after")
-    def _one_source(self) -> Column:
+    def _one_source(self) -> Self:
         if (self.column is None) == (self.constant is None):
             raise ValueError("give either 'column' (a name in the CSV) or 'constant' (a value)")
         return self
@@ -266,7 +264,7 @@ class DatasheetEntry(Section):
         return {**given, "range": numbers, "unit": unit}
 
     @model_validator(mode="after")
-    def _complete(self) -> DatasheetEntry:
+    def _complete(self) -> Self:
         if (self.value is None) == (self.range is None):
             raise ValueError("give either 'value' or 'range'")
         if self.value is None:

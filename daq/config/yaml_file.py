@@ -1,13 +1,11 @@
 """YAML files with errors that name file, line, column and key."""
 
-from __future__ import annotations
-
 import difflib
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import yaml
 
@@ -88,7 +86,7 @@ class TypedSettings(YamlFile):
     @classmethod
     def of(
         cls, options: Mapping[str, Any], settings: Sequence[str] = (), file: YamlFile | None = None
-    ) -> TypedSettings:
+    ) -> Self:
         """Options by name without their dashes, and settings as ``key.key=value``.
 
         Raises ConfigError for a setting that is not of that form.
@@ -288,8 +286,7 @@ def _syntax_mistake(path: Path, text: str, error: yaml.YAMLError) -> Mistake:
         opened = getattr(error, "context_mark", None) or mark
         cure = next((cure for start, cure in _CURES.items() if problem.startswith(start)), _LOOK)
         cause = cure.format(problem=problem, context=opened.line + 1)
-    place = (path, mark.line + 1, mark.column + 1)
-    return Mistake(f"not valid YAML: {cause}", "", *place)
+    return Mistake(f"not valid YAML: {cause}", "", path, mark.line + 1, mark.column + 1)
 
 
 def _kind(content: object) -> str:

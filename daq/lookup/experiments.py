@@ -1,7 +1,5 @@
 """Experiments by the names that users write."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -42,7 +40,7 @@ class LoadedExperiment:
         line, column = self.file.place(tuple(mistake.key.split(".")))
         return replace(mistake, file=self.file.path, line=line, column=column)
 
-    def validation(self) -> LoadedExperiment | None:
+    def validation(self) -> "LoadedExperiment | None":
         """The validation run: the same with the keys under ``validation`` changed, if any."""
         if not self.experiment.validation:
             return None

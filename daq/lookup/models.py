@@ -1,7 +1,5 @@
 """Process models by name, or in a user's own Python file; what they declare."""
 
-from __future__ import annotations
-
 import inspect
 import re
 from collections.abc import Callable

@@ -71,12 +71,13 @@ def documents(
     """The schemas by kind of file: experiment, rig, identification, datasheet."""
     settings = json_schema(IdentificationConfig)
     by_name = {"type": "object", "additionalProperties": json_schema(DatasheetEntry)}
-    return {
-        "experiment": _document("An experiment", experiment_schema(protocols)),
-        "rig": _document("A rig", rig_schema(backends)),
-        "identification": _document("Settings of an identification", settings),
-        "datasheet": _document("A data sheet: parameters by name", by_name),
+    schemas = {
+        "experiment": ("An experiment", experiment_schema(protocols)),
+        "rig": ("A rig", rig_schema(backends)),
+        "identification": ("Settings of an identification", settings),
+        "datasheet": ("A data sheet: parameters by name", by_name),
     }
+    return {k: {"$schema": DRAFT, "title": title, **s} for k, (title, s) in schemas.items()}
 
 
 def experiment_schema(protocols: Mapping[str, type[Experiment]]) -> Schema:
@@ -90,12 +91,8 @@ def experiment_schema(protocols: Mapping[str, type[Experiment]]) -> Schema:
     ]
     common = json_schema(Experiment)["properties"]
     common["protocol"] = {**common["protocol"], "oneOf": [*named, _FILE_AND_CLASS]}
-    return {
-        "type": "object",
-        "properties": common,
-        "required": ["protocol"],
-        "allOf": [_when("protocol", name, protocol_schema(k)) for name, k in protocols.items()],
-    }
+    cases = [_when("protocol", name, protocol_schema(kind)) for name, kind in protocols.items()]
+    return {"type": "object", "properties": common, "required": ["protocol"], "allOf": cases}
 
 
 def protocol_schema(kind: type[Experiment]) -> Schema:
@@ -135,11 +132,6 @@ def _when(key: str, value: str, then: Schema, or_absent: bool = False) -> Schema
     if not or_absent:
         condition["required"] = [key]
     return {"if": condition, "then": then}
-
-
-def _document(title: str, schema: Schema) -> Schema:
-    # The comment by which a JSON file itself may name its schema is everybody's.
-    return {"$schema": DRAFT, "title": title, **schema}
 
 
 def _loaded(kind: Kind, watch: Watch) -> dict[str, Any]:

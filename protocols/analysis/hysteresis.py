@@ -84,10 +84,7 @@ class LoopFit:
 
 
 def motion(cycles: Cycles) -> FloatArray:
-    """Mean angle [rad], speed and acceleration of a level's cycles, smoothed, (3, n).
-
-    No way is left at the end of the angle.
-    """
+    """Angle [rad], speed and acceleration of a level's mean cycle, smoothed and closed, (3, n)."""
     from scipy.signal import savgol_filter
 
     n = cycles.angle.shape[1]
@@ -150,10 +147,7 @@ def fit(levels: list[Cycles]) -> LoopFit:
 
 
 class _Problem:
-    """Mean torque and motion of all levels at the points that are fitted.
-
-    torque: (n_levels * points,) [N*m].
-    """
+    """Mean torque (n_levels * points,) [N*m] and motion of all levels at the fitted points."""
 
     def __init__(self, levels: list[Cycles]) -> None:
         self._motions = [motion(level) for level in levels]
@@ -233,13 +227,9 @@ def loop_findings(
     n = min(len(level.angle) for level in levels)
     levels = [replace(x, angle=x.angle[:n], torque=x.torque[:n]) for x in levels]
     loop = fit(levels)
-    return Findings(
-        _numbers(loop),
-        (_table(levels, loop),),
-        _charts(levels, loop),
-        _ranges(loop),
-        tuple(_remarks(loop, missing, brake_constant, torque_sensor)),
-    )
+    numbers, table = _numbers(loop), _table(levels, loop)
+    remarks = tuple(_remarks(loop, missing, brake_constant, torque_sensor))
+    return Findings(numbers, (table,), _charts(levels, loop), _ranges(loop), remarks)
 
 
 def _numbers(loop: LoopFit) -> tuple[Number, ...]:

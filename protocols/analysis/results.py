@@ -11,6 +11,7 @@ from daq.hal import FloatArray
 
 TIME, ANGLE = Axis("time", "s"), Axis("angle", "rad")
 VELOCITY, TORQUE = Axis("velocity", "rad/s"), Axis("torque", "N*m")
+DAMPING, STIFFNESS = Axis("damping", "N*m*s/rad"), Axis("stiffness", "N*m/rad")
 
 
 @dataclass(frozen=True)

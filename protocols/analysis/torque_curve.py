@@ -110,10 +110,7 @@ def _error_of_mean(values: FloatArray) -> float:
 
 
 class Motor(NamedTuple):
-    """Constant [N*m/A] and viscous damping [N*m*s/rad] of the motor, by its ratings.
-
-    Needed where the torque sensor is at the load; elsewhere the run tells both.
-    """
+    """Constant [N*m/A] and viscous damping [N*m*s/rad] of the motor, by its ratings."""
 
     constant: float
     damping: float
@@ -205,10 +202,7 @@ def _pooled(levels: Sequence[Level], errors: Sequence[float]) -> FloatArray:
 
 
 def _constant(torque: FloatArray, current: FloatArray) -> float:
-    """The motor's constant by the two signals alone; ValueError where they do not belong together.
-
-    A torque sensor that is at the load reads nothing of the motor.
-    """
+    """The motor's constant by the two signals; ValueError where the sensor reads none of it."""
     related = float(np.corrcoef(torque, current)[0, 1])
     if not related > 0.9:
         raise ValueError(
@@ -227,10 +221,7 @@ def _determined(estimate: Estimate) -> Estimate | None:
 def _solve(
     matrix: FloatArray, sides: FloatArray, errors: FloatArray
 ) -> tuple[list[Estimate], float]:
-    """Weighted least squares, and its misfit as of ``Line``.
-
-    What the rows cannot tell apart does not spoil what they can.
-    """
+    """Least-norm solution of weighted least squares, and its misfit as of ``Line``."""
     weighted, target = matrix / errors[:, None], sides / errors
     inverse = np.linalg.pinv(weighted, rcond=1e-10)
     values = inverse @ target

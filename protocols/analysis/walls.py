@@ -9,7 +9,7 @@ import numpy as np
 
 from daq.findings import Axis, Findings, Heatmap, Number, Series, Table
 from daq.hal import FloatArray, Samples
-from protocols.analysis.results import table_of_rows
+from protocols.analysis.results import DAMPING, STIFFNESS, table_of_rows
 from protocols.control.loop import tracker_gains
 from protocols.control.wall import ABORTED, WATCHED, Cell, WallSettings, oscillation
 
@@ -18,16 +18,6 @@ _HALVINGS = 32
 _DRAWN = 60  # dampings of a bound in a figure
 _WHOLE = 0.9  # of the time watched: samples may be lost at its ends
 _IN_CONTACT = 0.5  # of the time watched, at most, of a wall that does not count
-
-
-def passive_stiffness(physical: float, damping: float, period: float) -> float:
-    """Largest stiffness that (1.1), (1.2) call passive, b > K T / 2 + |B| [N*m/rad].
-
-    Colgate & Schenkel, "Passivity of a class of sampled-data systems", 1997. physical: b, with
-    what a brake adds [N*m*s/rad]; damping: B that is rendered; period: T [s]. Not positive where
-    the damping alone is more than b.
-    """
-    return 2.0 * (physical - abs(damping)) / period
 
 
 @dataclass(frozen=True)
@@ -107,18 +97,19 @@ class WallTheory:
     def loop(self, brake: float, hand: bool) -> SampledWall:
         """The sampled loop around the shaft, with the hand or without."""
         settings, body = self.settings, self.settings.body
-        return SampledWall(
-            body.inertia,
-            self.damping(brake) + (body.hand_damping if hand else 0.0),
-            body.hand_stiffness if hand else 0.0,
-            1.0 / settings.sample_rate,
-            settings.ahead,
-            settings.speed_filter,
-        )
+        hand_damping, stiffness = (body.hand_damping, body.hand_stiffness) if hand else (0.0, 0.0)
+        damping = self.damping(brake) + hand_damping
+        rendering = 1.0 / settings.sample_rate, settings.ahead, settings.speed_filter
+        return SampledWall(body.inertia, damping, stiffness, *rendering)
 
     def passive_stiffness(self, brake: float, damping: float) -> float:
-        """Largest passive stiffness of a wall of this damping [N*m/rad]."""
-        return passive_stiffness(self.damping(brake), damping, 1.0 / self.settings.sample_rate)
+        """Largest K that (1.1), (1.2) call passive with a damping B, b > K T / 2 + |B| [N*m/rad].
+
+        Colgate & Schenkel, "Passivity of a class of sampled-data systems", 1997. Not positive
+        where the damping alone is more than b.
+        """
+        period = 1.0 / self.settings.sample_rate
+        return 2.0 * (self.damping(brake) - abs(damping)) / period
 
     def bounds(self, brake: float) -> tuple[Series, ...]:
         """Bounds of stability, handle held and free, and of passivity over the damping."""
@@ -230,18 +221,13 @@ class WallFindings:
                 row = stiffnesses.index(visit.cell.stiffness)
                 shown = min(visit.amplitude, 2.0 * self.settings.ringing.amplitude)
                 values[row, dampings.index(visit.cell.damping)] = 1e3 * shown
-        return Heatmap(
-            name,
+        title = (
             f"Oscillation of the wall, brake at {brake:g} V; it rings above "
-            f"{1e3 * self.settings.ringing.amplitude:.3g} mrad",
-            Axis("damping", "N*m*s/rad"),
-            Axis("stiffness", "N*m/rad"),
-            Axis("amplitude", "mrad"),
-            np.array(dampings),
-            np.array(stiffnesses),
-            values,
-            self.theory.bounds(brake),
+            f"{1e3 * self.settings.ringing.amplitude:.3g} mrad"
         )
+        axes = DAMPING, STIFFNESS, Axis("amplitude", "mrad")
+        plane = np.array(dampings), np.array(stiffnesses), values
+        return Heatmap(name, title, *axes, *plane, self.theory.bounds(brake))
 
     def _remarks(self) -> tuple[str, ...]:
         left = sum(math.isinf(visit.amplitude) for visit in self.visits)

@@ -26,18 +26,18 @@ def command_bounds(
     motor_limit: float, brake_commands: Sequence[float]
 ) -> tuple[FloatArray, FloatArray]:
     """Lowest and highest commands of motor and brake, (2,) each [V]; zero is within them."""
-    return (
-        np.array([-motor_limit, min(0.0, *brake_commands)]),
-        np.array([motor_limit, max(0.0, *brake_commands)]),
+    lowest, highest = min(0.0, *brake_commands), max(0.0, *brake_commands)
+    return np.array([-motor_limit, lowest]), np.array([motor_limit, highest])
+
+
+class VelocityGains(Section):
+    """Gains of a velocity loop."""
+
+    proportional: Annotated[float, Unit("V*s/rad")] = Field(ge=0.0, description="proportional gain")
+    integral: Annotated[float, Unit("V/rad")] = Field(0.0, ge=0.0, description="integral gain")
+    derivative: Annotated[float, Unit("V*s^2/rad")] = Field(
+        0.0, ge=0.0, description="derivative gain, on the measured velocity"
     )
-
-
-class PidGains(Section):
-    """Gains of a loop from an error to volts; a protocol declares their units in a subclass."""
-
-    proportional: float = Field(ge=0.0, description="volts per unit of error")
-    integral: float = Field(0.0, ge=0.0, description="volts per second and unit of error")
-    derivative: float = Field(0.0, ge=0.0, description="volts per unit of the measurement's rate")
     derivative_filter: Seconds = Field(
         0.005, ge=0.0, le=10.0, description="time constant of the derivative's low-pass filter"
     )
@@ -54,7 +54,7 @@ class Pid:
     whatever the error, if there is an integral to take the difference up.
     """
 
-    def __init__(self, gains: PidGains, lowest: float, highest: float) -> None:
+    def __init__(self, gains: VelocityGains, lowest: float, highest: float) -> None:
         self._gains, self._lowest, self._highest = gains, lowest, highest
         self._time = math.nan
         self._measured = self._integral = self._derivative = 0.0
@@ -131,16 +131,6 @@ class SpeedTracker:
         self._angle += self._alpha * missed
         self.speed += self._beta / elapsed * missed
         return self.speed
-
-
-class VelocityGains(PidGains):
-    """Gains of a velocity loop."""
-
-    proportional: Annotated[float, Unit("V*s/rad")] = Field(ge=0.0, description="proportional gain")
-    integral: Annotated[float, Unit("V/rad")] = Field(0.0, ge=0.0, description="integral gain")
-    derivative: Annotated[float, Unit("V*s^2/rad")] = Field(
-        0.0, ge=0.0, description="derivative gain, on the measured velocity"
-    )
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,10 @@
 """A shaft driven through a staircase of velocities, each held once it has settled."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -17,11 +16,8 @@ from daq.experiment import Answer, Sample
 from daq.hal import FloatArray
 from protocols.control.loop import Ramp, VelocityServo
 
-# How much faster a shaft may turn that the motor brakes with all its might.
-_RUNAWAY = 10.0  # rad/s
-
-# A brake let go at once would let the shaft leap.
-_BRAKE_SLOPE = 0.5  # V/s
+_RUNAWAY = 10.0  # rad/s that a shaft may gain while the motor brakes with all its might
+_BRAKE_SLOPE = 0.5  # V/s; a brake let go at once would let the shaft leap
 
 
 class SettlingTest(Section):
@@ -38,7 +34,7 @@ class SettlingTest(Section):
     )
 
     @model_validator(mode="after")
-    def _possible(self) -> SettlingTest:
+    def _possible(self) -> Self:
         if self.timeout < self.time:
             raise ValueError(
                 f"timeout of {self.timeout:g} s is shorter than time, {self.time:g} s: no velocity "

@@ -1,5 +1,6 @@
 """A virtual wall, spring and damper, rendered at each point of a grid: settings and controller."""
 
+import itertools
 import math
 from collections.abc import Mapping
 from typing import Annotated, ClassVar, NamedTuple
@@ -114,12 +115,8 @@ class WallSettings(ClosedLoop):
     @property
     def cells(self) -> tuple[Cell, ...]:
         """All walls in the order in which they are visited: stiffer and stiffer."""
-        return tuple(
-            Cell(stiffness, damping, brake)
-            for brake in self.brake_commands
-            for damping in self.dampings
-            for stiffness in self.stiffnesses
-        )
+        grid = itertools.product(self.brake_commands, self.dampings, self.stiffnesses)
+        return tuple(Cell(stiffness, damping, brake) for brake, damping, stiffness in grid)
 
 
 class WallRenderer:
@@ -216,11 +213,9 @@ class WallRenderer:
             return rest.stiffness, rest.damping, 0.0
         cell = self._cells[self._index]
         share = min(max((now - self._began - rest.time) / rest.time, 0.0), 1.0)
-        return (
-            rest.stiffness + share * (cell.stiffness - rest.stiffness),
-            rest.damping + share * (cell.damping - rest.damping),
-            cell.brake,
-        )
+        stiffness = rest.stiffness + share * (cell.stiffness - rest.stiffness)
+        damping = rest.damping + share * (cell.damping - rest.damping)
+        return stiffness, damping, cell.brake
 
 
 def oscillation(time: FloatArray, depth: FloatArray) -> float:

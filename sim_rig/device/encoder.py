@@ -8,8 +8,7 @@ from numba import njit
 
 from daq.hal import FloatArray
 
-# After this long without an edge the shaft counts as standing still.
-_STANDSTILL = 0.1  # s
+_STANDSTILL = 0.1  # s without an edge after which the shaft counts as standing still
 
 
 @dataclass

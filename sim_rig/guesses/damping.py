@@ -23,10 +23,7 @@ _SETTLED = 6.0  # mean delays after a change of the brake's command
 
 @dataclass(frozen=True)
 class _Slope:
-    """The most that torque over speed can be [N*m*s/rad], at so many moments of a record.
-
-    current: the least that the brake carried [A].
-    """
+    """The most that torque over speed can be [N*m*s/rad]; current: the least of the brake [A]."""
 
     limit: float
     current: float

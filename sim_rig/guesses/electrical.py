@@ -56,12 +56,10 @@ def current_response(records: Sequence[Measured], channel: str) -> CurrentRespon
     if not responses:
         return None
     per_speeds = list(filter(None, [response.per_speed for response in responses]))
-    return CurrentResponse(
-        _overlap([response.gain for response in responses]),
-        _overlap([response.delay for response in responses]),
-        _overlap(per_speeds) if per_speeds else None,
-        responses[0].source if len(responses) == 1 else f"{len(responses)} logs",
-    )
+    gain = _overlap([response.gain for response in responses])
+    delay = _overlap([response.delay for response in responses])
+    source = responses[0].source if len(responses) == 1 else f"{len(responses)} logs"
+    return CurrentResponse(gain, delay, _overlap(per_speeds) if per_speeds else None, source)
 
 
 def narrow(ranges: Ranges, records: Sequence[Measured], channel: str, driver: DriverKind) -> float:
@@ -156,19 +154,12 @@ def _response(
         size = abs(float(felt @ weights))
         reach = SIGMAS * _deviation(felt, covariance) + _MARGIN * size
         per_speed = (max(size - reach, 0.0), size + reach)
-    return CurrentResponse(
-        (gain - spread, gain + spread),
-        (max(delay - 1.5 * dt - late, 0.0), max(delay, 0.0) + 0.5 * dt + late),
-        per_speed,
-        record.name,
-    )
+    delays = max(delay - 1.5 * dt - late, 0.0), max(delay, 0.0) + 0.5 * dt + late
+    return CurrentResponse((gain - spread, gain + spread), delays, per_speed, record.name)
 
 
 def _memory(current: FloatArray, signals: list[FloatArray]) -> int:
-    """Octaves of the past that the current depends on: one more than Schwarz's criterion takes.
-
-    0 where no regression is possible.
-    """
+    """Octaves of the past in the current, one more than Schwarz's criterion takes; 0 for none."""
     best, lowest = 0, math.inf
     start = min(_oldest(_OCTAVES), len(current) // 2)
     target = current[start:]

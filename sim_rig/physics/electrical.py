@@ -13,10 +13,7 @@ from sysid import Parameter
 
 SUPPLY = 24.0  # V, the amplifier's limit
 MAX_CURRENT = 2.5  # A, the amplifier's limit
-
-# How hard a voltage amplifier gives way beyond its current limit [V/A]. Assumed: about what the
-# current amplifier's own loop does.
-_FOLDBACK = 100.0
+_FOLDBACK = 100.0  # V/A, how a voltage amplifier gives way beyond that; assumed: as a closed loop
 
 # (voltage, current, command, K_v2i, p) -> dv/dt, p the driver's own parameters
 DriverFunction = Callable[[Any, Any, Any, Any, Any], Any]

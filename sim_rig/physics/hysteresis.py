@@ -190,8 +190,6 @@ _VISCOUS = (
     log_range("c0", "N*m*s/rad", 2e-4, 1e-5, 1e-2, "brake viscous damping at zero current"),
     log_range("c1", "N*m*s/(rad*A)", 2e-3, 1e-4, 5e-2, "brake viscous damping per ampere"),
 )
-
-
 _BRAKE = (
     log_range("alpha0", "N*m", 0.02, 2e-3, 0.5, "hysteretic torque at zero current"),
     log_range("alpha1", "N*m/A", 4.0, 0.5, 50.0, "hysteretic torque per ampere"),

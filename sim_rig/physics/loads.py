@@ -10,10 +10,7 @@ from sim_rig.physics.parameters import fixed
 from sysid import Input, Parameter, State
 
 GRAVITY = 9.80665  # m/s^2
-
-# Angle over which the cable changes sides of the pulley when it is wound off past its end:
-# about the angle in which a cable leaves a small drum.
-_CROSSOVER = 0.1  # rad
+_CROSSOVER = 0.1  # rad in which a cable wound off changes sides, about as it leaves a small drum
 
 # A hand (A.2): it responds in 0.237 s, with 0.707 of critical damping, and has an inertia an order
 # of magnitude above the rotors.

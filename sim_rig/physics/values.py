@@ -86,19 +86,13 @@ _BRAKES = {
     },
 }
 
-_DEFAULT = Design()
 
-
-def named(name: ParameterSet, design: Design = _DEFAULT) -> dict[str, float]:
+def named(name: ParameterSet, design: Design) -> dict[str, float]:
     """Values of a named set for a design's parts, by parameter; "nominal" changes none."""
     if name == "nominal":
         return {}
-    rig = (
-        RIG
-        | _DRIVERS_MOTOR[design.driver_motor]
-        | _DRIVERS_BRAKE[design.driver_brake]
-        | _BRAKES[design.hysteresis]
-    )
+    drivers = _DRIVERS_MOTOR[design.driver_motor] | _DRIVERS_BRAKE[design.driver_brake]
+    rig = RIG | drivers | _BRAKES[design.hysteresis]
     for shape in {"gamma", "beta"} & set(rig):
         rig[shape] *= _YIELD ** (1.0 - design.exponent)
     return rig | TABLE_4_1.get(name, {})

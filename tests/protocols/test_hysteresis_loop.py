@@ -14,10 +14,11 @@ from daq.run.plan import plan
 from protocols.analysis.hysteresis import Cycles, fit, hysteresis
 from protocols.hysteresis_loop import HysteresisLoop
 from sim_rig.physics.hysteresis import hysteresis as brake_model
+from sim_rig.physics.options import Design
 from sim_rig.physics.values import named
 from tests.protocols.closed_loop import numbers, run, shipped
 
-TRUTH = named("rig")
+TRUTH = named("rig", Design())
 GAMMA, BETA, A = (TRUTH[name] for name in ("gamma", "beta", "A"))
 RATE, PART, SATURATION = BETA + GAMMA, GAMMA / (BETA + GAMMA), A / (BETA + GAMMA)
 

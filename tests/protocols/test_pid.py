@@ -6,14 +6,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
-from protocols.control.loop import Pid, PidGains, Ramp, SpeedTracker
+from protocols.control.loop import Pid, Ramp, SpeedTracker, VelocityGains
 
 STEP = 1.0 / 800.0  # s
 numbers = st.floats(-100.0, 100.0)
 
 
 def pid(p=0.0, i=0.0, d=0.0, filter_time=0.0, limit=1e9):
-    gains = PidGains(proportional=p, integral=i, derivative=d, derivative_filter=filter_time)
+    gains = VelocityGains(proportional=p, integral=i, derivative=d, derivative_filter=filter_time)
     return Pid(gains, -limit, limit)
 
 

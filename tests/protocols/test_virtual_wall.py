@@ -9,7 +9,7 @@ from daq.config.rig import RigConfig
 from daq.errors import ConfigError, RunError
 from daq.experiment import Sample
 from daq.run.plan import plan
-from protocols.analysis.walls import SampledWall, passive_stiffness
+from protocols.analysis.walls import SampledWall
 from protocols.control.loop import SpeedTracker
 from protocols.virtual_wall import VirtualWall
 from sim_rig.backend import Simulation
@@ -62,10 +62,12 @@ def test_the_critical_stiffness_is_that_of_a_delayed_spring(ahead):
 
 
 def test_the_passive_stiffness_is_that_of_the_bound():
+    theory = wall().theory
+    physical = theory.damping(0.0)
     for damping in (0.0, 0.005, -0.01):
-        passive = passive_stiffness(0.018, damping, PERIOD)
-        assert passive * PERIOD / 2.0 + abs(damping) == pytest.approx(0.018)
-    assert passive_stiffness(0.018, 0.02, PERIOD) < 0.0
+        passive = theory.passive_stiffness(0.0, damping)
+        assert passive * PERIOD / 2.0 + abs(damping) == pytest.approx(physical)
+    assert theory.passive_stiffness(0.0, physical + 0.002) < 0.0
 
 
 def test_a_wall_that_rings_at_any_stiffness_has_no_critical_one():
