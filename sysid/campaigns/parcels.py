@@ -10,6 +10,7 @@ import pickle
 import sys
 import sysconfig
 import types
+from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -49,12 +50,11 @@ def unpack(parcel: bytes) -> Any:
     return pickle.loads(parcel)
 
 
-def _not_installed() -> list[types.ModuleType]:
+def _not_installed() -> Iterator[types.ModuleType]:
     """Loaded modules that another process may not find by their name."""
     paths = sysconfig.get_paths()
     places = {paths[key] for key in ("stdlib", "platstdlib", "purelib", "platlib")}
     everywhere = (__name__.partition(".")[0], "__main__")
-    modules = []
     for name, module in list(sys.modules.items()):
         file = Path(getattr(module, "__file__", None) or "")
         # Compiled modules have no code that could travel.
@@ -63,5 +63,4 @@ def _not_installed() -> list[types.ModuleType]:
         # Another environment's folder will do as well.
         installed = not _INSTALLED.isdisjoint(file.parts)
         if not installed and not any(file.is_relative_to(place) for place in places):
-            modules.append(module)
-    return modules
+            yield module

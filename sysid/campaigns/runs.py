@@ -222,10 +222,9 @@ def campaign(
         raise ModelError("a campaign needs at least one run")
     threads = _threads(n_jobs, len(runs))
     order = _order(runs)
-    parcels = _packed([runs[place] for place in order])
     jobs = [
         joblib.delayed(_identify)(place, *packed, runs[place].seed, threads)
-        for place, packed in zip(order, parcels, strict=True)
+        for place, packed in zip(order, _packed([runs[place] for place in order]), strict=True)
     ]
     outcomes: dict[int, Outcome] = {}
     interrupted, problem = False, ""
@@ -245,7 +244,10 @@ def campaign(
         # A worker that died, or one that lacks something, takes the others with it.
         problem = _described(error)
     finally:
-        _close(results)
+        if isinstance(results, Generator):
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # that some were not finished, which is known
+                results.close()
     if not interrupted:
         for place in set(range(len(runs))) - set(outcomes):
             outcomes[place] = Outcome(runs[place], None, (), (), 0.0, problem)
@@ -294,15 +296,11 @@ def _identify(
         fitted.space_ = replace(fitted.space_, model=None)  # type: ignore[arg-type]
     except Exception as error:
         fitted, problem = None, _described(error)
-    seconds = time.perf_counter() - started
-    return pack("result", (place, fitted, *scores, seconds, problem))
+    return pack("result", (place, fitted, *scores, time.perf_counter() - started, problem))
 
 
-@functools.lru_cache(maxsize=8)
-def _model(parcel: bytes) -> ProcessModel:
-    """The same object for all runs of a worker, so that its kernels are made once."""
-    model: ProcessModel = unpack(parcel)
-    return model
+# The same object for all runs of a worker, so that its kernels are made once.
+_model = functools.lru_cache(maxsize=8)(unpack)
 
 
 def _outcome(runs: Sequence[Run], parcel: bytes) -> tuple[int, Outcome]:
@@ -340,21 +338,10 @@ def _threads(n_jobs: int | None, n_runs: int) -> int:
 
 
 def _order(runs: Sequence[Run]) -> list[int]:
-    """Places of the runs with unlike models behind one another.
-
-    Workers then compile different models at the same time, not all of them the first one.
-    """
+    """Places of the runs, unlike models in turn: workers then compile them at the same time."""
     counts: dict[int, Iterator[int]] = defaultdict(itertools.count)
     turns = [next(counts[id(run.model)]) for run in runs]
     return sorted(range(len(runs)), key=lambda place: turns[place])
-
-
-def _close(results: Any) -> None:
-    """Let go of runs that are not finished."""
-    if isinstance(results, Generator):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # that some were not, which is known
-            results.close()
 
 
 def _described(error: Exception) -> str:

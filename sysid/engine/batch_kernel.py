@@ -166,11 +166,8 @@ class BatchKernel(Scheme):
         return [self._constants(), *self.call("observe", "o", states, "v")]
 
     def _spectrum(self) -> str:
-        """Bound on the fastest rate of N, also beyond limits that no output would show.
-
-        Only the driven rows of its Jacobian are not zero, so that its eigenvalues are those of
-        the block of driven rows and columns.
-        """
+        """Bound on the fastest rate of N, also beyond limits that no output would show."""
+        # Other rows of its Jacobian are zero: the eigenvalues are those of the driven block.
         n = len(self.structure.driven)
         head = "def spectrum(u, x, p, rate):"
         if not n:

@@ -11,10 +11,12 @@ import hashlib
 import os
 import tempfile
 import types
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from sysid.engine.batch_kernel import BatchKernel
 from sysid.engine.structure import analyse
@@ -30,67 +32,74 @@ _OPTIONS: dict[str, Any] = {
 }
 
 
-class Guarded:
-    """A compiled function that turns the compiler's complaints into a ModelError.
-
-    compiled: the function itself, for those who have called it before and count microseconds.
-    """
-
-    def __init__(self, model: ProcessModel, compiled: Callable[..., None]) -> None:
-        self.compiled = compiled
-        self._model = model
-
-    def __call__(self, *args: Any) -> None:
-        """Run the kernel; ModelError for a model that does not compile."""
-        from numba.core.errors import NumbaError
-
-        try:
-            self.compiled(*args)
-        except NumbaError as error:
-            raise ModelError(_explain(self._model, error)) from None
-
-
 @dataclass(frozen=True)
 class Kernels:
-    """Compiled functions of one model: ``simulate`` and ``spectrum`` of the batch kernel,
-    ``levels`` and ``advance`` of that of a trajectory.
-    """
+    """A model's compiled functions: two of the batch kernel, then two of the trajectory's."""
 
+    model: ProcessModel
     batch: BatchKernel
     trajectory: TrajectoryKernel
-    simulate: Guarded
-    spectrum: Guarded
-    levels: Guarded
-    advance: Guarded
+    simulate: Callable[..., None]
+    spectrum: Callable[..., None]
+    levels: Callable[..., None]
+    advance: Callable[..., None]
 
 
 @functools.lru_cache(maxsize=8)
 def kernels(model: ProcessModel, *, exact: bool = True) -> Kernels:
     """Compile a model's kernels, or load them from the cache folder.
 
-    Compilation itself happens at the first call. Without ``exact`` nothing is integrated
-    exactly. Raises ModelError when the model's functions use something that cannot be compiled.
+    Compilation itself happens at the first call, which belongs in ``explained_errors``. Without
+    ``exact`` nothing is integrated exactly.
     """
+    # Numba is slow to import.
+    from sysid.engine import intrinsics, vector_math
+    from sysid.engine.phi import scheme_matrices
+
     batch, trajectory, text, called = _source(model, exact)
     name = "".join(c if c.isalnum() else "_" for c in model.name)[:40]
     path = _source_file(f"{name}_{_key(text, called)}.py", text)
-    scope = _scope(called)
+    scope = {
+        "np": np,
+        "math": vector_math,
+        "scheme_matrices": scheme_matrices,
+        "wide_vectors": intrinsics.wide_vectors,
+        "always_inline": intrinsics.always_inline,
+        "__name__": __name__,  # a module that exists when Numba loads the kernel from its cache
+        **{name: machine_code(function) for name, function in called.items()},
+    }
     exec(compile(text, str(path or "<kernel>"), "exec"), scope)
     for name in ("constants", "remainder", "observe", "margins"):
         if name in scope:
             scope[name] = _njit(scope[name])
     compiled = {
-        name: Guarded(model, _njit(scope[name], nogil=True, cache=path is not None))
+        name: _njit(scope[name], nogil=True, cache=path is not None)
         for name in ("simulate", "spectrum", "levels", "advance")
     }
-    return Kernels(batch, trajectory, **compiled)
+    return Kernels(model, batch, trajectory, **compiled)
+
+
+@contextlib.contextmanager
+def explained_errors(model: ProcessModel) -> Iterator[None]:
+    """Make ModelErrors of the compiler's complaints about a model."""
+    from numba.core.errors import NumbaError
+
+    try:
+        yield
+    except NumbaError as error:
+        lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+        causes = (s for s in lines if "File " not in s and "pipeline" not in s)
+        place = next((s for s in lines if s.startswith('File "') and "<kernel>" not in s), "")
+        raise ModelError(
+            f"model {model.name}: its functions cannot be compiled: "
+            f"{next(causes, 'unknown cause')} {place}\n"
+            "  They may use floats, tuples, math functions, conditions and helper functions of the "
+            "same kind; not lists, dictionaries, strings or objects."
+        ) from None
 
 
 def fingerprint(model: ProcessModel) -> str:
-    """What decides every digit of a model's simulations and constraints, as a hash.
-
-    The equations, the constraints, and how this computer's processor is made use of.
-    """
+    """Hash of what decides every digit: equations, constraints, the use of this processor."""
     _, _, text, called = _source(model)
     key = hashlib.sha256(_key(text, called).encode())
     for constraint in model.constraints:
@@ -102,7 +111,6 @@ def _source(
     model: ProcessModel, exact: bool = True
 ) -> tuple[BatchKernel, TrajectoryKernel, str, dict[str, Any]]:
     """A model's kernels, their text, and the model's functions that it calls."""
-    # Numba is slow to import.
     from sysid.engine.intrinsics import many_registers
 
     structure = analyse(model, exact=exact)
@@ -124,24 +132,6 @@ def _key(text: str, called: Mapping[str, Any]) -> str:
     return key.hexdigest()[:24]
 
 
-def _scope(called: Mapping[str, Any]) -> dict[str, Any]:
-    """Globals of the kernels' text."""
-    import numpy as np
-
-    from sysid.engine import intrinsics, vector_math
-    from sysid.engine.phi import scheme_matrices
-
-    return {
-        "np": np,
-        "math": vector_math,
-        "scheme_matrices": scheme_matrices,
-        "wide_vectors": intrinsics.wide_vectors,
-        "always_inline": intrinsics.always_inline,
-        "__name__": __name__,  # a module that exists when Numba loads the kernel from its cache
-        **{name: machine_code(function) for name, function in called.items()},
-    }
-
-
 def _njit(function: Any, *, nogil: bool = False, cache: bool = False) -> Any:
     import numba
 
@@ -149,17 +139,6 @@ def _njit(function: Any, *, nogil: bool = False, cache: bool = False) -> Any:
     with contextlib.suppress(RuntimeError):
         return numba.njit(nogil=nogil, cache=cache, **_OPTIONS)(function)
     return numba.njit(nogil=nogil, **_OPTIONS)(function)
-
-
-def _explain(model: ProcessModel, error: Exception) -> str:
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    cause = next((s for s in lines if "File " not in s and "pipeline" not in s), "unknown cause")
-    place = next((s for s in lines if s.startswith('File "') and "<kernel>" not in s), "")
-    return (
-        f"model {model.name}: its functions cannot be compiled: {cause} {place}\n"
-        "  They may use floats, tuples, math functions, conditions and helper functions of the "
-        "same kind; not lists, dictionaries, strings or objects."
-    )
 
 
 def machine_code(function: Any) -> Any:
@@ -208,10 +187,7 @@ def _fingerprint_names(scope: dict[str, Any], names: set[str], key: Any, seen: s
 
 
 def _source_file(name: str, text: str) -> Path | None:
-    """Write the kernel's text where Numba can cache beside it; None when nowhere is writable.
-
-    The folder is RIG_CACHE_DIR, or the user's cache folder.
-    """
+    """Write the kernel's text where Numba can cache beside it; None when nowhere is writable."""
     import platformdirs
 
     chosen = os.environ.get("RIG_CACHE_DIR")

@@ -7,6 +7,7 @@ need math and always_inline.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import TypeVar
 
 from sysid.engine.tape import Line, Tape
@@ -18,6 +19,7 @@ _LONGEST = 25  # items of a tuple display
 _CALLED = {"remainder": "derivative", "observe": "output"}
 
 
+@dataclass
 class Writer:
     """Writes functions on a tape as Python text.
 
@@ -26,18 +28,16 @@ class Writer:
     text calls.
     """
 
-    def __init__(
-        self,
-        tape: Tape,
-        n_parameters: int,
-        functions: Mapping[str, Sequence[str]],
-        coefficients: Iterable[str],
-    ) -> None:
-        self._tape = tape
-        self._functions = functions
-        self._parameters = [f"p{i}" for i in range(n_parameters)]
+    tape: Tape
+    n_parameters: int
+    functions: Mapping[str, Sequence[str]]
+    coefficients: Iterable[str]
+
+    def __post_init__(self) -> None:
+        functions, tape = self.functions, self.tape
+        self._parameters = [f"p{i}" for i in range(self.n_parameters)]
         self.calls = frozenset(_CALLED[name] for name, values in functions.items() if not values)
-        used = set(coefficients)
+        used = set(self.coefficients)
         for values in functions.values():
             used |= _used(self._varying(values), values) if values else {*self._parameters}
         constants = [name for name in used if tape.named(name) and tape.fixed(name)]
@@ -50,9 +50,8 @@ class Writer:
 
     def program(self) -> str:
         """Text of all functions."""
-        lines = self._tape.needed(self.constants)
-        texts = [self._text("constants(p)", lines, self.constants, {})]
-        for name, values in self._functions.items():
+        texts = [self._text("constants(p)", self.tape.needed(self.constants), self.constants, {})]
+        for name, values in self.functions.items():
             head = f"{name}(x, u, c)"
             if values:
                 texts.append(self._text(head, self._varying(values), values, self._places))
@@ -63,14 +62,14 @@ class Writer:
         return "\n\n".join([*texts, ""])
 
     def _varying(self, values: Sequence[str]) -> list[Line]:
-        return [line for line in self._tape.needed(values) if not line.fixed]
+        return [line for line in self.tape.needed(values) if not line.fixed]
 
     def _text(
         self, head: str, lines: list[Line], values: Sequence[str], places: Mapping[str, str]
     ) -> str:
         text = [f"def {head}:", "    always_inline()"]
         for name in sorted(_used(lines, values) - {line.name for line in lines}):
-            if self._tape.named(name):
+            if self.tape.named(name):
                 text.append(f"    {name} = {places.get(name) or f'{name[0]}[{name[1:]}]'}")
         text += [f"    {line.name} = {line.text}" for line in lines]
         return "\n".join([*text, f"    return {listed(values)}"])

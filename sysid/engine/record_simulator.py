@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sysid.arrays import BoolArray, FloatArray, IntArray
-from sysid.engine.compiler import Kernels
+from sysid.engine.compiler import Kernels, explained_errors
 from sysid.engine.scheme import LANES, work_area
 from sysid.problem.data import Dataset
 from sysid.problem.model import ProcessModel
@@ -33,19 +33,22 @@ _ALL_LANES = np.arange(LANES)
 
 @dataclass(frozen=True)
 class Population:
-    """Simulations of parameter vectors, each with the steps that it needs.
+    """Parameter vectors, (n, n_parameters), each simulated with the steps that it needs.
 
     n_steps: (n,), integration steps per sample. over_budget: (n,), whether that is more than
     there may be. sse: (n, n_outputs), sums of squared residuals. spent: (n,), integration steps
     of all attempts.
     """
 
+    parameters: FloatArray
+    starts: FloatArray | None
     n_steps: IntArray
     over_budget: BoolArray
     sse: FloatArray
     spent: IntArray
 
 
+@dataclass(eq=False)
 class RecordSimulator:
     """Simulates one record under many parameter vectors.
 
@@ -54,30 +57,24 @@ class RecordSimulator:
     (``starts``), are (n, n_states); default the record's own.
     """
 
-    def __init__(
-        self,
-        model: ProcessModel,
-        kernels: Kernels,
-        record: Dataset,
-        scale: FloatArray | None,
-        accuracy: float,
-        max_steps: int,
-        workers: Workers,
-    ) -> None:
-        self.record = record
-        self._kernels = kernels
-        self._accuracy = accuracy
-        self._max_steps = max_steps
-        self._workers = workers
+    kernels: Kernels
+    record: Dataset
+    scale: FloatArray | None
+    accuracy: float
+    max_steps: int
+    workers: Workers
+
+    def __post_init__(self) -> None:
+        record, model = self.record, self.kernels.model
         self._start = record.initial_state(model)
         self._inputs = _with_bends(model, record.inputs)
         missing = ~np.isfinite(record.outputs)
         outputs = np.where(missing, 0.0, record.outputs)
         self._peak = np.abs(outputs).max(axis=0)
-        if scale is None:
+        if self.scale is None:
             self._measured, self._weights = np.zeros_like(outputs), np.ones_like(outputs)
         else:
-            self._measured, self._weights = outputs, np.where(missing, 0.0, 1.0 / scale)
+            self._measured, self._weights = outputs, np.where(missing, 0.0, 1.0 / self.scale)
         self._weight = self._weights.max(axis=0)
         # Where an input is largest is where a model driven through it is fastest.
         peaks = np.argmax(np.abs(record.inputs), axis=0) if record.inputs.shape[1] else []
@@ -89,25 +86,25 @@ class RecordSimulator:
         A simulation that does not stay finite is tried once more with much finer steps: when
         those fail too it is the model, not the scheme, that is unbounded.
         """
-        n, limit = len(parameters), self._max_steps
+        n, limit = len(parameters), self.max_steps
         steps = _rungs(self._rates(parameters, starts) * self.record.dt / _RATE_LIMIT)
-        steps = np.maximum(steps, self._kernels.batch.fewest_steps)
+        steps = np.maximum(steps, self.kernels.batch.fewest_steps)
         over, blown = steps > limit, np.zeros(n, dtype=bool)
         sse = np.full((n, self._measured.shape[1]), np.inf)
-        population = Population(steps, over, sse, np.zeros(n, dtype=np.int64))
+        population = Population(parameters, starts, steps, over, sse, np.zeros(n, dtype=np.int64))
         todo = np.flatnonzero(~over)
         # The record's start tells cheaply what most of them need; whether it is enough the whole
         # record says.
         pilot = self.record.n_samples // _PILOT_PART
         if pilot >= _PILOT_LEAST:
-            excess = self._attempt(parameters, starts, population, todo, pilot)
+            excess = self._attempt(population, todo, pilot)
             more = _finer(steps[todo], excess)
             raised = np.isfinite(excess) & (excess > 1.0) & (more <= limit)
             steps[todo[raised]] = more[raised]
         for _ in range(_MAX_ROUNDS):
             if len(todo) == 0:
                 break
-            excess = self._attempt(parameters, starts, population, todo, self.record.n_samples)
+            excess = self._attempt(population, todo, self.record.n_samples)
             finite = np.isfinite(excess)
             more = _finer(steps[todo], excess)
             again = ~(excess <= 1.0)
@@ -138,8 +135,7 @@ class RecordSimulator:
         n_samples = self.record.n_samples
         sse, estimates = self.block(parameters, starts, lanes, n_steps, n_samples, kept)
         values[:] = kept[..., : len(lanes)]
-        taken = np.full(len(lanes), n_steps * (n_samples - 1))
-        return sse, self._excess(sse, estimates, taken)
+        return sse, self._excess(sse, estimates, np.full(len(lanes), n_steps * (n_samples - 1)))
 
     def block(
         self,
@@ -158,23 +154,17 @@ class RecordSimulator:
         padded = lanes.take(_ALL_LANES, mode="wrap")
         n_outputs = self._measured.shape[1]
         sums = np.empty((2 * n_outputs, LANES))
-        work = work_area(self._kernels.batch.work_rows * LANES)
+        work = work_area(self.kernels.batch.work_rows * LANES)
         record = (signal[:n_samples] for signal in (self._inputs, self._measured, self._weights))
         start, p = self._initial(starts, padded), np.ascontiguousarray(parameters[padded].T)
-        self._kernels.simulate(
-            work, work.reshape(-1, LANES), self._kernels.batch.tables, *record, start, p,
-            self.record.dt, n_steps, sums, residuals,
-        )  # fmt: skip
+        with explained_errors(self.kernels.model):
+            self.kernels.simulate(
+                work, work.reshape(-1, LANES), self.kernels.batch.tables, *record, start, p,
+                self.record.dt, n_steps, sums, residuals,
+            )  # fmt: skip
         return sums[:n_outputs].T[: len(lanes)], sums[n_outputs:].T[: len(lanes)]
 
-    def _attempt(
-        self,
-        parameters: FloatArray,
-        starts: FloatArray | None,
-        population: Population,
-        todo: IntArray,
-        n_samples: int,
-    ) -> FloatArray:
+    def _attempt(self, population: Population, todo: IntArray, n_samples: int) -> FloatArray:
         """Simulate part of a population, at its steps; error estimates in parts of the allowed."""
         steps = population.n_steps
         tasks = [
@@ -187,35 +177,28 @@ class RecordSimulator:
 
         def run(task: tuple[IntArray, int]) -> None:
             lanes, rung = task
-            sums = self.block(parameters, starts, lanes, rung, n_samples, nothing)
-            population.sse[lanes], estimates[lanes] = sums
+            population.sse[lanes], estimates[lanes] = self.block(
+                population.parameters, population.starts, lanes, rung, n_samples, nothing
+            )
 
-        self._workers.each(run, tasks)
+        self.workers.each(run, tasks)
         taken = steps[todo] * (n_samples - 1)
         population.spent[todo] += taken
         return self._excess(population.sse[todo], estimates[todo], taken)
 
     def _excess(self, sse: FloatArray, estimates: FloatArray, taken: IntArray) -> FloatArray:
-        """Error estimates in parts of what the accuracy allows, (n,), infinite after a failure.
-
-        sse, estimates: (n, n_outputs), sums over a simulation; taken: (n,), its steps.
-        """
+        """Error estimates (n,) in parts of what is allowed, infinite after a failure."""
         with np.errstate(all="ignore"):
             per_step = np.sqrt(estimates / taken[:, None]) / self._size(sse)
-        excess = np.max(per_step, axis=1) / (_ESTIMATE_LIMIT * self._accuracy)
+        excess = np.max(per_step, axis=1) / (_ESTIMATE_LIMIT * self.accuracy)
         return np.where(np.isfinite(sse).all(axis=1), excess, np.inf)
 
     def _size(self, sse: FloatArray) -> FloatArray:
-        """What is large for each output of each chromosome, (n, n_outputs).
-
-        Where nothing but zeros was measured it is the RMS of the simulated output, and where
-        nothing was measured at all no error matters.
-        """
+        """Size of each output, (n, n_outputs): its measured peak, of zeros the simulated RMS."""
         simulated = np.sqrt(sse / len(self._weights)) / self._weight
-        unmeasured = np.where(self._weight > 0.0, simulated, np.inf)
+        unmeasured = np.where(self._weight > 0.0, simulated, np.inf)  # then no error matters
         size = np.where(self._peak > 0.0, self._peak, unmeasured)
-        filled: FloatArray = np.where(size > 0.0, size, 1.0)
-        return filled
+        return np.where(size > 0.0, size, 1.0)
 
     def _rates(self, parameters: FloatArray, starts: FloatArray | None) -> FloatArray:
         """Fastest rate at the start of the record, under its largest inputs [1/s]."""
@@ -226,10 +209,11 @@ class RecordSimulator:
             start = self._initial(starts, lanes)
             states = np.broadcast_to(start, (len(self._extremes), *start.shape)).copy()
             p = np.ascontiguousarray(parameters[lanes].T)
-            self._kernels.spectrum(self._extremes, states, p, rate)
+            with explained_errors(self.kernels.model):
+                self.kernels.spectrum(self._extremes, states, p, rate)
             rates[lanes] = rate
 
-        self._workers.each(run, _blocks(np.arange(len(parameters))))
+        self.workers.each(run, _blocks(np.arange(len(parameters))))
         return rates
 
     def _initial(self, starts: FloatArray | None, lanes: IntArray) -> FloatArray:
@@ -258,8 +242,7 @@ def _with_bends(model: ProcessModel, inputs: FloatArray) -> FloatArray:
 
 def _finer(steps: IntArray, excess: FloatArray) -> IntArray:
     """Steps per sample for those whose error estimates exceed what is allowed."""
-    finite = np.isfinite(excess)
-    factor = np.where(finite, excess ** (1.0 / _ESTIMATE_ORDER), 8.0)
+    factor = np.where(np.isfinite(excess), excess ** (1.0 / _ESTIMATE_ORDER), 8.0)
     return _rungs(1.1 * np.clip(factor, 1.2, 8.0) * steps)
 
 

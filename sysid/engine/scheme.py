@@ -185,10 +185,7 @@ class Scheme:
         columns: Iterable[int] | None = None,
         factor: str = "",
     ) -> str:
-        """`` + M[row, j] * vector_j`` for the entries of a row that are not zero.
-
-        columns: the j for which there is a vector_j; default all for k, else the driven rows.
-        """
+        """`` + M[row, j] * vector_j`` over columns j, by default all for k, else driven rows."""
         if columns is None:
             columns = range(self.n_states) if vector == "k" else self.structure.driven
         if self.plain(row):

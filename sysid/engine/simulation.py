@@ -16,7 +16,6 @@ from sysid.problem.data import Dataset
 from sysid.problem.model import ModelError, ProcessModel
 from sysid.threads import Workers, available_cores
 
-_MAX_STEPS = 512
 _MOST_STEPS = 4096  # a sample, where accuracy is asked for
 _MOST_RECORDS = 64  # that a simulator keeps ready
 
@@ -95,7 +94,7 @@ class BatchSimulator:
         *,
         accuracy: float = 1e-3,
         threads: int | None = None,
-        max_steps: int = _MAX_STEPS,
+        max_steps: int = 512,
     ) -> None:
         if not 1e-12 <= accuracy <= 0.1:
             raise ModelError(f"accuracy {accuracy:g} is outside [1e-12, 0.1]")
@@ -215,9 +214,8 @@ class BatchSimulator:
                 self._records.clear()
             # It holds the record, whose address stays its own as long.
             self._records[key] = RecordSimulator(
-                self.model, self._kernels, record, scale,
-                self.accuracy, self.max_steps, self._workers,
-            )  # fmt: skip
+                self._kernels, record, scale, self.accuracy, self.max_steps, self._workers
+            )
         return self._records[key]
 
     def _check(self, parameters: FloatArray, records: Sequence[Dataset]) -> FloatArray:
@@ -237,9 +235,8 @@ class BatchSimulator:
 def _runs(steps: IntArray) -> list[tuple[slice, int]]:
     """Up to LANES neighbours each that take the same steps, and these."""
     ends = [*(np.flatnonzero(np.diff(steps)) + 1).tolist(), len(steps)]
-    begins = [0, *ends[:-1]]
     return [
         (slice(i, min(i + LANES, end)), int(steps[begin]))
-        for begin, end in zip(begins, ends, strict=True)
+        for begin, end in zip([0, *ends[:-1]], ends, strict=True)
         for i in range(begin, end, LANES)
     ]

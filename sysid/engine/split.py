@@ -132,8 +132,7 @@ class Splitter:
 
     def _power(self, base: Split, exponent: Split) -> tuple[str, Sequence[Split]]:
         """Form and operands by which the kernels compute a power."""
-        named = self.tape.named(exponent.total)
-        power = math.nan if named else float(constant(exponent.total))
+        power = math.nan if self.tape.named(exponent.total) else float(constant(exponent.total))
         if power.is_integer() and abs(power) <= _WHOLE:
             whole = f"{int(power)}" if power >= 0.0 else f"({int(power)})"
             return "{} ** {}", (base, self._leaf(whole))

@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 
 from sysid.arrays import FloatArray
-from sysid.engine.compiler import kernels
+from sysid.engine.compiler import explained_errors, kernels
 from sysid.engine.scheme import work_area
 from sysid.engine.trajectory_kernel import LEVELS
 from sysid.problem.model import ModelError, ProcessModel
@@ -96,12 +96,13 @@ class Stepper:
         n = len(x)
         a = np.zeros((n, n))
         compiled, work, base = self._kernels, self._work, self._base
-        compiled.levels(work, compiled.trajectory.tables, self.parameters, self.scale, base, a)
-        if compiled.trajectory.structure.guards and np.isfinite(a).all():
-            periods = np.abs(np.linalg.eigvals(a)).max() * base / (2.0 * math.pi)
-            self._least = min(math.ceil(math.log2(max(periods, 1.0))), LEVELS)
-        # A call over no interval, by which the compiler's complaints are explained.
-        nothing = np.empty((0, n)), np.empty((0, self._n_outputs))
-        compiled.advance(work, u[:1], x, base, self.n_steps, self._least, self._limit, *nothing)
-        self._run = compiled.advance.compiled
+        with explained_errors(self.model):
+            compiled.levels(work, compiled.trajectory.tables, self.parameters, self.scale, base, a)
+            if compiled.trajectory.structure.guards and np.isfinite(a).all():
+                periods = np.abs(np.linalg.eigvals(a)).max() * base / (2.0 * math.pi)
+                self._least = min(math.ceil(math.log2(max(periods, 1.0))), LEVELS)
+            # A call over no interval, to compile.
+            nothing = np.empty((0, n)), np.empty((0, self._n_outputs))
+            compiled.advance(work, u[:1], x, base, self.n_steps, self._least, self._limit, *nothing)
+        self._run = compiled.advance
         return self._run

@@ -87,9 +87,8 @@ def analyse(model: ProcessModel, *, exact: bool = True) -> Structure:
         for k, clamp in clamps.items()
     )
     driven, nonlinear = _driven(model, slopes if exact else None, clamps)
-    program = writer.program()
     return Structure(
-        writer.placed(linear), driven, nonlinear, guards, shown, program,
+        writer.placed(linear), driven, nonlinear, guards, shown, writer.program(),
         len(writer.constants), writer.calls,
     )  # fmt: skip
 
@@ -102,8 +101,7 @@ def _driven(
         return tuple(range(len(model.states))), True
     moving = {j for j, signal in enumerate(model.inputs) if signal.hold != "zoh"}
     bent = [bool(row.nonlinear or row.kinks.keys() & clamps.keys()) for row in rows]
-    driven = (i for i, row in enumerate(rows) if bent[i] or row.inputs & moving)
-    return tuple(driven), any(bent)
+    return tuple(i for i, row in enumerate(rows) if bent[i] or row.inputs & moving), any(bent)
 
 
 def _splits(splitter: Splitter, model: ProcessModel, function: Function) -> list[Split] | None:

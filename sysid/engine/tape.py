@@ -48,8 +48,7 @@ class Tape:
             line = Line(f"t{len(self._lines)}", form, operands, text, fixed)
             self._lines[text] = self._by_name[line.name] = line
             if self._values is not None:
-                result = operation(form, len(operands))(*map(self.value, operands))
-                self._values[line.name] = result
+                self._values[line.name] = operation(form, len(operands))(*map(self.value, operands))
         return self._lines[text].name
 
     def decide(self, form: str, *operands: str) -> bool:

@@ -158,21 +158,14 @@ class Comparison:
     def verdict(self) -> str:
         """The comparison in sentences."""
         best, *rest = self.rows
-        if self.validated:
-            sentences = [f"{best.name} explains the validation data best."]
-            sentences += [_against_validation(row, best.name) for row in rest]
-        else:
-            sentences = [
+        ranking = f"{best.name} explains the validation data best."
+        if not self.validated:
+            ranking = (
                 "Without validation data this ranks by BIC on the training data, which favours "
                 f"{best.name}; validation data would decide better."
-            ]
-            sentences += [
-                f"{row.name} failed: its free run grows out of bounds."
-                if row.verdict == "failed"
-                else f"{row.name} is {row.dbic:.3g} above it: {row.verdict}."
-                for row in rest
-            ]
-        return " ".join([*sentences, *self._preference()])
+            )
+        sentences = [ranking, *(_against(row, best.name) for row in rest), *self._preference()]
+        return " ".join(sentences)
 
     def _preference(self) -> list[str]:
         """Sentences on which of the equally good structures is preferred, and why."""
@@ -230,30 +223,22 @@ def compare(
     score = np.array([runs.score(importance) for runs in tested]) if tested else bic
     best = int(np.argmin(score))
     ratios = _ratios(tested, best, importance) if tested else [None] * len(names)
-    order = np.argsort(score, kind="stable").tolist()
     if np.isposinf(score[best]):
         raise ModelError("no structure has a free run that stays finite")
     with np.errstate(invalid="ignore"):  # all may be infinite
         daic, dbic = (aic - aic.min()).tolist(), (bic - bic.min()).tolist()
-    unknown = np.full(q, np.nan)
-    unmeasured = [Metrics(unknown, unknown, unknown, unknown)] * len(names)
-    metrics = [runs.metrics for runs in tested] or unmeasured
-    rows = [
-        Row(
-            candidates[i].name,
-            candidates[i].n_free,
-            candidates[i].n_effective,
-            trained[i].mean_rmse(importance),
-            metrics[i].rmse,
-            metrics[i].msd,
-            metrics[i].fit,
-            daic[i],
-            dbic[i],
-            ratios[i],
-            _standing(i == best, score[i], ratios[i], dbic[i]),
-        )
-        for i in order
-    ]
+    unmeasured = Metrics(*[np.full(q, np.nan)] * 4)
+    metrics = [runs.metrics for runs in tested] or [unmeasured] * len(names)
+    rows = []
+    for i in np.argsort(score, kind="stable").tolist():
+        structure, quality = candidates[i], metrics[i]
+        standing = _standing(i == best, score[i], ratios[i], dbic[i])
+        row = Row(
+            structure.name, structure.n_free, structure.n_effective,
+            trained[i].mean_rmse(importance), quality.rmse, quality.msd, quality.fit,
+            daic[i], dbic[i], ratios[i], standing,
+        )  # fmt: skip
+        rows.append(row)
     least = min(row.dbic for row in rows if row.good)
     backed = [row for row in rows if row.good and not row.dbic - least > _BIC_STRONG]
     preferred = min(backed, key=lambda row: row.n_effective)
@@ -263,8 +248,7 @@ def compare(
 class _FreeRuns:
     """Free runs of a structure on some records, without the first ``lag`` rows of each.
 
-    measured, simulated: per record (n_rows, n_outputs). scale: (n_outputs,), max|y| over all
-    records.
+    measured, simulated: per record (n_rows, n_outputs). scale: max|y| over all, (n_outputs,).
     """
 
     def __init__(self, records: Sequence[Dataset], runs: Sequence[FloatArray], lag: int) -> None:
@@ -297,8 +281,7 @@ class _FreeRuns:
             rmses, msds, fits = np.outer([np.inf, np.nan, -np.inf], np.ones(len(self.scale)))
             return Metrics(rmses, msds, fits, self.scale)
         measured, simulated = np.concatenate(self.measured), np.concatenate(self.simulated)
-        pairs = zip(self.measured, self.simulated, strict=True)
-        fit = mean_known([fit_percent(*pair) for pair in pairs], 0)
+        fit = mean_known(list(map(fit_percent, self.measured, self.simulated)), 0)
         rmses, msds = (metric(measured, simulated, self.scale) for metric in (rmse, msd))
         return Metrics(rmses, msds, fit, self.scale)
 
@@ -367,9 +350,12 @@ def _standing(best: bool, score: float, ratio: Ratio | None, dbic: float) -> Sta
     return "as good" if good else "worse"
 
 
-def _against_validation(row: Row, best: str) -> str:
-    if row.ratio is None:
+def _against(row: Row, best: str) -> str:
+    """A structure beside the best one, in a sentence; without validation by BIC."""
+    if row.verdict == "failed":
         return f"{row.name} failed: its free run grows out of bounds."
+    if row.ratio is None:
+        return f"{row.name} is {row.dbic:.3g} above it: {row.verdict}."
     value, low, high = (_times(x) for x in (row.ratio.value, row.ratio.low, row.ratio.high))
     size = f"{row.name} has squared errors {value} times those of {best} (95 %: {low} to {high})"
     if row.verdict == "worse":

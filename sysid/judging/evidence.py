@@ -7,8 +7,6 @@ import numpy as np
 
 from sysid.arrays import FloatArray
 
-_LEVEL = 0.95
-
 
 @dataclass(frozen=True)
 class Ratio:
@@ -45,7 +43,7 @@ def ratio_of_means(losses: Sequence[FloatArray], references: Sequence[FloatArray
         [a / top - b / bottom for a, b in zip(losses, references, strict=True)]
     )
     log = float(np.log(top / bottom))
-    half = float(student.ppf(0.5 + _LEVEL / 2.0, freedom)) * error
+    half = float(student.ppf(0.975, freedom)) * error
     p_value = 2.0 * float(student.sf(abs(log) / error, freedom)) if error > 0.0 else 0.0
     low, value, high = np.exp(np.array([log - half, log, log + half])).tolist()
     return Ratio(value, low, high, p_value)
@@ -58,8 +56,7 @@ def _standard_error(series: Sequence[FloatArray]) -> tuple[float, float]:
     if variance == 0.0:
         return 0.0, float(n)
     rho = float(np.clip(_covariance(series, 1, n) / variance, -0.99, 0.99))
-    width = 1.1447 * (4.0 * rho**2 / (1.0 - rho**2) ** 2 * n) ** (1.0 / 3.0)
-    width = min(width, n / 4.0)
+    width = min(1.1447 * (4.0 * rho**2 / (1.0 - rho**2) ** 2 * n) ** (1.0 / 3.0), n / 4.0)
     for lag in range(1, int(width) + 1):
         variance += 2.0 * (1.0 - lag / (width + 1.0)) * _covariance(series, lag, n)
     return float(np.sqrt(max(variance, 0.0) / n)), max(n / (width + 1.0) - 1.0, 1.0)

@@ -41,12 +41,8 @@ class ResidualTest:
 
     @property
     def independent(self) -> FloatArray:
-        """Share of the lags inside the band, (n_outputs, n_inputs); 0.95 is expected.
-
-        NaN for inputs that are not tested.
-        """
-        share = np.mean(np.abs(self.cross) <= self.cross_band, axis=0)
-        return np.where(self.tested, share, np.nan)
+        """Share of lags inside the band, (n_outputs, n_inputs), 0.95 expected; NaN if untested."""
+        return np.where(self.tested, np.mean(np.abs(self.cross) <= self.cross_band, axis=0), np.nan)
 
 
 def residual_test(
@@ -95,5 +91,4 @@ def _standard(values: FloatArray) -> FloatArray:
 
 def _products(a: FloatArray, b: FloatArray, lag: int) -> FloatArray:
     """Sum of a(t) b(t - lag), (n_a, n_b)."""
-    product: FloatArray = a[lag:].T @ b[: len(b) - lag]
-    return product
+    return a[lag:].T @ b[: len(b) - lag]

@@ -20,8 +20,7 @@ def rmse(
     >>> rmse(np.zeros((2, 1)), np.array([[3.0], [-3.0]]), scale=2.0).tolist()
     [1.5]
     """
-    result: FloatArray = np.sqrt(_mean((simulated - measured) ** 2, measured)) / scale
-    return result
+    return np.sqrt(_mean((simulated - measured) ** 2, measured)) / scale
 
 
 def msd(measured: FloatArray, simulated: FloatArray, scale: FloatArray | float = 1.0) -> FloatArray:

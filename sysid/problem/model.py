@@ -201,7 +201,14 @@ class ProcessModel:
 
     def __post_init__(self) -> None:
         for kind in ("states", "inputs", "outputs", "parameters", "constraints", "equations"):
-            object.__setattr__(self, kind, _as_tuple(self.name, kind, getattr(self, kind)))
+            items = getattr(self, kind)
+            try:
+                object.__setattr__(self, kind, tuple(items))
+            except TypeError:
+                raise ModelError(
+                    f"model {self.name}: {kind} is one {type(items).__name__}, not several; "
+                    f"write ({type(items).__name__}(...),) with a comma before the bracket"
+                ) from None
         for kind in ("states", "inputs", "outputs", "parameters"):
             _check_names(self.name, kind, [item.name for item in getattr(self, kind)])
         for name in self.output_names if self.output is None else ():
@@ -365,16 +372,6 @@ def picker(places: Sequence[int]) -> Callable[[Any], tuple[Any, ...]]:
         return lambda values: (values[first],)
     rest = picker(places[1:])
     return lambda values: (values[first], *rest(values))
-
-
-def _as_tuple(model: str, kind: str, items: Any) -> tuple[Any, ...]:
-    try:
-        return tuple(items)
-    except TypeError:
-        raise ModelError(
-            f"model {model}: {kind} is one {type(items).__name__}, not several; "
-            f"write ({type(items).__name__}(...),) with a comma before the bracket"
-        ) from None
 
 
 def _check_names(model: str, kind: str, names: list[str]) -> None:

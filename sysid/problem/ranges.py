@@ -36,12 +36,18 @@ def with_search_range(parameter: Parameter, given: Range | None, scale: Scale | 
     """
     low, high = (parameter.lower, parameter.upper) if given is None else given
     minimum, maximum = parameter.minimum, parameter.maximum
-    if low is None and high is None:
+    ends = [end for end in (low, high) if end is not None]
+    if not ends:
         raise ModelError(
             f"parameter {parameter.name}: a range needs at least one end; write [low, high], "
             "[low, null] or [null, high]"
         )
-    _check_limits(parameter, low, high)
+    if min(ends) < minimum or max(ends) > maximum:
+        shown = ", ".join("null" if end is None else f"{end:g}" for end in (low, high))
+        raise ModelError(
+            f"parameter {parameter.name}: range [{shown}] leaves what is physically possible, "
+            f"[{minimum:g}, {maximum:g}]"
+        )
     if high is None:
         assert low is not None
         minimum = max(minimum, low)
@@ -111,13 +117,3 @@ def _decade_below(high: float) -> float:
     if high == 0.0:
         return -1.0
     return high / _DECADE if high > 0.0 else high - _DECADE * abs(high)
-
-
-def _check_limits(parameter: Parameter, low: float | None, high: float | None) -> None:
-    ends = [end for end in (low, high) if end is not None]
-    if min(ends) < parameter.minimum or max(ends) > parameter.maximum:
-        shown = ", ".join("null" if end is None else f"{end:g}" for end in (low, high))
-        raise ModelError(
-            f"parameter {parameter.name}: range [{shown}] leaves what is physically possible, "
-            f"[{parameter.minimum:g}, {parameter.maximum:g}]"
-        )

@@ -196,8 +196,7 @@ class SearchSpace:
         lower, upper = self.coded_bounds
         near = _ON_BOUND * self.width
         at = self.encode(chromosome)
-        mask: BoolArray = (at < lower + near) | (at > upper - near)
-        return mask
+        return (at < lower + near) | (at > upper - near)
 
     def encode(self, chromosomes: FloatArray) -> FloatArray:
         """Search coordinates of chromosomes, (..., n_free)."""
@@ -251,18 +250,15 @@ class SearchSpace:
         for tie in self.ties:
             parameter, values = self.model.parameters[tie.index], vectors[:, tie.index]
             rows.append(np.maximum(parameter.minimum - values, values - parameter.maximum)[:, None])
-        rows.append(self._constraints(vectors))
+        rows.append(self.constraint_values(chromosomes))
         violations = np.maximum(0.0, np.concatenate(rows, axis=1))
         # Not-a-number is no proof of feasibility.
         return np.where(np.isnan(violations), np.inf, violations)
 
     def constraint_values(self, chromosomes: FloatArray) -> FloatArray:
         """The model's constraints g, satisfied where not above 0, (n_chromosomes, n)."""
-        return self._constraints(self.full(chromosomes))
-
-    def _constraints(self, vectors: FloatArray) -> FloatArray:
-        columns = tuple(vectors.T)
-        values = np.zeros((len(vectors), len(self.model.constraints)))
+        columns = tuple(self.full(chromosomes).T)
+        values = np.zeros((len(chromosomes), len(self.model.constraints)))
         for i, constraint in enumerate(self.model.constraints):
             values[:, i] = constraint.function(columns)
         return values

@@ -31,7 +31,7 @@ class FrequencyResponse:
     input the ordinary one. deviation: the same shape, standard deviation of the response (as of a
     complex number, so of its magnitude that over root 2). input_density: (n, n_inputs), power
     spectral density, unit squared per Hz, one-sided. varied: (n_inputs,), inputs that change; the
-    columns of the others are NaN. n_segments: averaged, n_independent: what they are worth.
+    columns of the others are NaN. n_segments: how many were averaged.
     """
 
     frequency: FloatArray
@@ -41,7 +41,6 @@ class FrequencyResponse:
     input_density: FloatArray
     varied: BoolArray
     n_segments: int
-    n_independent: float
 
 
 def frequency_response(records: Sequence[Dataset]) -> FrequencyResponse:
@@ -99,8 +98,7 @@ def sampled_response(
     held = _solved(np.exp(1j * omega * dt)[:, None, None] * eye - step[:n, :n], step[:n, n:])
     smooth = _solved((1j * omega)[:, None, None] * eye - a, b)
     zoh = np.array([hold == "zoh" for hold in holds])
-    result: ComplexArray = (c @ np.where(zoh, held, smooth) + d).astype(np.complex128)
-    return result
+    return (c @ np.where(zoh, held, smooth) + d).astype(np.complex128)
 
 
 def _solved(matrices: npt.NDArray[Any], columns: FloatArray) -> ComplexArray:
@@ -116,9 +114,7 @@ def _segment_length(records: Sequence[Dataset]) -> int:
 
 def _spectra(records: Sequence[Dataset], length: int) -> tuple[ComplexArray, ComplexArray]:
     """Fourier transforms of all segments, (n_segments, n_frequencies, n_channels), from bin 1."""
-    window: FloatArray = np.sqrt(2.0 / 3.0) * (
-        1.0 - np.cos(2.0 * np.pi * np.arange(length) / length)
-    )
+    window = np.sqrt(2.0 / 3.0) * (1.0 - np.cos(2.0 * np.pi * np.arange(length) / length))
     segments: list[tuple[ComplexArray, ComplexArray]] = []
     for record in records:
         with np.errstate(invalid="ignore"):
@@ -137,8 +133,7 @@ def _spectra(records: Sequence[Dataset], length: int) -> tuple[ComplexArray, Com
 
 def _transform(values: FloatArray, window: FloatArray) -> ComplexArray:
     # Without the mean and its leakage, and without the bin that has no phase.
-    result: ComplexArray = np.fft.rfft(values * window[:, None], axis=0)[1:-1]
-    return result
+    return np.fft.rfft(values * window[:, None], axis=0)[1:-1]
 
 
 def _estimate(
@@ -157,26 +152,21 @@ def _estimate(
     power = np.abs(response) ** 2
     with np.errstate(divide="ignore", invalid="ignore"):
         coherence = np.where(power + spread > 0.0, power / (power + spread), 0.0)
-    worth = max(_WORTH * k, 1.0)
     # Each fitted input takes a degree of freedom of the noise.
-    left = max(worth - u.shape[2], 1.0)
-    shape = (n, outputs.shape[2], len(varied))
+    left = max(_WORTH * k - u.shape[2], 1.0)
     return FrequencyResponse(
         frequency=np.arange(1, n + 1) / (length * dt),
-        response=_among(response, varied, shape),
-        coherence=_among(coherence, varied, shape).real,
-        deviation=_among(np.sqrt(spread / left), varied, shape).real,
+        response=_among(response, varied),
+        coherence=_among(coherence, varied).real,
+        deviation=_among(np.sqrt(spread / left), varied).real,
         input_density=2.0 * dt / length * np.mean(np.abs(inputs) ** 2, axis=0),
         varied=varied,
         n_segments=k,
-        n_independent=worth,
     )
 
 
-def _among(
-    values: npt.NDArray[np.generic], varied: BoolArray, shape: tuple[int, ...]
-) -> ComplexArray:
-    """Columns of the inputs that vary among those of all."""
-    whole = np.full(shape, np.nan + 0j)
+def _among(values: npt.NDArray[np.generic], varied: BoolArray) -> ComplexArray:
+    """Columns of the inputs that vary among those of all, NaN for the others."""
+    whole = np.full((*values.shape[:-1], len(varied)), np.nan + 0j)
     whole[:, :, varied] = values
     return whole

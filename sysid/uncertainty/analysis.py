@@ -20,7 +20,6 @@ from sysid.uncertainty.directions import PART, Directions, directions
 from sysid.uncertainty.estimate import Z95, Estimate, Why, product_text, product_unit, sum_text
 from sysid.uncertainty.relations import (
     Kind,
-    Relation,
     main_parameters,
     overlapping,
     overlooked_directions,
@@ -107,8 +106,7 @@ def uncertainty(
         determined.singular_values,
         determined.rank,
     )
-    names = objective.space.names
-    named = [dict(zip(names, rival.tolist(), strict=True)) for rival in rivals]
+    named = [dict(zip(objective.space.names, rival.tolist(), strict=True)) for rival in rivals]
     return _among_rivals(result, named)
 
 
@@ -148,23 +146,22 @@ class _Analysis:
     """Estimates and ambiguities from the directions that the data determine."""
 
     def __init__(self, local: Sensitivity, determined: Directions) -> None:
-        self.determined, self.relations = determined, relations(local, determined)
+        self.determined = determined
+        self.exact, self.vague = relations(local, determined)
         self.chromosome, self.increments = local.chromosome, local.increments
         self.log = local.objective.space.log
         self.names = local.objective.space.names
         self.units = [parameter.unit for parameter in local.objective.space.parameters]
         # Relative change of each parameter per unit of its coordinate; none of what is zero.
-        nothing, nonzero = np.zeros(len(self.chromosome)), self.chromosome != 0.0
-        self.relative_increments = np.divide(
-            self.increments, self.chromosome, out=nothing, where=nonzero
-        )
+        divisors = np.where(self.chromosome != 0.0, self.chromosome, np.inf)
+        self.relative_increments = self.increments / divisors
 
     def parameter(self, j: int) -> Estimate:
         """Estimate of a free parameter."""
         why: Why = ""
         if self.determined.held[j]:
             why = "bound"
-        elif any(relation.exact and relation.support[j] for relation in self.relations):
+        elif any(relation.vector[j] for relation in self.exact):
             why = "tied"
         elif self.determined.undetermined_share[j] > PART:
             why = "vague"
@@ -176,19 +173,17 @@ class _Analysis:
 
     def ambiguities(self) -> Iterator[Ambiguity]:
         """Exact relations that share parameters together, each vague direction by itself."""
-        exact = [relation for relation in self.relations if relation.exact]
-        for places in overlapping([relation.support for relation in exact]):
-            members = [exact[i] for i in places]
-            group = np.flatnonzero(np.any([relation.support for relation in members], axis=0))
-            vectors = np.stack([relation.vector[group] for relation in members])
+        for places in overlapping([relation.vector != 0.0 for relation in self.exact]):
+            members = [self.exact[i] for i in places]
+            vectors = np.stack([relation.vector for relation in members])
+            group = np.flatnonzero(vectors.any(axis=0))
             if all(relation.kind == "sum" for relation in members):
-                yield self._ambiguity("sum", group, members, self._sums(group, vectors))
+                yield self._ambiguity("sum", group, vectors, self._sums(group, vectors[:, group]))
             else:
                 products = self._products(group, len(group) - len(members))
-                yield self._ambiguity("product", group, members, products)
-        for relation in self.relations:
-            if not relation.exact:
-                yield self._ambiguity("vague", main_parameters(relation.vector), [relation], [])
+                yield self._ambiguity("product", group, vectors, products)
+        for vector in self.vague:
+            yield self._ambiguity("vague", main_parameters(vector), vector[None], [])
 
     def _product(self, exponents: FloatArray) -> Estimate:
         """Estimate of a product of powers of the parameters."""
@@ -215,14 +210,12 @@ class _Analysis:
         return tuple((self.names[i], float(weights[i])) for i in np.flatnonzero(weights))
 
     def _deviation(self, direction: FloatArray) -> float:
-        variance = float(direction @ self.determined.covariance @ direction)
-        return float(np.sqrt(max(variance, 0.0)))
+        return float(np.sqrt(max(float(direction @ self.determined.covariance @ direction), 0.0)))
 
     def _ambiguity(
-        self, kind: Kind, group: IntArray, members: list[Relation], determined: list[Estimate]
+        self, kind: Kind, group: IntArray, vectors: FloatArray, determined: list[Estimate]
     ) -> Ambiguity:
         group = np.array(sorted(group, key=lambda i: _effort(self.units[i])))
-        vectors = np.stack([relation.vector for relation in members])
         measure: list[int] = []
         for i in group.tolist():
             if np.linalg.matrix_rank(vectors[:, [*measure, i]]) > len(measure):

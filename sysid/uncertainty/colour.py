@@ -65,10 +65,7 @@ def record_rows(lengths: Iterable[int]) -> list[slice]:
 def score_covariance(
     slopes: FloatArray, lengths: Sequence[int], model: Autoregression
 ) -> FloatArray:
-    """Covariance of sum_t slopes_t' e_t, (p, p).
-
-    slopes: (n, q, p), of records of the given lengths one after another.
-    """
+    """Covariance (p, p) of sum_t slopes_t' e_t; slopes: (n, q, p), record after record."""
     p = slopes.shape[2]
     total = np.zeros((p, p))
     for rows in record_rows(lengths):
@@ -157,7 +154,6 @@ def longest_memory(model: Autoregression, variance: FloatArray) -> FloatArray:
         gain = np.linalg.inv(np.eye(q) - model.coefficients.sum(axis=0))
     except np.linalg.LinAlgError:  # a pole at exactly one
         return np.full(q, np.inf)
-    slow = np.diag(gain @ model.noise @ gain.T)
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = slow / variance
+        ratio = np.diag(gain @ model.noise @ gain.T) / variance
     return np.where(np.isfinite(ratio), np.maximum(ratio, 1.0), 1.0)

@@ -58,8 +58,8 @@ class Estimate:
         return not self.low <= self.at(parameters) <= self.high
 
 
-def _fraction(powers: Iterable[tuple[str, float]], times: str, over: str) -> str:
-    """A product of powers as text: ``a*b^2/(c*d)`` with ``*`` for times and ``/`` for over."""
+def product_text(powers: Iterable[tuple[str, float]], times: str = " ", over: str = " / ") -> str:
+    """A product of powers: ``a b^2 / (c d)``, or ``a*b^2/(c*d)`` with ``*`` and ``/``."""
     above: list[str] = []
     below: list[str] = []
     for name, power in powers:
@@ -67,11 +67,6 @@ def _fraction(powers: Iterable[tuple[str, float]], times: str, over: str) -> str
         (above if power > 0 else below).append(factor)
     bottom = times.join(below) if len(below) < 2 else f"({times.join(below)})"
     return (times.join(above) or "1") + (over + bottom if below else "")
-
-
-def product_text(terms: Sequence[tuple[str, float]]) -> str:
-    """``a b^2 / c`` of exponents 1, 2 and -1."""
-    return _fraction(terms, " ", " / ")
 
 
 def sum_text(terms: Sequence[tuple[str, float]]) -> str:
@@ -101,7 +96,7 @@ def product_unit(factors: Iterable[tuple[str, float]]) -> str:
         if powers[unit] * powers[against] < 0:
             times = powers.pop(unit)
             powers.update({symbol: times * part for symbol, part in parts.items()})
-    return _fraction([(symbol, times) for symbol, times in powers.items() if times], "*", "/")
+    return product_text([(symbol, times) for symbol, times in powers.items() if times], "*", "/")
 
 
 def _powers(unit: str) -> Counter[str] | None:

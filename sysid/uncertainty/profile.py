@@ -18,9 +18,6 @@ _ITERATIONS = 20
 # A parameter without a standard deviation is moved by parts of its range.
 _BLIND_SHARE = 0.05
 
-# A search coordinate and the statistic there.
-_Point = tuple[float, float]
-
 
 @dataclass(frozen=True)
 class Profile:
@@ -85,11 +82,11 @@ class _Tracer:
         # Statistic per loss of error.
         self.factor = 2.0 * sum(local.lengths) / inflation
 
-    def side(self, sign: float) -> list[_Point]:
-        """Points on one side, each from the best fit before, until well beyond the 95 % level."""
+    def side(self, sign: float) -> list[tuple[float, float]]:
+        """Coordinates and statistics on one side, outwards until well beyond the 95 % level."""
         lower, upper = self.space.coded_bounds
         end = float((lower if sign < 0.0 else upper)[self.place])
-        at, points = self.start, []
+        at, points = self.start, []  # each fit starts from the one before
         for step in _STEPS:
             coordinate = self.centre + sign * step * self.unit
             beyond = sign * (coordinate - end) >= 0.0
@@ -113,7 +110,7 @@ class _Tracer:
         coded[self.place] = coordinate
         return float(self.space.decode(coded)[self.place])
 
-    def crossing(self, points: list[_Point]) -> float | None:
+    def crossing(self, points: list[tuple[float, float]]) -> float | None:
         """Value at which the root of the statistic, nearly straight, passes the 95 % level."""
         for (a, low), (b, high) in itertools.pairwise(points):
             below, above = np.sqrt(low), np.sqrt(high)

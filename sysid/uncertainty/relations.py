@@ -30,29 +30,16 @@ _SHARE = 0.1  # entries of a vague direction below this share of its largest are
 
 @dataclass(frozen=True)
 class Relation:
-    """A direction that leaves the outputs alone.
-
-    vector: (n_free,), in coordinates. kind: how it goes on beyond the first step; ``product``
-    and ``sum`` are exact, ``vague`` is only hidden by the noise.
-    """
+    """A direction, (n_free,), that leaves the outputs alone, followed as a product or a sum."""
 
     vector: FloatArray
     kind: Kind
 
-    @property
-    def exact(self) -> bool:
-        """Whether no data of this kind could ever determine it."""
-        return self.kind != "vague"
 
-    @property
-    def support(self) -> BoolArray:
-        """Parameters that take part, (n_free,)."""
-        taking: BoolArray = self.vector != 0.0
-        return taking
-
-
-def relations(sensitivity: Sensitivity, directions: Directions) -> list[Relation]:
-    """The undetermined directions as simple ones, each followed to see what it is.
+def relations(
+    sensitivity: Sensitivity, directions: Directions
+) -> tuple[list[Relation], list[FloatArray]]:
+    """Undetermined directions, made simple: exact relations, and those that the noise hides.
 
     Directions that do not move the outputs at all are made simple by themselves, the others up
     to these.
@@ -68,7 +55,7 @@ def relations(sensitivity: Sensitivity, directions: Directions) -> list[Relation
                 vague.append(vector)
             else:
                 exact.append(relation)
-    return exact + [Relation(_simplest(vector, exact), "vague") for vector in vague]
+    return exact, [_simplest(vector, exact) for vector in vague]
 
 
 def overlooked_directions(
@@ -115,13 +102,9 @@ class _Follower:
 
     def exact(self, vector: FloatArray, relations: list[Relation]) -> Relation | None:
         """The exact relation that a direction is but for errors, unless among ``relations``."""
-        tried = []
         size = np.abs(vector)
-        for share in _SHARES:
-            members = np.flatnonzero(size > share * size.max()).tolist()
-            if members in tried:
-                continue
-            tried.append(members)
+        groups = [np.flatnonzero(size > share * size.max()).tolist() for share in _SHARES]
+        for members, _ in itertools.groupby(groups):
             for candidate in self._candidates(vector, members):
                 kind = self.kind(candidate)
                 if kind != "vague" and _is_new(candidate, relations):
@@ -187,15 +170,13 @@ def _is_new(vector: FloatArray, relations: list[Relation]) -> bool:
     if not relations:
         return True
     basis = np.linalg.qr(np.stack([relation.vector for relation in relations]).T)[0]
-    rest = _beyond(vector, [*basis.T])
-    return bool(np.linalg.norm(rest) > _NEW * np.linalg.norm(vector))
+    return bool(np.linalg.norm(_beyond(vector, [*basis.T])) > _NEW * np.linalg.norm(vector))
 
 
 def _beyond(vector: FloatArray, basis: Sequence[FloatArray]) -> FloatArray:
     """What orthonormal directions leave unexplained of a direction."""
     axes = np.array(basis).reshape(-1, len(vector))
-    rest: FloatArray = vector - axes.T @ (axes @ vector)
-    return rest
+    return vector - axes.T @ (axes @ vector)
 
 
 def _whole(ratios: FloatArray) -> FloatArray | None:
@@ -218,7 +199,7 @@ def _simplest(vector: FloatArray, exact: list[Relation]) -> FloatArray:
     """A direction of the fewest parameters that adding exact ones, which do nothing, allows."""
     for relation in exact:
         ways = [vector]
-        for j in np.flatnonzero(relation.support):
+        for j in np.flatnonzero(relation.vector):
             way = vector - vector[j] / relation.vector[j] * relation.vector
             ways.append(np.where(np.abs(way) < _NOTHING * np.max(np.abs(way)), 0.0, way))
         vector = min(ways, key=lambda way: len(main_parameters(way)))

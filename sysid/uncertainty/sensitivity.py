@@ -19,7 +19,7 @@ _DRAWS = 128
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """Residuals and their slopes at a chromosome, (n_free,), by simulations of so many steps.
+    """Residuals and their slopes at a chromosome, (n_free,), by so many steps for each record.
 
     residual: (n_residuals, n_outputs), simulated minus measured in parts of the output's scale,
     0 where a sample was lost; seen: of the same shape, where none was. slopes: (n_residuals,
@@ -42,8 +42,7 @@ class Sensitivity:
     @cached_property
     def rows(self) -> FloatArray:
         """Slopes of the outputs that have a weight, (n_rows, n_free)."""
-        weighted = self.slopes[:, self.objective.weights > 0.0]
-        return weighted.reshape(-1, len(self.chromosome))
+        return self.slopes[:, self.objective.weights > 0.0].reshape(-1, len(self.chromosome))
 
     @cached_property
     def increments(self) -> FloatArray:
@@ -52,22 +51,15 @@ class Sensitivity:
         return np.where(self.objective.space.log, self.chromosome, units)
 
 
-def common_steps(objective: Objective, chromosome: FloatArray) -> list[int]:
-    """Integration steps per sample that serve a chromosome and its neighbours, for each record."""
-    needed = objective.steps_needed(_with_neighbours(objective, chromosome))
-    return [int(steps) for steps in needed.max(axis=0)]
+def sensitivity(objective: Objective, chromosome: FloatArray) -> Sensitivity:
+    """Residuals and slopes at a chromosome, (n_free,), by central differences.
 
-
-def sensitivity(
-    objective: Objective, chromosome: FloatArray, steps: list[int] | None = None
-) -> Sensitivity:
-    """Residuals and slopes by central differences of simulations with equal steps.
-
-    chromosome: (n_free,). steps: per sample of each record, default ``common_steps``. A
-    perturbed simulation that fails has slope zero.
+    All simulations of a record take as many steps as the most demanding of them needs; one that
+    fails has slope zero.
     """
-    steps = common_steps(objective, chromosome) if steps is None else steps
-    residuals = objective.residuals(_with_neighbours(objective, chromosome), steps).values
+    neighbours = _with_neighbours(objective, chromosome)
+    steps = [int(needed) for needed in objective.steps_needed(neighbours).max(axis=0)]
+    residuals = objective.residuals(neighbours, steps).values
     n = len(chromosome)
     slopes = (residuals[..., 1 : n + 1] - residuals[..., n + 1 :]) / (2.0 * _PERTURBATION)
     slopes = np.where(np.isfinite(slopes), slopes, 0.0)
@@ -91,10 +83,7 @@ def coordinate_units(objective: Objective, chromosome: FloatArray) -> FloatArray
 
 
 def zero_errors(sensitivity: Sensitivity) -> Iterator[FloatArray]:
-    """Change of all residuals by one standard deviation of each sensor's zero error.
-
-    Each is (n_residuals, n_outputs): a constant error of one channel of one record.
-    """
+    """Changes (n_residuals, n_outputs) by a standard deviation of each channel's zero error."""
     objective = sensitivity.objective
     for k, rows in enumerate(record_rows(sensitivity.lengths)):
         record = objective.records[k]
