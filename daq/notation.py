@@ -28,7 +28,7 @@ _TEX_OPERATORS = {" - ": " $-$ ", " + ": " $+$ "}
 _TEX_UNITS = {"*": r"\,", "ohm": r"\ensuremath{\Omega}"}
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _PREFIXES = {-9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M"}
-# A power would be of the prefix as well: mm^2 is no thousandth of m^2.
+# Not before a power, which would raise the prefix too: 1 mm^2 is not 1e-3 m^2.
 _PREFIXABLE = re.compile(r"(V|A|ohm|H|F|N|W|J|s|Hz|Pa|T|Wb|m|rad)(?![\w^])")
 
 
@@ -41,14 +41,14 @@ def equation(text: str) -> str:
     """An equation in names (``L_m di_m/dt = v_m - R_m*i_m``) as HTML."""
     parts = re.split(r"\bd([A-Za-z]\w*)/dt", text)
     parts[1::2] = [f"d{_html_atom(name)}/d<i>t</i>" for name in parts[1::2]]
-    # Products without their signs, and a minus that is one.
-    signs = [re.sub(r"(?<![\w;])-(?=[\s<\w(])", "−", html(part)) for part in parts[::2]]
-    parts[::2] = [part.replace("*", "\u2009") for part in signs]
+    # A proper minus sign, and a thin space for the sign of multiplication.
+    texts = [re.sub(r"(?<![\w;])-(?=[\s<\w(])", "−", html(part)) for part in parts[::2]]
+    parts[::2] = [part.replace("*", "\u2009") for part in texts]
     return "".join(parts)
 
 
 def tex(expression: str) -> str:
-    """The same as LaTeX, to stand in text."""
+    """A name or an expression of names as LaTeX, to stand in text."""
     return _translated(
         expression,
         lambda name: _math(name) or escape_tex(name),
@@ -57,17 +57,17 @@ def tex(expression: str) -> str:
 
 
 def label(expression: str) -> str:
-    """The same as a label of a figure, in matplotlib's mathematical text."""
+    """A name or an expression of names as a figure's label, in matplotlib's mathtext."""
     return _translated(expression, lambda name: _math(name) or words(name), _label_rest)
 
 
 def words(name: str) -> str:
-    """A signal's name as words; a dollar sign is no mathematics."""
+    """A signal's name as words, with dollar signs escaped: they would begin mathematics."""
     return name.replace("_", " ").replace("$", r"\$")
 
 
 def unit_text(unit: str) -> str:
-    """A unit with its signs: ``N·m·s/(rad·A)``, ``Ω``; nothing for a pure number."""
+    """A unit in its symbols: ``N·m·s/(rad·A)``, ``Ω``; empty for a pure number."""
     if unit in ("", "1"):
         return ""
     text = re.sub(r"\bohm\b", "Ω", unit).replace("*", "·")
@@ -75,7 +75,7 @@ def unit_text(unit: str) -> str:
 
 
 def unit_tex(unit: str) -> str:
-    """The same as LaTeX."""
+    """A unit as LaTeX; empty for a pure number."""
     return "" if unit == "1" else _tex_pieces(unit, r"(\^-?\d+|\*|\bohm\b)", _TEX_UNITS)
 
 
@@ -100,7 +100,7 @@ def number(value: float, digits: int = 4) -> str:
 
 
 def digits(value: float, deviation: float | None) -> int:
-    """As many significant digits as an uncertainty supports; few where there is no telling."""
+    """Significant digits that an uncertainty supports; 2 where it is unknown."""
     if deviation is None:
         return 2
     if deviation <= 0.0 or value == 0.0:
@@ -110,7 +110,7 @@ def digits(value: float, deviation: float | None) -> int:
 
 
 def engineering(value: float, unit: str) -> tuple[float, str]:
-    """Factor and unit in which a value has one to three digits before the point, as 0.54 mH.
+    """Factor and unit that bring one to three digits before the point: 1e6, ``µH`` for 5.4e-4 H.
 
     The factor is 1 from a tenth to a thousand, and for units that take no prefix (kg, 1/s, m^2).
     """
@@ -130,7 +130,7 @@ def number_html(text: str) -> str:
 
 
 def number_tex(text: str) -> str:
-    """The same as LaTeX."""
+    """A printed number (``5.4e-4``) as LaTeX."""
     mantissa, _, power = text.partition("e")
     return rf"${mantissa}\times10^{{{int(power)}}}$" if power else f"${mantissa}$"
 
@@ -151,7 +151,7 @@ def _translated(expression: str, atom: Callable[[str], str], rest: Callable[[str
 
 
 def _symbol(name: str) -> tuple[str, str, str] | None:
-    """A letter, its index, and ``(0)`` where its value at time 0 is meant; None for a word."""
+    """A letter, its index, and ``(0)`` for a value at time 0, or empty; None for a word."""
     match = _SYMBOL.fullmatch(name)
     if match is None:
         return None
@@ -184,7 +184,7 @@ def _math(name: str) -> str | None:
 
 
 def _tex_pieces(text: str, pattern: str, signs: Mapping[str, str]) -> str:
-    """A text as LaTeX, split at powers and signs."""
+    """A text as LaTeX; pattern: its powers and signs, signs: what the latter become."""
     pieces = re.split(pattern, text)
     for k, piece in enumerate(pieces):
         is_power = piece.startswith("^") and len(piece) > 1

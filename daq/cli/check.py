@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from daq.recording.preview import ChannelFacts, Preview
 
 _BARS = " ▁▂▃▄▅▆▇█"
-_WIDE, _HIGH = 60, 48.0  # letters and dB of a spectrum's sketch
+_WIDTH, _HEIGHT = 60, 48.0  # characters and dB of a spectrum's sketch
 
 
 def check(
@@ -51,10 +51,10 @@ def check(
 
 def _show(checked: Preview) -> None:
     plan, experiment, session = checked.plan, checked.experiment, checked.session
-    most = "up to " if plan.commands is None else ""
+    at_most = "up to " if plan.commands is None else ""
     _show_channels(
-        f"{session.loaded.file.path} on {session.rig.name}: {most}{plan.n_samples} samples at "
-        f"{experiment.sample_rate:g} Hz, {most}{checked.seconds:g} s",
+        f"{session.loaded.file.path} on {session.rig.name}: {at_most}{plan.n_samples} samples at "
+        f"{experiment.sample_rate:g} Hz, {at_most}{checked.seconds:g} s",
         checked.channels,
     )
     _show_references(checked)
@@ -80,19 +80,20 @@ def _show(checked: Preview) -> None:
 
 
 def _show_channels(title: str, channels: dict[str, ChannelFacts]) -> None:
-    """A column for each channel; rows of what is not known beforehand are left out."""
-    each, number = list(channels.values()), terminal.number
+    """A column for each channel, without the rows that only a run would tell."""
+    facts, number = list(channels.values()), terminal.number
     rows = [
-        ["lowest", *(number(facts.lowest_volts, 3) for facts in each)],
-        ["highest", *(number(facts.highest_volts, 3) for facts in each)],
-        ["limits of the rig", *("{:g} to {:g}".format(*facts.limits_volts) for facts in each)],
+        ["lowest", *(number(channel.lowest_volts, 3) for channel in facts)],
+        ["highest", *(number(channel.highest_volts, 3) for channel in facts)],
+        ["limits of the rig", *("{:g} to {:g}".format(*channel.limits_volts) for channel in facts)],
     ]
-    if any(facts.mean_volts is not None for facts in each):
+    if any(channel.mean_volts is not None for channel in facts):
+        bands = [channel.power_band_hz or [None] for channel in facts]
         rows += [
-            ["mean", *(_numbers(facts.mean_volts) for facts in each)],
-            ["rms about the mean", *(_numbers(facts.rms_volts) for facts in each)],
-            ["crest factor [1]", *(_numbers(facts.crest_factor) for facts in each)],
-            ["90 % of power [Hz]", *(_numbers(*(facts.power_band_hz or [None])) for facts in each)],
+            ["mean", *(_numbers(channel.mean_volts) for channel in facts)],
+            ["rms about the mean", *(_numbers(channel.rms_volts) for channel in facts)],
+            ["crest factor [1]", *(_numbers(channel.crest_factor) for channel in facts)],
+            ["90 % of power [Hz]", *(_numbers(*band) for band in bands)],
         ]
     terminal.print_table(title, ["command [V]", *channels], rows)
 
@@ -117,31 +118,32 @@ def _sketch(checked: Preview) -> None:
     from daq.hal import CHANNELS
     from daq.recording.preview import spectral_lines
 
-    can = (sys.stdout.encoding or "").lower().replace("-", "") == "utf8"
+    has_bars = (sys.stdout.encoding or "").lower().replace("-", "") == "utf8"
     plan = checked.plan
-    if plan.commands is None or not sys.stdout.isatty() or not can:
+    if plan.commands is None or not sys.stdout.isatty() or not has_bars:
         return
     low = high = 0.0
     for column, name in zip(plan.commands[plan.steady].T, CHANNELS, strict=True):
-        frequency, sizes = spectral_lines(column, checked.experiment.sample_rate)
+        frequency, amplitudes = spectral_lines(column, checked.experiment.sample_rate)
         low, high = float(frequency[0]), float(frequency[-1])
-        if sizes.any():
-            print(f"{name:<8} {_bars(frequency, sizes)}")
+        if amplitudes.any():
+            print(f"{name:<8} {_bars(frequency, amplitudes)}")
     ends = f"{low:.3g} Hz", f"{high:.3g} Hz"
-    scale = f"{ends[0]}{' logarithmic '.center(_WIDE - len(''.join(ends)), '·')}{ends[1]}"
-    print(f"{'':<8} {scale}  bars: {_HIGH:g} dB\n")
+    scale = f"{ends[0]}{' logarithmic '.center(_WIDTH - len(''.join(ends)), '·')}{ends[1]}"
+    print(f"{'':<8} {scale}  bars: {_HEIGHT:g} dB\n")
 
 
-def _bars(frequency: FloatArray, sizes: FloatArray) -> str:
-    """The largest line in each of equal parts of a logarithmic axis, as bars over decibels."""
+def _bars(frequency: FloatArray, amplitudes: FloatArray) -> str:
+    """Spectral lines as bars in dB: of each part of a logarithmic axis the largest line."""
     import numpy as np
 
-    edges = np.geomspace(frequency[0], frequency[-1] * (1.0 + 1e-9), _WIDE + 1)
+    edges = np.geomspace(frequency[0], frequency[-1] * (1.0 + 1e-9), _WIDTH + 1)
     first = np.searchsorted(frequency, edges[:-1])
     last = np.searchsorted(frequency, edges[1:])
-    # Where no line falls in a part, the next below it stands for it.
+    # A part without a line shows the next line below it.
     first = np.where(last > first, first, np.maximum(last - 1, 0))
-    largest = np.array([np.max(sizes[a : max(b, a + 1)]) for a, b in zip(first, last, strict=True)])
-    decibels = 20.0 * np.log10(np.maximum(largest / sizes.max(), 1e-9))
-    steps = np.ceil((decibels / _HIGH + 1.0) * (len(_BARS) - 1))
+    parts = zip(first, np.maximum(last, first + 1), strict=True)
+    largest = np.array([amplitudes[low:high].max() for low, high in parts])
+    decibels = 20.0 * np.log10(np.maximum(largest / amplitudes.max(), 1e-9))
+    steps = np.ceil((decibels / _HEIGHT + 1.0) * (len(_BARS) - 1))
     return "".join(_BARS[int(step)] for step in np.clip(steps, 0, len(_BARS) - 1))

@@ -1,4 +1,4 @@
-"""What identifications say: tables and sentences on a terminal, a document for machines."""
+"""Output of an identification: tables and sentences on a terminal, a document for machines."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ _STRONG = 0.95  # correlation above which two parameters are named together
 def show_identification(
     result: Identification, report: bool, json: bool, seeds: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """Print a result that was written, and write its report; the document for machines.
+    """Print a result whose files are written, and publish its report; the document for machines.
 
-    seeds: lines on the other seeds, of which this result is the best.
+    seeds: lines on all seeds of the search, of which this result is the best.
     """
     document = {**result.document, "files": {"parameters": str(result.parameters_file)}}
     if not json:
@@ -46,7 +46,7 @@ def show_identification(
 
 
 def _publish(result: Identification, json: bool) -> dict[str, str]:
-    # matplotlib: the printed result does not wait for it
+    # Imports matplotlib, for which the printed result does not wait.
     from daq.report.publication import publish
 
     assert result.folder is not None
@@ -93,7 +93,7 @@ def _show_parameters(result: Identification) -> None:
 
 
 def _parameter_row(result: Identification, row: ParameterRow) -> list[str]:
-    # All of a row in the same unit, which is that of its value.
+    # One unit for the whole row, chosen by its value.
     scale, unit = notation.engineering(row.value, row.unit)
     source = "data" if row.name in result.estimator.guesses_ else row.source
     digits = row.digits if result.rows.refined else 4
@@ -109,7 +109,7 @@ def _parameter_row(result: Identification, row: ParameterRow) -> list[str]:
 def _span(
     ends: tuple[float, float], configured: tuple[float | None, float | None] | None, scale: float
 ) -> str:
-    """A range; in brackets an end that is only where the search starts."""
+    """A range as text; brackets mark an end where the search starts, but which is no bound."""
     bounds = zip(ends, configured or ends, strict=True)
     return " .. ".join(
         f"({scale * end:g})" if bound is None else f"{scale * end:g}" for end, bound in bounds
@@ -123,23 +123,23 @@ def _interval(row: QuantityRow, scale: float) -> str:
 
 
 def _show_open_questions(rows: Rows) -> None:
-    """What the data do not tell, what they tell instead, and what measurement would."""
+    """Parameters that the data do not determine, and what measurement would tell them."""
     _show_rivals(rows)
     _show_products(rows)
     vague = rows.ambiguities_of("vague")
     if vague:
         names = "; ".join(" with ".join(a.parameters) for a in vague)
         terminal.print_text(f"Hardly felt by these data: {names}.")
-    close = [pair for pair, value in rows.correlations.items() if abs(value) > _STRONG]
-    if close:
-        pairs = "; ".join(" and ".join(pair) for pair in close)
+    strong = [pair for pair, value in rows.correlations.items() if abs(value) > _STRONG]
+    if strong:
+        pairs = "; ".join(" and ".join(pair) for pair in strong)
         terminal.print_text(f"Known mostly together (correlation above {_STRONG:g}): {pairs}.")
-    if rows.ambiguities_of("product", "sum", "vague") or close:
+    if rows.ambiguities_of("product", "sum", "vague") or strong:
         print()
 
 
 def _show_rivals(rows: Rows) -> None:
-    """Other minima that explain the data as well."""
+    """Sets of parameters in other minima, which explain the data as well."""
     for ambiguity in rows.ambiguities_of("rival"):
         table = [_rival_row(rows.parameter(name), rows.rivals) for name in ambiguity.parameters]
         head = ["parameter", "this one", *["another"] * len(rows.rivals), "unit"]
@@ -152,14 +152,14 @@ def _show_rivals(rows: Rows) -> None:
 
 
 def _rival_row(row: ParameterRow, rivals: Sequence[Mapping[str, float]]) -> list[str]:
-    """One parameter in each of the sets, all in the unit of the first."""
+    """One parameter in this result and in each rival, all in the unit of the first."""
     scale, unit = notation.engineering(row.value, row.unit)
     values = (row.value, *(rival[row.name] for rival in rivals))
     return [row.name, *(terminal.number(scale * value, 3) for value in values), unit]
 
 
 def _show_products(rows: Rows) -> None:
-    """Products and sums of parameters that are known where the parameters are not."""
+    """Products and sums that the data determine, of parameters that they do not."""
     for index, ambiguity in enumerate(rows.ambiguities_of("product", "sum")):
         if index == 0:
             print("What these data cannot tell apart:")
@@ -179,7 +179,7 @@ def _show_products(rows: Rows) -> None:
 def _show_profiles(profiles: Sequence[Profile]) -> None:
     rows = []
     for profile in profiles:
-        # The data set no end where the profile stays low.
+        # None where the profile never rises enough: the data set no end on that side.
         ends = ["open" if p is None else terminal.number(p) for p in (profile.low, profile.high)]
         rows.append([profile.name, terminal.number(profile.value), " .. ".join(ends), profile.unit])
     if rows:
@@ -224,9 +224,9 @@ def _show_notes(result: Identification) -> None:
         )
     terminal.print_text(f"Trust: {verdict.trust}. {' '.join(verdict.reasons)}")
     if rows.refined:
-        together = len(rows.combinations)
-        several = "s" if together != 1 else ""
-        also = f", and {together} combination{several} of others" if together else ""
+        n_combinations = len(rows.combinations)
+        plural = "s" if n_combinations != 1 else ""
+        also = f", and {n_combinations} combination{plural} of others" if n_combinations else ""
         terminal.print_text(
             f"Determined: {len(rows.determined)} of {len(rows.free)} free parameters by "
             f"themselves{also}."

@@ -55,7 +55,7 @@ def write_reference(folder: Path, command: Any) -> list[Path]:
 def pages(
     protocols: Mapping[str, type[Experiment]], backends: Mapping[str, Any], command: Any
 ) -> dict[str, str]:
-    """The text of each page by the name of its file; app: the command line."""
+    """The text of each page by the name of its file. command: the whole command line."""
     documents = schemas.documents(protocols, backends)
     made = {f"protocol-{name}.md": _protocol(name, kind) for name, kind in protocols.items()}
     made["rig.md"] = _rig(documents["rig"], backends)
@@ -115,7 +115,7 @@ def _page(title: str, intro: str, rows: str) -> str:
 
 
 def _rows(schema: Schema, prefix: str = "") -> str:
-    """A line of the table for each key of a schema, those of sections below their own."""
+    """A line of the table for each key of a schema; a section's keys follow below it."""
     lines = []
     for name, item in schema.get("properties", {}).items():
         sections = list(_sections(item))
@@ -127,7 +127,7 @@ def _rows(schema: Schema, prefix: str = "") -> str:
 
 
 def _sections(item: Schema) -> Iterator[tuple[str, Schema]]:
-    """Sections that may stand at a key, each with how it is reached from there."""
+    """Sections that may stand at a key, each with what its keys add to the path: [] or .NAME."""
     for branch in branches(item):
         items, named = branch.get("items"), branch.get("additionalProperties")
         if "properties" in branch:
@@ -143,34 +143,36 @@ def _row(key: str, item: Schema, is_required: bool, is_section: bool) -> str:
     meaning = item.get("description", "").removesuffix(f" [{unit}]")
     if "examples" in item:
         meaning += f", for example `{schemas.as_yaml(item['examples'][0])}`"
-    has_default = not is_section and default not in (None, "", [], {})
+    default_text = "required" if is_required else ""
+    if not (is_required or is_section or default in (None, "", [], {})):
+        default_text = f"`{_yaml(default)}`"
     cells = (
         f"`{key}`",
         _each(_kind, item),
         "" if is_section or unit in (None, "1") else unit,
-        "required" if is_required else f"`{_number(default)}`" if has_default else "",
+        default_text,
         _each(_bounds, item),
         meaning,
     )
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |\n"
 
 
-def _number(value: Any) -> str:
-    """A value as people write it in YAML."""
+def _yaml(value: Any) -> str:
+    """A default or bound as people write it in YAML."""
     if isinstance(value, list):
-        return f"[{', '.join(map(_number, value))}]"
+        return f"[{', '.join(map(_yaml, value))}]"
     if isinstance(value, float):
         return f"{value:.7g}"
     return value if isinstance(value, str) else json.dumps(value)
 
 
 def _each(describe: Callable[[Schema], str], item: Schema) -> str:
-    """What may stand at a key, each kind of value described."""
+    """Descriptions of the kinds of value that a key takes, joined by "or"."""
     return " or ".join(dict.fromkeys(filter(None, map(describe, branches(item)))))
 
 
 def _kind(schema: Schema) -> str:
-    """What stands at a key, in words."""
+    """The kind of a value in words."""
     if "enum" in schema:
         return "word" if isinstance(schema["enum"][0], str) else "number"
     if "properties" in schema:
@@ -181,22 +183,22 @@ def _kind(schema: Schema) -> str:
     if isinstance(items, list):
         items = items[0]
     if kind == "array" and isinstance(items, dict):
-        same = schema.get("minItems", 0) == schema.get("maxItems")
-        whole = f"{schema['minItems']} values" if same else "list"
-        return f"{whole}, each {_each(_kind, items)}"
+        has_fixed_length = schema.get("minItems", 0) == schema.get("maxItems")
+        values = f"{schema['minItems']} values" if has_fixed_length else "list"
+        return f"{values}, each {_each(_kind, items)}"
     if kind == "object" and isinstance(named, dict):
         return f"by name, each {_each(_kind, named)}"
     return _KINDS.get(str(kind), str(kind))
 
 
 def _bounds(schema: Schema) -> str:
-    """Words or bounds of a value, or of those inside it."""
+    """The words or bounds allowed for a value, or for the values inside it."""
     if "enum" in schema:
         return ", ".join(f"`{value}`" for value in schema["enum"])
     inner = schema.get("items") or schema.get("additionalProperties")
     if isinstance(inner, list):
         return _each(_bounds, inner[0])
-    bounds = [f"{words} {_number(schema[key])}" for key, words in _BOUNDS.items() if key in schema]
+    bounds = [f"{words} {_yaml(schema[key])}" for key, words in _BOUNDS.items() if key in schema]
     if "items" in schema and schema.get("minItems", 0) not in (0, schema.get("maxItems")):
         bounds.append(f"at least {schema['minItems']} of them")
     if isinstance(inner, dict) and "properties" not in inner:

@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 class Replay:
     """A log's inputs through a model, beside what was measured.
 
-    time: (n,) [s]. measured, simulated: (n, n_outputs) in the outputs' units. source: whose
-    parameters. warning: how a run that did not complete ended.
+    time: (n,) [s]. measured, simulated: (n, n_outputs) in the outputs' units. source: where the
+    parameters come from. warning: how the logged run ended if it did not complete.
 
     >>> from daq import record, replay
     >>> result = replay(record("prbs.yaml"))
@@ -75,11 +75,11 @@ class Replay:
         return pd.DataFrame({"t": self.time, **dict(zip(signals, values, strict=True))})
 
     def below(self, bounds: Mapping[str, float]) -> dict[str, float]:
-        """Of least fits [%] by output, those that are missed.
+        """Those of the required fits [%], by output, that this replay does not reach.
 
-        A fit that is not a number, of a simulation that failed, misses any.
+        A simulation that failed has NaN for a fit, which reaches none.
         """
-        return {name: least for name, least in bounds.items() if not self.fit[name] >= least}
+        return {name: bound for name, bound in bounds.items() if not self.fit[name] >= bound}
 
     def _by_output(self, values: FloatArray) -> dict[str, float]:
         return dict(zip(self.model.output_names, values.tolist(), strict=True))
@@ -91,10 +91,10 @@ def replay(
     rig: str | Path = DEFAULT_RIG,
     config: str | Path | None = None,
 ) -> Replay:
-    """Simulate what a log's applied commands and measured load do to a model.
+    """Simulate a model under the applied commands and the measured load of a log.
 
-    log: as for ``identify``. parameters: an identification or its ``parameters.yaml``; default
-    those of the simulated rig. config: names the columns of a foreign log. Raises ConfigError.
+    log: as for ``identify``. parameters: an identification or its ``parameters.yaml``; by default
+    those of the simulated ``rig``. config: names the columns of a foreign log. Raises ConfigError.
 
     >>> from daq import record, replay
     >>> result = replay(record("prbs.yaml"))  # through the simulated rig's own model
@@ -117,7 +117,7 @@ def replay(
 def _parameters(
     parameters: Identification | str | Path | None, rig: str
 ) -> tuple[ProcessModel, dict[str, float], str]:
-    """Model and values, and whose they are."""
+    """A model, its parameters, and where they come from."""
     if isinstance(parameters, Identification):
         return parameters.model, dict(parameters.estimator.parameters_), "identification"
     if parameters is not None:

@@ -1,4 +1,4 @@
-"""Process models by name, or in a user's own Python file; what they declare."""
+"""Process models by installed name or from a user's Python file, their options and contents."""
 
 import inspect
 import re
@@ -36,10 +36,9 @@ def find_model(name: str, relative_to: Path | None = None) -> ProcessModel:
     """
     source, where, options = _source(name, relative_to)
     if callable(source) and not isinstance(source, ProcessModel):
-        source = _made(source, where, options)
+        source = _call_factory(source, where, options)
     elif options:
-        cure = f"it takes no options ({options!r})"
-        raise ConfigError(f"{where} is a finished model", cure=cure)
+        raise ConfigError(f"{where} is a finished model", cure=f"it takes no options ({options!r})")
     if not isinstance(source, ProcessModel):
         raise ConfigError(
             f"{where} is of type {type(source).__name__}, not a sysid.ProcessModel or a function "
@@ -49,7 +48,7 @@ def find_model(name: str, relative_to: Path | None = None) -> ProcessModel:
 
 
 def _source(name: str, relative_to: Path | None = None) -> tuple[Any, str, str]:
-    """The model, or the function that makes it; where it is, and the options behind its name."""
+    """A model or the function that makes one, where it is defined, and the text of its options."""
     source, attribute, options = name_parts(name)
     if attribute is None:
         return load_plugin("model", source), f"model {source!r}", options
@@ -68,7 +67,7 @@ def whole_name(name: str, relative_to: Path | None = None) -> str:
 
 
 def describe(model: ProcessModel) -> dict[str, Any]:
-    """All that a model declares, for machines."""
+    """All that a model declares, as JSON can hold it."""
     return {
         **_attributes(model, "name", "description", "equations"),
         "states": [
@@ -93,29 +92,29 @@ def _attributes(part: Any, *names: str) -> dict[str, Any]:
     return {name: getattr(part, name) for name in names}
 
 
-def _split(options: str, where: str, factory: Callable[..., Any]) -> dict[str, Any]:
-    """``a=1,b=2`` by name; one that takes several values takes those up to the next name."""
-    lists = {key for key, hint in get_type_hints(factory).items() if get_origin(hint) is tuple}
-    chosen: dict[str, Any] = {}
+def _parse_options(text: str, where: str, factory: Callable[..., Any]) -> dict[str, Any]:
+    """Options by name from ``a=1,b=2``; a tuple takes all values up to the next name."""
+    tuples = {key for key, hint in get_type_hints(factory).items() if get_origin(hint) is tuple}
+    options: dict[str, Any] = {}
     last = ""
-    for item in filter(None, options.split(",")):
+    for item in filter(None, text.split(",")):
         key, equals, value = (part.strip() for part in item.partition("="))
-        if not equals and last in lists:
-            chosen[last] = (*chosen[last], key)
+        if not equals and last in tuples:
+            options[last] = (*options[last], key)
             continue
         if not (key and equals and value):
             cure = "write NAME:option=value,option=value"
             raise ConfigError(f"{item!r} is no option", cure=cure, file=where)
-        chosen[key] = (value,) if key in lists else value
+        options[key] = (value,) if key in tuples else value
         last = key
-    return chosen
+    return options
 
 
-def _made(factory: Callable[..., Any], where: str, text: str) -> Any:
-    """The model that a function makes of options given as text."""
+def _call_factory(factory: Callable[..., Any], where: str, text: str) -> Any:
+    """The model that a function makes from options given as text."""
     from pydantic import ValidationError
 
-    options = _split(text, where, factory)
+    options = _parse_options(text, where, factory)
     names = list(inspect.signature(factory).parameters)
     for key in options:
         if key not in names:
@@ -135,17 +134,17 @@ def _made(factory: Callable[..., Any], where: str, text: str) -> Any:
 
 
 def _validated(_factory: Callable[..., Any]) -> Callable[..., Any]:
-    # pydantic looks names of annotations up among the caller's variables first: there are no
-    # others here that a user's module may have, too.
+    # pydantic resolves a user's annotations among its caller's locals first: this caller has no
+    # local that a user's module is likely to name.
     from pydantic import validate_call
 
     return validate_call(_factory)
 
 
 def model_options(name: str) -> list[dict[str, Any]]:
-    """Options of the function that makes a model, with what may be written for each.
+    """Options of the function that makes a model, with the values that each accepts as text.
 
-    None of a finished model. Raises ConfigError.
+    A finished model has none: an empty list. Raises ConfigError.
     """
     factory, _, _ = _source(name)
     if not callable(factory) or isinstance(factory, ProcessModel):
@@ -157,16 +156,16 @@ def model_options(name: str) -> list[dict[str, Any]]:
         notes: list[Any] = []
         if get_origin(hint) is Annotated:
             hint, *notes = get_args(hint)
-        choices = _choices(hint)
+        choices = _accepted_values(hint)
         if choices and parameter.default is not inspect.Parameter.empty:
-            text = next((t for note in notes if (t := getattr(note, "description", None))), "")
+            descriptions = [getattr(note, "description", None) for note in notes]
             facts = {"name": key, "default": parameter.default, "choices": choices}
-            options.append({**facts, "description": text})
+            options.append({**facts, "description": next(filter(None, descriptions), "")})
     return options
 
 
-def _choices(hint: Any) -> list[str]:
-    """What may be written for an option; nothing for one that cannot be given as text."""
+def _accepted_values(hint: Any) -> list[str]:
+    """Values that may be written for an option, by its type; empty if it cannot be text."""
     if get_origin(hint) is Literal:
         return [str(choice) for choice in get_args(hint)]
     if hint is bool:

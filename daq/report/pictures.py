@@ -1,4 +1,4 @@
-"""Figures of an identification's report: which are drawn, of which arrays."""
+"""The figures of an identification's report: which are drawn, from which arrays."""
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -34,14 +34,15 @@ from sysid.response.frequency import FrequencyResponse, frequency_response, samp
 
 _OUTPUTS_A_FIGURE = 4
 _LOGS_A_PART = 3  # of more logs the worst, the middle and the best are shown
-_FELT, _FEWEST = 0.5, 4  # an input is seen in an output where so many coherences exceed this
+_COHERENT = 0.5  # coherence above which an input is seen in an output
+_FEWEST_COHERENT = 4  # frequencies at which it must be, for a Bode plot
 
 FreeRun = tuple[LoggedRecord, FloatArray]  # a log and the model's outputs, (n_samples, n_outputs)
 
 
 @dataclass(frozen=True)
 class Subject:
-    """What is reported on: a finished identification as its document tells it, and its logs.
+    """What is reported on: a finished identification, as its document holds it, and its logs.
 
     document: what ``report.json`` holds. baseline: what the free runs in validation are compared
     with, if anything.
@@ -75,7 +76,7 @@ class Subject:
 
 
 def pictures(subject: Subject) -> Iterator[Picture]:
-    """One figure after the other, as they are drawn."""
+    """The figures, each yielded as soon as it is drawn."""
     yield from _responses(subject, "validation", subject.validation, subject.baseline)
     yield from _responses(subject, "training", subject.training, None)
     yield from _excitation(subject)
@@ -112,16 +113,16 @@ def _responses(
 
 
 def _response(output: Output, log: Dataset, simulated: Mapping[str, FloatArray], j: int) -> Panel:
-    """The output j of a log, with how well each model fits."""
-    fits = {name: float(evaluate(log.outputs, run).fit[j]) for name, run in simulated.items()}
-    several = len(fits) > 1
-    shown = ", ".join(f"{name} " * several + f"{_percent(fit)} %" for name, fit in fits.items())
+    """Output j of a log as measured and simulated, with the fit of each model."""
+    fits = {name: _percent(evaluate(log.outputs, run).fit[j]) for name, run in simulated.items()}
+    by_model = ", ".join(f"{name} {fit}" for name, fit in fits.items())
+    note = f"fit: {by_model}" if len(fits) > 1 else f"fit {fits['identified']}"
     lines = {"measured": log.outputs[:, j]} | {name: run[:, j] for name, run in simulated.items()}
-    return Panel(output.name, output.unit, lines, note=f"fit{':' * several} {shown}")
+    return Panel(output.name, output.unit, lines, note=note)
 
 
 def _percent(fit: float) -> str:
-    return f"{fit:.1f}".replace("-", "−") if np.isfinite(fit) else "–"
+    return (f"{fit:.1f}".replace("-", "−") if np.isfinite(fit) else "–") + " %"
 
 
 def _excitation(subject: Subject) -> Iterator[Picture]:
@@ -178,7 +179,7 @@ def _parameters(rows: Rows) -> Iterator[Picture]:
             "interval: the data do not determine these by themselves.",
             ranges(
                 [row.name for row in rows.free],
-                np.array([_places(row) for row in rows.free]),
+                np.array([_scaled_to_range(row) for row in rows.free]),
                 [row.label for row in rows.free],
             ),
         )  # fmt: skip
@@ -204,16 +205,16 @@ def _parameters(rows: Rows) -> Iterator[Picture]:
         )  # fmt: skip
 
 
-def _places(row: ParameterRow) -> FloatArray:
-    """Value and interval's ends on the scale of the search: 0 at the low end, 1 at the high."""
+def _scaled_to_range(row: ParameterRow) -> FloatArray:
+    """Value and interval on the scale of the search: 0 at the range's low end, 1 at its high."""
     assert row.range is not None
     values = np.array([row.value, *(row.interval or (np.nan, np.nan)), *row.range])
     if row.logarithmic:
         values = np.log(np.maximum(values, np.finfo(float).tiny))
     value_and_ends, low, high = values[:3], values[3], values[4]
-    # An interval may be wider than the range.
-    places: FloatArray = np.clip((value_and_ends - low) / (high - low), -0.04, 1.04)
-    return places
+    # An interval wider than the range is drawn to just beyond its ends.
+    scaled: FloatArray = np.clip((value_and_ends - low) / (high - low), -0.04, 1.04)
+    return scaled
 
 
 def _correlations(names: Sequence[str], rows: Rows) -> FloatArray:
@@ -257,7 +258,7 @@ def _frequency(subject: Subject) -> Iterator[Picture]:
 
 
 def _model_responses(subject: Subject, frequency: FloatArray) -> dict[str, ComplexArray]:
-    """What the identified model does: through the estimate of the logs, and linearised."""
+    """Of the identified model: estimated from its free runs like the logs', and linearised."""
     model, records = subject.model, subject.records
     runs = [run for _, run in (*subject.training, *subject.validation)]
     curves = {}
@@ -279,7 +280,7 @@ def _model_responses(subject: Subject, frequency: FloatArray) -> dict[str, Compl
 def _linear_response(
     subject: Subject, u: FloatArray, held: Mapping[str, float], frequency: FloatArray, dt: float
 ) -> ComplexArray | None:
-    """The model linearised under constant inputs; None where it has no such operating point."""
+    """Of the model linearised at constant inputs u; None without an equilibrium there."""
     model, p = subject.model, subject.vector
     try:
         linear = linearize(model, equilibrium(model, u, p, hold=dict(held)), u, p)
@@ -290,7 +291,7 @@ def _linear_response(
 
 
 def _plots_of_model(subject: Subject) -> Iterator[Picture]:
-    """What the model itself brings."""
+    """Plots that the process model brings along."""
     if subject.model.plots is None:
         return
     log = {} if subject.foreign else _columns(subject.training[0][0])
@@ -307,7 +308,7 @@ def _plots_of_model(subject: Subject) -> Iterator[Picture]:
 
 
 def _chosen(logs: Sequence[FreeRun]) -> list[tuple[int, str]]:
-    """Which logs are shown, and as what: all of a few, else the middle, the worst, the best."""
+    """Logs to show and their labels: all if they are few, else the middle, worst and best."""
     n = len(logs)
     if n <= _LOGS_A_PART:
         return [(k, f"log {k + 1} of {n}" if n > 1 else "") for k in range(n)]
@@ -318,19 +319,19 @@ def _chosen(logs: Sequence[FreeRun]) -> list[tuple[int, str]]:
 
 
 def _stem(*words: str) -> str:
-    """A file's name of what any system takes."""
+    """A file name made of words, with only characters that every file system takes."""
     return "-".join(re.sub(r"[^\w.]+", "-", word) for word in words if word)
 
 
 def _pairs(measured: FrequencyResponse) -> list[tuple[int, int]]:
-    """For each output the input seen best in it, where one is seen at all."""
-    seen = np.sum(measured.coherence > _FELT, axis=0)
-    best = [(j, int(np.argmax(row))) for j, row in enumerate(seen)]
-    return [(j, i) for j, i in best if seen[j, i] >= _FEWEST]
+    """For each output the input most coherent with it, if any is coherent enough."""
+    n_coherent = np.sum(measured.coherence > _COHERENT, axis=0)
+    best = [(j, int(np.argmax(row))) for j, row in enumerate(n_coherent)]
+    return [(j, i) for j, i in best if n_coherent[j, i] >= _FEWEST_COHERENT]
 
 
 def _foreign_signals(model: ProcessModel, data: Dataset) -> Figure:
-    """The model's signals."""
+    """The model's inputs and outputs in a foreign log."""
     panels = [
         Panel(signal.name, signal.unit, {"": values}, steps=signal.hold == "zoh")
         for signal, values in zip(model.inputs, data.inputs.T, strict=True)
@@ -341,7 +342,7 @@ def _foreign_signals(model: ProcessModel, data: Dataset) -> Figure:
 
 
 def _capture_signals(log: LoggedRecord) -> Figure:
-    """All channels: commands with what was applied of them, then the sensors."""
+    """All columns of a capture: commands as asked and as applied, then the sensors."""
     columns = _columns(log)
     panels: list[Panel] = []
     for name, unit in UNITS.items():
@@ -363,7 +364,7 @@ def _columns(log: LoggedRecord) -> dict[str, FloatArray]:
 def draw_replay(replay: Replay, path: Path) -> None:
     """Measured and simulated outputs in a figure at a path.
 
-    Raises ConfigError for a format that there is not, RunError where the disk refuses.
+    Raises ConfigError for an unknown format, RunError if the file cannot be written.
     """
     outputs = [
         Panel(

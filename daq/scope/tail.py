@@ -1,4 +1,4 @@
-"""Reading a log that is still being written: whole lines only, and whatever of them is readable."""
+"""Reading a log that is still being written: the readable cells of its complete lines."""
 
 import io
 import math
@@ -14,7 +14,7 @@ from daq.logs.table import COMMENTS, Layout, layout_of
 
 CHUNK = 2_000_000  # bytes read at a time: some 20 ms of parsing, so that the page stays alive
 _HEAD = 65_536  # bytes in which a header must have ended
-_BULK = 50_000  # bytes from which pandas is quicker than going by line
+_BULK = 50_000  # bytes from which pandas is quicker than parsing line by line
 _KEPT = 5  # problems described; further ones are counted
 
 
@@ -38,10 +38,10 @@ class Problems:
 
 
 class LogTail:
-    """The rows of a log as they come.
+    """The rows of a log as they are written.
 
     columns: names, known once the header has been read. fault: why nothing can be read, or None.
-    problems: what was left out. offset: bytes read. Nothing here raises for what a file holds.
+    problems: what was left out. offset: bytes read. No content of the file raises an error.
     """
 
     def __init__(self, path: Path) -> None:
@@ -72,10 +72,10 @@ class LogTail:
         values, starts = self._parse(data, self.problems)
         self._line += data.count(b"\n")
         self.offset += len(data)
-        return self._advancing(values, starts)
+        return self._rows_that_advance(values, starts)
 
     def read_between(self, start: int, end: int) -> FloatArray:
-        """The rows whose lines stand in these bytes, once more, (n, n_columns)."""
+        """Read again the rows whose lines stand in these bytes, (n, n_columns)."""
         try:
             with self.path.open("rb") as file:
                 file.seek(start)
@@ -83,11 +83,11 @@ class LogTail:
         except OSError:
             data = b""
         values, _ = self._parse(data[: data.rfind(b"\n") + 1], Problems())
-        # What was left out the first time is left out again.
-        return values[_forward(values[:, self.columns.index("t")], -math.inf)]
+        # As in poll, rows in which time does not advance are left out.
+        return values[_advances(values[:, self.columns.index("t")], -math.inf)]
 
     def torn(self) -> bool:
-        """Whether the file ends in a line without its end."""
+        """Whether the file ends in an incomplete line."""
         return self._layout is not None and self.size() > self.offset and not self._whole_lines()
 
     def _whole_lines(self) -> bytes:
@@ -101,11 +101,11 @@ class LogTail:
             self.fault = f"cannot be read: {error.strerror}"
             return b""
         whole = data[: data.rfind(b"\n") + 1]
-        # A chunk without any end of line is no line of a log; it is passed over as one.
+        # No line of a log is as long as a chunk: a chunk without an end of line is skipped whole.
         return whole if whole or len(data) < CHUNK else data
 
     def _take_header(self, data: bytes) -> bytes:
-        """Read the header where it is whole; the data after it."""
+        """Read the header once it is complete; the data after it."""
         head = data[:_HEAD]
         text = head[: head.rfind(b"\n") + 1].decode("utf-8-sig", errors="replace")
         lines = text.replace("\r\n", "\n").split("\n")
@@ -118,14 +118,14 @@ class LogTail:
         if self.fault:
             return b""
         named = [(name, place) for place, name in enumerate(layout.names) if name]
-        first = dict(reversed(named))
+        first_places = dict(reversed(named))  # of columns with the same name the first stays
         self._layout = layout
-        self._places = sorted(first.values())
+        self._places = sorted(first_places.values())
         self.columns = tuple(layout.names[place] for place in self._places)
         at = f"line {layout.line}"
         for name in sorted({name for name, _ in named if layout.names.count(name) > 1}):
             self.problems.note(f"{at}: column {name!r} stands twice; the first counts")
-        missing = [name for name in ORIGINAL_COLUMNS if name not in first]
+        missing = [name for name in ORIGINAL_COLUMNS if name not in first_places]
         if missing:
             self.problems.note(f"{at}: without column {', '.join(missing)}")
         self._line = layout.line
@@ -142,7 +142,7 @@ class LogTail:
         return self._parse_lines(data, starts, problems)
 
     def _parse_lines(self, data: bytes, starts: IntArray, problems: Problems) -> TailRows:
-        """TailRows by line; other lines are left out, other cells become NaN."""
+        """Rows line by line; lines of other lengths are left out, other cells become NaN."""
         assert self._layout is not None
         names, separator = self._layout.names, self._layout.separator
         kept: list[int] = []
@@ -166,23 +166,24 @@ class LogTail:
         table = np.array(values, dtype=np.float64).reshape(len(values), len(self.columns))
         return table, np.append(starts[kept], starts[-1])
 
-    def _advancing(self, values: FloatArray, starts: IntArray) -> TailRows:
+    def _rows_that_advance(self, values: FloatArray, starts: IntArray) -> TailRows:
         """The rows in which time advances."""
         time = values[:, self.columns.index("t")]
-        good = _forward(time, self._last_time)
-        if not good.all():
-            wrong = int(np.count_nonzero(~good))
+        kept = _advances(time, self._last_time)
+        if not kept.all():
+            n_left_out = int(np.count_nonzero(~kept))
+            plural = "s" if n_left_out != 1 else ""
             self.problems.note(
-                f"before line {self._line + 1}: time does not advance in {wrong} "
-                f"row{'s' * (wrong != 1)}; left out"
+                f"before line {self._line + 1}: time does not advance in {n_left_out} "
+                f"row{plural}; left out"
             )
-        if good.any():
-            self._last_time = float(time[good][-1])
-        return values[good], np.append(starts[:-1][good], starts[-1])
+        if kept.any():
+            self._last_time = float(time[kept][-1])
+        return values[kept], np.append(starts[:-1][kept], starts[-1])
 
 
-def _forward(time: FloatArray, last: float) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Which times are beyond all before them."""
+def _advances(time: FloatArray, last: float) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    """Which times are later than all before them, and than ``last``."""
     finite = np.where(np.isfinite(time), time, -np.inf)
     before = np.maximum.accumulate(np.concatenate([[last], finite]))[:-1]
     return finite > before
@@ -214,7 +215,7 @@ def _number(cell: str, separator: str) -> float:
 
 
 def _parse_bulk(data: bytes, layout: Layout, places: list[int]) -> FloatArray | None:
-    """All rows at once; None where a row does not fit the header."""
+    """All rows at once by pandas; None if any row does not fit the header or is not finite."""
     import pandas as pd
 
     try:

@@ -1,4 +1,4 @@
-"""A run's commands by tick: the host's on their way, and the device's that wait to be played."""
+"""A run's commands by tick: the host's queue of those to send, the device's of those to play."""
 
 from collections.abc import Iterator
 
@@ -17,8 +17,8 @@ _REWIND = 0.05  # s between two repetitions that a device asked for
 class CommandStream:
     """The host's commands, from the program to the device's queue, in frames of ``chunk`` at most.
 
-    given, sent: tick after the last command of the program, and on the line. taken: tick after the
-    last that the device has received in order. Nothing is sent without credit.
+    given, sent, taken: tick after the last command that the program has given, that was sent, and
+    that the device has received in order. Nothing is sent without credit from the device.
     """
 
     def __init__(self, queue: int, chunk: int, now: float = 0.0) -> None:
@@ -26,7 +26,7 @@ class CommandStream:
         self._credit = 0  # until the device has answered
         self._chunk = chunk
         self._ring = np.zeros((2 * queue, len(CHANNELS)), messages.COMMAND_DTYPE)
-        self._progress, self._rewound = now, 0.0
+        self._progress_time, self._rewind_time = now, 0.0
 
     @property
     def room(self) -> int:
@@ -35,7 +35,7 @@ class CommandStream:
 
     @property
     def preloaded(self) -> bool:
-        """Whether the device has all that fits it of what was given."""
+        """Whether the device has all commands given, or as many as it has room for."""
         return self.taken >= min(self.given, self._credit)
 
     def give(self, tick: int, codes: Codes, now: float) -> None:
@@ -49,7 +49,7 @@ class CommandStream:
         self._ring[np.arange(tick, end) % len(self._ring)] = codes
         if self.sent == self.given:
             self.sent = max(self.sent, tick)
-            self._progress = now
+            self._progress_time = now
         self.given = max(self.given, end)
 
     def chunks(self, now: float) -> Iterator[tuple[int, Codes]]:
@@ -57,30 +57,30 @@ class CommandStream:
         end = min(self.given, self._credit)
         while self.sent < end:
             first, self.sent = self.sent, min(self.sent + self._chunk, end)
-            self._progress = now
+            self._progress_time = now
             yield first, self._ring[np.arange(first, self.sent) % len(self._ring)]
 
     def acknowledge(self, until: int, credit: int, now: float) -> None:
-        """Note what the device has, and for which ticks it has room."""
+        """Note the ticks before which the device has commands, and before which it has room."""
         if until > self.taken:
             self.taken = until
-            self._progress = now
+            self._progress_time = now
         self.sent = max(self.sent, min(self.taken, self.given))
         self._credit = max(self._credit, credit)
 
     def lags(self, now: float) -> bool:
-        """Whether what was sent has not arrived for so long that it must have been lost."""
-        return self.taken < self.sent and now - self._progress > _RESEND
+        """Whether commands sent have been unacknowledged for so long that they must be lost."""
+        return self.taken < self.sent and now - self._progress_time > _RESEND
 
     def lacks(self, until: int, now: float) -> bool:
-        """Whether a device that has commands until this tick misses those that were sent next."""
-        return until == self.taken < self.sent and now - self._rewound > _REWIND
+        """Whether a device with commands up to ``until`` has missed the next ones sent."""
+        return until == self.taken < self.sent and now - self._rewind_time > _REWIND
 
     def rewind(self, now: float) -> int:
-        """Go back to what the device lacks; the number of commands to be sent again."""
+        """Send again from the first command that the device lacks; how many that are."""
         resent = self.sent - self.taken
         self.sent = self.taken
-        self._rewound = self._progress = now
+        self._rewind_time = self._progress_time = now
         return resent
 
 
@@ -139,8 +139,8 @@ class CommandRing:
     def take(self, n: int) -> tuple[Codes, npt.NDArray[np.uint32]]:
         """Commands (n, 2) of the next n ticks, and their flags.
 
-        Where a command is missing, the one before is held in closed loop; in open loop zero stands
-        from there on.
+        Where one is missing, closed loop holds the command before it; in open loop all commands
+        from there on are zero.
         """
         ticks = np.arange(self.tick, self.tick + n)
         slots = ticks % self.size

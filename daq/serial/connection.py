@@ -1,4 +1,4 @@
-"""A session with the device behind a port: its machine, its threads, and who answers."""
+"""A connection to the device on a port: handshake, threads that read and feed, requests."""
 
 import contextlib
 import getpass
@@ -34,12 +34,12 @@ T = TypeVar("T")
 class Connection:
     """An open port and the device that answers on it.
 
-    One thread reads the port. Another feeds the device's watchdog, because the kernel may keep a
-    reader waiting for its own workers on a busy computer; it does so only while the program calls:
-    one that hangs is no better than one that is dead.
+    One thread reads the port. Another feeds the device's watchdog, because on a busy computer the
+    kernel may keep a reader waiting. It feeds only while the program keeps calling: a program that
+    hangs must trip the watchdog as a dead one does.
 
-    welcome: who answers. warnings: what is not as it should be about the port. Raises DeviceError,
-    with the cure, where nobody answers or the wrong device does.
+    welcome: what the device says of itself. warnings: what is wrong with the port's settings.
+    Raises DeviceError, with the cure, where nobody answers or the wrong device does.
     """
 
     def __init__(self, port: str, baud: int, watchdog: float = 0.1) -> None:
@@ -49,7 +49,7 @@ class Connection:
         self._machine = HostMachine(int.from_bytes(os.urandom(2), "little") or 1)
         self._leaving = threading.Event()
         self._changed = threading.Condition()
-        self._called = 0.0
+        self._last_call = 0.0
         self._threads = [
             threading.Thread(
                 target=self._serve, args=(work,), name=f"serial rig, {name}", daemon=True
@@ -66,22 +66,22 @@ class Connection:
         self.warnings = self._link.warnings
 
     def close(self) -> None:
-        """Disconnect; the device's watchdog does the rest."""
+        """Disconnect; the device's watchdog then stops a run."""
         self._leaving.set()
         for thread in self._threads:
             thread.join(timeout=2.0)
         self._link.close()
 
     def act(self, action: Callable[[HostMachine, float], T]) -> T:
-        """Result of an action of the machine at this instant [s]; the frames it makes are sent."""
+        """Let the machine act at the present time [s] and send its frames; the action's result."""
         with self._changed:
-            self._called = time.monotonic()
-            result = action(self._machine, self._called)
+            self._last_call = time.monotonic()
+            result = action(self._machine, self._last_call)
             self._write()
         return result
 
     def request(self, action: Callable[[HostMachine, float], None]) -> None:
-        """Act, and wait until the device has answered. Raises DeviceError for a refusal."""
+        """Let the machine act, and wait for the device's answer. DeviceError for a refusal."""
         self.act(action)
         self._wait(lambda: self._machine.pending is None)
         reply, failure = self._machine.reply, self._machine.failure
@@ -101,7 +101,7 @@ class Connection:
         with self._changed:
             if not self._wait(lambda: bool(machine.blocks)) and machine.failure is not None:
                 raise machine.failure
-            self._called = time.monotonic()
+            self._last_call = time.monotonic()
             taken, machine.blocks = machine.blocks, []
         return taken
 
@@ -118,7 +118,7 @@ class Connection:
         self.request(HostMachine.go)
 
     def describe(self) -> dict[str, Any]:
-        """The line's record."""
+        """Counts of bytes, frames and errors, and the clocks' relation, for the log."""
         with self._changed:
             return self._machine.describe()
 
@@ -148,12 +148,12 @@ class Connection:
         )
 
     def schedule_as_caller(self) -> None:
-        """Schedule the threads just ahead of the caller, where that is in real time."""
+        """If the caller runs in real time, schedule the threads just ahead of it."""
         if not sys.platform.startswith("linux"):
             return
         policy, priority = os.sched_getscheduler(0), os.sched_getparam(0).sched_priority
         for thread in self._threads:
-            # The limit may be the run's own priority.
+            # The system may allow no priority above the run's own.
             for urgency in (priority + 1, priority) if priority else (0,):
                 with contextlib.suppress(OSError):
                     os.sched_setscheduler(thread.native_id or 0, policy, os.sched_param(urgency))
@@ -190,14 +190,14 @@ class Connection:
         """Wait for a condition, a failure or a deadline; whether the condition holds."""
         with self._changed:
             while not condition():
-                self._called = time.monotonic()
-                if self._machine.failure is not None or self._called >= deadline:
+                self._last_call = time.monotonic()
+                if self._machine.failure is not None or self._last_call >= deadline:
                     return False
-                self._changed.wait(min(_LOOK, deadline - self._called))
+                self._changed.wait(min(_LOOK, deadline - self._last_call))
         return True
 
     def _serve(self, work: Callable[[], None]) -> None:
-        """Do a thread's work until the session ends, be it by a port that fails."""
+        """Do a thread's work until the session ends; a failing port ends it for all."""
         failure: DeviceError | None = None
         try:
             work()
@@ -221,13 +221,13 @@ class Connection:
         while not self._leaving.wait(pause) and machine.failure is None:
             with self._changed:
                 now, pending = time.monotonic(), machine.pending
-                machine.poll(now, keep_alive=now - self._called < _PATIENCE)
+                machine.poll(now, keep_alive=now - self._last_call < _PATIENCE)
                 self._write()
                 if machine.failure is not None or machine.pending is not pending:
                     self._changed.notify_all()
 
     def _write(self) -> None:
-        """Write the machine's frames; the lock is held, so they stay whole."""
+        """Write the machine's frames; the caller holds the lock, so that no two frames mix."""
         data = self._machine.take()
         if data:
             self._link.write(data)
@@ -235,7 +235,7 @@ class Connection:
 
 @dataclass(frozen=True)
 class Inquiry:
-    """Who answers on a port, or why nobody does; neither where nobody was asked."""
+    """The device that answers on a port, or why none does; neither if the port was not asked."""
 
     port: PortFacts
     welcome: Welcome | None = None

@@ -1,4 +1,4 @@
-"""When a rendered wall is stable, by passivity and by eigenvalues; findings of a run of walls."""
+"""Stability of rendered walls: by passivity, by eigenvalues, and as found in a run of them."""
 
 import functools
 import math
@@ -14,17 +14,18 @@ from protocols.control.loop import tracker_gains
 from protocols.control.wall import ABORTED, WATCHED, Cell, WallSettings, oscillation
 
 _STIFFEST = 1e4  # N*m/rad, beyond what any motor renders
-_HALVINGS = 32
-_DRAWN = 60  # dampings of a bound in a figure
-_WHOLE = 0.9  # of the time watched: samples may be lost at its ends
-_IN_CONTACT = 0.5  # of the time watched, at most, of a wall that does not count
+_BISECTIONS = 32
+_CURVE_POINTS = 60  # of a bound in a figure
+_COMPLETE = 0.9  # share of the time watched: samples may be lost at its ends
+_MIN_CONTACT = 0.5  # share of the time watched; a wall with no more does not count as stable
 
 
 @dataclass(frozen=True)
 class SampledWall:
-    """A wall touched by a shaft: inertia [kg*m^2], damping [N*m*s/rad] and stiffness [N*m/rad] of
-    all that is physical, hand included; rendered every ``period`` [s], ``ahead`` ticks late, with
-    the speed tracked at a bandwidth [Hz].
+    """The sampled loop of a shaft that touches a rendered wall.
+
+    inertia [kg*m^2], damping [N*m*s/rad], stiffness [N*m/rad]: of shaft and hand. The torque, made
+    every ``period`` [s], acts ``ahead`` ticks later. bandwidth [Hz]: of the speed's tracker.
     """
 
     inertia: float
@@ -35,24 +36,24 @@ class SampledWall:
     bandwidth: float
 
     def spectral_radius(self, stiffness: float, damping: float) -> float:
-        """Size of the sampled loop's largest eigenvalue with this wall; below 1 it is stable.
+        """Spectral radius of the loop with this wall; the loop is stable below 1.
 
         The shaft is discretised exactly between samples. States: angle and speed of the shaft,
-        the tracker's, and the torques on their way.
+        angle and speed of the tracker, and the last ``ahead`` torques computed.
         """
         n = 4 + self.ahead
-        plant, push = self._shaft
+        Phi, Gamma = self._shaft
         alpha, beta = tracker_gains(self.bandwidth, self.period)
         # The tracker as it stands after the sample k, from its state after k - 1 and theta_k.
-        track = np.array(
+        tracker = np.array(
             [[1.0 - alpha, (1.0 - alpha) * self.period], [-beta / self.period, 1.0 - beta]]
         )
         gain = np.array([alpha, beta / self.period])
         loop = np.zeros((n, n))
-        loop[:2, :2] = plant
-        loop[:2, -1] = push
-        loop[2:4, 0], loop[2:4, 2:4] = gain, track
-        loop[4] = -damping * loop[3]
+        loop[:2, :2] = Phi
+        loop[:2, -1] = Gamma
+        loop[2:4, 0], loop[2:4, 2:4] = gain, tracker
+        loop[4] = -damping * loop[3]  # the wall damps the tracked speed
         loop[4, 0] -= stiffness
         for late in range(1, self.ahead):
             loop[4 + late, 3 + late] = 1.0
@@ -60,11 +61,11 @@ class SampledWall:
         return float(np.abs(np.linalg.eigvals(loop)).max())
 
     def critical_stiffness(self, damping: float) -> float:
-        """The stiffness at which a wall of this damping begins to ring [N*m/rad]; 0 if all do."""
+        """The stiffness above which walls of this damping are unstable [N*m/rad]; 0 if all are."""
         low, high = 0.0, _STIFFEST
         if self.spectral_radius(1e-9, damping) >= 1.0:
             return 0.0
-        for _ in range(_HALVINGS):
+        for _ in range(_BISECTIONS):
             middle = 0.5 * (low + high)
             if self.spectral_radius(middle, damping) < 1.0:
                 low = middle
@@ -74,13 +75,13 @@ class SampledWall:
 
     @functools.cached_property
     def _shaft(self) -> tuple[FloatArray, FloatArray]:
-        """Exact discretisation of J dω/dt = torque - b ω - k θ with the torque held."""
+        """Phi and Gamma of J dω/dt = torque - b ω - k θ, discretised with the torque held."""
         from scipy.linalg import expm
 
-        whole = np.zeros((3, 3))
-        whole[0, 1] = 1.0
-        whole[1] = np.array([-self.stiffness, -self.damping, 1.0]) / self.inertia
-        step = expm(whole * self.period)
+        augmented = np.zeros((3, 3))
+        augmented[0, 1] = 1.0
+        augmented[1] = np.array([-self.stiffness, -self.damping, 1.0]) / self.inertia
+        step = expm(augmented * self.period)
         return step[:2, :2], step[:2, 2]
 
 
@@ -112,9 +113,9 @@ class WallTheory:
         return 2.0 * (self.damping(brake) - abs(damping)) / period
 
     def bounds(self, brake: float) -> tuple[Series, ...]:
-        """Bounds of stability, handle held and free, and of passivity over the damping."""
+        """Largest stiffness over the damping: stable with handle held and free, and passive."""
         dampings, stiffest = self.settings.dampings, self.settings.stiffnesses[-1]
-        drawn = np.linspace(min(dampings), max(dampings), _DRAWN)
+        drawn = np.linspace(min(dampings), max(dampings), _CURVE_POINTS)
         series = []
         for label, hand in (("stable, handle held", True), ("stable, handle free", False)):
             loop = self.loop(brake, hand)
@@ -130,7 +131,7 @@ class WallTheory:
 
 @dataclass(frozen=True)
 class Visit:
-    """A cell, its oscillation [rad], infinite where it was left at once, and time in contact."""
+    """A cell, its oscillation [rad], infinite if left at once, and its share of time in contact."""
 
     cell: Cell
     amplitude: float
@@ -140,7 +141,7 @@ class Visit:
 def visited(
     settings: WallSettings, samples: Samples, extra: Mapping[str, FloatArray]
 ) -> list[Visit]:
-    """The cells that were watched to their end or left at once."""
+    """Visits of the walls that were watched to the end or left at once."""
     visits = []
     for index, cell in enumerate(settings.cells):
         state = np.where(extra["cell"] == index, extra["state"], math.nan)
@@ -148,14 +149,14 @@ def visited(
         time, depth = samples.time[watched], extra["penetration"][watched]
         if (state == ABORTED).any():
             visits.append(Visit(cell, math.inf, math.nan))
-        elif watched.any() and np.ptp(time) > _WHOLE * 0.5 * settings.ringing.watch:
+        elif watched.any() and np.ptp(time) > _COMPLETE * 0.5 * settings.ringing.watch:
             visits.append(Visit(cell, oscillation(time, depth), float(np.mean(depth > 0.0))))
     return visits
 
 
 @dataclass(frozen=True)
 class WallFindings:
-    """Which walls are stable; visits: at least one."""
+    """Which walls are stable, by visits (at least one) and by theory."""
 
     settings: WallSettings
     theory: WallTheory
@@ -174,7 +175,7 @@ class WallFindings:
         return Findings(tuple(numbers), tables, tuple(maps), {}, self._remarks())
 
     def _is_stable(self, visit: Visit) -> bool:
-        return visit.amplitude <= self.settings.ringing.amplitude and visit.contact > _IN_CONTACT
+        return visit.amplitude <= self.settings.ringing.amplitude and visit.contact > _MIN_CONTACT
 
     def _stiffest(self, brake: float, damping: float) -> float:
         """The stiffest wall below the first that rang [N*m/rad]; 0 where the softest rang."""
@@ -232,11 +233,11 @@ class WallFindings:
     def _remarks(self) -> tuple[str, ...]:
         left = sum(math.isinf(visit.amplitude) for visit in self.visits)
         skipped = len(self.settings.cells) - len(self.visits)
-        loose = sum(visit.contact <= _IN_CONTACT for visit in self.visits)
+        loose = sum(visit.contact <= _MIN_CONTACT for visit in self.visits)
         speed = self.settings.ringing.speed
         remarks = (
             (left, f"Walls left at once, at {speed:g} rad/s"),
             (skipped, "Walls not visited, stiffer than one that rang at the same damping"),
             (loose, "Walls without contact while watched, which do not count as stable"),
         )
-        return tuple(f"{walls}: {count}." for count, walls in remarks if count)
+        return tuple(f"{text}: {count}." for count, text in remarks if count)

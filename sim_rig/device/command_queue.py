@@ -1,4 +1,4 @@
-"""Commands that wait for their ticks."""
+"""The simulated device's queue of commands by tick."""
 
 from collections import deque
 
@@ -12,9 +12,9 @@ _HELD, _UNDERFLOW = int(Flag.HELD), int(Flag.UNDERFLOW)
 
 
 class CommandQueue:
-    """Commands by tick; what to do when one is missing depends on the mode.
+    """Commands by tick, and what stands for a missing one.
 
-    In closed loop the last one is held and flagged; in open loop the outputs are latched at
+    In closed loop the last command is held and flagged; in open loop the outputs are latched at
     zero. ``latched`` outputs stay zero, whatever is queued, until the next ``restart``.
     """
 
@@ -23,7 +23,7 @@ class CommandQueue:
 
     def restart(self, mode: Mode) -> None:
         """Forget everything; the next tick is 0."""
-        self._closed = mode is Mode.CLOSED_LOOP
+        self._is_closed_loop = mode is Mode.CLOSED_LOOP
         self.tick = 0
         self.latch()
         self.latched = False
@@ -41,7 +41,7 @@ class CommandQueue:
         return self._until - self.tick
 
     def put(self, tick: int, commands: FloatArray) -> None:
-        """Append commands (n, 2); those for ticks already past are too late and dropped."""
+        """Append commands (n, 2) from ``tick`` on; those for ticks already past are dropped."""
         late = max(0, self.tick - tick)
         if late < len(commands):
             if not self.latched:
@@ -49,7 +49,7 @@ class CommandQueue:
             self._until = tick + len(commands)
 
     def take(self, n: int) -> tuple[FloatArray, IntArray]:
-        """Commands for the next n ticks and their flags; the ticks pass with ``advance``."""
+        """Commands (n, 2) for the next n ticks and their flags; ``advance`` lets the ticks pass."""
         flags = np.zeros(n, dtype=np.int64)
         if self.latched:
             return np.zeros((n, len(CHANNELS))), flags
@@ -67,7 +67,7 @@ class CommandQueue:
             filled += count
         if filled:
             self._last = applied[filled - 1 : filled].copy()
-        if filled < n and self._closed:
+        if filled < n and self._is_closed_loop:
             applied[filled:], flags[filled:] = self._last[-1], _HELD
         elif filled < n and self.tick + filled > 0:
             flags[filled:] = _UNDERFLOW

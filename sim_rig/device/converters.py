@@ -1,4 +1,4 @@
-"""Converters of the simulated rig, and the interlock that watches every tick what they read."""
+"""Converters of the simulated rig, and the interlock that checks their readings at every tick."""
 
 from dataclasses import dataclass
 
@@ -17,7 +17,7 @@ class Converters:
     """Analog inputs and outputs.
 
     senses: (3,), volts per SI unit of each input. offsets: (3,) [V]. noise: rms [V].
-    resolution: one step of the converters [V], zero for ideal ones without noise or range.
+    resolution: one step of the converters [V]; zero for ideal ones, without noise or range.
     """
 
     senses: FloatArray
@@ -26,15 +26,15 @@ class Converters:
     resolution: float
 
     def commands(self, volts: FloatArray, guard: Guard) -> FloatArray:
-        """What the outputs give for the commands, (n, 2) [V], within the guard's clamps."""
-        given = np.empty(volts.shape)
-        _give(volts, self.resolution, guard.command_low, guard.command_high, given)
-        return given
+        """Voltages that the outputs apply for the commands, (n, 2) [V], clamped by the guard."""
+        applied = np.empty(volts.shape)
+        _apply(volts, self.resolution, guard.command_low, guard.command_high, applied)
+        return applied
 
     def read(self, true: FloatArray, noise: FloatArray, flags: IntArray) -> FloatArray:
-        """Volts, (n, 3), of the plant's outputs true, (n, >= 3); flags are added to.
+        """Readings, (n, 3) [V], of the plant's true outputs, (n, >= 3).
 
-        noise: (n, 3), of unit variance.
+        noise: (n, 3), of unit variance. flags: (n,), where saturated samples are marked.
         """
         volts = np.empty(noise.shape)
         _read(true, self.senses, self.offsets, self.noise, self.resolution, noise, volts, flags)
@@ -42,7 +42,7 @@ class Converters:
 
 
 class Interlock:
-    """Limits of a guard, checked over the samples of a run in their order."""
+    """Checks the samples of a run, in their order, against the limits of a guard."""
 
     def __init__(self, guard: Guard) -> None:
         self._analog = np.array([guard.analog_low, guard.analog_high], dtype=np.float64)
@@ -54,21 +54,21 @@ class Interlock:
     def first_beyond(self, volts: FloatArray, counts: FloatArray, rates: FloatArray) -> int:
         """The first of the next n rows that is beyond a limit, or n.
 
-        volts: (n, 3). counts, rates: (n,), the latter in 1/s. What is no number is beyond any.
+        volts: (n, 3). counts, rates: (n,), the latter in 1/s. NaN is beyond every limit.
         """
         return int(_first_beyond(volts, counts, rates, self._analog, self._bounds, self._counts))
 
 
 @njit(cache=True, nogil=True)
-def _give(
-    volts: FloatArray, resolution: float, low: FloatArray, high: FloatArray, given: FloatArray
+def _apply(
+    volts: FloatArray, resolution: float, low: FloatArray, high: FloatArray, applied: FloatArray
 ) -> None:
     for i in range(volts.shape[0]):
         for j in range(volts.shape[1]):
             value = volts[i, j]
             if resolution > 0.0:
                 value = np.rint(value / resolution) * resolution
-            given[i, j] = min(max(value, low[j]), high[j])
+            applied[i, j] = min(max(value, low[j]), high[j])
 
 
 @njit(cache=True, nogil=True)

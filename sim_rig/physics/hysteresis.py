@@ -29,9 +29,9 @@ _RATED_CURRENT = 0.19  # A, up to which alpha(i) and c(i) must not be negative
 class HysteresisModel:
     """Parameters and equations of one hysteresis model.
 
-    constraints: section 3.4.2; that all parameters are positive is in their physical minimum.
-    z_range: where the hysteresis variable may stand when a record begins; a load that friction
-    holds leaves it away from zero. equations: rate and torque as text.
+    constraints: those of section 3.4.2, except that parameters are positive, which their physical
+    minimum ensures. z_range: of the hysteresis variable when a record begins; it is not zero where
+    friction holds a load. equations: rate and torque as text.
     """
 
     parameters: tuple[Parameter, ...]
@@ -63,7 +63,7 @@ def _brake_torque(current: Any, omega: Any, z: Any, coefficients: Any) -> Any:
 
 
 def _torque_from(first: int) -> Torque:
-    """The torque, its coefficients standing from ``first`` on."""
+    """``_brake_torque`` with its four coefficients at ``first`` and after among the parameters."""
     place = slice(first, first + 4)
     return lambda current, omega, z, z_rate, p: _brake_torque(current, omega, z, p[place])
 
@@ -74,12 +74,12 @@ _TORQUE_EQUATION = "tau_b = (alpha0 + alpha1*|i_b|)*z + (c0 + c1*|i_b|)*omega"
 def _bouc_wen(smooth: bool, exponent: float) -> HysteresisModel:
     if not (math.isfinite(exponent) and exponent >= 1.0):
         raise ModelError(f"the Bouc-Wen exponent must be at least 1, not {exponent:g}")
-    power, less = _power(exponent), _power(exponent - 1.0)
+    power, lower_power = _power(exponent), _power(exponent - 1.0)
 
     def exact_rate(omega: Any, z: Any, p: Any) -> Any:
         # (3.14), with |z|^(n-1) taken out of both terms
         gamma, beta, A = p[:3]
-        return A * omega - less(abs(z)) * (gamma * abs(omega) * z + beta * omega * abs(z))
+        return A * omega - lower_power(abs(z)) * (gamma * abs(omega) * z + beta * omega * abs(z))
 
     def smooth_rate(omega: Any, z: Any, p: Any) -> Any:
         # (3.26)
@@ -109,7 +109,7 @@ def _bouc_wen(smooth: bool, exponent: float) -> HysteresisModel:
 
 
 def _power(exponent: float) -> Callable[[Any], Any]:
-    """a^n for a >= 0; whole exponents avoid the power function, which is no vector code."""
+    """a^n for a >= 0; 0, 1 and 2 avoid the power function, which is not vectorised."""
     if exponent == 0.0:
         return lambda a: 1.0
     if exponent == 1.0:
@@ -175,7 +175,7 @@ def _lugre(smooth: bool) -> HysteresisModel:
         torque,
         (
             *_positive_torque(1),
-            ("epsilon(i_b) >= 0 for every current", lambda p: _lowest(p[5], p[6])),
+            ("epsilon(i_b) >= 0 for every current", lambda p: _deficit(p[5], p[6])),
         ),
         (
             f"dz/dt = omega - zeta*{sign}*z",
@@ -201,16 +201,16 @@ _SHARPNESS: dict[bool, tuple[Parameter, ...]] = {
 }
 
 
-def _lowest(constant: Any, per_ampere: Any) -> Any:
-    """By how much constant + per_ampere |i| falls below zero somewhere up to the rated current."""
+def _deficit(constant: Any, per_ampere: Any) -> Any:
+    """Largest -(constant + per_ampere |i|) up to the rated current: above 0 it is infeasible."""
     at_rated = -constant - per_ampere * _RATED_CURRENT
-    # The larger of the two ends, for floats and for columns of a population alike.
+    # max of both ends, written so that it holds for columns of a population as well.
     return 0.5 * (-constant + at_rated + abs(constant + at_rated))
 
 
 def _positive_torque(first: int) -> tuple[PartConstraint, ...]:
-    """alpha(i) and c(i) not negative, their coefficients standing from ``first`` on."""
+    """alpha(i) >= 0 and c(i) >= 0, with their coefficients at ``first`` and after."""
     return (
-        ("alpha(i_b) >= 0 for every current", lambda p: _lowest(p[first], p[first + 1])),
-        ("c(i_b) >= 0 for every current", lambda p: _lowest(p[first + 2], p[first + 3])),
+        ("alpha(i_b) >= 0 for every current", lambda p: _deficit(p[first], p[first + 1])),
+        ("c(i_b) >= 0 for every current", lambda p: _deficit(p[first + 2], p[first + 3])),
     )

@@ -1,4 +1,4 @@
-"""What the forms of a tape's lines compute, of floats and of arrays alike."""
+"""The operations that a tape's lines stand for, on floats and on arrays alike."""
 
 import functools
 import math
@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-# What a library function of one float is called for arrays.
+# NumPy's functions by the names that they have in ``math``.
 _SAME_NAMES = (
     "exp expm1 log log1p log2 log10 sqrt fabs hypot copysign sin cos tan sinh cosh tanh floor ceil"
 )
-_OF_ARRAYS = {
+_UFUNCS = {
     **{name: getattr(np, name) for name in _SAME_NAMES.split()},
     **{"asin": np.arcsin, "acos": np.arccos, "atan": np.arctan, "atan2": np.arctan2},
     "pow": np.power,
@@ -22,9 +22,9 @@ _OF_ARRAYS = {
 
 @functools.cache
 def operation(form: str, count: int) -> Callable[..., Any]:
-    """What a form with places for so many operands computes.
+    """The function of ``count`` operands that a form such as ``{} + {}`` stands for.
 
-    It raises TypeError for arrays given to a function of which only one for floats is known.
+    Calling it with arrays raises TypeError where NumPy has no such function.
     """
     names = [f"a{i}" for i in range(count)]
     text = "power({}, {})" if form == "{} ** {}" else form
@@ -38,70 +38,70 @@ def constant(text: str) -> Any:
     return eval(text, _SCOPE)
 
 
-def _of_either(function: Callable[..., Any], of_arrays: np.ufunc | None) -> Callable[..., Any]:
-    """A function of floats that does the same with arrays among them."""
+def _elementwise(function: Callable[..., Any], ufunc: np.ufunc | None) -> Callable[..., Any]:
+    """A function of floats that applies its NumPy counterpart where an argument is an array."""
 
     def call(*args: Any) -> Any:
         if not arrays(args):
             return function(*args)
-        if of_arrays is None or of_arrays.nin != len(args):
+        if ufunc is None or ufunc.nin != len(args):
             raise TypeError(f"{function.__name__} of many numbers is not known")
-        return of_arrays(*args)
+        return ufunc(*args)
 
     return call
 
 
 def arrays(args: Iterable[Any]) -> bool:
-    """Whether any of some numbers is an array of many."""
+    """Whether any of the numbers is an array."""
     return any(isinstance(a, np.ndarray) for a in args)
 
 
 def _select(condition: Any, first: Any, second: Any) -> Any:
-    """The first where a condition holds, else the second."""
+    """``first`` where a condition holds, else ``second``."""
     if arrays((condition,)):
         return np.where(condition, first, second)
     return first if condition else second
 
 
 def _extreme(better: Callable[[Any, Any], Any]) -> Callable[..., Any]:
-    """The first of several numbers than which none is better."""
+    """``min`` or ``max``, by what makes one number better than another; of equals the first."""
     return lambda *args: functools.reduce(lambda a, b: _select(better(b, a), b, a), args)
 
 
 def _sign(a: Any) -> Any:
-    """The slope of |a|: at zero, where there is none, the mean of its two sides."""
+    """The derivative of |a|; at zero, where it jumps, the mean of both sides."""
     if arrays((a,)):
         return np.sign(a)
     return math.copysign(1.0, a) if a else 0.0
 
 
 def _power(a: Any, b: Any) -> Any:
-    """a^b, of a negative number no number unless b is whole."""
+    """a^b; NaN for a negative a unless b is whole."""
     if arrays((a, b)):
         return np.power(a, b)
     power = a**b
     return math.nan if isinstance(power, complex) else power
 
 
-def _power_slope(a: Any, b: Any, moved: Any) -> Any:
-    """By how much a^b moves with a; a root at zero has no slope, unless nothing moves there."""
-    if arrays((a, b, moved)):
-        slope = b * _power(a, b - 1.0) * moved
-        return np.where((moved != 0.0) & (b != 0.0), slope, 0.0)
-    return b * _power(a, b - 1.0) * moved if b and moved else 0.0
+def _power_slope(a: Any, b: Any, da: Any) -> Any:
+    """b a^(b-1) da, the change of a^b with a; 0 where b or da is, even if a^(b-1) is infinite."""
+    if arrays((a, b, da)):
+        slope = b * _power(a, b - 1.0) * da
+        return np.where((da != 0.0) & (b != 0.0), slope, 0.0)
+    return b * _power(a, b - 1.0) * da if b and da else 0.0
 
 
-def _exponent_slope(a: Any, power: Any, moved: Any) -> Any:
-    """By how much a power of a moves with its exponent; 0^b stays 0 for all b > 0."""
-    if arrays((a, power, moved)):
-        return np.where(moved != 0.0, power * np.log(np.where(a == 0.0, 1.0, a)) * moved, 0.0)
-    return (power * math.log(a) if a else 0.0) * moved if moved else 0.0
+def _exponent_slope(a: Any, power: Any, db: Any) -> Any:
+    """a^b ln(a) db, the change of ``power`` = a^b with b; 0 at a = 0, as 0^b is for all b > 0."""
+    if arrays((a, power, db)):
+        return np.where(db != 0.0, power * np.log(np.where(a == 0.0, 1.0, a)) * db, 0.0)
+    return (power * math.log(a) if a else 0.0) * db if db else 0.0
 
 
 _SCOPE: dict[str, Any] = {
     "math": types.SimpleNamespace(
         **{
-            name: _of_either(item, _OF_ARRAYS.get(name)) if callable(item) else item
+            name: _elementwise(item, _UFUNCS.get(name)) if callable(item) else item
             for name, item in vars(math).items()
         }
     ),

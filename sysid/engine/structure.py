@@ -1,11 +1,10 @@
-"""A model's equations taken apart: dx/dt = A x + N(x, u), and what depends on parameters alone.
+"""Structure of a model's equations: dx/dt = A x + N(x, u), A fixed by the parameters alone.
 
 The batch simulator integrates A exactly, so that only N limits its steps. The parts are found
-by running the equations on numbers that write down what is done to them, not from samples of
-their values: a dead zone is never mistaken for a straight line, and the coefficients are exact.
-A value limited from both sides counts with its straight piece in A, which makes its row exact
-while it is not at a limit; N is what is left, zero until then. Where the equations branch on a
-value nothing is claimed to be linear, and N is the user's function itself.
+by running the equations on traces, which write down what is done to them, and not from samples:
+a dead zone is never mistaken for a straight line, and the coefficients are exact. A value
+clamped from both sides enters A as if it had no limits, and N takes away what they cut off. Where
+the equations branch on a value, nothing is claimed to be linear: N is the user's function.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,10 +19,10 @@ from sysid.problem.model import Function, ProcessModel
 
 @dataclass(frozen=True)
 class Guard:
-    """A number within a straight piece of which the equations have limits.
+    """A linear value that the equations clamp between limits.
 
-    n_limits: how many of the program's ``margins`` are its own. slopes: its coefficients by
-    state. gains: by row, what the number counts for there. Coefficients are text as in Structure.
+    n_limits: how many of the program's ``margins`` belong to it. slopes: its coefficients by
+    state. gains: its coefficients in the rows of dx/dt. Coefficients are text as in Structure.
     """
 
     n_limits: int
@@ -35,12 +34,12 @@ class Guard:
 class Structure:
     """What is linear in dx/dt = A x + N(x, u).
 
-    coefficients: of the entries (i, j) of A that are not always zero, each as Python text in
-    terms of the constants ``c[..]`` of the program, n_constants of them. driven: rows whose N
-    changes within a sample: nonlinear ones, and those with an input that is not held. nonlinear:
-    whether any row of N depends on a state. guards: limits that fast linear parts may run into.
-    shown: states that an output depends on directly, so that it shows when one of them is wrong.
-    program: see ``program``. calls: which of ``derivative`` and ``output`` it refers to.
+    coefficients: entries (i, j) of A that are not always zero, as Python text in terms of the
+    program's n_constants constants ``c[..]``. driven: rows whose N changes within a sample:
+    nonlinear ones, and those with an input that is not held. nonlinear: whether any row of N
+    depends on a state. guards: limits that fast linear parts may run into. shown: states that an
+    output depends on directly, so that an error in one of them shows there. program: source text,
+    see ``Writer.program``. calls: which of ``derivative`` and ``output`` the program refers to.
     """
 
     coefficients: Mapping[tuple[int, int], str]
@@ -57,13 +56,13 @@ def analyse(model: ProcessModel, *, exact: bool = True) -> Structure:
     """Take a model's equations apart; without ``exact`` all of them are left in N."""
     splitter = Splitter()
     tape = splitter.tape
-    slopes = _splits(splitter, model, model.derivative)
-    rows = slopes or []
-    # Limits on straight pieces that the rows are sums of, by their place among all.
+    derivatives = _splits(splitter, model, model.derivative)
+    rows = derivatives or []
+    # The clamps of linear values that the rows contain, by their place among all clamps.
     places = sorted({k for row in rows for k in row.kinks})
     clamps = {k: splitter.clamps[k] for k in places if splitter.clamps[k].base.linear}
     parts = [_parts(splitter, row) if exact else ({}, row.total) for row in rows]
-    linear = {(i, j): name for i, (piece, _) in enumerate(parts) for j, name in piece.items()}
+    linear = {(i, j): name for i, (row, _) in enumerate(parts) for j, name in row.items()}
     gains = {k: {i: row.kinks[k] for i, row in enumerate(rows) if k in row.kinks} for k in clamps}
     functions = {"remainder": [rest for _, rest in parts]}
     shown = frozenset(model.output_states or range(len(model.states)))
@@ -86,7 +85,7 @@ def analyse(model: ProcessModel, *, exact: bool = True) -> Structure:
         Guard(len(clamp.limits), writer.placed(clamp.base.linear), writer.placed(gains[k]))
         for k, clamp in clamps.items()
     )
-    driven, nonlinear = _driven(model, slopes if exact else None, clamps)
+    driven, nonlinear = _driven(model, derivatives if exact else None, clamps)
     return Structure(
         writer.placed(linear), driven, nonlinear, guards, shown, writer.program(),
         len(writer.constants), writer.calls,
@@ -100,16 +99,17 @@ def _driven(
     if rows is None:
         return tuple(range(len(model.states))), True
     moving = {j for j, signal in enumerate(model.inputs) if signal.hold != "zoh"}
-    bent = [bool(row.nonlinear or row.kinks.keys() & clamps.keys()) for row in rows]
-    return tuple(i for i, row in enumerate(rows) if bent[i] or row.inputs & moving), any(bent)
+    nonlinear = [bool(row.nonlinear or row.kinks.keys() & clamps.keys()) for row in rows]
+    driven = (i for i, row in enumerate(rows) if nonlinear[i] or row.inputs & moving)
+    return tuple(driven), any(nonlinear)
 
 
 def _splits(splitter: Splitter, model: ProcessModel, function: Function) -> list[Split] | None:
-    """A function's values, split; None where it cannot be followed."""
+    """The values of a model's function, split; None where traces cannot follow it."""
     equations = Tape()
     sides = zip("xup", (model.states, model.inputs, model.parameters), strict=True)
     try:
-        values = followed(function)(*(traces(equations, name, len(of)) for name, of in sides))
+        values = followed(function)(*(traces(equations, name, len(items)) for name, items in sides))
         return splitter.split(equations, map(operand, values))
     except Exception:
         # Whatever it does that a trace cannot follow, the compiler may well be able to.
@@ -117,7 +117,7 @@ def _splits(splitter: Splitter, model: ProcessModel, function: Function) -> list
 
 
 def _parts(splitter: Splitter, row: Split) -> tuple[Mapping[int, str], str]:
-    """Straight piece of a row, without the states it depends on in other ways, and the rest."""
+    """Coefficients of a row in A, and its rest in N with all states that enter it nonlinearly."""
     linear = {j: c for j, c in row.linear.items() if j not in row.nonlinear}
     if not linear:
         return {}, row.total

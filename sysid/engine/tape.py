@@ -1,7 +1,7 @@
 """Straight-line code, written down line by line while a model's equations run.
 
-A tape may stand at a point: then each number has its value there too, and where the equations
-branch it notes which way they went.
+A tape may stand at a point, with values of states, inputs and parameters. Then every result has
+a value too, and conditions in the equations can be decided; the tape keeps their outcomes.
 """
 
 from collections.abc import Iterable, Mapping
@@ -11,7 +11,7 @@ from sysid.engine.arithmetic import arrays, constant, operation
 
 
 class Line(NamedTuple):
-    """``name = text``, the text a form with places for operands; fixed by the parameters alone."""
+    """``name = text``: ``form`` with its operands filled in; fixed if parameters alone enter it."""
 
     name: str
     form: str
@@ -42,7 +42,7 @@ class Tape:
         """Name of the result of an operation, ``form`` with places for its operands."""
         text = form.format(*operands)
         if not any(map(self.named, operands)):
-            return f"({text})"  # literals alone, which the compiler works out
+            return f"({text})"  # literals alone: the compiler folds them
         if text not in self._lines:
             fixed = all(map(self.fixed, operands))
             line = Line(f"t{len(self._lines)}", form, operands, text, fixed)
@@ -60,7 +60,7 @@ class Tape:
         return self.decisions[name]
 
     def single(self, operands: Iterable[str]) -> bool:
-        """Whether the tape stands at a single point, as far as these numbers tell."""
+        """Whether these operands have values, and none of them is an array."""
         return self._values is not None and not arrays(map(self.value, operands))
 
     def value(self, operand: str) -> Any:
@@ -74,11 +74,11 @@ class Tape:
         return line.fixed if line else operand[0] not in "xu"
 
     def named(self, operand: str) -> bool:
-        """Whether it is a name and not a literal."""
+        """Whether an operand is a name and not a literal."""
         return operand in self._by_name or operand[0] in "xup"
 
     def needed(self, names: Iterable[str]) -> list[Line]:
-        """Lines that the named numbers need, in order."""
+        """Lines that must run to compute the named results, in order."""
         wanted = set(names)
         lines = []
         for line in reversed(self._lines.values()):
@@ -88,18 +88,20 @@ class Tape:
         return lines[::-1]
 
     def join(self, sign: str, a: str | None, b: str | None) -> str | None:
-        """``a + b`` or ``a - b``, where None is nothing."""
-        if a is None or b is None:
-            return a if b is None else b if sign == "+" else self.emit("-{}", b)
+        """``a + b`` or ``a - b``, by the sign; None stands for zero."""
+        if b is None:
+            return a
+        if a is None:
+            return b if sign == "+" else self.emit("-{}", b)
         return self.emit(f"{{}} {sign} {{}}", a, b)
 
     def join_all(self, sign: str, a: Mapping[int, str], b: Mapping[int, str]) -> dict[int, str]:
-        """The same of coefficients."""
+        """``join`` of the coefficients with equal keys."""
         joined = {k: self.join(sign, a.get(k), b.get(k)) for k in [*a, *b]}
         return {k: c for k, c in joined.items() if c is not None}
 
     def multiply(self, a: str, b: str) -> str:
-        """Product, without multiplying by a literal one."""
+        """``a * b``, without multiplying by a literal 1.0."""
         if "1.0" in (a, b):
             return a if b == "1.0" else b
         return self.emit("{} * {}", a, b)

@@ -1,4 +1,4 @@
-"""Numbers that write down on a tape what is done to them."""
+"""Numbers that write every operation on them down on a tape."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ def _condition(sign: str) -> Callable[[Trace, Any], bool]:
 class Trace:
     """A number on a tape, by its name there.
 
-    Where the tape stands at a point, conditions on the number are decided by its value there;
-    elsewhere they raise TypeError.
+    Conditions on it are decided by its value at the point where the tape stands; on a tape
+    without a point they raise TypeError.
     """
 
     __slots__ = ("name", "tape")
 
-    # NumPy's own numbers are to leave arithmetic to the methods here.
+    # A NumPy number on the left leaves arithmetic to the reflected methods here.
     __array_ufunc__ = None
 
     def __init__(self, tape: Tape, name: str) -> None:
@@ -68,9 +68,9 @@ class Trace:
 
 
 def followed(function: Any) -> Callable[..., tuple[Any, ...]]:
-    """A copy of a model's function that takes traces."""
-    library = {name: _follow(f) if callable(f) else f for name, f in vars(math).items()}
-    builtins = {"min": _follow(min), "max": _follow(max)}
+    """A copy of a model's function that takes traces for numbers."""
+    library = {name: _traceable(f) if callable(f) else f for name, f in vars(math).items()}
+    builtins = {"min": _traceable(min), "max": _traceable(max)}
     copier = Copier(types.SimpleNamespace(**library), lambda copy: copy, builtins, unwrap=True)
     copy: Callable[..., tuple[Any, ...]] = copier.copied(function)
     return copy
@@ -82,7 +82,7 @@ def traces(tape: Tape, letter: str, count: int) -> tuple[Trace, ...]:
 
 
 def operand(value: Any) -> str:
-    """Name of a trace, or text of a number, in parentheses where a sign could be misread."""
+    """Name of a trace, or text of a number, in parentheses if it is negative."""
     if isinstance(value, Trace):
         return value.name
     if isinstance(value, numbers.Integral):
@@ -94,13 +94,13 @@ def operand(value: Any) -> str:
     return f"({text})" if text.startswith("-") else text
 
 
-def _follow(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A library function that passes plain numbers on and follows traces."""
+def _traceable(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A library function that computes plain numbers, and writes itself down for traces."""
     prefix = "" if function in (min, max) else "math."
 
     def call(*args: Any) -> Any:
         first = next((a for a in args if isinstance(a, Trace)), None)
-        # At a single point a comparison picks the least or largest, derivatives and all.
+        # With values at hand, Python's own min and max pick one of the traces, as a branch would.
         if first is None or (function in (min, max) and first.tape.single(map(operand, args))):
             return function(*args)
         places = ", ".join("{}" for _ in args)

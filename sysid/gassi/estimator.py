@@ -30,16 +30,16 @@ from sysid.uncertainty import Profile, Uncertainty, profile, uncertainty
 
 Criterion = Literal["likelihood", "error"]
 
-# Settings that do not decide the result, or that a checkpoint holds in another form.
-_NOT_DECIDING = ("model", "threads", "dt")
+# Not compared with a checkpoint's: they do not decide the result, or it holds them otherwise.
+_NOT_COMPARED = ("model", "threads", "dt")
 
 
 @dataclass(frozen=True)
 class Progress:
-    """Progress of a search: generation ``done`` of ``total``, the best error.
+    """Progress of a search: generation ``done`` of ``total`` and the best error so far.
 
-    stage: ``search``; ``refine``, by the local refinement; ``weigh``, by the likelihood at the
-    end, where ``done`` and ``total`` are the iterations so far.
+    stage: ``search`` by the genetic algorithm, ``refine`` by local least squares, or ``weigh`` by
+    the likelihood at the end, where ``done`` and ``total`` are the iterations so far.
     """
 
     stage: str
@@ -89,7 +89,7 @@ class GASSI(RecordEstimator):
     guesses_ : {name: Guess} of the ranges that were read from the records.
     space_ : SearchSpace that was searched; estimated initial states stand behind the parameters.
     output_weights_ : (n_outputs,), final weights of the outputs.
-    rivals_ : parameters of further minima that the data do not tell from the result.
+    rivals_ : parameters in each further minimum that explains the data as well as the result.
     error_ : mean over outputs of the RMSE normalised by max|y| (see ``Objective``).
     search_error_ : the lowest error before local refinement.
     feasible_ : whether all constraints hold.
@@ -151,7 +151,7 @@ class GASSI(RecordEstimator):
         checkpoint: Path | None = None,
         resume: Path | None = None,
     ) -> Self:
-        """Search the parameters that make the model follow the records.
+        """Search for the parameters with which the model follows the records.
 
         X: one Dataset, several of any lengths and rates, or an (n_samples, n_inputs) array
         with y (n_samples,) or (n_samples, n_outputs), NaN where a sample was lost. records:
@@ -180,25 +180,25 @@ class GASSI(RecordEstimator):
         self._rivals: tuple[FloatArray, ...] = ()
         self._final_accuracy = self.accuracy
         run = self._search_run(objective, preset)
-        keeper = self._keeper(data, run, checkpoint, resume)
+        checkpoints = self._checkpoints(data, run, checkpoint, resume)
         notify = on_progress or (lambda progress: None)
-        self.stopped_ = self._search(run, keeper, notify)
-        self._take(run)
+        self.stopped_ = self._search(run, checkpoints, notify)
+        self._set_run(run)
         likelihood = preset.refine and self.criterion == "likelihood"
         if likelihood and self.stopped_ != "interrupted":
-            self._weigh(run, notify)
+            self._maximise_likelihood(run, notify)
         return self
 
     def _search(
-        self, run: SearchRun, keeper: Checkpoint | None, notify: Callable[[Progress], None]
+        self, run: SearchRun, checkpoints: Checkpoint | None, notify: Callable[[Progress], None]
     ) -> str:
-        """Why the search ended, after its end."""
+        """Run the search to its end; why it ended, as in ``stopped_``."""
         try:
             while not run.done:
                 run.step()
-                if keeper is not None:
-                    keeper.save(run.state())
-                self._take(run)
+                if checkpoints is not None:
+                    checkpoints.save(run.state())
+                self._set_run(run)
                 stage = "search" if run.local is None else "refine"
                 generation = min(len(run.history), self.generations)
                 notify(Progress(stage, generation, self.generations, self.error_))
@@ -207,12 +207,12 @@ class GASSI(RecordEstimator):
                 raise
             return "interrupted"
         finally:
-            if keeper is not None:
-                keeper.flush()
+            if checkpoints is not None:
+                checkpoints.flush()
         return "converged" if run.search.converged else "generations"
 
-    def _weigh(self, run: SearchRun, notify: Callable[[Progress], None]) -> None:
-        """End with the likelihood instead of the mean RMSE."""
+    def _maximise_likelihood(self, run: SearchRun, notify: Callable[[Progress], None]) -> None:
+        """Refit the minima of the mean RMSE by likelihood, and keep the likeliest."""
         iterations = itertools.count(1)
 
         def watch(_: Point) -> None:
@@ -225,9 +225,9 @@ class GASSI(RecordEstimator):
             self.stopped_ = "interrupted"
             return
         self._final_accuracy = likeliest.objective.simulator.accuracy
-        objective, chromosome = self._finally_accurate(run.objective), likeliest.chromosome
+        objective, chromosome = self._at_final_accuracy(run.objective), likeliest.chromosome
         error = float(objective.evaluate(chromosome[None])[0][0])
-        self._set(Best(objective.space, chromosome, error, likeliest.feasible))
+        self._set_best(Best(objective.space, chromosome, error, likeliest.feasible))
         self.output_weights_ = likeliest.objective.weights
         self.n_simulations_ = objective.simulations
 
@@ -244,10 +244,10 @@ class GASSI(RecordEstimator):
             return free_run(simulator, self.vector_, X)
         inputs, parts = self._inputs(X, reset=False), []
         for rows in split(len(inputs), records):
-            # A simulation needs two rows; of a single one only the start is wanted.
-            driven = np.concatenate([inputs[rows], inputs[rows][-1:]])
-            unknown = np.full((len(driven), len(simulator.model.outputs)), np.nan)
-            record = Dataset(driven, unknown, self._step(None))
+            # A simulation needs two rows: the last is repeated, so that one row suffices.
+            padded = np.concatenate([inputs[rows], inputs[rows][-1:]])
+            unknown = np.full((len(padded), len(simulator.model.outputs)), np.nan)
+            record = Dataset(padded, unknown, self._step(None))
             parts.append(free_run(simulator, self.vector_, record)[:-1])
         return self._shaped(np.concatenate(parts))
 
@@ -262,9 +262,9 @@ class GASSI(RecordEstimator):
     def uncertainty(
         self, X: Data, y: FloatArray | None = None, *, records: Any = None
     ) -> Uncertainty:
-        """Intervals of the parameters, and what the records, those of ``fit``, cannot tell.
+        """Intervals of the parameters, and which of them the records cannot tell apart.
 
-        Raises ModelError where the local refinement did not run to its end, in a minimum.
+        X, y, records: those of ``fit``. Raises ModelError unless refinement ended in a minimum.
         """
         return uncertainty(self._final_objective(X, y, records), self.chromosome_, self._rivals)
 
@@ -272,7 +272,7 @@ class GASSI(RecordEstimator):
     def profile(
         self, name: str, X: Data, y: FloatArray | None = None, *, records: Any = None
     ) -> Profile:
-        """How much worse the best fit becomes as one parameter is moved, the rest fitted anew.
+        """Profile likelihood: the best fit as one parameter moves and all others are refitted.
 
         X, y, records: those of ``fit``. Raises ModelError as ``uncertainty``, and for a parameter
         that is not free.
@@ -281,7 +281,7 @@ class GASSI(RecordEstimator):
 
     @property
     def rivals_(self) -> list[dict[str, float]]:
-        """All the model's parameters in minima that the data do not tell from the result."""
+        """All the model's parameters in each further minimum that explains the data as well."""
         return [self._named(self.space_.full(rival)) for rival in self._rivals]
 
     def _final_objective(self, X: Data, y: FloatArray | None, records: Any) -> Objective:
@@ -292,10 +292,10 @@ class GASSI(RecordEstimator):
         if self.stopped_ == "interrupted":
             raise ModelError("the identification was interrupted, so there are no intervals")
         data = self._records(X, y, records, None, reset=False)
-        return self._finally_accurate(self._objective(data).weighed(self.output_weights_))
+        return self._at_final_accuracy(self._objective(data).weighed(self.output_weights_))
 
-    def _finally_accurate(self, objective: Objective) -> Objective:
-        """The objective by simulations of the accuracy that ``fit`` ended with."""
+    def _at_final_accuracy(self, objective: Objective) -> Objective:
+        """The objective, simulated as accurately as at the end of ``fit``."""
         accuracy = self._final_accuracy
         return objective.finer(accuracy) if accuracy < self.accuracy else objective
 
@@ -353,7 +353,7 @@ class GASSI(RecordEstimator):
         return weights
 
     def _search_run(self, objective: Objective, preset: Preset) -> SearchRun:
-        # Of the generations the genetic search has its share, the local refinement the rest.
+        # The genetic search gets its share of the generations, local refinement the rest.
         generations = self.generations
         if preset.refine and generations > 0:
             generations = max(1, round((1.0 - preset.local_share) * generations))
@@ -362,31 +362,31 @@ class GASSI(RecordEstimator):
         search = GeneticSearch(self.space_, preset, self.population, generations, rng, *rule)
         return SearchRun(objective, search, self.generations, self.criterion == "likelihood")
 
-    def _keeper(
+    def _checkpoints(
         self, data: Sequence[Dataset], run: SearchRun, checkpoint: Path | None, resume: Path | None
     ) -> Checkpoint | None:
-        """Writer of the checkpoints, after the run has been restored from one."""
+        """Writer of the run's checkpoints, if wanted; restores the run when it resumes from one."""
         path = checkpoint if checkpoint is not None else resume
         if path is None:
             return None
-        settings = {k: v for k, v in self.get_params(deep=False).items() if k not in _NOT_DECIDING}
-        begun_with = origin(self._model(), data, settings)
+        settings = {k: v for k, v in self.get_params(deep=False).items() if k not in _NOT_COMPARED}
+        search_origin = origin(self._model(), data, settings)
         if resume is not None:
-            run.restore(load(Path(resume), begun_with))
-        keeper = Checkpoint(Path(path), begun_with)
-        keeper.save(run.state())
-        return keeper
+            run.restore(load(Path(resume), search_origin))
+        writer = Checkpoint(Path(path), search_origin)
+        writer.save(run.state())
+        return writer
 
-    def _take(self, run: SearchRun) -> None:
+    def _set_run(self, run: SearchRun) -> None:
         """Set the fitted attributes to the state of a run."""
         assert run.best is not None
-        self._set(run.best)
+        self._set_best(run.best)
         self.search_error_: float = run.search.elite_error
         self.history_: FloatArray = np.array(run.history)
         self.flagged_ = dict(run.flagged)
         self.n_simulations_ = run.objective.simulations
 
-    def _set(self, best: Best) -> None:
+    def _set_best(self, best: Best) -> None:
         self.space_, self.chromosome_, self.error_, self.feasible_ = best
         self.vector_ = self.space_.full(self.chromosome_)
         self.parameters_ = self._named(self.vector_)

@@ -16,12 +16,12 @@ from sysid.problem.model import ModelError
 from sysid.problem.records import Data, RecordEstimator, given_datasets, split
 from sysid.threads import one_thread
 
-_GROWN = 1e6  # times its start: a larger response is that of an unstable model
+_UNSTABLE_GROWTH = 1e6  # of a response over its start, beyond which the model is unstable
 
 
 @dataclass(repr=False, eq=False)
 class PolynomialModel(RecordEstimator):
-    """A(q) y = B(q) u + offset + C(q) e, resting at an operating point before each record."""
+    """A(q) y = B(q) u + offset + C(q) e, at rest at an operating point before each record."""
 
     _: KW_ONLY
     offset: bool = True
@@ -51,13 +51,13 @@ class PolynomialModel(RecordEstimator):
     def predict(self, X: Data, *, records: Any = None, dt: float | None = None) -> FloatArray:
         """Free-run outputs of the identified model, (n_samples, n_outputs).
 
-        A Dataset starts from the first ``n_lags_`` rows that make the whole record fit best, an
-        array from rest, each of its ``records`` anew; (n_samples,) if the outputs of ``fit`` were.
+        A Dataset starts with those ``n_lags_`` first rows with which the whole record fits best;
+        each of the ``records`` of an array from rest. (n_samples,) if the outputs of ``fit`` were.
         """
         check_is_fitted(self)
         datasets = given_datasets(X)
         if datasets is not None:
-            return self._follow(self._single(datasets))
+            return self._fitted_run(self._checked(datasets))
         inputs = self._inputs(X, reset=False)
         runs = [self._free_run(inputs[rows]) for rows in split(len(inputs), records)]
         return self._shaped(np.concatenate(runs))
@@ -88,7 +88,7 @@ class PolynomialModel(RecordEstimator):
     def predict_ahead(
         self, X: Dataset | FloatArray, y: FloatArray | None = None, k: int = 1
     ) -> FloatArray:
-        """Row t: outputs predicted from those up to row t-k and the inputs up to row t.
+        """Predictions k samples ahead: row t from outputs up to row t-k and inputs up to row t.
 
         X, y: a Dataset, or the arrays of one record. Lost outputs (NaN) are bridged by their
         prediction. The model starts from rest, so that k >= n_samples gives ``simulate(X)``; no
@@ -98,9 +98,9 @@ class PolynomialModel(RecordEstimator):
         if isinstance(k, bool) or not isinstance(k, int | np.integer) or k < 1:
             raise ModelError(f"k is {k!r}; predict 1 or more whole samples ahead")
         datasets = given_datasets(X)
-        record = self._single(datasets or self._arrays(X, y, None, None, reset=False))
+        record = self._checked(datasets or self._arrays(X, y, None, None, reset=False))
         first, drive = self.n_lags_, self._drive(record.inputs)
-        y = self._rested(self.output_mean_, self._held(record.outputs[:first]))
+        y = self._after_rest(self.output_mean_, self._filled(record.outputs[:first]))
         past = y[: len(y) - first]
         outputs, errors = innovations(self.A_, self.C_, drive[first:], y, record.outputs[first:])
         y, e = np.vstack((y, outputs)), np.vstack((np.zeros_like(y), errors))
@@ -119,10 +119,10 @@ class PolynomialModel(RecordEstimator):
     def score(
         self, X: Data, y: FloatArray | None = None, *, records: Any = None, dt: float | None = None
     ) -> float:
-        """Mean fit % / 100 of free runs like ``predict`` of a Dataset; 1 is perfect."""
+        """Mean fit % of free runs, as ``predict`` of a Dataset, divided by 100; 1 is perfect."""
         check_is_fitted(self)
         data = given_datasets(X) or self._arrays(X, y, records, dt, reset=False)
-        fits = [free_run_fit(r.outputs, self._follow(self._single([r])))[0] for r in data]
+        fits = [free_run_fit(r.outputs, self._fitted_run(self._checked([r])))[0] for r in data]
         return float(np.nanmean(fits)) / 100.0
 
     def _layout(self, record: Dataset) -> Layout:
@@ -132,7 +132,7 @@ class PolynomialModel(RecordEstimator):
     def _fit_rows(
         self, lag: int, X: Data, y: Any = None, records: Any = None, dt: float | None = None
     ) -> None:
-        """Fit all rows of the records but the first ``lag``, or those without a complete past."""
+        """Fit each record's rows but the first ``lag``, or more if more lack a complete past."""
         self.dt_ = dt
         data = self._records(X, y, records, dt, reset=True)
         if given_datasets(X) is not None:
@@ -148,14 +148,14 @@ class PolynomialModel(RecordEstimator):
         self.theta_ = np.concatenate([np.append(fit.theta, fit.c) for fit in fits])
         A = layout.polynomials(self.theta_)[0]
         self.A_ = reflect_poles(A) if self.stable else A
-        self.reflected_ = self.A_ is not A
+        self.reflected_ = self.A_ is not A  # reflect_poles returns a stable A itself
         estimated = np.full(len(self.theta_), True)
         if self.reflected_:
             rows = zip(stack.equations(layout, lag, self.A_), fits, strict=True)
             fits = [fit_equation(row, len(fit.c), [fit.c], limit) for row, fit in rows]
             estimated = np.nonzero(layout.free)[1] >= len(fits)
-            moved = layout.free[:, : len(fits), : len(A)]
-            self.theta_[~estimated] = self.A_.transpose(1, 2, 0)[moved]
+            free_of_A = layout.free[:, : len(fits), : len(A)]
+            self.theta_[~estimated] = self.A_.transpose(1, 2, 0)[free_of_A]
             self.theta_[estimated] = np.concatenate([np.append(fit.theta, fit.c) for fit in fits])
         _, self.B_, self.C_, self.offset_ = layout.polynomials(self.theta_)
         self._set_precision(layout, fits, estimated, len(stack.age))
@@ -170,9 +170,9 @@ class PolynomialModel(RecordEstimator):
     def _set_precision(
         self, layout: Layout, fits: list[EquationFit], estimated: BoolArray, n: int
     ) -> None:
-        """Of the estimated coefficients; Ljung, System Identification, sections 9.2 and 9.3."""
+        """Set covariances, standard errors and likelihood; Ljung, sections 9.2 and 9.3."""
         row, q, p = np.nonzero(layout.free)[0], len(fits), len(estimated)
-        # Over all n instants, for errors of several outputs at one may be correlated.
+        # Over all n instants: errors of several outputs at the same instant may be correlated.
         present, residual, gain = np.zeros((q, n)), np.zeros((q, n)), np.zeros((p, n))
         used, determined = np.zeros(q), estimated.copy()
         for i, fit in enumerate(fits):
@@ -180,12 +180,13 @@ class PolynomialModel(RecordEstimator):
             effect, basis, determined[fitted] = influence(fit.sensitivity)
             gain[np.ix_(fitted, fit.position)], used[i] = effect, basis.shape[1] / 2.0
             present[i, fit.position], residual[i, fit.position] = 1.0, fit.residual
-        # Each error counts for its degrees of freedom.
-        freedom = np.maximum(present @ present.T - used - used[:, None], 1.0)
-        self.noise_covariance_ = residual @ residual.T / freedom
+        # Instants shared by two outputs, less the mean number of their coefficients.
+        degrees_of_freedom = np.maximum(present @ present.T - used - used[:, None], 1.0)
+        self.noise_covariance_ = residual @ residual.T / degrees_of_freedom
         self.covariance_ = self.noise_covariance_[row[:, None], row] * (gain @ gain.T)
         self.covariance_[~determined] = self.covariance_[:, ~determined] = np.nan
-        self.covariance_[(estimated & ~determined,) * 2] = np.inf
+        undetermined = np.flatnonzero(estimated & ~determined)
+        self.covariance_[undetermined, undetermined] = np.inf
         deviations = np.sqrt(np.diag(self.covariance_))
         self.A_std_, self.B_std_, self.C_std_, self.offset_std_ = layout.polynomials(deviations, 0)
         self.residuals_ = tuple(fit.errors for fit in fits)
@@ -202,72 +203,73 @@ class PolynomialModel(RecordEstimator):
         self.bic_ = np.log(max(self.n_rows_, 1)) * p - 2.0 * self.log_likelihood_
 
     def _step(self, dt: float | None) -> float:
-        return dt if dt is not None else self.dt_ if self.dt_ is not None else 1.0
+        step = self.dt_ if dt is None else dt
+        return 1.0 if step is None else step
 
-    def _single(self, records: list[Dataset]) -> Dataset:
-        """The record to predict, of the model's signals."""
+    def _checked(self, records: list[Dataset]) -> Dataset:
+        """The only record; ModelError for several, or for other signals than the model's."""
         if len(records) > 1:
             raise ModelError("predictions take one Dataset at a time; call for each")
         check_signals(records[0], (len(self.input_mean_), len(self.offset_)), self.dt_, "the model")
         return records[0]
 
     def _drive(self, inputs: FloatArray) -> FloatArray:
-        """What inputs and offset add to each row's equation, (n, q)."""
-        rested = self._rested(self.input_mean_, inputs)
-        return filtered(self.B_, rested)[-len(inputs) :] + self.offset_
+        """B(q) u + offset of each row, (n, q)."""
+        u = self._after_rest(self.input_mean_, inputs)
+        return filtered(self.B_, u)[-len(inputs) :] + self.offset_
 
-    def _rested(self, rest: FloatArray, rows: FloatArray) -> FloatArray:
-        """Rows of a record after some at rest, as many as any lag needs."""
+    def _after_rest(self, rest: FloatArray, rows: FloatArray) -> FloatArray:
+        """Rows of a record, after as many rows at rest as the longest lag needs."""
         return np.vstack((np.tile(rest, (max(len(self.A_), len(self.B_), len(self.C_)), 1)), rows))
 
-    def _held(self, outputs: FloatArray) -> FloatArray:
-        """Lost samples replaced by the last one before, else the first after, else the mean."""
-        held = outputs.copy()
-        for column, mean in zip(held.T, self.output_mean_, strict=True):
+    def _filled(self, outputs: FloatArray) -> FloatArray:
+        """Outputs with lost samples replaced: by the last before, the first after, or the mean."""
+        filled = outputs.copy()
+        for column, mean in zip(filled.T, self.output_mean_, strict=True):
             last = next(iter(column[np.isfinite(column)]), mean)
             for row, value in enumerate(column):
                 last = column[row] = value if np.isfinite(value) else last
-        return held
+        return filled
 
     def _free_run(self, inputs: FloatArray, initial: FloatArray | tuple[()] = ()) -> FloatArray:
         """Free run, (n, q). initial: (k, q) outputs of the first rows, kept as they are."""
         first = np.reshape(initial, (-1, len(self.offset_)))
-        past = self._rested(first[0] if len(first) else self.output_mean_, first)
+        past = self._after_rest(first[0] if len(first) else self.output_mean_, first)
         outputs, _ = innovations(self.A_, self.C_, self._drive(inputs)[len(first) :], past)
         return np.vstack((first, outputs))
 
-    def _follow(self, record: Dataset) -> FloatArray:
-        """Free run from the first ``n_lags_`` rows that explain the record best, (n, q)."""
+    def _fitted_run(self, record: Dataset) -> FloatArray:
+        """Free run, (n, q), whose ``n_lags_`` first rows are fitted to explain the record best."""
         first, na, q = self.n_lags_, len(self.A_) - 1, len(self.offset_)
-        plain = self._free_run(record.inputs, self._held(record.outputs[:first]))
-        residual = record.outputs - plain
+        base = self._free_run(record.inputs, self._filled(record.outputs[:first]))
+        residual = record.outputs - base
         seen = np.isfinite(residual)
         with np.errstate(over="ignore", invalid="ignore"):
             squares = np.where(seen, residual, 0.0)[first:] ** 2
             unit = np.sqrt(squares.sum(axis=0) / max(len(squares), 1))
         if not first or not np.all((unit > 0.0) & (unit < np.inf)):
-            return plain
-        # Free runs from one unit in each value of those rows, each output in its residual's unit.
-        responses = np.zeros((na * q, len(plain), q))
+            return base
+        # Responses to a unit in each value of those rows, an output's unit its residual's RMS.
+        responses = np.zeros((na * q, len(base), q))
         for run, start in zip(responses, np.eye(na * q), strict=True):
             run[first - na : first] = unit * start.reshape(na, q)
             run[first:] = innovations(self.A_, self.C_, run[first:], run[first - na : first])[0]
         responses /= unit
-        if not np.all(np.abs(responses) < _GROWN):
-            return plain
+        if not np.all(np.abs(responses) < _UNSTABLE_GROWTH):
+            return base
         start = np.linalg.lstsq(responses[:, seen].T, (residual / unit)[seen])[0]
-        return np.asarray(plain + unit * np.tensordot(start, responses, axes=1), dtype=np.float64)
+        return np.asarray(base + unit * np.tensordot(start, responses, axes=1), dtype=np.float64)
 
 
 def free_run_fit(measured: FloatArray, simulated: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Fit %, minus infinity for a run that went out of bounds, and RMSE; each (n_outputs,)."""
+    """Fit %, minus infinity for a run that is not finite, and RMSE; each (n_outputs,)."""
     with np.errstate(all="ignore"):
         metrics = evaluate(measured, simulated)
     return np.where(np.isfinite(simulated).all(axis=0), metrics.fit, -np.inf), metrics.rmse
 
 
 def check_alike(records: list[Dataset]) -> None:
-    """Raise ModelError unless all have the same columns and sample time, and finite outputs."""
+    """Raise ModelError unless all have the same signals and sample time, and no infinite output."""
     first = records[0]
     for record in records:
         check_signals(record, (first.inputs.shape[1], first.outputs.shape[1]), first.dt, first.name)
@@ -278,7 +280,7 @@ def check_alike(records: list[Dataset]) -> None:
 
 
 def check_signals(record: Dataset, shape: tuple[int, int], dt: float | None, name: str) -> None:
-    """Raise ModelError unless a record has as many (inputs, outputs) and the dt [s] of another."""
+    """Raise ModelError unless a record has these numbers of inputs and outputs, and this dt [s]."""
     n_inputs, n_outputs = record.inputs.shape[1], record.outputs.shape[1]
     if (n_inputs, n_outputs) != shape:
         raise ModelError(
@@ -348,11 +350,11 @@ class ARMAX(PolynomialModel):
     ----------
     na, nb, nk, offset, stable : as of ``ARX``; with ``stable``, C is estimated again too.
     nc : lags of the noise: one number, or (n_outputs,).
-    max_iterations : of the search for each output's C.
+    max_iterations : limit of the iterations that search each output's C.
 
     Attributes
     ----------
-    iterations_, converged_ : for each output, and whether all were enough; the rest as of ``ARX``.
+    iterations_, converged_ : iterations by output; whether all converged. The rest as of ``ARX``.
 
     >>> import numpy as np
     >>> from scipy.signal import lfilter

@@ -14,8 +14,8 @@ Why = Literal["", "tied", "vague", "bound", "rival"]
 
 _FACTOR = re.compile(r"([^\W\d]+|1)(?:\^(-?\d+))?")
 _UNIT = re.compile(r"(?P<above>[^/()]+)(?:/(?:\((?P<several>[^/()]+)\)|(?P<single>[^/()*]+)))?")
-# Units made of others, which cancel the one named second.
-_MADE_OF: tuple[tuple[str, str, dict[str, int]], ...] = (
+# (unit, unit that it cancels, units that the first is made of)
+_DERIVED: tuple[tuple[str, str, dict[str, int]], ...] = (
     ("H", "ohm", {"ohm": 1, "s": 1}),
     ("ohm", "V", {"V": 1, "A": -1}),
     ("N", "kg", {"kg": 1, "m": 1, "s": -2}),
@@ -46,13 +46,13 @@ class Estimate:
     why: Why = ""
 
     def at(self, parameters: Mapping[str, float]) -> float:
-        """The same quantity of these parameters."""
+        """Value of the quantity for other values of the parameters."""
         if self.form == "product":
             return float(np.prod([parameters[name] ** power for name, power in self.terms]))
         return float(sum(factor * parameters[name] for name, factor in self.terms))
 
     def excludes(self, parameters: Mapping[str, float]) -> bool:
-        """Whether the quantity of these parameters is outside the interval, if there is one."""
+        """Whether the quantity has an interval, and lies outside it for these parameters."""
         if self.low is None or self.high is None:
             return False
         return not self.low <= self.at(parameters) <= self.high
@@ -74,33 +74,35 @@ def sum_text(terms: Sequence[tuple[str, float]]) -> str:
     parts: list[str] = []
     for name, factor in terms:
         size = name if abs(factor) == 1.0 else f"{abs(factor):.4g} {name}"
-        sign = "-" if factor < 0.0 else "+"
-        parts.append(f" {sign} {size}" if parts else size if factor > 0.0 else f"-{size}")
+        if parts:
+            parts.append(f" - {size}" if factor < 0.0 else f" + {size}")
+        else:
+            parts.append(size if factor > 0.0 else f"-{size}")
     return "".join(parts)
 
 
 def product_unit(factors: Iterable[tuple[str, float]]) -> str:
-    """The unit of units to their powers: ``N*m/rad`` of 1/rad and N*m.
+    """Unit of a product of units, each to its power: ``N*m/rad`` of 1/rad and N*m.
 
-    Empty where a unit is not written as ``a*b^2/(c*d)`` or a power is not whole: none is better
-    than a wrong one.
+    Empty where a unit is not written as ``a*b^2/(c*d)`` or a power is not whole: no unit is
+    better than a wrong one.
     """
     powers: Counter[str] = Counter()
     for unit, power in factors:
         symbols = _powers(unit or "1")
         if symbols is None or power != round(power):
             return ""
-        for symbol, times in symbols.items():
-            powers[symbol] += int(power) * times
-    for unit, against, parts in _MADE_OF:
-        if powers[unit] * powers[against] < 0:
-            times = powers.pop(unit)
-            powers.update({symbol: times * part for symbol, part in parts.items()})
-    return product_text([(symbol, times) for symbol, times in powers.items() if times], "*", "/")
+        for symbol, exponent in symbols.items():
+            powers[symbol] += int(power) * exponent
+    for unit, cancelled, parts in _DERIVED:
+        if powers[unit] * powers[cancelled] < 0:
+            exponent = powers.pop(unit)
+            powers.update({symbol: exponent * part for symbol, part in parts.items()})
+    return product_text([(symbol, power) for symbol, power in powers.items() if power], "*", "/")
 
 
 def _powers(unit: str) -> Counter[str] | None:
-    """Symbols of a unit with their powers; None of a unit that is written otherwise."""
+    """Powers of a unit by symbol; None for a unit not written as ``a*b^2/(c*d)``."""
     parts = _UNIT.fullmatch(unit)
     if parts is None:
         return None

@@ -1,4 +1,4 @@
-"""Faults of lines and devices, on purpose: what ``rig emulate --fault`` can do."""
+"""Deliberate faults of the line and the device, for ``rig emulate --fault``."""
 
 import math
 import random
@@ -27,13 +27,13 @@ KINDS: dict[str, tuple[float | None, str]] = {
     "garbage": (1.0, "the device answers with random bytes"),
     "stuck-encoder": (1.0, "the counter stands still"),
 }
-EVENTS = frozenset({"stall", "disconnect", "reboot", "overflow"})  # at an instant, not from then on
+EVENTS = frozenset({"stall", "disconnect", "reboot", "overflow"})  # once; others last from then on
 _PIECE_SECONDS = 1e-4  # between the pieces of a frame that arrives split
 
 
 @dataclass(frozen=True)
 class Fault:
-    """One fault: from the start on, or from ``after`` seconds into a phase of a run."""
+    """One fault, from the emulator's start or from ``after`` seconds into a phase of a run."""
 
     name: str
     value: float
@@ -43,17 +43,17 @@ class Fault:
 
 def parse(text: str) -> Fault:
     """``NAME[=VALUE][@PHASE[+SECONDS]]``, such as ``drop=0.01`` or ``disconnect@run+0.5``."""
-    what, _, when = text.partition("@")
-    name, _, value = what.partition("=")
+    setting, _, instant = text.partition("@")
+    name, _, value = setting.partition("=")
     if name not in KINDS:
         near = suggestion(name, list(KINDS))
         raise ConfigError(f"--fault {text}: unknown fault {name!r}; {near}")
     default = KINDS[name][0]
     if not value and default is None:
         raise ConfigError(f"--fault {text}: give a value, {name}=NUMBER: {KINDS[name][1]}")
-    phase_name, _, after = when.partition("+")
+    phase_name, _, after = instant.partition("+")
     phases = {phase.value: phase for phase in Phase}
-    if when and phase_name not in phases:
+    if instant and phase_name not in phases:
         near = suggestion(phase_name, list(phases))
         raise ConfigError(f"--fault {text}: unknown phase {phase_name!r}; {near}")
     size = _number(value, text) if value else default or 0.0
@@ -61,36 +61,36 @@ def parse(text: str) -> Fault:
     return Fault(name, size, phases.get(phase_name), seconds)
 
 
-def _number(text: str, whole: str) -> float:
+def _number(text: str, option: str) -> float:
     try:
         value = float(text)
     except ValueError:
         value = math.nan
     if not (math.isfinite(value) and value >= 0.0):
-        raise ConfigError(f"--fault {whole}: {text!r} is not a number of 0 or more")
+        raise ConfigError(f"--fault {option}: {text!r} is not a number of 0 or more")
     return value
 
 
 class Line:
-    """One direction of a line: bytes put in come out later, or never, or not as they were."""
+    """One direction of a line, on which bytes may arrive late, damaged, or not at all."""
 
     def __init__(self, seed: int) -> None:
         self._random = random.Random(seed)
         self._partial = b""
         self._due: deque[tuple[float, bytes]] = deque()
-        self._last = 0.0
+        self._last_arrival = 0.0
 
     def put(self, data: bytes, now: float, faults: Mapping[str, float]) -> None:
-        """Take bytes at ``now`` [s]; ``faults`` are those that act, with their values."""
+        """Send bytes at ``now`` [s]; faults: values of those that act now, by name."""
         if not faults:
-            self._due.append((max(now, self._last), self._partial + data))
+            self._due.append((max(now, self._last_arrival), self._partial + data))
             self._partial = b""
             return
         *pieces, self._partial = (self._partial + data).split(b"\0")
         for piece in pieces:
             if piece and self._random.random() >= faults.get("drop", 0.0):
-                twice = self._random.random() < faults.get("duplicate", 0.0)
-                for _ in range(1 + twice):
+                is_doubled = self._random.random() < faults.get("duplicate", 0.0)
+                for _ in range(2 if is_doubled else 1):
                     self._schedule(self._damaged(b"\0" + piece + b"\0", faults), now, faults)
 
     def ready(self, now: float) -> bytes:
@@ -105,7 +105,7 @@ class Line:
         return self._due[0][0] if self._due else math.inf
 
     def clear(self) -> None:
-        """Lose what is on the way."""
+        """Lose all bytes on the way."""
         self._due.clear()
         self._partial = b""
 
@@ -120,13 +120,13 @@ class Line:
         return bytes(damaged)
 
     def _schedule(self, frame: bytes, now: float, faults: Mapping[str, float]) -> None:
-        at = now + faults.get("delay", 0.0) + faults.get("jitter", 0.0) * self._random.random()
+        arrival = now + faults.get("delay", 0.0) + faults.get("jitter", 0.0) * self._random.random()
         merge = faults.get("merge", 0.0)
         if merge > 0.0:
-            at = math.ceil(at / merge) * merge
+            arrival = math.ceil(arrival / merge) * merge
         # A serial line keeps the order.
-        at = max(at, self._last)
+        arrival = max(arrival, self._last_arrival)
         size = int(faults.get("split", 0.0)) or len(frame)
         for index, begin in enumerate(range(0, len(frame), size)):
-            self._last = at + index * _PIECE_SECONDS
-            self._due.append((self._last, frame[begin : begin + size]))
+            self._last_arrival = arrival + index * _PIECE_SECONDS
+            self._due.append((self._last_arrival, frame[begin : begin + size]))
