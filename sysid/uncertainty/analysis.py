@@ -17,7 +17,8 @@ from scipy.linalg import null_space
 from sysid.arrays import FloatArray, IntArray
 from sysid.fitting.objective import Objective
 from sysid.uncertainty.directions import PART, Directions, directions
-from sysid.uncertainty.estimate import Z95, Estimate, Why, product_text, product_unit, sum_text
+from sysid.uncertainty.estimate import Z95, Estimate, Why
+from sysid.uncertainty.expressions import product_text, product_unit, sum_text
 from sysid.uncertainty.relations import (
     Kind,
     main_parameters,
