@@ -2,6 +2,7 @@
 
 import os
 import signal
+import tempfile
 
 from hypothesis import settings
 
@@ -15,7 +16,9 @@ def pytest_configure(config):
         # Compiled kernels are kept for the next session, as pytest's own cache is, and shared by
         # all processes: those of pytest-xdist and programs that tests start find the folder by
         # the environment. Their names are fingerprints of all that they are made of.
-        os.environ["RIG_CACHE_DIR"] = str(config.cache.mkdir("kernels"))
+        cache = getattr(config, "cache", None)  # None with -p no:cacheprovider
+        folder = cache.mkdir("kernels") if cache else tempfile.mkdtemp(prefix="kernels-")
+        os.environ["RIG_CACHE_DIR"] = str(folder)
 
 
 def _hear_signals():

@@ -135,10 +135,25 @@ def _key(text: str, called: Mapping[str, Any]) -> str:
 def _njit(function: Any, *, nogil: bool = False, cache: bool = False) -> Any:
     import numba
 
-    # RuntimeError: neither beside the text nor elsewhere can the compiler write.
-    with contextlib.suppress(RuntimeError):
-        return numba.njit(nogil=nogil, cache=cache, **_OPTIONS)(function)
-    return numba.njit(nogil=nogil, **_OPTIONS)(function)
+    dispatcher = numba.njit(nogil=nogil, **_OPTIONS)(function)
+    if cache:
+        # RuntimeError: neither beside the text nor elsewhere can the compiler write.
+        with contextlib.suppress(RuntimeError):
+            dispatcher._cache = _cache_of(function)
+    return dispatcher
+
+
+def _cache_of(function: Any) -> Any:
+    from numba.core.caching import FunctionCache
+
+    class Cache(FunctionCache):
+        """Machine code on disk; where the disk is full, it is compiled again the next time."""
+
+        def save_overload(self, sig: Any, data: Any) -> None:
+            with contextlib.suppress(OSError):
+                super().save_overload(sig, data)  # type: ignore[no-untyped-call]
+
+    return Cache(function)  # type: ignore[no-untyped-call]
 
 
 def machine_code(function: Any) -> Any:

@@ -63,13 +63,14 @@ def _words(args, report):
     return [*words, "--no-report"] if identifies and not report else words
 
 
-def rig(*args, cwd, env=None, timeout=120, report=False):
+def rig(*args, cwd, env=None, timeout=120, report=False, **options):
     """Run ``rig`` to its end; a CompletedProcess with text output.
 
-    env: further variables, which cost the seconds of a new interpreter.
+    env: further variables; options: of ``subprocess.run``. Both cost the seconds of a new
+    interpreter.
     """
     words = _words(args, report)
-    if env is None and hasattr(os, "fork"):
+    if env is None and not options and hasattr(os, "fork"):
         return _shared_server().run(words, cwd, timeout)
     return subprocess.run(
         [*RIG, *words],
@@ -79,6 +80,7 @@ def rig(*args, cwd, env=None, timeout=120, report=False):
         text=True,
         timeout=timeout,
         check=False,
+        **options,
     )
 
 

@@ -166,3 +166,15 @@ def test_a_cache_folder_that_takes_no_machine_code_is_done_without(workshop):
     home = str(blocked / "home")
     found = workshop.run(HOME=home, XDG_CACHE_HOME=home)
     assert found == pytest.approx(settled(BEFORE), rel=1e-3)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="no limit of a file's size here")
+def test_a_full_disk_is_done_without(workshop):
+    # Files may grow to 20 kB: the kernel's text is stored, its machine code is not.
+    (workshop.folder / "sitecustomize.py").write_text(
+        "import resource, signal\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))\n"
+    )
+    assert workshop.run() == pytest.approx(settled(BEFORE), rel=1e-3)
+    assert not any(path.suffix == ".nbc" for path in workshop.files())
