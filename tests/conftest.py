@@ -21,6 +21,11 @@ def pytest_configure(config):
         os.environ["RIG_CACHE_DIR"] = str(folder)
 
 
+def pytest_collection_modifyitems(items):
+    # The longest begins first, so that no process waits for it alone at the end.
+    items.sort(key=lambda item: "test_tutorial" not in item.nodeid)
+
+
 def _hear_signals():
     """Programs that tests start are to meet signals as in a terminal.
 
