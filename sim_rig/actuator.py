@@ -265,13 +265,10 @@ def _output(names: tuple[str, ...], shaft: _Shaft) -> Callable[..., tuple[Any, .
 
 
 def _description(design: Design) -> str:
-    motor, brake = design.driver_motor, design.driver_brake
-    drivers = f"{motor}-loop drivers"
-    if motor != brake:
-        drivers = f"{motor}-loop motor and {brake}-loop brake driver"
+    drivers = f"{design.driver_motor}-loop drivers"
+    if design.driver_motor != design.driver_brake:
+        drivers = f"{design.driver_motor}-loop motor and {design.driver_brake}-loop brake driver"
     kind = {"bouc-wen": "Bouc-Wen", "dahl": "Dahl", "lugre": "LuGre"}[design.hysteresis]
-    brushes = {"none": "", "stribeck": ", brush friction", "cyclic": ", cyclic brush friction"}
-    return (
-        f"{drivers}, DC motor, magnetorheological brake with {'smooth ' * design.smooth}{kind} "
-        f"hysteresis{brushes[design.friction]}, {design.load} load"
-    )
+    brake = f"magnetorheological brake with {'smooth ' if design.smooth else ''}{kind} hysteresis"
+    friction = FRICTIONS[design.friction].name
+    return ", ".join(filter(None, [drivers, "DC motor", brake, friction, f"{design.load} load"]))

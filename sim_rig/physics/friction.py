@@ -21,10 +21,11 @@ from sysid import Parameter
 class FrictionModel:
     """Parameters and equation of a friction model.
 
-    torque: (theta, omega, p) -> torque that resists the motion [N*m]. equation: the same as text,
-    empty where there is no friction.
+    name: as it stands in a list of parts, empty where there is no friction. torque:
+    (theta, omega, p) -> torque that resists the motion [N*m]. equation: the same as text.
     """
 
+    name: str
     parameters: tuple[Parameter, ...]
     torque: Callable[[Any, Any, Any], Any]
     constraints: tuple[PartConstraint, ...] = ()
@@ -80,9 +81,12 @@ _LEVEL = "F_c + (F_s - F_c)*exp(-(omega/omega_s)^2)"
 _TEXT = "tau_f = ({})*tanh(omega/omega_r) + B_f*omega"
 
 FRICTIONS: dict[Friction, FrictionModel] = {
-    "none": FrictionModel((), lambda theta, omega, p: 0.0),
-    "stribeck": FrictionModel(_STRIBECK, stribeck_torque, (_RISING,), _TEXT.format(_LEVEL)),
+    "none": FrictionModel("", (), lambda theta, omega, p: 0.0),
+    "stribeck": FrictionModel(
+        "brush friction", _STRIBECK, stribeck_torque, (_RISING,), _TEXT.format(_LEVEL)
+    ),
     "cyclic": FrictionModel(
+        "cyclic brush friction",
         _STRIBECK + _CYCLIC,
         cyclic_torque,
         (_RISING, _PRESSED),
