@@ -9,6 +9,7 @@ made here: the kernels are compiled for such, and would be compiled again for ot
 import pickle
 import sys
 import sysconfig
+import threading
 import types
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -19,6 +20,7 @@ from sysid.problem.model import ModelError
 
 # Folders that installers make: of Python, and of Debian's packages.
 _INSTALLED = {"site-packages", "dist-packages"}
+_REGISTRY = threading.Lock()  # what travels as code is noted once for all threads of a worker
 
 
 def pack(what: str, value: Any) -> bytes:
@@ -28,9 +30,9 @@ def pack(what: str, value: Any) -> bytes:
     """
     import cloudpickle
 
-    registered = cloudpickle.list_registry_pickle_by_value()
     try:
-        with ExitStack() as stack:
+        with _REGISTRY, ExitStack() as stack:
+            registered = cloudpickle.list_registry_pickle_by_value()
             for module in _not_installed():
                 if module.__name__ in sys.modules and module.__name__ not in registered:
                     cloudpickle.register_pickle_by_value(module)
