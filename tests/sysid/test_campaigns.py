@@ -7,6 +7,7 @@ import shutil
 import sys
 import threading
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import joblib
@@ -15,7 +16,6 @@ import pytest
 from joblib.externals.loky import get_reusable_executor
 
 from sysid import GASSI, Constraint, Dataset, ModelError, Run, campaign, combinations, fit_percent
-from sysid.campaigns import parcels
 from sysid.campaigns.parcels import pack, unpack
 from tests.sysid.support import lag
 
@@ -269,8 +269,8 @@ def test_every_run_of_a_lost_worker_is_accounted_for():
 
 def test_the_threads_of_a_worker_pack_at_the_same_time():
     def pack_often(_):
-        return [parcels.pack("model", lag()) for _ in range(30)]
+        return [pack("model", lag()) for _ in range(30)]
 
     with ThreadPoolExecutor(4) as pool:
-        parcels_of_all = list(pool.map(pack_often, range(4)))
-    assert all(parcels.unpack(each[0]).name == lag().name for each in parcels_of_all)
+        packed = list(pool.map(pack_often, range(4)))
+    assert all(unpack(each[0]).name == lag().name for each in packed)
