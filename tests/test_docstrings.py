@@ -13,6 +13,13 @@ import protocols
 import sim_rig
 import sysid
 
+# Examples that identify several times, or with intervals.
+IDENTIFYING = {
+    "daq.identification.campaign.campaign",
+    "daq.identification.comparison.ComparisonResult",
+    "daq.identification.result.Identification",
+}
+
 
 def modules_of(package):
     yield package.__name__
@@ -28,7 +35,8 @@ def examples():
         for name in modules_of(package):
             for test in finder.find(importlib.import_module(name)):
                 if test.examples:
-                    yield pytest.param(test, id=test.name)
+                    marks = [pytest.mark.soak] if test.name in IDENTIFYING else []
+                    yield pytest.param(test, id=test.name, marks=marks)
 
 
 @pytest.mark.parametrize("example", list(examples()))

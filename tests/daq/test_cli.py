@@ -74,6 +74,7 @@ def test_the_installed_command_is_the_module(tmp_path):
 # --- JSON ---------------------------------------------------------------------------------
 
 
+@pytest.mark.soak
 def test_json_of_a_run_with_identification_is_one_document(tmp_path):
     write_experiment(tmp_path / "e.yaml", duration=0.2, validation={"motor": {"seed": 77}})
     (tmp_path / "id.yaml").write_text("population: 20\ngenerations: 2\n")
@@ -88,6 +89,7 @@ def test_json_of_a_run_with_identification_is_one_document(tmp_path):
     assert (tmp_path / found["files"]["parameters"]).exists()
 
 
+@pytest.mark.soak
 def test_json_of_identify_check_models_and_replay(captured, tmp_path):
     root, folder = captured
     out = tmp_path / "out"
@@ -279,6 +281,7 @@ def test_a_model_and_a_csv_of_ones_own_work_like_the_built_in(tmp_path):
     assert json.loads(replayed.stdout)["outputs"]["y"]["fit_percent"] > 99.0
 
 
+@pytest.mark.soak
 def test_uneven_times_and_cells_without_a_number_are_taken_as_they_are(tmp_path):
     foreign_log(tmp_path / "even.csv")
     head, *rows = (tmp_path / "even.csv").read_text().splitlines()
@@ -304,6 +307,7 @@ def test_uneven_times_and_cells_without_a_number_are_taken_as_they_are(tmp_path)
     assert found["parameters"]["tau"]["value"] == pytest.approx(0.2, rel=1e-3)
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize(
     "chosen",
     [
@@ -328,6 +332,7 @@ def test_theta_in_place_of_omega(captured, tmp_path, chosen):
     assert list(metrics) == ["current_motor", "theta"]
 
 
+@pytest.mark.soak
 def test_an_output_that_does_not_count_needs_no_column(tmp_path):
     foreign_log(tmp_path / "bench.csv")
     two = OWN_MODEL.replace('Output("y", "m"),)', 'Output("y", "m"), Output("half", "m"))')
@@ -349,6 +354,7 @@ def test_an_output_that_does_not_count_needs_no_column(tmp_path):
     assert replayed.returncode == 0, replayed.stderr
 
 
+@pytest.mark.soak
 def test_the_end_of_each_log_is_held_back(captured, tmp_path):
     root, folder = captured
     whole = np.genfromtxt(folder / "log.csv", delimiter=",", names=True)
@@ -370,6 +376,7 @@ def test_the_end_of_each_log_is_held_back(captured, tmp_path):
     assert values[0] == values[1]
 
 
+@pytest.mark.soak
 def test_ranges_from_a_data_sheet_and_from_the_log(captured, tmp_path):
     root, folder = captured
     (tmp_path / "motor.yaml").write_text(
@@ -400,6 +407,7 @@ def test_ranges_from_a_data_sheet_and_from_the_log(captured, tmp_path):
     assert found["J_m"]["source"] == "model"
 
 
+@pytest.mark.soak
 def test_the_report_says_where_every_range_came_from(tmp_path):
     foreign_log(tmp_path / "bench.csv")
     two = OWN_MODEL.replace("1.0, \"log\"),)", "1.0, \"log\"), "
@@ -491,6 +499,7 @@ def test_ctrl_c_before_there_is_any_result_says_so_in_one_line(tmp_path):
     assert errors.splitlines()[-1] == "rig: stopped by Ctrl-C"
 
 
+@pytest.mark.soak
 def test_results_of_a_folder_of_logs_do_not_go_into_that_folder(tmp_path, captured):
     folder = tmp_path / "logs"
     folder.mkdir()

@@ -131,6 +131,7 @@ def test_tables_for_people_and_a_page_that_says_how_to_do_it_again(folder):
     assert "ARX:na=" in text and "comparison.yaml" in text
 
 
+@pytest.mark.soak
 def test_without_validation_bic_ranks_and_that_is_said(folder):
     report = document(folder, "--model", DOUBLE, "--model", LAG)
     assert not report["validated"] and short(report["preferred"]) == LAG

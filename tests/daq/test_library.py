@@ -45,6 +45,7 @@ def test_a_recorded_run_is_the_one_the_command_records(recorded):
     assert not validation.frame["cmd_voltage_motor"].equals(training.frame["cmd_voltage_motor"])
 
 
+@pytest.mark.soak
 def test_an_identification_is_the_one_the_command_makes(recorded, found):
     root, training, validation = recorded
     options = [f"--{name}={value}" for name, value in QUICK.items()]

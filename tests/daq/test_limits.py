@@ -214,7 +214,7 @@ QUIET = [
 ]
 
 
-@pytest.mark.parametrize(("options", "load", "driver"), mostly_soak(QUIET, 4), ids=str)
+@pytest.mark.parametrize(("options", "load", "driver"), mostly_soak(QUIET), ids=str)
 def test_nothing_trips_on_a_simulated_rig_that_rests_works_and_rests(options, load, driver):
     plant = {"load": load, "driver_motor": driver, "driver_brake": driver}
     config = RigConfig(limits=EVERYTHING | {"current": {"motor": 10.0, "brake": 10.0}})

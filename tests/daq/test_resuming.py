@@ -84,6 +84,7 @@ def test_nothing_is_left_of_an_identification_that_ended(captured, tmp_path):
     assert result.returncode == 2 and "no identification was interrupted there" in result.stderr
 
 
+@pytest.mark.soak
 def test_what_has_changed_meanwhile_is_named(captured, tmp_path):
     root, folder = captured
     log = tmp_path / "log.csv"

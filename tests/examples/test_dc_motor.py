@@ -40,6 +40,7 @@ def test_its_equations_balance_at_steady_state(dc_motor):
     np.testing.assert_allclose(np.array(rates) * [6e-4, 8e-7], 0.0, atol=1e-14)
 
 
+@pytest.mark.soak
 def test_simulate_identify_predict(dc_motor):
     t = np.arange(200) * 0.01
     inputs = np.column_stack(

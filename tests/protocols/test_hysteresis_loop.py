@@ -85,6 +85,7 @@ def test_intercept_and_slope_are_where_the_loop_has_them():
     assert found.reversal == pytest.approx(slope, rel=5e-3)
 
 
+@pytest.mark.soak
 def test_errors_are_those_of_the_noise():
     """Estimates of many noisy sets scatter as each of them says."""
     sets = [

@@ -12,7 +12,6 @@ from sim_rig.actuator import actuator
 from sysid import BatchSimulator, Dataset, ModelError, SearchSpace
 from tests.sim_rig import equations
 from tests.sim_rig.support import ALL, HYSTERESES, LOADS, PLANTS, Parts, combinations, random_point
-from tests.soak import mostly_soak
 from tests.sysid.reference import simulate as reference
 from tests.sysid.support import outputs_of
 
@@ -154,7 +153,8 @@ def feasible_rows(model, count, seed):
     return space.full(drawn[space.violations(drawn).sum(axis=1) == 0.0][:count])
 
 
-@pytest.mark.parametrize("parts", mostly_soak(COMPILED), ids=str)
+@pytest.mark.soak
+@pytest.mark.parametrize("parts", COMPILED, ids=str)
 def test_machine_code_simulates_what_scipy_does(parts):
     model = parts.build(parameters="rig")
     record = excitation(model)

@@ -300,6 +300,7 @@ def test_every_plant_runs_and_shows_what_scipy_computes(name):
     assert moves == (name != "locked")
 
 
+@pytest.mark.soak
 def test_a_hand_that_is_the_load_stays_where_it_has_wound_to():
     found = device(ideal=True, plant=Plant(**PLANTS["hand"]))
     found.announce(Phase.HOMING, 1.0)

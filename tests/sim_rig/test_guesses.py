@@ -97,6 +97,7 @@ def test_a_resistance_from_a_data_sheet_tells_gain_and_motor_constant():
     assert "R_m 1.18" in tight["K_dm"].source and "K_v2i 0.5" in tight["K_dm"].source
 
 
+@pytest.mark.soak
 def test_a_fast_log_tells_the_cutoff_and_the_inductance_of_an_open_driver():
     model = actuator(driver_motor="open", parameters="rig")
     found = guess_ranges(model, [record(model, model.nominal, 0, rate=8000, n=8000)])

@@ -100,6 +100,7 @@ def test_a_system_without_noise_is_found_exactly():
     assert_allclose(found.score(record(seed=1)), 1.0)
 
 
+@pytest.mark.soak
 def test_intervals_cover_what_they_claim():
     truth = np.array([-0.7, 1.0, 0.3, 0.5])
     hits = []

@@ -139,6 +139,7 @@ def test_least_squares_as_in_the_textbook():
     assert_array_equal(found.A_std_[0], 0.0)
 
 
+@pytest.mark.soak
 def test_intervals_cover_what_they_claim():
     # Errors of the two outputs are correlated, so that estimates of both are, too.
     truth = ARX(2, 2).fit(record()).theta_

@@ -89,6 +89,7 @@ def same(a, b):
             assert np.array_equal(p.rmse, q.rmse)
 
 
+@pytest.mark.soak
 def test_every_combination_is_fitted_as_by_itself(serial):
     todo, found = serial
     assert len(found.outcomes) == len(todo) == 8 and not found.interrupted and not found.failed
@@ -103,6 +104,7 @@ def test_every_combination_is_fitted_as_by_itself(serial):
         assert np.array_equal(outcome.estimator.predict(validation), alone.predict(validation))
 
 
+@pytest.mark.soak
 def test_processes_give_the_serial_result_to_the_bit(serial):
     todo, found = serial
     same(found, campaign(todo, n_jobs=2))
@@ -255,6 +257,7 @@ def test_what_cannot_travel_or_be_done_is_said():
         campaign([])
 
 
+@pytest.mark.soak
 def test_every_run_of_a_lost_worker_is_accounted_for():
     def deadly(p):
         if isinstance(p[0], np.ndarray):  # in the search, not when the model is made
@@ -269,7 +272,7 @@ def test_every_run_of_a_lost_worker_is_accounted_for():
 
 def test_the_threads_of_a_worker_pack_at_the_same_time():
     def pack_often(_):
-        return [pack("model", lag()) for _ in range(30)]
+        return [pack("model", lag()) for _ in range(8)]
 
     with ThreadPoolExecutor(4) as pool:
         packed = list(pool.map(pack_often, range(4)))

@@ -299,6 +299,7 @@ def static_derivative(x, u, p):
     return ((p[0] * u[0] - x[0]) / 1e-3,)
 
 
+@pytest.mark.soak
 def test_only_what_the_data_determine_counts():
     twofold = lag(
         name="twofold",

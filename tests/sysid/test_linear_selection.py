@@ -24,6 +24,7 @@ def orders(selection):
 # --- what is chosen -------------------------------------------------------------------------
 
 
+@pytest.mark.soak
 def test_bic_finds_the_orders_of_the_system():
     found = select_orders(
         ARMAX(), TRAINING, criterion="bic", na=range(1, 4), nb=range(1, 4), nc=range(4), nk=(1, 2)
@@ -87,6 +88,7 @@ def test_all_are_judged_on_the_same_rows():
     assert small.bic != pytest.approx(alone.best.bic)
 
 
+@pytest.mark.soak
 def test_units_do_not_change_the_choice():
     units = np.array([1e-6, 1e4])
     scaled = [Dataset(r.inputs, r.outputs * units, r.dt) for r in (*TRAINING, VALIDATION)]

@@ -229,6 +229,7 @@ def test_a_collapsed_population_starts_anew_over_the_whole_box_and_keeps_the_eli
     assert np.all(spreads[again] > 0.8)
 
 
+@pytest.mark.soak
 def test_starting_anew_finds_more_than_one_basin():
     def best(preset):
         runs = [

@@ -272,6 +272,7 @@ def swinging():
     return model, *records
 
 
+@pytest.mark.soak
 def test_errors_of_single_steps_do_not_add_up_beyond_the_accuracy(swinging):
     model, exact, _ = swinging
     outputs = free_run(BatchSimulator(model), SWING, exact)

@@ -386,6 +386,7 @@ def test_noise_of_an_input_that_the_residuals_show_is_not_counted_twice():
         assert other[name].std == pytest.approx(one[name].std, rel=1e-6)
 
 
+@pytest.mark.soak
 def test_intervals_cover_with_noise_on_an_input():
     inside = []
     for seed in range(150):
