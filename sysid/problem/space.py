@@ -250,15 +250,17 @@ class SearchSpace:
         for tie in self.ties:
             parameter, values = self.model.parameters[tie.index], vectors[:, tie.index]
             rows.append(np.maximum(parameter.minimum - values, values - parameter.maximum)[:, None])
-        rows.append(self.constraint_values(chromosomes))
+        rows.append(self._constraints_at(vectors))
         violations = np.maximum(0.0, np.concatenate(rows, axis=1))
         # Not-a-number is no proof of feasibility.
         return np.where(np.isnan(violations), np.inf, violations)
 
     def constraint_values(self, chromosomes: FloatArray) -> FloatArray:
         """The model's constraints g, satisfied where not above 0, (n_chromosomes, n)."""
-        columns = tuple(self.full(chromosomes).T)
-        values = np.zeros((len(chromosomes), len(self.model.constraints)))
+        return self._constraints_at(self.full(chromosomes))
+
+    def _constraints_at(self, vectors: FloatArray) -> FloatArray:
+        columns, values = tuple(vectors.T), np.zeros((len(vectors), len(self.model.constraints)))
         for i, constraint in enumerate(self.model.constraints):
             values[:, i] = constraint.function(columns)
         return values
