@@ -89,10 +89,7 @@ def _show(title: str, errors: dict[str, dict[str, float]], drawn: Path | None) -
     from daq.identification.rows import OutputErrors
 
     print(title)
-    shown = {
-        name: OutputErrors(each["rmse"], each["msd"], each["fit_percent"])
-        for name, each in errors.items()
-    }
+    shown = {name: OutputErrors.of(each) for name, each in errors.items()}
     print_errors(shown, label="replay")
     if drawn is not None:
         print(f"Figure: {drawn}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -134,6 +134,13 @@ def read_record(csv: Path) -> dict[str, Any] | None:
     if not isinstance(record, dict):
         raise ConfigError("not a run record", cure=cure, file=path)
     return record
+
+
+def settings_of(record: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Experiment and rig of a run.json; empty where a record of another program lacks them."""
+    sections = [record.get(key) for key in ("experiment", "rig")]
+    experiment, rig = (section if isinstance(section, dict) else {} for section in sections)
+    return experiment, rig
 
 
 def end_of_run(csv: Path, record: dict[str, Any] | None, torn: bool) -> str | None:

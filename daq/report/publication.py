@@ -15,7 +15,7 @@ from daq.identification.baseline import Baseline, baseline_of
 from daq.identification.records import LoggedRecord, Split
 from daq.identification.request import SettingsRequest
 from daq.identification.result import Identification, errors_document
-from daq.logs.recording import read_record
+from daq.logs.recording import read_record, settings_of
 from daq.lookup.models import DEFAULT_MODEL
 from daq.progress import Progress, Watch, ignore
 from daq.report.latex import latex
@@ -164,8 +164,7 @@ def _option(name: str, value: Any) -> list[str]:
 
 def _run(record: Mapping[str, Any]) -> dict[str, Any]:
     """What is known of a capture's run; a record of another program may lack any of it."""
-    sections = [record.get(key) for key in ("experiment", "rig")]
-    experiment, rig = (section if isinstance(section, dict) else {} for section in sections)
+    experiment, rig = settings_of(record)
     seeds = {
         name: part["seed"]
         for name, part in experiment.items()

@@ -7,7 +7,7 @@ from typing import Self
 
 from daq.errors import ConfigError
 from daq.logs.capture import LOG_NAME, RUN_NAME, RUNNING
-from daq.logs.recording import log_path, read_record
+from daq.logs.recording import log_path, read_record, settings_of
 from daq.scope.history import History
 from daq.scope.tail import LogTail
 
@@ -45,8 +45,7 @@ class RunState:
             return cls(problem=str(error))
         if record is None:
             return cls()
-        sections = [record.get(key) for key in ("experiment", "rig")]
-        experiment, rig = (section if isinstance(section, dict) else {} for section in sections)
+        experiment, rig = settings_of(record)
         rate, duration = (experiment.get(key) for key in ("sample_rate", "duration"))
         expected_rows = None
         if isinstance(rate, int | float) and isinstance(duration, int | float):
