@@ -210,10 +210,12 @@ class Scaling:
 
     def coded(self, guard: Guard) -> CodedGuard:
         """A run's guard in codes; commands within its clamps stay within them from now on."""
-        low, high = self._out(guard.command_low), self._out(guard.command_high)
-        self._low, self._high = _within(low, high, np.int16)
+        # An inverting stage has a negative scale, and its lowest volts the highest code.
+        commands = np.sort([self._out(guard.command_low), self._out(guard.command_high)], axis=0)
+        self._low, self._high = _within(*commands, np.int16)
         self._guard = guard
-        analog = _within(self._in(guard.analog_low), self._in(guard.analog_high), np.int32)
+        inputs = np.sort([self._in(guard.analog_low), self._in(guard.analog_high)], axis=0)
+        analog = _within(*inputs, np.int32)
         counts = _within(guard.counts_low, guard.counts_high, np.int32)
         rate = guard.count_rate if guard.count_rate < _LARGEST_RATE else math.inf
         _, step = _within(0.0, guard.count_step, np.uint32)
@@ -225,8 +227,8 @@ class Scaling:
         A command within the clamps is not rounded to beyond them, where the device would flag it.
         """
         codes = np.rint(self._out(volts))
-        codes = np.where(volts <= self._guard.command_high, np.minimum(codes, self._high), codes)
-        codes = np.where(volts >= self._guard.command_low, np.maximum(codes, self._low), codes)
+        within = (self._guard.command_low <= volts) & (volts <= self._guard.command_high)
+        codes = np.where(within, np.clip(codes, self._low, self._high), codes)
         info = np.iinfo(np.int16)
         return np.clip(codes, info.min, info.max).astype(messages.COMMAND_DTYPE)
 

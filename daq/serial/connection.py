@@ -171,13 +171,9 @@ class Connection:
         welcome = machine.welcome
         if welcome is None:
             raise DeviceError(_no_answer(machine.decoder), file=self._port)
-        names = tuple(channel.name for channel in welcome.channels)
-        if names != messages.CHANNEL_NAMES:
-            raise DeviceError(
-                f"{welcome.device} has the channels {', '.join(names) or 'none'}, "
-                f"not {', '.join(messages.CHANNEL_NAMES)}; its firmware is for another rig",
-                file=self._port,
-            )
+        if complaint := welcome.complaint():
+            problem = f"{welcome.device} says of itself what cannot be: {complaint}"
+            raise DeviceError(problem, cure="mend its firmware", file=self._port)
         return welcome
 
     def _ping(self, deadline: float) -> None:
@@ -203,6 +199,10 @@ class Connection:
             work()
         except DeviceError as error:
             failure = error
+        except Exception as error:  # a thread that ends in silence would leave the run waiting
+            doing = threading.current_thread().name
+            problem = f"{doing}: {type(error).__name__}: {error}"
+            failure = DeviceError(problem, cure="report this to who maintains hybrid-rig")
         with self._changed:
             self._machine.failure = self._machine.failure or failure
             self._changed.notify_all()

@@ -23,6 +23,7 @@ HELLO_RETRY = 0.2
 GIVE_UP = 1.0  # s until a request that nobody answers fails
 SILENCE = 1.0  # s without a sample until a run fails
 _CHUNK = 256  # ticks in a frame of commands at most
+_TICKS_TO_SPARE = 4096  # by which a device's count may be ahead of the host's clock
 
 _REASONS = {
     Result.WRONG_STATE: "is in a state in which it cannot",
@@ -86,7 +87,7 @@ class HostMachine:
         self._run = 0
         self._start: Start  # of the run, unless IDLE
         self._expected = 0  # tick of the next sample
-        self._sample_at = self._frame_at = self._pinged = 0.0
+        self._gone = self._sample_at = self._frame_at = self._pinged = 0.0
         self._rejected = 0  # damaged frames, by the time of the last good frame
         self._receivers: dict[int, tuple[Callable[[bytes], Any], Callable[..., None]]] = {
             Type.SAMPLES: (Block.unpack, self._add_samples),
@@ -155,7 +156,7 @@ class HostMachine:
     def go(self, now: float) -> None:
         """Start the clock."""
         self._state = State.RUNNING
-        self._sample_at = self._pinged = now
+        self._gone = self._sample_at = self._pinged = now
         self.ask(Type.GO, messages.RUN.pack(self._run), now)
 
     def stop(self, now: float) -> None:
@@ -200,12 +201,25 @@ class HostMachine:
         if block.first < self._expected:
             self.counters.duplicate_blocks += 1
             return
+        if block.first > self._most_ticks(now):
+            self._fail(
+                f"the device numbers a sample {block.first}, {now - self._gone:.3g} s after the "
+                "run began: it has lost count. Mend its firmware, or look for a supply that "
+                "breaks down"
+            )
+            return
         self._count(seq)
         self.counters.lost_samples += block.first - self._expected
         self._expected = block.first + len(block.records)
         self.blocks.append(block)
         self._sample_at = now
         self._learn(block.status, now)
+
+    def _most_ticks(self, now: float) -> float:
+        """Samples that a device whose clock is twice too fast can have taken."""
+        assert self.welcome is not None
+        rate = self.welcome.clock / self._start.period
+        return _TICKS_TO_SPARE + 2.0 * rate * (now - self._gone)
 
     def _add_round_trip(self, pong: Pong, seq: int, now: float) -> None:
         if self.welcome is None:

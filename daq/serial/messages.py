@@ -6,6 +6,7 @@ with a number that means nothing; a receiver counts it like a frame with a wrong
 """
 
 import enum
+import math
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -37,6 +38,17 @@ Records = npt.NDArray[np.void]
 Codes = npt.NDArray[np.int16]
 
 CHANNEL_NAMES = (*ANALOG_INPUTS, *CHANNELS, "encoder")  # in the order of the channel table
+
+# What the numbers of a WELCOME can be; the queue is more than a frame of commands, and less than
+# a host is asked for memory.
+LEGAL = {
+    "clock": (1_000, 2**32 - 1),
+    "max_rate": (1.0, 1e6),
+    "queue": (16, 1 << 20),
+    "max_payload": (64, 4096),
+    "watchdog_default": (1, 60_000),
+    "watchdog_longest": (10, 60_000),
+}
 
 
 class Type(enum.IntEnum):
@@ -140,6 +152,18 @@ class Channel:
     low: float
     high: float
 
+    def complaint(self) -> str | None:
+        """What no converter or counter can mean by a value, with what is legal."""
+        numbers = (self.scale, self.offset, self.low, self.high)
+        if not all(map(math.isfinite, numbers)) or self.scale == 0.0:
+            fields = "scale {:g}, offset {:g}, range {:g} to {:g}".format(*numbers)
+            return f"channel {self.name}: {fields}; legal are finite numbers and a scale beside 0"
+        if not self.low < self.high:
+            return f"channel {self.name}: its range is {self.low:g} to {self.high:g}"
+        if self.name in CHANNELS and (self.offset != 0.0 or not self.low <= 0.0 <= self.high):
+            return f"channel {self.name}: its code 0 is not 0 V, which is what safe means"
+        return None
+
     def pack(self) -> bytes:
         """The row's 56 bytes."""
         name, unit = self.name.encode()[:15], self.unit.encode()[:7]
@@ -188,6 +212,22 @@ class Welcome:
             raise ValueError("another number of channels")
         channels = tuple(Channel(_text(name), _text(unit), *row) for name, unit, *row in rows)
         return cls(device, firmware, serial, *facts, channels, Latch(latch), version)
+
+    def complaint(self) -> str | None:
+        """What no device can mean by a field, with its name, value and legal values."""
+        names = tuple(channel.name for channel in self.channels)
+        if names != CHANNEL_NAMES:
+            had = ", ".join(names) or "none"
+            return f"it has the channels {had}, not {', '.join(CHANNEL_NAMES)}"
+        for name, (least, most) in LEGAL.items():
+            value = getattr(self, name)
+            if not least <= value <= most:  # NaN is not within
+                return f"its {name} is {value:g}; legal are {least:g} to {most:g}"
+        if self.watchdog_default > self.watchdog_longest:
+            shorter = f"watchdog_longest of {self.watchdog_longest} ms"
+            return f"its watchdog_default of {self.watchdog_default} ms is beyond its {shorter}"
+        complaints = (channel.complaint() for channel in self.channels)
+        return next(filter(None, complaints), None)
 
 
 class Status(NamedTuple):
