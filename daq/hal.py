@@ -32,6 +32,7 @@ class Flag(enum.IntFlag):
     INTERLOCK = 8  #: A limit was passed in this sample; from it on the outputs are zero.
     UNDERFLOW = 16  #: The preloaded waveform ran dry; the outputs are zero.
     SATURATED = 32  #: An analog input stood at the end of its converter's range.
+    DOUBTFUL = 64  #: What was measured disagrees in a way that does not end a run; see run.json.
 
 
 class Mode(enum.Enum):

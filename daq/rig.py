@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from daq.config.rig import RigConfig
+from daq.config.rig import COUNT_GRAIN, RigConfig
 from daq.errors import DeviceError
 from daq.hal import (
     ANALOG_INPUTS,
@@ -96,8 +96,7 @@ class Rig:
             )
         # Twice what the device can hold ahead: as much may be on its way back.
         self._reset(sample_rate, 2 * self.info.queue)
-        encoder = self.config.sensors.encoder
-        self._radians = encoder.sign * 2.0 * np.pi / (4.0 * encoder.cycles)
+        self._radians = self.config.sensors.encoder.count
         self._device.start(sample_rate, mode, self._guard(window))
 
     def send(self, tick: int, commands: FloatArray) -> None:
@@ -184,6 +183,7 @@ class Rig:
         volts = bounds / np.abs(self._scale)
         counts_low, counts_high = sorted(angle / self._radians for angle in window)
         speed = math.inf if limits.speed is None else limits.speed
+        per_tick = np.array([limits.encoder.fastest, speed]) / self._rate / abs(self._radians)
         return Guard(
             self._low,
             self._high,
@@ -192,7 +192,8 @@ class Rig:
             counts_low,
             counts_high,
             speed / abs(self._radians),
-            limits.encoder.fastest / self._rate / abs(self._radians),
+            # A count that is about to come may come early or late.
+            min(per_tick[0], per_tick[1] + COUNT_GRAIN),
         )
 
     def _places(self, tick: int, n: int) -> slice | IntArray:

@@ -1,5 +1,6 @@
 """The rig's configuration: which backend, which calibration, which limits."""
 
+import math
 from collections.abc import Callable
 from typing import Annotated, Any, Literal
 
@@ -14,6 +15,8 @@ Realtime = Literal["off", "prefer", "require"]
 VoltsPerSecond = Annotated[float, Unit("V/s")]
 AmperesPerVolt = Annotated[float, Unit("A/V")]
 SquaredCurrentTime = Annotated[float, Unit("A^2*s")]
+
+COUNT_GRAIN = 2.0  # counts by which a change of the encoder's may be larger than the shaft's
 
 
 class AnalogInput(Section):
@@ -39,6 +42,11 @@ class Encoder(Section):
 
     cycles: int = Field(2048, ge=1, le=1_000_000, description="cycles per revolution")
     sign: Sign = Field(1, description="-1 turns the direction round")
+
+    @property
+    def count(self) -> float:
+        """Angle of a count [rad], with the sign."""
+        return self.sign * 2.0 * math.pi / (4.0 * self.cycles)
 
 
 class Sensors(Section):
@@ -112,11 +120,17 @@ class OverloadLimits(Section):
 
 
 class Stall(Section):
-    """A motor that must turn the shaft: current above, brake below, for so long, and no count."""
+    """What must turn the shaft: a motor current, more of it against the brake, and for how long."""
 
-    motor: Amperes = Field(gt=0.0, description="motor current that must move the shaft")
-    brake: Amperes = Field(0.03, gt=0.0, description="brake current below which it must")
-    time: Seconds = Field(0.5, gt=0.0, description="for which the encoder may stand still")
+    motor: Amperes = Field(
+        gt=0.0, description="motor current that turns the shaft and its load, brake off"
+    )
+    brake: Amperes = Field(
+        0.03, gt=0.0, description="brake current that takes as much motor current again"
+    )
+    time: Seconds = Field(
+        0.05, gt=0.0, description="for which the shaft may stand still; at twice the current half"
+    )
 
 
 class EncoderLimits(Section):
@@ -126,9 +140,9 @@ class EncoderLimits(Section):
         1000.0, gt=0.0, description="change of the angle from sample to sample that is a jump"
     )
     silent: Turns = Field(
-        0.25, gt=0.0, description="turns by the speed estimate without one count of the encoder"
+        0.25, gt=0.0, description="turns by which count and speed estimate may come to differ"
     )
-    stall: Stall | None = Field(None, description="current that must move it; left out: none")
+    stall: Stall | None = Field(None, description="current that turns it; left out: not watched")
 
 
 class UserLimit(Section):

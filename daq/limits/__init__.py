@@ -6,18 +6,49 @@ time.
 """
 
 import contextlib
+import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 from operator import itemgetter
 
 from daq.config.rig import RigConfig, UserLimit
 from daq.errors import USER_CODE_ERRORS, ConfigError, RigError, RunError, raised_in
-from daq.hal import CHANNELS, Phase, Samples
+from daq.hal import CHANNELS, Flag, Phase, Samples
+from daq.limits.agreement import (
+    Contrary,
+    CurrentAgreement,
+    CurrentLack,
+    Disagreement,
+    Drive,
+    Stalled,
+)
 from daq.limits.base import Limit, Trip
 from daq.limits.load import DeviceFound, I2t, Magnitude
-from daq.limits.sensors import Frozen, Jump, Silence, Stalled
-from daq.limits.shaft import Travel, Winding
+from daq.limits.sensors import Frozen, Jump
+from daq.limits.shaft import CountedSpeed, Travel, Winding
 
-__all__ = ["Limit", "Limits", "Trip"]
+__all__ = ["Doubt", "Limit", "Limits", "Trip"]
+
+_SLOW = 0.1  # of the speed limit, up to which the motor's back EMF leaves its amplifier voltage
+_FASTEST = 100.0  # rad/s, taken where there is no such limit
+
+
+@dataclass
+class Doubt:
+    """What a limit that does not stop a run has said of it.
+
+    phase, tick: of the sample that it spoke of first. samples: how many since.
+    """
+
+    phase: str
+    tick: int
+    reason: str
+    samples: int = 1
+
+    @property
+    def sentence(self) -> str:
+        """For people."""
+        return f"sample {self.tick} of the {self.phase}: {self.reason}"
 
 
 class Limits:
@@ -26,9 +57,17 @@ class Limits:
     def __init__(self, config: RigConfig) -> None:
         users = [_UserCode(settings) for settings in config.limits.own]
         self._limits: list[Limit] = [*_built_in(config), *users]
+        self._phase = Phase.OPEN
+        self._doubts: dict[Limit, Doubt] = {}
+
+    @property
+    def doubts(self) -> list[Doubt]:
+        """What those have said that do not stop a run, once each."""
+        return list(self._doubts.values())
 
     def begin(self, phase: Phase, sample_rate: float) -> None:
         """Tell every limit that a phase begins."""
+        self._phase = phase
         for limit in self._limits:
             limit.begin(phase, sample_rate)
 
@@ -38,14 +77,35 @@ class Limits:
         return max(lows), min(highs)
 
     def check(self, samples: Samples) -> Trip | None:
-        """The first row beyond any limit, and why; the earlier limit of two in one row."""
-        trips = [limit.check(samples) for limit in self._limits]
-        return min(filter(None, trips), key=itemgetter(0), default=None)
+        """The first row beyond any limit, and why; the earlier limit of two in one row.
+
+        A row that a limit only doubts is flagged.
+        """
+        trips = []
+        for limit in self._limits:
+            trip = limit.check(samples)
+            if trip is None:
+                continue
+            if limit.stops:
+                trips.append(trip)
+            else:
+                self._note(limit, samples, *trip)
+        return min(trips, key=itemgetter(0), default=None)
+
+    def _note(self, limit: Limit, samples: Samples, row: int, reason: str) -> None:
+        samples.flags[row] |= int(Flag.DOUBTFUL)
+        if limit in self._doubts:
+            self._doubts[limit].samples += 1
+        else:
+            tick = samples.tick.item(row)
+            self._doubts[limit] = Doubt(self._phase.value, tick, reason)
 
 
 def _built_in(config: RigConfig) -> list[Limit]:
     """The limits that a rig's file asks for; a value that is not finite passes none of them."""
     settings, encoder = config.limits, config.limits.encoder
+    count = abs(config.sensors.encoder.count)  # rad
+    gains = config.amplifiers.motor, config.amplifiers.brake
     limits: list[Limit] = [
         Magnitude("current_motor", settings.current.motor, "A"),
         Magnitude("current_brake", settings.current.brake, "A"),
@@ -53,8 +113,10 @@ def _built_in(config: RigConfig) -> list[Limit]:
         Magnitude("omega", settings.speed, "rad/s"),
         Magnitude("theta", None, "rad"),
         Jump(encoder.fastest),
-        Silence(encoder.silent),
+        Disagreement(encoder.silent),
     ]
+    if settings.speed is not None:
+        limits.append(CountedSpeed(settings.speed, count))
     for channel in CHANNELS:
         overload = getattr(settings.i2t, channel)
         if overload is not None:
@@ -64,11 +126,27 @@ def _built_in(config: RigConfig) -> list[Limit]:
     if settings.winding is not None:
         limits.append(Winding(settings.winding))
     if encoder.stall is not None:
-        limits.append(Stalled(encoder.stall))
+        drive = Drive(encoder.stall, gains)
+        limits.append(Stalled(encoder.stall, drive, count))
+        if settings.speed is not None:
+            limits.append(Contrary(drive, settings.speed))
+    limits += _of_currents(config)
     if settings.frozen is not None:
         limits += [Frozen(f"current_{name}", settings.frozen, name) for name in CHANNELS]
         limits.append(Frozen("torque", settings.frozen, None))
     limits.append(DeviceFound())  # last, for the others know more of what it found
+    return limits
+
+
+def _of_currents(config: RigConfig) -> list[Limit]:
+    """Limits that currents of amplifiers with a known gain allow."""
+    limits: list[Limit] = []
+    for channel in CHANNELS:
+        gain = getattr(config.amplifiers, channel)
+        if gain is not None:
+            rating = channel, gain, getattr(config.limits.current, channel)
+            slow = math.inf if channel == "brake" else _SLOW * (config.limits.speed or _FASTEST)
+            limits += [CurrentAgreement(*rating), CurrentLack(*rating, slow)]
     return limits
 
 
@@ -84,6 +162,7 @@ class _UserCode(Limit):
             problem = f"{settings.use} cannot be made: {type(error).__name__}: {error}"
             raise ConfigError(problem, key="limits.own") from error
         self._name = f"the limit {type(self._limit).__name__}"
+        self.stops = bool(self._limit.stops)
 
     def begin(self, phase: Phase, sample_rate: float) -> None:
         with self._blamed():

@@ -23,6 +23,8 @@ class Limit(abc.ABC):
     """
 
     Options: type[Section] | None = None
+    stops: bool = True
+    """Whether the run ends. Else it goes on, the sample is flagged, and the record says why."""
 
     def begin(self, phase: Phase, sample_rate: float) -> None:  # noqa: B027
         """A phase begins: ticks and time count from zero again. sample_rate in Hz."""

@@ -1,13 +1,12 @@
-"""Limits of what sensors that work can show: jumps, silence, readings frozen to the bit."""
+"""Limits of what sensors that work can show: jumps, readings frozen to the bit."""
 
 import abc
 import math
 
 import numpy as np
 
-from daq.config.rig import Stall
 from daq.hal import FloatArray, Phase, Samples
-from daq.limits.base import TURN, Limit, Trip, first_row
+from daq.limits.base import Limit, Trip, first_row
 
 _FOLLOWS = 0.1  # V of change of a command that must show in its current
 _RARER = 10  # times the longest standstill of the calibration that an input may stand still
@@ -87,42 +86,6 @@ class _Standstill(Limit):
     @abc.abstractmethod
     def _stood(self, samples: Samples, row: int) -> str | None:
         """One more sample that reads the same; why that cannot be."""
-
-
-class Silence(_Standstill):
-    """The speed estimate and the count of the encoder must agree on whether the shaft turns."""
-
-    def __init__(self, turns: float) -> None:
-        super().__init__("theta")
-        self._most = turns * TURN
-
-    def _stood(self, samples: Samples, row: int) -> str | None:
-        self._standing += abs(samples.omega.item(row)) * (1.0 / self._rate)  # rad
-        if not self._standing > self._most:
-            return None
-        return (
-            f"the speed estimate says that the shaft turned by {self._standing / TURN:.3g} "
-            "turns, and the encoder's count stands still; check the encoder"
-        )
-
-
-class Stalled(_Standstill):
-    """A current that must turn the shaft while the encoder shows not one count."""
-
-    def __init__(self, stall: Stall) -> None:
-        super().__init__("theta")
-        self._stall = stall
-
-    def _stood(self, samples: Samples, row: int) -> str | None:
-        motor, brake = samples.current_motor.item(row), samples.current_brake.item(row)
-        pulls = abs(motor) >= self._stall.motor and abs(brake) <= self._stall.brake
-        self._standing = self._standing + 1.0 if pulls else 0.0  # samples
-        if not pulls or self._standing < round(self._stall.time * self._rate):
-            return None
-        return (
-            f"the encoder has stood still for {self._stall.time:g} s at a motor current of "
-            f"{motor:.3g} A with the brake off: the shaft is blocked, or the encoder dead"
-        )
 
 
 class Frozen(_Standstill):

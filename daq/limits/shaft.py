@@ -1,9 +1,62 @@
-"""Limits of where the shaft may be: its travel, and what stays wound up."""
+"""Limits of the shaft: its speed by the count, its travel, and what stays wound up."""
 
 import math
 
+import numpy as np
+
+from daq.config.rig import COUNT_GRAIN
 from daq.hal import FloatArray, Phase, Samples
 from daq.limits.base import TURN, Limit, Trip, first_row
+
+_SHARE = 0.1  # of the limit, that the grain may take
+
+
+class CountedSpeed(Limit):
+    """Speed by the encoder's count, whatever the device's estimate says of it.
+
+    count: angle of one [rad]. Where a count in a sample is a large step, as with a coarse encoder,
+    the speed is judged over several samples.
+    """
+
+    def __init__(self, limit: float, count: float) -> None:
+        self._limit, self._grain = limit, COUNT_GRAIN * count
+
+    def begin(self, phase: Phase, sample_rate: float) -> None:
+        """The first angles of a phase follow none."""
+        self._dt = 1.0 / sample_rate
+        span = max(1, math.ceil(self._grain * sample_rate / (_SHARE * self._limit)))
+        self._theta = np.full(span, math.nan)
+        self._tick = np.arange(-span, 0)
+
+    def check(self, samples: Samples) -> Trip | None:
+        """Compare every angle with the one a few samples before; lost ones give it more time."""
+        span = len(self._theta)
+        if span == 1 == len(samples):
+            return self._check_one(samples)
+        theta = np.concatenate([self._theta, samples.theta])
+        tick = np.concatenate([self._tick, samples.tick])
+        self._theta, self._tick = theta[-span:], tick[-span:]
+        change = np.abs(theta[span:] - theta[:-span]) - self._grain
+        seconds = (tick[span:] - tick[:-span]) * self._dt
+        row = first_row(change > self._limit * seconds)
+        return (
+            None if row is None else (row, self._reason(change[row] / seconds[row], samples, row))
+        )
+
+    def _check_one(self, samples: Samples) -> Trip | None:
+        theta, tick = samples.theta.item(), samples.tick.item()
+        change = abs(theta - self._theta.item()) - self._grain
+        seconds = (tick - self._tick.item()) * self._dt
+        self._theta[0], self._tick[0] = theta, tick
+        if not change > self._limit * seconds:
+            return None
+        return 0, self._reason(change / seconds, samples, 0)
+
+    def _reason(self, speed: float, samples: Samples, row: int) -> str:
+        return (
+            f"the encoder's count moves at {speed:.4g} rad/s, beyond the limit of "
+            f"{self._limit:g} rad/s; the device's estimate is {samples.omega.item(row):.4g} rad/s"
+        )
 
 
 class _Position:

@@ -54,7 +54,8 @@ class Session:
         second = None
         if validation and self.validation is not None:
             second = _run(self.validation, self.rig, self.device, out, watch)
-        doubts = currents.notes(run.folder / LOG_NAME, self.rig)
+        doubts = [doubt for each in (run, second) if each for doubt in each.doubts]
+        doubts += currents.notes(run.folder / LOG_NAME, self.rig)
         return SessionResult(run, second, findings, doubts)
 
 

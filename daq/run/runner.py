@@ -1,7 +1,7 @@
 """The run loop: open, calibrate, home, excite, make safe, close, logging every sample."""
 
 import contextlib
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -23,17 +23,21 @@ from daq.run.signals import SignalHandling
 
 @dataclass(frozen=True)
 class RunResult:
-    """A completed run: its folder, what was logged, and how punctual it was, as in run.json."""
+    """A completed run: its folder, what was logged, and how punctual it was, as in run.json.
+
+    doubts: what the limits that do not stop a run have said, with the cures.
+    """
 
     folder: Path
     n_samples: int
     timing: dict[str, Any]
     realtime: dict[str, Any]
+    doubts: list[str]
 
     @property
     def document(self) -> dict[str, Any]:
         """The same for machines."""
-        facts = {"timing": self.timing, "realtime": self.realtime}
+        facts = {"timing": self.timing, "realtime": self.realtime, "doubts": self.doubts}
         return {"folder": str(self.folder), "samples": self.n_samples, **facts}
 
 
@@ -95,7 +99,9 @@ class _Run:
             raise failed from error
         self._finish(COMPLETED, None)
         record = self.capture.record
-        return RunResult(self.capture.folder, log.n_samples, record["timing"], record["realtime"])
+        doubts = [doubt.sentence for doubt in self.sampling.limits.doubts]
+        facts = record["timing"], record["realtime"], doubts
+        return RunResult(self.capture.folder, log.n_samples, *facts)
 
     def _all_phases(self, log: LogWriter) -> None:
         rig = self.sampling.rig
@@ -175,6 +181,7 @@ class _Run:
                 self.capture.record["connection"] = connection
         # A record that cannot be written (the disk is full) must not hide why the run ended;
         # the folder then still says "running", which a reader reports as interrupted.
+        self.capture.record["doubts"] = [asdict(doubt) for doubt in self.sampling.limits.doubts]
         phase, timing = self.sampling.phase.value, self.sampling.timing.summary()
         with contextlib.suppress(RigError):
             self.capture.finish(status, reason, phase=phase, timing=timing)

@@ -35,7 +35,8 @@ def nobody(progress: PhaseProgress) -> None:
 class Sampling:
     """An open rig that is sampled phase by phase under its limits.
 
-    phase: the one that is on. timing: how punctual the samples since ``begin`` were.
+    phase: the one that is on. limits: that watch it. timing: how punctual the samples since
+    ``begin`` were.
     """
 
     def __init__(self, rig: Rig, limits: Limits, sample_rate: float, watch: Watcher) -> None:
@@ -43,7 +44,7 @@ class Sampling:
         self.sample_rate = sample_rate
         self.phase = Phase.OPEN
         self.timing = Timing()
-        self._limits = limits
+        self.limits = limits
         self._watch = watch
 
     def enter(self, phase: Phase, turns: float = 0.0) -> None:
@@ -53,8 +54,8 @@ class Sampling:
 
     def begin(self, mode: Mode) -> None:
         """Sample from tick 0 on, outputs at zero."""
-        self._limits.begin(self.phase, self.sample_rate)
-        self.rig.start(self.sample_rate, mode, self._limits.window())
+        self.limits.begin(self.phase, self.sample_rate)
+        self.rig.start(self.sample_rate, mode, self.limits.window())
         self.timing = Timing()
 
     def at_zero(self) -> Iterator[Samples]:
@@ -66,7 +67,7 @@ class Sampling:
         sent = ahead
         while True:
             samples = self.rig.receive()
-            trip = self._limits.check(samples)
+            trip = self.limits.check(samples)
             if trip is not None:
                 self.rig.safe()
                 where = f"interlock during {self.phase.value}"
@@ -85,7 +86,7 @@ class Sampling:
         arrived = self.rig.receive()
         self.timing.received(arrived)
         samples = before(arrived, end)
-        trip = self._limits.check(samples) if len(samples) else None
+        trip = self.limits.check(samples) if len(samples) else None
         if trip is None:
             return samples, None
         self.rig.safe()

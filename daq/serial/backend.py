@@ -211,11 +211,11 @@ class Scaling:
     def coded(self, guard: Guard) -> CodedGuard:
         """A run's guard in codes; commands within its clamps stay within them from now on."""
         # An inverting stage has a negative scale, and its lowest volts the highest code.
-        commands = np.sort([self._out(guard.command_low), self._out(guard.command_high)], axis=0)
-        self._low, self._high = _within(*commands, np.int16)
+        low, high = np.sort([self._out(guard.command_low), self._out(guard.command_high)], axis=0)
+        self._low, self._high = _within(low, high, np.int16)
         self._guard = guard
-        inputs = np.sort([self._in(guard.analog_low), self._in(guard.analog_high)], axis=0)
-        analog = _within(*inputs, np.int32)
+        low, high = np.sort([self._in(guard.analog_low), self._in(guard.analog_high)], axis=0)
+        analog = _within(low, high, np.int32)
         counts = _within(guard.counts_low, guard.counts_high, np.int32)
         rate = guard.count_rate if guard.count_rate < _LARGEST_RATE else math.inf
         _, step = _within(0.0, guard.count_step, np.uint32)

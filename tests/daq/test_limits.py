@@ -48,9 +48,12 @@ def samples(n=400, tick=None, **columns):
     }
     zero = np.zeros(n)
     given = {name: np.broadcast_to(values, n).copy() for name, values in columns.items()}
+    ticks = np.arange(n) if tick is None else tick
+    if "theta" in given and "omega" not in given:
+        given["omega"] = np.gradient(given["theta"], ticks / RATE)
     return Samples(
         **{
-            "tick": np.arange(n) if tick is None else tick,
+            "tick": ticks,
             "time": time,
             "cmd_voltage_motor": zero,
             "cmd_voltage_brake": zero,
@@ -111,11 +114,27 @@ CASES = {
         {"travel": [-1, 1]}, {"theta": 5.0 + np.arange(400) * 0.1}, 63, "1.003 turns from where"),
     "a jump": ({}, {"theta": 0.01 * np.arange(400) + step(77, 0, 2.0)}, 77, "jumped by 2.01 rad"),
     # A quarter of a turn at 10 rad/s takes 126 ticks of 1/800 s.
-    "a silent encoder": ({}, {"theta": step(40, 0.0, 1.0)}, 40 + 126, "count stands still"),
+    "a dead encoder": (
+        {}, {"theta": step(40, 10.0 * np.arange(400) / RATE, 39 * 10.0 / RATE), "omega": 10.0},
+        39 + 126, "differ by 0.251 turns"),
+    "a dead estimate of the speed": (
+        {}, {"theta": 10.0 * np.arange(400) / RATE, "omega": step(40, 10.0, 0.0)},
+        40 + 126, "now 0 rad/s"),
+    "half the counts": (
+        {}, {"theta": 5.0 * np.arange(400) / RATE, "omega": 10.0}, 252, "differ by 0.251 turns"),
+    "speed by the count": (
+        {"speed": 150.0}, {"theta": step(40, 0.0, 0.25) , "omega": 0.0}, 40,
+        "the encoder's count moves at 198.8 rad/s, beyond the limit of 150 rad/s"),
+    # A drive of 1.2 must turn the shaft within 1 / 1.2 of the time, from the second sample on.
     "a blocked shaft": (
         {"encoder": {"stall": {"motor": 1.0, "time": 0.25}}},
         {**STILL, "current_motor": step(20, 0.3, 1.2) + RAMP, "current_brake": RAMP},
-        20 + 199, "stood still for 0.25 s at a motor current of 1.2 A"),
+        20 + 167, "times the current that must turn"),
+    "a dead encoder at speed": (
+        {"encoder": {"stall": {"motor": 0.5, "time": 0.05}}},
+        {"theta": step(99, 0.1 * np.arange(400), 9.9), "omega": step(99, 80.0, 0.0),
+         "current_motor": 2.0 + RAMP, "current_brake": RAMP},
+        99 + 11, "the encoder stands still at 3.99"),
     "a frozen torque": ({}, {"torque": step(60, math.nan, 0.01)}, 60 + 80, "its noise never let"),
     "a frozen motor current": (
         {}, {"current_motor": step(60, math.nan, 0.3)}, 60 + 80, "current_motor has read 0.3 to"),

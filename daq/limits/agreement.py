@@ -1,0 +1,238 @@
+"""What must agree while a rig works: count and speed, shaft and motor, currents and commands.
+
+Each bound is so wide that no healthy rig of the file's ratings reaches it.
+"""
+
+import math
+
+import numpy as np
+
+from daq.config.rig import Stall
+from daq.hal import Phase, Samples
+from daq.limits.base import TURN, Limit, Trip
+
+_FORGOTTEN = 20.0  # times the angle of disagreement that is turned until half of it is forgotten
+_AT_REST = 1.5  # counts by which a shaft at rest may flicker
+_AGAINST = 0.2  # of the largest speed, gained against the motor's current
+_SETTLED = 0.025  # s in which a current has come to follow its command
+_EVIDENCE = 0.05  # s for which it does not
+_EXCESS, _LACK = 1.5, 0.5  # of the current that the command asks for, at most and at least
+_FLOOR = 0.05  # of the current's limit, at least, for offsets and noise
+
+
+class Disagreement(Limit):
+    """The encoder's count and the estimate of its speed must tell the same angle.
+
+    Their difference is summed over the turns of the shaft, the older ones with less weight: an
+    estimate that lags at every change of speed is ahead again at the next.
+    """
+
+    def __init__(self, turns: float) -> None:
+        self._most = turns * TURN
+
+    def begin(self, phase: Phase, sample_rate: float) -> None:
+        """Start anew."""
+        self._dt = 1.0 / sample_rate
+        self._theta, self._omega, self._tick = math.nan, 0.0, -1
+        self._difference = self._path = 0.0  # rad
+
+    def check(self, samples: Samples) -> Trip | None:
+        """Sum up; what the shaft did between samples of which some are lost is unknown."""
+        columns = samples.tick.tolist(), samples.theta.tolist(), samples.omega.tolist()
+        for row, (tick, theta, omega) in enumerate(zip(*columns, strict=True)):
+            if tick == self._tick + 1 and tick > 0:
+                counted = theta - self._theta
+                estimated = 0.5 * (omega + self._omega) * self._dt
+                self._difference += counted - estimated
+                self._path += abs(counted) + abs(estimated)
+            self._theta, self._omega, self._tick = theta, omega, tick
+            if not abs(self._difference) <= self._most:
+                return row, self._reason(omega)
+            if self._path > _FORGOTTEN * self._most:
+                self._difference *= 0.5
+                self._path *= 0.5
+        return None
+
+    def _reason(self, omega: float) -> str:
+        return (
+            f"the encoder's count and the device's estimate of the speed, now {omega:.4g} rad/s, "
+            f"differ by {abs(self._difference) / TURN:.3g} turns: one of them fails. Check the "
+            "encoder's cable and both channels, and sensors.encoder of the rig's file"
+        )
+
+
+class Drive:
+    """What the motor asks of the shaft, and what the brake allows, by ``encoder.stall``.
+
+    gains: of the amplifiers [A/V], or None. An amplifier or a sensor that is dead shows no
+    current, so that of the command counts as well.
+    """
+
+    def __init__(self, stall: Stall, gains: tuple[float | None, float | None]) -> None:
+        self._stall = stall
+        self._motor_gain, self._brake_gain = (gain or 0.0 for gain in gains)
+
+    def ratios(self, samples: Samples, *, measured: bool = False) -> list[float]:
+        """Motor current over that which must turn the shaft, of every sample, with its sign.
+
+        measured: by the sensor alone.
+        """
+        motor, brake = samples.current_motor, np.abs(samples.current_brake)
+        if not measured:
+            asked = self._motor_gain * samples.applied_voltage_motor
+            motor = np.where(np.abs(asked) > np.abs(motor), asked, motor)
+        brake = np.maximum(brake, self._brake_gain * np.abs(samples.applied_voltage_brake))
+        least = self._stall.motor * (1.0 + brake / self._stall.brake)
+        ratios: list[float] = (motor / least).tolist()
+        return ratios
+
+
+class Stalled(Limit):
+    """A motor that must turn the shaft while the encoder shows no motion."""
+
+    def __init__(self, stall: Stall, drive: Drive, count: float) -> None:
+        self._drive, self._time = drive, stall.time
+        self._flicker = _AT_REST * count  # rad
+
+    def begin(self, phase: Phase, sample_rate: float) -> None:
+        """Start anew."""
+        self._dt = 1.0 / sample_rate
+        self._rest, self._driven = math.nan, 0.0  # rad, s
+
+    def check(self, samples: Samples) -> Trip | None:
+        """Sum up the time of standing still, by how much more the motor asks than it must."""
+        ratios = self._drive.ratios(samples)
+        for row, (theta, ratio) in enumerate(zip(samples.theta.tolist(), ratios, strict=True)):
+            if not abs(theta - self._rest) <= self._flicker:
+                self._rest, self._driven = theta, 0.0
+                continue
+            self._driven = self._driven + abs(ratio) * self._dt if abs(ratio) >= 1.0 else 0.0
+            if self._driven > self._time:
+                return row, (
+                    f"the encoder stands still at {abs(ratio):.3g} times the current that must "
+                    "turn the shaft (encoder.stall): the shaft is blocked, the brake does not let "
+                    "go, or encoder, motor or amplifier is dead"
+                )
+        return None
+
+
+class Contrary(Limit):
+    """A shaft that gains speed against a motor current which must turn it."""
+
+    stops = False
+
+    def __init__(self, drive: Drive, speed: float) -> None:
+        self._drive, self._most = drive, _AGAINST * speed
+
+    def begin(self, phase: Phase, sample_rate: float) -> None:
+        """Start anew."""
+        self._omega, self._against = math.nan, 0.0  # rad/s
+
+    def check(self, samples: Samples) -> Trip | None:
+        """Sum up the speed gained against the current, while it is strong enough."""
+        ratios = self._drive.ratios(samples, measured=True)
+        for row, (omega, ratio) in enumerate(zip(samples.omega.tolist(), ratios, strict=True)):
+            gained = math.copysign(1.0, ratio) * (omega - self._omega)
+            self._omega = omega
+            if math.isnan(gained) or not abs(ratio) >= 1.0:
+                self._against = 0.0
+                continue
+            self._against = max(0.0, self._against - gained)
+            if self._against > self._most and ratio * omega < 0.0:
+                self._against = 0.0
+                return row, (
+                    f"the shaft has gained {self._most:.3g} rad/s against the motor's current; "
+                    "compare the signs of sensors.encoder and sensors.current_motor in the rig's "
+                    "file with the hardware, or look for a load that is stronger than the motor"
+                )
+        return None
+
+
+class CurrentAgreement(Limit):
+    """The current of an amplifier of known gain follows its command.
+
+    The command asks for the currents between the least and the largest of the last 25 ms. A healthy
+    amplifier never gives more, nor the other sign; less only a motor's at speed, where the back EMF
+    has used up its supply. Either is judged once it has held for 50 ms more than it has not. What
+    the current varies by in the calibration is noise, and says nothing.
+    """
+
+    def __init__(self, name: str, gain: float, limit: float) -> None:
+        self._name, self._gain, self._floor = name, gain, _FLOOR * limit
+        self._least, self._most = math.inf, -math.inf  # A, in the calibration
+
+    def begin(self, phase: Phase, sample_rate: float) -> None:
+        """Learn from the calibration; then start anew, from zero outputs."""
+        self._learning = phase is Phase.CALIBRATION
+        self._floor = max(self._floor, self._most - self._least)
+        self._dt = 1.0 / sample_rate
+        self._half = max(1, math.ceil(0.5 * _SETTLED * sample_rate))  # samples of half the window
+        self._filled = 0
+        self._newer = self._older = (0.0, 0.0)  # A, least and largest of the window's halves
+        self._evidence = 0.0  # s
+
+    def check(self, samples: Samples) -> Trip | None:
+        """Compare every sample with the commands before it."""
+        currents = getattr(samples, f"current_{self._name}").tolist()
+        if self._learning:
+            self._least = min(self._least, *currents)
+            self._most = max(self._most, *currents)
+            return None
+        asked = (self._gain * getattr(samples, f"applied_voltage_{self._name}")).tolist()
+        speeds = np.abs(samples.omega).tolist()
+        for row, (current, ahead, speed) in enumerate(zip(currents, asked, speeds, strict=True)):
+            low = min(self._newer[0], self._older[0])
+            high = max(self._newer[1], self._older[1])
+            self._evidence = max(
+                0.0, self._evidence + self._dt * self._against(current, low, high, speed)
+            )
+            self._extend(ahead)
+            if self._evidence > _EVIDENCE:
+                self._evidence = 0.0
+                return row, self._reason(current, low, high)
+        return None
+
+    def _against(self, current: float, low: float, high: float, speed: float) -> int:
+        """1 for a sample that speaks against the amplifier, -1 for it, 0 for neither."""
+        most, least = _EXCESS * max(high, 0.0), _EXCESS * min(low, 0.0)
+        return -1 if least - self._floor <= current <= most + self._floor else 1
+
+    def _reason(self, current: float, low: float, high: float) -> str:
+        return (
+            f"current_{self._name} is {current:.3g} A, and by amplifiers.{self._name} the command "
+            f"asked for {low:.3g} to {high:.3g} A in the last {1e3 * _SETTLED:g} ms. Check "
+            "amplifier and current sensor: gain, sign, an output that sticks"
+        )
+
+    def _extend(self, asked: float) -> None:
+        """Take a command into the window."""
+        if self._filled == self._half:
+            self._older, self._newer = self._newer, (asked, asked)
+            self._filled = 0
+        self._newer = min(self._newer[0], asked), max(self._newer[1], asked)
+        self._filled += 1
+
+
+class CurrentLack(CurrentAgreement):
+    """An amplifier that gives less than half of what its command asks for.
+
+    slow: speed [rad/s] up to which it must give that; infinite for the brake's, without back EMF.
+    """
+
+    def __init__(self, name: str, gain: float, limit: float, slow: float) -> None:
+        super().__init__(name, gain, limit)
+        self._slow = slow
+
+    def _against(self, current: float, low: float, high: float, speed: float) -> int:
+        if high < 0.0:
+            current, low = -current, -high
+        if low <= 1.5 * self._floor or speed > self._slow:
+            return 0
+        return 1 if current < _LACK * low else -1
+
+    def _reason(self, current: float, low: float, high: float) -> str:
+        return (
+            f"current_{self._name} is {current:.3g} A, and by amplifiers.{self._name} the command "
+            f"asks for {low:.3g} to {high:.3g} A. Check whether the amplifier is on, its supply, "
+            "and that output and current sensor are connected"
+        )
