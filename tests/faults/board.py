@@ -20,6 +20,7 @@ SATURATED = 32
 
 _VOLTS = (2.0, 2.0, 1.0 / 0.706)  # per ampere, ampere and N*m
 _WINDING = 1.5  # turns/s by hand
+_MORE = 0.1  # turns that a hand winds beyond those asked for
 _ARM = Grip(stiffness=1.0, damping=0.02, angle=0.0, rate=0.0)  # that winds
 _FINGERS = Grip(stiffness=0.16, damping=0.0179, angle=0.0, rate=0.0)  # of the load ``hand``
 _LEAN = 1.0  # rad, reached after 1 s
@@ -161,7 +162,7 @@ class Board:
     def _grip(self):
         seconds = self.plant.time - self._begun
         if _PHASES[self._phase] == "homing" and self._turns:
-            target = 2.0 * math.pi * self._turns
+            target = 2.0 * math.pi * (self._turns + _MORE)
             part = min(1.0, seconds * _WINDING / self._turns)
             angle = self._wrist + target * (1.0 - math.cos(math.pi * part)) / 2.0
             rate = math.pi * math.pi * _WINDING * math.sin(math.pi * part) * (part < 1.0)
