@@ -46,8 +46,13 @@ _LOOPS: dict[str, tuple[str, dict[str, Any], float]] = {
     "open": ("prbs.yaml", {"duration": 5}, 4.0),
     "closed": (
         "constant_velocity.yaml",
-        {"velocities": [20, -70, 5, 120, -20], "brake_commands": [0, 0.08], "measure": 0.5},
-        8.0,
+        {
+            "velocities": [20, -70, 120],
+            "brake_commands": [0, 0.08],
+            "measure": 0.4,
+            "settling": {"tolerance": 5, "least": 0.5, "time": 0.2, "timeout": 4},
+        },
+        5.0,
     ),
 }
 _ORDER = ("stop", "warning", "missed", "before")
