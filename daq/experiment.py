@@ -79,6 +79,11 @@ class Plan:
     remarks: tuple[str, ...] = ()
     steady: slice = field(default_factory=lambda: slice(None))
 
+    @property
+    def excites(self) -> bool:
+        """Whether any command may be other than zero."""
+        return bool(np.any(self.lowest) or np.any(self.highest))
+
 
 class Experiment(Section, abc.ABC):
     """An experiment: common settings here, a protocol's own in its subclass.

@@ -69,7 +69,9 @@ def _show(checked: Preview) -> None:
             f"{experiment.homing.turns:g} turns to wind within {experiment.homing.timeout:g} s"
         )
     print(f"Before it: {', '.join(before)}.")
-    if checked.concludes:
+    if not plan.excites:
+        print("Its commands are zero throughout: it excites nothing, and logs everything.")
+    elif checked.concludes:
         print("It concludes by itself: results stand in the run's folder.")
     elif session.validation:
         print("With --identify a validation run follows.")

@@ -55,7 +55,10 @@ def emulate(
     chosen = [faults.parse(text) for text in fault or []]
     config, device = load_rig(rig, watch=terminal.report_event)
     if not isinstance(device, Simulation):
-        cure = "only the simulated one can be emulated. Name a rig file with 'backend: simulated'"
+        cure = (
+            "only the simulated one can be emulated. Leave --rig out for it, or name a rig file "
+            "with 'backend: simulated'"
+        )
         raise ConfigError(f"its backend is {config.backend!r}", cure=cure, file=rig)
 
     def ready(port: str) -> None:

@@ -14,12 +14,20 @@ def init(
         Path, Argument(metavar="[FOLDER]", help="Where the files go; default this folder.")
     ] = Path(),
     protocol: Annotated[
-        str,
-        Option(metavar="NAME", help="Shipped experiment to begin with.", autocompletion=protocols),
-    ] = "prbs",
+        str | None,
+        Option(
+            metavar="NAME",
+            help="Shipped experiment to begin with; default prbs, on hardware still and tenth.",
+            autocompletion=protocols,
+        ),
+    ] = None,
     rig: Annotated[
         str,
-        Option(metavar="NAME", help="Shipped rig to begin with.", autocompletion=rig_names),
+        Option(
+            metavar="NAME",
+            help="Shipped rig to begin with; serial for hardware, with limits at a tenth.",
+            autocompletion=rig_names,
+        ),
     ] = "simulated",
     json: options.AsJson = False,
 ) -> None:
@@ -28,23 +36,44 @@ def init(
     What is there already stays as it is. Editors complete and check the files by the JSON Schemas
     written beside them.
     """
-    from daq.lookup import schemas, starter
+    from daq.lookup import schemas
+    from daq.lookup.starter import DEFAULT_PROTOCOL, RIG, SETTINGS, write_starter
 
-    written, kept, validated = starter.write_starter(folder, protocol, rig, terminal.report_event)
+    starter = write_starter(folder, protocol, rig, terminal.report_event)
     schema_folder = folder / schemas.FOLDER
     if json:
-        terminal.print_json({"written": written, "kept": kept, "schemas": schema_folder})
+        document = {"written": starter.written, "kept": starter.kept, "schemas": schema_folder}
+        terminal.print_json(document)
         return
-    for path in written:
+    for path in starter.written:
         print(f"Written: {path}")
     print(f"Written: {schema_folder}, by which editors check these files")
-    for path in kept:
+    for path in starter.kept:
         print(f"Kept as it was: {path}")
     there = [] if folder.resolve() == Path.cwd() else [f"cd {folder}"]
+    experiment = f"{protocol or DEFAULT_PROTOCOL}.yaml"
+    if starter.hardware:
+        terminal.print_next(*there)
+        terminal.print_steps(_first_evening(experiment))
+        return
     # An experiment without a validation run is mostly not for an identification.
-    identify = f" --identify --config {starter.SETTINGS}" if validated else ""
+    identify = f" --identify --config {SETTINGS}" if starter.validated else ""
     terminal.print_next(
         *there,
-        f"rig check {protocol}.yaml --rig {starter.RIG}",
-        f"rig run {protocol}.yaml --rig {starter.RIG}{identify}",
+        f"rig check {experiment} --rig {RIG}",
+        f"rig run {experiment} --rig {RIG}{identify}",
     )
+
+
+def _first_evening(experiment: str) -> list[tuple[str, str]]:
+    """What to do from the port to the experiment, and what each step is for."""
+    from daq.lookup.starter import FIRST_EXPERIMENTS, RIG
+
+    still, tenth = FIRST_EXPERIMENTS
+    return [
+        ("rig ports", f"who answers where: write the port into {RIG}"),
+        (f"rig check {still}.yaml --rig {RIG}", "reads the files, energises nothing"),
+        (f"rig run {still}.yaml --rig {RIG}", "amplifiers off: what the sensors read"),
+        (f"rig run {tenth}.yaml --rig {RIG}", "no load, a hand at the switch: first commands"),
+        ("more", f"raise {RIG} and {tenth}.yaml by the steps they name, up to {experiment}"),
+    ]

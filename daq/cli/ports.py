@@ -53,7 +53,7 @@ def _show(inquiries: list[Inquiry], unasked: bool) -> None:
     answered = [inquiry.port for inquiry in inquiries if inquiry.welcome is not None]
     if answered:
         port = answered[0].lasting_name or answered[0].name
-        terminal.print_next(f"rig run prbs.yaml --rig serial.yaml --port {port}")
+        terminal.print_next(f"rig run still.yaml --rig serial_tenth.yaml --port {port}")
 
 
 def _document(inquiry: Inquiry, unasked: bool) -> dict[str, Any]:

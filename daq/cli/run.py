@@ -40,7 +40,7 @@ def run(
         result = session.record(out, validation=identify, watch=watch)
     document = _document(result)
     if not json:
-        _show(result, identify)
+        _show(result, identifiable=session.plan.excites and not identify)
     if problem is not None:
         if result.validation is None and not json:
             path = session.loaded.file.path
@@ -84,7 +84,7 @@ def _document(result: SessionResult) -> dict[str, Any]:
     return document
 
 
-def _show(result: SessionResult, identified: bool) -> None:
+def _show(result: SessionResult, identifiable: bool) -> None:
     from daq.cli.analyse import next_commands, show_findings
     from daq.diagnose import punctuality
 
@@ -104,5 +104,5 @@ def _show(result: SessionResult, identified: bool) -> None:
             terminal.report("note", note)
     for doubt in result.doubts:
         terminal.report("warning", doubt)
-    if not identified:
+    if identifiable:
         terminal.print_next(*next_commands(result.run.folder))

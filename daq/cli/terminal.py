@@ -74,6 +74,14 @@ def print_next(*commands: str) -> None:
             print(f"{'Then' if index else 'Next'}: {command}")
 
 
+def print_steps(steps: Sequence[tuple[str, str]]) -> None:
+    """What to do in this order, and what each is for, a numbered line each."""
+    if _volume.get() >= Volume.NORMAL:
+        width = max(len(action) for action, _ in steps)
+        for place, (action, purpose) in enumerate(steps, start=1):
+            print(f"{place}. {action:<{width}}  {purpose}")
+
+
 def print_json(document: Any) -> None:
     """One JSON document; numbers JSON cannot hold become null."""
     out = _documents.get() or sys.stdout

@@ -1,6 +1,7 @@
 """Commented files to begin with: an experiment, a rig and settings of an identification."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 from daq.errors import ConfigError, RunError, suggestion
@@ -10,6 +11,9 @@ from daq.lookup.shipped import shipped_files
 from daq.progress import Watch, ignore
 
 RIG, SETTINGS = "rig.yaml", "identification.yaml"
+DEFAULT_PROTOCOL = "prbs"
+FIRST_EXPERIMENTS = ("still", "tenth")  # zero commands, and a tenth of the default's
+_FIRST_LIMITS = "_tenth"  # ends the name of a shipped rig whose limits are for its first evening
 _HEAD = """\
 # Settings of an identification, all of which may be left out:
 #   rig identify RUN --config identification.yaml
@@ -18,29 +22,45 @@ _HEAD = """\
 _ACTIVE = {"model": "actuator", "preset": "default"}
 
 
-def write_starter(
-    folder: Path, protocol: str, rig: str, watch: Watch = ignore
-) -> tuple[list[Path], list[Path], bool]:
+@dataclass(frozen=True)
+class Starter:
+    """What lies in a folder to begin with.
+
+    written, kept: files written, and files kept as they were. hardware: whether the rig begins with
+    ``FIRST_EXPERIMENTS`` and limits for them. validated: whether the experiment that was asked for
+    has a validation run.
+    """
+
+    written: list[Path]
+    kept: list[Path]
+    hardware: bool
+    validated: bool
+
+
+def write_starter(folder: Path, protocol: str | None, rig: str, watch: Watch = ignore) -> Starter:
     """Write the files that are not there yet, and a folder of schemas.
 
-    Files written, files kept as they were, and whether the experiment has a validation run. Raises
-    ConfigError for names of nothing shipped.
+    protocol: default prbs, on hardware none but ``FIRST_EXPERIMENTS``. Raises ConfigError for names
+    of nothing shipped.
     """
-    experiment = f"{protocol}.yaml"
-    texts = {
-        experiment: _copy(shipped_files("protocol"), protocol, "protocol", "experiment"),
-        RIG: _copy(shipped_files("backend"), rig, "rig", "rig"),
-        SETTINGS: settings_text(),
-    }
+    experiments, rigs = shipped_files("protocol"), shipped_files("backend")
+    first_rig = f"{rig.removesuffix(_FIRST_LIMITS)}{_FIRST_LIMITS}"
+    hardware = f"{first_rig}.yaml" in rigs
+    names = list(FIRST_EXPERIMENTS) if hardware else []
+    if protocol or not hardware:
+        names.append(protocol or DEFAULT_PROTOCOL)
+    texts = {f"{name}.yaml": _copy(experiments, name, "protocol", "experiment") for name in names}
+    validated = "\nvalidation:" in texts[f"{names[-1]}.yaml"]
     # Tables that a shipped experiment reads lie beside it under its name.
-    table = shipped_files("protocol")[experiment].with_suffix(".csv")
-    if table.exists():
-        texts[table.name] = table.read_text(encoding="utf-8")
+    tables = [experiments[name].with_suffix(".csv") for name in texts]
+    texts |= {path.name: path.read_text(encoding="utf-8") for path in tables if path.exists()}
+    texts[RIG] = _copy(rigs, first_rig if hardware else rig, "rig", "rig")
+    texts[SETTINGS] = settings_text()
     make_folder(folder)
     written = [folder / name for name, text in texts.items() if _write_new(folder / name, text)]
     kept = [folder / name for name in texts if folder / name not in written]
     schemas.write_schemas(folder / schemas.FOLDER, watch)
-    return written, kept, "\nvalidation:" in texts[experiment]
+    return Starter(written, kept, hardware, validated)
 
 
 def settings_text() -> str:
