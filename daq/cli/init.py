@@ -69,11 +69,11 @@ def _first_evening(experiment: str) -> list[tuple[str, str]]:
     """What to do from the port to the experiment, and what each step is for."""
     from daq.lookup.starter import FIRST_EXPERIMENTS, RIG
 
-    still, tenth = FIRST_EXPERIMENTS
+    zero, first = FIRST_EXPERIMENTS
     return [
         ("rig ports", f"who answers where: write the port into {RIG}"),
-        (f"rig check {still}.yaml --rig {RIG}", "reads the files, energises nothing"),
-        (f"rig run {still}.yaml --rig {RIG}", "amplifiers off: what the sensors read"),
-        (f"rig run {tenth}.yaml --rig {RIG}", "no load, a hand at the switch: first commands"),
-        ("more", f"raise {RIG} and {tenth}.yaml by the steps they name, up to {experiment}"),
+        (f"rig check {zero}.yaml --rig {RIG}", "reads the files, energises nothing"),
+        (f"rig run {zero}.yaml --rig {RIG}", "amplifiers off: what the sensors read"),
+        (f"rig run {first}.yaml --rig {RIG}", "no load, a hand at the switch: first commands"),
+        ("more", f"raise {RIG} and {first}.yaml by the steps they name, up to {experiment}"),
     ]

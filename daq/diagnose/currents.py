@@ -25,12 +25,17 @@ def notes(log: Path, rig: RigConfig) -> list[str]:
     estimate = _gains(log) if any(gain is not None for gain in stated) else None
     if estimate is None:
         return []
-    judged = [_judge(row, gain, *estimate) for row, gain in enumerate(stated) if gain is not None]
+    signs = [rig.sensors.current_motor.sign, rig.sensors.current_brake.sign]
+    judged = [
+        _judge(row, gain, signs[row], *estimate)
+        for row, gain in enumerate(stated)
+        if gain is not None
+    ]
     return [note for note in judged if note is not None]
 
 
-def _judge(row: int, stated: float, gains: FloatArray, errors: FloatArray) -> str | None:
-    """A note on the gain of a channel, [A/V], by the data sheet and by the log."""
+def _judge(row: int, stated: float, sign: int, gains: FloatArray, errors: FloatArray) -> str | None:
+    """A note on the gain of a channel, [A/V], by the data sheet and by the log; sign: in use."""
     name, rival = CHANNELS[row], CHANNELS[1 - row]
     gain, error = float(gains[row, row]), float(errors[row, row])
     if not error <= stated / _CERTAIN:
@@ -48,7 +53,7 @@ def _judge(row: int, stated: float, gains: FloatArray, errors: FloatArray) -> st
     if abs(gain) < 0.1 * stated:
         return f"{contrast}; look whether the amplifier is on, and its sensor connected"
     if gain < 0.0:
-        return f"{contrast}; set 'sign: -1' of sensors.current_{name} in the rig's file"
+        return f"{contrast}; set 'sign: {-sign}' of sensors.current_{name} in the rig's file"
     if not 1.0 / _OFF < gain / stated < _OFF:
         return (
             f"{contrast}; measure the current with a clamp meter, and correct "

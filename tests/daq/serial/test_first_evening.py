@@ -151,4 +151,4 @@ def test_a_tenth_is_enough_to_find_a_sensor_turned_round(tmp_path, run, channel)
     content["sensors"][f"current_{channel}"]["sign"] = -1
     (tmp_path / "rig.yaml").write_text(yaml.safe_dump(content))
     result = run(["run", "tenth.yaml", "--rig", "rig.yaml"], tmp_path)
-    assert f"set 'sign: -1' of sensors.current_{channel}" in result.stderr
+    assert f"set 'sign: 1' of sensors.current_{channel}" in result.stderr
