@@ -253,7 +253,7 @@ class Crossed(SimulatedDevice):
     [
         (
             {"sensors": {"current_motor": {"scale": 0.5, "sign": -1}}},
-            "'sign: -1' of sensors.current_motor",
+            "'sign: 1' of sensors.current_motor",
         ),
         (
             {"sensors": {"current_brake": {"scale": 1.0}}},
