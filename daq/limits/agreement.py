@@ -79,8 +79,8 @@ class Drive:
         """
         motor, brake = samples.current_motor, np.abs(samples.current_brake)
         if not measured:
-            asked = self._motor_gain * samples.applied_voltage_motor
-            motor = np.where(np.abs(asked) > np.abs(motor), asked, motor)
+            wanted = self._motor_gain * samples.applied_voltage_motor
+            motor = np.where(np.abs(wanted) > np.abs(motor), wanted, motor)
         brake = np.maximum(brake, self._brake_gain * np.abs(samples.applied_voltage_brake))
         least = self._stall.motor * (1.0 + brake / self._stall.brake)
         ratios: list[float] = (motor / least).tolist()
@@ -178,9 +178,9 @@ class CurrentAgreement(Limit):
             self._least = min(self._least, *currents)
             self._most = max(self._most, *currents)
             return None
-        asked = (self._gain * getattr(samples, f"applied_voltage_{self._name}")).tolist()
+        wanted = (self._gain * getattr(samples, f"applied_voltage_{self._name}")).tolist()
         speeds = np.abs(samples.omega).tolist()
-        for row, (current, ahead, speed) in enumerate(zip(currents, asked, speeds, strict=True)):
+        for row, (current, ahead, speed) in enumerate(zip(currents, wanted, speeds, strict=True)):
             low = min(self._newer[0], self._older[0])
             high = max(self._newer[1], self._older[1])
             self._evidence = max(
@@ -204,12 +204,12 @@ class CurrentAgreement(Limit):
             "amplifier and current sensor: gain, sign, an output that sticks"
         )
 
-    def _extend(self, asked: float) -> None:
+    def _extend(self, wanted: float) -> None:
         """Take a command into the window."""
         if self._filled == self._half:
-            self._older, self._newer = self._newer, (asked, asked)
+            self._older, self._newer = self._newer, (wanted, wanted)
             self._filled = 0
-        self._newer = min(self._newer[0], asked), max(self._newer[1], asked)
+        self._newer = min(self._newer[0], wanted), max(self._newer[1], wanted)
         self._filled += 1
 
 
