@@ -17,7 +17,6 @@ from daq.hal import CHANNELS, Flag, Phase, Samples
 from daq.limits.agreement import (
     Contrary,
     CurrentAgreement,
-    CurrentLack,
     Disagreement,
     Drive,
     Stalled,
@@ -33,17 +32,13 @@ _SLOW = 0.1  # of the speed limit, up to which the motor's back EMF leaves its a
 _FASTEST = 100.0  # rad/s, taken where there is no such limit
 
 
-@dataclass
+@dataclass(frozen=True)
 class Doubt:
-    """What a limit that does not stop a run has said of it.
-
-    phase, tick: of the sample that it spoke of first. samples: how many since.
-    """
+    """What a limit that does not stop a run has said first, and of which sample."""
 
     phase: str
     tick: int
     reason: str
-    samples: int = 1
 
     @property
     def sentence(self) -> str:
@@ -94,11 +89,7 @@ class Limits:
 
     def _note(self, limit: Limit, samples: Samples, row: int, reason: str) -> None:
         samples.flags[row] |= int(Flag.DOUBTFUL)
-        if limit in self._doubts:
-            self._doubts[limit].samples += 1
-        else:
-            tick = samples.tick.item(row)
-            self._doubts[limit] = Doubt(self._phase.value, tick, reason)
+        self._doubts.setdefault(limit, Doubt(self._phase.value, samples.tick.item(row), reason))
 
 
 def _built_in(config: RigConfig) -> list[Limit]:
@@ -144,9 +135,9 @@ def _of_currents(config: RigConfig) -> list[Limit]:
     for channel in CHANNELS:
         gain = getattr(config.amplifiers, channel)
         if gain is not None:
-            rating = channel, gain, getattr(config.limits.current, channel)
             slow = math.inf if channel == "brake" else _SLOW * (config.limits.speed or _FASTEST)
-            limits += [CurrentAgreement(*rating), CurrentLack(*rating, slow)]
+            most = getattr(config.limits.current, channel)
+            limits.append(CurrentAgreement(channel, gain, most, slow))
     return limits
 
 

@@ -5,8 +5,6 @@ Each bound is so wide that no healthy rig of the file's ratings reaches it.
 
 import math
 
-import numpy as np
-
 from daq.config.rig import Stall
 from daq.hal import Phase, Samples
 from daq.limits.base import TURN, Limit, Trip
@@ -17,6 +15,7 @@ _AGAINST = 0.2  # of the largest speed, gained against the motor's current
 _SETTLED = 0.025  # s in which a current has come to follow its command
 _EVIDENCE = 0.05  # s for which it does not
 _EXCESS, _LACK = 1.5, 0.5  # of the current that the command asks for, at most and at least
+_JUDGED = 1.5  # times the floor, from which a lack is judged
 _FLOOR = 0.05  # of the current's limit, at least, for offsets and noise
 
 
@@ -69,7 +68,7 @@ class Drive:
     """
 
     def __init__(self, stall: Stall, gains: tuple[float | None, float | None]) -> None:
-        self._stall = stall
+        self._motor, self._brake = stall.motor, stall.brake
         self._motor_gain, self._brake_gain = (gain or 0.0 for gain in gains)
 
     def ratios(self, samples: Samples, *, measured: bool = False) -> list[float]:
@@ -77,14 +76,25 @@ class Drive:
 
         measured: by the sensor alone.
         """
-        motor, brake = samples.current_motor, np.abs(samples.current_brake)
-        if not measured:
-            wanted = self._motor_gain * samples.applied_voltage_motor
-            motor = np.where(np.abs(wanted) > np.abs(motor), wanted, motor)
-        brake = np.maximum(brake, self._brake_gain * np.abs(samples.applied_voltage_brake))
-        least = self._stall.motor * (1.0 + brake / self._stall.brake)
-        ratios: list[float] = (motor / least).tolist()
-        return ratios
+        columns = (
+            samples.current_motor,
+            samples.current_brake,
+            samples.applied_voltage_motor,
+            samples.applied_voltage_brake,
+        )
+        if len(samples) == 1:
+            return [self._ratio(*(column.item() for column in columns), measured)]
+        rows = zip(*(column.tolist() for column in columns), strict=True)
+        return [self._ratio(*row, measured) for row in rows]
+
+    def _ratio(
+        self, motor: float, brake: float, volts_motor: float, volts_brake: float, measured: bool
+    ) -> float:
+        commanded = self._motor_gain * volts_motor
+        if not measured and abs(commanded) > abs(motor):
+            motor = commanded
+        against = max(abs(brake), self._brake_gain * abs(volts_brake))
+        return motor / (self._motor * (1.0 + against / self._brake))
 
 
 class Stalled(Limit):
@@ -130,22 +140,24 @@ class Contrary(Limit):
 
     def check(self, samples: Samples) -> Trip | None:
         """Sum up the speed gained against the current, while it is strong enough."""
+        trip = None
         ratios = self._drive.ratios(samples, measured=True)
         for row, (omega, ratio) in enumerate(zip(samples.omega.tolist(), ratios, strict=True)):
             gained = math.copysign(1.0, ratio) * (omega - self._omega)
             self._omega = omega
-            if math.isnan(gained) or not abs(ratio) >= 1.0:
-                self._against = 0.0
-                continue
-            self._against = max(0.0, self._against - gained)
+            driven = abs(ratio) >= 1.0 and not math.isnan(gained)
+            self._against = max(0.0, self._against - gained) if driven else 0.0
             if self._against > self._most and ratio * omega < 0.0:
+                trip = trip or (row, self._reason())
                 self._against = 0.0
-                return row, (
-                    f"the shaft has gained {self._most:.3g} rad/s against the motor's current; "
-                    "compare the signs of sensors.encoder and sensors.current_motor in the rig's "
-                    "file with the hardware, or look for a load that is stronger than the motor"
-                )
-        return None
+        return trip
+
+    def _reason(self) -> str:
+        return (
+            f"the shaft has gained {self._most:.3g} rad/s against the motor's current; compare the "
+            "signs of sensors.encoder and sensors.current_motor in the rig's file with the "
+            "hardware, or look for a load that is stronger than the motor"
+        )
 
 
 class CurrentAgreement(Limit):
@@ -155,10 +167,15 @@ class CurrentAgreement(Limit):
     amplifier never gives more, nor the other sign; less only a motor's at speed, where the back EMF
     has used up its supply. Either is judged once it has held for 50 ms more than it has not. What
     the current varies by in the calibration is noise, and says nothing.
+
+    slow: speed [rad/s] up to which the amplifier must give half of what is asked; infinite for the
+    brake's, without back EMF.
     """
 
-    def __init__(self, name: str, gain: float, limit: float) -> None:
-        self._name, self._gain, self._floor = name, gain, _FLOOR * limit
+    def __init__(self, channel: str, gain: float, limit: float, slow: float) -> None:
+        self._name, self._command = f"current_{channel}", f"applied_voltage_{channel}"
+        self._amplifier = f"amplifiers.{channel}"
+        self._gain, self._floor, self._slow = gain, _FLOOR * limit, slow
         self._least, self._most = math.inf, -math.inf  # A, in the calibration
 
     def begin(self, phase: Phase, sample_rate: float) -> None:
@@ -168,71 +185,58 @@ class CurrentAgreement(Limit):
         self._dt = 1.0 / sample_rate
         self._half = max(1, math.ceil(0.5 * _SETTLED * sample_rate))  # samples of half the window
         self._filled = 0
-        self._newer = self._older = (0.0, 0.0)  # A, least and largest of the window's halves
-        self._evidence = 0.0  # s
+        self._low = self._high = self._low_before = self._high_before = 0.0  # A, of the halves
+        self._excess = self._lack = 0.0  # s
 
     def check(self, samples: Samples) -> Trip | None:
         """Compare every sample with the commands before it."""
-        currents = getattr(samples, f"current_{self._name}").tolist()
+        currents: list[float] = getattr(samples, self._name).tolist()
         if self._learning:
             self._least = min(self._least, *currents)
             self._most = max(self._most, *currents)
             return None
-        wanted = (self._gain * getattr(samples, f"applied_voltage_{self._name}")).tolist()
-        speeds = np.abs(samples.omega).tolist()
-        for row, (current, ahead, speed) in enumerate(zip(currents, wanted, speeds, strict=True)):
-            low = min(self._newer[0], self._older[0])
-            high = max(self._newer[1], self._older[1])
-            self._evidence = max(
-                0.0, self._evidence + self._dt * self._against(current, low, high, speed)
-            )
-            self._extend(ahead)
-            if self._evidence > _EVIDENCE:
-                self._evidence = 0.0
+        rows = zip(
+            currents, getattr(samples, self._command).tolist(), samples.omega.tolist(), strict=True
+        )
+        for row, (current, volts, omega) in enumerate(rows):
+            low, high = min(self._low, self._low_before), max(self._high, self._high_before)
+            self._weigh(current, low, high, abs(omega) <= self._slow)
+            self._extend(self._gain * volts)
+            if self._excess > _EVIDENCE or self._lack > _EVIDENCE:
                 return row, self._reason(current, low, high)
         return None
 
-    def _against(self, current: float, low: float, high: float, speed: float) -> int:
-        """1 for a sample that speaks against the amplifier, -1 for it, 0 for neither."""
+    def _weigh(self, current: float, low: float, high: float, slow: bool) -> None:
+        """Gather evidence, in seconds for the worse or the better."""
         most, least = _EXCESS * max(high, 0.0), _EXCESS * min(low, 0.0)
-        return -1 if least - self._floor <= current <= most + self._floor else 1
-
-    def _reason(self, current: float, low: float, high: float) -> str:
-        return (
-            f"current_{self._name} is {current:.3g} A, and by amplifiers.{self._name} the command "
-            f"asked for {low:.3g} to {high:.3g} A in the last {1e3 * _SETTLED:g} ms. Check "
-            "amplifier and current sensor: gain, sign, an output that sticks"
-        )
-
-    def _extend(self, wanted: float) -> None:
-        """Take a command into the window."""
-        if self._filled == self._half:
-            self._older, self._newer = self._newer, (wanted, wanted)
-            self._filled = 0
-        self._newer = min(self._newer[0], wanted), max(self._newer[1], wanted)
-        self._filled += 1
-
-
-class CurrentLack(CurrentAgreement):
-    """An amplifier that gives less than half of what its command asks for.
-
-    slow: speed [rad/s] up to which it must give that; infinite for the brake's, without back EMF.
-    """
-
-    def __init__(self, name: str, gain: float, limit: float, slow: float) -> None:
-        super().__init__(name, gain, limit)
-        self._slow = slow
-
-    def _against(self, current: float, low: float, high: float, speed: float) -> int:
+        within = least - self._floor <= current <= most + self._floor
+        self._excess = max(0.0, self._excess + (-self._dt if within else self._dt))
         if high < 0.0:
             current, low = -current, -high
-        if low <= 1.5 * self._floor or speed > self._slow:
-            return 0
-        return 1 if current < _LACK * low else -1
+        if slow and low > _JUDGED * self._floor:
+            enough = current >= _LACK * low
+            self._lack = max(0.0, self._lack + (-self._dt if enough else self._dt))
 
     def _reason(self, current: float, low: float, high: float) -> str:
-        return (
-            f"current_{self._name} is {current:.3g} A, and by amplifiers.{self._name} the command "
-            f"asks for {low:.3g} to {high:.3g} A. Check whether the amplifier is on, its supply, "
-            "and that output and current sensor are connected"
+        comparison = (
+            f"{self._name} is {current:.3g} A, and by {self._amplifier} the command of the last "
+            f"{1e3 * _SETTLED:g} ms asks for {low:.3g} to {high:.3g} A"
         )
+        if self._excess > _EVIDENCE:
+            return (
+                f"{comparison}. Check amplifier and current sensor: gain, sign, an output that "
+                "sticks"
+            )
+        return (
+            f"{comparison}. Check whether the amplifier is on, its supply, and that its output and "
+            "the current sensor are connected"
+        )
+
+    def _extend(self, current: float) -> None:
+        """Take the current that a command asks for into the window, which has two halves."""
+        if self._filled == self._half:
+            self._low_before, self._high_before = self._low, self._high
+            self._low = self._high = current
+            self._filled = 0
+        self._low, self._high = min(self._low, current), max(self._high, current)
+        self._filled += 1

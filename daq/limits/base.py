@@ -24,7 +24,8 @@ class Limit(abc.ABC):
 
     Options: type[Section] | None = None
     stops: bool = True
-    """Whether the run ends. Else it goes on, the sample is flagged, and the record says why."""
+    """Whether it ends the run. Else ``check`` looks at all rows of a block all the same, the first
+    beyond is flagged, and the record and the end of the run say why."""
 
     def begin(self, phase: Phase, sample_rate: float) -> None:  # noqa: B027
         """A phase begins: ticks and time count from zero again. sample_rate in Hz."""

@@ -85,8 +85,8 @@ def first_trip(limits, whole, cuts=()):
     return None
 
 
-def limits_of(phase=Phase.RUN, calibrated=True, **changes):
-    limits = Limits(RigConfig(limits=changes))
+def limits_of(phase=Phase.RUN, calibrated=True, amplifiers=None, **changes):
+    limits = Limits(RigConfig(limits=changes, amplifiers=amplifiers or {}))
     limits.begin(Phase.CALIBRATION, RATE)
     if calibrated:
         limits.check(samples(800, theta=0.0, omega=0.0))
@@ -100,6 +100,7 @@ def step(at, before, after, n=400):
 
 RAMP = 1e-6 * np.arange(400)  # never twice the same
 STILL = {"theta": 3.0, "omega": 0.0}
+MOTOR, BRAKE = ({"amplifiers": {channel: 0.5}} for channel in ("motor", "brake"))
 CASES = {
     "motor current": ({}, {"current_motor": step(100, math.nan, -2.5)}, 100, "-2.5 A, beyond its"),
     "brake current": ({}, {"current_brake": step(50, 0.1, 0.22)}, 50, "limit of 0.21 A"),
@@ -135,6 +136,16 @@ CASES = {
         {"theta": step(99, 0.1 * np.arange(400), 9.9), "omega": step(99, 80.0, 0.0),
          "current_motor": 2.0 + RAMP, "current_brake": RAMP},
         99 + 11, "the encoder stands still at 3.99"),
+    # 50 ms after the last command that would explain it is out of the window.
+    "an output that sticks": (
+        MOTOR, {"current_motor": step(60, 0.0, 0.5) + RAMP, "applied_voltage_motor": 0.0},
+        60 + 39, "current_motor is 0.5 A, and by amplifiers.motor"),
+    "a turned current": (
+        MOTOR, {"current_motor": -0.4 - RAMP, "applied_voltage_motor": 0.8}, 39, "gain, sign, an output"
+    ),
+    "a dead brake": (
+        BRAKE, {"current_brake": step(200, 0.1, 0.0) + RAMP, "applied_voltage_brake": 0.2},
+        200 + 39, "Check whether the amplifier is on"),
     "a frozen torque": ({}, {"torque": step(60, math.nan, 0.01)}, 60 + 80, "its noise never let"),
     "a frozen motor current": (
         {}, {"current_motor": step(60, math.nan, 0.3)}, 60 + 80, "current_motor has read 0.3 to"),
@@ -163,6 +174,28 @@ def test_a_limit_trips_at_its_sample_with_the_reason(name, size):
     trip = first_trip(limits_of(**changes), whole, range(size, 400, size))
     assert trip is not None and trip[0] == tick
     assert reason in trip[1]
+
+
+def test_a_shaft_that_runs_against_its_motor_is_doubted_and_not_stopped():
+    limits = limits_of(speed=150.0, encoder={"stall": {"motor": 0.3}})
+    omega = -0.5 * np.arange(400)
+    whole = samples(
+        theta=np.cumsum(omega) / RATE, omega=omega, current_motor=1.0 + RAMP, current_brake=RAMP
+    )
+    assert first_trip(limits, part(whole, slice(0, 290)), range(7, 290, 7)) is None
+    (doubt,) = limits.doubts
+    assert doubt.phase == "run" and "against the motor's current" in doubt.reason
+    # A fifth of the limit is 30 rad/s, of which a sample brings 0.5.
+    assert doubt.tick == 61
+    assert np.flatnonzero(whole.flags)[0] == 61
+
+
+def test_an_amplifier_without_voltage_at_speed_is_none_that_is_dead():
+    columns = {"theta": 0.1 * np.arange(400), "current_motor": 0.1 + RAMP}
+    columns["applied_voltage_motor"] = 2.0
+    assert first_trip(limits_of(speed=150.0, **MOTOR), samples(**columns)) is None
+    slow = columns | {"theta": 0.001 * np.arange(400)}
+    assert first_trip(limits_of(speed=150.0, **MOTOR), samples(**slow)) is not None
 
 
 @given(st.lists(st.integers(1, 399), max_size=12), st.sampled_from(sorted(CASES)))
