@@ -33,9 +33,7 @@ class _Loader(_FastLoader):  # type: ignore[misc]
         except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError):
             kind = node.tag.rpartition(":")[2]
             problem = f"this is no {_TAGS.get(kind, kind)}; put text in quotes"
-            raise yaml.constructor.ConstructorError(
-                None, None, problem, node.start_mark
-            ) from None
+            raise yaml.constructor.ConstructorError(None, None, problem, node.start_mark) from None
 
 
 _TAGS = {"int": "whole number", "float": "number", "bool": "truth value", "timestamp": "date"}

@@ -115,6 +115,15 @@ columns:
     y: {column: theta}
 """
 
+ROWS = "t,cmd_voltage_motor,theta\n"
+
+
+def foreign_log(name, rows, *said):
+    """A log of rows for the columns of ``id.yaml``."""
+    files = {"id.yaml": COLUMNS, "log.csv": ROWS + "".join(f"{row}\n" for row in rows)}
+    return Case(name, ["identify", "log.csv", "--config", "id.yaml"], list(said), files)
+
+
 ALIASES = "a0: &a0 [0]\n" + "".join(
     f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]\n" for k in range(1, 9)
 )
@@ -434,6 +443,21 @@ CASES = [
         "log.csv:1: column 'torque' is missing; did you mean 'torq'?", "--config"),
     log("a log with NaN", original_text().replace("0.75", "nan"),
         "log.csv:5: current_motor: 'nan' is not a finite number", "remove these lines"),
+    foreign_log("an infinite output", ["0,1,0", "0.1,1,1e999", "0.2,1,3"],
+                "log.csv:3: theta: '1e999' is not a finite number"),
+    foreign_log("an infinite input", ["0,1,0", "0.1,inf,1", "0.2,1,3"],
+                "log.csv:3: cmd_voltage_motor: 'inf' is not a finite number"),
+    foreign_log("a complex output", ["0,1,0", "0.1,1,1+2j", "0.2,1,3"],
+                "log.csv:3: theta: '1+2j' is not a finite number"),
+    foreign_log("a time that stands still", ["0,1,0", "0.1,1,1", "0.1,1,3"],
+                "log.csv:4: t: time does not advance from the line before"),
+    foreign_log("an output of zero", [f"{0.1 * k:.1f},{k % 2},0" for k in range(20)],
+                "log: y is 0 throughout, so that there is no deviation to explain; was the sensor"),
+    foreign_log("an output that never changes", [f"{0.1 * k:.1f},{k % 2},3" for k in range(20)],
+                "log: y is 3 throughout, so that there is no deviation to explain; was the sensor"),
+    foreign_log("a log of two rows", ["0,1,0", "0.1,1,1"],
+                "log: too short, with 1 measured value behind the first row for 1 unknown; give a",
+                "give a longer record"),
     log("a binary log", b"\x89PNG\r\n\x1a\n\x00", "log.csv:1: not a text file"),
     Case("a broken run record", ["identify", "run"],
          ["run.json:1:2: not a readable run record", "move it away"],
