@@ -128,9 +128,7 @@ class _Budget:
             levels, values = marked.levels, marked.values
             self._unclosed[-1].add(levels, values)
             if self._n_values + values > MOST_VALUES:
-                problem = (
-                    f"aliases (*name) make more than {MOST_VALUES} keys and values of this file"
-                )
+                problem = f"aliases (*name) make more than {MOST_VALUES} keys and values of it"
                 return problem, "write out what is meant"
         else:
             return None

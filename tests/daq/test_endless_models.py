@@ -27,8 +27,8 @@ def test_equations_without_end_are_refused_by_their_line(tmp_path):
     assert done.returncode == 2
     assert re.match(
         r"rig: model\.py:[5-9]: model lag: derivative\(x, u, p\) fails at the nominal parameters: "
-        r"TimeoutError: it has no end within 2 s of computing and is at line [5-9] of \S*model\.py, "
-        r"in derivative; give every loop an end, such as 'for _ in range\(50\)'\n$",
+        r"TimeoutError: it has no end within 2 s of computing and is at line [5-9] of \S*model\.py"
+        r", in derivative; give every loop an end, such as 'for _ in range\(50\)'\n$",
         done.stderr,
     ), done.stderr
 
@@ -86,10 +86,9 @@ def test_ctrl_c_ends_a_model_file_without_end(tmp_path):
 def test_limits_within_limits_leave_signals_and_timers_as_they_were():
     handler, timer = signal.getsignal(signal.SIGPROF), signal.getitimer(signal.ITIMER_PROF)
     with time_limit(30.0):
-        with pytest.raises(TimeoutError, match=r"no end within 0\.01 s .* in test_limits_within"):
-            with time_limit(0.01):
-                while True:
-                    pass
+        with pytest.raises(TimeoutError, match=r"0\.01 s .* in test_limits"), time_limit(0.01):
+            while True:
+                pass
         left, _ = signal.getitimer(signal.ITIMER_PROF)
         assert 0.0 < left <= 30.1
     assert signal.getsignal(signal.SIGPROF) is handler
