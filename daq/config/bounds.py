@@ -73,6 +73,7 @@ def check_yaml(
         problem = budget.spend(event)
         if problem is not None:
             mark = event.start_mark
+            assert mark is not None  # of a parser's event it never is
             raise ConfigError.of([Mistake(*problem, path, mark.line + 1, mark.column + 1)])
 
 
@@ -114,7 +115,8 @@ class _Budget:
         """Problem and cure where an event passes one of the bounds."""
         levels, values, digits = 0, 1, 0
         if isinstance(event, yaml.CollectionEndEvent):
-            return self._close()
+            self._close()
+            return None
         if isinstance(event, yaml.CollectionStartEvent):
             self._unclosed.append(_Section(event.anchor))
         elif isinstance(event, yaml.ScalarEvent):
@@ -124,7 +126,7 @@ class _Budget:
             if any(event.anchor == section.anchor for section in self._unclosed):
                 problem = f"alias *{event.anchor} stands inside its own anchor &{event.anchor}"
                 return problem, "write out what is meant"
-            marked = self._marked.get(event.anchor, _Section(levels=0))
+            marked = self._marked.get(event.anchor or "", _Section(levels=0))
             levels, values = marked.levels, marked.values
             self._unclosed[-1].add(levels, values)
             if self._n_values + values > MOST_VALUES:
