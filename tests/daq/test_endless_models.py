@@ -2,11 +2,13 @@
 
 import re
 import signal
+import subprocess
+import sys
 
 import pytest
 
 from sysid.time_limit import time_limit
-from tests.daq.support import rig, start_rig, until
+from tests.daq.support import environment, rig, start_rig, until
 from tests.daq.test_bad_input import COLUMNS, MODEL
 from tests.daq.test_log import original_text
 
@@ -50,12 +52,13 @@ def test_equations_without_end_are_refused_by_their_line(tmp_path):
             [(DERIVATIVE, f"{DERIVATIVE}    while p[0] < 0.02:\n        pass\n")],
             "model lag at {'tau': 0.01}: it has no end within 2 s of computing and is at line",
         ),
-        (
+        pytest.param(
             [
                 ("model = Process", f"def guesses(records, known):\n{LOOP}\n\nmodel = Process"),
                 ("derivative=", "guesses=guesses,\n    derivative="),
             ],
             "guesses(records, known) fails: TimeoutError: it has no end within 30 s of computing",
+            marks=pytest.mark.soak,
         ),
     ],
     ids=["constraint", "range", "guesses"],
@@ -93,3 +96,41 @@ def test_limits_within_limits_leave_signals_and_timers_as_they_were():
         assert 0.0 < left <= 30.1
     assert signal.getsignal(signal.SIGPROF) is handler
     assert signal.getitimer(signal.ITIMER_PROF) == timer
+
+
+# It interrupts itself once its loop runs, in machine code that holds no lock of Python's.
+STUCK = """\
+import os, signal, threading, time
+import numba, numpy as np
+from daq.cli.interrupt import heeded
+
+turns = np.zeros(1)
+
+
+@numba.njit(nogil=True)
+def endless(turns):
+    while turns[0] >= 0.0:
+        turns[0] += 1e-3
+
+
+def interrupt():
+    while turns[0] < 1.0:
+        time.sleep(0.001)
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+threading.Thread(target=interrupt).start()
+with heeded():
+    endless(turns)
+"""
+
+
+@pytest.mark.soak
+def test_ctrl_c_ends_compiled_equations_without_end():
+    done = subprocess.run(
+        [sys.executable, "-c", STUCK], env=environment(), capture_output=True, text=True,
+        timeout=120, check=False,
+    )  # fmt: skip
+    said = "rig: stopped by Ctrl-C, in compiled equations that have no end; give every loop in"
+    assert done.returncode == 1
+    assert done.stderr.startswith(said)
