@@ -137,7 +137,7 @@ class Dataset:
 
 
 def require_information(datasets: list[Dataset], names: Sequence[str], n_free: int) -> None:
-    """Raise ModelError for records that no parameter can be fitted to.
+    """Raise ModelError for records that determine nothing.
 
     names: of the outputs. n_free: how many numbers are to be fitted. A first row tells where a
     simulation starts, and no more; an output that never changes has no deviation to explain.
