@@ -30,7 +30,7 @@ def time_limit(seconds: float) -> Iterator[None]:
     ...     while True:
     ...         pass
     Traceback (most recent call last):
-    TimeoutError: it has no end within 0.01 s of computing and is at line 3 of <doctest ...
+    TimeoutError: it has no end within 0.01 s of computing and is at line ... of <doctest ...
     """
     if sys.platform == "win32" or threading.current_thread() is not threading.main_thread():
         yield

@@ -104,13 +104,15 @@ import os, signal, threading, time
 import numba, numpy as np
 from daq.cli.interrupt import heeded
 
-turns = np.zeros(1)
+turns = np.zeros(2)
 
 
 @numba.njit(nogil=True)
 def endless(turns):
-    while turns[0] >= 0.0:
-        turns[0] += 1e-3
+    k = 0
+    while turns[0] >= 0.0:  # at places in turn, so that every turn is written
+        turns[k & 1] += 1e-3
+        k += 1
 
 
 def interrupt():
