@@ -3,6 +3,7 @@
 import functools
 import sys
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from inspect import Parameter, signature
 from typing import Annotated, Any
 
@@ -16,6 +17,7 @@ from daq.cli.emulate import emulate
 from daq.cli.figures import figures
 from daq.cli.identify import identify
 from daq.cli.init import init
+from daq.cli.interrupt import heeded
 from daq.cli.models import models
 from daq.cli.ports import ports
 from daq.cli.replay import replay
@@ -44,12 +46,17 @@ _COMMANDS: tuple[tuple[Callable[..., None], str], ...] = (
     (ports, "rig ports"),
     (doctor, "rig doctor /dev/ttyACM0"),
 )
+_COMPUTING = {identify, campaign, replay, figures}  # that drive no rig
 _QUIET = Option("--quiet", "-q", help="Results and warnings only: no progress, no hints.")
 _VERBOSE = Option("--verbose", "-v", help="Also which files and plugins are used.")
 _VOLUME_OPTIONS = [
     Parameter(name, Parameter.KEYWORD_ONLY, default=False, annotation=Annotated[bool, option])
     for name, option in (("quiet", _QUIET), ("verbose", _VERBOSE))
 ]
+
+
+def _interruptible(command: Callable[..., None]) -> AbstractContextManager[None]:
+    return heeded() if command in _COMPUTING else nullcontext()
 
 
 def _with_volume(function: Callable[..., None]) -> Callable[..., None]:
@@ -60,7 +67,7 @@ def _with_volume(function: Callable[..., None]) -> Callable[..., None]:
         if quiet and verbose:
             raise BadParameter("give --quiet or --verbose, not both")
         level = Volume.QUIET if quiet else Volume.VERBOSE if verbose else Volume.NORMAL
-        with output(level, options.get("json", False)):
+        with output(level, options.get("json", False)), _interruptible(function):
             function(*args, **options)
 
     # Typer reads the options from the signature and the annotations.

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from typer import Option
 
 from daq.cli import options, terminal
+from daq.cli.interrupt import heeded
 
 if TYPE_CHECKING:
     from daq.identification.settings import Problem
@@ -66,7 +67,7 @@ def _identify(problem: Problem, result: SessionResult, report: bool, json: bool)
 
     validation = [result.validation.folder] if result.validation is not None else []
     folder = result.run.folder / "identification"
-    with terminal.watching(json) as watch:
+    with terminal.watching(json) as watch, heeded():
         identification = fit(problem, [result.run.folder], validation, folder, watch)
     return show_identification(identification, report, json)
 

@@ -17,6 +17,7 @@ from daq.errors import ConfigError, Mistake, suggestion
 
 Model = TypeVar("Model", bound=BaseModel)
 Complaint = tuple[str, str]  # problem and cure
+_MANY = 20  # mistakes that are told one by one
 _SHOWN = 60  # characters of a value in a message
 _DEEPEST = 6  # levels of sections in which a misplaced key is looked for
 
@@ -45,17 +46,32 @@ def mistakes(
     try:
         model.model_validate(content)
     except ValidationError as error:
-        return _Explainer(file, model, content, at).mistakes(error.errors())
+        errors = error.errors(include_url=False)
+        first = _Explainer(file, model, content, at).mistakes(errors[:_MANY])
+        return [*first, _More("", file=file.path, count=len(errors) - _MANY)]
     return []
 
 
+@dataclass(frozen=True)
+class _More(Mistake):
+    """In place of mistakes beyond those that are explained, none where the count is not above 0."""
+
+    count: int = 0
+
+
 def refuse(mistakes: Sequence[Mistake]) -> None:
-    """Raise a ConfigError of all mistakes, if any: what was typed, then in the file's order."""
-    if mistakes:
-        ordered = sorted(
-            set(mistakes), key=lambda each: (each.line or 0, each.column or 0, each.text)
-        )
-        raise ConfigError.of(ordered)
+    """Raise a ConfigError of the mistakes, if any: what was typed, then in the file's order.
+
+    Of more than anybody reads at once, it has the first and the number of the others.
+    """
+    plain = {mistake for mistake in mistakes if not isinstance(mistake, _More)}
+    if not plain:
+        return
+    ordered = sorted(plain, key=lambda each: (each.line or 0, each.column or 0, each.text))
+    n_more = sum(max(each.count, 0) for each in mistakes if isinstance(each, _More))
+    n_more += len(ordered[_MANY:])
+    summary = [Mistake(f"and {n_more} more mistakes", file=ordered[0].file)] if n_more else []
+    raise ConfigError.of([*ordered[:_MANY], *summary])
 
 
 # Keys by which each kind of file is known when it is given in another's place, and the cure.

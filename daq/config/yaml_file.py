@@ -9,20 +9,34 @@ from typing import Any, Self
 
 import yaml
 
+from daq.config import bounds
 from daq.errors import ConfigError, Mistake, RigError
 
 Key = tuple[str | int, ...]
-_DEEPEST = 20  # levels of nesting
-_MOST_COPIES = 10_000  # of keys and values by aliases; a few lines of them could make billions
+_LONG = 50_000  # characters that PyYAML's own parser would take a while for
+_SHOWN = 60  # characters of a setting in a message
 _LISTED = 8  # line numbers in a message
 _TYPED = "command line"  # in place of a file's name
 _LOOK = "{problem}; check the indentation, colons and quotes here and in the line before"
 
 
-class _Loader(yaml.SafeLoader):
+_FastLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # not every PyYAML has it
+
+
+class _Loader(_FastLoader):  # type: ignore[misc]
     """Safe YAML in which 1e-3 is a number, as everybody but YAML 1.1 expects."""
 
+    def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
+        """The value of a node; a ConstructorError also for text that is none of its tag's."""
+        try:
+            return super().construct_object(node, deep)
+        except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError):
+            kind = node.tag.rpartition(":")[2]
+            problem = f"this is no {_TAGS.get(kind, kind)}; put text in quotes"
+            raise yaml.constructor.ConstructorError(None, None, problem, node.start_mark) from None
 
+
+_TAGS = {"int": "whole number", "float": "number", "bool": "truth value", "timestamp": "date"}
 _Loader.yaml_implicit_resolvers = {
     key: list(value) for key, value in yaml.SafeLoader.yaml_implicit_resolvers.items()
 }
@@ -123,12 +137,16 @@ def _setting(text: str) -> dict[str, Any]:
     """``a.b=value`` as {a: {b: value}}, the value read as YAML."""
     name, equals, value = text.partition("=")
     keys = [part.strip() for part in name.split(".")]
-    if not equals or not all(keys):
-        raise ConfigError("write KEY=VALUE, for example ranges.K_m=[0.1,0.2]", key=f"--set {text}")
+    option = f"--set {_short(text)}"
+    if not equals or not all(keys) or len(keys) > bounds.DEEPEST:
+        raise ConfigError("write KEY=VALUE, for example ranges.K_m=[0.1,0.2]", key=option)
     try:
-        content: Any = yaml.load(value, Loader=_Loader)
+        content: Any = _built(value, None)[1]
     except yaml.YAMLError:
-        raise ConfigError(f"{value!r} is not valid YAML", key=f"--set {text}") from None
+        raise ConfigError(f"{_short(value)!r} is not valid YAML", key=option) from None
+    except ConfigError as error:
+        problem, cure = error.mistakes[0].problem, error.cure
+        raise ConfigError(problem, cure=cure, key=option) from None
     for key in reversed(keys[1:]):
         content = {key: content}
     return {keys[0]: content}
@@ -143,32 +161,52 @@ def load(path: Path) -> YamlFile:
     """Read a YAML mapping; ConfigError when it is missing, unreadable or malformed."""
     text = _text_of(path)
     try:
-        node = yaml.compose(text, Loader=_Loader)
-        content = yaml.load(text, Loader=_Loader)
+        places, content = _built(text, path)
     except yaml.YAMLError as error:
-        raise ConfigError.of([_syntax_mistake(path, text, error)]) from None
+        raise ConfigError.of([_syntax_mistake(path, text, _explicable(error, text))]) from None
     if content is None:
         raise ConfigError("the file is empty", cure="it must hold 'key: value' lines", file=path)
-    if not isinstance(node, yaml.MappingNode) or not isinstance(content, dict):
+    if not isinstance(content, dict):
         problem = f"expected 'key: value' lines, found {_kind(content)}"
         raise ConfigError(problem, file=path, line=1, column=1)
-    places = _Places(path)
-    places.collect(node, ())
     return YamlFile(path, content, places.places, tuple(places.repeated))
+
+
+def _built(text: str, path: Path | None) -> tuple["_Places", Any]:
+    """Places of a text's keys and what it says; YAMLError, or ConfigError beyond the bounds."""
+    loader = _Loader(text)
+
+    def tag_of(scalar: yaml.ScalarEvent) -> Any:
+        return scalar.tag or loader.resolve(yaml.ScalarNode, scalar.value, scalar.implicit)
+
+    bounds.check_yaml(yaml.parse(text, Loader=_Loader), tag_of, path)
+    node, places = loader.get_single_node(), _Places(path)
+    if node is None:
+        return places, None
+    # Before the mappings that << merges are put in.
+    places.collect(node, ())
+    return places, loader.construct_document(node)
+
+
+def _explicable(error: yaml.YAMLError, text: str) -> yaml.YAMLError:
+    """The same error in the words of PyYAML's own parser, which ``_CURES`` explains."""
+    if isinstance(error, yaml.MarkedYAMLError) and len(text) < _LONG:
+        try:
+            for _ in yaml.parse(text, Loader=yaml.SafeLoader):
+                pass
+        except yaml.YAMLError as explicable:
+            return explicable
+    return error
 
 
 def _text_of(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8")
+        return bounds.text_of(path)
     except FileNotFoundError:
         cure = nearest_file(path) or "check its name"
         raise ConfigError("there is no such file", cure=cure, file=path) from None
     except IsADirectoryError:
         raise ConfigError("this is a folder", cure="name a YAML file", file=path) from None
-    except UnicodeDecodeError as error:
-        line = error.object[: error.start].count(b"\n") + 1
-        cure = "save the file with this encoding, or name the right one"
-        raise ConfigError("not text in UTF-8", cure=cure, file=path, line=line) from None
     except OSError as error:
         raise ConfigError(f"cannot be read: {error.strerror}", file=path) from None
 
@@ -199,24 +237,13 @@ def nearest_file(path: Path, shipped: Sequence[str] = ()) -> str:
 class _Places:
     """Where each key of a file stands."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path | None) -> None:
         self.places: dict[Key, tuple[int, int]] = {}
         self.repeated: list[Mistake] = []
         self._path = path
-        self._met: set[int] = set()
-        self._copies = 0
 
     def collect(self, node: yaml.Node, key: Key) -> None:
-        """Note the places of all keys below a node; ConfigError where there is no end to them."""
-        line = node.start_mark.line + 1
-        if len(key) > _DEEPEST:
-            cure = "does an alias (*name) stand inside its own anchor (&name)?"
-            raise ConfigError("nested too deeply", cure=cure, file=self._path, line=line)
-        self._copies += id(node) in self._met
-        self._met.add(id(node))
-        if self._copies > _MOST_COPIES:
-            problem = f"aliases (*name) repeat this more than {_MOST_COPIES} times over"
-            raise ConfigError(problem, cure="write out what is meant", file=self._path, line=line)
+        """Note the places of all keys below a node, those that aliases repeat among them."""
         self.places.setdefault(key, _place(node))
         if isinstance(node, yaml.MappingNode):
             self._mapping(node, key)
@@ -267,6 +294,7 @@ _CURES = {
     "text that begins with * in quotes",
     "found character": "{problem}; put text that begins so in quotes",
     "but found another document": "a second document begins with '---'; keep one in a file",
+    "this is no": "{problem}",
     "could not determine a constructor": "text behind '!' is a tag, of which none is known here; "
     "leave it out, or put text that begins so in quotes",
 }
@@ -292,4 +320,8 @@ def _syntax_mistake(path: Path, text: str, error: yaml.YAMLError) -> Mistake:
 def _kind(content: object) -> str:
     if isinstance(content, str):
         return "plain text; write a space behind each colon"
-    return "a list" if isinstance(content, list) else repr(content)
+    return "a list" if isinstance(content, list) else _short(repr(content))
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= _SHOWN else f"{text[: _SHOWN - 3]}..."

@@ -18,10 +18,11 @@ from daq.identification.settings import Problem, gassi_settings, problem_of
 from daq.logs.capture import LOG_NAME
 from daq.logs.recording import Recording, log_path
 from daq.progress import Progress, Watch, ignore, warn
-from sysid import ModelError, ProcessModel
+from sysid import ModelError, ProcessModel, SearchSpace
 from sysid.gassi import GASSI, PRESETS
 from sysid.gassi import Progress as SearchProgress
 from sysid.judging.assessment import examine
+from sysid.problem.data import require_information
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -110,6 +111,7 @@ def fit(
     train, check = load_logs(problem, training, validation)
     warn(watch, *(log.warning for log in (*train, *check)))
     train, ends = records.hold_back(train, problem.settings.hold_back)
+    _require_information(problem, train)
     if folder is not None and not resume:
         request.remember(folder, problem.request, _paths(training), _paths(validation))
     estimator = _searched(problem, train, folder, watch, resume)
@@ -119,6 +121,18 @@ def fit(
         if not result.interrupted:
             request.forget(folder)
     return result
+
+
+def _require_information(problem: Problem, train: Sequence[LoggedRecord]) -> None:
+    """Raise ConfigError, before anything is written, for logs that determine nothing."""
+    settings, model = problem.settings, problem.model
+    space = SearchSpace.of(
+        model, settings.ranges, settings.fixed, tied=settings.tied, scale=settings.scale
+    )
+    try:
+        require_information([log.dataset for log in train], model.output_names, len(space.names))
+    except ModelError as error:
+        raise ConfigError(str(error), file=train[0].path) from None
 
 
 def load_logs(problem: Problem, training: Sequence[Source], validation: Sequence[Source]) -> Split:

@@ -19,7 +19,7 @@ from daq.logs.capture import LOG_NAME
 from daq.logs.recording import Recording, end_of_run, log_path, read_record
 from daq.logs.recording import load as load_recording
 from daq.logs.table import column_names, read_table
-from daq.logs.time_base import require_rows, time_base
+from daq.logs.time_base import refuse_rows, require_rows, time_base
 from sysid.problem.data import Dataset
 from sysid.problem.model import Input, ModelError, Output, ProcessModel
 
@@ -88,11 +88,19 @@ def from_frame(frame: pd.DataFrame, name: str, model: ProcessModel) -> LoggedRec
             cure = f"the table has {', '.join(map(str, frame.columns))}. Rename or add it"
             problem = f"model {model.name} needs the column {column!r}"
             raise ConfigError(problem, cure=cure, file=name)
+        if frame[column].dtype.kind == "c":
+            cure = "give real numbers, such as its .real"
+            raise ConfigError("its numbers are complex", cure=cure, file=name, key=column)
     require_rows(path, len(frame))
     try:
         numbers = frame.loc[:, list(wanted)].astype(np.float64)
     except (TypeError, ValueError) as error:
         raise ConfigError(f"a column is not of numbers: {error}", file=name) from None
+    for column in wanted:
+        values, is_output = numbers[column].to_numpy(), column in model.output_names
+        wrong = np.isinf(values) if is_output else ~np.isfinite(values)
+        cure = "NaN stands for what was not measured" if is_output else "remove these rows"
+        refuse_rows(path, wrong, "it is not finite", 0, column, cure)
     tick, dt = time_base(path, numbers["t"].to_numpy(), first_line=0)
     log = Recording(path, numbers.assign(tick=tick), dt)
     return LoggedRecord(_from_log(log, model, name), path, None)

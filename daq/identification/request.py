@@ -8,11 +8,13 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from daq.config import json_file
 from daq.errors import ConfigError
 from daq.files import make_folder, write_whole
 
 CHECKPOINT = "search.ckpt"  # the search's state, in the folder of its results
 _REQUEST = "search.json"
+_ANEW = "delete it and identify anew"
 
 
 @dataclass(frozen=True)
@@ -55,12 +57,13 @@ def recall(folder: Path) -> tuple[Path, SettingsRequest, list[Path], list[Path]]
         if not (place / _REQUEST).exists():
             continue
         try:
-            content = json.loads((place / _REQUEST).read_text(encoding="utf-8"))
+            content = json_file.load(place / _REQUEST, "request", _ANEW)
             settings = SettingsRequest(**content["asked"])
             training = [Path(path) for path in content["training"]]
             return place, settings, training, [Path(path) for path in content["validation"]]
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise ConfigError(f"cannot be read: {error}", file=place / _REQUEST) from None
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            problem = f"not a readable request ({type(error).__name__}: {error})"
+            raise ConfigError(problem, cure=_ANEW, file=place / _REQUEST) from None
     cure = "name the folder that its results were to go to"
     raise ConfigError("no identification was interrupted there", cure=cure, file=folder)
 

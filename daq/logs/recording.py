@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from daq.config import json_file
 from daq.errors import ConfigError
 from daq.hal import Samples
 from daq.logs.capture import COMPLETED, LOG_NAME, RUN_NAME, RUNNING
@@ -126,14 +126,7 @@ def read_record(csv: Path) -> dict[str, Any] | None:
     path = csv.parent / RUN_NAME
     if csv.name != LOG_NAME or not path.exists():
         return None
-    cure = "move it away to use the log alone"
-    try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"not a readable run record ({error})", cure=cure, file=path) from None
-    if not isinstance(record, dict):
-        raise ConfigError("not a run record", cure=cure, file=path)
-    return record
+    return json_file.load(path, "run record", "move it away to use the log alone")
 
 
 def settings_of(record: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:

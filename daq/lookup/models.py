@@ -10,6 +10,7 @@ from daq.errors import ConfigError, suggestion
 from daq.lookup.user_code import from_file, locate
 from daq.plugins import load_plugin
 from sysid import ModelError, ProcessModel
+from sysid.time_limit import AT_LENGTH, time_limit
 
 DEFAULT_MODEL = "actuator"
 
@@ -121,7 +122,8 @@ def _call_factory(factory: Callable[..., Any], where: str, text: str) -> Any:
             raise ConfigError(f"{where} has no option {key!r}", cure=suggestion(key, names))
     try:
         # Turns text into what the function's annotations ask for.
-        return _validated(factory)(**options) if options else factory()
+        with time_limit(AT_LENGTH):
+            return _validated(factory)(**options) if options else factory()
     except ValidationError as error:
         first = error.errors()[0]
         key = str(first["loc"][0]) if first["loc"] else "its options"

@@ -11,6 +11,7 @@ from daq.config.yaml_file import nearest_file
 from daq.errors import USER_CODE_ERRORS, ConfigError, line_in, same_file, suggestion
 from daq.plugins import Kind
 from sysid.problem.model import ModelError
+from sysid.time_limit import AT_LENGTH, time_limit
 
 
 def locate(path: Path, kind: Kind, relative_to: Path | None = None) -> Path:
@@ -47,7 +48,8 @@ def _import(path: Path, kind: Kind) -> ModuleType:
     # Typed settings look up the module that their annotations are written in.
     sys.modules[spec.name] = module
     try:
-        spec.loader.exec_module(module)
+        with time_limit(AT_LENGTH):
+            spec.loader.exec_module(module)
     except USER_CODE_ERRORS as error:
         del sys.modules[spec.name]
         problem = str(error)

@@ -1,15 +1,16 @@
 """The figures of an identification's report: which are drawn, from which arrays."""
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from matplotlib.figure import Figure
 
+from daq.errors import ConfigError
 from daq.figures import style
 from daq.figures.bode import ComplexArray, bode
 from daq.figures.findings import plot
@@ -29,14 +30,17 @@ from sysid.arrays import FloatArray
 from sysid.judging.residual_tests import residual_test
 from sysid.problem.metrics import mean_known
 from sysid.problem.model import ProcessModel
-from sysid.problem.plots import Evidence
+from sysid.problem.plots import Evidence, Plot
 from sysid.response.frequency import FrequencyResponse, frequency_response, sampled_response
+from sysid.time_limit import AT_LENGTH, time_limit
 
 _OUTPUTS_A_FIGURE = 4
 _LOGS_A_PART = 3  # of more logs the worst, the middle and the best are shown
 _COHERENT = 0.5  # coherence above which an input is seen in an output
 _FEWEST_COHERENT = 4  # frequencies at which it must be, for a Bode plot
 
+Given = TypeVar("Given")
+Drawn = TypeVar("Drawn")
 FreeRun = tuple[LoggedRecord, FloatArray]  # a log and the model's outputs, (n_samples, n_outputs)
 
 
@@ -269,7 +273,7 @@ def _model_responses(subject: Subject, frequency: FloatArray) -> dict[str, Compl
         ]
         curves["identified"] = frequency_response(simulated).response
     u = np.concatenate([record.inputs for record in records]).mean(axis=0)
-    points = model.operating_points(model, records) if model.operating_points else {}
+    points = _by_model(model, model.operating_points, records) if model.operating_points else {}
     for name, held in (points or {"linear, mean inputs": {}}).items():
         response = _linear_response(subject, u, held, frequency, records[0].dt)
         if response is not None:
@@ -283,20 +287,26 @@ def _linear_response(
     """Of the model linearised at constant inputs u; None without an equilibrium there."""
     model, p = subject.model, subject.vector
     try:
-        linear = linearize(model, equilibrium(model, u, p, hold=dict(held)), u, p)
+        with time_limit(AT_LENGTH):
+            linear = linearize(model, equilibrium(model, u, p, hold=dict(held)), u, p)
         response = sampled_response(linear, frequency, dt, [i.hold for i in model.inputs])
-    except (ModelError, ArithmeticError, ValueError, np.linalg.LinAlgError):
+    except (ModelError, ArithmeticError, TimeoutError, ValueError, np.linalg.LinAlgError):
         return None  # singular there; the other curves say what there is
     return response if np.isfinite(response).all() else None
 
 
 def _plots_of_model(subject: Subject) -> Iterator[Picture]:
     """Plots that the process model brings along."""
-    if subject.model.plots is None:
+    plots = subject.model.plots
+    if plots is None:
         return
     log = {} if subject.foreign else _columns(subject.training[0][0])
     records = [logged.dataset for logged, _ in subject.training]
-    for item in subject.model.plots(subject.model, Evidence(subject.vector, records, log)):
+
+    def drawn(model: ProcessModel, evidence: Evidence) -> list[Plot]:
+        return list(plots(model, evidence))
+
+    for item in _by_model(subject.model, drawn, Evidence(subject.vector, records, log)):
         yield Picture(
             item.name, item.topic, item.caption,
             plot(
@@ -305,6 +315,18 @@ def _plots_of_model(subject: Subject) -> Iterator[Picture]:
                 {curve.label: curve.values for curve in item.curves}, item.points,
             ),
         )  # fmt: skip
+
+
+def _by_model(
+    model: ProcessModel, function: Callable[[ProcessModel, Given], Drawn], given: Given
+) -> Drawn:
+    """What a model's own function returns; ConfigError where it fails or does not end."""
+    try:
+        with time_limit(AT_LENGTH):
+            return function(model, given)
+    except Exception as error:
+        problem = f"model {model.name}: its figures fail: {type(error).__name__}: {error}"
+        raise ConfigError(problem, cure="mend them, or give --no-report") from error
 
 
 def _chosen(logs: Sequence[FreeRun]) -> list[tuple[int, str]]:

@@ -1,11 +1,11 @@
 """The figures of a finished identification's report, in other formats."""
 
 import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from daq.config import json_file
 from daq.errors import ConfigError
 from daq.figures.style import FORMATS
 from daq.identification import records
@@ -59,7 +59,7 @@ def _report_in(folder: Path) -> Path:
 
 def _subject(source: Path) -> Subject:
     try:
-        return _restored(json.loads(source.read_text(encoding="utf-8")), source)
+        return _restored(json_file.load(source, "report", _AGAIN), source)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ConfigError(
             f"not a readable report ({type(error).__name__}: {error})", cure=_AGAIN, file=source

@@ -18,7 +18,7 @@ from sysid.gassi.checkpoint import Checkpoint, load, origin
 from sysid.gassi.genetic_search import PRESETS, GeneticSearch, Preset, PresetName
 from sysid.gassi.likelihood import fit_likelihood
 from sysid.gassi.search_run import Best, SearchRun
-from sysid.problem.data import Dataset
+from sysid.problem.data import Dataset, require_information
 from sysid.problem.guesses import Guess, guess_ranges
 from sysid.problem.metrics import fit_percent
 from sysid.problem.model import ModelError, ProcessModel, Scale
@@ -162,8 +162,8 @@ class GASSI(RecordEstimator):
         resume: such a file to go on from, to the same result; further checkpoints go to the same
         file unless another is named.
 
-        Raises ModelError when every simulation of the first generation fails, for settings that
-        make no sense, or for a checkpoint of other data, settings or model.
+        Raises ModelError when every simulation of the first generation fails, for records without
+        information, settings that make no sense, or a checkpoint of other data, settings or model.
         """
         data = self._records(X, y, records, None, reset=True)
         model, preset = self._model(), self._preset()
@@ -175,7 +175,9 @@ class GASSI(RecordEstimator):
         self.space_ = SearchSpace.of(
             model, ranges, self.fixed, preset.log_scale, tied=self.tied, scale=self.scale
         )
+        model.require_ends(self.space_.full(np.array([self.space_.lower, self.space_.upper])))
         objective = self._objective(data)
+        require_information(data, model.output_names, len(self.space_.names))
         self.output_weights_: FloatArray = objective.weights
         self._rivals: tuple[FloatArray, ...] = ()
         self._final_accuracy = self.accuracy

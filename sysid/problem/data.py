@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from sysid.arrays import FloatArray
+from sysid.arrays import BoolArray, FloatArray
 from sysid.problem.model import AROUND_FIRST_SAMPLE, ModelError, ProcessModel
 
 
@@ -21,7 +22,8 @@ class Dataset:
     (n_inputs,), standard deviation of the white noise on measured inputs. Default none; they
     widen the intervals of what is identified.
 
-    Raises ModelError for mismatched shapes, fewer than two rows, or inputs that are not finite.
+    Raises ModelError for mismatched shapes, fewer than two rows, complex numbers, inputs that are
+    not finite, or infinite outputs.
 
     >>> record = Dataset(inputs=np.ones(5), outputs=np.arange(5.0), dt=0.01, name="ramp")
     >>> record.n_samples, record.outputs.shape
@@ -38,8 +40,7 @@ class Dataset:
 
     def __post_init__(self) -> None:
         for name in ("inputs", "outputs"):
-            table = np.ascontiguousarray(getattr(self, name), dtype=np.float64)
-            object.__setattr__(self, name, table.reshape(-1, 1) if table.ndim == 1 else table)
+            object.__setattr__(self, name, self._table(name))
         if len(self.inputs) != len(self.outputs):
             raise ModelError(
                 f"{self.name}: {len(self.inputs)} rows of inputs, {len(self.outputs)} of outputs"
@@ -48,11 +49,31 @@ class Dataset:
             raise ModelError(f"{self.name}: it has {len(self.outputs)} row(s); at least 2 needed")
         if not (np.isfinite(self.dt) and self.dt > 0):
             raise ModelError(f"{self.name}: sample time {self.dt} s must be positive")
-        if not np.all(np.isfinite(self.inputs)):
-            row = int(np.argmax(~np.all(np.isfinite(self.inputs), axis=1)))
-            raise ModelError(f"{self.name}: an input is not finite in row {row}")
+        self._refuse(~np.isfinite(self.inputs), "input", "mend it, or cut the record there")
+        self._refuse(np.isinf(self.outputs), "output", "write NaN for a sample that was lost")
         for name in ("input_zero", "output_zero", "input_noise"):
             object.__setattr__(self, name, self._deviations(name))
+
+    def _table(self, name: str) -> FloatArray:
+        """Inputs or outputs as real numbers, (n_samples, n); ModelError where they are others."""
+        given = np.asarray(getattr(self, name))
+        if np.iscomplexobj(given):
+            raise ModelError(f"{self.name}: {name} are complex; give real numbers, such as .real")
+        try:
+            table = np.ascontiguousarray(given, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise ModelError(f"{self.name}: {name} are not numbers: {error}") from None
+        if table.ndim not in (1, 2):
+            raise ModelError(f"{self.name}: {name} have shape {table.shape}; give (n_samples, n)")
+        return table.reshape(-1, 1) if table.ndim == 1 else table
+
+    def _refuse(self, wrong: BoolArray, kind: str, cure: str) -> None:
+        """Raise ModelError at the first wrong entry of a table, if any."""
+        if wrong.any():
+            row, column = np.argwhere(wrong)[0].tolist()
+            raise ModelError(
+                f"{self.name}: {kind} {column} is not finite in row {row}, counted from 0; {cure}"
+            )
 
     def _deviations(self, name: str) -> FloatArray:
         """Standard deviations of a side's channels; zeros where none are given."""
@@ -113,6 +134,32 @@ class Dataset:
         middle = float(self.initial_state(model)[state])
         span = (float(np.ptp(values)) if len(values) else 0.0) or 1.0
         return middle - span, middle + span
+
+
+def require_information(datasets: list[Dataset], names: Sequence[str], n_free: int) -> None:
+    """Raise ModelError for records that determine nothing.
+
+    names: of the outputs. n_free: how many numbers are to be fitted. A first row tells where a
+    simulation starts, and no more; an output that never changes has no deviation to explain.
+    """
+    outputs = np.concatenate([record.outputs for record in datasets])
+    n_values = sum(int(np.isfinite(record.outputs[1:]).sum()) for record in datasets)
+    where = ", ".join(record.name for record in datasets[:3]) + ", ..." * (len(datasets) > 3)
+    if n_values <= n_free:
+        raise ModelError(
+            f"{where}: too short, with {n_values} measured value{'s' * (n_values != 1)} behind the "
+            f"first row for {n_free} unknown{'s' * (n_free != 1)}; give a longer record, or fix "
+            "parameters"
+        )
+    lowest = np.where(np.isfinite(outputs), outputs, np.inf).min(axis=0)
+    highest = np.where(np.isfinite(outputs), outputs, -np.inf).max(axis=0)
+    if np.all(highest <= lowest):
+        measured = [(n, v) for n, v in zip(names, highest, strict=True) if np.isfinite(v)]
+        values = ", ".join(f"{name} is {value:g}" for name, value in measured)
+        raise ModelError(
+            f"{where}: {values} throughout, so that there is no deviation to explain; was the "
+            "sensor connected, is it the right column? Else excite the system"
+        )
 
 
 def output_scale(datasets: list[Dataset], per_log: bool = False) -> list[FloatArray]:

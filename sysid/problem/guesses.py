@@ -22,6 +22,7 @@ from sysid.problem.model import ModelError, Parameter, ProcessModel
 from sysid.problem.ranges import Range, with_search_range
 from sysid.problem.space import SearchSpace
 from sysid.threads import one_thread
+from sysid.time_limit import AT_LENGTH, time_limit
 
 Known = Mapping[str, tuple[float, float]]
 
@@ -124,7 +125,8 @@ def _guesses(model: ProcessModel, records: list[Measured], assumed: Known) -> di
     assert model.guesses is not None
     where = f"model {model.name}: guesses(records, known)"
     try:
-        guesses = dict(model.guesses(records, assumed))
+        with time_limit(AT_LENGTH):
+            guesses = dict(model.guesses(records, assumed))
     except ModelError:
         raise
     except Exception as error:

@@ -15,6 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from sysid.arrays import FloatArray
+from sysid.time_limit import AT_A_POINT, time_limit
 
 # Elements are floats in a simulation, arrays when a whole population is checked at once.
 Function = Callable[..., tuple[Any, ...]]
@@ -314,6 +315,23 @@ class ProcessModel:
         inputs = tuple(replace(u, hold=holds.get(u.name, u.hold)) for u in self.inputs)
         return replace(self, inputs=inputs)
 
+    def require_ends(self, vectors: FloatArray) -> None:
+        """Raise ModelError where an equation does not end at parameters, (n, n_parameters).
+
+        To be tried before a search: once compiled, such code cannot be stopped.
+        """
+        x, u = tuple(self.initial_state.tolist()), (0.0,) * len(self.inputs)
+        for vector in map(tuple, vectors.tolist()):
+            for function in filter(None, (self.derivative, self.output)):
+                try:
+                    with time_limit(AT_A_POINT):
+                        function(x, u, vector)
+                except TimeoutError as error:
+                    values = dict(zip(self.parameter_names, vector, strict=True))
+                    raise ModelError(f"model {self.name} at {values}: {error}") from error
+                except Exception:
+                    pass  # compiled code divides as IEEE 754 does, and goes on
+
     def _started(self, state: State, start: InitialValue) -> State:
         where = f"state {state.name} of model {self.name}"
         measured = state.name in self.output_names
@@ -384,7 +402,8 @@ def _check_names(model: str, kind: str, names: list[str]) -> None:
 
 def _call(where: str, function: Callable[..., Any], *args: Any) -> Any:
     try:
-        return function(*args)
+        with time_limit(AT_A_POINT):
+            return function(*args)
     except ZeroDivisionError:
         # Compiled code divides as IEEE 754 does; a model singular at rest is still a model.
         raise ModelError(

@@ -14,6 +14,7 @@ from sysid.arrays import BoolArray, FloatArray
 from sysid.problem.data import Dataset
 from sysid.problem.model import ModelError, Parameter, ProcessModel, Scale
 from sysid.problem.ranges import Range, Tie, ties, with_search_range
+from sysid.time_limit import AT_A_POINT, time_limit
 
 # A search coordinate this close to an end of its range, in parts of the range, stands on it.
 _ON_BOUND = 1e-3
@@ -262,7 +263,11 @@ class SearchSpace:
     def _constraints_at(self, vectors: FloatArray) -> FloatArray:
         columns, values = tuple(vectors.T), np.zeros((len(vectors), len(self.model.constraints)))
         for i, constraint in enumerate(self.model.constraints):
-            values[:, i] = constraint.function(columns)
+            try:
+                with time_limit(AT_A_POINT):
+                    values[:, i] = constraint.function(columns)
+            except TimeoutError as error:
+                raise ModelError(f"constraint {constraint.text!r}: {error}") from error
         return values
 
 

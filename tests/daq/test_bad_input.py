@@ -115,6 +115,15 @@ columns:
     y: {column: theta}
 """
 
+ROWS = "t,cmd_voltage_motor,theta\n"
+
+
+def foreign_log(name, rows, *said):
+    """A log of rows for the columns of ``id.yaml``."""
+    files = {"id.yaml": COLUMNS, "log.csv": ROWS + "".join(f"{row}\n" for row in rows)}
+    return Case(name, ["identify", "log.csv", "--config", "id.yaml"], list(said), files)
+
+
 ALIASES = "a0: &a0 [0]\n" + "".join(
     f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]\n" for k in range(1, 9)
 )
@@ -163,7 +172,7 @@ CASES = [
                "e.yaml:16:11: validation.motor.sead: unknown key; did you mean 'seed'?",
                command="check"),
     experiment("aliases without end", "motor:", f"{ALIASES}motor:",
-               "aliases (*name) repeat this more than 10000 times over"),
+               "e.yaml:10:40: aliases (*name) make more than 100000 keys and values of it"),
     experiment("two documents", "motor:", "---\nmotor:", "a second document begins with '---'"),
     Case("a rig for an experiment", ["check", "rig.yaml"],
          ["rig.yaml:2:1: this file holds a rig, and should hold an experiment; give it with"]),
@@ -206,8 +215,11 @@ CASES = [
                "e.yaml:7:3: motor.amplitude: this key stands twice, first in line 6; keep one"),
     experiment("a number for a key", "sample_rate: 800", "1: 800", "e.yaml:2:1: 1: unknown key"),
     experiment("an alias inside its own anchor", "motor:", "motor: &m\n  again: *m",
-               "e.yaml:5: nested too deeply", "alias"),
-    experiment("a control character", "0.75", "0.75\x01", "e.yaml: not valid YAML"),
+               "e.yaml:6:10: alias *m stands inside its own anchor &m; write out what is meant"),
+    experiment("a control character", "0.75", "0.75\x01",
+               "e.yaml:6: not text: it holds a control character (byte 1)"),
+    experiment("a date that is none", "0.75", "2024-13-45",
+               "e.yaml:6:14: not valid YAML: this is no date; put text in quotes"),
     Case("missing experiment", ["run", "absent.yaml"],
          ["absent.yaml: there is no such file; check its name, or use a shipped one: ",
           "prbs.yaml"]),
@@ -431,9 +443,24 @@ CASES = [
         "log.csv:1: column 'torque' is missing; did you mean 'torq'?", "--config"),
     log("a log with NaN", original_text().replace("0.75", "nan"),
         "log.csv:5: current_motor: 'nan' is not a finite number", "remove these lines"),
+    foreign_log("an infinite output", ["0,1,0", "0.1,1,1e999", "0.2,1,3"],
+                "log.csv:3: theta: '1e999' is not a finite number"),
+    foreign_log("an infinite input", ["0,1,0", "0.1,inf,1", "0.2,1,3"],
+                "log.csv:3: cmd_voltage_motor: 'inf' is not a finite number"),
+    foreign_log("a complex output", ["0,1,0", "0.1,1,1+2j", "0.2,1,3"],
+                "log.csv:3: theta: '1+2j' is not a finite number"),
+    foreign_log("a time that stands still", ["0,1,0", "0.1,1,1", "0.1,1,3"],
+                "log.csv:4: t: time does not advance from the line before"),
+    foreign_log("an output of zero", [f"{0.1 * k:.1f},{k % 2},0" for k in range(20)],
+                "log.csv: log: y is 0 throughout, so that there is no deviation to explain"),
+    foreign_log("an output that never changes", [f"{0.1 * k:.1f},{k % 2},3" for k in range(20)],
+                "log.csv: log: y is 3 throughout, so that there is no deviation to explain"),
+    foreign_log("a log of two rows", ["0,1,0", "0.1,1,1"],
+                "log: too short, with 1 measured value behind the first row for 1 unknown;",
+                "give a longer record"),
     log("a binary log", b"\x89PNG\r\n\x1a\n\x00", "log.csv:1: not a text file"),
     Case("a broken run record", ["identify", "run"],
-         ["run.json: not a readable run record", "move it away"],
+         ["run.json:1:2: not a readable run record", "move it away"],
          {"run/log.csv": original_text(), "run/run.json": "{"}),
     Case("replay of parameters that are none", ["replay", "log.csv", "--parameters", "p.yaml"],
          ["p.yaml:1:1: model: this key is missing"], {"p.yaml": "a: 1\n"}),

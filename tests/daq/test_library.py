@@ -92,10 +92,12 @@ def test_a_replay_is_the_same_from_the_result_and_from_its_file(recorded, found,
         (lambda f: f.drop(columns="torque"), "needs the column 'torque'"),
         (lambda f: f.assign(omega="fast"), "a column is not of numbers"),
         (lambda f: f.iloc[::-1], "time does not advance"),
-        (lambda f: f.assign(torque=np.nan), "an input is not finite"),
+        (lambda f: f.assign(torque=np.nan), "torque: it is not finite"),
+        (lambda f: f.assign(omega=np.inf), ":0: omega: it is not finite; NaN stands for what"),
+        (lambda f: f.assign(omega=f.omega + 1j), "omega: its numbers are complex; give real"),
         (lambda f: f.iloc[:1], "at least 2 are needed"),
     ],
-    ids=["no column", "text", "backwards", "missing input", "one row"],
+    ids=["no column", "text", "backwards", "missing input", "infinite", "complex", "one row"],
 )
 def test_a_table_that_will_not_do_is_refused(recorded, change, words):
     _, training, _ = recorded

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sysid import Dataset, ModelError, output_scale
+from sysid import GASSI, Dataset, ModelError, output_scale
 from tests.sysid.support import lag, motor
 
 
@@ -21,12 +21,37 @@ def test_columns_may_be_vectors():
         (np.zeros(1), np.zeros(1), 0.1, "at least 2"),
         (np.zeros(3), np.zeros(3), 0.0, "must be positive"),
         (np.zeros(3), np.zeros(3), np.nan, "must be positive"),
-        (np.array([0.0, np.nan, 0.0]), np.zeros(3), 0.1, "not finite in row 1"),
+        (np.array([0.0, np.nan, 0.0]), np.zeros(3), 0.1, "input 0 is not finite in row 1"),
+        (np.zeros(3), np.array([0.0, 0.0, -np.inf]), 0.1, "output 0 is not finite in row 2.* NaN"),
+        (np.zeros(3) + 1j, np.zeros(3), 0.1, "inputs are complex; give real numbers"),
+        (np.zeros(3), np.zeros(3) + 1j, 0.1, "outputs are complex; give real numbers"),
+        (np.array(["0", "x", "1"]), np.zeros(3), 0.1, "inputs are not numbers: .*'x'"),
+        (np.zeros((3, 1, 1)), np.zeros(3), 0.1, r"inputs have shape \(3, 1, 1\)"),
     ],
 )
 def test_bad_records(inputs, outputs, dt, message):
     with pytest.raises(ModelError, match=message):
         Dataset(inputs, outputs, dt)
+
+
+@pytest.mark.parametrize("value", [0.0, 3.0])
+def test_an_output_that_never_changes_explains_nothing(value):
+    record = Dataset(np.arange(50.0), np.full(50, value), 0.1, "still")
+    with pytest.raises(ModelError, match=f"still: y is {value:g} throughout, .* no deviation"):
+        GASSI(lag(), population=10, generations=1).fit(record)
+
+
+def test_constant_outputs_of_several_records_explain_what_differs():
+    levels = [Dataset(np.full(9, u), np.full(9, 2.0 * u), 1.0, f"at {u}") for u in (1.0, 2.0)]
+    result = GASSI(lag(), population=20, generations=4).fit(levels)
+    assert np.isfinite(result.error_)
+
+
+def test_a_record_shorter_than_what_is_sought_determines_nothing():
+    record = Dataset(np.ones(2), np.array([0.0, 1.0]), 0.1, "short")
+    wrong = "short: too short, with 1 measured value behind the first row for 2 unknowns; give a"
+    with pytest.raises(ModelError, match=wrong):
+        GASSI(lag(), population=10, generations=1).fit(record)
 
 
 def test_columns_are_checked_against_the_model():
