@@ -1,7 +1,7 @@
 """The run loop: open, calibrate, home, excite, make safe, close, logging every sample."""
 
 import contextlib
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -63,7 +63,8 @@ def run_experiment(
     sampling = Sampling(Rig(device, rig_config), limits, experiment.sample_rate, watch)
     with SignalHandling() as signals:
         capture = Capture.create(root, name, record)
-        return _Run(experiment, planned, dialogue, sampling, capture, signals).execute()
+        realtime = RealTime(overrun=signals.end_by)
+        return _Run(experiment, planned, dialogue, sampling, capture, signals, realtime).execute()
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,7 @@ class _Run:
     sampling: Sampling
     capture: Capture
     signals: SignalHandling
-    realtime: RealTime = field(default_factory=RealTime)
+    realtime: RealTime
 
     def execute(self) -> RunResult:
         """All phases; the record in the capture folder names how they ended."""
