@@ -1,5 +1,6 @@
 """The ``rig`` command."""
 
+import contextlib
 import os
 import signal
 import sys
@@ -9,11 +10,12 @@ from types import FrameType
 from daq.errors import RigError, Terminated
 
 _INTERRUPTED = 130  # what Typer makes of Ctrl-C
+_NAMES = ("SIGINT", "SIGTERM", "SIGHUP")  # where there is such a signal
 
 
 def main() -> None:
     """Run the command line; expected errors end it with their message and exit status."""
-    _hear_signals()
+    heard = _hear_signals()
     end: BaseException | None = None
     try:
         # Ctrl-C may come while this is imported, too.
@@ -22,20 +24,31 @@ def main() -> None:
         app()
     except BaseException as error:
         end = error
-    # What is left is to say how it ended: another Ctrl-C has nothing to stop there, nor while the
-    # interpreter shuts down. ``_interrupt`` keeps the way from above to here free of them.
-    if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-    sys.exit(_status(end))
+    # What is left is to say how it ended: another signal has nothing to stop there. ``_interrupt``
+    # keeps the way from above to here free of them.
+    for number in heard:
+        signal.signal(number, signal.SIG_IGN)
+    status = _status(end)
+    if _is_stopped(end):
+        # The interpreter would wait for threads and, while it winds up, die of the next signal.
+        sys.stderr.flush()
+        os._exit(1)
+    for number in heard:
+        if number != signal.SIGINT:
+            signal.signal(number, signal.SIG_DFL)
+    sys.exit(status)
 
 
-def _hear_signals() -> None:
-    """Ctrl-C and SIGTERM raise, unless this process was started with them ignored."""
-    defaults = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
-    if threading.current_thread() is threading.main_thread():
-        for number, handler in defaults.items():
-            if signal.getsignal(number) is handler:
-                signal.signal(number, _interrupt)
+def _hear_signals() -> list[int]:
+    """Have signals that end a program raise, but those ignored from its start; which they are."""
+    if threading.current_thread() is not threading.main_thread():
+        return []
+    numbers = [getattr(signal, name) for name in _NAMES if hasattr(signal, name)]
+    defaults = (signal.default_int_handler, signal.SIG_DFL)
+    heard = [number for number in numbers if signal.getsignal(number) in defaults]
+    for number in heard:
+        signal.signal(number, _interrupt)
+    return heard
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
@@ -54,13 +67,9 @@ def _status(end: BaseException | None) -> int | str | None:
         end = None
     if isinstance(end, RigError):
         return _report(end, str(end), end.exit_status)
-    if isinstance(end, Terminated):
-        return _report(end, f"stopped by {end}")
-    if isinstance(end, KeyboardInterrupt):
-        return _report(end, "stopped by Ctrl-C")
+    if end is not None and _is_stopped(end):
+        return _report(end, f"stopped by {end if isinstance(end, Terminated) else 'Ctrl-C'}")
     if isinstance(end, SystemExit):
-        if end.code == _INTERRUPTED:
-            return _report(end, "stopped by Ctrl-C")
         if end.code or unwritten is None:
             return end.code
     elif end is not None:
@@ -73,16 +82,24 @@ def _status(end: BaseException | None) -> int | str | None:
     return _report(unwritten, f"{message}. Files that the command has written are whole")
 
 
+def _is_stopped(end: BaseException | None) -> bool:
+    """Whether a signal ended the command."""
+    interrupted = isinstance(end, SystemExit) and end.code == _INTERRUPTED
+    return interrupted or isinstance(end, KeyboardInterrupt | Terminated)
+
+
 def _report(error: BaseException, message: str, status: int = 1) -> int:
     """Say a message, behind the notes of the error and of those that led to it."""
     from daq.cli.terminal import report_error
 
+    lines: list[str] = []
     cause: BaseException | None = error
     while cause is not None:
-        for note in getattr(cause, "__notes__", ()):
-            report_error(note)
+        lines += getattr(cause, "__notes__", ())
         cause = cause.__context__
-    report_error(message)
+    with contextlib.suppress(OSError):  # its terminal is gone
+        for line in (*lines, message):
+            report_error(line)
     return status
 
 

@@ -166,6 +166,8 @@ class _Run:
         if disturbance is not None and disturbance not in reason:
             reason += f"; {self.capture.log_path.name}: {disturbance}"
             error.add_note(f"{self.capture.log_path}: {disturbance}")
+        if status == "stopped":
+            error.add_note("outputs were set to zero")
         self._finish(status, reason)
         n = log.n_samples if log is not None else 0
         late = self.sampling.timing.flags.get("held", 0)
