@@ -11,7 +11,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-_MARK_EVERY = 1 << 16  # bytes after which the content is fingerprinted; what is lost at most besides
+_MARK_EVERY = (
+    1 << 16
+)  # bytes after which the content is fingerprinted; what is lost at most besides
 
 
 class _Mark(NamedTuple):

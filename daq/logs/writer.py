@@ -142,8 +142,9 @@ class LogWriter:
             out.write(self._header)
             for part, end in zip(self._parts, ends, strict=True):
                 row = part.first
-                for row, text in enumerate(itertools.islice(part.rows(), end - row), row + 1):
+                for text in itertools.islice(part.rows(), end - row):
                     out.write(text)
+                    row += 1
                 if row < end:
                     lost.append(f"{row} to {end - 1}")
             out.flush()

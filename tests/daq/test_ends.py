@@ -196,7 +196,7 @@ def test_workers_end_with_the_program_that_started_them(data, number):
 @pytest.mark.parametrize("unbuffered", ["", "1"])
 def test_results_that_cannot_be_printed_are_one_line(tmp_path, unbuffered):
     write_experiment(tmp_path / "e.yaml")
-    with open("/dev/full", "w") as full:
+    with Path("/dev/full").open("w") as full:
         result = subprocess.run(
             [*RIG, "run", "e.yaml", "--quiet"], cwd=tmp_path, stdout=full, stderr=subprocess.PIPE,
             env=environment(PYTHONUNBUFFERED=unbuffered), text=True, timeout=60, check=False,
@@ -279,7 +279,10 @@ def test_what_a_protocol_refuses_to_conclude_stands_in_its_own_words(tmp_path):
     result = concluding(tmp_path, refuses=True)
     assert "rig: warning: hand: the handle was not held; hold it\n" in result.stderr
     result = rig("analyse", only_capture(tmp_path), cwd=tmp_path)
-    assert (result.returncode, result.stderr) == (1, "rig: hand: the handle was not held; hold it\n")
+    assert (result.returncode, result.stderr) == (
+        1,
+        "rig: hand: the handle was not held; hold it\n",
+    )
 
 
 def test_numbers_do_not_wait_for_the_library_of_figures(tmp_path):

@@ -77,9 +77,12 @@ class Control:
 @pytest.fixture(scope="module")
 def real_time():
     """Skips where this system schedules nothing of ours in real time."""
-    granted = sys.platform == "linux" and not subprocess.run(
-        [sys.executable, "-c", _GRANTED], capture_output=True, check=False
-    ).returncode
+    granted = (
+        sys.platform == "linux"
+        and not subprocess.run(
+            [sys.executable, "-c", _GRANTED], capture_output=True, check=False
+        ).returncode
+    )
     if not granted:
         pytest.skip("this system grants no real-time scheduling")
 
