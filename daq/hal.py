@@ -148,7 +148,11 @@ class Device(Protocol):
     """
 
     def open(self) -> DeviceInfo:
-        """Connect; outputs are zero afterwards."""
+        """Connect; outputs are zero afterwards.
+
+        What takes long, such as imports and compilation, is done here: real-time scheduling begins
+        behind it.
+        """
 
     def announce(self, phase: Phase, turns: float = 0.0) -> None:
         """Tell whoever stands at the rig which phase begins; homing asks to wind ``turns``.

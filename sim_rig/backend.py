@@ -136,6 +136,7 @@ class SimulatedDevice:
 
     def open(self) -> hal.DeviceInfo:
         """Switch on, the load let down since the last time; sampling starts with ``start``."""
+        self._warm_up()
         self._open = True
         self._x = self._plant.initial_state
         self._encoder = EncoderCounter(4 * self.options.encoder_cycles)
@@ -159,12 +160,7 @@ class SimulatedDevice:
         """Begin with tick 0; in open loop when the first commands are there."""
         if not self._open:
             raise DeviceError("the simulated rig is not open; open it before starting")
-        if sample_rate not in self._steppers:
-            plant, scale = self._plant, state_sizes(self._plant)
-            self._steppers[sample_rate] = Stepper(
-                plant, plant.nominal, 1.0 / sample_rate, scale=scale, accuracy=_ACCURACY
-            )
-        self._stepper = self._steppers[sample_rate]
+        self._stepper = self._stepper_at(sample_rate)
         self._rate, self._guard, self._interlock = sample_rate, guard, Interlock(guard)
         self._waits_for_commands = mode is Mode.OPEN_LOOP
         self._origin = self._clock
@@ -230,6 +226,20 @@ class SimulatedDevice:
         volts = (-converters.RANGE, converters.RANGE)
         step_in, step_out = (2.0 * converters.RANGE / 2**n for n in (bits, _OUTPUT_BITS))
         return hal.Electronics(SimulatedDevice(options), volts, step_in, step_out)
+
+    def _warm_up(self) -> None:
+        """Import and compile what the plant is computed with, once."""
+        if not self._steppers:
+            u = np.zeros((2, self._n_inputs))
+            self._stepper_at(1000.0).advance(self._plant.initial_state, u)
+
+    def _stepper_at(self, sample_rate: float) -> Stepper:
+        if sample_rate not in self._steppers:
+            plant, scale = self._plant, state_sizes(self._plant)
+            self._steppers[sample_rate] = Stepper(
+                plant, plant.nominal, 1.0 / sample_rate, scale=scale, accuracy=_ACCURACY
+            )
+        return self._steppers[sample_rate]
 
     def _require_running(self) -> None:
         if not self._running:

@@ -1,40 +1,116 @@
 """The ``rig`` command."""
 
+import contextlib
+import os
+import signal
 import sys
-from typing import NoReturn
+import threading
+from types import FrameType
 
 from daq.errors import RigError, Terminated
 
 _INTERRUPTED = 130  # what Typer makes of Ctrl-C
+_NAMES = ("SIGINT", "SIGTERM", "SIGHUP")  # where there is such a signal
 
 
 def main() -> None:
     """Run the command line; expected errors end it with their message and exit status."""
+    heard = _hear_signals()
+    end: BaseException | None = None
     try:
         # Ctrl-C may come while this is imported, too.
         from daq.cli.app import app
 
         app()
-    except RigError as error:
-        _end(error, str(error), error.exit_status)
-    except Terminated as signal:
-        _end(signal, f"stopped by {signal}; outputs are zero")
-    except KeyboardInterrupt as interrupt:
-        _end(interrupt, "stopped by Ctrl-C")
-    except SystemExit as exit:
-        if exit.code == _INTERRUPTED:
-            _end(exit, "stopped by Ctrl-C")
-        raise
+    except BaseException as error:
+        end = error
+    # What is left is to say how it ended: another signal has nothing to stop there. ``_interrupt``
+    # keeps the way from above to here free of them.
+    for number in heard:
+        signal.signal(number, signal.SIG_IGN)
+    status = _status(end)
+    if _is_stopped(end):
+        # The interpreter would wait for threads and, while it winds up, die of the next signal.
+        sys.stderr.flush()
+        os._exit(1)
+    for number in heard:
+        if number != signal.SIGINT:
+            signal.signal(number, signal.SIG_DFL)
+    sys.exit(status)
 
 
-def _end(error: BaseException, message: str, status: int = 1) -> NoReturn:
-    """Exit with a message, behind the notes of the error and of those that led to it."""
+def _hear_signals() -> list[int]:
+    """Have signals that end a program raise, but those ignored from its start; which they are."""
+    if threading.current_thread() is not threading.main_thread():
+        return []
+    numbers = [getattr(signal, name) for name in _NAMES if hasattr(signal, name)]
+    defaults = (signal.default_int_handler, signal.SIG_DFL)
+    heard = [number for number in numbers if signal.getsignal(number) in defaults]
+    for number in heard:
+        signal.signal(number, _interrupt)
+    return heard
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    if frame is not None and frame.f_code is main.__code__:
+        return  # the command has ended, and nothing would catch what is raised here
+    if number == signal.SIGINT:
+        raise KeyboardInterrupt
+    raise Terminated(signal.Signals(number).name)
+
+
+def _status(end: BaseException | None) -> int | str | None:
+    """Exit status of a command that ended like this, once its message is on standard error."""
+    # Whether it was a print that failed shows when another fails likewise.
+    unwritten = _finish_output("\n" if isinstance(end, OSError) else "")
+    if isinstance(end, OSError) and unwritten is not None and end.errno == unwritten.errno:
+        end = None
+    if isinstance(end, RigError):
+        return _report(end, str(end), end.exit_status)
+    if end is not None and _is_stopped(end):
+        return _report(end, f"stopped by {end if isinstance(end, Terminated) else 'Ctrl-C'}")
+    if isinstance(end, SystemExit):
+        if end.code or unwritten is None:
+            return end.code
+    elif end is not None:
+        raise end
+    if unwritten is None:
+        return 0
+    if isinstance(unwritten, BrokenPipeError):
+        return 1  # whoever read it has enough
+    message = f"standard output cannot be written: {unwritten.strerror}"
+    return _report(unwritten, f"{message}. Files that the command has written are whole")
+
+
+def _is_stopped(end: BaseException | None) -> bool:
+    """Whether a signal ended the command."""
+    interrupted = isinstance(end, SystemExit) and end.code == _INTERRUPTED
+    return interrupted or isinstance(end, KeyboardInterrupt | Terminated)
+
+
+def _report(error: BaseException, message: str, status: int = 1) -> int:
+    """Say a message, behind the notes of the error and of those that led to it."""
     from daq.cli.terminal import report_error
 
+    lines: list[str] = []
     cause: BaseException | None = error
     while cause is not None:
-        for note in getattr(cause, "__notes__", ()):
-            report_error(note)
+        lines += getattr(cause, "__notes__", ())
         cause = cause.__context__
-    report_error(message)
-    sys.exit(status)
+    with contextlib.suppress(OSError):  # its terminal is gone
+        for line in (*lines, message):
+            report_error(line)
+    return status
+
+
+def _finish_output(last: str) -> OSError | None:
+    """Have standard output written; why it cannot be. The interpreter then does not try again."""
+    if sys.stdout is None:
+        return None  # closed before this program began
+    try:
+        sys.stdout.write(last)
+        sys.stdout.flush()
+        return None
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return error

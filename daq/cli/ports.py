@@ -27,7 +27,7 @@ def ports(
 ) -> None:
     """List serial ports, and who answers there."""
     from daq.serial.connection import Inquiry, inquire
-    from daq.serial.ports import ports_of
+    from daq.serial.ports import ports_of, require_ports
 
     wanted = ports_of(names or [])
     inquiries = [Inquiry(port) for port in wanted] if unasked else inquire(wanted, baud)
@@ -35,6 +35,7 @@ def ports(
         terminal.print_json({"ports": [_document(inquiry, unasked) for inquiry in inquiries]})
     else:
         _show(inquiries, unasked)
+    require_ports(names or [])
 
 
 def _show(inquiries: list[Inquiry], unasked: bool) -> None:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from daq.errors import ConfigError
+from daq.errors import ConfigError, Terminated
 from daq.files import write_whole
 from daq.identification import records
 from daq.identification.fit import assemble, check_writable, load_logs
@@ -162,7 +162,12 @@ def campaign(wanted: CampaignRequest, watch: Watch = ignore) -> CampaignResult:
             _write_table(folder, Campaign(tuple(outcomes)))
             written = time.monotonic()
 
-    result = run_all(groups, seeds, wanted.workers, watch, keep)
+    try:
+        result = run_all(groups, seeds, wanted.workers, watch, keep)
+    except Terminated as stop:
+        if outcomes:
+            stop.add_note(f"they stand in {_write_table(folder, Campaign(tuple(outcomes)))}")
+        raise
     table = _write_table(folder, result)
     by_key = {(group.problem.model_name, group.name): group for group in groups}
     files = {
@@ -198,6 +203,9 @@ def run_all(
             result = run_campaign(runs, n_jobs=jobs, on_outcome=report)
         except ModelError as error:  # a model that cannot travel to another process
             raise ConfigError(str(error)) from None
+        except Terminated as stop:
+            stop.add_note(f"{finished} of {len(runs)} runs had been finished")
+            raise
     if result.failed and len(result.failed) == len(result.outcomes):
         raise ConfigError(result.failed[0].problem)
     if result.interrupted and not result.outcomes:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from daq.errors import ConfigError
+from daq.errors import ConfigError, Terminated
 from daq.identification import records, request
 from daq.identification.records import ColumnMapping, LoggedRecord, Split
 from daq.identification.request import SettingsRequest
@@ -114,8 +114,14 @@ def fit(
     _require_information(problem, train)
     if folder is not None and not resume:
         request.remember(folder, problem.request, _paths(training), _paths(validation))
-    estimator = _searched(problem, train, folder, watch, resume)
-    result = assemble(problem, estimator, (train, [*ends, *check]), folder, watch)
+    try:
+        estimator = _searched(problem, train, folder, watch, resume)
+        result = assemble(problem, estimator, (train, [*ends, *check]), folder, watch)
+    except (KeyboardInterrupt, Terminated) as stop:
+        if folder is not None and (folder / request.CHECKPOINT).exists():
+            command = request.resume_command(folder)
+            stop.add_note(f"the search until then is kept; go on with: {command}")
+        raise
     if folder is not None:
         result.save(folder)
         if not result.interrupted:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -66,6 +67,15 @@ def recall(folder: Path) -> tuple[Path, SettingsRequest, list[Path], list[Path]]
             raise ConfigError(problem, cure=_ANEW, file=place / _REQUEST) from None
     cure = "name the folder that its results were to go to"
     raise ConfigError("no identification was interrupted there", cure=cure, file=folder)
+
+
+def resume_command(folder: Path) -> str:
+    """What to type to continue what was interrupted.
+
+    >>> resume_command(Path("my runs"))
+    "rig identify --resume 'my runs'"
+    """
+    return f"rig identify --resume {shlex.quote(str(folder))}"
 
 
 def forget(folder: Path) -> None:

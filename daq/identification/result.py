@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,6 +15,7 @@ import yaml
 from daq.config.identification import Signals
 from daq.files import make_folder, write_whole
 from daq.identification.records import LoggedRecord
+from daq.identification.request import resume_command
 from daq.identification.rows import Rows
 from daq.identification.settings import Problem
 from daq.provenance import software_versions
@@ -96,7 +96,7 @@ class Identification:
         """What to type to continue an interrupted search; None where there is nothing to."""
         if not self.interrupted or self.folder is None:
             return None
-        return f"rig identify --resume {shlex.quote(str(self.folder))}"
+        return resume_command(self.folder)
 
     @property
     def parameters_file(self) -> Path | None:

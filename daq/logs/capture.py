@@ -6,6 +6,8 @@ import datetime
 import hashlib
 import json
 import platform
+import re
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +21,8 @@ RUN_NAME = "run.json"
 
 _RESERVE = ".reserve"  # room for the last run.json on a disk that the log has filled
 _RESERVED = 64 * 1024  # bytes
+
+_A_LOG = re.compile(r"log(-\d+)?\.csv")
 
 RUNNING = "running"
 COMPLETED = "completed"
@@ -46,8 +50,12 @@ class Capture:
         kept = "".join(c if c.isalnum() or c in "-_." else "-" for c in name).strip("-.")
         folder = _new_folder(root, f"{now:%Y%m%dT%H%M%SZ}-{kept or 'run'}")
         capture = cls(folder, facts)
-        capture._save()
-        capture._reserve()
+        try:
+            capture.save()
+            capture._reserve()
+        except BaseException:
+            shutil.rmtree(folder, ignore_errors=True)  # nothing has been recorded in it
+            raise
         return capture
 
     @property
@@ -55,7 +63,8 @@ class Capture:
         """Where the samples go."""
         return self.folder / LOG_NAME
 
-    def _save(self) -> None:
+    def save(self) -> None:
+        """Write the record as it stands. Raises RunError when the disk refuses."""
         write_whole(self.folder / RUN_NAME, json.dumps(self.record, indent=2) + "\n")
 
     def _reserve(self) -> None:
@@ -75,12 +84,23 @@ class Capture:
         """
         self.record.update(status=status, reason=reason, **facts)
         (self.folder / _RESERVE).unlink(missing_ok=True)
-        self._save()
+        self.save()
         if self.log_path.exists():
             with self.log_path.open("rb") as log:
                 digest = hashlib.file_digest(log, "sha256").hexdigest()
             self.record["log"] = {"file": LOG_NAME, "sha256": digest}
-            self._save()
+            self.save()
+
+
+def is_log(csv: Path) -> bool:
+    """Whether a file is a capture's log, or a part in which a disturbed one went on."""
+    return _A_LOG.fullmatch(csv.name) is not None
+
+
+def further_parts(csv: Path) -> list[str]:
+    """Names of the parts that a run has left beside its log, which are in order not there."""
+    beside = sorted(csv.parent.glob("log-*.csv")) if csv.name == LOG_NAME else []
+    return [path.name for path in beside if is_log(path)]
 
 
 def _new_folder(root: Path, stem: str) -> Path:

@@ -13,7 +13,7 @@ import numpy as np
 from daq.config import json_file
 from daq.errors import ConfigError
 from daq.hal import Samples
-from daq.logs.capture import COMPLETED, LOG_NAME, RUN_NAME, RUNNING
+from daq.logs.capture import COMPLETED, LOG_NAME, RUN_NAME, RUNNING, further_parts, is_log
 from daq.logs.columns import ATTRIBUTES, COLUMNS, ORIGINAL_COLUMNS
 from daq.logs.table import column_names, read_table
 from daq.logs.time_base import refuse_rows, require_rows, time_base
@@ -96,6 +96,9 @@ def load(path: str | Path, extra: Sequence[str] = ()) -> Recording:
     ('day1', 0.1, [0.0, 0.5])
     """
     csv = log_path(Path(path))
+    if not csv.exists() and (parts := further_parts(csv)):
+        cure = f"what was recorded afterwards is in {', '.join(parts)}: name that file"
+        raise ConfigError("the log was deleted while it was written", cure=cure, file=csv)
     present = column_names(csv)
     names = [name for name in COLUMNS if name in present or name in ORIGINAL_COLUMNS]
     names += [name for name in extra if name in present]
@@ -124,7 +127,7 @@ def log_path(path: Path) -> Path:
 def read_record(csv: Path) -> dict[str, Any] | None:
     """run.json beside a log.csv; None when there is none. ConfigError when it is malformed."""
     path = csv.parent / RUN_NAME
-    if csv.name != LOG_NAME or not path.exists():
+    if not is_log(csv) or not path.exists():
         return None
     return json_file.load(path, "run record", "move it away to use the log alone")
 
@@ -140,9 +143,13 @@ def end_of_run(csv: Path, record: dict[str, Any] | None, torn: bool) -> str | No
     """One line on how a run ended that did not complete, or None."""
     record = record or {}
     cut = "; its last line is incomplete and is left out" if torn else ""
+    if parts := further_parts(csv):
+        cut += f"; it was disturbed, and went on in {', '.join(parts)}, which is not read with it"
+    elif csv.name != LOG_NAME and is_log(csv):
+        cut += f"; this part of it begins where {LOG_NAME} was disturbed"
     status = record.get("status", COMPLETED)
     if status == RUNNING:
         return f"{csv}: the run was interrupted (killed, or still running){cut}"
     if status != COMPLETED:
         return f"{csv}: the run ended early: {status}: {record.get('reason')}{cut}"
-    return f"{csv}: the log was interrupted{cut}" if torn else None
+    return f"{csv}: the log was interrupted{cut}" if cut else None

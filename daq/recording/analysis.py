@@ -97,7 +97,7 @@ def conclude(experiment: Experiment, folder: Path) -> Findings | None:
     """What an experiment's protocol concludes from a capture, written to its ``results``.
 
     None of a protocol that only excites. Raises RunError where nothing follows, or the protocol
-    has a mistake.
+    has a mistake; a RigError of the protocol's own as it is.
     """
     if type(experiment).findings is Experiment.findings:
         return None
@@ -108,6 +108,8 @@ def conclude(experiment: Experiment, folder: Path) -> Findings | None:
         findings = experiment.findings(log.samples(), columns)
         if findings is not None and not isinstance(findings, Findings):
             raise TypeError(f"it returned {findings!r}; return daq.findings.Findings or None")
+    except RigError:
+        raise  # the protocol's own words
     except ValueError as error:
         at = raised_in(type(experiment), error)
         raise RunError(f"no result: {error}{at}", file=folder) from None
@@ -133,18 +135,13 @@ def _contents(findings: Findings) -> dict[str, Any]:
 
 def _write(findings: Findings, folder: Path) -> None:
     """Tables as CSV, figures, and all in findings.json."""
-    from daq.figures import style
-    from daq.figures.findings import draw
-
     make_folder(folder)
     for table in findings.tables:
         rows = np.column_stack(list(table.columns.values()))
         lines = [",".join(table.columns), *(",".join(map(repr, row)) for row in rows.tolist())]
         write_whole(folder / f"{table.name}.csv", "\n".join(lines) + "\n")
-    for chart in findings.figures:
-        figure = draw(chart)
-        for kind in style.PRINTED:
-            write_whole(folder / f"{chart.name}.{kind}", style.render(figure, kind))
+    if findings.figures:
+        _write_figures(findings, folder)
     text = json.dumps(plain(_contents(findings)), indent=2)
     write_whole(folder / "findings.json", text + "\n")
     # Of an earlier analysis with another protocol's text.
@@ -153,3 +150,14 @@ def _write(findings: Findings, folder: Path) -> None:
         lines = ["# Starting ranges for rig identify --config", "ranges:"]
         lines += [f"  {k}: [{low:.6g}, {high:.6g}]" for k, (low, high) in findings.ranges.items()]
         write_whole(folder / "ranges.yaml", "\n".join(lines) + "\n")
+
+
+def _write_figures(findings: Findings, folder: Path) -> None:
+    # Imports matplotlib, for which numbers and tables do not wait.
+    from daq.figures import style
+    from daq.figures.findings import draw
+
+    for chart in findings.figures:
+        figure = draw(chart)
+        for kind in style.PRINTED:
+            write_whole(folder / f"{chart.name}.{kind}", style.render(figure, kind))

@@ -119,7 +119,9 @@ def record(
             problem = "it has no 'validation' section"
             raise ConfigError(problem, cure="add one", file=loaded.file.path)
         loaded = changed
-    config, device = load_rig(str(rig or rig_for(str(experiment), watch)), options, watch)
+    name = str(rig or rig_for(str(experiment), watch))
+    config, device = load_rig(name, options, watch)
+    _require_port(config, name)
     loaded.plan(config)
     return load(_run(loaded, config, device, Path(out), watch).folder)
 
@@ -138,7 +140,17 @@ def _rig_on(rig: str, port: str | None, realtime: bool, watch: Watch) -> tuple[R
         changes["time"] = "real"
     elif realtime:
         watch(Note("note", f"{rig}: its own clock paces it; --realtime changes nothing"))
-    return load_rig(rig, changes, watch) if changes else (config, device)
+    if changes:
+        config, device = load_rig(rig, changes, watch)
+    _require_port(config, rig)
+    return config, device
+
+
+def _require_port(config: RigConfig, rig: str) -> None:
+    """Raise ConfigError for a rig on a port that is still to be named."""
+    if getattr(config.options, "port", None) == "":
+        cure = "give --port PORT, or write it there; 'rig ports' lists the ports that there are"
+        raise ConfigError("no port is named", cure=cure, file=rig, key="options.port")
 
 
 def _run(
@@ -146,7 +158,10 @@ def _run(
 ) -> RunResult:
     watch(Started(f"{loaded.name} on {rig.name}"))
 
-    def report(step: PhaseProgress) -> None:
+    def report(step: PhaseProgress | Note) -> None:
+        if isinstance(step, Note):
+            watch(step)
+            return
         done = f"{step.done:.0f}" if step.unit == "samples" else f"{step.done:.1f}"
         status = f"{done}/{step.total:.10g} {step.unit}"
         watch(Progress(_ACTIVITIES[step.phase], step.done, step.total, status))

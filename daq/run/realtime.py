@@ -4,13 +4,22 @@ import contextlib
 import ctypes
 import gc
 import os
+import signal
 import sys
+import threading
+from collections.abc import Callable
+from types import FrameType
 from typing import Any
 
 from daq.config.rig import Realtime
-from daq.errors import ConfigError
+from daq.errors import ConfigError, RunError
+
+if sys.platform == "linux":
+    import resource
 
 _PRIORITY = 40  # of 99: above all ordinary work, below the kernel's own interrupt threads at 50
+_LONGEST = 1  # s of computing without a pause, after which real-time scheduling is given back
+_END = 4  # s after which the system ends a program that does not hear of that
 _LOCK = 1 | 2 | 4  # MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT: what is touched stays in memory
 _HIGH_PRIORITY_CLASS = 0x80
 _NORMAL_PRIORITY_CLASS = 0x20
@@ -24,12 +33,16 @@ _CURE = (
 class RealTime:
     """Scheduler class, memory and garbage collector of a run; ``undo`` gives all back.
 
-    granted: what was obtained, by name, for run.json; refused: what was not, and why.
+    granted: what was obtained, by name, for run.json; refused: what was not, and why. overrun: is
+    called with an error, all having been given back, when the program has kept a core to itself
+    for a second, computing without a pause. One that is too busy in a library's own code to hear
+    of it is ended by the system after four, rather than hold the computer.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, overrun: Callable[[RunError], None] = lambda error: None) -> None:
         self.granted: dict[str, Any] = {}
         self.refused: dict[str, str] = {}
+        self._overrun = overrun
         self._undo = contextlib.ExitStack()
 
     def begin(self, wanted: Realtime) -> None:
@@ -66,8 +79,10 @@ class RealTime:
         if sys.platform != "linux":
             self.refused["scheduler"] = f"{sys.platform} has no real-time scheduler for processes"
             return
-        import resource
-
+        if threading.current_thread() is not threading.main_thread():
+            self.refused["scheduler"] = "the time of a thread that is not the main one has no bound"
+            return
+        self._bound_time()
         before, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
         # The limit of this user; a privileged one is not bound by it.
         limit, _ = resource.getrlimit(resource.RLIMIT_RTPRIO)
@@ -83,6 +98,32 @@ class RealTime:
         ordinary = before | os.SCHED_RESET_ON_FORK
         self._undo.callback(os.sched_setscheduler, 0, ordinary, parameters)
         self.granted.update(scheduler="SCHED_FIFO", priority=priority)
+
+    def _bound_time(self) -> None:
+        """Have the system say when this program computes in real time without a pause."""
+        if sys.platform != "linux":
+            return
+        kind, unlimited = resource.RLIMIT_RTTIME, resource.RLIM_INFINITY
+        before = resource.getrlimit(kind)
+        end = _END * 1_000_000 if before[1] == unlimited else min(before[1], _END * 1_000_000)
+        self._undo.callback(signal.signal, signal.SIGXCPU, signal.getsignal(signal.SIGXCPU))
+        signal.signal(signal.SIGXCPU, self._exceeded)
+        resource.setrlimit(kind, (min(_LONGEST * 1_000_000, end), end))
+
+        def lift() -> None:
+            try:
+                resource.setrlimit(kind, before)
+            except ValueError:  # only the privileged may raise the upper one again
+                resource.setrlimit(kind, (end, end))
+
+        self._undo.callback(lift)
+
+    def _exceeded(self, number: int, frame: FrameType | None) -> None:
+        self.undo()
+        problem = f"the program computed for {_LONGEST} s without a pause"
+        self.granted.pop("scheduler", None)
+        self.refused["scheduler"] = f"given back: {problem}"
+        self._overrun(RunError(f"{problem}, in which no sample was answered"))
 
     def _lock_memory(self) -> None:
         library = ctypes.CDLL(None, use_errno=True)

@@ -1,7 +1,7 @@
 """The run loop: open, calibrate, home, excite, make safe, close, logging every sample."""
 
 import contextlib
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ from daq.errors import USER_CODE_ERRORS, DeviceError, InterlockError, RigError, 
 from daq.experiment import ClosedLoop, Experiment, Plan
 from daq.hal import Device, Phase
 from daq.limits import Limits
-from daq.logs.capture import COMPLETED, Capture
+from daq.logs.capture import COMPLETED, RUNNING, Capture
 from daq.logs.writer import LogWriter
 from daq.rig import Rig
 from daq.run.phases import calibrate, control, home, play
@@ -60,10 +60,11 @@ def run_experiment(
     dialogue = Dialogue(experiment, planned) if isinstance(experiment, ClosedLoop) else None
     limits = Limits(rig_config)
     record = {"experiment": description, "rig": rig_config.model_dump(mode="json")}
-    capture = Capture.create(root, name, record)
+    sampling = Sampling(Rig(device, rig_config), limits, experiment.sample_rate, watch)
     with SignalHandling() as signals:
-        sampling = Sampling(Rig(device, rig_config), limits, experiment.sample_rate, watch)
-        return _Run(experiment, planned, dialogue, sampling, capture, signals).execute()
+        capture = Capture.create(root, name, record)
+        realtime = RealTime(overrun=signals.end_by)
+        return _Run(experiment, planned, dialogue, sampling, capture, signals, realtime).execute()
 
 
 @dataclass(frozen=True)
@@ -76,16 +77,18 @@ class _Run:
     sampling: Sampling
     capture: Capture
     signals: SignalHandling
-    realtime: RealTime = field(default_factory=RealTime)
+    realtime: RealTime
 
     def execute(self) -> RunResult:
         """All phases; the record in the capture folder names how they ended."""
         log = None
         columns = self.experiment.columns if isinstance(self.experiment, ClosedLoop) else ()
+        self.signals.last_act = self._give_up
         try:
-            with LogWriter(self.capture.log_path, tuple(columns)) as log:
+            self.signals.release()
+            with LogWriter(self.capture.log_path, tuple(columns), self.sampling.warn) as log:
                 self._all_phases(log)
-                log.require_there()
+            log.require_whole()
         except (RigError, KeyboardInterrupt, Terminated) as error:
             self._finish_early(error, log)
             raise
@@ -158,14 +161,14 @@ class _Run:
 
     def _finish_early(self, error: BaseException, log: LogWriter | None) -> None:
         """Record why the run ended, and note on the error where the record is."""
-        where = f"during {self.sampling.phase.value}"
-        if isinstance(error, KeyboardInterrupt):
-            self._finish("stopped", f"stopped by Ctrl-C {where}")
-        elif isinstance(error, Terminated):
-            self._finish("stopped", f"stopped by {error} {where}")
-        else:
-            status = "interlock" if isinstance(error, InterlockError) else "failed"
-            self._finish(status, str(error))
+        status, reason = self._end(error)
+        disturbance = log.disturbance if log is not None else None
+        if disturbance is not None and disturbance not in reason:
+            reason += f"; {self.capture.log_path.name}: {disturbance}"
+            error.add_note(f"{self.capture.log_path}: {disturbance}")
+        if status == "stopped":
+            error.add_note("outputs were set to zero")
+        self._finish(status, reason)
         n = log.n_samples if log is not None else 0
         late = self.sampling.timing.flags.get("held", 0)
         punctuality = f", {late} commands came too late" if late else ""
@@ -173,6 +176,23 @@ class _Run:
             f"what was recorded until then: {self.capture.folder} ({n} samples of the run"
             f"{punctuality})"
         )
+
+    def _end(self, error: BaseException) -> tuple[str, str]:
+        """Status and reason of a run that ended by an error."""
+        where = f"during {self.sampling.phase.value}"
+        if isinstance(error, KeyboardInterrupt):
+            return "stopped", f"stopped by Ctrl-C {where}"
+        if isinstance(error, Terminated):
+            return "stopped", f"stopped by {error} {where}"
+        return "interlock" if isinstance(error, InterlockError) else "failed", str(error)
+
+    def _give_up(self) -> None:
+        """The least record of a run whose clean-up hangs; in the middle of whatever it does."""
+        record, phase = self.capture.record, self.sampling.phase.value
+        if record["status"] == RUNNING:
+            reason = f"stopped during {phase}; the clean-up hung and was ended by another signal"
+            record.update(status="stopped", reason=reason, phase=phase)
+        self.capture.save()
 
     def _finish(self, status: str, reason: str | None) -> None:
         # A backend that failed may fail to report as well.

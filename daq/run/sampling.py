@@ -9,6 +9,7 @@ from daq.errors import InterlockError
 from daq.hal import CHANNELS, Flag, FloatArray, Mode, Phase, Samples
 from daq.limits import Limits
 from daq.logs.writer import LogWriter
+from daq.progress import Note
 from daq.rig import Rig
 from daq.run.timing import Timing
 
@@ -25,10 +26,10 @@ class PhaseProgress:
     unit: str
 
 
-Watcher = Callable[[PhaseProgress], None]
+Watcher = Callable[[PhaseProgress | Note], None]
 
 
-def nobody(progress: PhaseProgress) -> None:
+def nobody(event: PhaseProgress | Note) -> None:
     """Watch nothing."""
 
 
@@ -118,8 +119,15 @@ class Sampling:
 
     def tell(self, done: float, total: float, unit: str) -> None:
         """Tell the watcher how far the phase is."""
+        self._say(PhaseProgress(self.phase, done, total, unit))
+
+    def warn(self, text: str) -> None:
+        """Tell the watcher what must not wait for the end of the run."""
+        self._say(Note("warning", text))
+
+    def _say(self, event: PhaseProgress | Note) -> None:
         try:
-            self._watch(PhaseProgress(self.phase, done, total, unit))
+            self._watch(event)
         except OSError:
             # Its terminal or pipe is gone. That is no reason to lose a run: whoever closed it
             # ends the run by a signal, if that was meant.

@@ -7,7 +7,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from types import FrameType
 from typing import Any
 
@@ -22,18 +22,20 @@ _PATIENCE = 2.0  # s after the first signal in which the outputs must have been 
 class SignalHandling:
     """Turns signals into exceptions while a run is on. Use as a context manager.
 
-    The first signal raises KeyboardInterrupt or ``Terminated``. From then on, and from ``shield``
-    on, nothing is raised, so that zeroing the outputs is never cut short, but in ``breakable``: a
-    second Ctrl-C ends what hangs there. A process that still does not get on is ended by the next
-    signal, and the device's watchdog zeroes the outputs. What came behind the shield without an
-    effect is raised at the end. Signals that the process ignores, as under nohup, stay ignored.
+    Nothing is raised before ``release``, where somebody catches it. The first signal then raises
+    KeyboardInterrupt or ``Terminated``. From then on, and from ``shield`` on, nothing is raised, so
+    that zeroing the outputs is never cut short, but in ``breakable``: a second Ctrl-C ends what
+    hangs there. A process that still does not get on is ended by the next signal, behind a call of
+    ``last_act``, and the device's watchdog zeroes the outputs. What came behind the shield without
+    an effect is raised at the end. Signals that the process ignores, as under nohup, stay ignored.
     """
 
     def __init__(self) -> None:
+        self.last_act: Callable[[], None] = lambda: None
         self._before: list[tuple[int, Any]] = []
         self._first = 0.0  # when the first signal came
         self._pending: BaseException | None = None
-        self._shielded = self._breakable = False
+        self._shielded, self._breakable = True, False
 
     def __enter__(self) -> SignalHandling:
         if threading.current_thread() is threading.main_thread():
@@ -43,10 +45,16 @@ class SignalHandling:
         return self
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        for number, handler in self._before:
+        for number, handler in reversed(self._before):  # Ctrl-C last: with its own it raises again
             signal.signal(number, handler)
         if error is None and self._pending is not None:
             raise self._pending
+
+    def release(self) -> None:
+        """From now on signals raise, with one that has come already."""
+        self._shielded = False
+        if self._pending is not None:
+            self.end_by(self._pending)
 
     def shield(self) -> None:
         """From now on no signal raises."""
@@ -62,14 +70,19 @@ class SignalHandling:
             self._breakable = False
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
-        now = time.monotonic()
         name = signal.Signals(number).name
-        error = KeyboardInterrupt() if number == signal.SIGINT else Terminated(name)
+        self.end_by(KeyboardInterrupt() if number == signal.SIGINT else Terminated(name))
+
+    def end_by(self, error: BaseException) -> None:
+        """Raise an error that came out of turn, or keep it for later behind the shield."""
+        now = time.monotonic()
         if not self._shielded or self._breakable:
             self._first = self._first or now
             self._shielded, self._breakable = True, False
             raise error
         if self._first and now - self._first > _PATIENCE:
+            with contextlib.suppress(Exception):
+                self.last_act()
             os.write(2, b"rig: the clean-up hangs; ended without it\n")
             os._exit(1)
         self._first = self._first or now

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from daq.errors import DeviceError
+from daq.errors import ConfigError, DeviceError, Mistake
 
 _PATIENCE = 0.01  # s that a read waits at most
 _WRITE_PATIENCE = 0.5  # s that a port may take to accept a frame
@@ -53,6 +53,24 @@ def ports_of(names: Sequence[str]) -> list[PortFacts]:
         description = port.description or ""
         ports[port.device] = PortFacts(port.device, description, lasting_name, usb, timer)
     return [ports.get(name, PortFacts(name, "")) for name in names] or list(ports.values())
+
+
+def require_ports(names: Sequence[str]) -> None:
+    """Raise ConfigError for device names that this computer does not have, with those it has.
+
+    What answers at a URL only trying shows.
+    """
+    present = [port.lasting_name or port.name for port in ports_of(())]
+    cure = "no serial port has hardware behind it: plug the device in"
+    if present:
+        cure = f"there {'is' if len(present) == 1 else 'are'} {', '.join(present)}"
+    missing = [
+        Mistake("there is no such port", cure, file=name)
+        for name in names
+        if "://" not in name and name not in present and not Path(name).exists()
+    ]
+    if missing:
+        raise ConfigError.of(missing)
 
 
 def _gone(port: str, error: Exception | None = None) -> DeviceError:

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import functools
 import itertools
+import os
+import threading
 import time
 import warnings
 from collections import defaultdict
@@ -29,6 +31,7 @@ if TYPE_CHECKING:
 
     from sysid.gassi import GASSI
 
+_LOOK_EVERY = 0.5  # s between two looks of a worker at whether it is still wanted
 # Two seeds whose errors differ by no more than this share found the same minimum.
 _SAME = 0.01
 
@@ -223,7 +226,7 @@ def campaign(
     threads = _threads(n_jobs, len(runs))
     order = _order(runs)
     jobs = [
-        joblib.delayed(_identify)(place, *packed, runs[place].seed, threads)
+        joblib.delayed(_identify)(place, *packed, runs[place].seed, threads, os.getpid())
         for place, packed in zip(order, _packed([runs[place] for place in order]), strict=True)
     ]
     outcomes: dict[int, Outcome] = {}
@@ -275,11 +278,12 @@ def _packed(runs: Sequence[Run]) -> list[tuple[bytes, bytes, bytes]]:
 
 
 def _identify(
-    place: int, model: bytes, data: bytes, settings: bytes, seed: int, threads: int
+    place: int, model: bytes, data: bytes, settings: bytes, seed: int, threads: int, caller: int
 ) -> bytes:
     """A worker's part: fit, evaluate, and send back all but the model, which is here already."""
     from sysid.gassi import GASSI
 
+    _end_with(caller)
     started = time.perf_counter()
     fitted: GASSI | None = None
     scores: list[tuple[Metrics, ...]] = [(), ()]
@@ -297,6 +301,19 @@ def _identify(
     except Exception as error:
         fitted, problem = None, _described(error)
     return pack("result", (place, fitted, *scores, time.perf_counter() - started, problem))
+
+
+@functools.cache
+def _end_with(caller: int) -> None:
+    """If this is a process of the caller's, end it when that is gone, even by ``kill -9``."""
+
+    def watch() -> None:
+        while os.getppid() == caller:
+            time.sleep(_LOOK_EVERY)
+        os._exit(1)
+
+    if os.getppid() == caller:
+        threading.Thread(target=watch, daemon=True).start()
 
 
 # The same object for all runs of a worker, so that its kernels are made once.
