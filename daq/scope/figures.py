@@ -20,7 +20,7 @@ BLUE, ORANGE, GREEN, RED = "#0072B2", "#E69F00", "#009E73", "#D55E00"
 PURPLE, GREY = "#CC79A7", "#666666"
 _FLAG_COLORS = {
     Flag.CLAMPED: ORANGE, Flag.HELD: BLUE, Flag.LOST: RED, Flag.INTERLOCK: RED,
-    Flag.UNDERFLOW: RED, Flag.SATURATED: PURPLE,
+    Flag.UNDERFLOW: RED, Flag.SATURATED: PURPLE, Flag.DOUBTFUL: PURPLE,
 }  # fmt: skip
 _CALM = 0.03  # of a column's span that a stretch may cover and still be drawn as broad: 3 pixels
 _MARGIN, _FILLED = 0.06, 0.7  # parts of a figure's height: free at each end, filled at least
