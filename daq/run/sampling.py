@@ -10,6 +10,7 @@ from daq.hal import CHANNELS, Flag, FloatArray, Mode, Phase, Samples
 from daq.limits import Limits
 from daq.logs.writer import LogWriter
 from daq.rig import Rig
+from daq.run.pace import Pace
 from daq.run.timing import Timing
 
 _ZEROS_AHEAD = 0.05  # s of zero commands queued while waiting
@@ -44,6 +45,7 @@ class Sampling:
         self.sample_rate = sample_rate
         self.phase = Phase.OPEN
         self.timing = Timing()
+        self._pace: Pace | None = None
         self.limits = limits
         self._watch = watch
 
@@ -55,6 +57,7 @@ class Sampling:
     def begin(self, mode: Mode) -> None:
         """Sample from tick 0 on, outputs at zero."""
         self.limits.begin(self.phase, self.sample_rate)
+        self._pace = None if self.rig.info.virtual_time else Pace(self.sample_rate)
         self.rig.start(self.sample_rate, mode, self.limits.window())
         self.timing = Timing()
 
@@ -66,7 +69,7 @@ class Sampling:
         self.rig.send(0, np.zeros((ahead, len(CHANNELS))))
         sent = ahead
         while True:
-            samples = self.rig.receive()
+            samples = self._arrived()
             trip = self.limits.check(samples)
             if trip is not None:
                 self.rig.safe()
@@ -83,7 +86,7 @@ class Sampling:
 
         The outputs are zero by then. Without samples the last ones before ``end`` were lost.
         """
-        arrived = self.rig.receive()
+        arrived = self._arrived()
         self.timing.received(arrived)
         samples = before(arrived, end)
         trip = self.limits.check(samples) if len(samples) else None
@@ -95,6 +98,13 @@ class Sampling:
         flags = samples.flags.copy()
         flags[row] |= int(Flag.INTERLOCK)
         return replace(samples, flags=flags), reason
+
+    def _arrived(self) -> Samples:
+        """Samples in time with this computer's clock; DeviceError for others."""
+        samples = self.rig.receive()
+        if self._pace is not None:
+            self._pace.received(samples.tick.item(-1))
+        return samples
 
     def keep(
         self,

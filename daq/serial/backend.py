@@ -20,6 +20,8 @@ from daq.serial.messages import Block, Channel, CodedGuard, Codes, Latch, Start,
 
 _SAFE_PATIENCE = 0.25  # s to hear that the outputs are zero
 _RATE_TOLERANCE = 5e-5  # as good as a quartz
+_MOST_DRIFT = 200.0  # ppm between two clocks with a quartz each, and to spare
+_SIGMAS = 3.0  # of the drift's error that are not held against the device
 _N_IN, _N_OUT = len(ANALOG_INPUTS), len(CHANNELS)
 _ROUNDING = 1e-9  # codes, by which a quotient may miss a whole number
 _LARGEST_RATE = float(np.finfo(np.float32).max)  # 1/s
@@ -158,6 +160,8 @@ class SerialDevice:
                 "them by the device, for which the line was too slow) and "
                 f"{line['rejected_frames']} damaged frames refused; the log shows the gaps"
             )
+        if warning := _drift_warning(self._record.get("clock")):
+            warnings.append(warning)
         return {**self._facts, "warnings": warnings, **self._record}
 
     def _opened(self) -> Connection:
@@ -192,6 +196,20 @@ class SerialDevice:
                 f"not {watchdog} ms"
             )
         return period, watchdog
+
+
+def _drift_warning(clock: dict[str, Any] | None) -> str | None:
+    """What is wrong with a clock that drifts by more than two quartzes, and the cure."""
+    if clock is None or clock["drift_ppm"] is None:
+        return None
+    drift, error = clock["drift_ppm"], clock["drift_error_ppm"]
+    if abs(drift) <= _MOST_DRIFT + _SIGMAS * error:
+        return None
+    return (
+        f"the device's clock drifts by {drift:.0f} ppm (standard error {error:.0f}) from this "
+        "computer's, and with it every time, speed and identified parameter of the log. Give the "
+        "device a quartz, or let WELCOME say the frequency that its clock has"
+    )
 
 
 def _name(welcome: Welcome) -> str:

@@ -102,6 +102,7 @@ class Result(enum.IntEnum):
 # By their numbers on the wire; quicker than the enums.
 _STATES, _LATCHES, _MODES = tuple(State), tuple(Latch), tuple(Mode)
 
+NOTHING = struct.Struct("<")  # payload of SAFE and CLEAR
 RUN = struct.Struct("<H")  # payload of GO and STOP: the run
 ANNOUNCE = struct.Struct("<B3xf")  # the phase's number in the order of daq.hal.Phase, and turns
 PING = struct.Struct("<Q")  # the host's own time, which the device only returns
