@@ -18,7 +18,7 @@ def main() -> None:
     except RigError as error:
         _end(error, str(error), error.exit_status)
     except Terminated as signal:
-        _end(signal, f"stopped by {signal}; outputs are zero")
+        _end(signal, f"stopped by {signal}")
     except KeyboardInterrupt as interrupt:
         _end(interrupt, "stopped by Ctrl-C")
     except SystemExit as exit:

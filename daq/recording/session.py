@@ -13,7 +13,7 @@ from daq.diagnose import currents
 from daq.errors import ConfigError, together
 from daq.experiment import Plan
 from daq.findings import Findings
-from daq.hal import Device, Phase, Reporting
+from daq.hal import Device, Phase
 from daq.logs.capture import LOG_NAME
 from daq.logs.recording import Recording, load
 from daq.lookup.experiments import LoadedExperiment, load_experiment
@@ -152,6 +152,5 @@ def _run(
         watch(Progress(_ACTIVITIES[step.phase], step.done, step.total, status))
 
     result = run_experiment(loaded.experiment, loaded.name, rig, device, out, report)
-    if isinstance(device, Reporting):
-        warn(watch, *device.report().get("warnings", []))
+    warn(watch, *result.warnings)
     return result

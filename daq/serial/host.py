@@ -16,7 +16,18 @@ from daq.serial import codec, messages
 from daq.serial.clock import RATE_TOLERANCE, ClockEstimator, RateBounds
 from daq.serial.codec import Decoder, Frame
 from daq.serial.commands import CommandStream
-from daq.serial.messages import Block, Latch, Pong, Reply, Result, Start, State, Status, Type
+from daq.serial.messages import (
+    WATCHDOG_ZEROES,
+    Block,
+    Latch,
+    Pong,
+    Reply,
+    Result,
+    Start,
+    State,
+    Status,
+    Type,
+)
 
 RETRY = 0.1  # s until a request is sent again
 HELLO_RETRY = 0.2
@@ -202,6 +213,10 @@ class HostMachine:
         self._count(seq)
         if self._state is State.IDLE or block.status.run != self._run:
             return  # of a run that was stopped
+        if block.status.latch is Latch.WATCHDOG and not block.records["applied"][-1].any():
+            # Zeros that no flag explains: what explains them is the latch, which ends the run.
+            self._learn(block.status, now)
+            return
         if block.first < self._expected:
             self.counters.duplicate_blocks += 1
             return
@@ -251,8 +266,8 @@ class HostMachine:
             self._fail(
                 f"the device's clock runs {abs(deviation):.1%} or more too "
                 f"{'fast' if deviation > 0.0 else 'slow'} by this computer's: it is not the "
-                f"{1e-6 * self.welcome.clock:g} MHz that WELCOME says, and no sample would stand at its "
-                "time. Mend its crystal or its clock's set-up, or what its firmware says of it"
+                f"{1e-6 * self.welcome.clock:g} MHz that WELCOME says. Mend its "
+                "crystal or its clock's set-up, or what its firmware says of it"
             )
         self._learn(pong.status, now)
 
@@ -268,8 +283,8 @@ class HostMachine:
         if reply.result is Result.NO_SESSION:
             if self.welcome is not None:
                 self._fail(
-                    "the device has restarted and forgotten the run; its outputs are zero. Look "
-                    "for a supply that breaks down, a reset by the port, or firmware that crashed"
+                    "the device has restarted and forgotten the run. Look for a supply that breaks "
+                    "down, a reset by the port, or firmware that crashed"
                 )
             return
         self._learn(reply.status, now)
@@ -295,7 +310,7 @@ class HostMachine:
         if self._state is State.RUNNING and status.latch is Latch.WATCHDOG:
             self._fail(self._why_tripped(now, self._start.watchdog))
         elif self._state is State.RUNNING and status.state is State.IDLE and self.pending is None:
-            self._fail("the device has ended the run by itself; its outputs are zero")
+            self._fail("the device has ended the run by itself; mend its firmware")
 
     def _send(self, type_: Type, payload: bytes) -> None:
         self._outbox.append(codec.encode(type_, self.session, next(self._sequence), payload))
@@ -343,13 +358,13 @@ class HostMachine:
                 "baud rate, here and in the firmware, lower sample_rate, or check the cable"
             )
         return (
-            f"the device does not answer {name} any more; check its cable and its supply. It makes "
-            "itself safe when it hears nothing"
+            f"the device does not answer {name} any more; check its cable and its supply. "
+            f"{WATCHDOG_ZEROES}"
         )
 
     def _why_tripped(self, now: float, watchdog: int) -> str:
         tripped = (
-            "the device's watchdog has zeroed the outputs: it had heard nothing from this program "
+            "the device's watchdog has tripped: it had heard nothing from this program "
             f"for {watchdog} ms"
         )
         pause = max(self.counters.longest_pause, now - self._pinged)
@@ -369,13 +384,12 @@ class HostMachine:
         if damaged > 1:
             return (
                 f"nothing but damaged frames ({damaged}) has come from the device for {SILENCE:g} "
-                "s; check cable, connectors and its supply. It makes itself safe when it hears "
-                "nothing"
+                f"s; check cable, connectors and its supply. {WATCHDOG_ZEROES}"
             )
         if now - self._frame_at > 0.5 * SILENCE:
             return (
                 f"nothing has come from the device for {SILENCE:g} s; check its cable and its "
-                "supply. It makes itself safe when it hears nothing"
+                f"supply. {WATCHDOG_ZEROES}"
             )
         return (
             f"the device answers but has sent no sample for {SILENCE:g} s; its firmware hangs, or "

@@ -20,6 +20,7 @@ from daq.hal import ANALOG_INPUTS, CHANNELS, Mode
 MALFORMED = (struct.error, ValueError, IndexError)  # raised by a payload that is not of its type
 
 VERSION = 1
+WATCHDOG_ZEROES = "A device that follows the protocol zeroes its outputs when it hears nothing"
 MAGIC = b"HRIG"
 
 COMMAND_DTYPE = np.dtype("<i2")  # a command on the wire: a converter code per channel and tick

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from daq.errors import DeviceError
+from daq.serial.messages import WATCHDOG_ZEROES
 
 _PATIENCE = 0.01  # s that a read waits at most
 _WRITE_PATIENCE = 0.5  # s that a port may take to accept a frame
@@ -58,8 +59,7 @@ def ports_of(names: Sequence[str]) -> list[PortFacts]:
 def _gone(port: str, error: Exception | None = None) -> DeviceError:
     reason = "" if error is None else f" ({error})"
     return DeviceError(
-        f"the port has gone{reason}; check the cable and the device's supply. The device makes "
-        "itself safe when it hears nothing",
+        f"the port has gone{reason}; check the cable and the device's supply. {WATCHDOG_ZEROES}",
         file=port,
     )
 

@@ -58,7 +58,7 @@ class Lies:
     row of WELCOME. sticks: ``"output"`` for outputs that stay where SAFE, STOP or START find
     them, ``"amplifier"`` for a current that does. deaf: requests without an answer.
     output: what is applied for a command, a function of sample number and codes. flags: by sample
-    number, a function.
+    number, a function. saturates: in which samples the torque stands at its end, a function.
     """
 
     clock: float = 1.0
@@ -73,6 +73,7 @@ class Lies:
     deaf: tuple = ()
     output: object = None
     flags: object = None
+    saturates: object = None
 
 
 class Paper:
@@ -162,6 +163,8 @@ class Paper:
     def play(self, tick):
         """Latch, then apply: a record of this tick."""
         analog = [code + self.noise.integers(-3, 4) for code in (*self.current, 0)]
+        if self.lies.saturates is not None and self.lies.saturates(tick):
+            analog[2] = 10_000
         count = 0 if self.lies.counts is None else self.lies.counts(tick)
         half = 2 ** (self.lies.bits - 1)
         count = (count + half) % (2 * half) - half
