@@ -79,7 +79,7 @@ def test_phases_come_in_order_and_the_device_is_made_safe_before_it_is_closed(co
     assert "safe" in order[order.index("run") :], "announced, or called, at the end"
     assert_left_safe(root)
     modes = [e["mode"] for e in journal if e["what"] == "start"]
-    assert modes == ["closed loop", "closed loop", "open loop"]
+    assert modes == ["closed loop", "closed loop", "open loop", "closed loop"]
 
 
 def test_outputs_are_zero_before_the_run_phase(completed):
@@ -97,7 +97,8 @@ def test_the_capture_folder_holds_the_run_as_resolved(completed):
     assert sorted(p.name for p in folder.iterdir()) == ["log.csv", "run.json"]
     assert {
         "status", "reason", "started", "experiment", "rig", "software", "host", "device",
-        "calibration", "offsets", "homing", "phase", "timing", "log", "realtime",
+        "calibration", "offsets", "homing", "phase", "timing", "log", "realtime", "outputs",
+        "saturated_samples",
     } == set(record)  # fmt: skip
     assert (record["status"], record["reason"], record["phase"]) == ("completed", None, "close")
     assert record["experiment"] == {
