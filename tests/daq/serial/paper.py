@@ -209,7 +209,7 @@ class Paper:
 @contextmanager
 def paper_device(**lies):
     """The port of such a device, which serves one connection after the other."""
-    told = Lies(**lies)
+    rules = Lies(**lies)
     with socket.create_server(("127.0.0.1", 0)) as server:
 
         def serve():
@@ -220,7 +220,7 @@ def paper_device(**lies):
                     return
                 with line:
                     try:
-                        Paper(line, told).serve()
+                        Paper(line, rules).serve()
                     except OSError:
                         continue
 
