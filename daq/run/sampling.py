@@ -78,7 +78,7 @@ class Sampling:
     def receive(self, end: int) -> tuple[Samples, str | None]:
         """Samples before the tick ``end``, up to the first beyond a limit, and why it is.
 
-        The outputs have been commanded to zero by then. Without samples the last ones before ``end`` were lost.
+        The device has been told SAFE by then. Without samples the last before ``end`` were lost.
         """
         arrived = self.rig.receive()
         self._keep_pace(arrived)
