@@ -131,7 +131,11 @@ class RunError(RigError):
 
 
 class InterlockError(RunError):
-    """A measured quantity passed its limit; the outputs were zeroed."""
+    """A measured quantity passed its limit; the device was told to zero its outputs."""
+
+
+class IncompleteError(RunError):
+    """More samples of a run are missing than may be."""
 
 
 class Terminated(BaseException):

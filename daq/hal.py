@@ -123,7 +123,8 @@ class DeviceInfo:
     """Who answers, and what it can do.
 
     max_rate [Hz]; queue: commands it can hold ahead of time; volts_in: (low, high) of its
-    analog inputs; virtual_time: whether its clock waits for the host.
+    analog inputs; virtual_time: whether its clock waits for the host. step_out [V]: by which what
+    an output applies may differ from its command.
     """
 
     name: str
@@ -131,6 +132,7 @@ class DeviceInfo:
     queue: int
     volts_in: tuple[float, float]
     virtual_time: bool = False
+    step_out: float = 0.01
 
 
 @runtime_checkable

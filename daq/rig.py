@@ -31,13 +31,15 @@ from daq.hal import (
 class Rig:
     """A rig to command and sample in SI units.
 
-    offsets: volts that each analog input reads at zero, (3,) in ``ANALOG_INPUTS`` order. Use as a
-    context manager: leaving it, by whatever way, zeroes the outputs and closes the device.
+    offsets: volts that each analog input reads at zero, (3,) in ``ANALOG_INPUTS`` order.
+    saturated: samples in which each stood at the end of its converter, (3,). Use as a context
+    manager: leaving it, by whatever way, zeroes the outputs and closes the device.
     """
 
     def __init__(self, device: Device, config: RigConfig) -> None:
         self.config = config
         self.offsets = np.zeros(len(ANALOG_INPUTS))
+        self.saturated: IntArray = np.zeros(len(ANALOG_INPUTS), dtype=np.int64)
         inputs = [getattr(config.sensors, name) for name in ANALOG_INPUTS]
         self._scale = np.array([item.sign * item.scale for item in inputs])
         self._device = device
@@ -212,6 +214,8 @@ class Rig:
             # A tick without a command counts as the one before.
             places = np.minimum(raw.tick, max(self._next_command - 1, 0)) % len(self._commands)
         commands, flags = self._commands[places].copy(), raw.flags.copy()
+        if flags.any():
+            self._count_saturated(raw)
         if self._clamped[places].any():
             flags |= self._clamped[places] * int(Flag.CLAMPED)
         if first != self._last_tick + 1:
@@ -233,3 +237,10 @@ class Rig:
             omega=raw.count_rate * self._radians,
             flags=flags,
         )
+
+    def _count_saturated(self, raw: RawSamples) -> None:
+        low, high = self.info.volts_in
+        end = 1e-3 * (high - low)  # V, of a converter whose last codes are not all used
+        at_end = (raw.analog <= low + end) | (raw.analog >= high - end)
+        marked = (raw.flags & int(Flag.SATURATED)) != 0
+        self.saturated += np.count_nonzero(at_end & marked[:, None], axis=0)

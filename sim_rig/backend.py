@@ -146,6 +146,7 @@ class SimulatedDevice:
             queue=command_queue.SIZE,
             volts_in=(-converters.RANGE, converters.RANGE),
             virtual_time=self.options.time == "virtual",
+            step_out=self._converters.resolution,
         )
 
     def announce(self, phase: Phase, turns: float = 0.0) -> None:

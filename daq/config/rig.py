@@ -7,7 +7,16 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, PrivateAttr, create_model, field_validator
 
 from daq.config.base import Section
-from daq.config.units import Amperes, NewtonMetres, RadiansPerSecond, Seconds, Turns, Unit, Volts
+from daq.config.units import (
+    Amperes,
+    NewtonMetres,
+    Part,
+    RadiansPerSecond,
+    Seconds,
+    Turns,
+    Unit,
+    Volts,
+)
 from daq.errors import ConfigError
 
 Sign = Literal[-1, 1]
@@ -184,6 +193,9 @@ class LimitSettings(Section):
         gt=0.0,
         description="for which an input with noise, or one that must follow its command, may "
         "read the same to the bit; null: not watched",
+    )
+    lost: Part = Field(
+        0.01, ge=0.0, le=1.0, description="share of a run's samples that may be missing in its log"
     )
     own: list[UserLimit] = Field(default_factory=list, description="limits from your own code")
 

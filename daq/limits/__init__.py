@@ -178,7 +178,7 @@ class _UserCode(Limit):
         except (TypeError, ValueError):
             raise RunError(
                 f"{self._name} answered {trip!r} to {len(samples)} samples",
-                cure="check must return None or (row, reason); outputs were set to zero",
+                cure="check must return None or (row, reason)",
             ) from None
         return int(row), str(reason)
 
@@ -191,4 +191,4 @@ class _UserCode(Limit):
         except USER_CODE_ERRORS as error:
             place = raised_in(type(self._limit), error)
             problem = f"{self._name} failed: {type(error).__name__}: {error}{place}"
-            raise RunError(f"{problem}; outputs were set to zero") from error
+            raise RunError(problem) from error

@@ -13,7 +13,7 @@ from daq.diagnose import currents
 from daq.errors import ConfigError, together
 from daq.experiment import Plan
 from daq.findings import Findings
-from daq.hal import Device, Phase, Reporting
+from daq.hal import Device, Phase
 from daq.logs.capture import LOG_NAME
 from daq.logs.recording import Recording, load
 from daq.lookup.experiments import LoadedExperiment, load_experiment
@@ -46,8 +46,8 @@ class Session:
     def record(self, out: Path, *, validation: bool, watch: Watch) -> SessionResult:
         """Run the experiment, and then its validation run where there is one and it is wanted.
 
-        Raises DeviceError, InterlockError, RunError, KeyboardInterrupt or Terminated; outputs are
-        zero then.
+        Raises DeviceError, InterlockError, RunError, KeyboardInterrupt or Terminated, whose notes
+        say whether the outputs were read as zero then.
         """
         run = _run(self.loaded, self.rig, self.device, out, watch)
         findings = conclude_or_warn(self.loaded.experiment, run.folder, watch)
@@ -105,7 +105,7 @@ def record(
 
     Files as for ``rig run``, shipped ones among them. validation: the experiment with what its
     ``validation`` section changes. options: of the rig's backend, over those of its file. Raises
-    RigError with cause and cure; outputs are zero then.
+    RigError with cause and cure, and a note on whether the outputs were read as zero then.
 
     >>> from daq import record
     >>> run = record("prbs.yaml", options={"seed": 1})
@@ -167,6 +167,5 @@ def _run(
         watch(Progress(_ACTIVITIES[step.phase], step.done, step.total, status))
 
     result = run_experiment(loaded.experiment, loaded.name, rig, device, out, report)
-    if isinstance(device, Reporting):
-        warn(watch, *device.report().get("warnings", []))
+    warn(watch, *result.warnings)
     return result

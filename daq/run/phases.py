@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from daq.errors import DeviceError, RunError
+from daq.errors import DeviceError, IncompleteError, RunError
 from daq.experiment import Homing, OffsetCalibration
 from daq.hal import ANALOG_INPUTS, CHANNELS, Flag, FloatArray, Mode, Samples
 from daq.logs.writer import LogWriter
@@ -95,7 +95,10 @@ def home(sampling: Sampling, homing: Homing, record: dict[str, Any]) -> None:
 
 
 def play(sampling: Sampling, log: LogWriter, commands: FloatArray) -> None:
-    """Play commands (n_samples, 2) [V] and log every sample. Raises DeviceError, InterlockError."""
+    """Play commands (n_samples, 2) [V] and log every sample.
+
+    Raises DeviceError, InterlockError, and IncompleteError where too many samples are missing.
+    """
     rig, n_samples = sampling.rig, len(commands)
     sampling.begin(Mode.OPEN_LOOP)
     sent = done = 0
@@ -113,14 +116,19 @@ def play(sampling: Sampling, log: LogWriter, commands: FloatArray) -> None:
         done = sampling.keep(log, samples, (), trip, n_samples)
         if np.any(samples.flags & int(Flag.UNDERFLOW)):
             raise DeviceError(
-                f"the device ran out of commands by sample {done - 1} and made itself safe; "
-                "the host was too slow to refill it"
+                f"the device ran out of commands by sample {done - 1} and says that it zeroed "
+                "its outputs; the host was too slow to refill it"
             )
+        _require_samples(sampling, log, done, n_samples)
     rig.stop()
+    _require_samples(sampling, log, n_samples, n_samples)
 
 
 def control(sampling: Sampling, log: LogWriter, dialogue: Dialogue, n_samples: int) -> None:
-    """Answer and log every sample until the controller has ended, ``n_samples`` at the most."""
+    """Answer and log every sample until the controller has ended, ``n_samples`` at the most.
+
+    Raises DeviceError, RunError, InterlockError, and IncompleteError as ``play`` does.
+    """
     rig, ahead = sampling.rig, dialogue.ahead
     sampling.begin(Mode.CLOSED_LOOP)
     rig.send(0, np.zeros((ahead, len(CHANNELS))))
@@ -141,4 +149,19 @@ def control(sampling: Sampling, log: LogWriter, dialogue: Dialogue, n_samples: i
             sampling.timing.answered(end - 1)
             sent = until
         done = sampling.keep(log, before(samples, end), logged, trip, n_samples)
+        _require_samples(sampling, log, done, n_samples)
     rig.stop()
+    end = done if dialogue.ended else n_samples
+    _require_samples(sampling, log, end, end)
+
+
+def _require_samples(sampling: Sampling, log: LogWriter, end: int, total: int) -> None:
+    """Raise IncompleteError once too many of a run's samples are missing before ``end``."""
+    missing, share = end - log.n_samples, sampling.rig.config.limits.lost
+    if missing > share * total:
+        raise IncompleteError(
+            f"{missing} of the run's {total} samples are missing by sample {end - 1}, more than "
+            f"limits.lost of {share:g} allows",
+            cure="look at the line ('rig doctor', connection.line in run.json), sample more "
+            "slowly, or allow more in the rig's file",
+        )

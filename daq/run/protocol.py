@@ -138,7 +138,7 @@ class Dialogue:
 
     def _failed(self, tick: int, error: BaseException) -> RunError:
         text = failure(self._experiment, f"at sample {tick}", error)
-        return RunError(f"{text}; outputs were set to zero")
+        return RunError(text)
 
 
 def preview_of(experiment: Experiment) -> Chart | Heatmap | None:

@@ -6,13 +6,23 @@ from pathlib import Path
 from typing import Any
 
 from daq.config.rig import RigConfig
-from daq.errors import USER_CODE_ERRORS, DeviceError, InterlockError, RigError, Terminated
+from daq.errors import (
+    USER_CODE_ERRORS,
+    DeviceError,
+    IncompleteError,
+    InterlockError,
+    RigError,
+    RunError,
+    Terminated,
+)
 from daq.experiment import ClosedLoop, Experiment, Plan
-from daq.hal import Device, Phase
+from daq.hal import ANALOG_INPUTS, Device, Phase
 from daq.limits import Limits
+from daq.limits.device import saturation_warnings
 from daq.logs.capture import COMPLETED, RUNNING, Capture
 from daq.logs.writer import LogWriter
 from daq.rig import Rig
+from daq.run.outputs import INTERRUPTED, OutputState, read_back
 from daq.run.phases import calibrate, control, home, play
 from daq.run.plan import plan
 from daq.run.protocol import Dialogue, description_of
@@ -20,12 +30,18 @@ from daq.run.realtime import RealTime
 from daq.run.sampling import Sampling, Watcher, nobody
 from daq.run.signals import SignalHandling
 
+_STATUS: dict[type[BaseException], str] = {
+    InterlockError: "interlock",
+    IncompleteError: "incomplete",
+}  # others: failed
+
 
 @dataclass(frozen=True)
 class RunResult:
     """A completed run: its folder, what was logged, and how punctual it was, as in run.json.
 
-    doubts: what the limits that do not stop a run have said, with the cures.
+    doubts: what the limits that do not stop a run have said, with the cures. warnings: the same of
+    the device.
     """
 
     folder: Path
@@ -33,6 +49,7 @@ class RunResult:
     timing: dict[str, Any]
     realtime: dict[str, Any]
     doubts: list[str]
+    warnings: list[str]
 
     @property
     def document(self) -> dict[str, Any]:
@@ -67,9 +84,13 @@ def run_experiment(
         return _Run(experiment, planned, dialogue, sampling, capture, signals, realtime).execute()
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Run:
-    """One run through its phases; dialogue: with the controller of a closed loop."""
+    """One run through its phases.
+
+    dialogue: with the controller of a closed loop. outputs: as they were at the end of a run whose
+    rig was opened.
+    """
 
     experiment: Experiment
     plan: Plan
@@ -78,6 +99,7 @@ class _Run:
     capture: Capture
     signals: SignalHandling
     realtime: RealTime
+    outputs: OutputState | None = None
 
     def execute(self) -> RunResult:
         """All phases; the record in the capture folder names how they ended."""
@@ -95,15 +117,19 @@ class _Run:
         except USER_CODE_ERRORS as error:
             phase = self.sampling.phase.value
             failed = DeviceError(
-                f"the backend failed during {phase}: {type(error).__name__}: {error}; "
-                "outputs were set to zero. Mend the backend, or report this to who maintains it"
+                f"the backend failed during {phase}: {type(error).__name__}: {error}. "
+                "Mend the backend, or report this to who maintains it"
             )
             self._finish_early(failed, log)
             raise failed from error
         self._finish(COMPLETED, None)
         record = self.capture.record
         doubts = [doubt.sentence for doubt in self.sampling.limits.doubts]
-        facts = record["timing"], record["realtime"], doubts
+        warnings = [
+            *record.get("connection", {}).get("warnings", []),
+            *saturation_warnings(self.sampling.rig.saturated),
+        ]
+        facts = record["timing"], record["realtime"], doubts, warnings
         return RunResult(self.capture.folder, log.n_samples, *facts)
 
     def _all_phases(self, log: LogWriter) -> None:
@@ -118,13 +144,22 @@ class _Run:
             self._leave()
             # A device that failed may fail to close as well; why it failed is what counts.
             broken = (Exception, KeyboardInterrupt, Terminated)
-            with contextlib.suppress(*broken), self.signals.breakable():
-                rig.close()
+            for step in (self._read_back, rig.close):
+                with contextlib.suppress(*broken), self.signals.breakable():
+                    step()
             raise
         self._leave()
         self.sampling.phase = Phase.CLOSE
         with self.signals.breakable():
-            rig.close()
+            try:
+                self._read_back()
+            finally:
+                rig.close()
+        if self.outputs is not None and self.outputs.problem is not None:
+            raise RunError(
+                "all was recorded, but the outputs did not become zero as they must: "
+                f"{self.outputs.problem}"
+            )
 
     def _phases_under_power(self, log: LogWriter) -> None:
         sampling, record, homing = self.sampling, self.capture.record, self.experiment.homing
@@ -147,6 +182,17 @@ class _Run:
         """Zero outputs, whatever came before; ordinary scheduling."""
         self.sampling.rig.safe()
         self.realtime.undo()
+        # A backend that failed may fail to report as well.
+        with contextlib.suppress(Exception):
+            if connection := self.sampling.rig.report():
+                self.capture.record["connection"] = connection
+
+    def _read_back(self) -> None:
+        """Record whether the outputs of a rig that was opened are zero."""
+        if "device" in self.capture.record:
+            rate, calibration = self.experiment.sample_rate, self.experiment.calibration
+            self.outputs = INTERRUPTED
+            self.outputs = read_back(self.sampling.rig, rate, calibration)
 
     def _schedule(self, virtual_time: bool) -> None:
         wanted = self.sampling.rig.config.realtime
@@ -166,8 +212,6 @@ class _Run:
         if disturbance is not None and disturbance not in reason:
             reason += f"; {self.capture.log_path.name}: {disturbance}"
             error.add_note(f"{self.capture.log_path}: {disturbance}")
-        if status == "stopped":
-            error.add_note("outputs were set to zero")
         self._finish(status, reason)
         n = log.n_samples if log is not None else 0
         late = self.sampling.timing.flags.get("held", 0)
@@ -176,6 +220,8 @@ class _Run:
             f"what was recorded until then: {self.capture.folder} ({n} samples of the run"
             f"{punctuality})"
         )
+        if self.outputs is not None:
+            error.add_note(self.outputs.text)
 
     def _end(self, error: BaseException) -> tuple[str, str]:
         """Status and reason of a run that ended by an error."""
@@ -184,7 +230,7 @@ class _Run:
             return "stopped", f"stopped by Ctrl-C {where}"
         if isinstance(error, Terminated):
             return "stopped", f"stopped by {error} {where}"
-        return "interlock" if isinstance(error, InterlockError) else "failed", str(error)
+        return _STATUS.get(type(error), "failed"), str(error)
 
     def _give_up(self) -> None:
         """The least record of a run whose clean-up hangs; in the middle of whatever it does."""
@@ -195,10 +241,10 @@ class _Run:
         self.capture.save()
 
     def _finish(self, status: str, reason: str | None) -> None:
-        # A backend that failed may fail to report as well.
-        with contextlib.suppress(Exception):
-            if connection := self.sampling.rig.report():
-                self.capture.record["connection"] = connection
+        saturated = dict(zip(ANALOG_INPUTS, self.sampling.rig.saturated.tolist(), strict=True))
+        self.capture.record["saturated_samples"] = saturated
+        if self.outputs is not None:
+            self.capture.record["outputs"] = self.outputs.document
         # A record that cannot be written (the disk is full) must not hide why the run ended;
         # the folder then still says "running", which a reader reports as interrupted.
         self.capture.record["doubts"] = [asdict(doubt) for doubt in self.sampling.limits.doubts]

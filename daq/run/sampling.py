@@ -2,15 +2,18 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from operator import itemgetter
 
 import numpy as np
 
 from daq.errors import InterlockError
 from daq.hal import CHANNELS, Flag, FloatArray, Mode, Phase, Samples
-from daq.limits import Limits
+from daq.limits import Limits, Trip
+from daq.limits.device import Obedience
 from daq.logs.writer import LogWriter
 from daq.progress import Note
 from daq.rig import Rig
+from daq.run.pace import Pace
 from daq.run.timing import Timing
 
 _ZEROS_AHEAD = 0.05  # s of zero commands queued while waiting
@@ -45,6 +48,7 @@ class Sampling:
         self.sample_rate = sample_rate
         self.phase = Phase.OPEN
         self.timing = Timing()
+        self._pace: Pace | None = None
         self.limits = limits
         self._watch = watch
 
@@ -56,38 +60,32 @@ class Sampling:
     def begin(self, mode: Mode) -> None:
         """Sample from tick 0 on, outputs at zero."""
         self.limits.begin(self.phase, self.sample_rate)
+        self._pace = None if self.rig.info.virtual_time else Pace(self.sample_rate)
+        self._obedience = Obedience(self.rig.config.limits.command, self.rig.info.step_out)
         self.rig.start(self.sample_rate, mode, self.limits.window())
         self.timing = Timing()
 
     def at_zero(self) -> Iterator[Samples]:
         """Blocks of samples at zero command without end. Raises InterlockError."""
-        # Sent a little ahead: zeros are safe to hold, and the host need not hurry every tick.
-        ahead = max(1, round(_ZEROS_AHEAD * self.sample_rate))
         self.begin(Mode.CLOSED_LOOP)
-        self.rig.send(0, np.zeros((ahead, len(CHANNELS))))
-        sent = ahead
-        while True:
-            samples = self.rig.receive()
-            trip = self.limits.check(samples)
+        for samples in at_rest(self.rig, self.sample_rate):
+            self._keep_pace(samples)
+            trip = self._check(samples)
             if trip is not None:
                 self.rig.safe()
-                where = f"interlock during {self.phase.value}"
-                raise InterlockError(f"{where}: {trip[1]}; outputs are zero")
+                raise InterlockError(f"interlock during {self.phase.value}: {trip[1]}")
             yield samples
-            missing = int(samples.tick[-1]) + 1 + ahead - sent
-            if missing > 0:
-                self.rig.send(sent, np.zeros((missing, len(CHANNELS))))
-                sent += missing
 
     def receive(self, end: int) -> tuple[Samples, str | None]:
         """Samples before the tick ``end``, up to the first beyond a limit, and why it is.
 
-        The outputs are zero by then. Without samples the last ones before ``end`` were lost.
+        The device has been told SAFE by then. Without samples the last before ``end`` were lost.
         """
         arrived = self.rig.receive()
+        self._keep_pace(arrived)
         self.timing.received(arrived)
         samples = before(arrived, end)
-        trip = self.limits.check(samples) if len(samples) else None
+        trip = self._check(samples) if len(samples) else None
         if trip is None:
             return samples, None
         self.rig.safe()
@@ -96,6 +94,16 @@ class Sampling:
         flags = samples.flags.copy()
         flags[row] |= int(Flag.INTERLOCK)
         return replace(samples, flags=flags), reason
+
+    def _check(self, samples: Samples) -> Trip | None:
+        """The first row beyond a limit, or in which the device does not do as it is told."""
+        trips = [self.limits.check(samples), self._obedience.check(samples)]
+        return min(filter(None, trips), key=itemgetter(0), default=None)
+
+    def _keep_pace(self, arrived: Samples) -> None:
+        """Raise DeviceError for samples that are not in time with this computer's clock."""
+        if self._pace is not None:
+            self._pace.received(arrived.tick.item(-1))
 
     def keep(
         self,
@@ -114,7 +122,7 @@ class Sampling:
         end = samples.tick.item(-1) + 1
         self.tell(end, total, "samples")
         if trip is not None:
-            raise InterlockError(f"interlock in sample {end - 1}: {trip}; outputs are zero")
+            raise InterlockError(f"interlock in sample {end - 1}: {trip}")
         return end
 
     def tell(self, done: float, total: float, unit: str) -> None:
@@ -132,6 +140,21 @@ class Sampling:
             # Its terminal or pipe is gone. That is no reason to lose a run: whoever closed it
             # ends the run by a signal, if that was meant.
             self._watch = nobody
+
+
+def at_rest(rig: Rig, sample_rate: float) -> Iterator[Samples]:
+    """Blocks of samples at zero command without end, of a rig started in closed loop."""
+    # Sent a little ahead: zeros are safe to hold, and the host need not hurry every tick.
+    ahead = max(1, round(_ZEROS_AHEAD * sample_rate))
+    rig.send(0, np.zeros((ahead, len(CHANNELS))))
+    sent = ahead
+    while True:
+        samples = rig.receive()
+        yield samples
+        missing = int(samples.tick[-1]) + 1 + ahead - sent
+        if missing > 0:
+            rig.send(sent, np.zeros((missing, len(CHANNELS))))
+            sent += missing
 
 
 def before(samples: Samples, end: int) -> Samples:

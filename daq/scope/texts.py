@@ -14,6 +14,7 @@ from daq.scope.watch import FollowedLog
 _STATES = {
     "running": (GREEN, "recording"),
     "completed": (BLUE, "completed"),
+    "incomplete": (ORANGE, "incomplete"),
     "stopped": (ORANGE, "stopped"),
     "log": (GREY, "log without a run record"),
 }

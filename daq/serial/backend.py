@@ -20,7 +20,10 @@ from daq.serial.messages import Block, Channel, CodedGuard, Codes, Latch, Start,
 
 _SAFE_PATIENCE = 0.25  # s to hear that the outputs are zero
 _RATE_TOLERANCE = 5e-5  # as good as a quartz
+_MOST_DRIFT = 200.0  # ppm between two clocks with a quartz each, and to spare
+_SIGMAS = 3.0  # of the drift's error that are not held against the device
 _N_IN, _N_OUT = len(ANALOG_INPUTS), len(CHANNELS)
+_SHORT, _NEAR = 2**16, 2**12  # counts of a short counter, and in a tick at its end
 _ROUNDING = 1e-9  # codes, by which a quotient may miss a whole number
 _LARGEST_RATE = float(np.finfo(np.float32).max)  # 1/s
 
@@ -83,7 +86,13 @@ class SerialDevice:
             raise
         self._connection, self._scaling = connection, Scaling(welcome.channels)
         volts_in = self._scaling.input_range
-        return DeviceInfo(_name(welcome), welcome.max_rate, welcome.queue, volts_in)
+        return DeviceInfo(
+            _name(welcome),
+            welcome.max_rate,
+            welcome.queue,
+            volts_in,
+            step_out=self._scaling.step_out,
+        )
 
     def announce(self, phase: Phase, turns: float = 0.0) -> None:
         """Tell the device which phase begins; an emulator's user winds the handle then."""
@@ -158,6 +167,8 @@ class SerialDevice:
                 "them by the device, for which the line was too slow) and "
                 f"{line['rejected_frames']} damaged frames refused; the log shows the gaps"
             )
+        if warning := _drift_warning(self._record.get("clock")):
+            warnings.append(warning)
         return {**self._facts, "warnings": warnings, **self._record}
 
     def _opened(self) -> Connection:
@@ -194,26 +205,46 @@ class SerialDevice:
         return period, watchdog
 
 
+def _drift_warning(clock: dict[str, Any] | None) -> str | None:
+    """What is wrong with a clock that drifts by more than two quartzes, and the cure."""
+    if clock is None or clock["drift_ppm"] is None:
+        return None
+    drift, error = clock["drift_ppm"], clock["drift_error_ppm"]
+    if abs(drift) <= _MOST_DRIFT + _SIGMAS * error:
+        return None
+    return (
+        f"the device's clock drifts by {drift:.0f} ppm (standard error {error:.0f}) from this "
+        "computer's, and with it every time, speed and identified parameter of the log. Give the "
+        "device a quartz, or let WELCOME say the frequency that its clock has"
+    )
+
+
 def _name(welcome: Welcome) -> str:
     return f"{welcome.device} (firmware {welcome.firmware})"
 
 
 class Scaling:
-    """Scales of a device's codes. input_range: volts that every analog input can measure."""
+    """Scales of a device's codes.
+
+    input_range: volts that every analog input can measure. step_out [V]: of the coarser output.
+    """
 
     def __init__(self, channels: Sequence[Channel]) -> None:
         inputs, outputs = channels[:_N_IN], channels[_N_IN : _N_IN + _N_OUT]
         self.input_range = max(c.low for c in inputs), min(c.high for c in inputs)
         self._in_scale, self._in_offset = _columns(inputs)
         self._out_scale, self._out_offset = _columns(outputs)
+        self._counter = Counter(channels[-1])
+        self.step_out = float(np.abs(self._out_scale).max())
         self._guard: Guard  # of the run
+        self._count: int | None = None  # the latest of the run
 
     def coded(self, guard: Guard) -> CodedGuard:
         """A run's guard in codes; commands within its clamps stay within them from now on."""
         # An inverting stage has a negative scale, and its lowest volts the highest code.
         low, high = np.sort([self._out(guard.command_low), self._out(guard.command_high)], axis=0)
         self._low, self._high = _within(low, high, np.int16)
-        self._guard = guard
+        self._guard, self._count = guard, None
         low, high = np.sort([self._in(guard.analog_low), self._in(guard.analog_high)], axis=0)
         analog = _within(low, high, np.int32)
         counts = _within(guard.counts_low, guard.counts_high, np.int32)
@@ -233,13 +264,24 @@ class Scaling:
         return np.clip(codes, info.min, info.max).astype(messages.COMMAND_DTYPE)
 
     def samples(self, blocks: Sequence[Block]) -> RawSamples:
-        """Blocks of records in volts and counts."""
+        """Blocks of records in volts and counts; DeviceError for a counter that runs over early."""
         records = messages.joined(blocks)
         ticks = [np.arange(b.first, b.first + len(b.records), dtype=np.int64) for b in blocks]
+        counts = self._counter.unwrapped(records["counts"].astype(np.int64))
+        before = counts[0] if self._count is None else self._count
+        steps = np.abs(np.diff(counts, prepend=before))
+        self._count = int(counts[-1])
+        if np.any((steps > self._guard.count_step) & (np.abs(steps - _SHORT) < _NEAR)):
+            raise DeviceError(
+                f"the encoder's count jumped by {steps.max()} from one sample to the next, as a "
+                "counter of 16 bits does that runs over",
+                cure="extend it to 32 bits in the firmware, or let its row of WELCOME say that "
+                "it counts from -32768 to 32767",
+            )
         return RawSamples(
             tick=np.concatenate(ticks),
             analog=records["analog"] * self._in_scale + self._in_offset,
-            counts=records["counts"].astype(np.float64),
+            counts=counts.astype(np.float64),
             count_rate=records["count_rate"].astype(np.float64),
             applied=records["applied"] * self._out_scale + self._out_offset,
             flags=records["flags"].astype(np.int64),
@@ -250,6 +292,26 @@ class Scaling:
 
     def _out(self, volts: FloatArray) -> FloatArray:
         return np.asarray((volts - self._out_offset) / self._out_scale, dtype=np.float64)
+
+
+class Counter:
+    """Counts without an end, of a counter that runs over.
+
+    It has 32 bits, or 16 where its row of the channel table ends there.
+    """
+
+    def __init__(self, channel: Channel) -> None:
+        self._span = _SHORT if channel.high - channel.low == _SHORT - 1 else 2**32
+        self._last: int | None = None
+
+    def unwrapped(self, counts: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        """The counts (n,) that follow those before: the nearer way round is taken for the true."""
+        first = counts[0] if self._last is None else self._last
+        half = self._span // 2
+        steps = (np.diff(counts, prepend=first) + half) % self._span - half
+        result: npt.NDArray[np.int64] = first + np.cumsum(steps)
+        self._last = int(result[-1])
+        return result
 
 
 def _columns(channels: Sequence[Channel]) -> tuple[FloatArray, FloatArray]:

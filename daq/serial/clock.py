@@ -1,4 +1,4 @@
-"""Relation between the host's clock and the device's: offset and drift, from round trips."""
+"""Relation between the host's clock and the device's: offset, drift, bounds of its rate."""
 
 import math
 from dataclasses import dataclass, field
@@ -8,6 +8,43 @@ import numpy as np
 
 _WINDOW = 1.0  # s of which the quickest round trip is kept
 _KEPT = 1024  # windows; beyond, neighbours are joined
+
+RATE_TOLERANCE = 0.01  # share of a rate beyond which it is another than the one agreed on
+
+
+@dataclass
+class RateBounds:
+    """Bounds of a clock's rate by the host's that no delay of a message can make wrong.
+
+    A reading was taken at some instant between sending and receiving. Two of them bound the rate
+    from both sides, the more closely the longer they lie apart.
+    """
+
+    lowest: float = 0.0
+    highest: float = math.inf
+    _anchor: tuple[float, float, float] | None = None
+
+    def add(self, sent: float, reading: float, received: float) -> None:
+        """Add a round trip: host times of sending and receiving, the clock between them [s]."""
+        if self._anchor is None:
+            self._anchor = sent, reading, received
+            return
+        earliest, before, latest = self._anchor
+        passed = reading - before
+        if received > earliest:
+            self.lowest = max(self.lowest, passed / (received - earliest))
+        if sent > latest:
+            self.highest = min(self.highest, passed / (sent - latest))
+        if received - sent < 0.5 * (latest - earliest):
+            self._anchor = sent, reading, received
+
+    def deviation(self) -> float | None:
+        """By which share the rate is wrong at the least; None for one that may be right."""
+        if self.lowest > 1.0 + RATE_TOLERANCE:
+            return self.lowest - 1.0
+        if self.highest < 1.0 - RATE_TOLERANCE:
+            return self.highest - 1.0
+        return None
 
 
 @dataclass
@@ -48,7 +85,8 @@ class ClockEstimator:
         """The relation for run.json; None before the first round trip.
 
         device time = offset + (1 + drift) * (host time - reference). The offset is uncertain by
-        half the quickest round trip; the drift needs three windows.
+        half the quickest round trip, which its change from end to end adds to the drift's error;
+        the drift needs three windows.
         """
         if not self._quickest:
             return None
@@ -63,7 +101,8 @@ class ClockEstimator:
         if len(x) > 2 and moment > 0.0:
             drift = float(weight @ ((x - centre) * (y - mean)) / moment)
             residuals = y - mean - drift * (x - centre)
-            drift_error = math.sqrt(float(weight @ residuals**2) / (len(x) - 2) / moment)
+            scatter = math.sqrt(float(weight @ residuals**2) / (len(x) - 2) / moment)
+            drift_error = math.hypot(scatter, 0.5 * float(trips.min()) / float(x[-1]))
         return {
             "reference_host_seconds": float(host[0]),
             "offset_seconds": float(device[0]) + mean - drift * centre,

@@ -13,10 +13,21 @@ from typing import Any
 from daq.errors import DeviceError
 from daq.hal import CHANNELS, Mode
 from daq.serial import codec, messages
-from daq.serial.clock import ClockEstimator
+from daq.serial.clock import RATE_TOLERANCE, ClockEstimator, RateBounds
 from daq.serial.codec import Decoder, Frame
 from daq.serial.commands import CommandStream
-from daq.serial.messages import Block, Latch, Pong, Reply, Result, Start, State, Status, Type
+from daq.serial.messages import (
+    WATCHDOG_ZEROES,
+    Block,
+    Latch,
+    Pong,
+    Reply,
+    Result,
+    Start,
+    State,
+    Status,
+    Type,
+)
 
 RETRY = 0.1  # s until a request is sent again
 HELLO_RETRY = 0.2
@@ -24,6 +35,7 @@ GIVE_UP = 1.0  # s until a request that nobody answers fails
 SILENCE = 1.0  # s without a sample until a run fails
 _CHUNK = 256  # ticks in a frame of commands at most
 _TICKS_TO_SPARE = 4096  # by which a device's count may be ahead of the host's clock
+_TIME_JITTER = 1e-4  # s by which a device may mistake the time of a sample
 
 _REASONS = {
     Result.WRONG_STATE: "is in a state in which it cannot",
@@ -70,6 +82,7 @@ class HostMachine:
         self.session = session
         self.decoder = Decoder()
         self.clock = ClockEstimator()
+        self._clock_rate = RateBounds()
         self.counters = Counters()
         self.blocks: list[Block] = []
         self.failure: DeviceError | None = None
@@ -87,6 +100,7 @@ class HostMachine:
         self._run = 0
         self._start: Start  # of the run, unless IDLE
         self._expected = 0  # tick of the next sample
+        self._first_block: Block | None = None  # of the run
         self._gone = self._sample_at = self._frame_at = self._pinged = 0.0
         self._rejected = 0  # damaged frames, by the time of the last good frame
         self._receivers: dict[int, tuple[Callable[[bytes], Any], Callable[..., None]]] = {
@@ -146,7 +160,7 @@ class HostMachine:
         assert self.welcome is not None
         self._state, self._run, self._start = State.ARMED, start.run, start
         self.blocks.clear()
-        self.status = None
+        self.status = self._first_block = None
         self._expected = 0
         size = len(CHANNELS) * messages.COMMAND_DTYPE.itemsize
         chunk = min(_CHUNK, (self.welcome.max_payload - messages.COMMANDS_OVERHEAD) // size)
@@ -196,8 +210,13 @@ class HostMachine:
             receive(message, frame.seq, now)
 
     def _add_samples(self, block: Block, seq: int, now: float) -> None:
+        self._count(seq)
         if self._state is State.IDLE or block.status.run != self._run:
             return  # of a run that was stopped
+        if block.status.latch is Latch.WATCHDOG and not block.records["applied"][-1].any():
+            # Zeros that no flag explains: what explains them is the latch, which ends the run.
+            self._learn(block.status, now)
+            return
         if block.first < self._expected:
             self.counters.duplicate_blocks += 1
             return
@@ -208,12 +227,27 @@ class HostMachine:
                 "breaks down"
             )
             return
-        self._count(seq)
+        self._check_period(block)
         self.counters.lost_samples += block.first - self._expected
         self._expected = block.first + len(block.records)
         self.blocks.append(block)
         self._sample_at = now
         self._learn(block.status, now)
+
+    def _check_period(self, block: Block) -> None:
+        """Fail where the device's clock says that its samples are not as far apart as agreed."""
+        assert self.welcome is not None
+        first = self._first_block = self._first_block or block
+        due = (block.first - first.first) * self._start.period
+        passed, clock = block.time - first.time, self.welcome.clock
+        jitter = max(2.0, _TIME_JITTER * clock)
+        if abs(passed - due) > RATE_TOLERANCE * due + jitter:
+            ticks = block.first - first.first
+            self._fail(
+                f"by its own clock the device took {ticks} samples in {passed / clock:.6g} s; at "
+                f"the period of START they take {due / clock:.6g} s. Mend its firmware: its timer "
+                "must divide the clock by that period, and SAMPLES must carry that clock"
+            )
 
     def _most_ticks(self, now: float) -> float:
         """Samples that a device whose clock is twice too fast can have taken."""
@@ -225,7 +259,16 @@ class HostMachine:
         if self.welcome is None:
             return  # of a ping that nobody has sent
         middle = 0.5 * (pong.received + pong.answered) / self.welcome.clock
-        self.clock.add(pong.stamp * 1e-9, middle, now)
+        sent, tick = pong.stamp * 1e-9, 1.0 / self.welcome.clock
+        self.clock.add(sent, middle, now)
+        self._clock_rate.add(sent - tick, middle, now + tick)
+        if deviation := self._clock_rate.deviation():
+            self._fail(
+                f"the device's clock runs {abs(deviation):.1%} or more too "
+                f"{'fast' if deviation > 0.0 else 'slow'} by this computer's: it is not the "
+                f"{1e-6 * self.welcome.clock:g} MHz that WELCOME says. Mend its "
+                "crystal or its clock's set-up, or what its firmware says of it"
+            )
         self._learn(pong.status, now)
 
     def _update(self, status: Status, seq: int, now: float) -> None:
@@ -240,8 +283,8 @@ class HostMachine:
         if reply.result is Result.NO_SESSION:
             if self.welcome is not None:
                 self._fail(
-                    "the device has restarted and forgotten the run; its outputs are zero. Look "
-                    "for a supply that breaks down, a reset by the port, or firmware that crashed"
+                    "the device has restarted and forgotten the run. Look for a supply that breaks "
+                    "down, a reset by the port, or firmware that crashed"
                 )
             return
         self._learn(reply.status, now)
@@ -267,7 +310,7 @@ class HostMachine:
         if self._state is State.RUNNING and status.latch is Latch.WATCHDOG:
             self._fail(self._why_tripped(now, self._start.watchdog))
         elif self._state is State.RUNNING and status.state is State.IDLE and self.pending is None:
-            self._fail("the device has ended the run by itself; its outputs are zero")
+            self._fail("the device has ended the run by itself; mend its firmware")
 
     def _send(self, type_: Type, payload: bytes) -> None:
         self._outbox.append(codec.encode(type_, self.session, next(self._sequence), payload))
@@ -315,13 +358,13 @@ class HostMachine:
                 "baud rate, here and in the firmware, lower sample_rate, or check the cable"
             )
         return (
-            f"the device does not answer {name} any more; check its cable and its supply. It makes "
-            "itself safe when it hears nothing"
+            f"the device does not answer {name} any more; check its cable and its supply. "
+            f"{WATCHDOG_ZEROES}"
         )
 
     def _why_tripped(self, now: float, watchdog: int) -> str:
         tripped = (
-            "the device's watchdog has zeroed the outputs: it had heard nothing from this program "
+            "the device's watchdog has tripped: it had heard nothing from this program "
             f"for {watchdog} ms"
         )
         pause = max(self.counters.longest_pause, now - self._pinged)
@@ -341,13 +384,12 @@ class HostMachine:
         if damaged > 1:
             return (
                 f"nothing but damaged frames ({damaged}) has come from the device for {SILENCE:g} "
-                "s; check cable, connectors and its supply. It makes itself safe when it hears "
-                "nothing"
+                f"s; check cable, connectors and its supply. {WATCHDOG_ZEROES}"
             )
         if now - self._frame_at > 0.5 * SILENCE:
             return (
                 f"nothing has come from the device for {SILENCE:g} s; check its cable and its "
-                "supply. It makes itself safe when it hears nothing"
+                f"supply. {WATCHDOG_ZEROES}"
             )
         return (
             f"the device answers but has sent no sample for {SILENCE:g} s; its firmware hangs, or "

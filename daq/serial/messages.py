@@ -20,6 +20,7 @@ from daq.hal import ANALOG_INPUTS, CHANNELS, Mode
 MALFORMED = (struct.error, ValueError, IndexError)  # raised by a payload that is not of its type
 
 VERSION = 1
+WATCHDOG_ZEROES = "A device that follows the protocol zeroes its outputs when it hears nothing"
 MAGIC = b"HRIG"
 
 COMMAND_DTYPE = np.dtype("<i2")  # a command on the wire: a converter code per channel and tick
@@ -102,6 +103,7 @@ class Result(enum.IntEnum):
 # By their numbers on the wire; quicker than the enums.
 _STATES, _LATCHES, _MODES = tuple(State), tuple(Latch), tuple(Mode)
 
+NOTHING = struct.Struct("<")  # payload of SAFE and CLEAR
 RUN = struct.Struct("<H")  # payload of GO and STOP: the run
 ANNOUNCE = struct.Struct("<B3xf")  # the phase's number in the order of daq.hal.Phase, and turns
 PING = struct.Struct("<Q")  # the host's own time, which the device only returns

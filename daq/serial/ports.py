@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from daq.errors import ConfigError, DeviceError, Mistake
+from daq.serial.messages import WATCHDOG_ZEROES
 
 _PATIENCE = 0.01  # s that a read waits at most
 _WRITE_PATIENCE = 0.5  # s that a port may take to accept a frame
@@ -74,10 +75,13 @@ def require_ports(names: Sequence[str]) -> None:
 
 
 def _gone(port: str, error: Exception | None = None) -> DeviceError:
+    if error is None and Path(port).exists() and (holder := _holder(port)):
+        # Of two that wait for the same bytes one gets them, and the other an empty hand.
+        problem = f"another program reads the same port{holder}"
+        return DeviceError(problem, cure="close that one and run again", file=port)
     reason = "" if error is None else f" ({error})"
     return DeviceError(
-        f"the port has gone{reason}; check the cable and the device's supply. The device makes "
-        "itself safe when it hears nothing",
+        f"the port has gone{reason}; check the cable and the device's supply. {WATCHDOG_ZEROES}",
         file=port,
     )
 
@@ -100,6 +104,12 @@ class SerialLink:
             )
         except (OSError, ValueError) as error:
             raise _not_opened(port, error) from None
+        if holder := _holder(port):
+            # It got there first, and knows no lock.
+            self.warnings.append(
+                f"{port}: another program has it open too{holder} and may take what the device "
+                "sends; close that one"
+            )
         # pyserial asks before every read and after every write whether the port is ready. To ask a
         # terminal is to wait for the kernel's worker that hands on what has come: tens of
         # milliseconds on a busy computer, however urgent who asks. So ask no more than needed.

@@ -249,7 +249,8 @@ def test_a_rig_that_is_not_at_rest_is_not_calibrated(tmp_path, turns, volts, sai
 
 
 def test_late_commands_and_lost_samples_are_counted_where_the_log_has_them(run, folder):
-    write_rig(folder / "rig.yaml", options={"faults": {"late": 0.05, "lost": 0.03}})
+    faults = {"faults": {"late": 0.05, "lost": 0.03}}
+    write_rig(folder / "rig.yaml", options=faults, limits={"lost": 0.1})
     result = run(["run", "steady.yaml", "--rig", "rig.yaml"], folder)
     assert result.returncode == 0, result.stderr
     log = pd.read_csv(only_capture(folder) / "log.csv")

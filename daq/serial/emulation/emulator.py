@@ -229,7 +229,8 @@ class Emulator:
             self._inward.put(data, now, self._line_faults())
         arrived = self._inward.ready(now)
         if arrived:
-            self._machine.receive(arrived, self._ticks(now))
+            # The time after reading: no frame may be answered with one before it was sent.
+            self._machine.receive(arrived, self._ticks(time.perf_counter()))
 
     def _transmit(self, now: float) -> None:
         if now < self._quiet_until:

@@ -79,8 +79,8 @@ class DeviceMachine:
             Type.GO: (messages.RUN.unpack, self._go),
             Type.STOP: (messages.RUN.unpack, self._stop),
             Type.ANNOUNCE: (messages.ANNOUNCE.unpack, self._announce),
-            Type.SAFE: (bytes, self._safe),
-            Type.CLEAR: (bytes, self._clear),
+            Type.SAFE: (messages.NOTHING.unpack, self._safe),
+            Type.CLEAR: (messages.NOTHING.unpack, self._clear),
         }
 
     def receive(self, data: bytes, now: int) -> None:
@@ -175,11 +175,11 @@ class DeviceMachine:
         self._board.announce(*payload)
         return Result.OK
 
-    def _safe(self, payload: bytes, now: int) -> Result:
+    def _safe(self, payload: tuple[()], now: int) -> Result:
         self._hold_at_zero(Latch.SAFE if self.latch is Latch.NONE else self.latch)
         return Result.OK
 
-    def _clear(self, payload: bytes, now: int) -> Result:
+    def _clear(self, payload: tuple[()], now: int) -> Result:
         # What clears a latch ends the run as well: nothing plays on from where it stood.
         self._end()
         self.latch = Latch.NONE

@@ -59,7 +59,7 @@ def emulator(folder, *arguments, plant=None):
 
 
 # Imports and compiles what an emulator needs, then becomes one per line of standard input.
-_FORKING = """
+_FORKING = """# rig emulate, a fork a line
 import json, os, signal, sys, traceback
 import daq.cli, daq.cli.app
 from daq.serial.emulation.emulator import warm_up

@@ -3,6 +3,7 @@
 import itertools
 import os
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -75,7 +76,9 @@ def write_run(folder, port, mode="open", seconds=0.5, watchdog=WATCHDOG, homing=
             f"protocol: loop.py:Steady\nduration: {seconds}\ncalibration: {{samples: 16}}\n"
             f"homing: {{turns: {turns}, timeout: 5}}\n"
         )
-    write_serial_rig(folder / "rig.yaml", port, watchdog=watchdog)
+    rig_file = write_serial_rig(folder / "rig.yaml", port, watchdog=watchdog)
+    with rig_file.open("a") as text:
+        text.write("limits: {lost: 0.25}\n")  # what faults take shall not end the run
 
 
 def assert_consistent(folder, total=400):
@@ -256,7 +259,7 @@ def test_a_program_that_hangs_is_no_better_than_a_dead_one(tmp_path, emulate):
         # Its threads live on, but nobody asks for samples any more.
         until(lambda: running.journal[-1]["latch"] == "WATCHDOG", "the watchdog")
         assert running.journal[-1]["outputs"] == [0, 0]
-        with pytest.raises(DeviceError, match="watchdog has zeroed the outputs"):
+        with pytest.raises(DeviceError, match="watchdog has tripped"):
             while True:
                 device.receive()
         device.close()
@@ -292,6 +295,28 @@ def test_more_than_a_port_takes_at_once_is_written_in_full():
         heard += os.read(ours, 4096)
     writer.join()
     assert heard == said
+    link.close()
+    os.close(ours)
+    os.close(theirs)
+
+
+_HOLDER = "import os, sys; os.open(sys.argv[1], os.O_RDWR); print(flush=True); sys.stdin.read()"
+
+
+def test_another_program_that_has_the_port_open_without_a_lock_is_named():
+    import pty
+    import tty
+
+    ours, theirs = pty.openpty()
+    tty.setraw(theirs)
+    name = os.ttyname(theirs)
+    words = [sys.executable, "-c", _HOLDER, name]
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        other.stdout.readline()
+        link = open_link(name, 115_200)
+        other.stdin.close()
+    (warning,) = link.warnings
+    assert f"another program has it open too (process {other.pid}" in warning
     link.close()
     os.close(ours)
     os.close(theirs)

@@ -5,6 +5,7 @@ import pytest
 
 from daq.hal import ANALOG_INPUTS, CHANNELS, Flag, Mode
 from daq.serial import codec, messages
+from daq.serial.clock import RateBounds
 from daq.serial.emulation.faults import Line
 from daq.serial.emulation.machine import DeviceMachine
 from daq.serial.host import HostMachine
@@ -433,6 +434,39 @@ def test_random_bytes_never_move_a_device():
         bench.host.feed(rng.bytes(300), bench.now)
     assert bench.device.state is State.ARMED and bench.host.failure is None
     assert bench.device.decoder.accepted == accepted
+
+
+@pytest.mark.parametrize("type_", [Type.SAFE, Type.CLEAR])
+def test_what_takes_no_payload_is_refused_with_one(type_):
+    bench = Bench()
+    bench.connect()
+    bench.start(Mode.CLOSED_LOOP)
+    assert bench.ask(type_, b"\0") is Result.BAD_VALUE
+    assert bench.device.state is State.ARMED and bench.device.latch is Latch.NONE
+    assert bench.ask(type_) is Result.OK
+
+
+def test_what_a_stopped_run_still_had_on_the_line_is_not_missing():
+    bench = Bench({"delay": 0.03})
+    bench.connect()
+    for run in (1, 2, 3):
+        bench.start(Mode.CLOSED_LOOP, run=run)
+        bench.host.send(0, wave(10), bench.now)
+        bench.go()
+        bench.wait(0.1)
+        bench.host.stop(bench.now)
+        bench.until(lambda: bench.host.pending is None)
+    assert bench.host.counters.missing_frames == 0 and bench.host.counters.lost_samples == 0
+
+
+@pytest.mark.parametrize("rate", [0.9, 0.995, 1.0, 1.1])
+def test_no_delay_makes_the_bounds_of_a_clocks_rate_wrong(rate):
+    rng, bounds = np.random.default_rng(4), RateBounds()
+    for sent in np.arange(0.0, 10.0, 0.025):
+        there, back = rng.exponential([0.002, 0.05])  # s; the way back is held up
+        bounds.add(sent, 7.0 + rate * (sent + there), sent + there + back)
+        assert bounds.lowest <= rate <= bounds.highest
+    assert (bounds.deviation() is None) == (abs(rate - 1.0) < 0.01)
 
 
 def test_the_machines_speak_of_the_same_channels():

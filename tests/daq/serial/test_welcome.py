@@ -8,7 +8,6 @@ import socket
 import struct
 import threading
 import time
-import zlib
 from contextlib import contextmanager
 
 import pytest
@@ -16,31 +15,9 @@ from cobs import cobs
 
 from daq.errors import DeviceError
 from daq.serial.backend import SerialDevice, SerialOptions
+from tests.daq.serial.paper import HELLO, WELCOME, channel, frame, welcome
 
-HELLO, WELCOME = 0x01, 0x81
-NAMES = ["current_motor", "current_brake", "torque", "motor", "brake", "encoder"]
 ANSWERS_WITHIN = 3.0  # s
-
-
-def frame(kind, session, number, payload):
-    head = struct.pack("<BBHHH", kind, 0, session, number, len(payload)) + payload
-    return b"\0" + cobs.encode(head + struct.pack("<I", zlib.crc32(head))) + b"\0"
-
-
-def channel(name, scale=1e-3, offset=0.0, low=-10.0, high=10.0):
-    return struct.pack("<16s8sdddd", name.encode(), b"V", scale, offset, low, high)
-
-
-def welcome(*, channels=None, **changes):
-    facts = {
-        "clock": 48_000_000, "max_rate": 4000.0, "queue": 512, "max_payload": 256,
-        "watchdog": 100, "longest": 1000,
-    }  # fmt: skip
-    rows = {name: channel(name) for name in NAMES} | (channels or {})
-    numbers = tuple((facts | changes).values())
-    head = struct.pack("<4sHBBIfIHHHH", b"HRIG", 1, len(rows), 0, *numbers, 0)
-    texts = struct.pack("<32s32s32s", b"liar", b"1", b"7")
-    return head + texts + b"".join(rows.values())
 
 
 @contextmanager
