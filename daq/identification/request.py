@@ -12,7 +12,7 @@ from daq.errors import ConfigError
 from daq.files import make_folder, write_whole
 
 CHECKPOINT = "search.ckpt"  # the search's state, in the folder of its results
-_REQUEST = "search.json"
+FILE = "search.json"
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ def remember(
     make_folder(folder)
     logs = {"training": _absolute(training), "validation": _absolute(validation)}
     content = {"asked": asdict(settings), **logs}
-    write_whole(folder / _REQUEST, json.dumps(content, indent=1))
+    write_whole(folder / FILE, json.dumps(content, indent=1))
 
 
 def recall(folder: Path) -> tuple[Path, SettingsRequest, list[Path], list[Path]]:
@@ -52,22 +52,22 @@ def recall(folder: Path) -> tuple[Path, SettingsRequest, list[Path], list[Path]]
     Logs are those for training, then for validation. Raises ConfigError when there is no request.
     """
     for place in (folder, folder / "identification"):
-        if not (place / _REQUEST).exists():
+        if not (place / FILE).exists():
             continue
         try:
-            content = json.loads((place / _REQUEST).read_text(encoding="utf-8"))
+            content = json.loads((place / FILE).read_text(encoding="utf-8"))
             settings = SettingsRequest(**content["asked"])
             training = [Path(path) for path in content["training"]]
             return place, settings, training, [Path(path) for path in content["validation"]]
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise ConfigError(f"cannot be read: {error}", file=place / _REQUEST) from None
+            raise ConfigError(f"cannot be read: {error}", file=place / FILE) from None
     cure = "name the folder that its results were to go to"
     raise ConfigError("no identification was interrupted there", cure=cure, file=folder)
 
 
 def forget(folder: Path) -> None:
     """Remove what is needed only to continue."""
-    for name in (CHECKPOINT, _REQUEST):
+    for name in (CHECKPOINT, FILE):
         (folder / name).unlink(missing_ok=True)
 
 
