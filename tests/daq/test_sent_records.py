@@ -177,6 +177,7 @@ def test_in_python(sent, tmp_path):
 # --- not even looked at -------------------------------------------------------------------
 
 
+@pytest.mark.soak
 def test_commands_that_need_only_the_log_of_such_a_run(sent, tmp_path):
     name_protocol(sent, "theirs.py:Rest")
     for command in (
