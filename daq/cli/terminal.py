@@ -54,13 +54,19 @@ def output(level: Volume, documents_alone: bool) -> Iterator[None]:
 
 
 def _show_warning(
-    message: Warning | str, category: type[Warning], filename: str, lineno: int, *rest: Any
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
 ) -> None:
     """A library's words to the user as the program's own; others with their place, as usual."""
     if category is UserWarning:
         report("warning", str(message))
     else:
-        sys.stderr.write(warnings.formatwarning(message, category, filename, lineno))
+        text = warnings.formatwarning(message, category, filename, lineno, line)
+        (file or sys.stderr).write(text)
 
 
 def report_error(message: str) -> None:
