@@ -71,7 +71,7 @@ class SimulatedRig:
             self.root,
             options={"seed": self.seed, **options},
         )
-        protocol = recorded_experiment(recording.folder)
+        protocol = recorded_experiment(recording.folder, trust=True)  # the test has named it
         return Recorded(recording, conclude_or_warn(protocol, recording.folder, _warn))
 
 
@@ -91,12 +91,14 @@ class Replayer:
         *,
         rig: str | Path = _RIG,
         config: str | Path | None = None,
+        trust: bool = False,
     ) -> Replay:
         """The outputs of a model under the log's applied commands and measured load.
 
         log: capture folder or CSV. parameters: ``parameters.yaml`` of an identification; default
-        the simulated rig's own. config: names the columns of a foreign log. The result has
-        ``fit`` [%], ``rmse`` and ``msd`` by output, and the arrays. Raises ConfigError.
+        the simulated rig's own. config: names the columns of a foreign log. trust: run the Python
+        file of a model that ``parameters.yaml`` names. The result has ``fit`` [%], ``rmse`` and
+        ``msd`` by output, and the arrays. Raises ConfigError.
         """
         from daq import replay
 
@@ -105,6 +107,7 @@ class Replayer:
             None if parameters is None else _beside(self.tests, parameters),
             _beside(self.tests, rig),
             None if config is None else _beside(self.tests, config),
+            trust=trust,
         )
 
 

@@ -3,6 +3,7 @@
 import os
 import signal
 import tempfile
+from pathlib import Path
 
 from hypothesis import settings
 
@@ -18,6 +19,7 @@ def pytest_configure(config):
         # the environment. Their names are fingerprints of all that they are made of.
         cache = getattr(config, "cache", None)  # None with -p no:cacheprovider
         folder = cache.mkdir("kernels") if cache else tempfile.mkdtemp(prefix="kernels-")
+        Path(folder).chmod(0o700)  # whatever the umask: a folder that others write to is refused
         os.environ["RIG_CACHE_DIR"] = str(folder)
 
 

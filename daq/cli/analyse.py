@@ -19,6 +19,7 @@ _WIDTH = 2 * 1.96  # standard deviations in a 95 % interval
 
 def analyse(
     run: Annotated[Path, Argument(metavar="RUN", help="Capture folder.")],
+    trust: options.Trust = False,
     json: options.AsJson = False,
 ) -> None:
     """Conclude from a log what its protocol is for.
@@ -28,7 +29,7 @@ def analyse(
     from daq.recording import analysis
 
     with terminal.watching(json) as watch:
-        result = analysis.analyse(run, watch=watch)
+        result = analysis.analyse(run, trust=trust, watch=watch)
     if json:
         terminal.print_json(result.document)
         return

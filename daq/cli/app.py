@@ -1,6 +1,7 @@
 """The commands of ``rig``, each a module of its own. Heavy imports stay inside the commands."""
 
 import functools
+import os
 import sys
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
@@ -25,6 +26,7 @@ from daq.cli.run import run
 from daq.cli.schema import schema
 from daq.cli.scope import scope
 from daq.cli.terminal import Volume, output
+from daq.errors import ConfigError
 
 _COMMANDS: tuple[tuple[Callable[..., None], str], ...] = (
     (run, "rig run prbs.yaml --identify"),
@@ -68,6 +70,7 @@ def _with_volume(function: Callable[..., None]) -> Callable[..., None]:
             raise BadParameter("give --quiet or --verbose, not both")
         level = Volume.QUIET if quiet else Volume.VERBOSE if verbose else Volume.NORMAL
         with output(level, options.get("json", False)), _interruptible(function):
+            _secure_cache()
             function(*args, **options)
 
     # Typer reads the options from the signature and the annotations.
@@ -76,6 +79,25 @@ def _with_volume(function: Callable[..., None]) -> Callable[..., None]:
     command.__signature__ = plain.replace(parameters=parameters)  # type: ignore[attr-defined]
     command.__annotations__ = {each.name: each.annotation for each in parameters}
     return command
+
+
+def _secure_cache() -> None:
+    """Have machine code come from nobody else, before anything moves or is computed.
+
+    Raises ConfigError for a RIG_CACHE_DIR that others may write to.
+    """
+    # Else Numba takes them from a .numba_config.yaml in the working folder, whoever wrote that.
+    for name in ("NUMBA_CACHE_DIR", "NUMBA_CACHE_LOCATOR_CLASSES"):
+        os.environ.setdefault(name, "")
+    if not os.environ.get("RIG_CACHE_DIR"):
+        return
+    from sysid.engine.compiler import cache_folder
+    from sysid.problem.model import ModelError
+
+    try:
+        cache_folder()
+    except ModelError as error:
+        raise ConfigError(str(error)) from None
 
 
 app = Typer(

@@ -65,6 +65,8 @@ def campaign(
 
 
 def _show(result: CampaignResult) -> None:
+    from daq.lookup.models import trust_option
+
     runs = result.campaign
     print()
     title = "Error over seeds: mean over outputs of the RMSE in parts of max|y|"
@@ -78,8 +80,8 @@ def _show(result: CampaignResult) -> None:
     for (model, data), path in result.files.items():
         print(f"Best of {model} on {data}: {path}")
     print(f"All runs with their parameters: {result.table}")
-    if result.files:
-        terminal.print_next(f"rig replay LOG --parameters {next(iter(result.files.values()))}")
+    for (model, _), path in list(result.files.items())[:1]:
+        terminal.print_next(f"rig replay LOG --parameters {path}{trust_option(model)}")
 
 
 def _spread_row(spread: Spread, result: CampaignResult) -> list[str]:

@@ -19,13 +19,14 @@ def figures(
     out: Annotated[
         Path | None, Option(metavar="DIR", help="Where they go; default beside the report.")
     ] = None,
+    trust: options.Trust = False,
     json: options.AsJson = False,
 ) -> None:
     """Draw an identification's figures for papers and slides."""
     from daq.report.reprint import redraw
 
     with terminal.watching(json) as watch:
-        files = redraw(run, kinds or ["pdf", "png"], out, watch)
+        files = redraw(run, kinds or ["pdf", "png"], out, watch, trust)
     if json:
         terminal.print_json({"figures": files})
     else:

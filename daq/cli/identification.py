@@ -77,7 +77,9 @@ def _show_next(result: Identification) -> None:
     mapping = result.problem.mapping
     columns = f" --config {mapping.file.path}" if mapping is not None else ""
     log = (*result.validation, *result.training)[0].log.path
-    terminal.print_next(f"rig replay {log} --parameters {result.parameters_file}{columns}")
+    terminal.print_next(
+        f"rig replay {log} --parameters {result.parameters_file}{columns}{result.trust_option}"
+    )
 
 
 def _show_parameters(result: Identification) -> None:
@@ -266,6 +268,7 @@ def show_comparison(
 ) -> dict[str, Any]:
     """Print a comparison and write its page; the document for machines."""
     from daq.identification.comparison import ComparisonResult
+    from daq.lookup.models import trust_option
 
     if not isinstance(result, ComparisonResult):
         return show_identification(result.best, report, json, _runs_lines(result.campaign))
@@ -278,9 +281,9 @@ def show_comparison(
         files["page"] = publish_comparison(result)
         if not json:
             print(f"Page: {files['page']}")
-    preferred = result.files.get(result.comparison.preferred)
-    if not json and preferred is not None:
-        terminal.print_next(f"rig replay LOG --parameters {preferred}")
+    name = result.comparison.preferred
+    if not json and name in result.files:
+        terminal.print_next(f"rig replay LOG --parameters {result.files[name]}{trust_option(name)}")
     return {**result.document, "files": files}
 
 

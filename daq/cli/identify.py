@@ -9,7 +9,7 @@ from typer import BadParameter, Context, Option
 from daq.cli import options, terminal
 from daq.cli.identification import show_comparison, show_identification
 
-_WITH_RESUME = {"resume", "report", "json", "quiet", "verbose"}
+_WITH_RESUME = {"resume", "trust", "report", "json", "quiet", "verbose"}
 
 
 def identify(
@@ -48,6 +48,7 @@ def identify(
     resume: Annotated[
         Path | None, Option(metavar="DIR", help="Go on with what was interrupted, as it was asked.")
     ] = None,
+    trust: options.Trust = False,
     report: options.WithReport = True,
     json: options.AsJson = False,
 ) -> None:
@@ -62,10 +63,10 @@ def identify(
     if resume is not None:
         if any(context.params[name] for name in context.params if name not in _WITH_RESUME):
             raise BadParameter(
-                "--resume goes on as it was asked; give nothing but --json or --no-report"
+                "--resume goes on as it was asked; give nothing but --json, --no-report or --trust"
             )
         with terminal.watching(json) as watch:
-            result = fit.resume(resume, watch)
+            result = fit.resume(resume, watch, trust=trust)
         _finish(show_identification(result, report, json), json)
         return
     if not logs:

@@ -61,6 +61,9 @@ Jobs = Annotated[int | None, Option(metavar="N", help="Runs at a time; default a
 Dask = Annotated[
     str | None, Option(metavar="tcp://HOST:PORT", help="Compute on this dask cluster.")
 ]
+Trust = Annotated[
+    bool, Option("--trust", help="Run the Python file that the run or result names; look at it.")
+]
 WithReport = Annotated[
     bool, Option("--report/--no-report", help="Write report.html with its figures as well.")
 ]

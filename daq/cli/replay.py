@@ -35,6 +35,7 @@ def replay(
             metavar="OUTPUT=PERCENT", help="Exit status 1 when its fit is below; may be repeated."
         ),
     ] = None,
+    trust: options.Trust = False,
     json: options.AsJson = False,
 ) -> None:
     """Simulate a log's commands, and say how well that fits it.
@@ -44,7 +45,7 @@ def replay(
     from daq.identification.replay import replay as simulate
 
     bounds = _bounds(fail_under or [])
-    result = simulate(log, parameters, rig, config)
+    result = simulate(log, parameters, rig, config, trust=trust)
     model = result.model
     for name in bounds:
         if name not in result.fit:
@@ -74,7 +75,8 @@ def replay(
         _show(through, errors, drawn)
         if not missed:
             columns = f" --config {config}" if config is not None else ""
-            again = f"rig replay ANOTHER_LOG --parameters {parameters}{columns}"
+            trusted = " --trust" if trust else ""
+            again = f"rig replay ANOTHER_LOG --parameters {parameters}{columns}{trusted}"
             terminal.print_next(again if parameters else f"rig identify {log}")
     if missed:
         shortfalls = (

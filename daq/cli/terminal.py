@@ -6,6 +6,7 @@ import shutil
 import sys
 import textwrap
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext, redirect_stdout
 from contextvars import ContextVar
@@ -41,11 +42,31 @@ def output(level: Volume, documents_alone: bool) -> Iterator[None]:
     """
     before = _volume.set(level), _documents.set(sys.stdout if documents_alone else None)
     try:
-        with redirect_stdout(sys.stderr) if documents_alone else nullcontext():
+        with (
+            warnings.catch_warnings(),
+            redirect_stdout(sys.stderr) if documents_alone else nullcontext(),
+        ):
+            warnings.showwarning = _show_warning
             yield
     finally:
         _volume.reset(before[0])
         _documents.reset(before[1])
+
+
+def _show_warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
+) -> None:
+    """A library's words to the user as the program's own; others with their place, as usual."""
+    if category is UserWarning:
+        report("warning", str(message))
+    else:
+        text = warnings.formatwarning(message, category, filename, lineno, line)
+        (file or sys.stderr).write(text)
 
 
 def report_error(message: str) -> None:

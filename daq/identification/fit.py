@@ -82,17 +82,19 @@ def identify_files(
     return fit(problem, logs, validate, folder, watch)
 
 
-def resume(folder: str | Path, watch: Watch = ignore) -> Identification:
+def resume(folder: str | Path, watch: Watch = ignore, *, trust: bool = False) -> Identification:
     """Continue an identification that was interrupted, as it was requested.
 
-    folder: of its results, or the capture folder above. Raises ConfigError without such a one.
+    folder: of its results, or the capture folder above. trust: run the Python file of a model that
+    the request names. Raises ConfigError without such a one.
 
     >>> resume("runs")
     Traceback (most recent call last):
     daq.errors.ConfigError: runs: no identification was interrupted there; name the folder ...
     """
     place, settings, training, validation = request.recall(Path(folder))
-    return fit(problem_of(settings, watch), training, validation, place, watch, resume=True)
+    problem = problem_of(settings, watch, record=None if trust else place / request.FILE)
+    return fit(problem, training, validation, place, watch, resume=True)
 
 
 def fit(

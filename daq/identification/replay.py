@@ -90,18 +90,21 @@ def replay(
     parameters: Identification | str | Path | None = None,
     rig: str | Path = DEFAULT_RIG,
     config: str | Path | None = None,
+    *,
+    trust: bool = False,
 ) -> Replay:
     """Simulate a model under the applied commands and the measured load of a log.
 
     log: as for ``identify``. parameters: an identification or its ``parameters.yaml``; by default
-    those of the simulated ``rig``. config: names the columns of a foreign log. Raises ConfigError.
+    those of the simulated ``rig``. config: names the columns of a foreign log. trust: run the
+    Python file of a model that ``parameters.yaml`` names. Raises ConfigError.
 
     >>> from daq import record, replay
     >>> result = replay(record("prbs.yaml"))  # through the simulated rig's own model
     >>> result.fit["current_motor"] > 95.0
     True
     """
-    model, values, source = _parameters(parameters, str(rig))
+    model, values, source = _parameters(parameters, str(rig), trust)
     mapping = columns_of(Path(config) if config is not None else None, model)
     logged = take(log, "data", model, mapping)
     record = logged.dataset
@@ -115,13 +118,13 @@ def replay(
 
 
 def _parameters(
-    parameters: Identification | str | Path | None, rig: str
+    parameters: Identification | str | Path | None, rig: str, trust: bool
 ) -> tuple[ProcessModel, dict[str, float], str]:
     """A model, its parameters, and where they come from."""
     if isinstance(parameters, Identification):
         return parameters.model, dict(parameters.estimator.parameters_), "identification"
     if parameters is not None:
-        return *read_parameters(Path(parameters)), str(parameters)
+        return *read_parameters(Path(parameters), trust), str(parameters)
     _, device = load_rig(rig)
     if not isinstance(device, Simulation):
         cure = "give those of an identification with --parameters"
@@ -133,18 +136,21 @@ def _parameters(
     return model, dict(zip(model.parameter_names, model.nominal, strict=True)), rig
 
 
-def read_parameters(path: Path) -> tuple[ProcessModel, dict[str, float]]:
+def read_parameters(path: Path, trust: bool) -> tuple[ProcessModel, dict[str, float]]:
     """Model and parameters from a parameters.yaml, as identification writes it.
 
-    Raises ConfigError naming line and key of what is missing or wrong.
+    trust: run the Python file of the model, where it is in one. Raises ConfigError naming line and
+    key of what is missing or wrong.
     """
     file = yaml_file.load(path)
     name = file.content.get("model")
     if not isinstance(name, str):
         raise file.error(("model",), "this key is missing; it names the process model")
     try:
-        model = find_model(name, path.parent)
+        model = find_model(name, path.parent, record=None if trust else path)
     except ConfigError as error:
+        if error.file == path:
+            raise
         raise file.error(("model",), str(error)) from None
     signals = {key: file.content[key] for key in Signals.model_fields if key in file.content}
     model = with_signals(file, check.validate(file, Signals, signals), model)

@@ -14,7 +14,7 @@ from daq.errors import ConfigError
 from daq.files import make_folder, write_whole
 
 CHECKPOINT = "search.ckpt"  # the search's state, in the folder of its results
-_REQUEST = "search.json"
+FILE = "search.json"
 _ANEW = "delete it and identify anew"
 
 
@@ -46,7 +46,7 @@ def remember(
     make_folder(folder)
     logs = {"training": _absolute(training), "validation": _absolute(validation)}
     content = {"asked": asdict(settings), **logs}
-    write_whole(folder / _REQUEST, json.dumps(content, indent=1))
+    write_whole(folder / FILE, json.dumps(content, indent=1))
 
 
 def recall(folder: Path) -> tuple[Path, SettingsRequest, list[Path], list[Path]]:
@@ -55,16 +55,16 @@ def recall(folder: Path) -> tuple[Path, SettingsRequest, list[Path], list[Path]]
     Logs are those for training, then for validation. Raises ConfigError when there is no request.
     """
     for place in (folder, folder / "identification"):
-        if not (place / _REQUEST).exists():
+        if not (place / FILE).exists():
             continue
         try:
-            content = json_file.load(place / _REQUEST, "request", _ANEW)
+            content = json_file.load(place / FILE, "request", _ANEW)
             settings = SettingsRequest(**content["asked"])
             training = [Path(path) for path in content["training"]]
             return place, settings, training, [Path(path) for path in content["validation"]]
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             problem = f"not a readable request ({type(error).__name__}: {error})"
-            raise ConfigError(problem, cure=_ANEW, file=place / _REQUEST) from None
+            raise ConfigError(problem, cure=_ANEW, file=place / FILE) from None
     cure = "name the folder that its results were to go to"
     raise ConfigError("no identification was interrupted there", cure=cure, file=folder)
 
@@ -80,7 +80,7 @@ def resume_command(folder: Path) -> str:
 
 def forget(folder: Path) -> None:
     """Remove what is needed only to continue."""
-    for name in (CHECKPOINT, _REQUEST):
+    for name in (CHECKPOINT, FILE):
         (folder / name).unlink(missing_ok=True)
 
 

@@ -18,6 +18,7 @@ from daq.identification.records import LoggedRecord
 from daq.identification.request import resume_command
 from daq.identification.rows import Rows
 from daq.identification.settings import Problem
+from daq.lookup.models import trust_option
 from daq.provenance import software_versions
 from sysid import Metrics, ProcessModel
 from sysid.arrays import FloatArray
@@ -92,11 +93,16 @@ class Identification:
         return self.estimator.stopped_ == "interrupted"
 
     @property
+    def trust_option(self) -> str:
+        """`` --trust`` where commands that read this result need it, to run the model's file."""
+        return trust_option(self.problem.model_name)
+
+    @property
     def resume_command(self) -> str | None:
         """What to type to continue an interrupted search; None where there is nothing to."""
         if not self.interrupted or self.folder is None:
             return None
-        return resume_command(self.folder)
+        return f"{resume_command(self.folder)}{self.trust_option}"
 
     @property
     def parameters_file(self) -> Path | None:

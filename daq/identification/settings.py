@@ -45,13 +45,21 @@ class Problem:
     request: SettingsRequest
 
 
-def problem_of(request: SettingsRequest, watch: Watch = ignore) -> Problem:
-    """Read and check settings and model; ConfigError names file, line, key and cure."""
-    return problems_of(request, [request.options.get("model")], watch)[0]
+def problem_of(
+    request: SettingsRequest, watch: Watch = ignore, record: Path | None = None
+) -> Problem:
+    """Read and check settings and model; ConfigError names file, line, key and cure.
+
+    record: which the request comes from, and whose files of models are not to be run.
+    """
+    return problems_of(request, [request.options.get("model")], watch, record)[0]
 
 
 def problems_of(
-    request: SettingsRequest, names: Sequence[str | None], watch: Watch = ignore
+    request: SettingsRequest,
+    names: Sequence[str | None],
+    watch: Watch = ignore,
+    record: Path | None = None,
 ) -> list[Problem]:
     """The same settings for each of several models, None for the default one.
 
@@ -64,7 +72,7 @@ def problems_of(
     if written is not None:
         check.refuse_other_kind(written, "an identification's settings")
     file = TypedSettings.of(options, request.settings, written)
-    declared = _find_models(config, file, names)
+    declared = _find_models(config, file, names, record)
     file, unconverted = in_model_units(file, [model for model, _ in declared])
     settings = check.validate(file, IdentificationConfig, others=unconverted)
     for model, name in declared:
@@ -152,11 +160,11 @@ def gassi_settings(settings: IdentificationConfig) -> dict[str, Any]:
 
 
 def _find_models(
-    config: Path | None, file: TypedSettings, names: Sequence[str | None]
+    config: Path | None, file: TypedSettings, names: Sequence[str | None], record: Path | None
 ) -> list[tuple[ProcessModel, str]]:
     """Models and their whole names; when one is not found, the file's other mistakes as well."""
     try:
-        return [_find_model(config, file, name) for name in names]
+        return [_find_model(config, file, name, record) for name in names]
     except ConfigError as error:
         if error.key == "model":
             check.validate(file, IdentificationConfig, others=error.mistakes)
@@ -164,7 +172,7 @@ def _find_models(
 
 
 def _find_model(
-    config: Path | None, file: TypedSettings, typed: str | None
+    config: Path | None, file: TypedSettings, typed: str | None, record: Path | None
 ) -> tuple[ProcessModel, str]:
     """A model and its whole name, from the command line or else the configuration."""
     configured = file.content.get("model")
@@ -176,7 +184,7 @@ def _find_model(
     beside = config.parent if config is not None and typed is None else None
     name = typed or configured or DEFAULT_MODEL
     try:
-        return find_model(name, beside), whole_name(name, beside)
+        return find_model(name, beside, record), whole_name(name, beside)
     except ConfigError as error:
         if beside is None or configured is None:
             raise

@@ -16,17 +16,19 @@ from daq.lookup.user_code import from_file, locate
 from daq.plugins import Kind, load_plugin
 
 
-def find_class(kind: Kind, name: str, folder: Path) -> Any:
+def find_class(kind: Kind, name: str, folder: Path, record: Path | None = None) -> Any:
     """A class fit for its kind: an installed one, or in a file given as ``FILE.py:CLASS``.
 
-    File names are looked up from the working folder, then from ``folder``. Raises ConfigError.
+    File names are looked up from the working folder, then from ``folder``. record: which names it,
+    and whose files are not to be run. Raises ConfigError.
     """
     is_fit, cure = _CLASSES[kind]
     parts = file_and_class(name)
     if parts is None:
         candidate = load_plugin(kind, name)
     else:
-        candidate = from_file(locate(parts[0], kind, folder), parts[1], kind, is_fit)
+        path = locate(parts[0], kind, folder)
+        candidate = from_file(path, parts[1], kind, is_fit, record)
     if not is_fit(candidate):
         raise ConfigError(f"{name} is no {kind}", cure=cure)
     return candidate

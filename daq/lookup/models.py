@@ -28,14 +28,17 @@ def name_parts(name: str) -> tuple[str, str | None, str]:
     return source, None, options
 
 
-def find_model(name: str, relative_to: Path | None = None) -> ProcessModel:
+def find_model(
+    name: str, relative_to: Path | None = None, record: Path | None = None
+) -> ProcessModel:
     """An installed model, or an object of a Python file given as ``file.py:object``.
 
     The object is a ProcessModel or a function that makes one; ``:option=value,...`` behind it
     are the function's arguments. File names are looked up from the working folder, then from
-    ``relative_to``. Raises ConfigError naming file, line and cause.
+    ``relative_to``. record: which names it, and whose files are not to be run. Raises ConfigError
+    naming file, line and cause.
     """
-    source, where, options = _source(name, relative_to)
+    source, where, options = _source(name, relative_to, record)
     if callable(source) and not isinstance(source, ProcessModel):
         source = _call_factory(source, where, options)
     elif options:
@@ -48,14 +51,20 @@ def find_model(name: str, relative_to: Path | None = None) -> ProcessModel:
     return source
 
 
-def _source(name: str, relative_to: Path | None = None) -> tuple[Any, str, str]:
+def _source(
+    name: str, relative_to: Path | None = None, record: Path | None = None
+) -> tuple[Any, str, str]:
     """A model or the function that makes one, where it is defined, and the text of its options."""
     source, attribute, options = name_parts(name)
     if attribute is None:
         return load_plugin("model", source), f"model {source!r}", options
     path = locate(Path(source), "model", relative_to)
-    model = from_file(path, attribute, "model", lambda value: isinstance(value, ProcessModel))
+    model = from_file(path, attribute, "model", _is_model, record)
     return model, f"{path}:{attribute}", options
+
+
+def _is_model(candidate: Any) -> bool:
+    return isinstance(candidate, ProcessModel)
 
 
 def whole_name(name: str, relative_to: Path | None = None) -> str:
@@ -65,6 +74,15 @@ def whole_name(name: str, relative_to: Path | None = None) -> str:
         return name
     path = locate(Path(source), "model", relative_to).resolve()
     return f"{path}{name.removeprefix(source)}"
+
+
+def trust_option(name: str) -> str:
+    """`` --trust`` for a model in a file, as commands need it that read the name in a result.
+
+    >>> trust_option("actuator"), trust_option("lag.py:model")
+    ('', ' --trust')
+    """
+    return "" if name_parts(name)[1] is None else " --trust"
 
 
 def describe(model: ProcessModel) -> dict[str, Any]:

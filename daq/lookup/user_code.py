@@ -24,12 +24,26 @@ def locate(path: Path, kind: Kind, relative_to: Path | None = None) -> Path:
     raise ConfigError(f"there is no such {kind} file", cure=cure, file=path)
 
 
-def from_file(path: Path, attribute: str, kind: Kind, is_valid: Callable[[Any], bool]) -> Any:
-    """An object of a user's own Python file.
+def from_file(
+    path: Path,
+    attribute: str,
+    kind: Kind,
+    is_valid: Callable[[Any], bool],
+    record: Path | None = None,
+) -> Any:
+    """An object of a user's own Python file, which is run for it.
 
-    is_valid: whether an object is of the kind, for suggestions. Raises ConfigError naming file,
-    line and cause.
+    is_valid: whether an object is of the kind, for suggestions. record: of a run or a result, where
+    only that names the file: whoever sent it is not to choose what runs here. Raises ConfigError
+    naming file, line and cause.
     """
+    if record is not None:
+        raise ConfigError(
+            f"this record names {path.resolve()}, which would be run as a program",
+            cure="look at that file, then add --trust (in Python trust=True)",
+            file=record,
+            key=kind,
+        )
     module = _import(path, kind)
     if not hasattr(module, attribute):
         names = [key for key, value in vars(module).items() if is_valid(value)]

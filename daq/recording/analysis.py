@@ -39,11 +39,11 @@ class Analysis:
         return {**_contents(self.findings), "files": written}
 
 
-def analyse(folder: str | Path, *, watch: Watch = ignore) -> Analysis:
+def analyse(folder: str | Path, *, trust: bool = False, watch: Watch = ignore) -> Analysis:
     """Conclude from a capture what its protocol is for, however old it is.
 
-    Raises ConfigError for what is no capture, or one of a protocol that only excites; RunError
-    where nothing follows.
+    trust: run the Python file of a protocol that ``run.json`` names. Raises ConfigError for what is
+    no capture, or one of a protocol that only excites; RunError where nothing follows.
 
     >>> from daq import analyse, record
     >>> analyse(record("prbs.yaml").folder)
@@ -53,7 +53,7 @@ def analyse(folder: str | Path, *, watch: Watch = ignore) -> Analysis:
     folder = Path(folder)
     csv = log_path(folder)
     warn(watch, end_of_run(csv, read_record(csv), torn=False))
-    experiment = recorded_experiment(folder)
+    experiment = recorded_experiment(folder, trust)
     findings = conclude(experiment, folder)
     if findings is None:
         raise ConfigError(
@@ -64,8 +64,11 @@ def analyse(folder: str | Path, *, watch: Watch = ignore) -> Analysis:
     return Analysis(folder, findings)
 
 
-def recorded_experiment(folder: Path) -> Experiment:
-    """The experiment that a capture folder says was run; ConfigError when it does not."""
+def recorded_experiment(folder: Path, trust: bool = False) -> Experiment:
+    """The experiment that a capture folder says was run; ConfigError when it does not.
+
+    trust: run the Python file of its protocol, where it is in one.
+    """
     path = folder / RUN_NAME
     record = read_record(log_path(folder))
     if record is None:
@@ -75,7 +78,9 @@ def recorded_experiment(folder: Path) -> Experiment:
     settings = record.get("experiment")
     if not isinstance(settings, dict) or not isinstance(settings.get("protocol"), str):
         raise ConfigError("experiment.protocol: the name of a protocol is missing", file=path)
-    kind: type[Experiment] = find_class("protocol", settings["protocol"], folder)
+    kind: type[Experiment] = find_class(
+        "protocol", settings["protocol"], folder, record=None if trust else path
+    )
     # Beside the settings stands what the protocol made of them.
     written = {name: value for name, value in settings.items() if name != "excitation"}
     try:

@@ -12,6 +12,7 @@ from daq.figures.parameters import ratios
 from daq.figures.signals import Panel, responses
 from daq.files import write_whole
 from daq.identification.comparison import ComparisonResult
+from daq.lookup.models import trust_option
 from daq.report.page import Picture, rendered
 from daq.report.publication import FIGURES, command_of, draw, fingerprints
 
@@ -38,6 +39,7 @@ def publish_comparison(result: ComparisonResult) -> str:
         "written": f"{now:%Y-%m-%d %H:%M} UTC",
         "outputs": result.outputs,
         "preferred_file": preferred.get("parameters_file"),
+        "trust_option": trust_option(preferred["name"]),
         "reproduction": {
             "command": command_of(group.problem.request, logs, models, result.request_words),
             "folder": str(Path.cwd()),

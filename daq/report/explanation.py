@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from daq.identification.rows import Rows, logs_of, mean_errors
+from daq.lookup.models import trust_option
 from sysid import ProcessModel
 
 _ENDED = {
@@ -128,7 +129,8 @@ def _steps(document: Mapping[str, Any], rows: Rows) -> list[Step]:
         )
         columns = document["reproduction"]["columns"]
         command = "rig replay LOG --parameters parameters.yaml"
-        steps.insert(0, Step(use, command=f"{command} --config {columns}" if columns else command))
+        command += f" --config {columns}" if columns else ""
+        steps.insert(0, Step(use, command=command + trust_option(document["model"])))
     elif not steps:
         steps.append(Step("See in the residuals below when and where the model errs."))
     if not rows.logs["validation"]:

@@ -22,12 +22,17 @@ _AGAIN = "identify again to have a report of it"
 
 
 def redraw(
-    folder: Path, kinds: Sequence[str], out: Path | None = None, watch: Watch = ignore
+    folder: Path,
+    kinds: Sequence[str],
+    out: Path | None = None,
+    watch: Watch = ignore,
+    trust: bool = False,
 ) -> list[Path]:
     """Draw the figures of a report again, from its numbers and logs; the files written.
 
     folder: of an identification, or of the run that it was made from. kinds: formats by name. out:
-    default beside the report. Raises ConfigError.
+    default beside the report. trust: run the Python file of a model that the result names. Raises
+    ConfigError.
     """
     for kind in kinds:
         if kind.lower() not in FORMATS:
@@ -35,7 +40,7 @@ def redraw(
             raise ConfigError(f"--format {kind}: figures are written as {written}")
     formats = [kind.lower() for kind in kinds]
     source = _report_in(folder)
-    subject = _subject(source)
+    subject = _subject(source, trust)
     target = out or source.parent / FIGURES
     files: list[Path] = []
     for picture, _ in draw(pictures(subject), target, formats):
@@ -57,18 +62,18 @@ def _report_in(folder: Path) -> Path:
     )
 
 
-def _subject(source: Path) -> Subject:
+def _subject(source: Path, trust: bool) -> Subject:
     try:
-        return _restored(json_file.load(source, "report", _AGAIN), source)
+        return _restored(json_file.load(source, "report", _AGAIN), source, trust)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ConfigError(
             f"not a readable report ({type(error).__name__}: {error})", cure=_AGAIN, file=source
         ) from None
 
 
-def _restored(document: Mapping[str, Any], source: Path) -> Subject:
+def _restored(document: Mapping[str, Any], source: Path, trust: bool) -> Subject:
     """A report's subject, its free runs simulated again."""
-    model, values = read_parameters(source.with_name("parameters.yaml"))
+    model, values = read_parameters(source.with_name("parameters.yaml"), trust)
     parts = _logs(document["reproduction"], model)
     simulator, vector = BatchSimulator(model), model.vector(values)
     training, validation = (

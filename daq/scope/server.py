@@ -1,18 +1,25 @@
-"""Serving the page to this machine, and to no other."""
+"""Serving the page to this machine, and on it to who has the address that was printed."""
 
 import asyncio
 import logging
+import secrets
 import signal
 import socket
 import sys
 import warnings
 from collections.abc import Callable
 from types import FrameType
+from typing import Any
 
 from bokeh.application import Application
 from bokeh.application.handlers.function import FunctionHandler
 from bokeh.document import Document
-from bokeh.server.server import Server
+from bokeh.server.server import BaseServer
+from bokeh.server.tornado import BokehTornado
+from tornado.httpserver import HTTPServer
+from tornado.httputil import HTTPServerRequest
+from tornado.ioloop import IOLoop
+from tornado.web import RequestHandler
 
 from daq.errors import ConfigError
 from daq.scope.page import Page
@@ -20,6 +27,9 @@ from daq.scope.watch import Watch
 
 HOST = "127.0.0.1"
 USUAL_PORT = 5006
+
+_NAMES = (HOST, "localhost", "[::1]")  # of this machine, in addresses
+_CURE = "open the address that rig scope has printed"
 
 
 def serve(watch: Watch, port: int | None, ready: Callable[[str], None]) -> None:
@@ -51,18 +61,61 @@ async def _serve(watch: Watch, port: int, ready: Callable[[str], None]) -> None:
     def make_page(document: Document) -> None:
         Page(document, watch)
 
-    origins = [f"{HOST}:{port}", f"localhost:{port}"]
-    pages = {"/": Application(FunctionHandler(make_page))}
-    server = Server(pages, port=port, address=HOST, allow_websocket_origin=origins)
+    key = secrets.token_urlsafe()
+    pages = _PrivatePages(Application(FunctionHandler(make_page)), key, port)
+    http = HTTPServer(pages)
+    http.listen(port, HOST)
+    server = BaseServer(IOLoop.current(), pages, http)
     before = [(number, signal.signal(number, end)) for number in (signal.SIGINT, signal.SIGTERM)]
     try:
         server.start()
-        ready(f"http://{HOST}:{port}/")
+        ready(f"http://{HOST}:{port}/{key}/")
         await ended.wait()
     finally:
         server.stop()
         for number, handler in before:
             signal.signal(number, handler)
+
+
+class _PrivatePages(BokehTornado):
+    """The page and its socket below ``/KEY/``, refused to what comes by way of another site.
+
+    A name of another site may lead to this machine (DNS rebinding): the browser then takes the page
+    for one of that site's, and says so in ``Host`` and ``Origin``.
+    """
+
+    def __init__(self, page: Application, key: str, port: int) -> None:
+        # Browsers leave the usual port of the web out.
+        self._hosts = [name if port == 80 else f"{name}:{port}" for name in _NAMES]
+        self._origins = [f"http://{host}" for host in self._hosts]
+        super().__init__(
+            page,
+            prefix=key,
+            extra_websocket_origins=self._hosts,
+            default_handler_class=_Refusal,
+            default_handler_args={"problem": f"there is no page at this address; {_CURE}"},
+        )
+
+    def find_handler(self, request: HTTPServerRequest, **kwargs: Any) -> Any:
+        """What answers a request; the refusal where its host or its origin is a foreign one."""
+        host, origin = request.host.lower(), request.headers.get("Origin")
+        if host in self._hosts and (origin is None or origin.lower() in self._origins):
+            return super().find_handler(request, **kwargs)
+        problem = f"this page answers to {', '.join(self._hosts)} alone; {_CURE}"
+        return self.get_handler_delegate(request, _Refusal, {"problem": problem})
+
+
+class _Refusal(RequestHandler):
+    """Answers whatever is requested with status 403 and a sentence."""
+
+    def initialize(self, problem: str) -> None:
+        self._problem = problem
+
+    def prepare(self) -> None:
+        """End the request before it comes to a method."""
+        self.set_status(403)
+        self.set_header("Content-Type", "text/plain; charset=UTF-8")
+        self.finish(f"{self._problem}\n")
 
 
 def _free(port: int) -> int:

@@ -9,8 +9,10 @@ import contextlib
 import functools
 import hashlib
 import os
+import sys
 import tempfile
 import types
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -201,17 +203,50 @@ def _fingerprint_names(scope: dict[str, Any], names: set[str], key: Any, seen: s
             _fingerprint_names(vars(item), names, key, seen)
 
 
-def _source_file(name: str, text: str) -> Path | None:
-    """Write the kernel's text where Numba can cache beside it; None when nowhere is writable."""
+def cache_folder() -> Path | None:
+    """Where kernels are kept, by default in the user's cache; None, with a warning, for nowhere.
+
+    What lies there is run as machine code, so the folder is the user's and written to by nobody
+    else. Raises ModelError for one in ``RIG_CACHE_DIR`` that is not.
+    """
     import platformdirs
 
     chosen = os.environ.get("RIG_CACHE_DIR")
-    folder = Path(chosen or platformdirs.user_cache_dir("hybrid-rig", False))
+    folder = Path(chosen or platformdirs.user_cache_dir("hybrid-rig", False)).absolute()
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        problem = _intrusion(folder)
+    except OSError:
+        return None
+    if problem is None:
+        return folder
+    cure = "remove it, and it is made anew for you alone; or name another in RIG_CACHE_DIR"
+    danger = f"{problem}, and compiled kernels in it are run as they are"
+    if chosen:
+        raise ModelError(f"RIG_CACHE_DIR: {folder}: {danger}; {cure}")
+    warnings.warn(f"{folder}: {danger}. None is kept now; {cure}", stacklevel=2)
+    return None
+
+
+def _intrusion(folder: Path) -> str | None:
+    """How another user could put something into a folder; None where none can."""
+    if sys.platform == "win32":
+        return None  # it has no such bits; a folder in a user's profile is that user's
+    status = folder.stat()
+    if status.st_uid != os.geteuid():
+        return "it belongs to another user"
+    return "others may write to it" if status.st_mode & 0o022 else None
+
+
+def _source_file(name: str, text: str) -> Path | None:
+    """Write the kernel's text where Numba can cache beside it; None when nowhere is writable."""
+    folder = cache_folder()
+    if folder is None:
+        return None
     path = folder / name
     try:
         if path.exists():
             return path
-        folder.mkdir(parents=True, exist_ok=True)
         handle, temporary = tempfile.mkstemp(dir=folder, suffix=".tmp")
         with os.fdopen(handle, "w", encoding="utf-8") as file:
             file.write(text)

@@ -209,7 +209,9 @@ def test_verdict_in_two_sentences_and_how_to_do_it_again(page, document, work, r
     (ambiguity,) = document["ambiguities"]
     assert re.search(rf"Measure {ambiguity['measure'][0]} by other means", page.text)
     assert "give the values under fixed in a file for --config:" in page.text
-    assert re.search(r"rig replay LOG --parameters parameters.yaml --config \S*id.yaml", page.text)
+    assert re.search(
+        r"rig replay LOG --parameters parameters.yaml --config \S*id.yaml --trust", page.text
+    )
     for log in document["reproduction"]["logs"]:
         assert log["sha256"] in page.text
     assert document["software"]["numpy"] in page.text
@@ -264,8 +266,8 @@ def test_without_intervals_and_validation_the_page_says_so(work, rig):
 
 @pytest.mark.soak
 def test_figures_are_drawn_again_in_other_formats(result, work, rig):
-    done = rig(["figures", "found", "--format", "png", "--format", "svg", "--out", "drawn",
-                "--json"], cwd=work)  # fmt: skip
+    formats = ["--format", "png", "--format", "svg"]
+    done = rig(["figures", "found", "--trust", *formats, "--out", "drawn", "--json"], cwd=work)
     assert done.returncode == 0, done.stderr
     files = json.loads(done.stdout)["figures"]
     assert len(files) == 2 * len(list((work / "found/figures").iterdir()))
@@ -277,10 +279,12 @@ def test_figures_are_drawn_again_in_other_formats(result, work, rig):
 
 def test_columns_of_a_file_for_another_model_of_the_same_signals_serve(result, work, rig):
     (work / "other.yaml").write_text(CONFIG.replace("my_model.py:model", "actuator"))
-    args = ["replay", "check.csv", "--parameters", "found/parameters.yaml"]
+    args = ["replay", "check.csv", "--parameters", "found/parameters.yaml", "--trust"]
     done = rig([*args, "--config", "other.yaml", "--figure", "replay.png"], cwd=work)
     assert done.returncode == 0, done.stderr
-    assert re.search(r"Next: rig replay ANOTHER_LOG .* --config \S*other.yaml\n", done.stdout)
+    assert re.search(
+        r"Next: rig replay ANOTHER_LOG .* --config \S*other.yaml --trust\n", done.stdout
+    )
 
 
 def test_figures_of_what_is_not_there_any_more(result, work, rig, tmp_path):
@@ -294,7 +298,7 @@ def test_figures_of_what_is_not_there_any_more(result, work, rig, tmp_path):
         document["reproduction"] |= wrong
         document["reproduction"]["logs"].reverse()
         data.write_text(json.dumps(document))
-        done = rig(["figures", "found"], cwd=tmp_path)
+        done = rig(["figures", "found", "--trust"], cwd=tmp_path)
         assert done.returncode == 2
         assert said in done.stderr
     (tmp_path / "copy.csv").write_text((work / "check.csv").read_text() + "0,0,0\n")
@@ -304,7 +308,7 @@ def test_figures_of_what_is_not_there_any_more(result, work, rig, tmp_path):
         log | {"log": "copy.csv"} for log in document["reproduction"]["logs"]
     ]
     data.write_text(json.dumps(document))
-    done = rig(["figures", "found"], cwd=tmp_path)
+    done = rig(["figures", "found", "--trust"], cwd=tmp_path)
     assert "copy.csv: this log is another than the report's; identify again" in done.stderr
     assert "nowhere: no report.json there" in rig(["figures", "nowhere"], cwd=tmp_path).stderr
     assert "written as svg, pdf, png" in rig(["figures", ".", "--format", "gif"], cwd=work).stderr

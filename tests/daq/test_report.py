@@ -201,8 +201,8 @@ def test_json_is_what_the_file_holds(identify, folder, told):
 
 
 def test_replay_reads_the_parameters_of_a_report(command, folder, told):
-    parameters = ("--parameters", "found/parameters.yaml", "--config", "id.yaml", "--json")
-    result = command(("replay", "validation.csv", *parameters), folder)
+    parameters = ("--parameters", "found/parameters.yaml", "--config", "id.yaml")
+    result = command(("replay", "validation.csv", *parameters, "--trust", "--json"), folder)
     assert result.returncode == 0, result.stderr
     again = json.loads(result.stdout)["outputs"]["y"]
     (validated,) = told[1]["metrics"]["validation"]

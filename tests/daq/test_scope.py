@@ -1,18 +1,19 @@
 """What the scope reads and keeps of a log, and its command; the page itself needs a browser."""
 
-import asyncio
+import http.client
 import json
 import signal
 import socket
 import subprocess
 import sys
+from urllib.parse import urlsplit
 
 import numpy as np
 import psutil
 import pytest
+from bokeh.util.token import generate_jwt_token
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tornado import httpclient, websocket
 
 from daq.hal import Samples
 from daq.logs.columns import COLUMNS
@@ -307,7 +308,7 @@ def start_scope(*args, cwd):
 
 def test_it_serves_this_machine_only_until_it_is_ended(tmp_path):
     process, address = start_scope(cwd=tmp_path)
-    port = int(address.rstrip("/").rsplit(":", 1)[1])
+    port = urlsplit(address).port
     listens = [
         c.laddr for c in psutil.Process(process.pid).net_connections("inet") if c.status == "LISTEN"
     ]
@@ -321,25 +322,114 @@ def test_it_serves_this_machine_only_until_it_is_ended(tmp_path):
         again.bind(("127.0.0.1", port))
 
 
-def test_its_json_has_the_address_and_other_sites_are_refused(tmp_path):
+def test_its_json_has_the_address(tmp_path):
     process = start_rig("scope", "--port", 0, "--json", cwd=tmp_path)
     text = ""
     while not text.endswith("}\n"):
         text += process.stdout.readline()
     document = json.loads(text)
     assert document["run"] is None and document["out"] == "runs"
-    request = httpclient.HTTPRequest(
-        document["address"].replace("http", "ws") + "ws", headers={"Origin": "http://example.com"}
-    )
-    with pytest.raises(httpclient.HTTPClientError, match="403"):
-        asyncio.run(_connect(request))
+    assert request(document["address"])[0] == 200
     process.terminate()
     process.communicate(timeout=30)
     assert process.returncode == 0
 
 
-async def _connect(request):
-    await websocket.websocket_connect(request)
+@pytest.fixture(scope="module")
+def page_address(tmp_path_factory):
+    process, address = start_scope(cwd=tmp_path_factory.mktemp("scope"))
+    yield address
+    process.terminate()
+    process.communicate(timeout=30)
+
+
+def request(address, path=None, **headers):
+    """Status and body of what a server answers over a plain socket."""
+    url = urlsplit(address)
+    lines = {"Host": url.netloc, **headers}
+    head = [f"GET {url.path if path is None else path} HTTP/1.1"]
+    head += [f"{name.replace('_', '-')}: {value}" for name, value in lines.items()]
+    with socket.create_connection((url.hostname, url.port), timeout=30) as connection:
+        connection.sendall("\r\n".join([*head, "", ""]).encode())
+        with connection.makefile("rb") as answer:
+            status = int(answer.readline().split()[1])
+            length = int(http.client.parse_headers(answer).get("Content-Length", 0))
+            return status, answer.read(length)
+
+
+def upgrade(address, path=None, **headers):
+    """Status of what a server answers to a WebSocket's request."""
+    url = urlsplit(address)
+    if path is None:
+        path = f"{url.path}ws"
+    socket_headers = {
+        "Connection": "Upgrade",
+        "Upgrade": "websocket",
+        "Sec_WebSocket_Version": "13",
+        "Sec_WebSocket_Key": "dGhlIHNhbXBsZSBub25jZQ==",
+        "Sec_WebSocket_Protocol": f"bokeh, {generate_jwt_token('any')}",
+    }
+    return request(address, path, **{**socket_headers, "Origin": f"http://{url.netloc}", **headers})
+
+
+@pytest.mark.parametrize("name", ["127.0.0.1", "localhost", "LOCALHOST", "[::1]"])
+def test_the_printed_address_is_answered_under_all_names_of_this_machine(page_address, name):
+    host = f"{name}:{urlsplit(page_address).port}"
+    status, body = request(page_address, Host=host)
+    assert status == 200 and b"rig scope" in body
+    assert upgrade(page_address, Host=host, Origin=f"http://{host}")[0] == 101
+
+
+def test_a_key_that_nobody_guesses_is_part_of_the_address(page_address, tmp_path):
+    key = urlsplit(page_address).path.strip("/")
+    assert len(key) >= 32
+    process, another = start_scope(cwd=tmp_path)
+    process.terminate()
+    process.communicate(timeout=30)
+    assert urlsplit(another).path.strip("/") != key
+
+
+@pytest.mark.parametrize("knock", [request, upgrade], ids=["page", "socket"])
+@pytest.mark.parametrize("wrong", ["no key", "another key", "its beginning", "a path beside it"])
+def test_without_the_key_neither_page_nor_socket_is_given(page_address, knock, wrong):
+    key = urlsplit(page_address).path.strip("/")
+    other = key[:-1] + ("A" if key[-1] != "A" else "B")
+    paths = {"no key": "", "another key": f"/{other}", "its beginning": f"/{key[:-1]}"}
+    path = paths.get(wrong, f"/x/{key}") + ("/ws" if knock is upgrade else "/")
+    status, body = knock(page_address, path)
+    assert status == 403
+    words = b"there is no page at this address; open the address that rig scope has printed\n"
+    assert body == words
+
+
+@pytest.mark.parametrize("path", ["/metadata", "/autoload.js", "/static/js/bokeh.min.js"])
+def test_without_the_key_nothing_else_is_given_either(page_address, path):
+    assert request(page_address, path)[0] == 403
+
+
+@pytest.mark.parametrize("knock", [request, upgrade], ids=["page", "socket"])
+@pytest.mark.parametrize(
+    "foreign",
+    [
+        {"Host": "rebound.example:{port}"},
+        {"Host": "rebound.example:{port}", "Origin": "http://rebound.example:{port}"},
+        {"Origin": "http://rebound.example:{port}"},
+        {"Origin": "http://127.0.0.1:1"},
+        {"Origin": "https://127.0.0.1:{port}"},
+        {"Origin": "null"},
+        {"Host": "127.0.0.1"},
+        {"Host": "127.0.0.1:1"},
+        {"Host": "127.0.0.1.rebound.example:{port}"},
+    ],
+    ids=str,
+)
+def test_another_site_is_refused_even_with_the_key(page_address, knock, foreign):
+    port = urlsplit(page_address).port
+    headers = {name: text.format(port=port) for name, text in foreign.items()}
+    status, body = knock(page_address, **headers)
+    assert status == 403
+    words = f"this page answers to 127.0.0.1:{port}, localhost:{port}, [::1]:{port} alone; open"
+    assert body.startswith(words.encode())
 
 
 @pytest.mark.parametrize(

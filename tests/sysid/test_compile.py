@@ -58,9 +58,9 @@ class Workshop:
             "PYTHONDONTWRITEBYTECODE": "1",
         }
 
-    def start(self, **env: str) -> subprocess.Popen[str]:
+    def start(self, warnings: str = "error", **env: str) -> subprocess.Popen[str]:
         return subprocess.Popen(
-            [sys.executable, "-W", "error", "user.py"],
+            [sys.executable, "-W", warnings, "user.py"],
             cwd=self.folder, env=self.env | env, text=True,
             stdout=subprocess.PIPE, stderr=subprocess.PIPE,
         )  # fmt: skip
@@ -159,7 +159,7 @@ def test_a_cache_folder_that_cannot_be_made_is_done_without(workshop):
 
 
 def test_a_cache_folder_that_takes_no_machine_code_is_done_without(workshop):
-    workshop.cache.mkdir()
+    workshop.cache.mkdir(mode=0o700)
     (workshop.cache / "__pycache__").write_text("in the way")
     blocked = workshop.folder / "blocked"
     blocked.write_text("no home either")
@@ -178,3 +178,53 @@ def test_a_full_disk_is_done_without(workshop):
     )
     assert workshop.run() == pytest.approx(settled(BEFORE), rel=1e-3)
     assert not any(path.suffix == ".nbc" for path in workshop.files())
+
+
+# --- who may write to the cache ---------------------------------------------------------------
+
+posix = pytest.mark.skipif(os.name == "nt", reason="Windows keeps no such bits of a folder")
+CURE = "remove it, and it is made anew for you alone; or name another in RIG_CACHE_DIR"
+
+
+@posix
+def test_the_cache_folder_is_made_for_its_user_alone(workshop):
+    workshop.run(NAME_ONLY="1")
+    assert workshop.cache.stat().st_mode & 0o777 == 0o700
+    workshop.cache.chmod(0o755)  # others may read it
+    workshop.run(NAME_ONLY="1")
+
+
+@posix
+@pytest.mark.parametrize("mode", [0o770, 0o702, 0o1777], ids=oct)
+def test_a_chosen_folder_that_others_may_write_to_is_refused(workshop, mode):
+    workshop.cache.mkdir()
+    workshop.cache.chmod(mode)
+    _, errors = workshop.start(NAME_ONLY="1").communicate(timeout=120)
+    told = (
+        f"{workshop.cache}: others may write to it, and compiled kernels in it are run as they are"
+    )
+    assert errors.endswith(f"ModelError: RIG_CACHE_DIR: {told}; {CURE}\n")
+    assert not workshop.files()
+
+
+@posix
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root gives away")
+def test_a_chosen_folder_of_another_user_is_refused(workshop):
+    workshop.cache.mkdir(mode=0o700)
+    os.chown(workshop.cache, 65534, 65534)
+    _, errors = workshop.start(NAME_ONLY="1").communicate(timeout=120)
+    assert f"ModelError: RIG_CACHE_DIR: {workshop.cache}: it belongs to another user, and" in errors
+    assert not workshop.files()
+
+
+@posix
+def test_the_usual_folder_is_done_without_where_others_may_write_to_it(workshop):
+    folder = workshop.folder / "home" / "hybrid-rig"
+    folder.mkdir(parents=True)
+    folder.chmod(0o777)
+    home = str(folder.parent)
+    process = workshop.start("default", RIG_CACHE_DIR="", XDG_CACHE_HOME=home, HOME=home)
+    result, errors = process.communicate(timeout=120)
+    assert float(result) == pytest.approx(settled(BEFORE), rel=1e-3)
+    assert errors.count("UserWarning") == 1 and f"None is kept now; {CURE}" in errors
+    assert not list(folder.iterdir())
