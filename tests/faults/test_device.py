@@ -4,7 +4,7 @@ import contextlib
 import functools
 import json
 import re
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -45,6 +45,16 @@ LOOPS = {
     },
     "hysteresis_loop.yaml": {"brake_commands": [0.06], "cycles": 3, "period": 0.5},
 }  # fmt: skip
+# Loops that a busy machine closes in time.
+SLOW_LOOP = {
+    "sample_rate": 100,
+    "speed_filter": 30,
+    "loop": {"proportional": 0.02, "integral": 0.3},
+}
+LEISURE = {
+    "constant_velocity.yaml": SLOW_LOOP | {"velocities": [20], "slope": 20},
+    "hysteresis_loop.yaml": SLOW_LOOP | {"brake_commands": [0.0], "amplitude": 2, "period": 1.5},
+}
 
 
 def changed(kind, name, folder, **changes):
@@ -53,9 +63,9 @@ def changed(kind, name, folder, **changes):
     return write_yaml(folder / name, content, **changes)
 
 
-def quick(name, folder):
+def quick(name, folder, **others):
     """A shipped experiment that takes seconds."""
-    changes = {**EXCITATIONS, **LOOPS}[name]
+    changes = {**EXCITATIONS, **LOOPS}[name] | others
     if name == "constant_velocity.yaml":
         return changed("protocol", name, folder, calibration=QUICK["calibration"], **changes)
     return changed("protocol", name, folder, **QUICK, **changes)
@@ -82,13 +92,14 @@ class TestVirtualDevice(HalContract):
         )
 
 
+@pytest.fixture(scope="module")
+def port():
+    with serving(Setting(noise=0.0, offset=0.0)) as server:
+        yield server.port
+
+
 @pytest.mark.soak
 class TestSerialDevice(HalContract):
-    @pytest.fixture(scope="class")
-    def port(self):
-        with serving(Setting(noise=0.0, offset=0.0)) as server:
-            yield server.port
-
     @pytest.fixture
     def bench(self, port):
         return Bench(
@@ -123,18 +134,37 @@ SLOW = [pytest.param(name, marks=pytest.mark.soak) for name in ("multisine.yaml"
 @pytest.mark.parametrize("name", ["prbs.yaml", *SLOW])
 def test_on_a_line_it_completes_them_at_the_pace_of_the_clock(tmp_path, name):
     load = "free" if name == "constant_velocity.yaml" else "pulley"
-    content = yaml.safe_load(find_file("backend", "serial.yaml").read_text(encoding="utf-8"))
-    content["limits"].pop("travel")
-    if load == "free":
-        content["limits"].pop("winding")
-    path = write_yaml(tmp_path / "rig.yaml", content, options={"watchdog": 1.0})
-    setting = Setting(load=load, sensor="between" if load == "free" else "load")
-    with serving(setting) as server:
-        words = ("run", quick(name, tmp_path), "--rig", path, "--port", server.port)
-        result = rig(*words, cwd=tmp_path)
+    experiment = quick(name, tmp_path, **LEISURE.get(name, {}))
+    result, truth = run_on_a_line(tmp_path, experiment, Setting(load=load))
     assert result.returncode == 0, result.stderr
     assert record_of(only_capture(tmp_path))["device"].startswith("faulty board")
-    assert server.board.truth.output == [0.0, 0.0]
+    assert truth.output == [0.0, 0.0]
+
+
+BROKEN = {"device resets": 1, "device mute": 1, "device hangs": 1, "host paused 0.5 s": 1}
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("fault", [*BROKEN, "samples lost", "frames damaged"])
+def test_a_line_or_a_device_that_fails_ends_in_words(tmp_path, fault):
+    setting = Setting(load="pulley", fault=fault, at=0.2)
+    result, truth = run_on_a_line(tmp_path, quick("prbs.yaml", tmp_path), setting, watchdog=0.3)
+    assert result.returncode == BROKEN.get(fault, result.returncode) < 2, result.stderr
+    assert "Traceback" not in result.stderr and result.stderr.startswith("rig: ")
+    assert truth.onset is not None
+    assert truth.output == [0.0, 0.0] or fault == "device hangs"
+
+
+def run_on_a_line(folder, experiment, setting, watchdog=1.0):
+    """``rig run`` on the device behind a socket: its result and the truth."""
+    content = yaml.safe_load(find_file("backend", "serial.yaml").read_text(encoding="utf-8"))
+    cable = setting.load == "pulley"
+    content["limits"] |= {"travel": None, "winding": 0.25 if cable else None}
+    path = write_yaml(folder / "rig.yaml", content, options={"watchdog": watchdog})
+    setting = replace(setting, sensor="load" if cable else "between")
+    with serving(setting) as server:
+        result = rig("run", experiment, "--rig", path, "--port", server.port, cwd=folder)
+    return result, server.board.truth
 
 
 # --- the faults --------------------------------------------------------------------------
