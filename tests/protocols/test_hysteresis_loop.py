@@ -152,12 +152,12 @@ def test_a_run_finds_the_plants_parameters(tmp_path, plant, changes):
 def test_an_encoder_that_counts_the_other_way_ends_the_run(tmp_path):
     rig = {"sensors": {"encoder": {"sign": -1}}}
     with pytest.raises(RunError, match="encoder counts the other way round"):
-        run(experiment(), tmp_path, {"load": "free"}, rig)
+        run(experiment(), tmp_path, {"load": "free", "sensor": "between"}, rig)
 
 
 def test_a_run_that_ended_early_concludes_from_what_there_is(tmp_path):
-    chosen = experiment()
-    samples, extra = run(chosen, tmp_path, {"load": "free"}, ideal=True)
+    chosen, plant = experiment(torque_sensor="between"), {"load": "free", "sensor": "between"}
+    samples, extra = run(chosen, tmp_path, plant, ideal=True)
 
     def first(n):
         fields = {name: getattr(samples, name)[:n] for name in samples.__dataclass_fields__}
