@@ -2,6 +2,7 @@
 
 import os
 import signal
+import sys
 import tempfile
 from pathlib import Path
 
@@ -13,6 +14,7 @@ settings.load_profile("repeatable")
 
 def pytest_configure(config):
     _hear_signals()
+    _keep_bytecode()
     if not hasattr(config, "workerinput"):
         # Compiled kernels are kept for the next session, as pytest's own cache is, and shared by
         # all processes: those of pytest-xdist and programs that tests start find the folder by
@@ -26,6 +28,16 @@ def pytest_configure(config):
 def pytest_collection_modifyitems(items):
     # The longest begins first, so that no process waits for it alone at the end.
     items.sort(key=lambda item: "test_tutorial" not in item.nodeid)
+
+
+def _keep_bytecode():
+    """Hundreds of programs are started; without it each would compile anew all that it imports.
+
+    Where packages were installed without bytecode and PYTHONDONTWRITEBYTECODE is set, as in many
+    containers, that is several seconds for each.
+    """
+    sys.dont_write_bytecode = False
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 
 def _hear_signals():

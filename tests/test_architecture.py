@@ -1,6 +1,7 @@
 """What keeps the house in order: rooms, names and who prints, read from the source itself."""
 
 import ast
+import functools
 import re
 import tomllib
 from collections import defaultdict
@@ -11,7 +12,6 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("daq", "sysid", "sim_rig", "protocols")
 MODULES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
-TREES = {path: ast.parse(path.read_text(encoding="utf-8")) for path in MODULES}
 
 # Said by grammar, not by what a thing is.
 GRAMMAR = {"found", "told", "own", "one", "known", "asked", "said", "some", "other", "still"}
@@ -20,6 +20,12 @@ NOUNS = {"timing", "scaling", "sampling", "damping", "fitting", "judging", "reco
 
 
 KEYS_OF_FILES = {("daq/config/rig.py", "own")}  # limits.own
+
+
+@functools.cache
+def trees():
+    """Every module with its syntax tree."""
+    return {path: ast.parse(path.read_text(encoding="utf-8")) for path in MODULES}
 
 
 def name_of(path):
@@ -40,7 +46,7 @@ def variables_of(tree):
 def test_a_variable_is_named_after_what_it_is():
     by_grammar = [
         f"{name_of(path)}:{line}: {name}"
-        for path, tree in TREES.items()
+        for path, tree in trees().items()
         for name, line in variables_of(tree)
         if name.strip("_") in GRAMMAR and (name_of(path), name) not in KEYS_OF_FILES
     ]
@@ -50,7 +56,7 @@ def test_a_variable_is_named_after_what_it_is():
 @pytest.mark.parametrize("package", PACKAGES)
 def test_a_class_name_stands_once_in_a_package(package):
     places = defaultdict(list)
-    for path, tree in TREES.items():
+    for path, tree in trees().items():
         if path.is_relative_to(ROOT / package):
             for node in ast.walk(tree):
                 if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
@@ -84,7 +90,7 @@ def test_rooms_and_floors_of_sysid():
 def test_only_the_command_line_prints():
     """``print`` and the standard streams stand in ``daq/cli`` alone."""
     printing = []
-    for path, tree in TREES.items():
+    for path, tree in trees().items():
         if path.is_relative_to(ROOT / "daq" / "cli"):
             continue
         for node in ast.walk(tree):
@@ -98,7 +104,7 @@ def test_a_use_case_knows_nothing_of_json():
     """What becomes of a result is decided where it is shown."""
     knowing = [
         f"{name_of(path)}:{line}"
-        for path, tree in TREES.items()
+        for path, tree in trees().items()
         if not path.is_relative_to(ROOT / "daq" / "cli")
         for name, line in variables_of(tree)
         if name == "as_json"

@@ -17,6 +17,7 @@ import sysid
 IDENTIFYING = {
     "daq.identification.campaign.campaign",
     "daq.identification.comparison.ComparisonResult",
+    "daq.identification.fit.identify",
     "daq.identification.result.Identification",
 }
 

@@ -97,12 +97,13 @@ def start_rig(*args, cwd, env=None, **options):
     )
 
 
-# Imports what the commands import, then becomes a ``rig`` process per line of standard input.
+# Prepares what the commands need, then becomes a ``rig`` process per line of standard input.
 _FORKING = """
 import json, os, signal, sys, traceback
 import daq.cli, daq.cli.app, daq.identification.comparison, daq.identification.fit
-import daq.identification.replay, daq.recording.preview, numba, pandas, pint, protocols.prbs
-import sim_rig.actuator, sim_rig.backend
+import daq.identification.replay, daq.recording.preview, matplotlib.figure, numba, pandas, pint
+import protocols.prbs, rich.progress, rich.table, sim_rig.actuator, sim_rig.backend
+numba.njit("f8(f8)")(lambda x: x)  # what the first compilation of a process takes half a second for
 
 for line in sys.stdin:
     job = json.loads(line)

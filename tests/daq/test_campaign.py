@@ -122,6 +122,7 @@ def test_a_dask_cluster_by_one_setting_gives_the_same(folder):
     assert settled(there) == settled(here)
 
 
+@pytest.mark.soak
 def test_ctrl_c_keeps_what_is_finished(folder):
     process = start_rig(
         "campaign", "fast.csv", "--model", LAG, "--config", "id.yaml", "--seeds", "0:5000",

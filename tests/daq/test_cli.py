@@ -176,6 +176,7 @@ def on_terminal(args, cwd, answer=None):
     return process.returncode, text, out
 
 
+@pytest.mark.soak
 def test_a_terminal_shows_progress_as_it_goes(tmp_path):
     write_experiment(tmp_path / "e.yaml", duration=1.5)
     write_rig(tmp_path / "rig.yaml", options={"time": "real"})
@@ -199,6 +200,7 @@ def test_a_pipe_shows_one_plain_line_per_phase(tmp_path):
     assert "\x1b" not in result.stderr + result.stdout and "\r" not in result.stderr
 
 
+@pytest.mark.soak
 def test_a_reader_that_leaves_early_causes_no_traceback(tmp_path):
     for args in (["models"], ["models", "actuator"], ["models", "--json"], ["--help"]):
         reader, writer = os.pipe()
@@ -433,6 +435,7 @@ def test_the_report_says_where_every_range_came_from(tmp_path):
         assert line in result.stdout
 
 
+@pytest.mark.soak
 def test_a_log_without_time_has_its_rate_in_the_configuration(tmp_path):
     foreign_log(tmp_path / "bench.csv")
     text = (tmp_path / "bench.csv").read_text()
@@ -447,6 +450,7 @@ def test_a_log_without_time_has_its_rate_in_the_configuration(tmp_path):
     assert found == pytest.approx(0.2, rel=1e-3)
 
 
+@pytest.mark.soak
 def test_one_seed_gives_one_result(captured, tmp_path):
     root, folder = captured
     values = []
@@ -485,6 +489,7 @@ def test_ctrl_c_during_a_search_prints_the_parameters_found_so_far(captured, tmp
     assert kept["search"]["generations"] >= asked[0]
 
 
+@pytest.mark.soak
 def test_ctrl_c_before_there_is_any_result_says_so_in_one_line(tmp_path):
     write_experiment(tmp_path / "e.yaml", homing={"turns": 500, "timeout": 3600})
     write_rig(tmp_path / "rig.yaml", options={"time": "real"})

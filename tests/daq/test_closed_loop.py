@@ -11,6 +11,7 @@ import pytest
 import yaml
 
 from tests.daq.support import only_capture, record_of, rig, write_rig
+from tests.soak import mostly_soak
 
 PROTOCOL = '''
 import numpy as np
@@ -81,7 +82,7 @@ def log_of(root):
     return pd.read_csv(only_capture(root) / "log.csv")
 
 
-@pytest.mark.parametrize("ahead", [1, 3])
+@pytest.mark.parametrize("ahead", mostly_soak([3, 1]))
 def test_every_sample_is_answered_so_many_ticks_later(run, tmp_path, ahead):
     result = run(ahead=ahead)
     assert result.returncode == 0, result.stderr
@@ -159,6 +160,7 @@ def test_commands_beyond_the_rig_are_refused_before_anything_moves(run, tmp_path
     assert not (tmp_path / "runs").exists()
 
 
+@pytest.mark.soak
 def test_an_excitation_concludes_nothing(run, tmp_path):
     assert run().returncode == 0
     folder = only_capture(tmp_path)

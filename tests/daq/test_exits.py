@@ -27,6 +27,7 @@ from tests.daq.support import (
     write_experiment,
     write_rig,
 )
+from tests.soak import mostly_soak
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
 
@@ -251,7 +252,26 @@ def assert_consistent(folder, status, reason):
             assert len(loaded.frame) == len(rows) - 1
 
 
-@pytest.mark.parametrize("exit", list(exits()), ids=str)
+# One of every fault and every phase runs always; all with -m soak.
+ALWAYS = {
+    "unplugged in open", "bug in open", "SIGHUP in calibration", "interlock in calibration",
+    "SIGINT in homing", "nan in homing", "interlock in run", "full in run", "bug in run",
+    "SIGTERM+SIGINT@safe in run", "SIGQUIT in run", "SIGTSTP in run", "SIGINT in safe",
+    "SIGINT+SIGINT@close in run", "unplugged in close", "unplugged in run, closed loop",
+    "nan in run, closed loop",
+}  # fmt: skip
+EXITS = sorted(exits(), key=lambda exit: str(exit) not in ALWAYS)
+
+
+def test_every_fault_and_every_phase_is_met_always():
+    met = [exit for exit in EXITS if str(exit) in ALWAYS]
+    assert len(met) == len(ALWAYS)
+    assert {exit.phase for exit in met} == set(PHASES)
+    first = {exit.fault.partition("+")[0] for exit in EXITS}
+    assert {exit.fault.partition("+")[0] for exit in met} == first
+
+
+@pytest.mark.parametrize("exit", mostly_soak(EXITS, len(ALWAYS)), ids=str)
 def test_outputs_are_zero_and_the_record_says_why(run, tmp_path, exit):
     if exit.closed_loop:
         (tmp_path / "constant.py").write_text(_PROTOCOL)

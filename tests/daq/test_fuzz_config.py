@@ -14,6 +14,7 @@ from daq.identification.settings import problem_of
 from daq.lookup.experiments import load_experiment
 from daq.lookup.rigs import load_rig
 from daq.lookup.shipped import shipped_files
+from tests.soak import mostly_soak
 
 WORDS = st.sampled_from(
     [
@@ -92,7 +93,13 @@ def changed(content, key, value, new_name):
     return result
 
 
-@pytest.mark.parametrize(("name", "content", "load"), FILES, ids=[name for name, *_ in FILES])
+# One file of every kind first.
+FILES.sort(key=lambda file: file[0] not in {"prbs.yaml", "serial.yaml", "identification.yaml"})
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "load"), mostly_soak(FILES, 3), ids=[name for name, *_ in FILES]
+)
 @settings(
     deadline=None, max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )

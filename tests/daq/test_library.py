@@ -64,6 +64,7 @@ def test_an_identification_is_the_one_the_command_makes(recorded, found):
     assert list(found.reasons) == told["verdict"]["reasons"]
 
 
+@pytest.mark.soak
 def test_a_table_does_for_a_log(recorded):
     _, training, validation = recorded
     columns = ["t", "applied_voltage_motor", "applied_voltage_brake", "torque"]

@@ -123,6 +123,7 @@ def test_any_decimal_is_read_as_python_reads_it(tmp_path, cells):
     assert read.tobytes() == np.array([float(cell) for cell in cells]).tobytes()
 
 
+@pytest.mark.soak
 def test_a_long_log_is_read_whole_and_its_mistakes_found(tmp_path):
     path = tmp_path / "long.csv"
     rng, n = np.random.default_rng(5), 75_000
@@ -460,6 +461,7 @@ def test_a_full_disk_ends_the_run_safely_with_a_log_that_loads(tmp_path):
     assert outputs and not np.any(outputs[-1]["applied"]) and entries[-1]["what"] == "close"
 
 
+@pytest.mark.soak
 def test_a_disk_full_from_the_start_is_no_traceback(tmp_path):
     write_experiment(tmp_path / "e.yaml")
 

@@ -253,6 +253,7 @@ def test_no_report_writes_none(work, rig):
     assert "Report:" not in done.stdout
 
 
+@pytest.mark.soak
 def test_without_intervals_and_validation_the_page_says_so(work, rig):
     args = ["identify", "check.csv", "--config", "id.yaml", "--preset", "thesis", "--json"]
     done = rig([*args, "--generations", "3", "--out", "plain"], cwd=work, report=True)
@@ -277,6 +278,7 @@ def test_figures_are_drawn_again_in_other_formats(result, work, rig):
         assert again.read_bytes() == before.read_bytes()
 
 
+@pytest.mark.soak
 def test_columns_of_a_file_for_another_model_of_the_same_signals_serve(result, work, rig):
     (work / "other.yaml").write_text(CONFIG.replace("my_model.py:model", "actuator"))
     args = ["replay", "check.csv", "--parameters", "found/parameters.yaml", "--trust"]
@@ -287,6 +289,7 @@ def test_columns_of_a_file_for_another_model_of_the_same_signals_serve(result, w
     )
 
 
+@pytest.mark.soak
 def test_figures_of_what_is_not_there_any_more(result, work, rig, tmp_path):
     shutil.copytree(work / "found", tmp_path / "found")
     data = tmp_path / "found/report.json"

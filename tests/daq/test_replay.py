@@ -15,6 +15,7 @@ import yaml
 
 from sim_rig.plant import Plant
 from tests.daq.support import environment, forked_rig, only_capture, write_experiment, write_rig
+from tests.soak import mostly_soak
 
 DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "testing.md"
 
@@ -57,6 +58,7 @@ def test_a_gate_that_is_met_passes_and_says_so(rig, capture, tmp_path):
     assert figure.read_bytes().startswith(b"%PDF")
 
 
+@pytest.mark.soak
 def test_the_figure_is_written_beside_the_log(rig, capture, tmp_path):
     assert rig("replay", capture, cwd=tmp_path).returncode == 0
     assert (capture / "replay.png").read_bytes().startswith(b"\x89PNG")
@@ -64,14 +66,17 @@ def test_the_figure_is_written_beside_the_log(rig, capture, tmp_path):
 
 @pytest.mark.parametrize(
     ("options", "message"),
-    [
-        (["--fail-under", "omga=80"], "did you mean 'omega'"),
-        (["--fail-under", "omega"], "write OUTPUT=PERCENT"),
-        (["--fail-under", "omega=high"], "write OUTPUT=PERCENT"),
-        (["--fail-under", "omega=nan"], "write OUTPUT=PERCENT"),
-        (["--figure", "absent/figure.png"], "choose another with --figure"),
-        (["--figure", "figure.docx"], "figures are written as"),
-    ],
+    mostly_soak(
+        [
+            (["--fail-under", "omga=80"], "did you mean 'omega'"),
+            (["--fail-under", "omega"], "write OUTPUT=PERCENT"),
+            (["--fail-under", "omega=high"], "write OUTPUT=PERCENT"),
+            (["--fail-under", "omega=nan"], "write OUTPUT=PERCENT"),
+            (["--figure", "absent/figure.png"], "choose another with --figure"),
+            (["--figure", "figure.docx"], "figures are written as"),
+        ],
+        always=4,
+    ),
 )
 def test_a_mistake_is_answered_with_the_cure(rig, capture, tmp_path, options, message):
     result = rig("replay", capture, *options, cwd=tmp_path)

@@ -183,6 +183,7 @@ def test_residual_tests_and_verdict_are_those_of_the_document(told):
     assert f"Trust: limited. {' '.join(reasons)}" in text
 
 
+@pytest.mark.soak
 def test_without_validation_the_residuals_are_those_of_the_training(command, folder):
     result = command(("identify", "training.csv", "--config", "id.yaml", "--out", "alone"), folder)
     assert "Residuals, training: share of correlations" in result.stdout
@@ -200,6 +201,7 @@ def test_json_is_what_the_file_holds(identify, folder, told):
         assert document[part] == before[part]
 
 
+@pytest.mark.soak
 def test_replay_reads_the_parameters_of_a_report(command, folder, told):
     parameters = ("--parameters", "found/parameters.yaml", "--config", "id.yaml")
     result = command(("replay", "validation.csv", *parameters, "--trust", "--json"), folder)
@@ -209,6 +211,7 @@ def test_replay_reads_the_parameters_of_a_report(command, folder, told):
     assert again["rmse"] == pytest.approx(validated["outputs"]["y"]["rmse"], rel=1e-6)
 
 
+@pytest.mark.soak
 def test_fixing_what_should_be_measured_gives_all_the_rest(identify):
     settings = ("--set", "fixed.b=1", "--set", "fixed.idle=0.1")
     report = json.loads(identify("--out", "fixed", "--json", *settings))
@@ -217,6 +220,7 @@ def test_fixing_what_should_be_measured_gives_all_the_rest(identify):
     assert a["interval"][0] < GAIN < a["interval"][1]
 
 
+@pytest.mark.soak
 def test_the_thesis_preset_has_no_intervals_and_says_nothing_of_them(identify, folder):
     text = identify("--preset", "thesis", "--out", "thesis")
     assert "95 % interval" not in text and "act only together" not in text

@@ -56,6 +56,7 @@ def test_a_killed_identification_goes_on_to_the_same_result(captured, tmp_path):
     assert [path.name for path in cut.iterdir()] == [path.name for path in whole.iterdir()]
 
 
+@pytest.mark.soak
 def test_ctrl_c_says_how_to_go_on(captured, tmp_path):
     root, folder = captured
     out = tmp_path / "out"

@@ -27,6 +27,7 @@ from tests.daq.support import (
     write_experiment,
     write_rig,
 )
+from tests.soak import mostly_soak
 
 FAULTY = {"backend": "faulty", "options": {"journal": "journal.jsonl"}}
 
@@ -180,6 +181,7 @@ def test_homing_that_takes_too_long_ends_the_run(tmp_path, plugin):
     assert_left_safe(tmp_path)
 
 
+@pytest.mark.soak
 def test_a_device_that_fails_during_the_run_leaves_zero_outputs_and_says_why(tmp_path, plugin):
     result = run_with(tmp_path, plugin, "unplugged", at=300)
     assert result.returncode == 1
@@ -195,6 +197,7 @@ def test_a_device_that_fails_during_the_run_leaves_zero_outputs_and_says_why(tmp
     assert "ended early: failed: the device no longer answers" in recording.warning
 
 
+@pytest.mark.soak
 def test_a_mistake_in_a_backend_leaves_zero_outputs_and_is_named(tmp_path, plugin):
     result = run_with(tmp_path, plugin, "bug", at=300)
     assert result.returncode == 1
@@ -315,7 +318,9 @@ def test_losing_the_last_samples_of_a_run_is_no_complete_run(tmp_path, plugin):
     assert ticks.max() < 400
 
 
-@pytest.mark.parametrize(("number", "by"), [(signal.SIGINT, "Ctrl-C"), (signal.SIGTERM, "SIGTERM")])
+@pytest.mark.parametrize(
+    ("number", "by"), mostly_soak([(signal.SIGINT, "Ctrl-C"), (signal.SIGTERM, "SIGTERM")])
+)
 def test_a_signal_stops_a_run_in_real_time_with_its_log_whole(tmp_path, plugin, number, by):
     write_experiment(tmp_path / "e.yaml", duration=30)
     write_rig(tmp_path / "rig.yaml", **merged(FAULTY, {"options": {"time": "real"}}))
@@ -333,6 +338,7 @@ def test_a_signal_stops_a_run_in_real_time_with_its_log_whole(tmp_path, plugin, 
     assert_left_safe(tmp_path)
 
 
+@pytest.mark.soak
 def test_a_closed_terminal_stops_a_run_too(tmp_path, plugin):
     write_experiment(tmp_path / "e.yaml", duration=30)
     write_rig(tmp_path / "rig.yaml", **merged(FAULTY, {"options": {"time": "real"}}))
@@ -345,6 +351,7 @@ def test_a_closed_terminal_stops_a_run_too(tmp_path, plugin):
     assert_left_safe(tmp_path)
 
 
+@pytest.mark.soak
 def test_a_signal_while_the_load_is_wound_is_recorded_with_its_phase(tmp_path):
     write_experiment(tmp_path / "e.yaml", homing={"turns": 20, "timeout": 60})
     write_rig(tmp_path / "rig.yaml", options={"time": "real"})

@@ -32,6 +32,7 @@ from tests.daq.support import (
     write_experiment,
     write_rig,
 )
+from tests.soak import mostly_soak
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 DOCS = EXAMPLES.parent / "docs"
@@ -162,6 +163,7 @@ def test_a_limit_of_ones_own_stops_a_run_as_the_docs_say(run, folder):
     assert log["flags"].iloc[-1] & int(Flag.INTERLOCK)
 
 
+@pytest.mark.soak
 def test_a_limit_of_an_installed_package_is_found_by_its_name(tmp_path):
     text = (
         "from daq.limits import Limit\n\n\n"
@@ -311,7 +313,7 @@ os.execv(sys.argv[1], sys.argv[1:])
 
 @pytest.mark.skipif(not hasattr(ctypes.CDLL(None) if os.name == "posix" else None, "prctl"),
                     reason="capabilities of Linux")  # fmt: skip
-@pytest.mark.parametrize("asked", ["require", "prefer"])
+@pytest.mark.parametrize("asked", mostly_soak(["require", "prefer"]))
 def test_without_the_right_to_it_real_time_is_refused_or_done_without(tmp_path, asked):
     write_experiment(tmp_path / "e.yaml", duration=0.1)
     write_rig(tmp_path / "rig.yaml", realtime=asked, options={"time": "real"})

@@ -241,6 +241,7 @@ def test_a_finished_run_is_shown_whole_and_magnified_to_its_samples(scope, tmp_p
     until(lambda: tab.height("torque")[1] > 9.0, "its height")
 
 
+@pytest.mark.soak
 def test_the_values_are_those_under_the_cursor_and_from_the_mark(scope, tmp_path):
     block = samples(800)
     with recording(tmp_path, "short") as (capture, log):
@@ -278,6 +279,7 @@ def test_a_broken_log_shows_what_is_readable_and_says_what_is_not(scope, tmp_pat
     assert ">interlock<" in tab.head() and "too much &lt;i&gt;" in tab.head()
 
 
+@pytest.mark.soak
 def test_a_log_of_the_original_program_is_shown(scope, tmp_path):
     names = ("t", "cmd_voltage_motor", "cmd_voltage_brake", "current_motor", "current_brake")
     names = (*names, "torque", "theta", "omega")

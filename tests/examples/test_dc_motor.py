@@ -55,6 +55,7 @@ def test_simulate_identify_predict(dc_motor):
     assert found.score(inputs, outputs) > 0.999
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize("seed", range(5))
 def test_what_it_guesses_from_a_noisy_record_holds_the_truth(dc_motor, seed):
     rng = np.random.default_rng(seed)

@@ -161,7 +161,8 @@ def test_a_run_cut_short_concludes_from_what_it_has(between):
 def test_a_loop_that_runs_away_is_ended(tmp_path):
     settings = experiment(**QUICK)
     with pytest.raises(RunError, match=r"encoder\.sign"):
-        run(settings, tmp_path, {"load": "free"}, {"sensors": {"encoder": {"sign": -1}}})
+        plant = {"load": "free", "sensor": "between"}
+        run(settings, tmp_path, plant, {"sensors": {"encoder": {"sign": -1}}})
     (folder,) = (tmp_path).iterdir()
     samples, extra = logged(settings, folder)
     assert len(samples) < 800
@@ -169,6 +170,7 @@ def test_a_loop_that_runs_away_is_ended(tmp_path):
         settings.findings(samples, extra)
 
 
+@pytest.mark.soak
 def test_a_sensor_said_to_be_elsewhere_is_noticed(tmp_path):
     settings = experiment(
         velocities=[20, 60], brake_commands=[0, 0.04], measure=0.5, calibration={"samples": 400}

@@ -16,6 +16,7 @@ from daq.lookup.experiments import load_experiment
 from daq.plugins import load_plugin
 from tests.daq.support import only_capture, record_of
 from tests.protocols.support import loaded, planned
+from tests.soak import mostly_soak
 
 HELD = {"offset": 0.1}
 MULTISINE = {
@@ -333,7 +334,9 @@ def test_any_settings_give_a_clear_error_or_commands_within_what_they_declare(co
 # --- on the simulated rig -----------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["multisine", "chirp", "sine", "steps", "play", "prbs"])
+@pytest.mark.parametrize(
+    "name", mostly_soak(["multisine", "prbs", "chirp", "sine", "steps", "play"], 2)
+)
 def test_every_shipped_file_runs_and_is_logged_as_planned(tmp_path, command, name):
     result = command(["run", f"{name}.yaml"], tmp_path)
     assert result.returncode == 0, result.stderr

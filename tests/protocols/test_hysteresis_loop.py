@@ -17,6 +17,7 @@ from sim_rig.physics.hysteresis import hysteresis as brake_model
 from sim_rig.physics.options import Design
 from sim_rig.physics.values import named
 from tests.protocols.closed_loop import numbers, run, shipped
+from tests.soak import mostly_soak
 
 TRUTH = named("rig", Design())
 GAMMA, BETA, A = (TRUTH[name] for name in ("gamma", "beta", "A"))
@@ -113,10 +114,15 @@ def test_the_energy_is_the_closed_forms():
 
 @pytest.mark.parametrize(
     ("plant", "changes"),
-    [
-        ({"load": "pulley"}, {"homing": {"turns": 3}}),
-        ({"load": "free", "sensor": "between"}, {"torque_sensor": "between", "shape": "triangle"}),
-    ],
+    mostly_soak(
+        [
+            ({"load": "pulley"}, {"homing": {"turns": 3}}),
+            (
+                {"load": "free", "sensor": "between"},
+                {"torque_sensor": "between", "shape": "triangle"},
+            ),
+        ]
+    ),
 )
 def test_a_run_finds_the_plants_parameters(tmp_path, plant, changes):
     chosen = experiment(**changes)
@@ -146,12 +152,12 @@ def test_a_run_finds_the_plants_parameters(tmp_path, plant, changes):
 def test_an_encoder_that_counts_the_other_way_ends_the_run(tmp_path):
     rig = {"sensors": {"encoder": {"sign": -1}}}
     with pytest.raises(RunError, match="encoder counts the other way round"):
-        run(experiment(), tmp_path, {"load": "free"}, rig)
+        run(experiment(), tmp_path, {"load": "free", "sensor": "between"}, rig)
 
 
 def test_a_run_that_ended_early_concludes_from_what_there_is(tmp_path):
-    chosen = experiment()
-    samples, extra = run(chosen, tmp_path, {"load": "free"}, ideal=True)
+    chosen, plant = experiment(torque_sensor="between"), {"load": "free", "sensor": "between"}
+    samples, extra = run(chosen, tmp_path, plant, ideal=True)
 
     def first(n):
         fields = {name: getattr(samples, name)[:n] for name in samples.__dataclass_fields__}
@@ -165,6 +171,7 @@ def test_a_run_that_ended_early_concludes_from_what_there_is(tmp_path):
         chosen.findings(*first(1600))
 
 
+@pytest.mark.soak
 def test_a_few_lost_samples_do_not_cost_their_cycles(tmp_path):
     chosen = experiment()
     samples, extra = run(chosen, tmp_path, {"load": "free"}, ideal=True)
@@ -241,10 +248,12 @@ def test_any_settings_give_a_clear_error_or_a_plan_within_what_it_declares(chang
 
 @pytest.mark.parametrize(
     ("said", "place", "told"),
-    [
-        ("between", "load", "That is too little for ranges. Is the torque sensor"),
-        ("load", "between", "where ratings.brake_constant says 3.568"),
-    ],
+    mostly_soak(
+        [
+            ("load", "between", "where ratings.brake_constant says 3.568"),
+            ("between", "load", "That is too little for ranges. Is the torque sensor"),
+        ]
+    ),
 )
 def test_a_torque_sensor_that_is_elsewhere_is_suspected(tmp_path, said, place, told):
     chosen = experiment(torque_sensor=said, brake_commands=[0.05, 0.1])

@@ -15,6 +15,7 @@ from protocols.virtual_wall import VirtualWall
 from sim_rig.backend import Simulation
 from sim_rig.device.user import SimulatedUser
 from tests.protocols.closed_loop import logged, numbers, run, shipped
+from tests.soak import mostly_soak
 
 PERIOD = 1.0 / 800.0
 HELD = {"load": "hand"}
@@ -74,7 +75,7 @@ def test_a_wall_that_rings_at_any_stiffness_has_no_critical_one():
     assert SampledWall(1e-4, 2e-4, 0.0, PERIOD, 1, 150.0).critical_stiffness(0.2) == 0.0
 
 
-@pytest.mark.parametrize("damping", [0.0, 0.02])
+@pytest.mark.parametrize("damping", mostly_soak([0.0, 0.02]))
 def test_on_the_simulated_rig_walls_ring_on_the_side_that_theory_says(tmp_path, damping):
     critical = wall().theory.loop(0.0, hand=True).critical_stiffness(damping)
     walls = [0.6 * critical, 0.85 * critical, 1.2 * critical, 1.4 * critical]

@@ -77,6 +77,7 @@ ALL = tuple(combinations())
 
 # Plants of simulated rigs besides the default one: few, as each takes seconds to compile.
 PLANTS = {
+    "unloaded": {"load": "free", "sensor": "between"},
     "free": {
         "load": "free", "friction": "stribeck", "sensor": "between", "hysteresis": "dahl",
         "driver_motor": "open", "driver_brake": "open",

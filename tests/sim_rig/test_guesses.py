@@ -137,6 +137,7 @@ def test_a_still_or_empty_log_tells_nothing():
     assert guess_ranges(model, [short]) == {}
 
 
+@pytest.mark.soak
 def test_lost_samples_do_not_mislead():
     """A gap in the speed is unknown, not zero, also for the samples that follow it."""
     model = actuator(driver_motor="open", parameters="rig")

@@ -40,6 +40,7 @@ def differences(function, point, steps):
 STEPS = {"omega": 2e-6, "z": 2e-6, "theta": 1e-5, "height": 1e-6, "speed": 1e-4}
 
 
+@pytest.mark.soak
 @settings(max_examples=300)
 @given(parts=st.sampled_from(ALL), seed=st.integers(0, 2**32 - 1))
 def test_every_combinations_matrices_are_its_slopes(parts, seed):

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from tests.sim_rig.support import Parts, constant, follow, random_point
+from tests.soak import mostly_soak
 from tests.sysid.support import outputs_of
 
 FREE_TORQUES = (
@@ -209,7 +210,9 @@ def test_coil_and_driver_may_swap_their_time_constants(kind):
     assert distance(one, response(parts, {}, changes=half)) > 1e-3
 
 
-@pytest.mark.parametrize(("kind", "directions"), [("bouc-wen", 4), ("dahl", 3), ("lugre", 3)])
+@pytest.mark.parametrize(
+    ("kind", "directions"), mostly_soak([("bouc-wen", 4), ("dahl", 3), ("lugre", 3)])
+)
 def test_there_are_no_more_redundancies_than_these(kind, directions):
     """Rank of the outputs' sensitivities: coil, inertias, dampings, and the bristle's unit."""
     model = Parts(hysteresis=kind).build()

@@ -114,6 +114,7 @@ def test_intervals_cover_what_they_claim():
     assert 0.93 < inside.mean() < 0.97
 
 
+@pytest.mark.soak
 def test_coloured_noise_biases_arx_but_not_armax():
     arx = np.array([ARX(1, 1).fit(*siso(seed, sigma=1.0)).theta_[0] for seed in range(100)])
     armax = np.array([ARMAX(1, 1, 1).fit(*siso(seed, sigma=1.0)).theta_[0] for seed in range(100)])

@@ -17,6 +17,7 @@ from joblib.externals.loky import get_reusable_executor
 
 from sysid import GASSI, Constraint, Dataset, ModelError, Run, campaign, combinations, fit_percent
 from sysid.campaigns.parcels import pack, unpack
+from tests.soak import mostly_soak
 from tests.sysid.support import lag
 
 SETTINGS = {"population": 32, "generations": 4}
@@ -212,7 +213,7 @@ def test_what_violates_the_constraints_is_not_the_best(serial):
     assert list(chosen.values()) == [high]
 
 
-@pytest.mark.parametrize("n_jobs", [1, 2])
+@pytest.mark.parametrize("n_jobs", mostly_soak([1, 2]))
 def test_an_interrupt_keeps_what_is_finished(serial, n_jobs):
     todo, found = serial
 
@@ -226,6 +227,7 @@ def test_an_interrupt_keeps_what_is_finished(serial, n_jobs):
     assert kept.error == whole.error
 
 
+@pytest.mark.soak
 def test_the_cores_are_shared_among_the_runs(monkeypatch):
     seen = []
     original = GASSI.fit
@@ -270,6 +272,7 @@ def test_every_run_of_a_lost_worker_is_accounted_for():
     assert "worker" in found.failed[0].problem
 
 
+@pytest.mark.soak
 def test_the_threads_of_a_worker_pack_at_the_same_time():
     def pack_often(_):
         return [pack("model", lag()) for _ in range(8)]

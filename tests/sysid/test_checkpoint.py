@@ -120,6 +120,7 @@ def test_a_finished_search_is_only_read_again(tmp_path, whole):
     assert searching(steps) == []
 
 
+@pytest.mark.soak
 def test_estimated_starts_go_on_too(tmp_path):
     model = lag(
         states=(replace(lag().states[0], initial_range=(-5.0, 5.0)),),

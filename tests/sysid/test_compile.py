@@ -153,11 +153,13 @@ def test_two_processes_that_start_at_once_both_work(workshop):
     assert not list(workshop.cache.glob("*.tmp"))
 
 
+@pytest.mark.soak
 def test_a_cache_folder_that_cannot_be_made_is_done_without(workshop):
     workshop.cache.write_text("a file stands where the folder should be")
     assert workshop.run() == pytest.approx(settled(BEFORE), rel=1e-3)
 
 
+@pytest.mark.soak
 def test_a_cache_folder_that_takes_no_machine_code_is_done_without(workshop):
     workshop.cache.mkdir(mode=0o700)
     (workshop.cache / "__pycache__").write_text("in the way")
@@ -168,6 +170,7 @@ def test_a_cache_folder_that_takes_no_machine_code_is_done_without(workshop):
     assert found == pytest.approx(settled(BEFORE), rel=1e-3)
 
 
+@pytest.mark.soak
 @pytest.mark.skipif(os.name == "nt", reason="no limit of a file's size here")
 def test_a_full_disk_is_done_without(workshop):
     # Files may grow to 20 kB: the kernel's text is stored, its machine code is not.

@@ -15,6 +15,7 @@ from sysid import (
     ProcessModel,
     State,
 )
+from tests.soak import mostly_soak
 from tests.sysid.support import INFEASIBLE, MOTOR, lag, motor, motor_record
 
 TRUE = np.array(list(MOTOR.values()))
@@ -63,7 +64,7 @@ def test_several_records_of_any_length_and_rate():
 # --- one seed, one result -------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("preset", ["default", "thesis", "cega", "classic"])
+@pytest.mark.parametrize("preset", mostly_soak(["default", "thesis", "cega", "classic"], 2))
 def test_one_seed_gives_one_result_whatever_the_threads(preset):
     fits = [
         quick(preset=preset, random_state=3, threads=threads).fit(motor_record())
@@ -91,6 +92,7 @@ def test_ranges_and_fixed_values_are_kept():
     np.testing.assert_array_equal(found.vector_, list(found.parameters_.values()))
 
 
+@pytest.mark.soak
 def test_a_search_passes_an_open_end_but_not_a_given_one():
     for given, expected in (
         ((2.0, None), 2.0),  # the truth is below
@@ -271,6 +273,7 @@ def test_an_unfitted_one_cannot_predict():
         quick().predict(motor_record())
 
 
+@pytest.mark.soak
 def test_arrays_serve_as_well_as_records():
     record = motor_record()
     a = quick().fit(record)
@@ -298,6 +301,7 @@ def test_fit_returns_itself():
     assert found.fit(motor_record()) is found
 
 
+@pytest.mark.soak
 def test_a_free_motion_has_no_inputs():
     """y = exp(-a t) cos(w t), from an unknown speed at the start."""
     model = ProcessModel(

@@ -117,6 +117,7 @@ def test_a_minimum_among_aliases_is_found_from_any_other(seed):
 # --- rivals ---------------------------------------------------------------------------------
 
 
+@pytest.mark.soak
 def test_lags_that_may_change_places_have_no_intervals_of_their_own():
     record = record_of(lags(), 0.01, noise=0.02)
     fitted = GASSI(lags(), population=40, generations=8).fit(record)
@@ -132,6 +133,7 @@ def test_lags_that_may_change_places_have_no_intervals_of_their_own():
     assert ambiguity.kind == "rival" and set(ambiguity.parameters) == {"first", "second"}
 
 
+@pytest.mark.soak
 def test_a_measured_one_tells_them_apart():
     record = record_of(lags(), 0.01, noise=0.02)
     fitted = GASSI(lags(), population=40, generations=8, fixed={"first": 0.03}).fit(record)
@@ -154,6 +156,7 @@ def twice_derivative(x, u, p):
     return (-x[0],)
 
 
+@pytest.mark.soak
 def test_the_likelihood_weighs_each_output_by_its_own_error():
     rng = np.random.default_rng(3)
     u = rng.uniform(-1.0, 1.0, (300, 1))

@@ -84,7 +84,7 @@ def play(stepper, inputs):
     return np.vstack([trace[:: stepper.n_steps], x])
 
 
-@pytest.mark.parametrize(("derivative", "limit", "scale"), CASES)
+@pytest.mark.parametrize(("derivative", "limit", "scale"), mostly_soak(CASES))
 @pytest.mark.parametrize(("n_steps", "accuracy"), [(1, 1e-3), (1, 1e-5), (4, 1e-5), (4, 1e-7)])
 def test_the_stepper_keeps_its_accuracy(derivative, limit, scale, accuracy, n_steps):
     chosen, inputs, exact = solved(derivative, limit)

@@ -136,6 +136,7 @@ def test_a_candidate_that_cannot_be_fitted_says_why():
 # --- use ------------------------------------------------------------------------------------
 
 
+@pytest.mark.soak
 def test_threads_do_not_change_the_result():
     grid = {"na": (1, 2, 3), "nb": (1, 2), "nc": (0, 2)}
     one = select_orders(ARMAX(), TRAINING, VALIDATION, **grid)
@@ -154,6 +155,7 @@ def test_orders_not_given_are_the_estimators():
     assert tables.best.orders["na"] == [[2, 2], [2, 2]]
 
 
+@pytest.mark.soak
 def test_tuning_holds_the_ends_back_and_then_fits_the_whole():
     grid = {"na": (1, 2, 3), "nb": (1, 2), "nc": (0, 2), "nk": (1,)}
     found = tuned(ARMAX(stable=True), TRAINING, **grid)

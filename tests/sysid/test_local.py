@@ -143,6 +143,7 @@ def test_a_descent_is_the_same_alone_and_among_others():
         assert alone[0].point.error == descent.point.error
 
 
+@pytest.mark.soak
 def test_flat_directions_cost_nothing():
     """Two parameters of which only the product acts: the descent ends as with one."""
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from sysid import BatchSimulator, Dataset, ModelError, Output
+from tests.soak import mostly_soak
 from tests.sysid.reference import simulate as reference
 from tests.sysid.support import lag, motor, motor_inputs
 
@@ -73,7 +74,7 @@ def test_a_hold_is_changed_for_one_input():
         model.with_holds({"lod": "zoh"})
 
 
-@pytest.mark.parametrize("hold", ["zoh", "foh"])
+@pytest.mark.parametrize("hold", mostly_soak(["zoh", "foh"]))
 def test_an_input_is_held_or_interpolated_as_told(hold):
     model = lag("foh" if hold == "zoh" else "zoh").with_holds({"u": hold})
     ramp = np.arange(5.0)[:, None]

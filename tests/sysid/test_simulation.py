@@ -22,6 +22,7 @@ from sysid import (
     State,
     Status,
 )
+from tests.soak import mostly_soak
 from tests.sysid.reference import simulate as reference
 from tests.sysid.support import (
     MOTOR,
@@ -107,6 +108,7 @@ def oscillator_derivative(x, u, p):
     return x[1], -p[0] * p[0] * x[0]
 
 
+@pytest.mark.soak
 def test_an_oscillator_keeps_amplitude_and_phase():
     model = ProcessModel(
         name="oscillator",
@@ -144,7 +146,7 @@ def linear_model(hold):
     )
 
 
-@pytest.mark.parametrize("hold", ["zoh", "foh"])
+@pytest.mark.parametrize("hold", mostly_soak(["zoh", "foh"]))
 def test_linear_systems_follow_their_exact_discretisation(hold):
     rng = np.random.default_rng(3)
     model, dt, n = linear_model(hold), 0.05, 60
@@ -407,6 +409,7 @@ def cliff_derivative(x, u, p):
     return (p[0] * x[0] - p[1] * math.tanh(1000.0 * x[0]),)
 
 
+@pytest.mark.soak
 def test_how_a_chromosome_fails_does_not_depend_on_its_population():
     """Far from zero it is slow and blows up; near zero, where it never is, it would be stiff."""
     model = lag(

@@ -279,6 +279,7 @@ def test_errors_of_single_steps_do_not_add_up_beyond_the_accuracy(swinging):
     assert np.sqrt(np.mean((outputs - exact.outputs) ** 2)) < 1e-3 * 1.2
 
 
+@pytest.mark.soak
 def test_what_acts_only_together_is_told_where_slopes_are_jagged(swinging):
     model, _, noisy = swinging
     space = SearchSpace.of(model).with_starts([noisy])

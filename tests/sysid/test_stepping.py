@@ -10,6 +10,7 @@ import pytest
 
 from sim_rig.actuator import actuator
 from sysid import Input, ModelError, Output, Parameter, ProcessModel, State, Stepper
+from tests.soak import mostly_soak
 from tests.sysid.reference import simulate as reference
 from tests.sysid.support import blank, lag, motor, motor_inputs, outputs_of, prbs
 
@@ -57,9 +58,9 @@ def actuator_inputs(n):
 
 N = 60
 CASES = {
+    "pendulum": (pendulum(), np.sin(np.arange(N))[:, None] * 5e3),
     "motor": (motor(), motor_inputs(N, DT)),
     "actuator": (actuator(), actuator_inputs(N)),
-    "pendulum": (pendulum(), np.sin(np.arange(N))[:, None] * 5e3),
     "stiff": (stiff(), prbs(np.random.default_rng(3), N, -1, 1)[:, None]),
 }
 
@@ -88,7 +89,7 @@ def sizes(model, inputs):
 
 
 @pytest.mark.parametrize("accuracy", [1e-3, 1e-5, 1e-7])
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", mostly_soak(list(CASES)))
 def test_it_follows_scipy_as_closely_as_asked(name, accuracy):
     model, inputs = CASES[name]
     exact = solved(name)
@@ -116,7 +117,7 @@ def test_the_trace_has_the_state_at_every_base_step():
 
 
 @pytest.mark.parametrize("cuts", [(1,), (37,), (1, 2, 3, 50), tuple(range(1, N - 1))])
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", mostly_soak(list(CASES)))
 def test_where_a_run_is_cut_does_not_change_a_bit(name, cuts):
     model, inputs = CASES[name]
     stepper = Stepper(model, model.nominal, DT)
@@ -126,7 +127,7 @@ def test_where_a_run_is_cut_does_not_change_a_bit(name, cuts):
 
 
 def test_two_steppers_of_one_model_do_not_meet():
-    model, inputs = CASES["motor"]
+    model, inputs = CASES["pendulum"]
     first = Stepper(model, model.nominal, DT)
     before = play(first, inputs)[2]
     other = Stepper(model, 1.5 * model.nominal, DT, n_steps=7)
@@ -134,7 +135,7 @@ def test_two_steppers_of_one_model_do_not_meet():
     np.testing.assert_array_equal(play(first, inputs)[2], before)
 
 
-@pytest.mark.parametrize("name", ["actuator", "pendulum", "stiff"])
+@pytest.mark.parametrize("name", mostly_soak(["pendulum", "actuator", "stiff"]))
 def test_what_is_not_a_number_stays_so_and_takes_no_longer(name):
     model, inputs = CASES[name]
     stepper = Stepper(model, model.nominal, DT)

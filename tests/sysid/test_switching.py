@@ -104,6 +104,7 @@ def test_refinement_sees_past_the_steps_that_switching_makes():
     np.testing.assert_allclose(found.chromosome, [MASS, FRICTION, OFFSET], rtol=2e-2)
 
 
+@pytest.mark.soak
 def test_dry_friction_is_identified_from_the_whole_box():
     found = GASSI(sledge(copied), population=60, generations=15).fit(pushed())
     expected = {"mass": MASS, "friction": FRICTION, "offset": OFFSET}

@@ -405,6 +405,7 @@ def lag_record(rng, n=200, sigma=0.05):
     return Dataset(u, y + sigma * rng.standard_normal(y.shape), 0.01)
 
 
+@pytest.mark.soak
 def test_intervals_of_a_lag_cover():
     simulator, space = BatchSimulator(lag(), accuracy=1e-6), SearchSpace.of(lag())
     inside = []

@@ -27,6 +27,7 @@ from tests.daq.support import (
     until,
     write_experiment,
 )
+from tests.soak import mostly_soak
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="ptys and signals of POSIX")
 
@@ -101,9 +102,14 @@ FATAL = {"disconnect=0.2": "the port has gone", "reboot": "has restarted"}
 PHASES, MODES = ["calibration", "homing", "run+0.1"], ["open", "closed"]
 
 
-def cases(whole, chosen):
-    """A few in the suite; all of them (ten minutes) with SERIAL_MATRIX=1 in the environment."""
-    return list(itertools.product(*whole)) if os.environ.get("SERIAL_MATRIX") else chosen
+def cases(whole, chosen, always):
+    """A few in every run, and some more with -m soak.
+
+    All of them (ten minutes) with SERIAL_MATRIX=1 in the environment.
+    """
+    if os.environ.get("SERIAL_MATRIX"):
+        return list(itertools.product(*whole))
+    return mostly_soak(chosen, always)
 
 
 @pytest.mark.parametrize(
@@ -112,16 +118,17 @@ def cases(whole, chosen):
         (BORNE, PHASES, MODES),
         [
             ("bit-errors=2e-4", "run", "open"),
-            ("bit-errors=2e-4", "run", "closed"),
             ("drop=0.03", "calibration", "closed"),
+            ("stall=0.3", "run+0.1", "closed"),
+            ("overflow=40", "run+0.1", "open"),
+            ("bit-errors=2e-4", "run", "closed"),
             ("duplicate=0.2", "calibration", "open"),
             ("split=9", "run", "closed"),
             ("merge=0.016", "run", "closed"),
             ("stall=0.3", "run+0.1", "open"),
-            ("stall=0.3", "run+0.1", "closed"),
-            ("overflow=40", "run+0.1", "open"),
             ("stuck-encoder", "run", "closed"),
         ],
+        always=4,
     ),
 )
 def test_a_run_goes_on_over_what_can_be_borne(tmp_path, emulate, rig, fault, phase, mode):
@@ -157,12 +164,13 @@ def test_a_run_goes_on_over_what_can_be_borne(tmp_path, emulate, rig, fault, pha
     cases(
         (FATAL, PHASES, MODES),
         [
-            ("disconnect=0.2", "calibration", "open"),
-            ("disconnect=0.2", "run+0.15", "open"),
             ("disconnect=0.2", "run+0.15", "closed"),
             ("reboot", "calibration", "closed"),
+            ("disconnect=0.2", "calibration", "open"),
+            ("disconnect=0.2", "run+0.15", "open"),
             ("reboot", "run+0.15", "open"),
         ],
+        always=2,
     ),
 )
 def test_a_run_that_cannot_go_on_says_why_and_the_next_one_just_works(
@@ -188,14 +196,17 @@ def test_a_run_that_cannot_go_on_says_why_and_the_next_one_just_works(
 
 @pytest.mark.parametrize(
     ("fault", "reason"),
-    [
-        ("mute", "no answer"),
-        ("garbage", "no frame of the protocol"),
-        ("version=2", "This program is the old one"),
-        ("version=0", "The device's firmware is the old one"),
-        ("delay=0.4", "too slow for its watchdog"),
-        ("delay=9", "no answer"),
-    ],
+    mostly_soak(
+        [
+            ("mute", "no answer"),
+            ("version=2", "This program is the old one"),
+            ("version=0", "The device's firmware is the old one"),
+            ("garbage", "no frame of the protocol"),
+            ("delay=0.4", "too slow for its watchdog"),
+            ("delay=9", "no answer"),
+        ],
+        always=3,
+    ),
 )
 def test_a_device_that_cannot_be_worked_with_is_refused_within_three_seconds(
     tmp_path, emulate, fault, reason
@@ -226,7 +237,7 @@ def test_a_port_that_is_not_there_is_named_with_the_cure(tmp_path):
             SerialDevice(SerialOptions(port=port)).open()
 
 
-@pytest.mark.parametrize("mode", ["open", "closed"])
+@pytest.mark.parametrize("mode", mostly_soak(["closed", "open"]))
 def test_a_killed_host_means_zero_outputs_within_the_watchdogs_time(tmp_path, emulate, rig, mode):
     with emulate(tmp_path) as running:
         write_run(tmp_path, running.port, mode, seconds=60, watchdog=0.2)

@@ -40,6 +40,7 @@ class TestSerial(HalContract):
         return _exact_currents
 
 
+@pytest.mark.soak
 def test_a_tcp_port_carries_the_same(tmp_path):
     commands = plan(400, 3)
     with emulator(tmp_path, "--tcp", "0", plant={"seed": 5}) as running:
