@@ -26,8 +26,9 @@ def pytest_configure(config):
 
 
 def pytest_collection_modifyitems(items):
-    # The longest begins first, so that no process waits for it alone at the end.
-    items.sort(key=lambda item: "test_tutorial" not in item.nodeid)
+    # The longest begin first, so that no process waits for one alone at the end.
+    first = "test_tutorial", "test_combinations", "test_friction_identification"
+    items.sort(key=lambda item: not any(name in item.nodeid for name in first))
 
 
 def _keep_bytecode():

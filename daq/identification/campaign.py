@@ -136,7 +136,7 @@ def campaign(wanted: CampaignRequest, watch: Watch = ignore) -> CampaignResult:
 
     >>> from daq import CampaignRequest, campaign, record
     >>> from daq.identification.request import SettingsRequest
-    >>> quick = SettingsRequest(options={"population": 16, "generations": 2})
+    >>> quick = SettingsRequest(options={"preset": "thesis", "generations": 2})
     >>> run = record("prbs.yaml")
     >>> result = campaign(CampaignRequest([run.folder], seeds="0:2", settings=quick))
     >>> len(result.campaign.outcomes), result.table.name

@@ -53,7 +53,7 @@ def identify(
 
     >>> from daq import identify, record
     >>> run = record("prbs.yaml")
-    >>> result = identify(run, population=16, generations=2, fixed={"R_m": 1.2})
+    >>> result = identify(run, preset="thesis", generations=2, fixed={"R_m": 1.2})
     >>> result.parameters.loc["R_m", "value"]
     np.float64(1.2)
     >>> result.trust in ("good", "limited", "poor")

@@ -51,7 +51,7 @@ class Identification:
     several seeds, of which this is the best.
 
     >>> from daq import identify, record
-    >>> result = identify(record("prbs.yaml"), population=16, generations=2)
+    >>> result = identify(record("prbs.yaml"), preset="thesis", generations=2)
     >>> result.save("results").name, list(result.metrics.columns)
     ('parameters.yaml', ['rmse', 'msd', 'fit_percent'])
     """
