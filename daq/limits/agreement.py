@@ -17,6 +17,7 @@ _EVIDENCE = 0.05  # s for which it does not
 _EXCESS, _LACK = 1.5, 0.5  # of the current that the command asks for, at most and at least
 _JUDGED = 1.5  # times the floor, from which a lack is judged
 _FLOOR = 0.05  # of the current's limit, at least, for offsets and noise
+_NOISE = 4.0  # standard deviations in the calibration
 
 
 class Disagreement(Limit):
@@ -165,8 +166,8 @@ class CurrentAgreement(Limit):
 
     The command asks for the currents between the least and the largest of the last 25 ms. A healthy
     amplifier never gives more, nor the other sign; less only a motor's at speed, where the back EMF
-    has used up its supply. Either is judged once it has held for 50 ms more than it has not. What
-    the current varies by in the calibration is noise, and says nothing.
+    has used up its supply. Either is judged once it has held for 50 ms more than it has not. Four
+    standard deviations of the calibration are noise, and say nothing.
 
     slow: speed [rad/s] up to which the amplifier must give half of what is asked; infinite for the
     brake's, without back EMF.
@@ -176,12 +177,14 @@ class CurrentAgreement(Limit):
         self._name, self._command = f"current_{channel}", f"applied_voltage_{channel}"
         self._amplifier = f"amplifiers.{channel}"
         self._gain, self._floor, self._slow = gain, _FLOOR * limit, slow
-        self._least, self._most = math.inf, -math.inf  # A, in the calibration
+        self._seen, self._sum, self._squares = 0, 0.0, 0.0  # samples, A, A^2 of the calibration
 
     def begin(self, phase: Phase, sample_rate: float) -> None:
         """Learn from the calibration; then start anew, from zero outputs."""
         self._learning = phase is Phase.CALIBRATION
-        self._floor = max(self._floor, self._most - self._least)
+        if self._seen:
+            variance = self._squares / self._seen - (self._sum / self._seen) ** 2
+            self._floor = max(self._floor, _NOISE * math.sqrt(max(0.0, variance)))
         self._dt = 1.0 / sample_rate
         self._half = max(1, math.ceil(0.5 * _SETTLED * sample_rate))  # samples of half the window
         self._filled = 0
@@ -192,8 +195,9 @@ class CurrentAgreement(Limit):
         """Compare every sample with the commands before it."""
         currents: list[float] = getattr(samples, self._name).tolist()
         if self._learning:
-            self._least = min(self._least, *currents)
-            self._most = max(self._most, *currents)
+            self._seen += len(currents)
+            self._sum += sum(currents)
+            self._squares += sum(current * current for current in currents)
             return None
         rows = zip(
             currents, getattr(samples, self._command).tolist(), samples.omega.tolist(), strict=True
