@@ -13,14 +13,6 @@ import protocols
 import sim_rig
 import sysid
 
-# Examples that identify several times, or with intervals.
-IDENTIFYING = {
-    "daq.identification.campaign.campaign",
-    "daq.identification.comparison.ComparisonResult",
-    "daq.identification.fit.identify",
-    "daq.identification.result.Identification",
-}
-
 
 def modules_of(package):
     yield package.__name__
@@ -36,8 +28,7 @@ def examples():
         for name in modules_of(package):
             for test in finder.find(importlib.import_module(name)):
                 if test.examples:
-                    marks = [pytest.mark.soak] if test.name in IDENTIFYING else []
-                    yield pytest.param(test, id=test.name, marks=marks)
+                    yield pytest.param(test, id=test.name)
 
 
 @pytest.mark.parametrize("example", list(examples()))

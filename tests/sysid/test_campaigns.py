@@ -275,7 +275,7 @@ def test_every_run_of_a_lost_worker_is_accounted_for():
 @pytest.mark.soak
 def test_the_threads_of_a_worker_pack_at_the_same_time():
     def pack_often(_):
-        return [pack("model", lag()) for _ in range(8)]
+        return [pack("model", lag()) for _ in range(30)]
 
     with ThreadPoolExecutor(4) as pool:
         packed = list(pool.map(pack_often, range(4)))
