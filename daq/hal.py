@@ -181,7 +181,10 @@ class Device(Protocol):
         """End sampling; outputs are zero afterwards."""
 
     def safe(self) -> None:
-        """Zero both outputs now, in any state, any number of times, without raising."""
+        """Zero both outputs now, in any state, any number of times, without raising.
+
+        Sampling goes on until ``stop``: the host reads back what is applied.
+        """
 
     def close(self) -> None:
         """Disconnect; outputs are zero afterwards."""

@@ -32,8 +32,9 @@ class Rig:
     """A rig to command and sample in SI units.
 
     offsets: volts that each analog input reads at zero, (3,) in ``ANALOG_INPUTS`` order.
-    saturated: samples in which each stood at the end of its converter, (3,). Use as a context
-    manager: leaving it, by whatever way, zeroes the outputs and closes the device.
+    saturated: samples in which each stood at the end of its converter, (3,). sampling: between
+    ``start`` and ``stop``, after ``safe`` as well. Use as a context manager: leaving it, by
+    whatever way, zeroes the outputs and closes the device.
     """
 
     def __init__(self, device: Device, config: RigConfig) -> None:
@@ -42,6 +43,7 @@ class Rig:
         self.saturated: IntArray = np.zeros(len(ANALOG_INPUTS), dtype=np.int64)
         inputs = [getattr(config.sensors, name) for name in ANALOG_INPUTS]
         self._scale = np.array([item.sign * item.scale for item in inputs])
+        self.sampling = False
         self._device = device
         self._info: DeviceInfo | None = None
         self._radians = 0.0  # per count
@@ -100,6 +102,7 @@ class Rig:
         self._reset(sample_rate, 2 * self.info.queue)
         self._radians = self.config.sensors.encoder.count
         self._device.start(sample_rate, mode, self._guard(window))
+        self.sampling = True
 
     def send(self, tick: int, commands: FloatArray) -> None:
         """Queue commands (n, 2) [V] for consecutive ticks from ``tick``; clamped to the limits.
@@ -138,6 +141,7 @@ class Rig:
 
     def stop(self) -> None:
         """End sampling with zero outputs."""
+        self.sampling = False
         self._device.stop()
 
     def safe(self) -> None:
@@ -153,6 +157,7 @@ class Rig:
     def close(self) -> None:
         """Zero the outputs and disconnect."""
         self.safe()
+        self.sampling = False
         self._device.close()
 
     def _largest_step(self) -> FloatArray | None:

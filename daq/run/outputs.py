@@ -3,7 +3,7 @@
 import contextlib
 import math
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -52,12 +52,12 @@ INTERRUPTED = OutputState(False, "reading them back was interrupted")
 
 
 def read_back(rig: Rig, sample_rate: float, calibration: OffsetCalibration) -> OutputState:
-    """Sample at zero command, after the outputs were zeroed; never raises but for signals."""
+    """Sample after the outputs were zeroed; never raises but for signals."""
     states = [OutputState(False, f"the device has not answered within {_DEADLINE:g} s")]
 
     def work() -> None:
         try:
-            states.append(_sampled_anew(rig, sample_rate, calibration))
+            states.append(_read(rig, sample_rate, calibration))
         except Exception as error:  # a backend's mistakes among them
             states.append(OutputState(False, str(error) or type(error).__name__))
 
@@ -68,8 +68,28 @@ def read_back(rig: Rig, sample_rate: float, calibration: OffsetCalibration) -> O
     return states[-1]
 
 
+def _read(rig: Rig, sample_rate: float, calibration: OffsetCalibration) -> OutputState:
+    """By the samples that follow SAFE in the run; where they fail, anew with commands of zero."""
+    problem = None
+    if rig.sampling:
+        try:
+            state = _watched(rig, iter(rig.receive, None), sample_rate, calibration)
+        except DeviceError as failure:
+            state = OutputState(False, str(failure))
+        if state.confirmed:
+            return state
+        problem = state.problem
+    try:
+        state = _sampled_anew(rig, sample_rate, calibration)
+    except Exception:
+        if problem is None:
+            raise
+        return OutputState(False, problem)
+    return replace(state, problem=state.problem or problem)
+
+
 def _sampled_anew(rig: Rig, sample_rate: float, calibration: OffsetCalibration) -> OutputState:
-    """Sample, in a new session where the one of the run has failed: the device may still answer."""
+    """Sample at zero command; on a new connection where the old one fails."""
     try:
         return _sampled(rig, sample_rate, calibration)
     except DeviceError as failure:
@@ -85,18 +105,23 @@ def _sampled_anew(rig: Rig, sample_rate: float, calibration: OffsetCalibration) 
 
 
 def _sampled(rig: Rig, sample_rate: float, calibration: OffsetCalibration) -> OutputState:
-    least, most = (max(2, math.ceil(span * sample_rate)) for span in (_WINDOW, _LONGEST))
     rig.start(sample_rate, Mode.CLOSED_LOOP)
+    return _watched(rig, at_rest(rig, sample_rate), sample_rate, calibration)
+
+
+def _watched(
+    rig: Rig, arriving: Iterator[Samples], sample_rate: float, calibration: OffsetCalibration
+) -> OutputState:
+    """The state by samples that arrive until the currents have decayed, or should have."""
+    least, most = (max(2, math.ceil(span * sample_rate)) for span in (_WINDOW, _LONGEST))
     blocks: list[Samples] = []
+    n_samples = 0
     state = INTERRUPTED
-    for samples in at_rest(rig, sample_rate):
-        blocks.append(samples)
-        n_samples = samples.tick.item(-1) + 1
-        if n_samples < least:
-            continue
-        state = _judged(blocks, least // 2, rig, calibration)
-        if state.confirmed or n_samples >= most:
-            break
+    while not state.confirmed and n_samples < most:
+        blocks.append(next(arriving))
+        n_samples += len(blocks[-1])
+        if n_samples >= least:
+            state = _judged(blocks, least // 2, rig, calibration)
     rig.stop()
     return state
 

@@ -120,7 +120,6 @@ def play(sampling: Sampling, log: LogWriter, commands: FloatArray) -> None:
                 "its outputs; the host was too slow to refill it"
             )
         _require_samples(sampling, log, done, n_samples)
-    rig.stop()
     _require_samples(sampling, log, n_samples, n_samples)
 
 
@@ -150,7 +149,6 @@ def control(sampling: Sampling, log: LogWriter, dialogue: Dialogue, n_samples: i
             sent = until
         done = sampling.keep(log, before(samples, end), logged, trip, n_samples)
         _require_samples(sampling, log, done, n_samples)
-    rig.stop()
     end = done if dialogue.ended else n_samples
     _require_samples(sampling, log, end, end)
 
