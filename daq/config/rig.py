@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, PrivateAttr, create_model, field_validator
+from pydantic import Field, PrivateAttr, ValidationInfo, create_model, field_validator
 
 from daq.config.base import Section
 from daq.config.units import (
@@ -41,9 +41,15 @@ class CurrentInput(AnalogInput):
 
 
 class TorqueInput(AnalogInput):
-    """A torque bridge's volts."""
+    """A torque bridge's volts; between motor and brake it is compared with the motor's current."""
 
     scale: Annotated[float, Unit("N*m/V")] = Field(gt=0.0, description="torque per volt")
+    motor_constant: Annotated[float, Unit("N*m/A")] | None = Field(
+        None,
+        gt=0.0,
+        description="torque per ampere of the motor, roughly, of a sensor between motor and brake; "
+        "left out: not compared",
+    )
 
 
 class Encoder(Section):
@@ -152,6 +158,19 @@ class EncoderLimits(Section):
         0.25, gt=0.0, description="turns by which count and speed estimate may come to differ"
     )
     stall: Stall | None = Field(None, description="current that turns it; left out: not watched")
+    acceleration: Annotated[float, Unit("rad/s^2/A")] | None = Field(
+        None,
+        gt=0.0,
+        description="of the shaft without load by an ampere of the motor, at most; needs stall; "
+        "left out: not watched",
+    )
+
+    @field_validator("acceleration")
+    @classmethod
+    def _has_stall(cls, acceleration: float | None, info: ValidationInfo) -> float | None:
+        if acceleration is not None and info.data.get("stall") is None:
+            raise ValueError("it needs encoder.stall, which tells the friction; write that as well")
+        return acceleration
 
 
 class UserLimit(Section):

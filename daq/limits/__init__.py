@@ -15,11 +15,13 @@ from daq.config.rig import RigConfig, UserLimit
 from daq.errors import USER_CODE_ERRORS, ConfigError, RigError, RunError, raised_in
 from daq.hal import CHANNELS, Flag, Phase, Samples
 from daq.limits.agreement import (
+    Acceleration,
     Contrary,
     CurrentAgreement,
     Disagreement,
     Drive,
     Stalled,
+    TorqueAgreement,
 )
 from daq.limits.base import Limit, Trip
 from daq.limits.load import DeviceFound, I2t, Magnitude
@@ -29,6 +31,7 @@ from daq.limits.shaft import CountedSpeed, Travel, Winding
 __all__ = ["Doubt", "Limit", "Limits", "Trip"]
 
 _SLOW = 0.1  # of the speed limit, up to which the motor's back EMF leaves its amplifier voltage
+_LEAST = 0.1  # of the current's limit, that may be friction where no stall tells
 _FASTEST = 100.0  # rad/s, taken where there is no such limit
 
 
@@ -121,7 +124,9 @@ def _built_in(config: RigConfig) -> list[Limit]:
         limits.append(Stalled(encoder.stall, drive, count))
         if settings.speed is not None:
             limits.append(Contrary(drive, settings.speed))
-    limits += _of_currents(config)
+        if encoder.acceleration is not None:
+            limits.append(Acceleration(drive, encoder.acceleration, count))
+    limits += [*_of_currents(config), *_of_torque(config)]
     if settings.frozen is not None:
         limits += [Frozen(f"current_{name}", settings.frozen, name) for name in CHANNELS]
         limits.append(Frozen("torque", settings.frozen, None))
@@ -139,6 +144,15 @@ def _of_currents(config: RigConfig) -> list[Limit]:
             most = getattr(config.limits.current, channel)
             limits.append(CurrentAgreement(channel, gain, most, slow))
     return limits
+
+
+def _of_torque(config: RigConfig) -> list[Limit]:
+    """The limit that a torque sensor between motor and brake allows."""
+    constant, stall = config.sensors.torque.motor_constant, config.limits.encoder.stall
+    if constant is None:
+        return []
+    current = stall.motor if stall is not None else _LEAST * config.limits.current.motor
+    return [TorqueAgreement(constant, constant * current, config.limits.speed or _FASTEST)]
 
 
 class _UserCode(Limit):

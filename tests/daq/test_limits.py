@@ -85,8 +85,8 @@ def first_trip(limits, whole, cuts=()):
     return None
 
 
-def limits_of(phase=Phase.RUN, calibrated=True, amplifiers=None, **changes):
-    limits = Limits(RigConfig(limits=changes, amplifiers=amplifiers or {}))
+def limits_of(phase=Phase.RUN, calibrated=True, amplifiers=None, sensors=None, **changes):
+    limits = Limits(RigConfig(limits=changes, amplifiers=amplifiers or {}, sensors=sensors or {}))
     limits.begin(Phase.CALIBRATION, RATE)
     if calibrated:
         limits.check(samples(800, theta=0.0, omega=0.0))
@@ -99,6 +99,7 @@ def step(at, before, after, n=400):
 
 
 RAMP = 1e-6 * np.arange(400)  # never twice the same
+SWING = np.sin(62.8 * np.arange(400) / RATE)
 STILL = {"theta": 3.0, "omega": 0.0}
 MOTOR, BRAKE = ({"amplifiers": {channel: 0.5}} for channel in ("motor", "brake"))
 CASES = {
@@ -121,6 +122,18 @@ CASES = {
     "a dead estimate of the speed": (
         {}, {"theta": 10.0 * np.arange(400) / RATE, "omega": step(40, 10.0, 0.0)},
         40 + 126, "now 0 rad/s"),
+    # Swings of a radian either way at 10 Hz; the dead band is left out twice.
+    "a dead estimate of a shaft that swings": (
+        {}, {"theta": SWING, "omega": step(0, 0.0, 0.0)}, 36, "to and fro, differ by"),
+    "a dead count of a shaft that swings": (
+        {}, {"theta": 3.0, "omega": 62.8 * np.cos(62.8 * np.arange(400) / RATE)},
+        36, "to and fro, differ by"),
+    # 2 A and 1 A of friction give 7.5 rad/s a sample.
+    "half the counts at speed": (
+        {"encoder": {"stall": {"motor": 1.0, "brake": 0.025}, "acceleration": 2000.0}},
+        {"theta": np.cumsum(step(99, 100.0, 50.0)) / RATE, "omega": step(99, 100.0, 50.0),
+         "current_motor": 2.0 + RAMP, "current_brake": RAMP},
+        99 + 2, "the speed came to 50 rad/s, where currents and inertia allow"),
     "half the counts": (
         {}, {"theta": 5.0 * np.arange(400) / RATE, "omega": 10.0}, 252, "differ by 0.251 turns"),
     "speed by the count": (
@@ -185,9 +198,87 @@ def test_a_shaft_that_runs_against_its_motor_is_doubted_and_not_stopped():
     assert first_trip(limits, part(whole, slice(0, 290)), range(7, 290, 7)) is None
     (doubt,) = limits.doubts
     assert doubt.phase == "run" and "against the motor's current" in doubt.reason
-    # A fifth of the limit is 30 rad/s, of which a sample brings 0.5.
-    assert doubt.tick == 61
-    assert np.flatnonzero(whole.flags)[0] == 61
+    # A tenth of the limit is 15 rad/s, of which a sample brings 0.5.
+    assert doubt.tick == 31
+    assert np.flatnonzero(whole.flags)[0] == 31
+
+
+def test_a_shaft_that_turns_round_gains_nothing_against_its_motor():
+    limits = limits_of(speed=150.0, encoder={"stall": {"motor": 0.3}})
+    time = np.arange(400) / RATE
+    omega = 60.0 * np.sin(30.0 * time)
+    columns = {"omega": omega, "theta": 2.0 * (1.0 - np.cos(30.0 * time))}
+    whole = samples(**columns, current_motor=np.cos(30.0 * time) + RAMP, current_brake=RAMP)
+    assert first_trip(limits, whole) is None
+    assert limits.doubts == []
+
+
+ACCELERATION = {"encoder": {"stall": {"motor": 0.3, "brake": 0.01}, "acceleration": 2000.0}}
+
+
+@pytest.mark.parametrize("phase", [Phase.RUN, Phase.HOMING])
+def test_two_wrong_speeds_or_a_hand_in_homing_contradict_no_current(phase):
+    omega = np.full(400, 20.0)
+    if phase is Phase.RUN:
+        omega[100:102] = omega[300:302] = -20.0
+    else:
+        omega[100:] = -20.0
+    columns = {"theta": np.cumsum(omega) / RATE, "current_motor": RAMP, "current_brake": RAMP}
+    assert first_trip(limits_of(phase, **ACCELERATION), samples(omega=omega, **columns)) is None
+
+
+def test_a_brake_whose_torque_lags_its_current_contradicts_nothing():
+    # 0.2 A, gone within a sample, have stopped the shaft as 6.3 A of the motor would.
+    omega = np.maximum(0.0, 60.0 - np.maximum(0, np.arange(400) - 100) * 6.0)
+    columns = {"theta": np.cumsum(omega) / RATE, "current_motor": RAMP}
+    columns["current_brake"] = step(99, 0.0, 0.2) * step(102, 1.0, 0.0) + RAMP
+    assert first_trip(limits_of(**ACCELERATION), samples(omega=omega, **columns)) is None
+    columns["current_brake"] = RAMP
+    assert first_trip(limits_of(**ACCELERATION), samples(omega=omega, **columns)) is not None
+
+
+def test_an_acceleration_without_the_friction_is_refused():
+    with pytest.raises(ValueError, match=r"it needs encoder\.stall"):
+        RigConfig(limits={"encoder": {"acceleration": 2000.0}})
+
+
+@pytest.mark.parametrize("turns_to", [0.0, 1.0, -1.0])
+def test_what_shakes_a_shaft_to_and_fro_need_not_turn_it(turns_to):
+    """Ten milliseconds either way; a motor that asks more of one direction must turn it."""
+    way = np.where(np.arange(400) // 8 % 2 == 0, 1.0, -1.0)
+    current = np.where(way == turns_to, 1.5, 1.0) * way
+    stall = {"encoder": {"stall": {"motor": 0.5, "time": 0.05}}}
+    columns = {"theta": 3.0, "omega": 0.0, "current_motor": current + RAMP, "current_brake": RAMP}
+    trip = first_trip(limits_of(**stall), samples(**columns))
+    assert (trip is None) == (turns_to == 0.0)
+
+
+TORQUES = {
+    "right": (0.14, None), "a fifth more": (0.17, None), "dead": (0.0, 159), "turned": (-0.14, 159),
+    "times three": (0.42, 159),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", TORQUES)
+def test_a_torque_that_is_not_the_motors_is_doubted_at_steady_speed(name):
+    per_ampere, tick = TORQUES[name]
+    rng = np.random.default_rng(3)
+    columns = {"current_motor": 1.0 + RAMP, "current_brake": RAMP, "theta": 0.1 * np.arange(400)}
+    torque = per_ampere + 0.01 * rng.standard_normal(400)
+    limits = limits_of(sensors={"torque": {"scale": 0.7, "motor_constant": 0.14}})
+    whole = samples(**columns, torque=torque)
+    assert first_trip(limits, whole, range(37, 400, 37)) is None
+    assert [doubt.tick for doubt in limits.doubts] == ([] if tick is None else [tick])
+    for doubt in limits.doubts:
+        assert "the motor's 1 A give 0.14 N*m (sensors.torque.motor_constant)" in doubt.reason
+
+
+def test_a_torque_is_not_judged_while_the_shaft_gathers_speed():
+    columns = {"current_motor": 1.0 + RAMP, "current_brake": RAMP, "omega": 0.2 * np.arange(400)}
+    limits = limits_of(sensors={"torque": {"scale": 0.7, "motor_constant": 0.14}}, speed=100.0)
+    columns["theta"] = np.cumsum(columns["omega"]) / RATE
+    first_trip(limits, samples(**columns, torque=0.01 + RAMP))
+    assert limits.doubts == []
 
 
 def test_an_amplifier_without_voltage_at_speed_is_none_that_is_dead():
