@@ -1,13 +1,16 @@
 """A random fault in a random rig at a random instant: is it caught, how soon, how bad was it?
 
     python -m benchmarks.faults [--trials 2000] [--seed 1] [--rows] [--json]
+    python -m benchmarks.faults --each [--line]
     python -m benchmarks.faults --alarms 200
 
 Every trial is a whole run, calibration and homing with it, in virtual time on the independent
 device of ``tests/faults``: a plant drawn at random, a fault that begins in the calibration, the
 homing or the run, in open loop (prbs) or closed loop (constant_velocity). Limits are those of the
 shipped rig files. Speed, currents and energy are the plant's, from the fault's instant until one
-second after the run. ``--alarms``: runs of every shipped protocol without any fault.
+second after the run. ``--each``: every fault once in either loop, in the middle of the plants;
+``--line``: in real time, with the device at the other end of a socket. ``--alarms``: runs of every
+shipped protocol without any fault.
 """
 
 from __future__ import annotations
@@ -29,15 +32,19 @@ import numpy as np
 import yaml
 
 from benchmarks._common import arguments, report
+from daq.config.rig import LimitSettings
 from daq.diagnose import punctuality
 from daq.errors import RigError
 from daq.lookup.rigs import rig_for
 from daq.lookup.shipped import find_file, shipped_files
 from daq.progress import Event, Note
 from daq.recording.session import open_session
+from tests.faults.board import Setting
 from tests.faults.faults import FAULTS, VIRTUAL
+from tests.faults.serial_device import Server, serving
 
 _DEVICE = Path(__file__).parents[1] / "tests" / "faults" / "device.py"
+AT = 0.6  # s of the run at which a fault begins, where open loop excites and closed loop turns
 _RATE = 800.0  # Hz, of the shipped experiments
 _PHASES = {"calibration": 0.15, "homing": 0.15, "run": 0.7}  # and the share of trials
 _LASTS = {"calibration": 4.0, "homing": 5.0}  # s
@@ -55,12 +62,25 @@ _LOOPS: dict[str, tuple[str, dict[str, Any], float]] = {
         5.0,
     ),
 }
+# On a line they take the time that they take: less of it, and a loop that Python closes in time.
+_HASTE: dict[str, dict[str, Any]] = {
+    "open": {"duration": 3, "homing": {"turns": 0.5}, "calibration": {"samples": 200}},
+    "closed": {
+        "sample_rate": 200,
+        "speed_filter": 30,
+        "loop": {"proportional": 0.02, "integral": 0.3},
+        "velocities": [20, 60],
+        "brake_commands": [0.08],
+        "slope": 40,
+        "calibration": {"samples": 100},
+    },
+}
 _ORDER = ("stop", "warning", "missed", "before")
 
 
 @dataclass(frozen=True)
 class Trial:
-    """Which rig, which run, and what goes wrong in it; fault "": nothing."""
+    """Which rig, which run, and what goes wrong in it; fault "": nothing. line: on a socket."""
 
     seed: int
     protocol: str
@@ -68,6 +88,7 @@ class Trial:
     loop: str = ""
     phase: str = "run"
     at: float = 0.0
+    line: bool = False
 
 
 @dataclass(frozen=True)
@@ -113,11 +134,15 @@ def draw(number: int, seed: int) -> Trial:
 
 def perform(trial: Trial) -> Outcome:
     """One trial."""
-    with tempfile.TemporaryDirectory() as name:
+    with contextlib.ExitStack() as stack:
+        name = stack.enter_context(tempfile.TemporaryDirectory())
         folder = Path(name)
         changes = _LOOPS[trial.loop][1] if trial.loop else {}
+        if trial.line:
+            changes = {**changes, **_HASTE[trial.loop]}
         experiment = _changed("protocol", trial.protocol, folder, changes)
-        rig = _faulty_rig(trial, folder)
+        server = stack.enter_context(serving(_setting(trial))) if trial.line else None
+        rig = _faulty_rig(trial, folder, server)
         notes: list[str] = []
 
         def watch(event: Event) -> None:
@@ -133,12 +158,14 @@ def perform(trial: Trial) -> Outcome:
             notes += [*result.doubts, *punctuality.notes(result.run)]
         except RigError as error:
             stopped = f"{type(error).__name__}: {error}"
-    return _judged(trial, session, stopped, notes)
+    board = session.device.board if server is None else server.board
+    return _judged(trial, session.rig.limits, board, stopped, notes)
 
 
-def _judged(trial: Trial, session: Any, stopped: str, notes: list[str]) -> Outcome:
-    truth, plant = session.device.board.truth, session.device.board.plant
-    limits = session.rig.limits
+def _judged(
+    trial: Trial, limits: LimitSettings, board: Any, stopped: str, notes: list[str]
+) -> Outcome:
+    truth, plant = board.truth, board.plant
     begun = truth.onset is not None or not trial.fault
     # A fault that begins with the very end of the run has nothing to be seen by.
     if not begun or (trial.fault and truth.onset >= truth.ended):
@@ -174,16 +201,35 @@ def _changed(kind: Any, name: str, folder: Path, changes: dict[str, Any]) -> Pat
     return path
 
 
-def _faulty_rig(trial: Trial, folder: Path) -> Path:
-    """The rig file that the protocol is for, with the independent device in its place."""
+def _setting(trial: Trial) -> Setting:
+    """The independent device's, with the load and the sensor of the protocol's rig file."""
     source = find_file("backend", rig_for(trial.protocol))
     plant = yaml.safe_load(source.read_text(encoding="utf-8"))["options"]["plant"]
-    options: dict[str, Any] = {"seed": trial.seed, "load": plant["load"]}
-    options["sensor"] = plant.get("sensor", "load")
-    if trial.fault:
-        options |= {"fault": trial.fault, "phase": trial.phase, "at": trial.at}
-    changes = {"backend": f"{_DEVICE}:VirtualDevice", "options": options}
-    return _changed("backend", source.name, folder, changes)
+    fault = {"fault": trial.fault, "phase": trial.phase, "at": trial.at} if trial.fault else {}
+    sensor = plant.get("sensor", "load")
+    return Setting(seed=trial.seed, load=plant["load"], sensor=sensor, **fault)
+
+
+def _faulty_rig(trial: Trial, folder: Path, server: Server | None) -> Path:
+    """The rig file that the protocol is for, with the independent device in its place."""
+    changes: dict[str, Any] = {
+        "backend": f"{_DEVICE}:VirtualDevice",
+        "options": {name: v for name, v in asdict(_setting(trial)).items() if v is not None},
+    }
+    if server is not None:
+        changes = {"backend": "serial", "options": {"port": server.port, "watchdog": 0.3}}
+    return _changed("backend", rig_for(trial.protocol), folder, changes)
+
+
+def each(line: bool) -> list[Trial]:
+    """Every fault once in either loop, early in the run of the plant in the middle."""
+    names = FAULTS if line else VIRTUAL
+    loops = {name: ["open"] if "free" not in FAULTS[name].loads else list(_LOOPS) for name in names}
+    return [
+        Trial(0, _LOOPS[loop][0], name, loop, at=AT, line=line)
+        for name in names
+        for loop in loops[name]
+    ]
 
 
 def alarms(runs: int, seed: int) -> Iterator[Trial]:
@@ -288,6 +334,8 @@ def _milliseconds(seconds: float | None) -> str:
 def main() -> None:
     parser = arguments(__doc__ or "")
     parser.add_argument("--trials", type=int, default=2000)
+    parser.add_argument("--each", action="store_true", help="every fault once, not at random")
+    parser.add_argument("--line", action="store_true", help="on a socket in real time")
     parser.add_argument("--alarms", type=int, metavar="N", help="correct runs instead of faults")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--workers", type=int, default=2, help="processes")
@@ -297,11 +345,15 @@ def main() -> None:
         outcomes = perform_all(alarms(options.alarms, options.seed), options.workers)
         report(_alarm_figures(outcomes, options.seed), options.json, show)
         return
-    trials = [draw(number, options.seed) for number in range(options.trials)]
+    trials = (
+        each(options.line)
+        if options.each
+        else [draw(number, options.seed) for number in range(options.trials)]
+    )
     outcomes = perform_all(trials, options.workers)
     figures: dict[str, Any] = {"trials": len(outcomes), "seed": options.seed}
     figures["rows"] = table(outcomes)
-    if options.rows:
+    if options.rows or options.each:
         figures["each"] = [asdict(outcome) for outcome in outcomes]
     report(figures, options.json, show)
 

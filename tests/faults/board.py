@@ -62,10 +62,11 @@ class Setting:
 class Truth:
     """What really happened, from the instant of the fault on, or from the beginning without one.
 
-    Times in seconds of the plant: onset, None while it has not come; safe, when the outputs were
-    last told to be zero; ended, when the host had gone. Peaks are magnitudes [rad/s, A, A], also
-    while it coasts at the end. energy: from the supply [J]. output: volts at the amplifiers at
-    the very end. trace: time, omega, currents and volts at the amplifiers, tick by tick.
+    Times in seconds of the plant: onset, None while it has not come; safe, since when the outputs
+    have been told to be zero, None while they are not; ended, when the host had gone. Peaks are
+    magnitudes [rad/s, A, A], also while it coasts at the end. energy: from the supply [J]. output:
+    volts at the amplifiers at the very end. trace: time, omega, currents and volts at the
+    amplifiers, tick by tick.
     """
 
     onset: float | None = None
@@ -140,6 +141,10 @@ class Board:
         """The outputs have been told to be zero, by host or firmware."""
         if self.truth.safe is None:
             self.truth.safe = self.plant.time
+
+    def told_volts(self):
+        """The outputs have been told to be something else."""
+        self.truth.safe = None
 
     def coast(self, motor, brake, period):
         """The host has gone: what the shaft does with what the outputs still give."""

@@ -69,7 +69,6 @@ class VirtualDevice:
     def start(self, sample_rate, mode, guard):
         if not self._opened:
             raise DeviceError("the board is not connected; open it first")
-        self.board.truth.safe = None
         self._period = 1.0 / sample_rate
         arrays = (guard.command_low, guard.command_high, guard.analog_low, guard.analog_high)
         limits = Limits(

@@ -76,6 +76,8 @@ class Ticker:
             volts = self.last
         self._count = (count if self._count is None else self._count[0], count)
         self.last = volts
+        if any(volts):
+            self.board.told_volts()
         self.board.drive(*volts, self.period)
         row = Row(self.tick, analog, count, rate, self.board.now.echo(volts), flags)
         self.tick += 1

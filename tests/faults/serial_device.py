@@ -264,7 +264,6 @@ class SerialBoard:
         if self._latch == WATCHDOG:
             return line.LATCHED
         ticker = Ticker(self.board, request.period / CLOCK, request.mode == 1, _limits(request))
-        self.board.truth.safe = None
         self._run = Run(request.run, ticker, request.period, watchdog * 1e-3, request.mode == 1)
         self._state, self._latch = ARMED, NONE
         return line.OK
