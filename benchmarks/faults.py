@@ -40,7 +40,7 @@ from daq.lookup.shipped import find_file, shipped_files
 from daq.progress import Event, Note
 from daq.recording.session import open_session
 from tests.faults.board import Setting
-from tests.faults.faults import FAULTS, VIRTUAL
+from tests.faults.faults import FAULTS, ON_A_LINE, VIRTUAL
 from tests.faults.serial_device import Server, serving
 
 _DEVICE = Path(__file__).parents[1] / "tests" / "faults" / "device.py"
@@ -223,7 +223,7 @@ def _faulty_rig(trial: Trial, folder: Path, server: Server | None) -> Path:
 
 def each(line: bool) -> list[Trial]:
     """Every fault once in either loop, early in the run of the plant in the middle."""
-    names = FAULTS if line else VIRTUAL
+    names = ON_A_LINE if line else VIRTUAL
     loops = {name: ["open"] if "free" not in FAULTS[name].loads else list(_LOOPS) for name in names}
     return [
         Trial(0, _LOOPS[loop][0], name, loop, at=AT, line=line)

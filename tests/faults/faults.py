@@ -297,6 +297,10 @@ VIRTUAL = tuple(name for name, fault in FAULTS.items() if not fault.damaged)
 """Those that need no line."""
 
 
+ON_A_LINE = tuple(name for name in FAULTS if not name.endswith("NaN"))
+"""Those that codes of 16 bits can show."""
+
+
 def make(name, size=None):
     """A fault of this name, new; size: in place of its own. "" is none."""
     fault = copy.deepcopy(FAULTS[name]) if name else Fault()
