@@ -17,6 +17,7 @@ from daq.identification.result import FittedLog, Identification
 from daq.identification.settings import Problem, gassi_settings, problem_of
 from daq.logs.capture import LOG_NAME
 from daq.logs.recording import Recording, log_path
+from daq.lookup.models import trust_option
 from daq.progress import Progress, Watch, ignore, warn
 from sysid import ModelError, ProcessModel, SearchSpace
 from sysid.gassi import GASSI, PRESETS
@@ -121,7 +122,7 @@ def fit(
         result = assemble(problem, estimator, (train, [*ends, *check]), folder, watch)
     except (KeyboardInterrupt, Terminated) as stop:
         if folder is not None and (folder / request.CHECKPOINT).exists():
-            command = request.resume_command(folder)
+            command = request.resume_command(folder) + trust_option(problem.model_name)
             stop.add_note(f"the search until then is kept; go on with: {command}")
         raise
     if folder is not None:

@@ -71,12 +71,14 @@ class Part:
 
     def disturbed(self) -> str | None:
         """What became of the file by somebody else's doing, in a word."""
+        return self.resized() if self.in_place() else "deleted, moved or replaced"
+
+    def in_place(self) -> bool:
+        """Whether the file of that name is still this one."""
         try:
-            if os.path.samestat(self.path.stat(), os.fstat(self._file.fileno())):
-                return self.resized()
+            return os.path.samestat(self.path.stat(), os.fstat(self._file.fileno()))
         except OSError:
-            pass
-        return "deleted, moved or replaced"
+            return False
 
     def changed(self) -> bool:
         """Whether anything in it is not as it was written; reads all of it."""

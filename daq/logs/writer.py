@@ -149,8 +149,13 @@ class LogWriter:
                     lost.append(f"{row} to {end - 1}")
             out.flush()
             os.fsync(out.fileno())
+        strange = self.path.exists() and not self._parts[0].in_place()
         for part in self._parts:
             part.close()  # Windows replaces no file that is open
+        if strange:
+            aside = self.path.with_name(f"{self.path.name}.stranger")
+            self.path.replace(aside)
+            self.disturbance = f"{self.disturbance}; what stood in its place is now {aside.name}"
         temporary.replace(self.path)
         for part in self._parts[1:]:
             part.path.unlink(missing_ok=True)

@@ -73,6 +73,11 @@ def ripple(theta: FloatArray, torque: FloatArray) -> Ripple:
     )
 
 
+def _slope(omega: FloatArray, torque: FloatArray) -> float:
+    """From the slowest to the fastest; NaN of a single plateau."""
+    return float(np.ptp(torque) / np.ptp(omega)) if len(omega) > 1 else math.nan
+
+
 @dataclass(frozen=True)
 class PlateauFindings:
     """What follows from the settled plateaus.
@@ -154,7 +159,7 @@ class PlateauFindings:
     def _brake_table(self, line: Line) -> Table:
         """The line at each brake command, and (4.5) across both directions of motion."""
         brake, omega, torque, _ = self._points
-        across = [np.ptp(torque[brake == x]) / np.ptp(omega[brake == x]) for x in line.commands]
+        across = [_slope(omega[brake == x], torque[brake == x]) for x in line.commands]
         columns = (line.commands, line.currents, line.kappa, line.kappa_errors, line.slopes, across)
         rows = list(zip(*columns, strict=True))
         heading = (

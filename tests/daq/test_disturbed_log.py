@@ -111,8 +111,8 @@ def truth(run, tmp_path_factory):
     mostly_soak(
         [
             ("delete", "deleted, moved or replaced"),
-            ("add", "written into"),
             ("replace", "deleted, moved or replaced"),
+            ("add", "written into"),
             ("remove", "deleted, moved or replaced"),
         ],
         always=2,
@@ -121,10 +121,13 @@ def truth(run, tmp_path_factory):
 def test_a_log_whose_rows_are_all_there_is_put_together_again(run, tmp_path, truth, act, what):
     result = record(run, tmp_path, act)
     assert result.returncode == 1 and "Traceback" not in result.stderr
-    assert f"log.csv: it was {what} while the run was on; nothing of it is lost" in result.stderr
+    aside = "what stood in its place is now log.csv.stranger; " if act == "replace" else ""
+    said = f"log.csv: it was {what} while the run was on; {aside}nothing of it is lost"
+    assert said in result.stderr
     folder = only_capture(tmp_path)
     assert (folder / "log.csv").read_text().splitlines() == truth
-    assert sorted(path.name for path in folder.iterdir()) == ["log.csv", "run.json"]
+    strangers = ["log.csv.stranger"] if aside else []
+    assert sorted(path.name for path in folder.iterdir()) == ["log.csv", *strangers, "run.json"]
     assert record_of(folder)["status"] == "failed"
     assert what in record_of(folder)["reason"] and what in load(folder).warning
 

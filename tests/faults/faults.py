@@ -309,4 +309,4 @@ def make(name, size=None):
     return fault
 
 
-__all__ = ["FAULTS", "FREE", "HAND", "VIRTUAL", "Fault", "make"]
+__all__ = ["FAULTS", "FREE", "HAND", "ON_A_LINE", "VIRTUAL", "Fault", "make"]

@@ -158,6 +158,17 @@ def test_a_run_cut_short_concludes_from_what_it_has(between):
     )
 
 
+def test_a_brake_command_with_a_single_plateau_has_no_slope_across(between):
+    settings, samples, extra, whole = between
+    plateaus = whole.tables[1].columns
+    first = int(np.flatnonzero(plateaus["brake_command"] == plateaus["brake_command"][-1])[0])
+    end = int(np.flatnonzero(extra["plateau"] == first)[-1]) + 200
+    cut = Samples(**{name: getattr(samples, name)[:end] for name in samples.__dataclass_fields__})
+    found = settings.findings(cut, {name: values[:end] for name, values in extra.items()})
+    across = found.tables[0].columns["slope_across"]
+    assert np.isfinite(across[:-1]).all() and np.isnan(across[-1])
+
+
 def test_a_loop_that_runs_away_is_ended(tmp_path):
     settings = experiment(**QUICK)
     with pytest.raises(RunError, match=r"encoder\.sign"):
