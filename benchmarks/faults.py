@@ -44,7 +44,7 @@ from tests.faults.faults import FAULTS, ON_A_LINE, VIRTUAL
 from tests.faults.serial_device import Server, serving
 
 _DEVICE = Path(__file__).parents[1] / "tests" / "faults" / "device.py"
-AT = 0.6  # s of the run at which a fault begins, where open loop excites and closed loop turns
+_AT = 0.6  # s of the run at which a fault begins, where open loop excites and closed loop turns
 _RATE = 800.0  # Hz, of the shipped experiments
 _PHASES = {"calibration": 0.15, "homing": 0.15, "run": 0.7}  # and the share of trials
 _LASTS = {"calibration": 4.0, "homing": 5.0}  # s
@@ -62,17 +62,23 @@ _LOOPS: dict[str, tuple[str, dict[str, Any], float]] = {
         5.0,
     ),
 }
-# On a line they take the time that they take: less of it, and a loop that Python closes in time.
-_HASTE: dict[str, dict[str, Any]] = {
-    "open": {"duration": 3, "homing": {"turns": 0.5}, "calibration": {"samples": 200}},
+# Of a fault that begins soon; on a line, besides, a loop that Python closes in time.
+_SHORT: dict[str, dict[str, Any]] = {
+    "open": {"duration": 4, "homing": {"turns": 0.5}, "calibration": {"samples": 200}},
+    "closed": {
+        "velocities": [20, 120],
+        "brake_commands": [0.1],
+        "settling": {"tolerance": 5, "least": 0.5, "time": 0.2, "timeout": 1.5},
+        "calibration": {"samples": 200},
+    },
+}
+_SLOW_LOOP: dict[str, dict[str, Any]] = {
+    "open": {},
     "closed": {
         "sample_rate": 200,
         "speed_filter": 30,
         "loop": {"proportional": 0.02, "integral": 0.3},
-        "velocities": [20, 60],
-        "brake_commands": [0.08],
         "slope": 40,
-        "calibration": {"samples": 100},
     },
 }
 _ORDER = ("stop", "warning", "missed", "before")
@@ -80,7 +86,10 @@ _ORDER = ("stop", "warning", "missed", "before")
 
 @dataclass(frozen=True)
 class Trial:
-    """Which rig, which run, and what goes wrong in it; fault "": nothing. line: on a socket."""
+    """Which rig, which run, and what goes wrong in it; fault "": nothing.
+
+    line: on a socket. short: runs of seconds.
+    """
 
     seed: int
     protocol: str
@@ -89,6 +98,7 @@ class Trial:
     phase: str = "run"
     at: float = 0.0
     line: bool = False
+    short: bool = False
 
 
 @dataclass(frozen=True)
@@ -137,10 +147,7 @@ def perform(trial: Trial) -> Outcome:
     with contextlib.ExitStack() as stack:
         name = stack.enter_context(tempfile.TemporaryDirectory())
         folder = Path(name)
-        changes = _LOOPS[trial.loop][1] if trial.loop else {}
-        if trial.line:
-            changes = {**changes, **_HASTE[trial.loop]}
-        experiment = _changed("protocol", trial.protocol, folder, changes)
+        experiment = _changed("protocol", trial.protocol, folder, _changes(trial))
         server = stack.enter_context(serving(_setting(trial))) if trial.line else None
         rig = _faulty_rig(trial, folder, server)
         notes: list[str] = []
@@ -160,6 +167,18 @@ def perform(trial: Trial) -> Outcome:
             stopped = f"{type(error).__name__}: {error}"
     board = session.device.board if server is None else server.board
     return _judged(trial, session.rig.limits, board, stopped, notes)
+
+
+def _changes(trial: Trial) -> dict[str, Any]:
+    """What differs from the shipped experiment."""
+    if not trial.loop:
+        return {}
+    changes = dict(_LOOPS[trial.loop][1])
+    if trial.short:
+        changes |= _SHORT[trial.loop]
+    if trial.line:
+        changes |= _SLOW_LOOP[trial.loop]
+    return changes
 
 
 def _judged(
@@ -221,15 +240,16 @@ def _faulty_rig(trial: Trial, folder: Path, server: Server | None) -> Path:
     return _changed("backend", rig_for(trial.protocol), folder, changes)
 
 
+def trial_of(fault: str, loop: str, line: bool) -> Trial:
+    """The fault early in a short run of the plant in the middle."""
+    return Trial(0, _LOOPS[loop][0], fault, loop, at=_AT, line=line, short=True)
+
+
 def each(line: bool) -> list[Trial]:
     """Every fault once in either loop, early in the run of the plant in the middle."""
     names = ON_A_LINE if line else VIRTUAL
     loops = {name: ["open"] if "free" not in FAULTS[name].loads else list(_LOOPS) for name in names}
-    return [
-        Trial(0, _LOOPS[loop][0], name, loop, at=AT, line=line)
-        for name in names
-        for loop in loops[name]
-    ]
+    return [trial_of(name, loop, line) for name in names for loop in loops[name]]
 
 
 def alarms(runs: int, seed: int) -> Iterator[Trial]:

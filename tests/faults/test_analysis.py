@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.faults import AT, Trial, perform
+from benchmarks.faults import perform, trial_of
 from tests.faults.faults import FAULTS, VIRTUAL
 from tests.soak import mostly_soak
 
@@ -47,26 +47,22 @@ def cases(names, suffix=""):
     ]
 
 
-PROTOCOLS = {"open": "prbs.yaml", "closed": "constant_velocity.yaml"}
-
-
 @pytest.mark.parametrize(
     ("fault", "loop", "end"), mostly_soak(cases(VIRTUAL), always=2 * len(ALWAYS))
 )
 def test_a_fault_ends_as_the_page_says(fault, loop, end):
-    outcome = perform(Trial(0, PROTOCOLS[loop], fault, loop, at=AT))
+    outcome = perform(trial_of(fault, loop, line=False))
     assert outcome.result == OUTCOMES[end], outcome
     assert outcome.reason or end == "no"
 
 
 # The others take minutes in real time: python -m benchmarks.faults --each --line
-LINE = ("encoder dead", "clock 10 % fast", "SAFE ignored", "outputs stuck after SAFE",
-             "motor output stuck 5 V")  # fmt: skip
+LINE = [("encoder dead", "closed"), ("clock 10 % fast", "open"), ("SAFE ignored", "open")]
 
 
 @pytest.mark.soak
-@pytest.mark.parametrize(("fault", "loop", "end"), cases(LINE, "_line"))
-def test_on_a_line_as_well(fault, loop, end):
-    outcome = perform(Trial(0, PROTOCOLS[loop], fault, loop, at=AT, line=True))
+@pytest.mark.parametrize(("fault", "loop"), LINE)
+def test_on_a_line_as_well(fault, loop):
+    (end,) = (end for *case, end in cases([fault], "_line") if case == [fault, loop])
+    outcome = perform(trial_of(fault, loop, line=True))
     assert outcome.result == OUTCOMES[end], outcome
-    assert outcome.reason or end == "no"
