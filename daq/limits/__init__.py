@@ -14,16 +14,9 @@ from operator import itemgetter
 from daq.config.rig import RigConfig, UserLimit
 from daq.errors import USER_CODE_ERRORS, ConfigError, RigError, RunError, raised_in
 from daq.hal import CHANNELS, Flag, Phase, Samples
-from daq.limits.agreement import (
-    Acceleration,
-    Contrary,
-    CurrentAgreement,
-    Disagreement,
-    Drive,
-    Stalled,
-    TorqueAgreement,
-)
+from daq.limits.agreement import CurrentAgreement, TorqueAgreement
 from daq.limits.base import Limit, Trip
+from daq.limits.encoder import Acceleration, Contrary, Disagreement, Drive, Stalled
 from daq.limits.load import DeviceFound, I2t, Magnitude
 from daq.limits.sensors import Frozen, Jump
 from daq.limits.shaft import CountedSpeed, Travel, Winding
