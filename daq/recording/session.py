@@ -81,14 +81,17 @@ def open_session(
     rig: default what the experiment's file says it is for. port, realtime: settings of its backend
     over those of its file.
     """
+    name = rig or rig_for(experiment, watch)
     loaded, (config, device) = together(
         lambda: load_experiment(experiment, watch),
-        lambda: _rig_on(rig or rig_for(experiment, watch), port, realtime, watch),
+        lambda: _rig_on(name, port, realtime, watch),
     )
     # Checked even where it will not run: a mistake in the file is best heard of early.
     validation = loaded.validation()
     runs = [run for run in (loaded, validation) if run is not None]
-    plans = together(*[partial(run.plan, config) for run in runs])
+    plans = together(
+        *[partial(run.plan, config) for run in runs], partial(_require_port, config, name)
+    )
     return Session(loaded, validation, config, device, plans[0])
 
 
@@ -121,8 +124,7 @@ def record(
         loaded = changed
     name = str(rig or rig_for(str(experiment), watch))
     config, device = load_rig(name, options, watch)
-    _require_port(config, name)
-    loaded.plan(config)
+    together(partial(loaded.plan, config), partial(_require_port, config, name))
     return load(_run(loaded, config, device, Path(out), watch).folder)
 
 
@@ -142,7 +144,6 @@ def _rig_on(rig: str, port: str | None, realtime: bool, watch: Watch) -> tuple[R
         watch(Note("note", f"{rig}: its own clock paces it; --realtime changes nothing"))
     if changes:
         config, device = load_rig(rig, changes, watch)
-    _require_port(config, rig)
     return config, device
 
 

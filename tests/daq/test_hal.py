@@ -163,4 +163,15 @@ def test_limits_of_the_shaft_reach_the_device_in_counts(sign):
     window = (-500.0, np.inf) if sign > 0 else (-np.inf, 500.0)
     np.testing.assert_allclose((guard.counts_low, guard.counts_high), window)
     np.testing.assert_allclose(guard.count_rate, 2000.0)
-    np.testing.assert_allclose(guard.count_step, 100.0 / 800.0 / (2.0 * np.pi) * 2000.0)
+    np.testing.assert_allclose(guard.count_step, 2000.0 / 800.0 + 2.0)
+
+
+def test_a_jump_of_the_count_is_watched_without_a_limit_of_speed_too():
+    config = RigConfig.model_validate(
+        {"limits": {"encoder": {"fastest": 100.0}}, "sensors": {"encoder": {"cycles": 500}}}
+    )
+    device = Guarded(Simulation())
+    with Rig(device, config) as rig:
+        rig.start(800.0, Mode.OPEN_LOOP)
+    assert np.isinf(device.guard.count_rate)
+    np.testing.assert_allclose(device.guard.count_step, 100.0 / 800.0 / (2.0 * np.pi) * 2000.0)

@@ -107,11 +107,11 @@ class Count(ClosedLoop):
 '''
 
 
-def played(rig, tmp_path, **faults):
+def played(rig, tmp_path, limits=(), **faults):
     (tmp_path / "count.py").write_text(HOLD)
     content = {"protocol": "count.py:Count", "calibration": {"samples": 16}}
     (tmp_path / "count.yaml").write_text(yaml.safe_dump(content))
-    write_rig(tmp_path / "rig.yaml", options={"faults": faults})
+    write_rig(tmp_path / "rig.yaml", options={"faults": faults}, limits=dict(limits))
     assert rig("run", "count.yaml", "--rig", "rig.yaml", cwd=tmp_path).returncode == 0
     return pd.read_csv(only_capture(tmp_path) / "log.csv")
 
@@ -128,7 +128,7 @@ def test_late_commands_are_held_and_flagged_and_no_other_is_moved(rig, tmp_path)
 
 
 def test_lost_samples_leave_a_gap_that_is_flagged(rig, tmp_path):
-    log = played(rig, tmp_path, lost=0.05)
+    log = played(rig, tmp_path, {"lost": 0.1}, lost=0.05)
     gaps = np.diff(log["tick"], prepend=-1) > 1
     assert 20 < 800 - len(log) < 65
     np.testing.assert_array_equal((log["flags"] & 4) != 0, gaps)

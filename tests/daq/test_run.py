@@ -74,13 +74,12 @@ def test_phases_come_in_order_and_the_device_is_made_safe_before_it_is_closed(co
     journal = journal_of(root / "journal.jsonl")
     steps = [e.get("phase") or e["what"] for e in journal if e["what"] != "outputs"]
     order = [step for step, _ in itertools.groupby(steps)]
-    wanted = ["calibration", "start", "homing", "start", "run", "start", "start", "safe", "close"]
-    kept = [step for step in order if step in wanted and step != "safe"] + ["safe"]
-    assert kept == [*wanted[:-2], "close", "safe"]
+    wanted = ["calibration", "start", "homing", "start", "run", "start", "close"]
+    assert [step for step in order if step in wanted] == wanted
     assert "safe" in order[order.index("run") :], "announced, or called, at the end"
     assert_left_safe(root)
     modes = [e["mode"] for e in journal if e["what"] == "start"]
-    assert modes == ["closed loop", "closed loop", "open loop", "closed loop"]
+    assert modes == ["closed loop", "closed loop", "open loop"]
 
 
 def test_outputs_are_zero_before_the_run_phase(completed):
@@ -277,7 +276,8 @@ def test_currents_that_do_not_follow_their_commands_are_named_with_the_cure(
     (tmp_path / "crossed.py").write_text(CROSSED)
     write_experiment(tmp_path / "e.yaml", calibration={"samples": 400})
     gains = {"motor": 0.5, "brake": 0.5}
-    limits = {"current": {"motor": 5.0, "brake": 5.0}}
+    # So wide that what the limits on currents allow for noise hides the mistake during the run.
+    limits = {"current": {"motor": 10.0, "brake": 10.0}}
     write_rig(tmp_path / "rig.yaml", amplifiers=gains, limits=limits, **changes)
     result = rig("run", "e.yaml", "--rig", "rig.yaml", cwd=tmp_path)
     assert result.returncode == 0, result.stderr

@@ -292,7 +292,7 @@ def test_a_malformed_record_hides_no_samples(tmp_path):
     recording.read()
     assert recording.history.n_rows == 10
     (told,) = recording.complaints()
-    assert "run.json: not a readable run record" in told
+    assert "run.json:1:2: not a readable run record" in told
 
 
 # --- the command --------------------------------------------------------------------------
