@@ -63,15 +63,15 @@ def _words(args, report):
     return [*words, "--no-report"] if identifies and not report else words
 
 
-def rig(*args, cwd, env=None, timeout=120, report=False, **options):
+def rig(*args, cwd, env=None, timeout=120, report=False, fresh=False, **options):
     """Run ``rig`` to its end; a CompletedProcess with text output.
 
-    env: further variables; options: of ``subprocess.run``. Both cost the seconds of a new
-    interpreter.
+    env: further variables. fresh: by an interpreter of its own, which costs seconds, as do options
+    of ``subprocess.run``.
     """
     words = _words(args, report)
-    if env is None and not options and hasattr(os, "fork"):
-        return _shared_server().run(words, cwd, timeout)
+    if not fresh and not options and hasattr(os, "fork"):
+        return _shared_server().run(words, cwd, timeout, env)
     return subprocess.run(
         [*RIG, *words],
         cwd=cwd,
@@ -116,6 +116,7 @@ for line in sys.stdin:
         signal.alarm(job["timeout"])
         os.environ.clear()
         os.environ.update(job["env"])
+        sys.path[:0] = filter(None, job["env"].get("PYTHONPATH", "").split(os.pathsep))
         os.chdir(job["cwd"])
         for number, name in ((0, os.devnull), (1, job["out"]), (2, job["err"])):
             os.dup2(os.open(name, os.O_RDWR | os.O_CREAT), number)
@@ -138,20 +139,19 @@ for line in sys.stdin:
 class _Server:
     """``rig`` processes without the seconds that each needs for its imports, one at a time."""
 
-    def __init__(self, **env):
-        self._env = env
+    def __init__(self):
         self._folder = tempfile.TemporaryDirectory()
         self._process = subprocess.Popen(
             [sys.executable, "-c", _FORKING],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment(**env),
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment(),
         )  # fmt: skip
 
-    def run(self, words, cwd, timeout=120):
+    def run(self, words, cwd, timeout=120, env=None):
         out, err = Path(self._folder.name) / "out", Path(self._folder.name) / "err"
         out.unlink(missing_ok=True)
         err.unlink(missing_ok=True)
         job = {"args": words, "cwd": str(cwd), "out": str(out), "err": str(err)}
-        job |= {"env": environment(**self._env), "timeout": timeout}
+        job |= {"env": environment(**(env or {})), "timeout": timeout}
         self._process.stdin.write(json.dumps(job) + "\n")
         self._process.stdin.flush()
         status = int(self._process.stdout.readline())
@@ -174,16 +174,12 @@ def _shared_server():
 
 @contextmanager
 def forked_rig(**env):
-    """A function of arguments and folder that runs ``rig``; env: what its interpreter starts with.
+    """A function of arguments and folder that runs ``rig``; env: further variables.
 
     Its result is a CompletedProcess.
     """
-    server = _Server(**env) if env else _shared_server()
-    try:
-        yield lambda args, cwd, report=False: server.run(_words(args, report), cwd)
-    finally:
-        if env:
-            server.close()
+    server = _shared_server()
+    yield lambda args, cwd, report=False: server.run(_words(args, report), cwd, env=env)
 
 
 def until(condition, what, seconds=60.0):

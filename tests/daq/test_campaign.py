@@ -118,7 +118,8 @@ def test_a_dask_cluster_by_one_setting_gives_the_same(folder):
     with distributed.LocalCluster(
         n_workers=1, threads_per_worker=2, processes=False, protocol="tcp", dashboard_address=":0"
     ) as cluster:
-        there = campaign(folder, "--dask", cluster.scheduler_address, env={"PYTHONWARNINGS": ""})
+        there = campaign(folder, "--dask", cluster.scheduler_address, env={"PYTHONWARNINGS": ""},
+                         fresh=True)  # fmt: skip
     assert settled(there) == settled(here)
 
 

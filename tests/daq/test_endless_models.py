@@ -39,7 +39,7 @@ def test_equations_without_end_are_refused_by_their_line(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        (
+        pytest.param(
             [
                 ("model = Process", 'from sysid import Constraint\n\ndef bound(p):\n'
                  '    while getattr(p[0], "size", 1) > 1:\n        pass\n    return -1.0\n\n\n'
@@ -47,6 +47,7 @@ def test_equations_without_end_are_refused_by_their_line(tmp_path):
                 ("derivative=", 'constraints=(Constraint("tau < 1", bound),),\n    derivative='),
             ],
             "constraint 'tau < 1': it has no end within 2 s of computing and is at line",
+            marks=pytest.mark.soak,
         ),
         (
             [(DERIVATIVE, f"{DERIVATIVE}    while p[0] < 0.02:\n        pass\n")],

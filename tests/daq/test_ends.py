@@ -24,6 +24,7 @@ from tests.daq.support import (
     write_experiment,
     write_rig,
 )
+from tests.soak import mostly_soak
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
 
@@ -56,7 +57,7 @@ def test_ctrl_c_at_the_very_end_leaves_the_status_as_it_is(tmp_path):
     (tmp_path / "impatient.py").write_text(_IMPATIENT)
     write_experiment(tmp_path / "e.yaml")
     write_rig(tmp_path / "rig.yaml", backend="impatient.py:Impatient")
-    result = rig("run", "e.yaml", "--rig", "rig.yaml", cwd=tmp_path, env={})
+    result = rig("run", "e.yaml", "--rig", "rig.yaml", cwd=tmp_path, fresh=True)
     assert result.returncode == 0
     assert "Traceback" not in result.stderr and "Exception ignored" not in result.stderr
 
@@ -119,6 +120,7 @@ class Hanging(SimulatedDevice):
 '''
 
 
+@pytest.mark.soak
 def test_a_clean_up_that_hangs_is_ended_with_a_record(tmp_path):
     (tmp_path / "hanging.py").write_text(_HANGING)
     write_experiment(tmp_path / "e.yaml")
@@ -172,7 +174,7 @@ def children(pid):
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="no /proc")
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize("number", mostly_soak([signal.SIGKILL, signal.SIGTERM]))
 def test_workers_end_with_the_program_that_started_them(data, number):
     words = ("campaign", "log.csv", "--model", "model.py:lag", "--config", "id.yaml")
     process = start_rig(*words, "--seeds", "0:4", "--jobs", 2, cwd=data)
@@ -193,7 +195,7 @@ def test_workers_end_with_the_program_that_started_them(data, number):
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full")
-@pytest.mark.parametrize("unbuffered", ["", "1"])
+@pytest.mark.parametrize("unbuffered", mostly_soak(["", "1"]))
 def test_results_that_cannot_be_printed_are_one_line(tmp_path, unbuffered):
     write_experiment(tmp_path / "e.yaml")
     with Path("/dev/full").open("w") as full:
@@ -207,7 +209,7 @@ def test_results_that_cannot_be_printed_are_one_line(tmp_path, unbuffered):
     assert record_of(only_capture(tmp_path))["status"] == "completed"
 
 
-@pytest.mark.parametrize("unbuffered", ["", "1"])
+@pytest.mark.parametrize("unbuffered", mostly_soak(["", "1"]))
 def test_a_reader_that_has_enough_is_no_error(tmp_path, unbuffered):
     process = start_rig(
         "models", "actuator", "--json", cwd=tmp_path, env={"PYTHONUNBUFFERED": unbuffered}

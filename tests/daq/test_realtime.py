@@ -91,7 +91,7 @@ def test_nothing_is_imported_while_a_run_is_on(tmp_path):
     (tmp_path / "watched.py").write_text(_WATCHED)
     write_experiment(tmp_path / "e.yaml", duration=0.1, homing={"turns": 0})
     write_rig(tmp_path / "rig.yaml", backend="watched.py:Watched", options={"time": "real"})
-    result = rig("run", "e.yaml", "--rig", "rig.yaml", cwd=tmp_path, env={})
+    result = rig("run", "e.yaml", "--rig", "rig.yaml", cwd=tmp_path, fresh=True)
     assert result.returncode == 0, result.stderr
     assert json.loads((tmp_path / "imported.json").read_text()) == []
 

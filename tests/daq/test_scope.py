@@ -322,7 +322,7 @@ def test_it_serves_this_machine_only_until_it_is_ended(tmp_path):
         again.bind(("127.0.0.1", port))
 
 
-def test_its_json_has_the_address(tmp_path):
+def test_its_json_has_the_address_with_a_key_that_nobody_guesses(page_address, tmp_path):
     process = start_rig("scope", "--port", 0, "--json", cwd=tmp_path)
     text = ""
     while not text.endswith("}\n"):
@@ -330,6 +330,8 @@ def test_its_json_has_the_address(tmp_path):
     document = json.loads(text)
     assert document["run"] is None and document["out"] == "runs"
     assert request(document["address"])[0] == 200
+    key, another = (urlsplit(each).path.strip("/") for each in (page_address, document["address"]))
+    assert len(key) >= 32 and another != key
     process.terminate()
     process.communicate(timeout=30)
     assert process.returncode == 0
@@ -378,15 +380,6 @@ def test_the_printed_address_is_answered_under_all_names_of_this_machine(page_ad
     status, body = request(page_address, Host=host)
     assert status == 200 and b"rig scope" in body
     assert upgrade(page_address, Host=host, Origin=f"http://{host}")[0] == 101
-
-
-def test_a_key_that_nobody_guesses_is_part_of_the_address(page_address, tmp_path):
-    key = urlsplit(page_address).path.strip("/")
-    assert len(key) >= 32
-    process, another = start_scope(cwd=tmp_path)
-    process.terminate()
-    process.communicate(timeout=30)
-    assert urlsplit(another).path.strip("/") != key
 
 
 @pytest.mark.parametrize("knock", [request, upgrade], ids=["page", "socket"])

@@ -244,7 +244,7 @@ def test_the_usual_cache_folder_is_done_without_where_others_may_write_to_it(sen
     home = {name: str(folder.parent) for name in ("HOME", "XDG_CACHE_HOME")}
     command = ("replay", "sent", "--parameters", "sent/parameters.yaml", "--trust")
     env = {"RIG_CACHE_DIR": "", "PYTHONWARNINGS": "default::UserWarning", **home}
-    result = rig(*command, cwd=tmp_path, env=env)
+    result = rig(*command, cwd=tmp_path, env=env, fresh=True)
     assert result.returncode == 0, result.stderr
     (warning,) = [line for line in result.stderr.splitlines() if "kernels" in line]
     assert warning.startswith(f"rig: warning: {folder}: others may write to it, and compiled")
@@ -253,7 +253,8 @@ def test_the_usual_cache_folder_is_done_without_where_others_may_write_to_it(sen
 
 def test_machine_code_that_somebody_sent_is_not_loaded(tmp_path):
     """Numba reads its settings in the working folder, also where to load machine code from."""
+    write_experiment(tmp_path / "e.yaml")
     (tmp_path / ".numba_config.yaml").write_text(f"cache_dir: {tmp_path}/elsewhere\n")
-    result = rig("run", "prbs.yaml", cwd=tmp_path, env={})
+    result = rig("run", "e.yaml", cwd=tmp_path, fresh=True)
     assert result.returncode == 0, result.stderr
     assert not (tmp_path / "elsewhere").exists()

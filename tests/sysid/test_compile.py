@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.soak import mostly_soak
+
 PREFIX = """
 import os
 import numpy as np
@@ -198,7 +200,7 @@ def test_the_cache_folder_is_made_for_its_user_alone(workshop):
 
 
 @posix
-@pytest.mark.parametrize("mode", [0o770, 0o702, 0o1777], ids=oct)
+@pytest.mark.parametrize("mode", mostly_soak([0o702, 0o770, 0o1777]), ids=oct)
 def test_a_chosen_folder_that_others_may_write_to_is_refused(workshop, mode):
     workshop.cache.mkdir()
     workshop.cache.chmod(mode)
@@ -221,6 +223,7 @@ def test_a_chosen_folder_of_another_user_is_refused(workshop):
 
 
 @posix
+@pytest.mark.soak
 def test_the_usual_folder_is_done_without_where_others_may_write_to_it(workshop):
     folder = workshop.folder / "home" / "hybrid-rig"
     folder.mkdir(parents=True)

@@ -11,6 +11,7 @@ import yaml
 from daq.lookup.shipped import shipped_files
 from tests.daq.serial.support import emulator
 from tests.daq.support import forked_rig, record_of
+from tests.soak import mostly_soak
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="forks")
 
@@ -127,7 +128,7 @@ def test_the_first_limits_are_a_tenth_of_the_full_ones():
     assert heat["budget"] == pytest.approx(0.01 * full_heat["budget"])  # of amperes squared
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", mostly_soak(range(4), always=2))
 def test_no_first_limit_trips_by_an_honest_sensors_noise(tmp_path, run, seed):
     """50 mV of offset and 10 mV rms of noise on every input, load and cable on or off."""
     content = {

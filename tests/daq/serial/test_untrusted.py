@@ -7,6 +7,7 @@ from daq.logs.recording import load
 from tests.daq.serial.paper import I32, SAFE, paper_device
 from tests.daq.serial.support import write_serial_rig
 from tests.daq.support import forked_rig, only_capture, record_of, rows_in, write_experiment
+from tests.soak import mostly_soak
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +37,7 @@ def test_a_device_that_keeps_the_rules_completes(rig, tmp_path):
     assert record["outputs"]["confirmed"] and record["outputs"]["applied_voltage_motor"] == 0.0
 
 
-@pytest.mark.parametrize("share", [0.9, 1.1])
+@pytest.mark.parametrize("share", mostly_soak([0.9, 1.1]))
 def test_a_clock_of_another_frequency_is_refused_before_the_rig_moves(rig, tmp_path, share):
     result, record = run_on(rig, tmp_path, calibration=400, clock=share)
     assert result.returncode == 1 and record["status"] == "failed"
@@ -46,7 +47,7 @@ def test_a_clock_of_another_frequency_is_refused_before_the_rig_moves(rig, tmp_p
 
 
 def test_a_timer_that_divides_wrongly_is_refused_before_the_rig_moves(rig, tmp_path):
-    result, record = run_on(rig, tmp_path, timer=1.1)
+    result, record = run_on(rig, tmp_path, timer=0.9)
     assert result.returncode == 1 and record["status"] == "failed"
     assert "by its own clock the device took" in record["reason"]
     assert rows_in(only_capture(tmp_path)) == 0
@@ -102,8 +103,13 @@ def turning(bits, way=1):
     return lambda tick: way * (2 ** (bits - 1) - 50 + 3 * max(0, tick - 150))
 
 
-@pytest.mark.parametrize("way", [1, -1])
-@pytest.mark.parametrize(("bits", "counter"), [(32, I32), (16, (-(2**15), 2**15 - 1))])
+I16 = (-(2**15), 2**15 - 1)
+
+
+@pytest.mark.parametrize(
+    ("bits", "counter", "way"),
+    mostly_soak([(32, I32, 1), (16, I16, -1), (32, I32, -1), (16, I16, 1)], always=2),
+)
 def test_a_counter_that_runs_over_is_followed(rig, tmp_path, bits, counter, way):
     result, _ = run_on(rig, tmp_path, counts=turning(bits, way), bits=bits, counter=counter)
     assert result.returncode == 0, result.stderr
