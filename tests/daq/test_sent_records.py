@@ -39,8 +39,8 @@ model = ProcessModel(
     (State("current_motor", "A"),),
     (Input("applied_voltage_motor", "V"),),
     (Output("current_motor", "A"),),
-    (Parameter("rate", "1/s", 100.0, 1.0, 1000.0),),
-    lambda x, u, p: (p[0] * (u[0] - x[0]),),
+    (Parameter("tau", "s", 0.01, 0.001, 1.0),),
+    lambda x, u, p: ((u[0] - x[0]) / p[0],),
 )
 """
 
@@ -72,7 +72,7 @@ def name_protocol(folder, name):
 
 
 def name_model(folder, name):
-    content = {"model": name, "parameters": {"rate": 100.0}}
+    content = {"model": name, "parameters": {"tau": 0.01}}
     path = folder / "parameters.yaml"
     path.write_text(yaml.safe_dump(content))
     (folder / "report.json").write_text("{}")
