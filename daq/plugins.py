@@ -1,5 +1,6 @@
 """Backends, protocols, models and limits found by name, whichever installed package brings them."""
 
+import functools
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Literal
 
@@ -10,7 +11,13 @@ Kind = Literal["backend", "limit", "model", "protocol"]
 
 def installed(kind: Kind) -> dict[str, EntryPoint]:
     """Entry points of a kind, whichever installed package brings them, by name."""
-    return {point.name: point for point in entry_points(group=f"rig.{kind}s")}
+    return {point.name: point for point in _entry_points().select(group=f"rig.{kind}s")}
+
+
+@functools.cache
+def _entry_points() -> Any:
+    """Those of all packages, read once: that takes longer than all else of a lookup."""
+    return entry_points()
 
 
 def load_plugin(kind: Kind, name: str) -> Any:

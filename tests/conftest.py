@@ -27,7 +27,7 @@ def pytest_configure(config):
 
 def pytest_collection_modifyitems(items):
     # The longest begin first, so that no process waits for one alone at the end.
-    first = "test_tutorial", "test_combinations", "test_friction_identification"
+    first = "test_tutorial", "test_combinations", "test_friction_identification", "test_docstrings"
     items.sort(key=lambda item: not any(name in item.nodeid for name in first))
 
 

@@ -99,11 +99,16 @@ def start_rig(*args, cwd, env=None, **options):
 
 # Prepares what the commands need, then becomes a ``rig`` process per line of standard input.
 _FORKING = """
-import json, os, signal, sys, traceback
-import daq.cli, daq.cli.app, daq.identification.comparison, daq.identification.fit
-import daq.identification.replay, daq.recording.preview, matplotlib.figure, numba, pandas, pint
-import protocols.prbs, rich.progress, rich.table, sim_rig.actuator, sim_rig.backend
+import gc, importlib.metadata, json, os, signal, sys, traceback
+import daq.cli, daq.cli.app, daq.figures.findings, daq.identification.comparison
+import daq.identification.fit, daq.identification.replay, daq.recording.preview, daq.serial.backend
+import matplotlib.figure, numba, pandas, pint, pydantic.type_adapter, rich.progress, rich.table
+import sim_rig.actuator, sim_rig.backend, sysid.engine.intrinsics, sysid.engine.phi
+for protocol in importlib.metadata.entry_points(group="rig.protocols"):
+    protocol.load()
+daq.config.units.factor("rpm", "rad/s")
 numba.njit("f8(f8)")(lambda x: x)  # what the first compilation of a process takes half a second for
+gc.freeze()  # so that no child looks through, and copies, what all share
 
 for line in sys.stdin:
     job = json.loads(line)
