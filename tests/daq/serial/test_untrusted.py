@@ -66,11 +66,14 @@ def test_samples_that_come_at_another_rate_are_refused_whatever_the_device_says(
 
 @pytest.mark.parametrize(
     ("lies", "problem"),
-    [
-        ({"sticks": "output"}, "V are applied to the motor"),
-        ({"sticks": "amplifier"}, "A at zero command, where calibration.current_"),
-        ({"deaf": (SAFE,)}, "does not answer SAFE"),
-    ],
+    mostly_soak(
+        [
+            ({"sticks": "output"}, "V are applied to the motor"),
+            ({"sticks": "amplifier"}, "A at zero command, where calibration.current_"),
+            ({"deaf": (SAFE,)}, "does not answer SAFE"),
+        ],
+        always=2,
+    ),
     ids=["converter", "amplifier", "no SAFE"],
 )
 def test_outputs_are_called_zero_only_when_they_were_read_as_zero(rig, tmp_path, lies, problem):
@@ -89,7 +92,9 @@ def test_a_log_without_most_of_its_samples_is_not_complete(rig, tmp_path):
     assert "limits.lost" in result.stderr and record["outputs"]["confirmed"]
 
 
-@pytest.mark.parametrize(("allowed", "status"), [(0.01, "incomplete"), (0.05, "completed")])
+@pytest.mark.parametrize(
+    ("allowed", "status"), mostly_soak([(0.01, "incomplete"), (0.05, "completed")])
+)
 def test_the_last_samples_count_too_and_a_user_says_how_many(rig, tmp_path, allowed, status):
     # Of 320: what the device takes after them ends the run.
     limits = f"{{lost: {allowed}}}"
@@ -108,7 +113,7 @@ I16 = (-(2**15), 2**15 - 1)
 
 @pytest.mark.parametrize(
     ("bits", "counter", "way"),
-    mostly_soak([(32, I32, 1), (16, I16, -1), (32, I32, -1), (16, I16, 1)], always=2),
+    mostly_soak([(16, I16, -1), (32, I32, 1), (32, I32, -1), (16, I16, 1)]),
 )
 def test_a_counter_that_runs_over_is_followed(rig, tmp_path, bits, counter, way):
     result, _ = run_on(rig, tmp_path, counts=turning(bits, way), bits=bits, counter=counter)
@@ -126,10 +131,12 @@ def test_a_counter_of_16_bits_that_says_32_is_named(rig, tmp_path):
 
 @pytest.mark.parametrize(
     ("output", "said"),
-    [
-        (lambda tick, codes: (codes[0] + 400 * (tick == 200), codes[1]), "to the motor"),
-        (lambda tick, codes: (codes[0], 9000 if tick == 200 else codes[1]), "9 V to the brake"),
-    ],
+    mostly_soak(
+        [
+            (lambda tick, codes: (codes[0] + 400 * (tick == 200), codes[1]), "to the motor"),
+            (lambda tick, codes: (codes[0], 9000 if tick == 200 else codes[1]), "9 V to the brake"),
+        ]
+    ),
 )
 def test_a_device_that_applies_another_voltage_is_stopped(rig, tmp_path, output, said):
     result, record = run_on(rig, tmp_path, output=output)
