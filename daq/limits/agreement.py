@@ -140,10 +140,16 @@ class CurrentAgreement(Limit):
             f"{self._name} is {current:.3g} A, and by {self._amplifier} the command of the last "
             f"{1e3 * _SETTLED:g} ms asks for {low:.3g} to {high:.3g} A"
         )
+        least = min(abs(low), abs(high)) if low * high > 0.0 else 0.0
+        if least > self._floor and current * low < 0.0 and abs(current) > _LACK * least:
+            return (
+                f"{comparison}. It has the other sign: turn 'sign' of sensors.{self._name} in the "
+                "rig's file, if it is the sensor's; else the wires of the amplifier's output"
+            )
         if self._excess > _EVIDENCE:
             return (
-                f"{comparison}. Check amplifier and current sensor: gain, sign, an output that "
-                "sticks"
+                f"{comparison}. Check amplifier and current sensor: gain, an output that sticks, "
+                "or the two channels swapped"
             )
         return (
             f"{comparison}. Check whether the amplifier is on, its supply, and that its output and "

@@ -154,8 +154,8 @@ CASES = {
         MOTOR, {"current_motor": step(60, 0.0, 0.5) + RAMP, "applied_voltage_motor": 0.0},
         60 + 39, "current_motor is 0.5 A, and by amplifiers.motor"),
     "a turned current": (
-        MOTOR, {"current_motor": -0.4 - RAMP, "applied_voltage_motor": 0.8}, 39, "gain, sign, "
-    ),
+        MOTOR, {"current_motor": -0.4 - RAMP, "applied_voltage_motor": 0.8}, 39,
+        "turn 'sign' of sensors.current_motor in the rig's file"),
     "a dead brake": (
         BRAKE, {"current_brake": step(200, 0.1, 0.0) + RAMP, "applied_voltage_brake": 0.2},
         200 + 39, "Check whether the amplifier is on"),

@@ -153,7 +153,7 @@ def test_no_first_limit_trips_by_an_honest_sensors_noise(tmp_path, run, seed):
         (
             "motor",
             r"current_motor is 0\.\d+ A, and by amplifiers.motor .* asks for -0\.\d+ to -0\.\d+ A"
-            r"\. .*sensor",
+            r"\. It has the other sign: turn 'sign' of sensors\.current_motor",
         ),
         # The brake's is too small for its limit, which noise would pass.
         ("brake", "set 'sign: 1' of sensors.current_brake"),
