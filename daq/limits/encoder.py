@@ -14,7 +14,7 @@ _IDLE, _SEEN = 0.02, 0.25  # of silent: motions that do not count; of the other'
 _FORGOTTEN = 20.0  # times the angle of disagreement that is turned until half of it is forgotten
 _AT_REST = 1.5  # counts by which a shaft at rest may flicker
 _AGAINST = 0.1  # of the largest speed, gained against the motor's current
-_GRAIN = 4.0  # counts in a sample by which an estimate of the speed may be off
+_GRAIN = 2.0  # counts in a sample by which an estimate of the speed may be off
 _LASTING = 0.02  # s in which the currents' torque fades behind them
 _BEYOND = 3  # samples in a row that contradict the currents
 
@@ -236,7 +236,10 @@ class Acceleration(Limit):
             self._current = max(abs(push.at_work) + push.needed, self._fading * self._current)
             change = self._per_ampere * self._current * (tick - self._tick) * self._dt
             self._tick = tick
-            low, high = self._low - change, self._high + change
+            low, high = self._low, self._high
+            # While they are contradicted they stay: a single wrong speed is within them again.
+            if self._beyond == 0:
+                low, high = low - change, high + change
             if low - self._margin <= omega <= high + self._margin:
                 low, high = max(low, omega - self._margin), min(high, omega + self._margin)
                 self._beyond = 0
