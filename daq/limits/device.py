@@ -1,42 +1,98 @@
 """Checks of the device itself: it applies what it is told to, within the rig's limits."""
 
+import math
+
 import numpy as np
 
-from daq.config.rig import CommandLimits
-from daq.hal import ANALOG_INPUTS, CHANNELS, Flag, FloatArray, IntArray, Samples
+from daq.config.rig import LimitSettings
+from daq.hal import ANALOG_INPUTS, CHANNELS, Flag, FloatArray, IntArray, Mode, Samples
 from daq.limits.base import Limit, Trip, first_row
 
-_EXCUSES = int(Flag.CLAMPED | Flag.HELD | Flag.INTERLOCK | Flag.UNDERFLOW)
+_ZEROED = int(Flag.INTERLOCK | Flag.UNDERFLOW)
 
 
 class Obedience(Limit):
-    """The voltages applied are those commanded, but where a flag says why they are not.
+    """The voltages applied are those commanded, but where a flag says what they are instead.
 
-    step [V]: by which an output may differ from its command. No flag excuses one beyond its range.
+    INTERLOCK and UNDERFLOW mean zero, HELD the voltage of the sample before (in closed loop, and
+    not for ever), CLAMPED one between zero and the command. No flag excuses one beyond its range.
+
+    step [V]: by which an output may differ from its command. sample_rate in Hz.
     """
 
-    def __init__(self, command: CommandLimits, step: float) -> None:
-        self._ranges = [getattr(command, channel) for channel in CHANNELS]
+    def __init__(self, limits: LimitSettings, step: float, mode: Mode, sample_rate: float) -> None:
+        self._ranges = [getattr(limits.command, channel) for channel in CHANNELS]
+        self._slewed = [getattr(limits.slew, channel) is not None for channel in CHANNELS]
         self._step = step * (1.0 + 1e-9)
+        self._holds = int(Flag.HELD) if mode is Mode.CLOSED_LOOP else 0
+        self._longest = max(1, math.ceil(limits.late * sample_rate))  # samples
+        self._late = limits.late
+        self._tick, self._held = -1, 0
+        self._applied = [0.0, 0.0]  # V, in the sample before
 
     def check(self, samples: Samples) -> Trip | None:
         """Compare every sample; what is no number is no command's."""
-        if len(samples) == 1 and self._obeys(samples):
-            return None
-        excused = (samples.flags & _EXCUSES) != 0
         trips = []
-        for channel, (low, high) in zip(CHANNELS, self._ranges, strict=True):
-            applied, command = _voltages(samples, channel)
-            as_told = excused | (np.abs(applied - command) <= self._step)
-            within = (low - self._step <= applied) & (applied <= high + self._step)
-            row = first_row(~(as_told & within))
-            if row is not None:
-                trips.append((row, _reason(channel, applied[row], command[row])))
+        if len(samples) > 1 or not self._obeys(samples):
+            trips = [trip for trip in map(self._compared, range(2), 2 * [samples]) if trip]
+        trips += self._count_held(samples)
+        self._tick = samples.tick.item(-1)
+        self._applied = [_voltages(samples, channel)[0].item(-1) for channel in CHANNELS]
         return min(trips, default=None)
 
     def _obeys(self, samples: Samples) -> bool:
-        pairs = (_voltages(samples, channel) for channel in CHANNELS)
-        return all(abs(applied.item() - cmd.item()) <= self._step for applied, cmd in pairs)
+        """Whether both voltages of a single sample are those commanded, and not to be zero."""
+        if samples.flags.item() & _ZEROED:
+            return False
+        for channel, (low, high) in zip(CHANNELS, self._ranges, strict=True):
+            applied, command = (volts.item() for volts in _voltages(samples, channel))
+            within = low - self._step <= applied <= high + self._step
+            if not (within and abs(applied - command) <= self._step):
+                return False
+        return True
+
+    def _compared(self, place: int, samples: Samples) -> Trip | None:
+        """The first sample in which the voltage of a channel is another."""
+        (low, high), step = self._ranges[place], self._step
+        applied, command = _voltages(samples, CHANNELS[place])
+        flags = samples.flags
+        before = np.concatenate([[self._applied[place]], applied[:-1]])
+        least, most = command.copy(), command.copy()
+        clamped = (flags & int(Flag.CLAMPED)) != 0
+        ends = [np.zeros(len(samples)), command, *([before] if self._slewed[place] else [])]
+        least[clamped] = np.minimum.reduce(ends)[clamped]
+        most[clamped] = np.maximum.reduce(ends)[clamped]
+        held = (flags & self._holds) != 0
+        # Behind lost samples nobody knows what is held.
+        known = np.diff(samples.tick, prepend=self._tick) == 1
+        least[held] = np.where(known, before, low)[held]
+        most[held] = np.where(known, before, high)[held]
+        zeroed = (flags & _ZEROED) != 0
+        least[zeroed] = most[zeroed] = 0.0
+        least, most = np.maximum(least, low) - step, np.minimum(most, high) + step
+        row = first_row(~((least <= applied) & (applied <= most)))
+        if row is None:
+            return None
+        return row, _reason(CHANNELS[place], applied[row], command[row], flags.item(row))
+
+    def _count_held(self, samples: Samples) -> list[Trip]:
+        """How long a device has held what is not zero; a trip where that is too long."""
+        if not self._holds or not (self._held or (samples.flags & self._holds).any()):
+            return []
+        pairs = zip(_voltages(samples, "motor")[0], _voltages(samples, "brake")[0], strict=True)
+        for row, (flags, volts) in enumerate(zip(samples.flags.tolist(), pairs, strict=True)):
+            held = flags & self._holds and any(abs(value) > self._step for value in volts)
+            self._held = self._held + 1 if held else 0
+            if self._held > self._longest:
+                return [
+                    (
+                        row,
+                        f"no command has reached the device for {self._late:g} s "
+                        "(limits.late), and it holds the one before; look at the line and at "
+                        "what else this computer does",
+                    )
+                ]
+        return []
 
 
 def _voltages(samples: Samples, channel: str) -> tuple[FloatArray, FloatArray]:
@@ -46,10 +102,12 @@ def _voltages(samples: Samples, channel: str) -> tuple[FloatArray, FloatArray]:
     return applied, command
 
 
-def _reason(channel: str, applied: float, command: float) -> str:
+def _reason(channel: str, applied: float, command: float, flags: int) -> str:
+    names = " | ".join(flag.name or "" for flag in Flag(flags & ~int(Flag.LOST | Flag.DOUBTFUL)))
+    why = f"and {names} does not say why" if names else "and no flag says why"
     return (
         f"the device applies another voltage than commanded: {applied:.4g} V to the {channel}, "
-        f"where {command:.4g} V was sent, and no flag says why; mend its firmware or its converter"
+        f"where {command:.4g} V was sent, {why}; mend its firmware or its converter"
     )
 
 

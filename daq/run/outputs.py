@@ -70,22 +70,24 @@ def read_back(rig: Rig, sample_rate: float, calibration: OffsetCalibration) -> O
 
 def _read(rig: Rig, sample_rate: float, calibration: OffsetCalibration) -> OutputState:
     """By the samples that follow SAFE in the run; where they fail, anew with commands of zero."""
-    problem = None
+    first = None
     if rig.sampling:
         try:
-            state = _watched(rig, iter(rig.receive, None), sample_rate, calibration)
+            first = _watched(rig, iter(rig.receive, None), sample_rate, calibration)
         except DeviceError as failure:
-            state = OutputState(False, str(failure))
-        if state.confirmed:
-            return state
-        problem = state.problem
+            first = OutputState(False, str(failure))
+        if first.confirmed:
+            return first
     try:
-        state = _sampled_anew(rig, sample_rate, calibration)
+        anew = _sampled_anew(rig, sample_rate, calibration)
     except Exception:
-        if problem is None:
+        if first is None:
             raise
-        return OutputState(False, problem)
-    return replace(state, problem=state.problem or problem)
+        return first
+    if first is None or not anew.confirmed:
+        return anew
+    # Where SAFE did not help, zero commands may have; but SAFE is what the device is left in.
+    return replace(anew, confirmed=not first.readings, problem=first.problem)
 
 
 def _sampled_anew(rig: Rig, sample_rate: float, calibration: OffsetCalibration) -> OutputState:

@@ -61,7 +61,9 @@ class Sampling:
         """Sample from tick 0 on, outputs at zero."""
         self.limits.begin(self.phase, self.sample_rate)
         self._pace = None if self.rig.info.virtual_time else Pace(self.sample_rate)
-        self._obedience = Obedience(self.rig.config.limits.command, self.rig.info.step_out)
+        self._obedience = Obedience(
+            self.rig.config.limits, self.rig.info.step_out, mode, self.sample_rate
+        )
         self.rig.start(self.sample_rate, mode, self.limits.window())
         self.timing = Timing()
 
