@@ -237,6 +237,12 @@ class Amplifiers(Section):
 
     motor: AmperesPerVolt | None = Field(None, gt=0.0, description="of the motor's amplifier")
     brake: AmperesPerVolt | None = Field(None, gt=0.0, description="of the brake's amplifier")
+    speed: RadiansPerSecond | None = Field(
+        None,
+        gt=0.0,
+        description="up to which the motor's amplifier gives at least half of the current asked "
+        "for, against the back EMF; left out: a tenth of limits.speed",
+    )
 
 
 class RigConfig(Section):

@@ -133,7 +133,9 @@ def _of_currents(config: RigConfig) -> list[Limit]:
     for channel in CHANNELS:
         gain = getattr(config.amplifiers, channel)
         if gain is not None:
-            slow = math.inf if channel == "brake" else _SLOW * (config.limits.speed or _FASTEST)
+            slow = config.amplifiers.speed or _SLOW * (config.limits.speed or _FASTEST)
+            if channel == "brake":  # without back EMF
+                slow = math.inf
             most = getattr(config.limits.current, channel)
             limits.append(CurrentAgreement(channel, gain, most, slow))
     return limits
