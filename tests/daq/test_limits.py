@@ -287,6 +287,8 @@ def test_an_amplifier_without_voltage_at_speed_is_none_that_is_dead():
     assert first_trip(limits_of(speed=150.0, **MOTOR), samples(**columns)) is None
     slow = columns | {"theta": 0.001 * np.arange(400)}
     assert first_trip(limits_of(speed=150.0, **MOTOR), samples(**slow)) is not None
+    strong = {"amplifiers": {"motor": 0.5, "speed": 95.0}}
+    assert first_trip(limits_of(speed=150.0, **strong), samples(**columns)) is not None
 
 
 @given(st.lists(st.integers(1, 399), max_size=12), st.sampled_from(sorted(CASES)))
