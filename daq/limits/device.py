@@ -56,6 +56,9 @@ class Obedience(Limit):
         (low, high), step = self._ranges[place], self._step
         applied, command = _voltages(samples, CHANNELS[place])
         flags = samples.flags
+        within = (low - step <= applied) & (applied <= high + step)
+        if not (flags & _ZEROED).any() and (within & (np.abs(applied - command) <= step)).all():
+            return None
         before = np.concatenate([[self._applied[place]], applied[:-1]])
         least, most = command.copy(), command.copy()
         clamped = (flags & int(Flag.CLAMPED)) != 0
