@@ -27,6 +27,7 @@ from tests.faults.device import Options, VirtualDevice
 from tests.faults.faults import FAULTS, VIRTUAL
 from tests.faults.plant import COUNTS, Plant, draw
 from tests.faults.serial_device import serving
+from tests.soak import mostly_soak
 
 DEVICE = Path(__file__).parent / "device.py"
 PAGE = Path(__file__).parents[2] / "docs" / "serial-protocol.md"
@@ -126,6 +127,31 @@ def test_without_a_fault_every_protocol_is_completed(tmp_path, name, seed):
     truth = json.loads((tmp_path / "truth.json").read_text())
     assert truth["onset"] is None and truth["output"] == [0.0, 0.0]
     assert 0.0 < truth["omega"] < 150.0 and 0.0 < truth["current_motor"] < 2.4
+
+
+STAIRCASES = [
+    ([30, 120], [0, 0.06]),  # fast but for its ends, and the brake comes on with the motor
+    ([120, -120], [0, 0.08]),
+    ([30, 60, 120], [0, 0.04, 0.12]),
+    ([-30, -120], [0.15, 0]),
+    ([70, 20], [0, 0.08]),
+    ([5], [0.02]),
+]
+
+
+@pytest.mark.parametrize("seed", [None, *(pytest.param(n, marks=pytest.mark.soak) for n in (1, 2))])
+@pytest.mark.parametrize(("velocities", "brake"), mostly_soak(STAIRCASES, always=2))
+def test_a_healthy_motor_at_speed_is_not_called_wrong(tmp_path, velocities, brake, seed):
+    """On the simulated rig, without a seed, as on drawn plants of this folder's."""
+    name = "constant_velocity.yaml"
+    changes = {"velocities": velocities, "brake_commands": brake, "measure": 0.2, "turns": 0.1}
+    path = changed("protocol", name, tmp_path, calibration=QUICK["calibration"], **changes)
+    rig_of = "free_shaft.yaml" if seed is None else str(rig_file(tmp_path, seed=seed))
+    session = open_session(str(path), rig_of)
+    result = run_experiment(
+        session.loaded.experiment, "e", session.rig, session.device, tmp_path / "runs"
+    )
+    assert currents.notes(result.folder / "log.csv", session.rig) == []
 
 
 SLOW = [pytest.param(name, marks=pytest.mark.soak) for name in ("multisine.yaml", *LOOPS)]
