@@ -14,7 +14,7 @@ _BLOCK = 5e-3  # s that are averaged
 _TAPS = 5  # blocks, the present among them, in which a current comes to follow its command
 _FEWEST = 50  # blocks
 _CERTAIN = 5.0  # standard errors
-_CLEARLY = 0.5  # of a current's power that one command must explain beyond what another does
+_CLEARLY = 0.1  # of what others leave unexplained of a current's power, for one to be right
 _OFF = 1.4  # ratio of gains, either way, that no data sheet's tolerance explains
 
 
@@ -56,11 +56,9 @@ def _judge(
 ) -> str | None:
     """A note on the gain of a channel, [A/V], by the data sheet and by the log; sign: in use."""
     channel = CHANNELS.index(name)
-    if not responses[channel]:
-        return None  # too few samples
-    gain, error, _ = responses[channel][channel]
-    if not error <= stated / _CERTAIN:
-        return None  # too small a command, or none
+    if not responses[channel] or not responses[channel][channel].error <= stated / _CERTAIN:
+        return None  # too few samples, too small a command, or none
+    gain = responses[channel][channel].gain
     contrast = (
         f"current_{name} follows its command with {gain:.3g} A/V, where amplifiers.{name} says "
         f"{stated:g}"
@@ -91,7 +89,7 @@ def _swapped(responses: list[list[_Response]]) -> bool:
         return False
     (motor, brake_in_motor), (motor_in_brake, brake) = responses
     crossed = max(brake_in_motor.explained, motor_in_brake.explained)
-    return crossed > max(motor.explained, brake.explained) + _CLEARLY
+    return 1.0 - crossed < _CLEARLY * (1.0 - max(motor.explained, brake.explained))
 
 
 def _responses(blocks: FloatArray, channel: int, usable: npt.NDArray[np.bool_]) -> list[_Response]:
@@ -113,8 +111,8 @@ def _response(current: FloatArray, command: FloatArray, rows: IntArray) -> _Resp
         return _Response(0.0, np.inf, 0.0)
     inverse = np.linalg.pinv(design.T @ design)
     taps = inverse @ design.T @ current
-    residual = np.square(current - design @ taps).mean()
-    explained = 1.0 - residual / np.square(current).mean()
+    residual, power = np.square(current - design @ taps).mean(), np.square(current).mean()
+    explained = 1.0 - residual / power if power > 0.0 else 0.0
     return _Response(taps.sum(), np.sqrt(residual * inverse.sum()), explained)
 
 

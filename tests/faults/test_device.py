@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import itertools
 import json
 import re
 from dataclasses import dataclass, fields, replace
@@ -17,11 +18,13 @@ from daq.errors import DeviceError
 from daq.hal import Mode, Phase, RawSamples
 from daq.lookup.shipped import find_file
 from daq.recording.session import open_session
+from daq.rig import Rig
 from daq.run.runner import run_experiment
+from daq.run.sampling import at_rest
 from daq.serial.backend import SerialDevice, SerialOptions
 from tests.daq.hal_contract import Bench, HalContract, guard_of
 from tests.daq.support import only_capture, record_of, rig, write_yaml
-from tests.faults import line
+from tests.faults import line, serial_device
 from tests.faults.board import Setting
 from tests.faults.device import Options, VirtualDevice
 from tests.faults.faults import FAULTS, VIRTUAL
@@ -165,6 +168,17 @@ def test_on_a_line_it_completes_them_at_the_pace_of_the_clock(tmp_path, name):
     assert result.returncode == 0, result.stderr
     assert record_of(only_capture(tmp_path))["device"].startswith("faulty board")
     assert truth.output == [0.0, 0.0]
+
+
+def test_no_more_zeros_are_sent_ahead_than_the_queue_holds(monkeypatch):
+    monkeypatch.setattr(serial_device, "QUEUE", 16)
+    with serving(Setting()) as server:
+        device = SerialDevice(SerialOptions(port=server.port, watchdog=1.0))
+        with Rig(device, RigConfig()) as opened:
+            opened.start(800.0, Mode.CLOSED_LOOP)
+            ticks = [samples.tick[-1] for samples in itertools.islice(at_rest(opened, 800.0), 40)]
+            opened.stop()
+    assert ticks[-1] >= 39
 
 
 BROKEN = {"device resets": 1, "device mute": 1, "device hangs": 1, "host paused 0.5 s": 1}
