@@ -25,6 +25,8 @@ VoltsPerSecond = Annotated[float, Unit("V/s")]
 AmperesPerVolt = Annotated[float, Unit("A/V")]
 SquaredCurrentTime = Annotated[float, Unit("A^2*s")]
 
+_SLOW = 0.1  # of the speed limit, up to which the motor's back EMF leaves its amplifier voltage
+_FASTEST = 100.0  # rad/s, taken where there is no such limit
 COUNT_GRAIN = 2.0  # counts by which a change of the encoder's may be larger than the shaft's
 
 
@@ -220,6 +222,11 @@ class LimitSettings(Section):
         0.2, gt=0.0, description="for which a device may hold a command because none arrives"
     )
     own: list[UserLimit] = Field(default_factory=list, description="limits from your own code")
+
+    @property
+    def slow(self) -> float:
+        """Speed [rad/s] up to which the motor's back EMF leaves its amplifier enough voltage."""
+        return _SLOW * (self.speed or _FASTEST)
 
     @field_validator("travel")
     @classmethod

@@ -1,54 +1,72 @@
 """Whether the currents of a run are what its commands and the amplifiers' gains make of them."""
 
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from daq.config.rig import RigConfig
-from daq.hal import CHANNELS, FloatArray
+from daq.hal import CHANNELS, FloatArray, IntArray
 
 _ROWS = 20_000  # of a log, from its beginning: enough to tell a gain
 _BLOCK = 5e-3  # s that are averaged
 _TAPS = 5  # blocks, the present among them, in which a current comes to follow its command
 _FEWEST = 50  # blocks
 _CERTAIN = 5.0  # standard errors
-_ALIKE = 0.95  # cosine of two commands of which nobody can say which a current follows
+_CLEARLY = 0.1  # of what others leave unexplained of a current's power, for one to be right
 _OFF = 1.4  # ratio of gains, either way, that no data sheet's tolerance explains
+
+
+class _Response(NamedTuple):
+    """A current by one command alone: gain, its standard error [A/V], part of its power explained.
+
+    The error is infinite without a command.
+    """
+
+    gain: float
+    error: float
+    explained: float
 
 
 def notes(log: Path, rig: RigConfig) -> list[str]:
     """Mistakes in sensors' signs, scales or wiring by a completed run's log, each with its cure.
 
-    Empty for amplifiers without a gain in the rig's file, and for channels without a command.
+    Empty for amplifiers without a gain in the rig's file, for channels without a command, and for
+    the motor of a run that was never slow: at speed the back EMF takes of what its amplifier gives.
     """
-    stated = [getattr(rig.amplifiers, name) for name in CHANNELS]
-    estimate = _gains(log) if any(gain is not None for gain in stated) else None
-    if estimate is None:
-        return []
-    signs = [rig.sensors.current_motor.sign, rig.sensors.current_brake.sign]
+    gains = [getattr(rig.amplifiers, name) for name in CHANNELS]
+    blocks = _averaged(log) if any(gain is not None for gain in gains) else np.empty((0, 6))
+    slow = np.abs(blocks[:, 4]) <= rig.limits.slow
+    responses = [
+        _responses(blocks, CHANNELS.index("motor"), slow),
+        _responses(blocks, CHANNELS.index("brake"), np.full(len(blocks), True)),
+    ]
+    swapped = _swapped(responses)
     judged = [
-        _judge(row, gain, signs[row], *estimate)
-        for row, gain in enumerate(stated)
+        _judge(name, gain, getattr(rig.sensors, f"current_{name}").sign, responses, swapped)
+        for name, gain in zip(CHANNELS, gains, strict=True)
         if gain is not None
     ]
     return [note for note in judged if note is not None]
 
 
-def _judge(row: int, stated: float, sign: int, gains: FloatArray, errors: FloatArray) -> str | None:
+def _judge(
+    name: str, stated: float, sign: int, responses: list[list[_Response]], swapped: bool
+) -> str | None:
     """A note on the gain of a channel, [A/V], by the data sheet and by the log; sign: in use."""
-    name, rival = CHANNELS[row], CHANNELS[1 - row]
-    gain, error = float(gains[row, row]), float(errors[row, row])
-    if not error <= stated / _CERTAIN:
-        return None  # too small a command, or none
+    channel = CHANNELS.index(name)
+    if not responses[channel] or not responses[channel][channel].error <= stated / _CERTAIN:
+        return None  # too few samples, too small a command, or none
+    gain = responses[channel][channel].gain
     contrast = (
         f"current_{name} follows its command with {gain:.3g} A/V, where amplifiers.{name} says "
         f"{stated:g}"
     )
-    crossed = max(abs(gains[1 - row, row]), abs(gains[row, 1 - row]))
-    if crossed > max(0.5 * stated, 2.0 * abs(gain)):
+    if swapped:
         return (
-            f"{contrast}, and what it should do the {rival}'s does; look whether the inputs "
-            "or the outputs of the two channels are swapped"
+            f"{contrast}, and what it should do the {CHANNELS[1 - channel]}'s does; look whether "
+            "the inputs or the outputs of the two channels are swapped"
         )
     if abs(gain) < 0.1 * stated:
         return f"{contrast}; look whether the amplifier is on, and its sensor connected"
@@ -62,34 +80,40 @@ def _judge(row: int, stated: float, sign: int, gains: FloatArray, errors: FloatA
     return None
 
 
-def _gains(log: Path) -> tuple[FloatArray, FloatArray] | None:
-    """Gains of both currents by both commands, (2, 2) [A/V], and standard errors; None: unknown.
+def _swapped(responses: list[list[_Response]]) -> bool:
+    """Whether a command shows in the other channel's current, and in neither current its own does.
 
-    By least squares of each current on the applied commands of the last 25 ms, in the slower half
-    of the run: at speed the back EMF may leave an amplifier short of voltage. There is no constant:
-    the calibration has made the current at zero command zero. The error is infinite for a channel
-    without a command.
+    Commands so alike that nobody can say which a current follows explain both currents equally.
     """
-    blocks = _averaged(log)
-    if len(blocks) < _FEWEST:
-        return None
-    speed = np.abs(blocks[_TAPS:, 4])
-    slow = np.flatnonzero(speed <= np.median(speed)) + _TAPS
-    current, command = blocks[slow, :2], blocks[:, 2:4]
-    norm = np.linalg.norm(command, axis=0)
-    commanded = np.flatnonzero(norm > 0.0)
-    if not len(commanded) or abs(command[:, 0] @ command[:, 1]) > _ALIKE * norm[0] * norm[1] > 0.0:
-        return None
-    design = np.hstack([command[np.ix_(slow - lag, commanded)] for lag in range(_TAPS)])
+    if not all(responses):
+        return False
+    (motor, brake_in_motor), (motor_in_brake, brake) = responses
+    crossed = max(brake_in_motor.explained, motor_in_brake.explained)
+    return 1.0 - crossed < _CLEARLY * (1.0 - max(motor.explained, brake.explained))
+
+
+def _responses(blocks: FloatArray, channel: int, usable: npt.NDArray[np.bool_]) -> list[_Response]:
+    """A channel's current by each command in turn, in the usable blocks; none for too few."""
+    rows = np.flatnonzero(usable[_TAPS:]) + _TAPS
+    if len(rows) < _FEWEST:
+        return []
+    commands = (blocks[:, len(CHANNELS) + other] for other in range(len(CHANNELS)))
+    return [_response(blocks[rows, channel], command, rows) for command in commands]
+
+
+def _response(current: FloatArray, command: FloatArray, rows: IntArray) -> _Response:
+    """By least squares of a current, (n,), on a command in the 25 ms before each of its ``rows``.
+
+    There is no constant: the calibration has made the current at zero command zero.
+    """
+    design = np.column_stack([command[rows - lag] for lag in range(_TAPS)])
+    if not design.any():
+        return _Response(0.0, np.inf, 0.0)
     inverse = np.linalg.pinv(design.T @ design)
-    solution = inverse @ design.T @ current
-    variance = ((current - design @ solution) ** 2).mean(axis=0)
-    gains, errors = np.zeros((2, 2)), np.full((2, 2), np.inf)
-    for place, channel in enumerate(commanded):
-        taps = slice(place, None, len(commanded))
-        gains[:, channel] = solution[taps].sum(axis=0)
-        errors[:, channel] = np.sqrt(variance * inverse[taps, taps].sum())
-    return gains, errors
+    taps = inverse @ design.T @ current
+    residual, power = np.square(current - design @ taps).mean(), np.square(current).mean()
+    explained = 1.0 - residual / power if power > 0.0 else 0.0
+    return _Response(taps.sum(), np.sqrt(residual * inverse.sum()), explained)
 
 
 def _averaged(log: Path) -> FloatArray:

@@ -129,6 +129,12 @@ def control(sampling: Sampling, log: LogWriter, dialogue: Dialogue, n_samples: i
     Raises DeviceError, RunError, InterlockError, and IncompleteError as ``play`` does.
     """
     rig, ahead = sampling.rig, dialogue.ahead
+    if ahead > rig.info.queue:
+        raise DeviceError(
+            f"{rig.info.name} holds {rig.info.queue} commands, and the experiment sends its "
+            f"{ahead} ticks ahead",
+            cure=f"set ahead to {rig.info.queue} or less in the experiment's file",
+        )
     sampling.begin(Mode.CLOSED_LOOP)
     rig.send(0, np.zeros((ahead, len(CHANNELS))))
     sent, done = ahead, 0

@@ -6,8 +6,9 @@ from operator import itemgetter
 
 import numpy as np
 
-from daq.errors import InterlockError
-from daq.hal import CHANNELS, Flag, FloatArray, Mode, Phase, Samples
+from daq.config.rig import CommandLimits
+from daq.errors import DeviceError, InterlockError
+from daq.hal import CHANNELS, DeviceInfo, Flag, FloatArray, Mode, Phase, Samples
 from daq.limits import Limits, Trip
 from daq.limits.device import Obedience
 from daq.logs.writer import LogWriter
@@ -17,6 +18,7 @@ from daq.run.pace import Pace
 from daq.run.timing import Timing
 
 _ZEROS_AHEAD = 0.05  # s of zero commands queued while waiting
+_COARSEST = 0.5  # of a command's range that a step of its output may be
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,8 @@ class Sampling:
         self.rig.announce(phase, turns)
 
     def begin(self, mode: Mode) -> None:
-        """Sample from tick 0 on, outputs at zero."""
+        """Sample from tick 0 on, outputs at zero. Raises DeviceError for outputs too coarse."""
+        _require_fine_outputs(self.rig.info, self.rig.config.limits.command)
         self.limits.begin(self.phase, self.sample_rate)
         self._pace = None if self.rig.info.virtual_time else Pace(self.sample_rate)
         self._obedience = Obedience(
@@ -144,10 +147,24 @@ class Sampling:
             self._watch = nobody
 
 
+def _require_fine_outputs(info: DeviceInfo, command: CommandLimits) -> None:
+    """Raise DeviceError where a step of the outputs is no small part of a command's range."""
+    for channel in CHANNELS:
+        low, high = getattr(command, channel)
+        if info.step_out > _COARSEST * (high - low):
+            raise DeviceError(
+                f"the outputs of {info.name} have steps of {info.step_out:.3g} V, and "
+                f"limits.command.{channel} of the rig's file is {low:g} to {high:g} V: a command "
+                "could not be told from none",
+                cure="mend what the device says of its outputs (the scale in WELCOME, "
+                "DeviceInfo.step_out of a backend), or give it finer ones",
+            )
+
+
 def at_rest(rig: Rig, sample_rate: float) -> Iterator[Samples]:
     """Blocks of samples at zero command without end, of a rig started in closed loop."""
     # Sent a little ahead: zeros are safe to hold, and the host need not hurry every tick.
-    ahead = max(1, round(_ZEROS_AHEAD * sample_rate))
+    ahead = min(max(1, round(_ZEROS_AHEAD * sample_rate)), rig.info.queue)
     rig.send(0, np.zeros((ahead, len(CHANNELS))))
     sent = ahead
     while True:

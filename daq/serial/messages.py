@@ -50,6 +50,8 @@ LEGAL = {
     "watchdog_default": (1, 60_000),
     "watchdog_longest": (10, 60_000),
 }
+_PLAUSIBLE = 0.1, 1000.0  # V, of all of a converter's codes
+_LEAST_CODES = 16  # of an input
 
 
 class Type(enum.IntEnum):
@@ -162,9 +164,27 @@ class Channel:
             return f"channel {self.name}: {fields}; legal are finite numbers and a scale beside 0"
         if not self.low < self.high:
             return f"channel {self.name}: its range is {self.low:g} to {self.high:g}"
+        if self.name in (*ANALOG_INPUTS, *CHANNELS) and (problem := self._implausible()):
+            return f"channel {self.name}: {problem}; mend its scale in the channel table"
+        if self.name == "encoder" and self.scale != 1.0:
+            return f"channel encoder: its scale is {self.scale:g}; legal is one count per code"
         if self.name in CHANNELS and (self.offset != 0.0 or not self.low <= 0.0 <= self.high):
             return f"channel {self.name}: its code 0 is not 0 V, which is what safe means"
         return None
+
+    def _implausible(self) -> str | None:
+        """What no converter's volts are: all of an output's codes, or an input's range."""
+        if self.name in CHANNELS:
+            volts, what = abs(self.scale) * 2.0**16, "the 65536 codes of the output span"
+        else:
+            volts, what = self.high - self.low, "the input's range is"
+            codes = volts / abs(self.scale)
+            if not _LEAST_CODES <= codes <= 2.0**32:
+                return f"a scale of {self.scale:g} V makes {codes:.3g} codes of its {volts:g} V"
+        least, most = _PLAUSIBLE
+        if least <= volts <= most:
+            return None
+        return f"{what} {volts:.3g} V; legal are {least:g} to {most:g} V"
 
     def pack(self) -> bytes:
         """The row's 56 bytes."""

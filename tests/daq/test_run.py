@@ -285,6 +285,39 @@ def test_currents_that_do_not_follow_their_commands_are_named_with_the_cure(
     assert (message in result.stderr) if message else not warned
 
 
+BOASTING = """
+import dataclasses
+
+from sim_rig.backend import SimulatedDevice
+
+
+class Boasting(SimulatedDevice):
+    def open(self):
+        return dataclasses.replace(super().open(), {change})
+"""
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("step_out=6.0", "limits.command.motor of the rig's file is -5 to 5 V"),
+        ("step_out=0.2", "limits.command.brake of the rig's file is 0 to 0.38 V"),
+        ("step_out=float('nan')", "steps of nan V"),
+        ("step_out=float('inf')", "steps of inf V"),
+        ("step_out=-0.01", "steps of -0.01 V"),
+        ("queue=0", "its queue holds 0 commands"),
+    ],
+)
+def test_what_no_device_can_be_is_refused_before_anything_is_energised(tmp_path, change, message):
+    (tmp_path / "boasting.py").write_text(BOASTING.format(change=change))
+    write_experiment(tmp_path / "e.yaml")
+    write_rig(tmp_path / "rig.yaml", backend="boasting.py:Boasting")
+    result = rig("run", "e.yaml", "--rig", "rig.yaml", cwd=tmp_path)
+    assert result.returncode == 1 and "Traceback" not in result.stderr
+    assert message in " ".join(result.stderr.split()), result.stderr
+    assert rows_in(only_capture(tmp_path)) == 0
+
+
 def test_an_interlock_that_only_the_device_saw_ends_the_run(tmp_path, plugin):
     result = run_with(tmp_path, plugin, "own interlock", at=150)
     assert result.returncode == 1

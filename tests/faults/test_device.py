@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import itertools
 import json
 import re
 from dataclasses import dataclass, fields, replace
@@ -17,16 +18,19 @@ from daq.errors import DeviceError
 from daq.hal import Mode, Phase, RawSamples
 from daq.lookup.shipped import find_file
 from daq.recording.session import open_session
+from daq.rig import Rig
 from daq.run.runner import run_experiment
+from daq.run.sampling import at_rest
 from daq.serial.backend import SerialDevice, SerialOptions
 from tests.daq.hal_contract import Bench, HalContract, guard_of
 from tests.daq.support import only_capture, record_of, rig, write_yaml
-from tests.faults import line
+from tests.faults import line, serial_device
 from tests.faults.board import Setting
 from tests.faults.device import Options, VirtualDevice
 from tests.faults.faults import FAULTS, VIRTUAL
 from tests.faults.plant import COUNTS, Plant, draw
 from tests.faults.serial_device import serving
+from tests.soak import mostly_soak
 
 DEVICE = Path(__file__).parent / "device.py"
 PAGE = Path(__file__).parents[2] / "docs" / "serial-protocol.md"
@@ -128,6 +132,31 @@ def test_without_a_fault_every_protocol_is_completed(tmp_path, name, seed):
     assert 0.0 < truth["omega"] < 150.0 and 0.0 < truth["current_motor"] < 2.4
 
 
+STAIRCASES = [
+    ([30, 120], [0, 0.06]),  # fast but for its ends, and the brake comes on with the motor
+    ([120, -120], [0, 0.08]),
+    ([30, 60, 120], [0, 0.04, 0.12]),
+    ([-30, -120], [0.15, 0]),
+    ([70, 20], [0, 0.08]),
+    ([5], [0.02]),
+]
+
+
+@pytest.mark.parametrize("seed", [None, *(pytest.param(n, marks=pytest.mark.soak) for n in (1, 2))])
+@pytest.mark.parametrize(("velocities", "brake"), mostly_soak(STAIRCASES, always=2))
+def test_a_healthy_motor_at_speed_is_not_called_wrong(tmp_path, velocities, brake, seed):
+    """On the simulated rig, without a seed, as on drawn plants of this folder's."""
+    name = "constant_velocity.yaml"
+    changes = {"velocities": velocities, "brake_commands": brake, "measure": 0.2, "turns": 0.1}
+    path = changed("protocol", name, tmp_path, calibration=QUICK["calibration"], **changes)
+    rig_of = "free_shaft.yaml" if seed is None else str(rig_file(tmp_path, seed=seed))
+    session = open_session(str(path), rig_of)
+    result = run_experiment(
+        session.loaded.experiment, "e", session.rig, session.device, tmp_path / "runs"
+    )
+    assert currents.notes(result.folder / "log.csv", session.rig) == []
+
+
 SLOW = [pytest.param(name, marks=pytest.mark.soak) for name in ("multisine.yaml", *LOOPS)]
 
 
@@ -139,6 +168,17 @@ def test_on_a_line_it_completes_them_at_the_pace_of_the_clock(tmp_path, name):
     assert result.returncode == 0, result.stderr
     assert record_of(only_capture(tmp_path))["device"].startswith("faulty board")
     assert truth.output == [0.0, 0.0]
+
+
+def test_no_more_zeros_are_sent_ahead_than_the_queue_holds(monkeypatch):
+    monkeypatch.setattr(serial_device, "QUEUE", 16)
+    with serving(Setting()) as server:
+        device = SerialDevice(SerialOptions(port=server.port, watchdog=1.0))
+        with Rig(device, RigConfig()) as opened:
+            opened.start(800.0, Mode.CLOSED_LOOP)
+            ticks = [samples.tick[-1] for samples in itertools.islice(at_rest(opened, 800.0), 40)]
+            opened.stop()
+    assert ticks[-1] >= 39
 
 
 BROKEN = {"device resets": 1, "device mute": 1, "device hangs": 1, "host paused 0.5 s": 1}

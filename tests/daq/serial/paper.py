@@ -40,7 +40,8 @@ def welcome(*, channels=None, **changes):
         "clock": CLOCK, "max_rate": 4000.0, "queue": 512, "max_payload": 256,
         "watchdog": 100, "longest": 1000,
     }  # fmt: skip
-    rows = {name: channel(name) for name in NAMES} | (channels or {})
+    rows = {name: channel(name) for name in NAMES}
+    rows |= {"encoder": channel("encoder", 1.0, unit=b"count")} | (channels or {})
     numbers = tuple((facts | changes).values())
     head = struct.pack("<4sHBBIfIHHHH", b"HRIG", 1, len(rows), 0, *numbers, 0)
     texts = struct.pack("<32s32s32s", b"paper", b"1", b"7")

@@ -63,6 +63,18 @@ LIES = {
     "a range of nothing": (welcome(channels={"torque": channel("torque", low=10.0)}), "torque"),
     "code 0 that is 1 V": (welcome(channels={"motor": channel("motor", offset=1.0)}), "code 0"),
     "no way to 0 V": (welcome(channels={"brake": channel("brake", low=0.1)}), "code 0"),
+    "an output without volts": (welcome(channels={"brake": channel("brake", 1e-308)}), "brake"),
+    "an output of 3 V steps": (
+        welcome(channels={"motor": channel("motor", 3.0)}),
+        "motor: the 6553",
+    ),
+    "an input of few codes": (welcome(channels={"torque": channel("torque", 5.0)}), "torque: a sc"),
+    "an input of endless codes": (welcome(channels={"torque": channel("torque", 1e-308)}), "torq"),
+    "an input of kilovolts": (
+        welcome(channels={"torque": channel("torque", 1.0, high=1e4)}),
+        "torque: the input's range is 1e\\+04 V; legal are 0.1 to 1000 V",
+    ),
+    "a counter of half counts": (welcome(channels={"encoder": channel("encoder", 0.5)}), "encoder"),
     "a channel of another name": (welcome(channels={"motor": channel("fan")}), "fan"),
 }
 
