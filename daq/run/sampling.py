@@ -147,13 +147,14 @@ class Sampling:
 def at_rest(rig: Rig, sample_rate: float) -> Iterator[Samples]:
     """Blocks of samples at zero command without end, of a rig started in closed loop."""
     # Sent a little ahead: zeros are safe to hold, and the host need not hurry every tick.
-    ahead = max(1, round(_ZEROS_AHEAD * sample_rate))
+    ahead = min(max(1, round(_ZEROS_AHEAD * sample_rate)), rig.info.queue)
     rig.send(0, np.zeros((ahead, len(CHANNELS))))
     sent = ahead
     while True:
         samples = rig.receive()
         yield samples
-        missing = int(samples.tick[-1]) + 1 + ahead - sent
+        # Behind a gap it takes several blocks: commands for ticks that are past take room too.
+        missing = min(samples.tick.item(-1) + 1 + ahead - sent, rig.room())
         if missing > 0:
             rig.send(sent, np.zeros((missing, len(CHANNELS))))
             sent += missing
