@@ -1,13 +1,16 @@
 """The contract with a backend, checked at every call: a breach is a DeviceError in words."""
 
+import functools
 import json
 import traceback
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import chain
 from operator import attrgetter
 from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
+import numpy.typing as npt
 from pydantic import TypeAdapter, ValidationError
 
 from daq.errors import ConfigError, DeviceError, RigError, RunError, Terminated, raised_in
@@ -29,7 +32,8 @@ _COLUMNS = {
     "applied": (_REAL, "fiu", (len(CHANNELS),)),
     "flags": (_WHOLE, "iub", ()),
 }
-_fields = attrgetter(*_COLUMNS)
+_FORM = ("__class__", "dtype", "shape")
+_form_of = attrgetter(*(f"{name}.{part}" for name in _COLUMNS for part in _FORM))
 
 
 def printable(text: str) -> str:
@@ -105,31 +109,35 @@ def checked_samples(raw: object, last_tick: int) -> RawSamples:
     """
     if not isinstance(raw, RawSamples):
         raise _breach(f"returned {type(raw).__name__} from receive(); RawSamples are expected")
-    n = np.size(raw.tick)
-    if not _fits(raw, n):
+    if not _fits(raw):
+        n = _array(raw.tick).size
         raw = RawSamples(**{name: _column(raw, name, n) for name in _COLUMNS})
     ticks = raw.tick
-    if not n:
+    if not ticks.size:
         raise _breach("returned a block without samples; receive() waits until there is one")
-    if ticks.item(0) <= last_tick or (n > 1 and not (ticks[1:] > ticks[:-1]).all()):
+    if ticks.item(0) <= last_tick or (ticks.size > 1 and not (ticks[1:] > ticks[:-1]).all()):
         raise _breach(_not_rising(ticks, last_tick))
     return raw
 
 
-def _fits(raw: RawSamples, n: int) -> bool:
+def _fits(raw: RawSamples) -> bool:
     """Whether all is as most backends have it; asked of every sample in closed loop."""
-    for column, (dtype, _, width) in zip(_fields(raw), _COLUMNS.values(), strict=True):
-        if type(column) is not np.ndarray or column.dtype != dtype or column.shape != (n, *width):
-            return False
-    return True
+    try:
+        return bool(_form_of(raw) == _form(raw.tick.size))
+    except AttributeError:  # something is no array
+        return False
+
+
+@functools.lru_cache
+def _form(n: int) -> tuple[Any, ...]:
+    """Class, type and shape of the fields of n rows, one behind the other."""
+    columns = [(np.ndarray, dtype, (n, *width)) for dtype, _, width in _COLUMNS.values()]
+    return tuple(chain.from_iterable(columns))
 
 
 def _column(raw: RawSamples, name: str, n: int) -> Any:
     dtype, kinds, width = _COLUMNS[name]
-    try:
-        column = np.asarray(getattr(raw, name))
-    except ValueError:  # rows of several lengths
-        column = np.asarray(None)
+    column = _array(getattr(raw, name))
     if column.dtype.kind not in kinds or column.shape != (n, *width):
         kind = "whole" if dtype == _WHOLE else "real"
         raise _breach(
@@ -137,6 +145,13 @@ def _column(raw: RawSamples, name: str, n: int) -> Any:
             f"{kind} numbers of shape {(n, *width)} are expected"
         )
     return column.astype(dtype)
+
+
+def _array(values: object) -> npt.NDArray[Any]:
+    try:
+        return np.asarray(values)
+    except ValueError:  # rows of several lengths
+        return np.asarray(None)
 
 
 def _not_rising(ticks: IntArray, last_tick: int) -> str:

@@ -225,8 +225,9 @@ class Rig:
         else:
             # A tick without a command counts as the one before.
             places = np.minimum(raw.tick, max(self._next_command - 1, 0)) % len(self._commands)
-        commands, flags = self._commands[places].copy(), raw.flags & DEVICE_FLAGS
+        commands, flags = self._commands[places].copy(), raw.flags.copy()
         if flags.any():
+            flags &= DEVICE_FLAGS
             self._count_saturated(raw)
         if self._clamped[places].any():
             flags |= self._clamped[places] * int(Flag.CLAMPED)

@@ -76,6 +76,7 @@ WRONG_BLOCKS = {
     "complex": (changed("analog", lambda volts: volts + 1j), "complex128; real numbers"),
     "text": (changed("analog", lambda volts: volts.astype(str)), "analog of .*; real numbers"),
     "ragged": (changed("applied", lambda volts: [[0.0, 0.0], [0.0]]), "applied of .* object"),
+    "ragged ticks": (changed("tick", lambda tick: [[0], [1, 2]]), "tick of .* object"),
     "flags of floats": (changed("flags", lambda flags: flags + 0.0), "flags of .*; whole numbers"),
     "no flags": (changed("flags", lambda flags: None), "flags of .* object; whole numbers"),
 }
