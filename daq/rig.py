@@ -135,7 +135,7 @@ class Rig:
 
     def room(self) -> int:
         """How many more commands the device can take now."""
-        return checked_room(call(self._device.room))
+        return min(checked_room(call(self._device.room)), self.info.queue)
 
     def receive(self) -> Samples:
         """Wait for samples; all that have arrived, in SI units, offsets removed."""

@@ -389,3 +389,9 @@ def test_a_device_with_little_room_is_never_sent_more(tmp_path):
     write_rig(tmp_path / "rig.yaml", backend="small.py:Small")
     result = rig("run", "e.yaml", "--rig", "rig.yaml", cwd=tmp_path)
     assert result.returncode == 0, result.stderr
+
+
+def test_a_backend_that_raises_what_a_signal_does_while_outputs_are_read_back_is_heard(tmp_path):
+    result, record = run_spy(tmp_path, "stop", "KeyboardInterrupt('no key')")
+    assert result.returncode == 1 and record["status"] in {"failed", "stopped"}
+    assert record["outputs"]["problem"] == "no key"
