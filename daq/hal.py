@@ -11,10 +11,11 @@ and interlocks around any device, so that those exist once.
 import enum
 import math
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Annotated, Any, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import Field, FiniteFloat
 
 from daq.errors import DeviceError
 
@@ -35,6 +36,10 @@ class Flag(enum.IntFlag):
     UNDERFLOW = 16  #: The preloaded waveform ran dry; the outputs are zero.
     SATURATED = 32  #: An analog input stood at the end of its converter's range.
     DOUBTFUL = 64  #: What was measured disagrees in a way that does not end a run; see run.json.
+
+
+DEVICE_FLAGS = int(Flag.CLAMPED | Flag.HELD | Flag.INTERLOCK | Flag.UNDERFLOW | Flag.SATURATED)
+"""What a device may set; the others are the host's."""
 
 
 class Mode(enum.Enum):
@@ -130,12 +135,12 @@ class DeviceInfo:
     device has.
     """
 
-    name: str
-    max_rate: float
-    queue: int
-    volts_in: tuple[float, float]
+    name: Annotated[str, Field(max_length=200)]
+    max_rate: Annotated[float, Field(gt=0.0)]
+    queue: Annotated[int, Field(ge=1, le=1_000_000)]
+    volts_in: tuple[FiniteFloat, FiniteFloat]
     virtual_time: bool = False
-    step_out: float = 0.01
+    step_out: Annotated[float, Field(ge=0.0, allow_inf_nan=False)] = 0.01
 
     def __post_init__(self) -> None:
         if self.queue < 1:

@@ -10,10 +10,12 @@ from typing import Any
 import numpy as np
 
 from daq.config.rig import COUNT_GRAIN, RigConfig
-from daq.errors import DeviceError
+from daq.contract import call, checked_info, checked_report, checked_room, checked_samples
+from daq.errors import DeviceError, RigError
 from daq.hal import (
     ANALOG_INPUTS,
     CHANNELS,
+    DEVICE_FLAGS,
     Device,
     DeviceInfo,
     Flag,
@@ -78,12 +80,12 @@ class Rig:
 
     def open(self) -> DeviceInfo:
         """Connect to the device, outputs at zero."""
-        self._info = self._device.open()
+        self._info = checked_info(call(self._device.open))
         return self._info
 
     def announce(self, phase: Phase, turns: float = 0.0) -> None:
         """Tell the device which phase of the run begins."""
-        self._device.announce(phase, turns)
+        call(self._device.announce, phase, turns)
 
     def start(
         self, sample_rate: float, mode: Mode, window: tuple[float, float] = (-math.inf, math.inf)
@@ -101,7 +103,7 @@ class Rig:
         # Twice what the device can hold ahead: as much may be on its way back.
         self._reset(sample_rate, 2 * self.info.queue)
         self._radians = self.config.sensors.encoder.count
-        self._device.start(sample_rate, mode, self._guard(window))
+        call(self._device.start, sample_rate, mode, self._guard(window))
         self.sampling = True
 
     def send(self, tick: int, commands: FloatArray) -> None:
@@ -124,7 +126,7 @@ class Rig:
         self._commands[places] = commands
         self._clamped[places] = changed.any(axis=1) if changed.any() else False
         self._next_command += len(commands)
-        self._device.send(tick, limited)
+        call(self._device.send, tick, limited)
 
     def take_offsets(self, means: Mapping[str, float]) -> None:
         """Make what the inputs read now, in SI units by name, their zero."""
@@ -133,32 +135,37 @@ class Rig:
 
     def room(self) -> int:
         """How many more commands the device can take now."""
-        return self._device.room()
+        return min(checked_room(call(self._device.room)), self.info.queue)
 
     def receive(self) -> Samples:
         """Wait for samples; all that have arrived, in SI units, offsets removed."""
-        return self._to_si(self._device.receive())
+        return self._to_si(checked_samples(call(self._device.receive), self._last_tick))
 
     def stop(self) -> None:
         """End sampling with zero outputs."""
         self.sampling = False
-        self._device.stop()
+        call(self._device.stop)
 
     def safe(self) -> None:
-        """Zero both outputs now; never raises."""
+        """Zero both outputs now; never raises but for signals."""
         # A backend's mistake here must not keep the rest of the way out from being gone.
         with contextlib.suppress(Exception):
-            self._device.safe()
+            call(self._device.safe)
 
     def report(self) -> dict[str, Any]:
-        """What the device has to say for the record of a run; nothing for most."""
-        return self._device.report() if isinstance(self._device, Reporting) else {}
+        """What the device has to say for the record of a run; nothing for most, or a warning."""
+        if not isinstance(self._device, Reporting):
+            return {}
+        try:
+            return checked_report(call(self._device.report))
+        except RigError as error:
+            return {"warnings": [str(error)]}
 
     def close(self) -> None:
         """Zero the outputs and disconnect."""
         self.safe()
         self.sampling = False
-        self._device.close()
+        call(self._device.close)
 
     def _largest_step(self) -> FloatArray | None:
         """Largest change of each command from tick to tick, (2,) [V]; None without a slew limit."""
@@ -220,6 +227,7 @@ class Rig:
             places = np.minimum(raw.tick, max(self._next_command - 1, 0)) % len(self._commands)
         commands, flags = self._commands[places].copy(), raw.flags.copy()
         if flags.any():
+            flags &= DEVICE_FLAGS
             self._count_saturated(raw)
         if self._clamped[places].any():
             flags |= self._clamped[places] * int(Flag.CLAMPED)

@@ -58,7 +58,7 @@ def read_back(rig: Rig, sample_rate: float, calibration: OffsetCalibration) -> O
     def work() -> None:
         try:
             states.append(_read(rig, sample_rate, calibration))
-        except Exception as error:  # a backend's mistakes among them
+        except BaseException as error:  # no signal is raised in a thread
             states.append(OutputState(False, str(error) or type(error).__name__))
 
     # A thread can be left behind where a backend hangs; a signal ends the waiting for it.
@@ -128,6 +128,7 @@ def _watched(
     return state
 
 
+@np.errstate(invalid="ignore", over="ignore")
 def _judged(
     blocks: Sequence[Samples], n_last: int, rig: Rig, calibration: OffsetCalibration
 ) -> OutputState:

@@ -7,8 +7,6 @@ from typing import Any
 
 from daq.config.rig import RigConfig
 from daq.errors import (
-    USER_CODE_ERRORS,
-    DeviceError,
     IncompleteError,
     InterlockError,
     RigError,
@@ -114,11 +112,11 @@ class _Run:
         except (RigError, KeyboardInterrupt, Terminated) as error:
             self._finish_early(error, log)
             raise
-        except USER_CODE_ERRORS as error:
-            phase = self.sampling.phase.value
-            failed = DeviceError(
-                f"the backend failed during {phase}: {type(error).__name__}: {error}. "
-                "Mend the backend, or report this to who maintains it"
+        except BaseException as error:
+            failed = RunError(
+                f"the program failed during {self.sampling.phase.value}: "
+                f"{type(error).__name__}: {error}",
+                cure="report this to who maintains it",
             )
             self._finish_early(failed, log)
             raise failed from error
@@ -144,17 +142,16 @@ class _Run:
             self._leave()
             # A device that failed may fail to close as well; why it failed is what counts.
             broken = (Exception, KeyboardInterrupt, Terminated)
-            for step in (self._read_back, rig.close):
+            for step in (self._read_back, rig.close, self._report):
                 with contextlib.suppress(*broken), self.signals.breakable():
                     step()
             raise
         self._leave()
         self.sampling.phase = Phase.CLOSE
-        with self.signals.breakable():
-            try:
-                self._read_back()
-            finally:
-                rig.close()
+        with self.signals.breakable(), contextlib.ExitStack() as last_steps:
+            last_steps.callback(self._report)
+            last_steps.callback(rig.close)
+            self._read_back()
         if self.outputs is not None and self.outputs.problem is not None:
             raise RunError(
                 "all was recorded, but the outputs did not become zero as they must: "
@@ -180,12 +177,15 @@ class _Run:
 
     def _leave(self) -> None:
         """Zero outputs, whatever came before; ordinary scheduling."""
-        self.sampling.rig.safe()
+        # Behind the shield it is the backend's own doing if one of these is raised.
+        with contextlib.suppress(KeyboardInterrupt, Terminated):
+            self.sampling.rig.safe()
         self.realtime.undo()
-        # A backend that failed may fail to report as well.
-        with contextlib.suppress(Exception):
-            if connection := self.sampling.rig.report():
-                self.capture.record["connection"] = connection
+
+    def _report(self) -> None:
+        """Record what the device has to say."""
+        if connection := self.sampling.rig.report():
+            self.capture.record["connection"] = connection
 
     def _read_back(self) -> None:
         """Record whether the outputs of a rig that was opened are zero."""
@@ -232,13 +232,20 @@ class _Run:
             return "stopped", f"stopped by {error} {where}"
         return _STATUS.get(type(error), "failed"), str(error)
 
-    def _give_up(self) -> None:
-        """The least record of a run whose clean-up hangs; in the middle of whatever it does."""
+    def _give_up(self) -> str:
+        """The least record of a run whose clean-up hangs, in the middle of whatever it does.
+
+        What is to be said of its outputs.
+        """
         record, phase = self.capture.record, self.sampling.phase.value
+        outputs = self.outputs or OutputState(False, "the clean-up hangs")
+        record["outputs"] = outputs.document
         if record["status"] == RUNNING:
             reason = f"stopped during {phase}; the clean-up hung and was ended by another signal"
             record.update(status="stopped", reason=reason, phase=phase)
-        self.capture.save()
+        with contextlib.suppress(RigError):
+            self.capture.save()
+        return outputs.text
 
     def _finish(self, status: str, reason: str | None) -> None:
         saturated = dict(zip(ANALOG_INPUTS, self.sampling.rig.saturated.tolist(), strict=True))

@@ -26,12 +26,13 @@ class SignalHandling:
     KeyboardInterrupt or ``Terminated``. From then on, and from ``shield`` on, nothing is raised, so
     that zeroing the outputs is never cut short, but in ``breakable``: a second Ctrl-C ends what
     hangs there. A process that still does not get on is ended by the next signal, behind a call of
-    ``last_act``, and the device's watchdog zeroes the outputs. What came behind the shield without
-    an effect is raised at the end. Signals that the process ignores, as under nohup, stay ignored.
+    ``last_act``, whose words are shown, and the device's watchdog zeroes the outputs. What came
+    behind the shield without an effect is raised at the end. Signals that the process ignores, as
+    under nohup, stay ignored.
     """
 
     def __init__(self) -> None:
-        self.last_act: Callable[[], None] = lambda: None
+        self.last_act: Callable[[], str] = str
         self._before: list[tuple[int, Any]] = []
         self._first = 0.0  # when the first signal came
         self._pending: BaseException | None = None
@@ -81,9 +82,10 @@ class SignalHandling:
             self._shielded, self._breakable = True, False
             raise error
         if self._first and now - self._first > _PATIENCE:
+            words = "the clean-up hangs; ended without it"
             with contextlib.suppress(Exception):
-                self.last_act()
-            os.write(2, b"rig: the clean-up hangs; ended without it\n")
+                words = f"{words}\nrig: {self.last_act()}"
+            os.write(2, f"rig: {words}\n".encode())
             os._exit(1)
         self._first = self._first or now
         self._pending = error

@@ -127,7 +127,9 @@ def test_a_clean_up_that_hangs_is_ended_with_a_record(tmp_path):
     write_rig(tmp_path / "rig.yaml", backend="hanging.py:Hanging")
     result = rig("run", "e.yaml", "--rig", "rig.yaml", cwd=tmp_path)
     assert result.returncode == 1 and "the clean-up hangs" in result.stderr
+    assert "switch off the amplifier: zero outputs are not confirmed" in result.stderr
     record = record_of(only_capture(tmp_path))
+    assert record["outputs"]["confirmed"] is False
     assert record["status"] == "stopped" and "clean-up hung" in record["reason"]
 
 

@@ -176,6 +176,7 @@ os.execv(sys.argv[1], sys.argv[1:])
 """
 
 PHASES = ("open", "calibration", "homing", "run", "safe", "close")
+METHODS = {"open": "open", "safe": "announce", "close": "close"}  # that act
 SIGNALS = {
     "SIGINT": "Ctrl-C", "SIGTERM": "SIGTERM", "SIGHUP": "SIGHUP",
     "SIGINT+SIGINT@safe": "Ctrl-C", "SIGINT+SIGINT@close": "Ctrl-C",
@@ -199,7 +200,9 @@ class Exit:
 def exits():
     for phase in PHASES:
         yield Exit(phase, "unplugged", "failed", "the device no longer answers")
-        yield Exit(phase, "bug", "failed", f"the backend failed during {phase}: ZeroDivisionError")
+        yield Exit(
+            phase, "bug", "failed", f"the backend failed in {METHODS.get(phase, 'receive')}()"
+        )
         for fault, name in SIGNALS.items():
             if not (phase == "close" and "@" in fault):
                 yield Exit(phase, fault, "stopped", f"stopped by {name} during {phase}")

@@ -202,7 +202,7 @@ def test_a_mistake_in_a_backend_leaves_zero_outputs_and_is_named(tmp_path, plugi
     assert result.returncode == 1
     record = record_of(only_capture(tmp_path))
     assert record["status"] == "failed"
-    assert "backend failed during run" in record["reason"]
+    assert "the backend failed in receive()" in record["reason"]
     assert "ZeroDivisionError: a mistake in the backend" in record["reason"]
     assert record["reason"] in result.stderr
     assert "Traceback" not in result.stderr
