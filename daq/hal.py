@@ -17,8 +17,6 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, FiniteFloat
 
-from daq.errors import DeviceError
-
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
@@ -131,8 +129,7 @@ class DeviceInfo:
 
     max_rate [Hz]; queue: commands it can hold ahead of time, one at least; volts_in: (low, high)
     of its analog inputs; virtual_time: whether its clock waits for the host. step_out [V]: by which
-    what an output applies may differ from its command. Raises DeviceError for numbers that no
-    device has.
+    what an output applies may differ from its command.
     """
 
     name: Annotated[str, Field(max_length=200)]
@@ -141,19 +138,6 @@ class DeviceInfo:
     volts_in: tuple[FiniteFloat, FiniteFloat]
     virtual_time: bool = False
     step_out: Annotated[float, Field(ge=0.0, allow_inf_nan=False)] = 0.01
-
-    def __post_init__(self) -> None:
-        if self.queue < 1:
-            raise DeviceError(
-                f"{self.name} says that its queue holds {self.queue} commands",
-                cure="let DeviceInfo.queue be how many it can hold ahead of time, 1 at least",
-            )
-        if not 0.0 <= self.step_out < math.inf:
-            raise DeviceError(
-                f"{self.name} says that its outputs have steps of {self.step_out:g} V",
-                cure="let DeviceInfo.step_out be by how many volts what an output applies may "
-                "differ from its command",
-            )
 
 
 @runtime_checkable
