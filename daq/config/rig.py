@@ -219,7 +219,7 @@ class LimitSettings(Section):
         0.01, ge=0.0, le=1.0, description="share of a run's samples that may be missing in its log"
     )
     late: Seconds = Field(
-        0.2, gt=0.0, description="for which a device may hold a command because none arrives"
+        0.5, gt=0.0, description="for which a device may hold a command because none arrives"
     )
     own: list[UserLimit] = Field(default_factory=list, description="limits from your own code")
 

@@ -67,9 +67,9 @@ class Obedience(Limit):
         most[clamped] = np.maximum.reduce(ends)[clamped]
         held = (flags & self._holds) != 0
         # Behind lost samples nobody knows what is held.
-        known = np.diff(samples.tick, prepend=self._tick) == 1
-        least[held] = np.where(known, before, low)[held]
-        most[held] = np.where(known, before, high)[held]
+        contiguous = np.diff(samples.tick, prepend=self._tick) == 1
+        least[held] = np.where(contiguous, before, low)[held]
+        most[held] = np.where(contiguous, before, high)[held]
         zeroed = (flags & _ZEROED) != 0
         least[zeroed] = most[zeroed] = 0.0
         least, most = np.maximum(least, low) - step, np.minimum(most, high) + step
