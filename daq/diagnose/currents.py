@@ -97,8 +97,8 @@ def _responses(blocks: FloatArray, channel: int, usable: npt.NDArray[np.bool_]) 
     rows = np.flatnonzero(usable[_TAPS:]) + _TAPS
     if len(rows) < _FEWEST:
         return []
-    commands = (blocks[:, len(CHANNELS) + other] for other in range(len(CHANNELS)))
-    return [_response(blocks[rows, channel], command, rows) for command in commands]
+    current, commands = blocks[rows, channel], blocks[:, len(CHANNELS) : 2 * len(CHANNELS)]
+    return [_response(current, command, rows) for command in commands.T]
 
 
 def _response(current: FloatArray, command: FloatArray, rows: IntArray) -> _Response:
