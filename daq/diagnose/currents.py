@@ -37,7 +37,7 @@ def notes(log: Path, rig: RigConfig) -> list[str]:
     """
     gains = [getattr(rig.amplifiers, name) for name in CHANNELS]
     blocks = _averaged(log) if any(gain is not None for gain in gains) else np.empty((0, 6))
-    slow = np.abs(blocks[:, 4]) <= rig.limits.slow
+    slow = np.abs(blocks[:, 4]) <= rig.slow
     responses = [
         _responses(blocks, CHANNELS.index("motor"), slow),
         _responses(blocks, CHANNELS.index("brake"), np.full(len(blocks), True)),
