@@ -223,11 +223,6 @@ class LimitSettings(Section):
     )
     own: list[UserLimit] = Field(default_factory=list, description="limits from your own code")
 
-    @property
-    def slow(self) -> float:
-        """Speed [rad/s] up to which the motor's back EMF leaves its amplifier enough voltage."""
-        return _SLOW * (self.speed or _FASTEST)
-
     @field_validator("travel")
     @classmethod
     def _includes_start(cls, travel: tuple[float, float] | None) -> tuple[float, float] | None:
@@ -268,6 +263,12 @@ class RigConfig(Section):
         description="real-time scheduling during a run: off, prefer (as far as it is granted), "
         "or require (no run without)",
     )
+
+    @property
+    def slow(self) -> float:
+        """Speed [rad/s] up to which the motor's amplifier gives nearly all of what is asked."""
+        speed = _SLOW * (self.limits.speed or _FASTEST)
+        return min(speed, self.amplifiers.speed or speed)
 
     @field_validator("realtime", mode="before")
     @classmethod

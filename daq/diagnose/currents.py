@@ -37,7 +37,7 @@ def notes(log: Path, rig: RigConfig) -> list[str]:
     """
     gains = [getattr(rig.amplifiers, name) for name in CHANNELS]
     blocks = _averaged(log) if any(gain is not None for gain in gains) else np.empty((0, 6))
-    slow = np.abs(blocks[:, 4]) <= rig.limits.slow
+    slow = np.abs(blocks[:, 4]) <= rig.slow
     responses = [
         _responses(blocks, CHANNELS.index("motor"), slow),
         _responses(blocks, CHANNELS.index("brake"), np.full(len(blocks), True)),
@@ -97,8 +97,8 @@ def _responses(blocks: FloatArray, channel: int, usable: npt.NDArray[np.bool_]) 
     rows = np.flatnonzero(usable[_TAPS:]) + _TAPS
     if len(rows) < _FEWEST:
         return []
-    commands = (blocks[:, len(CHANNELS) + other] for other in range(len(CHANNELS)))
-    return [_response(blocks[rows, channel], command, rows) for command in commands]
+    current, commands = blocks[rows, channel], blocks[:, len(CHANNELS) : 2 * len(CHANNELS)]
+    return [_response(current, command, rows) for command in commands.T]
 
 
 def _response(current: FloatArray, command: FloatArray, rows: IntArray) -> _Response:

@@ -302,10 +302,10 @@ class Boasting(SimulatedDevice):
     [
         ("step_out=6.0", "limits.command.motor of the rig's file is -5 to 5 V"),
         ("step_out=0.2", "limits.command.brake of the rig's file is 0 to 0.38 V"),
-        ("step_out=float('nan')", "steps of nan V"),
-        ("step_out=float('inf')", "steps of inf V"),
-        ("step_out=-0.01", "steps of -0.01 V"),
-        ("queue=0", "its queue holds 0 commands"),
+        ("step_out=float('nan')", "nan for DeviceInfo.step_out"),
+        ("step_out=float('inf')", "inf for DeviceInfo.step_out"),
+        ("step_out=-0.01", "-0.01 for DeviceInfo.step_out"),
+        ("queue=0", "0 for DeviceInfo.queue"),
     ],
 )
 def test_what_no_device_can_be_is_refused_before_anything_is_energised(tmp_path, change, message):
