@@ -23,9 +23,7 @@ from daq.limits.shaft import CountedSpeed, Travel, Winding
 
 __all__ = ["Doubt", "Limit", "Limits", "Trip"]
 
-_SLOW = 0.1  # of the speed limit, up to which the motor's back EMF leaves its amplifier voltage
 _LEAST = 0.1  # of the current's limit, that may be friction where no stall tells
-_FASTEST = 100.0  # rad/s, taken where there is no such limit
 
 
 @dataclass(frozen=True)
@@ -133,9 +131,8 @@ def _of_currents(config: RigConfig) -> list[Limit]:
     for channel in CHANNELS:
         gain = getattr(config.amplifiers, channel)
         if gain is not None:
-            slow = config.amplifiers.speed or _SLOW * (config.limits.speed or _FASTEST)
-            if channel == "brake":  # without back EMF
-                slow = math.inf
+            # The brake has no back EMF.
+            slow = math.inf if channel == "brake" else config.amplifiers.speed or config.slow
             most = getattr(config.limits.current, channel)
             limits.append(CurrentAgreement(channel, gain, most, slow))
     return limits
@@ -147,7 +144,7 @@ def _of_torque(config: RigConfig) -> list[Limit]:
     if constant is None:
         return []
     current = stall.motor if stall is not None else _LEAST * config.limits.current.motor
-    return [TorqueAgreement(constant, constant * current, config.limits.speed or _FASTEST)]
+    return [TorqueAgreement(constant, constant * current, config.slow)]
 
 
 class _UserCode(Limit):

@@ -8,7 +8,7 @@ import math
 from daq.hal import Phase, Samples
 from daq.limits.base import Limit, Trip
 
-_STEADY = 0.02  # of the largest speed, by which it may change while torques are compared
+_STEADY = 0.2  # of a slow speed, by which it may change while torques are compared
 _AVERAGED = 0.1  # s of which the torques are compared
 _WIDE = 0.4  # of the motor's torque by which the sensor may differ from it, beside the friction
 _SETTLED = 0.025  # s in which a current has come to follow its command
@@ -23,14 +23,14 @@ class TorqueAgreement(Limit):
     """The torque between motor and brake is the motor's, at a speed that does not change.
 
     constant: torque per ampere [N*m/A]. friction: torque [N*m] that the motor's own may take.
-    speed: the largest [rad/s].
+    slow: a slow speed [rad/s].
     """
 
     stops = False
 
-    def __init__(self, constant: float, friction: float, speed: float) -> None:
+    def __init__(self, constant: float, friction: float, slow: float) -> None:
         self._constant, self._friction = constant, friction
-        self._steady = _STEADY * speed
+        self._steady = _STEADY * slow
 
     def begin(self, phase: Phase, sample_rate: float) -> None:
         """Offsets are taken off from homing on, when a hand moves the shaft."""

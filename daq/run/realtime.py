@@ -14,7 +14,7 @@ from typing import Any
 from daq.config.rig import Realtime
 from daq.errors import ConfigError, RunError
 
-if sys.platform == "linux":
+with contextlib.suppress(ImportError):  # Windows has nothing of the kind
     import resource
 
 _PRIORITY = 40  # of 99: above all ordinary work, below the kernel's own interrupt threads at 50

@@ -46,7 +46,7 @@ RIGHT = {
     "the range's end": (CLOSED, 4.0 * SINE, np.clip(4.0 * SINE, -5.0, 5.0), CLAMPED),
     "held now and then": (
         CLOSED, SINE, HELD_SINE, np.where(np.arange(N) % 4 < 2, PLAIN, HELD)),
-    "held until one arrives": (CLOSED, at(160, 1.0, 2.0), 1.0, at(160, PLAIN, HELD)[:N]),
+    "held until one arrives": (CLOSED, at(160, 1.0, 2.0), 1.0, at(160, PLAIN, HELD)),
     "held at zero for ever": (CLOSED, at(40, 0.0, 2.0), 0.0, at(40, PLAIN, HELD)),
     "zeroed": (OPEN, SINE, at(99, SINE, 0.0), at(99, PLAIN, ZEROED[1])),
 }  # fmt: skip
@@ -60,8 +60,8 @@ WRONG = {
     "not zeroed by its guard": (CLOSED, 1.0, 1.0, at(99, PLAIN, ZEROED[0]), 99),
     "no number": (CLOSED, 1.0, at(7, 1.0, np.nan), at(7, PLAIN, HELD), 7),
     "no flag": (CLOSED, SINE, at(120, SINE, 0.0), PLAIN, 120),
-    # A fifth of a second is 160 samples.
-    "held too long": (CLOSED, at(100, 1.0, 2.0), 1.0, at(100, PLAIN, HELD), 260),
+    # A fourth of a second is 200 samples.
+    "held too long": (CLOSED, at(100, 1.0, 2.0), 1.0, at(100, PLAIN, HELD), 300),
 }  # fmt: skip
 
 
@@ -77,9 +77,9 @@ def test_what_its_flags_explain_is_obedience(name, size):
 @pytest.mark.parametrize("name", WRONG)
 def test_what_its_flags_do_not_explain_is_not(name, size):
     mode, command, applied, flags, tick = WRONG[name]
-    trip = first_trip(samples(command, applied, flags), size, mode)
+    trip = first_trip(samples(command, applied, flags), size, mode, late=0.25)
     assert trip is not None and trip[0] == tick
-    words = "no command has reached the device for 0.2 s" if "long" in name else "another voltage"
+    words = "no command has reached the device for 0.25 s" if "long" in name else "another voltage"
     assert words in trip[1]
 
 

@@ -146,11 +146,12 @@ def test_a_device_that_applies_another_voltage_is_stopped(rig, tmp_path, output,
     assert said in record["reason"] and rows_in(only_capture(tmp_path)) == 201
 
 
-def test_what_the_device_flags_is_no_disobedience_but_its_range_is_the_rigs(rig, tmp_path):
+def test_what_a_flag_does_not_mean_is_disobedience_all_the_same(rig, tmp_path):
     _, record = run_on(
-        rig, tmp_path, flags=lambda tick: 2, output=lambda tick, codes: (0, 1000 * (tick == 300))
+        rig, tmp_path, flags=lambda tick: 1, output=lambda tick, codes: (0, 1000 * (tick == 300))
     )
     assert "interlock in sample 300" in record["reason"] and "1 V to the brake" in record["reason"]
+    assert "CLAMPED does not say why" in record["reason"]
 
 
 def test_an_input_at_its_converters_end_is_named_with_the_cure(rig, tmp_path):
