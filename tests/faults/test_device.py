@@ -55,10 +55,7 @@ SLOW_LOOP = {
     "speed_filter": 30,
     "loop": {"proportional": 0.02, "integral": 0.3},
 }
-LEISURE = {
-    "constant_velocity.yaml": SLOW_LOOP | {"velocities": [20], "slope": 20},
-    "hysteresis_loop.yaml": SLOW_LOOP | {"brake_commands": [0.0], "amplitude": 2, "period": 1.5},
-}
+LEISURE = {"constant_velocity.yaml": SLOW_LOOP | {"velocities": [20], "slope": 20}}
 
 
 def changed(kind, name, folder, **changes):
@@ -137,12 +134,11 @@ STAIRCASES = [
     ([120, -120], [0, 0.08]),
     ([30, 60, 120], [0, 0.04, 0.12]),
     ([-30, -120], [0.15, 0]),
-    ([70, 20], [0, 0.08]),
     ([5], [0.02]),
 ]
 
 
-@pytest.mark.parametrize("seed", [None, *(pytest.param(n, marks=pytest.mark.soak) for n in (1, 2))])
+@pytest.mark.parametrize("seed", [None, pytest.param(1, marks=pytest.mark.soak)])
 @pytest.mark.parametrize(("velocities", "brake"), mostly_soak(STAIRCASES, always=2))
 def test_a_healthy_motor_at_speed_is_not_called_wrong(tmp_path, velocities, brake, seed):
     """On the simulated rig, without a seed, as on drawn plants of this folder's."""
@@ -157,10 +153,10 @@ def test_a_healthy_motor_at_speed_is_not_called_wrong(tmp_path, velocities, brak
     assert currents.notes(result.folder / "log.csv", session.rig) == []
 
 
-SLOW = [pytest.param(name, marks=pytest.mark.soak) for name in ("multisine.yaml", *LOOPS)]
+SLOW = pytest.param("constant_velocity.yaml", marks=pytest.mark.soak)
 
 
-@pytest.mark.parametrize("name", ["prbs.yaml", *SLOW])
+@pytest.mark.parametrize("name", ["prbs.yaml", SLOW])
 def test_on_a_line_it_completes_them_at_the_pace_of_the_clock(tmp_path, name):
     load = "free" if name == "constant_velocity.yaml" else "pulley"
     experiment = quick(name, tmp_path, **LEISURE.get(name, {}))
@@ -181,11 +177,11 @@ def test_no_more_zeros_are_sent_ahead_than_the_queue_holds(monkeypatch):
     assert ticks[-1] >= 39
 
 
-BROKEN = {"device resets": 1, "device mute": 1, "device hangs": 1, "host paused 0.5 s": 1}
+BROKEN = {"device hangs": 1, "host paused 0.5 s": 1}
 
 
 @pytest.mark.soak
-@pytest.mark.parametrize("fault", [*BROKEN, "samples lost", "frames damaged"])
+@pytest.mark.parametrize("fault", ["device hangs", "host paused 0.5 s", "frames damaged"])
 def test_a_line_or_a_device_that_fails_ends_in_words(tmp_path, fault):
     setting = Setting(load="pulley", fault=fault, at=0.2)
     result, truth = run_on_a_line(tmp_path, quick("prbs.yaml", tmp_path), setting, watchdog=0.3)

@@ -78,12 +78,6 @@ def test_the_numbered_commands_work_as_they_stand_on_the_emulator(tmp_path, run)
     assert_gentle(lab, evening(lab, run, **shorter))
 
 
-@pytest.mark.soak
-def test_the_numbered_commands_work_at_full_length(tmp_path, run):
-    lab = tmp_path / "lab"
-    assert_gentle(lab, evening(lab, run))
-
-
 def test_what_the_init_wrote_passes_the_check_on_any_port(tmp_path, run):
     run(["init", "--rig", "serial"], tmp_path)
     for name in ("still", "tenth"):
