@@ -132,7 +132,7 @@ def test_a_log_whose_rows_are_all_there_is_put_together_again(run, tmp_path, tru
     assert what in record_of(folder)["reason"] and what in load(folder).warning
 
 
-@pytest.mark.parametrize("act", mostly_soak(["truncate", "overwrite", "empty"], always=2))
+@pytest.mark.parametrize("act", mostly_soak(["truncate", "overwrite", "empty"]))
 def test_rows_that_nobody_has_are_named_and_all_others_kept(run, tmp_path, truth, act):
     result = record(run, tmp_path, act, block=55)
     assert result.returncode == 1 and "Traceback" not in result.stderr
@@ -166,6 +166,7 @@ def test_a_log_deleted_in_a_long_run_is_noticed_at_once(tmp_path):
     assert np.all(np.diff(load(folder).frame["tick"]) == 1)
 
 
+@pytest.mark.soak
 def test_what_is_left_by_kill_behind_a_deleted_log_is_no_whole_log(tmp_path):
     write_experiment(tmp_path / "e.yaml", duration=60)
     write_rig(tmp_path / "rig.yaml", options={"time": "real"})

@@ -176,7 +176,8 @@ def children(pid):
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="no /proc")
-@pytest.mark.parametrize("number", mostly_soak([signal.SIGKILL, signal.SIGTERM]))
+@pytest.mark.soak
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
 def test_workers_end_with_the_program_that_started_them(data, number):
     words = ("campaign", "log.csv", "--model", "model.py:lag", "--config", "id.yaml")
     process = start_rig(*words, "--seeds", "0:4", "--jobs", 2, cwd=data)

@@ -139,7 +139,7 @@ STAIRCASES = [
 
 
 @pytest.mark.parametrize("seed", [None, pytest.param(1, marks=pytest.mark.soak)])
-@pytest.mark.parametrize(("velocities", "brake"), mostly_soak(STAIRCASES, always=2))
+@pytest.mark.parametrize(("velocities", "brake"), mostly_soak(STAIRCASES))
 def test_a_healthy_motor_at_speed_is_not_called_wrong(tmp_path, velocities, brake, seed):
     """On the simulated rig, without a seed, as on drawn plants of this folder's."""
     name = "constant_velocity.yaml"

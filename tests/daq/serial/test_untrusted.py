@@ -55,7 +55,7 @@ def test_a_timer_that_divides_wrongly_is_refused_before_the_rig_moves(rig, tmp_p
 
 @pytest.mark.parametrize(
     ("timer", "seconds"),
-    [(1.1, 2), (0.95, 3), *(pytest.param(t, 4, marks=pytest.mark.soak) for t in (0.9, 0.97))],
+    mostly_soak([(1.1, 2), (0.95, 3), (0.9, 4), (0.97, 4)]),
 )
 def test_samples_that_come_at_another_rate_are_refused_whatever_the_device_says(
     rig, tmp_path, timer, seconds
