@@ -361,6 +361,8 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2, help="processes")
     parser.add_argument("--rows", action="store_true", help="every trial as well")
     options = parser.parse_args()
+    if options.line and not options.each:
+        parser.error("--line is for --each; drawn at random, the faults take hours in real time")
     if options.alarms is not None:
         outcomes = perform_all(alarms(options.alarms, options.seed), options.workers)
         report(_alarm_figures(outcomes, options.seed), options.json, show)

@@ -32,13 +32,12 @@ class Obedience(Limit):
 
     def check(self, samples: Samples) -> Trip | None:
         """Compare every sample; what is no number is no command's."""
-        trips = []
+        trips = [self._held_too_long(samples)]
         if len(samples) > 1 or not self._obeys(samples):
-            trips = [trip for trip in map(self._compared, range(2), 2 * [samples]) if trip]
-        trips += self._count_held(samples)
+            trips += [self._compared(place, samples) for place in range(len(CHANNELS))]
         self._tick = samples.tick.item(-1)
         self._applied = [_voltages(samples, channel)[0].item(-1) for channel in CHANNELS]
-        return min(trips, default=None)
+        return min(filter(None, trips), default=None)
 
     def _obeys(self, samples: Samples) -> bool:
         """Whether both voltages of a single sample are those commanded, and not to be zero."""
@@ -78,24 +77,20 @@ class Obedience(Limit):
             return None
         return row, _reason(CHANNELS[place], applied[row], command[row], flags.item(row))
 
-    def _count_held(self, samples: Samples) -> list[Trip]:
-        """How long a device has held what is not zero; a trip where that is too long."""
+    def _held_too_long(self, samples: Samples) -> Trip | None:
+        """Count the samples in which the device has held what is not zero."""
         if not self._holds or not (self._held or (samples.flags & self._holds).any()):
-            return []
+            return None
         pairs = zip(_voltages(samples, "motor")[0], _voltages(samples, "brake")[0], strict=True)
         for row, (flags, volts) in enumerate(zip(samples.flags.tolist(), pairs, strict=True)):
             held = flags & self._holds and any(abs(value) > self._step for value in volts)
             self._held = self._held + 1 if held else 0
             if self._held > self._longest:
-                return [
-                    (
-                        row,
-                        f"no command has reached the device for {self._late:g} s "
-                        "(limits.late), and it holds the one before; look at the line and at "
-                        "what else this computer does",
-                    )
-                ]
-        return []
+                return row, (
+                    f"no command has reached the device for {self._late:g} s (limits.late), and it "
+                    "holds the one before; look at the line and at what else this computer does"
+                )
+        return None
 
 
 def _voltages(samples: Samples, channel: str) -> tuple[FloatArray, FloatArray]:

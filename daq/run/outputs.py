@@ -3,7 +3,8 @@
 import contextlib
 import math
 import threading
-from collections.abc import Iterator, Sequence
+from collections import deque
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -19,6 +20,7 @@ from daq.run.sampling import at_rest
 _WINDOW = 0.05  # s at zero command, of whose second half the outputs are judged
 _LONGEST = 0.5  # s that a coil's current may take to decay
 _DEADLINE = 5.0  # s for all of it: a device that hangs must not hold up the end of a run
+_READ = [f"{what}_{channel}" for what in ("applied_voltage", "current") for channel in CHANNELS]
 _SIGMAS = 4.0  # of a mean current's noise
 
 
@@ -116,7 +118,7 @@ def _watched(
 ) -> OutputState:
     """The state by samples that arrive until the currents have decayed, or should have."""
     least, most = (max(2, math.ceil(span * sample_rate)) for span in (_WINDOW, _LONGEST))
-    blocks: list[Samples] = []
+    blocks: deque[Samples] = deque(maxlen=least // 2)  # enough, for none is without samples
     n_samples = 0
     state = INTERRUPTED
     while not state.confirmed and n_samples < most:
@@ -130,12 +132,12 @@ def _watched(
 
 @np.errstate(invalid="ignore", over="ignore")
 def _judged(
-    blocks: Sequence[Samples], n_last: int, rig: Rig, calibration: OffsetCalibration
+    blocks: Collection[Samples], n_last: int, rig: Rig, calibration: OffsetCalibration
 ) -> OutputState:
     """The state by the last samples: voltages of zero, and currents that have decayed."""
     columns = {
         name: np.concatenate([getattr(block, name) for block in blocks])[-n_last:]
-        for name in vars(blocks[0])
+        for name in (*_READ, "omega")
     }
     readings, problems = {}, []
     for channel in CHANNELS:

@@ -96,6 +96,18 @@ def test_every_sample_is_answered_so_many_ticks_later(run, tmp_path, ahead):
     assert not log["flags"].any()
 
 
+def test_no_answer_is_planned_further_ahead_than_the_device_can_hold(run, tmp_path):
+    (tmp_path / "small.py").write_text(
+        "import dataclasses\nfrom sim_rig.backend import SimulatedDevice\n\n\n"
+        "class Small(SimulatedDevice):\n    def open(self):\n"
+        "        return dataclasses.replace(super().open(), queue=2)\n"
+    )
+    write_rig(tmp_path / "rig.yaml", backend="small.py:Small")
+    result = run(ahead=3)
+    assert result.returncode == 1 and "set ahead to 2 or less" in " ".join(result.stderr.split())
+    assert len(log_of(tmp_path)) == 0
+
+
 def test_the_plan_bounds_a_controller_that_does_not_end(run, tmp_path):
     assert run(ends_at=10_000).returncode == 0
     assert len(log_of(tmp_path)) == 200
