@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
-from collections.abc import Mapping
-from typing import Any
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar, TypeVarTuple
 
 import numpy as np
 
@@ -29,14 +29,18 @@ from daq.hal import (
     Samples,
 )
 
+_Arguments = TypeVarTuple("_Arguments")
+_Result = TypeVar("_Result")
+
 
 class Rig:
     """A rig to command and sample in SI units.
 
     offsets: volts that each analog input reads at zero, (3,) in ``ANALOG_INPUTS`` order.
     saturated: samples in which each stood at the end of its converter, (3,). sampling: between
-    ``start`` and ``stop``, after ``safe`` as well. Use as a context manager: leaving it, by
-    whatever way, zeroes the outputs and closes the device.
+    ``start`` and ``stop``, after ``safe`` as well. call: the method of an open device that has not
+    returned yet, and since when [s] by ``time.monotonic``. Use as a context manager: leaving it,
+    by whatever way, zeroes the outputs and closes the device.
     """
 
     def __init__(self, device: Device, config: RigConfig) -> None:
@@ -46,6 +50,8 @@ class Rig:
         inputs = [getattr(config.sensors, name) for name in ANALOG_INPUTS]
         self._scale = np.array([item.sign * item.scale for item in inputs])
         self.sampling = False
+        self.call: tuple[str, float] | None = None
+        self._unsafe = ""  # why the device could not be told to zero its outputs
         self._device = device
         self._info: DeviceInfo | None = None
         self._radians = 0.0  # per count
@@ -103,7 +109,7 @@ class Rig:
         # Twice what the device can hold ahead: as much may be on its way back.
         self._reset(sample_rate, 2 * self.info.queue)
         self._radians = self.config.sensors.encoder.count
-        call(self._device.start, sample_rate, mode, self._guard(window))
+        self._timed(self._device.start, sample_rate, mode, self._guard(window))
         self.sampling = True
 
     def send(self, tick: int, commands: FloatArray) -> None:
@@ -126,7 +132,7 @@ class Rig:
         self._commands[places] = commands
         self._clamped[places] = changed.any(axis=1) if changed.any() else False
         self._next_command += len(commands)
-        call(self._device.send, tick, limited)
+        self._timed(self._device.send, tick, limited)
 
     def take_offsets(self, means: Mapping[str, float]) -> None:
         """Make what the inputs read now, in SI units by name, their zero."""
@@ -135,37 +141,50 @@ class Rig:
 
     def room(self) -> int:
         """How many more commands the device can take now."""
-        return min(checked_room(call(self._device.room)), self.info.queue)
+        return min(checked_room(self._timed(self._device.room)), self.info.queue)
 
     def receive(self) -> Samples:
         """Wait for samples; all that have arrived, in SI units, offsets removed."""
-        return self._to_si(checked_samples(call(self._device.receive), self._last_tick))
+        return self._to_si(checked_samples(self._timed(self._device.receive), self._last_tick))
 
     def stop(self) -> None:
         """End sampling with zero outputs."""
         self.sampling = False
-        call(self._device.stop)
+        self._timed(self._device.stop)
 
     def safe(self) -> None:
-        """Zero both outputs now; never raises but for signals."""
-        # A backend's mistake here must not keep the rest of the way out from being gone.
-        with contextlib.suppress(Exception):
-            call(self._device.safe)
+        """Zero both outputs now; never raises but for signals. ``report`` says that it failed."""
+        try:
+            self._timed(self._device.safe)
+        except Exception as error:
+            # A backend's mistake here must not keep the rest of the way out from being gone.
+            self._unsafe = self._unsafe or str(error)
 
     def report(self) -> dict[str, Any]:
         """What the device has to say for the record of a run; nothing for most, or a warning."""
-        if not isinstance(self._device, Reporting):
-            return {}
+        report: dict[str, Any] = {}
         try:
-            return checked_report(call(self._device.report))
+            if isinstance(self._device, Reporting):
+                report = checked_report(call(self._device.report))
         except RigError as error:
-            return {"warnings": [str(error)]}
+            report = {"warnings": [str(error)]}
+        if self._unsafe:
+            report["warnings"] = [*report.get("warnings", []), self._unsafe]
+        return report
 
     def close(self) -> None:
         """Zero the outputs and disconnect."""
         self.safe()
         self.sampling = False
         call(self._device.close)
+
+    def _timed(self, method: Callable[[*_Arguments], _Result], *args: *_Arguments) -> _Result:
+        """What a method of the open device returns; ``call`` says that it is being waited for."""
+        self.call = getattr(method, "__name__", "a method"), time.monotonic()
+        try:
+            return call(method, *args)
+        finally:
+            self.call = None
 
     def _largest_step(self) -> FloatArray | None:
         """Largest change of each command from tick to tick, (2,) [V]; None without a slew limit."""

@@ -20,6 +20,7 @@ from daq.limits.device import saturation_warnings
 from daq.logs.capture import COMPLETED, RUNNING, Capture
 from daq.logs.writer import LogWriter
 from daq.rig import Rig
+from daq.run.hang import HangGuard
 from daq.run.outputs import INTERRUPTED, OutputState, read_back
 from daq.run.phases import calibrate, control, home, play
 from daq.run.plan import plan
@@ -133,20 +134,22 @@ class _Run:
     def _all_phases(self, log: LogWriter) -> None:
         rig = self.sampling.rig
         try:
-            try:
-                self._phases_under_power(log)
-            finally:
-                # A signal between here and the shield raises: the outer try answers that.
-                self.signals.shield()
+            with HangGuard(rig, self.signals, self.experiment.sample_rate):
+                try:
+                    try:
+                        self._phases_under_power(log)
+                    finally:
+                        # A signal between here and the shield raises: the outer try answers that.
+                        self.signals.shield()
+                finally:
+                    self._leave()
         except BaseException:
-            self._leave()
             # A device that failed may fail to close as well; why it failed is what counts.
             broken = (Exception, KeyboardInterrupt, Terminated)
             for step in (self._read_back, rig.close, self._report):
                 with contextlib.suppress(*broken), self.signals.breakable():
                     step()
             raise
-        self._leave()
         self.sampling.phase = Phase.CLOSE
         with self.signals.breakable(), contextlib.ExitStack() as last_steps:
             last_steps.callback(self._report)
@@ -232,17 +235,16 @@ class _Run:
             return "stopped", f"stopped by {error} {where}"
         return _STATUS.get(type(error), "failed"), str(error)
 
-    def _give_up(self) -> str:
-        """The least record of a run whose clean-up hangs, in the middle of whatever it does.
+    def _give_up(self, status: str, reason: str) -> str:
+        """The least record of a run that hangs, in the middle of whatever it does.
 
         What is to be said of its outputs.
         """
         record, phase = self.capture.record, self.sampling.phase.value
-        outputs = self.outputs or OutputState(False, "the clean-up hangs")
+        outputs = self.outputs or OutputState(False, reason)
         record["outputs"] = outputs.document
         if record["status"] == RUNNING:
-            reason = f"stopped during {phase}; the clean-up hung and was ended by another signal"
-            record.update(status="stopped", reason=reason, phase=phase)
+            record.update(status=status, reason=f"{reason}, during {phase}", phase=phase)
         with contextlib.suppress(RigError):
             self.capture.save()
         return outputs.text

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import _thread
 import contextlib
 import os
 import signal
@@ -9,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from types import FrameType
-from typing import Any
+from typing import Any, NoReturn
 
 from daq.errors import Terminated
 
@@ -28,14 +29,16 @@ class SignalHandling:
     hangs there. A process that still does not get on is ended by the next signal, behind a call of
     ``last_act``, whose words are shown, and the device's watchdog zeroes the outputs. What came
     behind the shield without an effect is raised at the end. Signals that the process ignores, as
-    under nohup, stay ignored.
+    under nohup, stay ignored. ``interrupt`` raises an error of another thread's as if a signal had
+    brought it.
     """
 
     def __init__(self) -> None:
-        self.last_act: Callable[[], str] = str
+        self.last_act: Callable[[str, str], str] = lambda status, reason: ""
         self._before: list[tuple[int, Any]] = []
         self._first = 0.0  # when the first signal came
         self._pending: BaseException | None = None
+        self._interruption: BaseException | None = None
         self._shielded, self._breakable = True, False
 
     def __enter__(self) -> SignalHandling:
@@ -70,7 +73,21 @@ class SignalHandling:
         finally:
             self._breakable = False
 
+    def interrupt(self, error: BaseException) -> None:
+        """From another thread: raise an error in the main one, out of the call it waits in."""
+        if signal.SIGTERM not in dict(self._before):
+            return  # not in the main thread, or told to ignore it: it would end nothing, or all
+        self._interruption = error
+        if hasattr(signal, "pthread_kill"):
+            signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGTERM)
+        else:  # Windows: heard once the call is back in Python
+            _thread.interrupt_main(signal.SIGTERM)
+
     def _handle(self, number: int, frame: FrameType | None) -> None:
+        interruption, self._interruption = self._interruption, None
+        if interruption is not None:
+            self.end_by(interruption)
+            return
         name = signal.Signals(number).name
         self.end_by(KeyboardInterrupt() if number == signal.SIGINT else Terminated(name))
 
@@ -82,10 +99,14 @@ class SignalHandling:
             self._shielded, self._breakable = True, False
             raise error
         if self._first and now - self._first > _PATIENCE:
-            words = "the clean-up hangs; ended without it"
-            with contextlib.suppress(Exception):
-                words = f"{words}\nrig: {self.last_act()}"
-            os.write(2, f"rig: {words}\n".encode())
-            os._exit(1)
+            self.give_up("stopped", "the clean-up hung and was ended by another signal")
         self._first = self._first or now
         self._pending = error
+
+    def give_up(self, status: str, reason: str) -> NoReturn:
+        """End the process, from any thread, behind a call of ``last_act`` with the same."""
+        words = reason
+        with contextlib.suppress(Exception):
+            words = f"{reason}\nrig: {self.last_act(status, reason)}"
+        os.write(2, f"rig: {words}\n".encode())
+        os._exit(1)

@@ -55,6 +55,7 @@ class SerialDevice:
         self._connection: Connection | None = None
         self._facts: dict[str, Any] = {}  # of the device, for the record of a run
         self._warnings: list[str] = []
+        self._unsafe = ""  # why the device has not confirmed zero outputs
         self._record: dict[str, Any] = {}  # of the line
         self._run = 0
         self._armed = self._going = False
@@ -138,9 +139,11 @@ class SerialDevice:
     def safe(self) -> None:
         """Zero both outputs now. Where the device cannot be reached, its watchdog does it."""
         if self._connection is not None:
-            # Said even to a device that seems lost: it may still hear.
-            with contextlib.suppress(DeviceError):
+            try:
+                # Said even to a device that seems lost: it may still hear.
                 self._connection.ask(Type.SAFE, give_up=_SAFE_PATIENCE)
+            except DeviceError as error:
+                self._unsafe = self._unsafe or f"SAFE was not acknowledged: {error}"
 
     def close(self) -> None:
         """Zero the outputs and disconnect."""
@@ -160,7 +163,7 @@ class SerialDevice:
         if self._connection is not None and self._armed:
             self._record = self._connection.describe()
         line = self._record.get("line", {})
-        warnings = list(self._warnings)
+        warnings = [*self._warnings, *filter(None, [self._unsafe])]
         if line.get("lost_samples"):
             warnings.append(
                 f"{line['lost_samples']} samples were lost ({line['device_overflow_samples']} of "

@@ -126,11 +126,71 @@ def test_a_clean_up_that_hangs_is_ended_with_a_record(tmp_path):
     write_experiment(tmp_path / "e.yaml")
     write_rig(tmp_path / "rig.yaml", backend="hanging.py:Hanging")
     result = rig("run", "e.yaml", "--rig", "rig.yaml", cwd=tmp_path)
-    assert result.returncode == 1 and "the clean-up hangs" in result.stderr
+    assert result.returncode == 1 and "the clean-up hung" in result.stderr
     assert "switch off the amplifier: zero outputs are not confirmed" in result.stderr
     record = record_of(only_capture(tmp_path))
     assert record["outputs"]["confirmed"] is False
     assert record["status"] == "stopped" and "clean-up hung" in record["reason"]
+
+
+_STUCK = '''
+"""Simulated rigs in real time whose receive() does not return in the middle of the run."""
+import time
+
+from daq.hal import Phase
+from sim_rig.backend import SimulatedDevice
+
+
+class Waiting(SimulatedDevice):
+    stuck = False
+
+    def announce(self, phase, turns=0.0):
+        super().announce(phase, turns)
+        self.stuck = phase is Phase.RUN
+
+    def receive(self):
+        if self.stuck:
+            self.wait()
+        return super().receive()
+
+    def wait(self):
+        time.sleep(60)
+
+
+class Deaf(Waiting):
+    def wait(self):
+        end = time.monotonic() + 60
+        while time.monotonic() < end:
+            try:
+                time.sleep(1)
+            except BaseException:
+                pass
+'''
+
+
+@pytest.mark.soak
+def test_a_call_that_does_not_return_ends_the_run(tmp_path):
+    (tmp_path / "stuck.py").write_text(_STUCK)
+    write_experiment(tmp_path / "e.yaml")
+    processes = {}
+    for name in ("Waiting", "Deaf"):
+        folder = tmp_path / name
+        folder.mkdir()
+        write_rig(folder / "rig.yaml", backend="../stuck.py:" + name, options={"time": "real"})
+        processes[name] = start_rig("run", "../e.yaml", "--rig", "rig.yaml", cwd=folder)
+    outcomes = {}
+    for name, process in processes.items():
+        _, errors = process.communicate(timeout=60)
+        assert process.returncode == 1 and "Traceback" not in errors
+        assert "has not returned from receive() for 5 s" in errors
+        outcomes[name] = errors, record_of(only_capture(tmp_path / name))
+    errors, record = outcomes["Waiting"]  # hears of it, and all ends in good order
+    assert record["status"] == "failed" and "receive()" in record["reason"]
+    assert "switch off the amplifier" in errors
+    errors, record = outcomes["Deaf"]
+    assert "was ended without it" in errors and "zero outputs are not confirmed" in errors
+    assert record["status"] == "failed" and "receive()" in record["reason"]
+    assert record["outputs"]["confirmed"] is False
 
 
 @pytest.fixture

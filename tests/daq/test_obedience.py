@@ -125,3 +125,29 @@ def test_zero_at_a_new_start_does_not_outweigh_what_safe_leaves(tmp_path):
     assert "switch off the amplifier: zero outputs are not confirmed" in result.stderr
     outputs = record_of(only_capture(tmp_path))["outputs"]
     assert outputs["confirmed"] is False and "current_motor reads 0.25" in outputs["problem"]
+
+
+_REFUSING = '''
+"""The simulated rig, which zeroes its outputs and fails to say so."""
+from sim_rig.backend import SimulatedDevice
+
+
+class Refusing(SimulatedDevice):
+    def safe(self):
+        super().safe()
+        raise OSError("the relay sticks")
+
+    stop = close = SimulatedDevice.safe
+'''
+
+
+def test_a_device_that_fails_in_safe_is_named_though_its_outputs_are_zero(tmp_path):
+    (tmp_path / "refusing.py").write_text(_REFUSING)
+    write_experiment(tmp_path / "e.yaml")
+    write_rig(tmp_path / "rig.yaml", backend="refusing.py:Refusing", options={})
+    result = rig("run", "e.yaml", "--rig", "rig.yaml", cwd=tmp_path)
+    record = record_of(only_capture(tmp_path))
+    assert result.returncode == 0 and record["outputs"]["confirmed"] is True
+    (warning,) = record["connection"]["warnings"]
+    assert "failed in safe()" in warning and "the relay sticks" in warning
+    assert "the relay sticks" in result.stderr
