@@ -9,6 +9,7 @@ import numpy as np
 from sysid.arrays import FloatArray
 from sysid.judging.residual_tests import ResidualTest, residual_test
 from sysid.problem.data import Dataset
+from sysid.problem.faults import DataFault
 from sysid.problem.metrics import Metrics, evaluate, mean_known
 from sysid.problem.model import ProcessModel
 from sysid.uncertainty import Uncertainty
@@ -63,11 +64,13 @@ def judge(
     validation: Sequence[RecordResult],
     uncertainty: Uncertainty | None,
     feasible: bool = True,
+    faults: Sequence[DataFault] = (),
 ) -> Verdict:
     """The verdict on an identification.
 
     validation: none where no records were held back. uncertainty: None without intervals.
-    feasible: whether the parameters satisfy the constraints.
+    feasible: whether the parameters satisfy the constraints. faults: of the data, those in doubt
+    lower it.
     """
     grave = [] if feasible else ["No parameters were found that satisfy all the constraints."]
     light: list[str] = []
@@ -80,6 +83,7 @@ def judge(
             reasons.append(f"{name} errs {ratio:.1f} times as much in validation as in training.")
     if not validation:
         light.append("No data were held back for validation: the errors are those of the fit.")
+    light += [fault.sentence for fault in faults if fault.severity == "doubt"]
     light += _input_traces(model, validation or training)
     light += _wandering_residuals(model, validation or training)
     if uncertainty is not None:

@@ -1,0 +1,264 @@
+"""What is wrong with the samples of one channel, read from the samples alone.
+
+Each test takes the samples of a channel in time, (n,), NaN where one was lost, and returns what it
+finds, or None. Steps, pulses, levels held, rest, quantisation and noise as sensors have them are
+not faults, and what looks like one without being sure to be it is left alone.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sysid.arrays import BoolArray, FloatArray
+
+_EQUAL = 1e-9  # of a channel's span: samples so close are the same
+_RESTING = 1e-3  # of its span: how near 0 a level is that of rest
+_HARMLESS = 1e-4  # of a channel's variance
+_NORMAL = 0.6745  # median of the absolute value of a standard normal variable
+
+
+@dataclass(frozen=True)
+class PileUp:
+    """Samples that stand at a channel's largest or smallest value.
+
+    level: that value. share: of all samples. stretches: how often the channel gets there.
+    at: (n,), which samples.
+    """
+
+    level: float
+    share: float
+    stretches: int
+    at: BoolArray
+
+
+@dataclass(frozen=True)
+class Spikes:
+    """Single samples far off their neighbours.
+
+    share: of all samples. size: of the median one. at: (n,), which samples.
+    """
+
+    share: float
+    size: float
+    at: BoolArray
+
+
+@dataclass(frozen=True)
+class Standstill:
+    """A stretch in which a channel with noise repeats one value.
+
+    value: it. first, length: of the longest such stretch, in samples. at: (n,), samples of all.
+    """
+
+    value: float
+    first: int
+    length: int
+    at: BoolArray
+
+
+@dataclass(frozen=True)
+class Steps:
+    """Resolution of a channel that is coarser than its noise: the step, and steps in its span."""
+
+    step: float
+    levels: int
+
+
+def pile_ups(values: FloatArray) -> list[PileUp]:
+    """Where a channel was cut off: at its largest value, at its smallest, or at both.
+
+    The channel runs into the value and leaves it at full slope, time and again, and is there far
+    more often than at values just short of it. Levels held on purpose, turning points and a rest
+    at 0 are no such thing.
+
+    >>> wave = np.sin(0.1 * np.arange(500))
+    >>> [round(pile.level, 2) for pile in pile_ups(np.minimum(wave, 0.8))], pile_ups(wave)
+    ([0.8], [])
+    """
+    piles = (_pile_up(values), _pile_up(-values))
+    signed = zip(piles, (1.0, -1.0), strict=True)
+    return [PileUp(s * p.level, p.share, p.stretches, p.at) for p, s in signed if p is not None]
+
+
+def _pile_up(values: FloatArray) -> PileUp | None:
+    """Of samples at the largest value."""
+    measured = np.flatnonzero(np.isfinite(values))
+    v = values[measured]
+    span = float(np.ptp(v)) if len(v) else 0.0
+    if span == 0.0:
+        return None
+    top = float(v.max())
+    at = v >= top - _EQUAL * span
+    count = int(at.sum())
+    levels, counts = np.unique(v[~at], return_counts=True)
+    if count < max(8, 0.002 * len(v)) or len(levels) < 20 or abs(top) < _RESTING * span:
+        return None
+    if count < 8.0 * counts[-5:].mean():
+        return None
+    edges = np.flatnonzero(np.diff(at.astype(np.int8)))
+    stretches = (len(edges) + int(at[0]) + int(at[-1])) // 2
+    # How far the channel was from the level a sample before it got there, and after it left.
+    steps = v[edges + 1] - v[edges]
+    entries, exits = steps[steps > 0.0], -steps[steps < 0.0]
+    moving = np.abs(np.diff(v[~at]))
+    moving = moving[moving > _EQUAL * span]
+    if stretches < 2 or not len(moving) or _is_piecewise_linear(v):
+        return None
+    slowest = min(np.median(entries), np.median(exits))
+    if slowest < max(2.0 * np.diff(levels).min(), 0.03 * float(np.median(moving))):
+        return None
+    place = np.zeros(len(values), dtype=np.bool_)
+    place[measured[at]] = True
+    return PileUp(top, count / len(v), stretches, place)
+
+
+def _is_piecewise_linear(v: FloatArray) -> bool:
+    """Whether a channel is made of ramps and levels, as people design them."""
+    slopes = np.diff(v)
+    bends = np.abs(np.diff(slopes))
+    sloping = np.abs(slopes[1:]) > _EQUAL * np.ptp(v)
+    return bool(sloping.any()) and float(np.median(bends[sloping])) < 1e-3 * float(
+        np.median(np.abs(slopes[1:][sloping]))
+    )
+
+
+def noise(values: FloatArray) -> float:
+    """Standard deviation of a channel's white noise, from its third differences.
+
+    0 where they are what a smooth signal without noise has.
+
+    >>> print(round(noise(np.random.default_rng(0).normal(0.0, 0.1, 4000)), 2))
+    0.1
+    >>> noise(np.sin(0.1 * np.arange(500)))
+    0.0
+    """
+    v = values[np.isfinite(values)]
+    if len(v) < 8:
+        return 0.0
+    first, third = (
+        float(np.median(np.abs(np.diff(v, order)))) / _NORMAL / width
+        for order, width in ((1, np.sqrt(2.0)), (3, np.sqrt(20.0)))
+    )
+    return float(third) if third > 0.3 * first else 0.0
+
+
+def resolution(values: FloatArray) -> float:
+    """The least difference between two of a channel's values: its resolution; 0 of none."""
+    levels = np.unique(values[np.isfinite(values)])
+    gaps = np.diff(levels)
+    gaps = gaps[gaps > _EQUAL * np.ptp(levels)] if len(levels) > 1 else gaps
+    return float(gaps.min()) if len(gaps) else 0.0
+
+
+def spikes(values: FloatArray, inputs: FloatArray) -> Spikes | None:
+    """Single samples that leave their neighbours and return, too far for noise, or a sharp corner.
+
+    None where all together they are below a per cent of the channel's own deviation.
+    inputs: (n, n_inputs), whose jumps answer for pulses that follow them.
+
+    >>> quiet = 0.01 * np.random.default_rng(0).standard_normal(400)
+    >>> jolted = quiet + np.isin(np.arange(400), [30, 90, 300])
+    >>> spikes(jolted, np.zeros((400, 1))).at.nonzero()[0].tolist()
+    [30, 90, 300]
+    """
+    n = len(values)
+    before, middle, after = values[:-2], values[1:-1], values[2:]
+    away = middle - 0.5 * (before + after)
+    returned = np.abs(after - before) < 0.3 * np.minimum(
+        np.abs(middle - before), np.abs(middle - after)
+    )
+    finite = away[np.isfinite(away)]
+    if len(finite) < 20:
+        return None
+    usual = max(float(np.median(np.abs(finite))) / _NORMAL, resolution(values))
+    at = np.zeros(n, dtype=np.bool_)
+    with np.errstate(invalid="ignore"):
+        at[1:-1] = returned & (np.abs(away) > 7.0 * usual) & (usual > 0.0)
+    # A shaft that slips out of its rest for a sample.
+    at[1:-1] &= (before != 0.0) | (after != 0.0)
+    jolted = _after_jumps(inputs)
+    if jolted[1:-1].any():
+        # What follows a jump may be as large as what usually follows one.
+        reaction = np.nanquantile(np.abs(away)[jolted[1:-1]], 0.9)
+        at[1:-1] &= ~jolted[1:-1] | (np.abs(away) > 3.0 * reaction)
+    count = int(at.sum())
+    if count == 0:
+        return None
+    sizes = np.abs(away[at[1:-1]])
+    if sizes @ sizes < _HARMLESS * len(finite) * np.nanvar(values):
+        return None
+    return Spikes(count / len(finite), float(np.median(sizes)), at)
+
+
+def _after_jumps(inputs: FloatArray) -> BoolArray:
+    """Samples at which an input jumps, and the three that follow, (n,)."""
+    return np.convolve(_jumps(inputs), np.ones(4), "full")[: len(inputs)] > 0.5
+
+
+def _jumps(inputs: FloatArray) -> BoolArray:
+    """Samples at which an input jumps, (n,)."""
+    jumps = np.zeros(len(inputs), dtype=np.bool_)
+    for column in inputs.T:
+        steps = np.abs(np.diff(column))
+        jumps[1:] |= (steps > 0.05 * steps.max(initial=0.0)) & (steps > 10.0 * np.median(steps))
+    return jumps
+
+
+def standstill(values: FloatArray, inputs: FloatArray) -> Standstill | None:
+    """Where a channel that is never twice the same repeats a value for long, then jumps.
+
+    A channel that comes to rest slows down before, and one that has been at rest has not moved.
+    inputs: (n, n_inputs), whose jumps end a rest.
+
+    >>> trace = np.arange(400) + 0.5 * np.random.default_rng(0).standard_normal(400)
+    >>> trace[100:150] = trace[100]
+    >>> hang = standstill(trace, np.zeros((400, 1)))
+    >>> hang.first, hang.length
+    (100, 50)
+    """
+    steps = np.abs(np.diff(values, prepend=values[:1], append=values[-1:]))
+    usual = float(np.nanmedian(steps))
+    same = steps[1:-1] == 0.0
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(np.int8)))
+    begins, lengths = edges[::2], edges[1::2] - edges[::2] + 1
+    # It is caught in motion, at 0 where it might rest in fast motion, and jumps when it is free.
+    resting = np.abs(values[begins]) < _RESTING * float(np.nanmax(np.abs(values)))
+    least = np.where(resting, 5.0 * usual, max(0.01 * usual, 1.5 * resolution(values)))
+    caught = (steps[begins] > least) & (steps[begins + lengths] > 5.0 * usual)
+    # What has settled moves with the next jump of an input, and has not slept through another.
+    jumps = np.concatenate([[0], np.cumsum(_jumps(inputs)), [0, 0, 0]])
+    ends = begins + lengths
+    slept = jumps[ends - 3] > jumps[begins + 4]
+    caught &= slept | (jumps[np.minimum(ends + 1, len(values))] == jumps[ends - 3])
+    hangs = (lengths >= 20) & caught & (usual > 0.0)
+    repeated = (int(same.sum()) - int((lengths[hangs] - 1).sum())) / len(values)
+    if not hangs.any() or repeated > 0.1:
+        return None
+    at = np.zeros(len(values), dtype=np.bool_)
+    for begin, length in zip(begins[hangs], lengths[hangs], strict=True):
+        at[begin : begin + length] = True
+    place = int(np.argmax(np.where(hangs, lengths, 0)))
+    first = int(begins[place])
+    return Standstill(float(values[first]), first, int(lengths[place]), at)
+
+
+def coarse_steps(values: FloatArray) -> Steps | None:
+    """The resolution of a measured channel that mostly repeats its last value.
+
+    Only where it moves over fewer than 64 steps, all alike: finer ones do no harm.
+
+    >>> coarse_steps(np.round(8.0 * np.sin(0.02 * np.arange(1000)))).levels
+    17
+    """
+    v = values[np.isfinite(values)]
+    levels = np.unique(v)
+    if not 4 <= len(levels) < 64:
+        return None
+    step = float(np.diff(levels).min())
+    counts = np.abs(np.diff(v)) / step
+    jumps = counts[counts > 0.5]
+    even = np.abs(np.diff(levels) / step - np.round(np.diff(levels) / step)).max() < 0.05
+    held = 1.0 - len(jumps) / max(len(counts), 1)
+    if not even or held < 0.4 or len(v) < 3 * len(levels):
+        return None
+    return Steps(step, len(levels))

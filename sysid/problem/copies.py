@@ -1,0 +1,75 @@
+"""Samples that stand in two records: a copy proves nothing, and counts twice."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from sysid.arrays import FloatArray
+from sysid.problem.channels import noise, resolution
+from sysid.problem.data import Dataset
+
+UIntArray = npt.NDArray[np.uint64]
+
+_RARE = 4  # times that a row may stand in a record and still be told from others
+
+
+def shared_samples(records: Sequence[Dataset]) -> FloatArray:
+    """Share of a record's rows, where it moves, that stand in another, (n_records, n_records).
+
+    Entry [i, j] is the share of record i that stands in record j. Rows are compared by their
+    content, all inputs and outputs, bit for bit, and count where the row that follows is the same
+    in both. Rows that are common, as those at rest are, say nothing. Records of one length whose
+    outputs differ by less than noise are one, written with other digits. NaN of a record with
+    itself.
+
+    >>> rows = np.random.default_rng(0).standard_normal((400, 2))
+    >>> whole = Dataset(rows[:, :1], rows[:, 1:], dt=0.01)
+    >>> shared_samples([whole.part(100, 200, "cut"), whole])[0, 1].item()
+    1.0
+    """
+    shares = np.full((len(records), len(records)), np.nan)
+    contents = [_contents(record) for record in records]
+    for j, source in enumerate(contents):
+        distinct, first, counts = np.unique(source, return_index=True, return_counts=True)
+        for i, rows in enumerate(contents):
+            if i == j:
+                continue
+            place = np.minimum(np.searchsorted(distinct, rows), len(distinct) - 1)
+            same = (distinct[place] == rows) & (counts[place] <= _RARE)
+            followed = same[:-1] & same[1:] & (np.diff(first[place]) == 1)
+            moving = rows[1:] != rows[:-1]
+            shares[i, j] = (followed & moving).sum() / max(moving.sum(), 1)
+            if shares[i, j] < 1.0 and _rewritten(records[i], records[j]):
+                shares[i, j] = 1.0
+    return shares
+
+
+def _rewritten(record: Dataset, source: Dataset) -> bool:
+    """Whether two records are one, written with other digits.
+
+    Their outputs are nearer than noise lets two records be, or than half a unit of the last digit.
+    """
+    if record.outputs.shape != source.outputs.shape:
+        return False
+    moves = False
+    for y, original in zip(record.outputs.T, source.outputs.T, strict=True):
+        both = np.isfinite(y) & np.isfinite(original)
+        difference = np.abs(y - original)[both].max(initial=0.0)
+        if difference > 0.1 * np.nanstd(original):
+            return False
+        digit = max(resolution(y), resolution(original))
+        if difference > max(0.51 * digit, noise(original)):
+            return False
+        moves |= digit > 0.0
+    return moves
+
+
+def _contents(record: Dataset) -> UIntArray:
+    """A number for each row, (n,), alike where its inputs and outputs are."""
+    rows = np.column_stack([record.inputs, record.outputs])
+    # Zeros of either sign are alike, and so are lost samples.
+    words = np.ascontiguousarray(np.where(np.isnan(rows), np.nan, rows + 0.0)).view(np.uint64)
+    odd = np.random.default_rng(0).integers(0, 2**63, words.shape[1], dtype=np.uint64) * 2 + 1
+    keys: UIntArray = ((words ^ (words >> np.uint64(32))) * odd).sum(axis=1)
+    return keys

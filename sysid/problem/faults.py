@@ -1,0 +1,379 @@
+"""What is wrong with records before anything is fitted to them, and what it does to parameters."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from sysid.arrays import FloatArray
+from sysid.problem.channels import coarse_steps, noise, pile_ups, spikes, standstill
+from sysid.problem.copies import shared_samples
+from sysid.problem.data import Dataset
+from sysid.problem.model import Input, Output, ProcessModel
+
+Part = Literal["training", "validation"]
+Severity = Literal["doubt", "note"]
+FaultKind = Literal[
+    "clipped", "frozen", "outliers", "coarse", "copy", "still", "constant", "gap", "unit"
+]
+
+Role = Literal["command", "input", "sensor"]
+
+_COPIED = 0.5  # of a record's moving rows, beyond which it is no other record
+_STILL = 0.05  # of the motion in training, below which a record does not move
+_LONG = 10  # samples lost in a row that are many
+_GROSS = 5.0  # of a command's deviation, beyond which a single value is no command
+_LEFT_OUT = "as 'robust: true' has it, these samples count as not measured"
+_COARSE = 16  # steps in a channel's span, below which they are seen in the parameters
+
+
+@dataclass(frozen=True)
+class DataFault:
+    """A fault of the data in a channel, or in whole records where ``channel`` is empty.
+
+    statement: what is wrong, with its numbers; effect: what it does to the parameters or to what
+    is said of them; cure: how to mend it. severity: ``doubt`` where a result may be wrong by it,
+    ``note`` where the user has to judge. share: of the samples of the worst record, the first of
+    ``records``. moves_parameters: whether it biases parameters beyond what their intervals know.
+    voids_validation: whether it makes the errors in validation no evidence.
+
+    >>> fault = DataFault("still", "doubt", "validation", ("rest",), "", "it does not move",
+    ...     "a validation that does not move is none", "validate with another log", 1.0,
+    ...     moves_parameters=False, voids_validation=True)
+    >>> fault.sentence
+    'rest: it does not move: a validation that does not move is none. Validate with another log.'
+    """
+
+    kind: FaultKind
+    severity: Severity
+    part: Part
+    records: tuple[str, ...]
+    channel: str
+    statement: str
+    effect: str
+    cure: str
+    share: float
+    moves_parameters: bool = False
+    voids_validation: bool = False
+
+    @property
+    def sentence(self) -> str:
+        """All of it in words."""
+        more = f" (and {len(self.records) - 1} more)" if len(self.records) > 1 else ""
+        cure = f" {self.cure[:1].upper()}{self.cure[1:]}." if self.cure else ""
+        return f"{self.records[0]}{more}: {self.statement}: {self.effect}.{cure}"
+
+
+def data_faults(
+    model: ProcessModel, training: Sequence[Dataset], validation: Sequence[Dataset] = ()
+) -> tuple[DataFault, ...]:
+    """Faults of records, the gravest first; each kind once for a channel and part.
+
+    >>> from sysid.examples import lag, lag_record
+    >>> log = lag_record()
+    >>> data_faults(lag(), [log])
+    ()
+    >>> copied, = data_faults(lag(), [log], [log.part(0, 200, "copy")])
+    >>> copied.kind, copied.voids_validation
+    ('copy', True)
+    """
+    faults = [*_copies(training, validation), *_stillness(model, training, validation)]
+    parts: tuple[tuple[Part, Sequence[Dataset]], ...]
+    parts = ("training", training), ("validation", validation)
+    for part, records in parts:
+        for record in records:
+            faults += _in_record(model, record, part)
+    return tuple(sorted(_merged(faults), key=lambda fault: fault.severity))
+
+
+def mended(model: ProcessModel, record: Dataset) -> Dataset:
+    """A record whose faulty samples count as not measured: outliers, clipped, hanging ones.
+
+    Outliers of inputs are replaced by what stands before and behind them. A first sample stays, as
+    it tells where a simulation starts.
+
+    >>> from sysid.examples import lag, lag_record
+    >>> log = lag_record()
+    >>> log.outputs[50] += 10.0
+    >>> np.flatnonzero(np.isnan(mended(lag(), log).outputs))
+    array([50])
+    """
+    inputs, outputs = record.inputs.copy(), record.outputs.copy()
+    for column in outputs.T:
+        jolts, hang = spikes(column, record.inputs), standstill(column, record.inputs)
+        tests = (jolts, hang, *pile_ups(column))
+        wrong = np.zeros(len(column), dtype=np.bool_)
+        for test in tests:
+            wrong |= test.at if test is not None else False
+        column[1:][wrong[1:]] = np.nan
+    rows = np.arange(record.n_samples)
+    for j, column in enumerate(inputs.T):
+        jolts = spikes(column, np.delete(record.inputs, j, axis=1))
+        if jolts is not None and _role(model, record, j) != "command":
+            good = ~jolts.at
+            column[:] = np.interp(rows, rows[good], column[good])
+    return replace(record, inputs=inputs, outputs=outputs)
+
+
+def after_mending(faults: Sequence[DataFault], model: ProcessModel) -> tuple[DataFault, ...]:
+    """What is left of faults where records are ``mended``: those samples are mentioned only."""
+    return tuple(
+        replace(fault, severity="note", effect=_LEFT_OUT, cure="", moves_parameters=False)
+        if (fault.kind in {"clipped", "frozen"} and fault.channel in model.output_names)
+        or (fault.kind == "outliers" and fault.severity == "doubt")
+        else fault
+        for fault in faults
+    )
+
+
+def _merged(faults: Sequence[DataFault]) -> list[DataFault]:
+    """One fault for all records in which it is the same, described by the worst of them."""
+    alike: dict[tuple[str, ...], list[DataFault]] = {}
+    for fault in faults:
+        alike.setdefault((fault.kind, fault.severity, fault.channel, fault.part), []).append(fault)
+    merged = []
+    for group in alike.values():
+        ordered = sorted(group, key=lambda fault: -fault.share)
+        records = dict.fromkeys(name for fault in ordered for name in fault.records)
+        merged.append(replace(ordered[0], records=tuple(records)))
+    return merged
+
+
+def _in_record(model: ProcessModel, record: Dataset, part: Part) -> Iterator[DataFault]:
+    """Faults of a record's channels, and its gaps."""
+    yield from _gaps(record, part)
+    for j, u in enumerate(model.inputs):
+        role, others = _role(model, record, j), np.delete(record.inputs, j, axis=1)
+        yield from _Channel(record, part, u, record.inputs[:, j], role, others).faults()
+    for j, y in enumerate(model.outputs):
+        values, inputs = record.outputs[:, j], record.inputs
+        yield from _Channel(record, part, y, values, "sensor", inputs).faults()
+
+
+def _role(model: ProcessModel, record: Dataset, place: int) -> Role:
+    """What an input is: without calibration, held between samples, a command."""
+    if record.input_noise[place] > 0.0:
+        return "sensor"
+    return "command" if model.inputs[place].hold == "zoh" else "input"
+
+
+@dataclass(frozen=True)
+class _Channel:
+    """A channel of a record; role: whether it is a command, a sensor, or an input that is either.
+
+    What a command does is meant. inputs: (n, n_inputs), those that may drive it.
+    """
+
+    record: Dataset
+    part: Part
+    signal: Input | Output
+    values: FloatArray
+    role: Role
+    inputs: FloatArray
+
+    @property
+    def name(self) -> str:
+        """Of the signal."""
+        return self.signal.name
+
+    def faults(self) -> Iterator[DataFault]:
+        """What is wrong with its samples."""
+        yield from self._clipping()
+        if self.role != "command":
+            yield from self._standstill()
+        yield from self._outliers()
+        if self.role == "sensor":
+            yield from self._coarseness()
+
+    def _clipping(self) -> Iterator[DataFault]:
+        piles = pile_ups(self.values)
+        if not piles:
+            return
+        share = sum(pile.share for pile in piles)
+        levels = " and ".join(self._quantity(pile.level, 4) for pile in piles)
+        stretches = sum(pile.stretches for pile in piles)
+        statement = (
+            f"{self.name} ends at {levels}, where {_percent(share)} of its samples stand in "
+            f"{stretches} stretches"
+        )
+        if self.role == "command" or (self.role == "input" and noise(self.values) == 0.0):
+            effect = (
+                "right if this is what reached the plant; if only the log was limited, gains and "
+                "time constants are wrong"
+            )
+            yield self._fault("clipped", "note", statement, effect, "log what was applied", share)
+            return
+        effect = (
+            "a sensor at the end of its range; the fit takes what it cut off for a limit of the "
+            "plant"
+        )
+        cure = (
+            "record it in a larger range, or write 'robust: true', which counts these samples as "
+            "not measured"
+        )
+        yield self._fault("clipped", "doubt", statement, effect, cure, share)
+
+    def _standstill(self) -> Iterator[DataFault]:
+        hang = standstill(self.values, self.inputs)
+        if hang is None:
+            return
+        begin = hang.first * self.record.dt
+        end = begin + hang.length * self.record.dt
+        statement = (
+            f"{self.name} repeats {self._quantity(hang.value, 4)} from {begin:.4g} s to {end:.4g} "
+            f"s, {hang.length} samples, then jumps"
+        )
+        effect = "a channel that hangs looks like a plant that does not move"
+        cure = (
+            f"leave it out with 'use: [0 s .. {begin:.4g} s]', or write 'robust: true', which "
+            "counts these samples as not measured"
+        )
+        yield self._fault("frozen", "doubt", statement, effect, cure, float(hang.at.mean()))
+
+    def _outliers(self) -> Iterator[DataFault]:
+        jolts = spikes(self.values, self.inputs)
+        if jolts is None or (self.role == "command" and jolts.size < _GROSS * self.values.std()):
+            return
+        count = int(jolts.at.sum())
+        statement = (
+            f"{count} sample{'s' * (count != 1)} of {self.name} ({_percent(jolts.share)}) "
+            f"{'stand' if count > 1 else 'stands'} alone, typically {self._quantity(jolts.size)} "
+            "off the neighbours"
+        )
+        effect = "squared, they count more than their number, and move every parameter"
+        cure = "write 'robust: true', which counts them as not measured"
+        yield self._fault("outliers", "doubt", statement, effect, cure, jolts.share)
+
+    def _coarseness(self) -> Iterator[DataFault]:
+        steps = coarse_steps(self.values)
+        if steps is None:
+            return
+        statement = (
+            f"{self.name} moves over {steps.levels} steps of {self._quantity(steps.step)}, which "
+            "are coarser than its noise"
+        )
+        effect = "errors of half a step are no noise that averages out, and intervals miss them"
+        cure = "excite more strongly, or read it in finer steps"
+        severity: Severity = "doubt" if steps.levels < _COARSE else "note"
+        yield self._fault("coarse", severity, statement, effect, cure, 1.0 / steps.levels)
+
+    def _quantity(self, value: float, digits: int = 3) -> str:
+        return f"{value:.{digits}g}" + (
+            f" {self.signal.unit}" if self.signal.unit not in {"", "1"} else ""
+        )
+
+    def _fault(
+        self,
+        kind: FaultKind,
+        severity: Severity,
+        statement: str,
+        effect: str,
+        cure: str,
+        share: float,
+    ) -> DataFault:
+        where = self.part, (self.record.name,), self.name
+        moves = severity == "doubt" and self.part == "training"
+        return DataFault(kind, severity, *where, statement, effect, cure, share, moves)
+
+
+def _gaps(record: Dataset, part: Part) -> Iterator[DataFault]:
+    """Rows that are missing, beside those between which outputs are measured regularly."""
+    rows = np.flatnonzero(np.isfinite(record.outputs).any(axis=1))
+    if len(rows) < 3:
+        return
+    # A first sample alone stands before a run-in, which is left out on purpose.
+    distances = np.diff(rows)[1:]
+    usual = float(np.median(distances))
+    gaps = distances > 1.5 * usual
+    if not gaps.any():
+        return
+    lost = distances[gaps] / usual - 1.0
+    share = float(lost.sum() / (lost.sum() + len(rows)))
+    longest = round(float(lost.max()))
+    many = longest >= _LONG or share > 0.05
+    yield DataFault(
+        "gap", "doubt" if many else "note", part, (record.name,), "",
+        f"{int(lost.sum())} samples ({_percent(share)}) are missing in {int(gaps.sum())} "
+        f"gap{'s' * (int(gaps.sum()) != 1)}, the longest of {longest * usual * record.dt:.3g} s",
+        "what its inputs did meanwhile is not known, and counts as if they had gone on",
+        "fit a part without gaps ('use: 0 s .. 2 s'), or record anew" if many
+        else "a few lost samples do no harm",
+        share, moves_parameters=many and part == "training",
+    )  # fmt: skip
+
+
+def _copies(training: Sequence[Dataset], validation: Sequence[Dataset]) -> Iterator[DataFault]:
+    """Records whose samples stand in another."""
+    records = [*training, *validation]
+    shares = shared_samples(records) if len(records) > 1 else np.zeros((1, 1))
+    for i, record in enumerate(records):
+        is_validation = i >= len(training)
+        # Of two that are alike the later is the copy; validation is compared with training.
+        earlier = shares[i, : len(training) if is_validation else i]
+        if not len(earlier) or np.max(earlier) <= _COPIED:
+            continue
+        share, source = float(np.max(earlier)), records[int(np.argmax(earlier))]
+        yield DataFault(
+            "copy", "doubt", "validation" if is_validation else "training", (record.name,), "",
+            f"{_percent(share)} of its samples stand in {source.name} as well",
+            "a model proves itself only on data it has not seen" if is_validation
+            else "they count twice, and intervals become too narrow",
+            "validate with another log" if is_validation else "leave one of them out",
+            share, voids_validation=is_validation,
+        )  # fmt: skip
+
+
+def _stillness(
+    model: ProcessModel, training: Sequence[Dataset], validation: Sequence[Dataset]
+) -> Iterator[DataFault]:
+    """Records that do not move, and outputs that never do."""
+    motion = np.array([_deviations(record) for record in training])
+    largest = motion.max(axis=0)
+    for j, output in enumerate(model.outputs):
+        if largest[j] == 0.0 and largest.any():
+            yield DataFault(
+                "constant", "doubt", "training", tuple(r.name for r in training), output.name,
+                f"{output.name} never changes",
+                "nothing is learnt from it, and parameters that act on it alone stay open",
+                "check its sensor and column, or leave it out with 'outputs'", 1.0,
+            )  # fmt: skip
+    parts: tuple[tuple[Part, Sequence[Dataset]], ...]
+    parts = ("training", training), ("validation", validation)
+    for part, records in parts:
+        for record in records:
+            moves = _deviations(record)
+            share = float(np.max(moves[largest > 0.0] / largest[largest > 0.0], initial=0.0))
+            buried = [
+                bool(m <= 2.0 * noise(y)) for m, y in zip(moves, record.outputs.T, strict=True)
+            ]
+            if share >= _STILL and not all(buried):
+                continue
+            how = (
+                f"its outputs move {_percent(share)} as far as in training"
+                if share < _STILL
+                else "no output moves farther than its noise"
+            )
+            is_validation = part == "validation"
+            yield DataFault(
+                "still", "doubt", part, (record.name,), "", how,
+                "a validation that does not move is none" if is_validation
+                else "little but noise is fitted there",
+                "validate with a log that moves" if is_validation else "leave it out",
+                1.0 - share, voids_validation=is_validation,
+            )  # fmt: skip
+
+
+def _deviations(record: Dataset) -> FloatArray:
+    """Standard deviation of each output of a record, 0 where rounding is all that changes."""
+    y = record.outputs
+    seen = np.isfinite(y)
+    count = np.maximum(seen.sum(axis=0), 1)
+    centred = np.where(seen, y - np.where(seen, y, 0.0).sum(axis=0) / count, 0.0)
+    deviation: FloatArray = np.sqrt(np.sum(centred**2, axis=0) / count)
+    peak = np.max(np.where(seen, np.abs(y), 0.0), axis=0)
+    return np.where(deviation > 1e-12 * peak, deviation, 0.0)
+
+
+def _percent(share: float) -> str:
+    return f"{100.0 * share:.2g} %"

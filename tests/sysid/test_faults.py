@@ -1,0 +1,282 @@
+"""What is wrong with records is said before a fit; what only looks wrong is left alone."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from sysid import Dataset, Input, Output, ProcessModel, SearchSpace, State
+from sysid.judging.plausibility import implausible
+from sysid.problem.faults import after_mending, data_faults, mended
+from tests.sysid.support import lag
+
+DT = 0.01
+N = 1000
+
+
+def model(hold="zoh"):
+    return lag(hold=hold)
+
+
+def driven(u, noise=0.01, seed=0, tau=0.05):
+    """A record of a lag of gain 2 under an input, with white noise."""
+    pole = np.exp(-DT / tau)
+    y = lfilter([0.0, 2.0 * (1.0 - pole)], [1.0, -pole], u)
+    y += noise * np.random.default_rng(seed).standard_normal(len(u))
+    return Dataset(u, y, DT, f"log {seed}")
+
+
+def levels(seed=0, length=8):
+    """Random levels, each held."""
+    rng = np.random.default_rng(seed)
+    return np.repeat(rng.uniform(-1.0, 1.0, N // length), length)
+
+
+def wave(period=100, n=N):
+    return np.sin(2.0 * np.pi * np.arange(n) / period)
+
+
+TIME = DT * np.arange(N)
+# Correct records whose samples look in one way or another like a fault.
+CORRECT = {
+    "random levels": driven(levels()),
+    "binary, noise free": driven(np.sign(levels()), noise=0.0),
+    "single-sample pulses": driven(np.sign(levels(length=1))),
+    "square wave that settles": driven(np.sign(wave(400) + 1e-9), noise=0.0),
+    "a staircase": driven(np.repeat(np.arange(10.0), 100), noise=0.0),
+    "a trapezoid, again and again": driven(np.clip(3.0 * np.abs((TIME % 2) - 1) - 1, -1, 1), 0.0),
+    "rest, then a step": driven((TIME > 5.0).astype(float), noise=0.0),
+    "a sine": driven(wave(), noise=0.0),
+    "an impulse": driven((np.arange(N) == 500).astype(float), noise=0.0, tau=0.02),
+    "fine quantisation": replace(
+        driven(wave()), outputs=np.round(driven(wave(), 0.0).outputs, 2)
+    ),
+    "one channel that moves little": driven(0.1 * levels()),
+    "lost samples, few": replace(
+        driven(levels()),
+        outputs=np.where(
+            np.isin(np.arange(N), [3, 400, 401])[:, None], np.nan, driven(levels()).outputs
+        ),
+    ),
+    "measured every fifth row": replace(
+        driven(levels()),
+        outputs=np.where((np.arange(N) % 5 > 0)[:, None], np.nan, driven(levels()).outputs),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CORRECT)
+def test_a_correct_record_has_no_fault(name):
+    for log in (model(), model("foh")):
+        faults = data_faults(log, [CORRECT[name]], [driven(levels(99), seed=99)])
+        assert [fault.sentence for fault in faults if fault.severity == "doubt"] == []
+
+
+def changed(record, change):
+    outputs = record.outputs.copy()
+    outputs[:, 0] = change(outputs[:, 0])
+    return replace(record, outputs=outputs)
+
+
+def one_fault(training, validation=(), inputs="zoh"):
+    (fault,) = data_faults(model(inputs), training, validation)
+    return fault
+
+
+def rare(y):
+    jolted = y.copy()
+    jolted[np.random.default_rng(3).choice(N, N // 100, replace=False)] += 2.0 * y.std()
+    return jolted
+
+
+def hung(y):
+    copy = y.copy()
+    begin = 300 + int(np.argmax(np.abs(y[340:640] - y[300:600])))
+    copy[begin : begin + 40] = copy[begin]
+    return copy
+
+
+FAULTS = {
+    "clipped": lambda y: np.clip(y, -0.8 * y.max(), 0.8 * y.max()),
+    "frozen": hung,
+    "outliers": rare,
+    "coarse": lambda y: 0.4 * np.round(y / 0.4),
+}
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("kind", FAULTS)
+def test_a_faulty_channel_is_named_with_its_number_and_cure(kind, seed):
+    record = changed(driven(levels(seed), seed=seed), FAULTS[kind])
+    fault = one_fault([record])
+    assert (fault.kind, fault.channel, fault.severity) == (kind, "y", "doubt")
+    assert fault.moves_parameters and fault.records == (record.name,)
+    assert "y" in fault.statement and fault.cure and fault.effect
+
+
+def test_clipping_on_one_side_gives_its_level():
+    record = changed(driven(wave()), lambda y: np.minimum(y, 1.5))
+    fault = one_fault([record])
+    assert "ends at 1.5," in fault.statement
+    assert fault.share == pytest.approx(np.mean(record.outputs == 1.5))
+
+
+def test_a_measured_input_is_examined_like_an_output():
+    record = driven(wave(), seed=1)
+    measured = record.inputs + 0.01 * np.random.default_rng(2).standard_normal((N, 1))
+    record = replace(record, inputs=np.clip(measured, -0.8, 0.8), input_noise=np.array([0.01]))
+    fault = one_fault([record])
+    assert (fault.kind, fault.channel, fault.severity) == ("clipped", "u", "doubt")
+
+
+def test_a_limited_command_is_left_to_the_user():
+    fault = one_fault([driven(np.clip(wave(), -0.8, 0.8))])
+    assert (fault.kind, fault.channel, fault.severity) == ("clipped", "u", "note")
+    assert not fault.moves_parameters
+
+
+def test_a_copy_is_no_validation_whatever_its_name():
+    record = driven(levels())
+    for copy in (replace(record, name="other"), record.part(200, 700, "cut")):
+        fault = one_fault([record], [copy])
+        assert fault.kind == "copy" and fault.voids_validation and not fault.moves_parameters
+        assert fault.records == (copy.name,) and "log 0" in fault.statement
+
+
+def test_a_copy_in_training_counts_twice():
+    record = driven(levels())
+    fault = one_fault([driven(levels(5), seed=5), record, replace(record, name="again")])
+    assert fault.kind == "copy" and fault.part == "training" and fault.records == ("again",)
+
+
+def test_the_same_experiment_measured_twice_is_no_copy():
+    assert data_faults(model(), [driven(levels())], [driven(levels(), seed=1)]) == ()
+
+
+def test_a_validation_that_does_not_move_is_none():
+    rest = driven(1e-6 * levels(1), seed=1)
+    constant = replace(rest, outputs=np.full((N, 1), 0.3))
+    for record in (rest, constant):
+        fault = one_fault([driven(levels())], [record])
+        assert fault.kind == "still" and fault.voids_validation
+        assert fault.records == (record.name,)
+
+
+def test_a_gentle_validation_is_one():
+    assert data_faults(model(), [driven(levels())], [driven(0.2 * levels(1), seed=1)]) == ()
+
+
+def two_outputs():
+    return ProcessModel(
+        name="pair",
+        states=(State("y", "m"), State("z", "m")),
+        inputs=(Input("u", "V"),),
+        outputs=(Output("y", "m"), Output("z", "m")),
+        parameters=lag().parameters,
+        derivative=lambda x, u, p: ((p[0] * u[0] - x[0]) / p[1], x[0] - x[1]),
+    )
+
+
+def test_an_output_that_never_changes_is_named():
+    record = driven(levels())
+    record = Dataset(record.inputs, np.column_stack([record.outputs, np.zeros(N)]), DT)
+    (fault,) = data_faults(two_outputs(), [record])
+    assert (fault.kind, fault.channel) == ("constant", "z")
+
+
+def test_a_long_gap_is_a_doubt_and_a_short_one_is_mentioned():
+    record = driven(levels())
+    for length, severity in ((50, "doubt"), (2, "note")):
+        outputs = record.outputs.copy()
+        outputs[200 : 200 + length] = np.nan
+        fault = one_fault([replace(record, outputs=outputs)])
+        assert (fault.kind, fault.severity) == ("gap", severity)
+        assert f"{length} samples" in fault.statement
+
+
+def test_the_same_fault_of_several_records_is_said_once():
+    records = [changed(driven(levels(k), seed=k), FAULTS["clipped"]) for k in range(4)]
+    fault = one_fault(records)
+    assert set(fault.records) == {record.name for record in records}
+    assert "(and 3 more)" in fault.sentence
+
+
+def shaft():
+    """A shaft whose angle and speed are measured."""
+    return ProcessModel(
+        name="shaft",
+        states=(State("angle", "rad"), State("speed", "rad/s")),
+        inputs=(Input("u", "V"),),
+        outputs=(Output("angle", "rad"), Output("speed", "rad/s")),
+        parameters=lag().parameters,
+        derivative=lambda x, u, p: (x[1], (p[0] * u[0] - x[1]) / p[1]),
+    )
+
+
+def turning(u, angle=1.0, speed=1.0):
+    """A record of a shaft, its columns multiplied by factors."""
+    omega = driven(u, noise=0.0).outputs[:, 0]
+    theta = DT * np.cumsum(omega) - DT * omega
+    noise = 0.001 * np.random.default_rng(0).standard_normal((N, 2))
+    return Dataset(u, (np.column_stack([theta, omega]) + noise) * [angle, speed], DT, "shaft")
+
+
+@pytest.mark.parametrize(
+    ("factors", "words"),
+    [
+        ({"speed": 60 / (2 * np.pi)}, "9.5"),
+        ({"angle": 180 / np.pi}, "radians for degrees"),
+        ({"speed": -1.0}, "turned round"),
+    ],
+)
+def test_a_speed_in_another_unit_than_its_angle_is_named(factors, words):
+    (fault,) = implausible(shaft(), SearchSpace.of(shaft()), [turning(levels(), **factors)])
+    assert fault.kind == "unit" and fault.moves_parameters and words in fault.statement
+
+
+def test_a_speed_that_goes_with_its_angle_has_no_fault():
+    for u in (levels(), wave(), (TIME > 5.0).astype(float), 0.01 * levels(3)):
+        assert implausible(shaft(), SearchSpace.of(shaft()), [turning(u)]) == ()
+
+
+@pytest.mark.parametrize("factor", [1e3, 1e-3])
+def test_an_output_far_beyond_the_ranges_is_named(factor):
+    record = driven(levels())
+    record = replace(record, outputs=factor * record.outputs)
+    (fault,) = implausible(model(), SearchSpace.of(model()), [record])
+    assert fault.kind == "unit" and "thousand" in fault.statement
+
+
+@pytest.mark.parametrize("gain", [0.15, 2.0, 25.0])
+def test_a_gain_near_the_ends_of_its_range_is_no_unit(gain):
+    record = driven(levels(), noise=0.001)
+    record = replace(record, outputs=0.5 * gain * record.outputs)
+    assert implausible(model(), SearchSpace.of(model()), [record]) == ()
+
+
+def test_an_output_of_nothing_but_noise_is_no_unit():
+    quiet = Dataset(np.zeros(N), 5.0 * np.random.default_rng(0).standard_normal(N), DT)
+    assert implausible(model(), SearchSpace.of(model()), [quiet]) == ()
+
+
+def test_outliers_of_a_measured_input_are_named_and_mended():
+    record = driven(wave(), seed=1)
+    measured = record.inputs + 0.01 * np.random.default_rng(2).standard_normal((N, 1))
+    measured[[100, 400, 720]] += 3.0
+    record = replace(record, inputs=measured, input_noise=np.array([0.01]))
+    fault = one_fault([record])
+    assert (fault.kind, fault.channel) == ("outliers", "u") and "3 samples" in fault.statement
+    smooth = mended(model(), record)
+    assert np.abs(smooth.inputs[:, 0] - wave()).max() < 0.1
+    assert data_faults(model(), [smooth]) == ()
+    (note,) = after_mending([fault], model())
+    assert (note.severity, note.moves_parameters) == ("note", False)
+
+
+def test_a_plant_that_settles_until_the_next_step_does_not_hang():
+    u = np.repeat([0.0, 1.0, -1.0, 0.5], [100, 200, 300, 400]) + 0.3 * (TIME < 1.0) * wave(37)
+    settled = driven(u, noise=0.0, tau=0.002)
+    coarse = replace(settled, outputs=np.round(settled.outputs, 3))
+    for record in (settled, coarse):
+        assert not any(fault.severity == "doubt" for fault in data_faults(model(), [record]))
