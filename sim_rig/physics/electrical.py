@@ -88,7 +88,7 @@ _MOTOR_CUTOFF = log_range("omega_dm", "rad/s", 1000.0, 100.0, 5000.0, "motor dri
 
 # Gain and cutoff of the amplifiers.
 MOTOR_DRIVERS: dict[DriverKind, tuple[Parameter, ...]] = {
-    "closed": (log_range("K_dm", "V/A", 100.0, 10.0, 500.0, "motor driver gain"), _MOTOR_CUTOFF),
+    "closed": (log_range("K_dm", "V/A", 100.0, 5.0, 500.0, "motor driver gain"), _MOTOR_CUTOFF),
     "open": (log_range("G_dm", "V/V", 1.0, 0.1, 10.0, "motor driver gain"), _MOTOR_CUTOFF),
 }
 BRAKE_DRIVERS: dict[DriverKind, tuple[Parameter, ...]] = {
@@ -103,9 +103,9 @@ BRAKE_DRIVERS: dict[DriverKind, tuple[Parameter, ...]] = {
 }
 
 WINDINGS = (
-    log_range("R_m", "ohm", 1.0, 0.5, 8.0, "motor resistance"),
-    log_range("L_m", "H", 1e-3, 2e-4, 3e-3, "motor inductance"),
-    log_range("K_m", "N*m/A", 0.14, 0.03, 0.25, "motor constant"),
+    log_range("R_m", "ohm", 1.0, 0.2, 8.0, "motor resistance"),
+    log_range("L_m", "H", 1e-3, 2e-4, 6e-3, "motor inductance"),
+    log_range("K_m", "N*m/A", 0.14, 0.03, 0.5, "motor constant"),
     log_range("R_b", "ohm", 120.0, 40.0, 200.0, "brake coil resistance"),
     log_range("L_b", "H", 0.15, 0.05, 1.0, "brake coil inductance"),
 )

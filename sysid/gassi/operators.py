@@ -64,8 +64,11 @@ def adaptive_mutation(
 def replace_by_elite(
     population: FloatArray, elite: FloatArray, percent: float, rng: np.random.Generator
 ) -> None:
-    """Replace a percentage of the chromosomes, at random and at least one, by the elite."""
-    count = max(1, round(len(population) * percent / 100.0))
+    """Replace a percentage of the chromosomes, at random, by the elite.
+
+    At least one where the percentage is above 0, none where it is 0.
+    """
+    count = max(int(percent > 0.0), round(len(population) * percent / 100.0))
     population[rng.choice(len(population), size=count, replace=False)] = elite
 
 

@@ -117,6 +117,15 @@ def test_the_rigs_own_values_are_feasible_and_within_the_ranges_of_a_search(kind
         assert differing.sum() > 10  # identification does not start from the truth
 
 
+@pytest.mark.parametrize("row", TABLE_4_1)
+def test_the_ranges_of_a_search_hold_every_row_of_table_4_1(row):
+    K, cutoff, R, L, K_m = TABLE_4_1[row]
+    values = {"K_dm": K, "omega_dm": cutoff, "R_m": R, "L_m": 1e-3 * L, "K_m": K_m}
+    parameters = {p.name: p for p in actuator().parameters}
+    for name, value in values.items():
+        assert parameters[name].lower < value < parameters[name].upper, name
+
+
 def test_a_set_changes_no_range():
     nominal, rig = Parts().build(), Parts().build(parameters="C")
     for one, other in zip(nominal.parameters, rig.parameters, strict=True):

@@ -180,7 +180,7 @@ def test_mutation_noise_has_the_given_spread_times_the_threshold():
 
 
 @pytest.mark.parametrize(
-    ("n", "percent", "count"), [(400, 1.0, 4), (100, 0.5, 1), (50, 0.0, 1), (40, 25.0, 10)]
+    ("n", "percent", "count"), [(400, 1.0, 4), (100, 0.5, 1), (50, 0.0, 0), (40, 25.0, 10)]
 )
 def test_the_elite_replaces_its_share(n, percent, count):
     rows = population(n=n)
