@@ -241,26 +241,37 @@ def print_errors(
     label: str = "training",
 ) -> None:
     """Table of RMSE, MSD and fit of each output, on one log or on two."""
-    head = ["output", f"RMSE, {label}", "MSD", "fit [%]"]
+    head = ["output", f"RMSE, {label}", "MSD", "RMSE", "fit [%]"]
     if validation:
-        head += ["RMSE, validation", "MSD", "fit [%]"]
+        head += ["RMSE, validation", "MSD", "RMSE", "fit [%]"]
     rows = []
     for output in training:
         row = [output]
         for errors in (log[output] for log in (training, *validation)):
             row += [terminal.number(errors.rmse, 3), terminal.number(errors.msd, 2)]
-            row.append(f"{errors.fit_percent:.1f}")
+            row += [_absolute(errors), f"{errors.fit_percent:.1f}"]
         rows.append(row)
-    terminal.print_table("Free-run simulation, RMSE and MSD in parts of max|y|", head, rows)
+    title = "Free-run simulation, RMSE and MSD in parts of max|y|, then RMSE in the output's unit"
+    terminal.print_table(title, head, rows)
+
+
+def _absolute(errors: OutputErrors) -> str:
+    """RMSE with its unit."""
+    scale, unit = notation.engineering(errors.rmse_absolute, errors.unit)
+    value = terminal.number(scale * errors.rmse_absolute, 3)
+    return value if unit in {"", "1"} else f"{value} {unit}"
 
 
 def _print_logs(title: str, logs: Sequence[LogErrors], mean: Mapping[str, OutputErrors]) -> None:
     head = ["log", *(f"fit of {name} [%]" for name in mean), *(f"RMSE of {n}" for n in mean)]
+    head += [f"{name} [{errors.unit or '1'}]" for name, errors in mean.items()]
     rows = []
     for name, outputs in [*((log.name, log.outputs) for log in logs), ("mean", mean)]:
         fits = [f"{errors.fit_percent:.1f}" for errors in outputs.values()]
-        rows.append([name, *fits, *(terminal.number(e.rmse, 3) for e in outputs.values())])
-    terminal.print_table(title, head, rows)
+        parts = [terminal.number(errors.rmse, 3) for errors in outputs.values()]
+        absolute = [terminal.number(errors.rmse_absolute, 3) for errors in outputs.values()]
+        rows.append([name, *fits, *parts, *absolute])
+    terminal.print_table(f"{title}: RMSE in parts of max|y|, then in units", head, rows)
 
 
 def show_comparison(

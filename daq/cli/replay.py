@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from typer import Argument, Option
 
@@ -43,6 +43,7 @@ def replay(
     The model is given the applied commands and the measured load torque, never the outputs.
     """
     from daq.identification.replay import replay as simulate
+    from daq.identification.result import errors_document
 
     bounds = _bounds(fail_under or [])
     result = simulate(log, parameters, rig, config, trust=trust)
@@ -55,10 +56,7 @@ def replay(
         terminal.report("warning", result.warning)
     drawn = _draw(result, figure)
     missed = result.below(bounds)
-    errors = {
-        name: {"rmse": result.rmse[name], "msd": result.msd[name], "fit_percent": result.fit[name]}
-        for name in model.output_names
-    }
+    errors = errors_document(model, result.metrics)
     if json:
         document = {
             "log": result.path,
@@ -86,7 +84,7 @@ def replay(
         raise RunError(f"{result.path}: {'; '.join(shortfalls)}")
 
 
-def _show(title: str, errors: dict[str, dict[str, float]], drawn: Path | None) -> None:
+def _show(title: str, errors: dict[str, dict[str, Any]], drawn: Path | None) -> None:
     from daq.cli.identification import print_errors
     from daq.identification.rows import OutputErrors
 

@@ -1,6 +1,8 @@
 """How logs are turned into parameters: model, search settings, foreign columns, data sheets."""
 
 import math
+import re
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
@@ -13,7 +15,17 @@ from pydantic import (
 )
 
 from daq.config.base import Section
-from daq.config.units import QUANTITY_SCHEMA, Hertz, Part, Percent, Quantity, Seconds, factor, split
+from daq.config.units import (
+    QUANTITY_SCHEMA,
+    Hertz,
+    Part,
+    Percent,
+    Quantity,
+    Seconds,
+    converted,
+    factor,
+    split,
+)
 
 
 def _ordered(ends: tuple[float | None, float | None]) -> tuple[float | None, float | None]:
@@ -52,6 +64,102 @@ _START_SCHEMA = {
 StartSetting = Annotated[Any, BeforeValidator(_start), WithJsonSchema(_START_SCHEMA)]
 _NAMES_SCHEMA = {"anyOf": [{"type": "string"}, {"type": "array", "items": {"type": "string"}}]}
 Preset = Literal["default", "thesis", "cega", "classic"]
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """A part of a log: by time [s] as the log counts it, or by rows counted from 1.
+
+    first, last: its ends, both of which belong to it; None for those of the log.
+
+    >>> stretch("2 s .. 5 s"), stretch("rows 100 ..")
+    (Stretch(first=2.0, last=5.0, rows=False), Stretch(first=100.0, last=None, rows=True))
+    """
+
+    first: float | None
+    last: float | None
+    rows: bool = False
+
+
+_STRETCH_CURE = "write '0 s .. 20 s' or 'rows 1 .. 1000', with an end left out for that of the log"
+
+
+def stretch(value: Any) -> Stretch:
+    """What ``use`` says of a log; ValueError with the cure."""
+    if isinstance(value, Stretch):
+        return value
+    if not isinstance(value, str) or value.count("..") != 1:
+        raise ValueError(_STRETCH_CURE)
+    rows = value.strip().startswith("rows")
+    ends = [_end(part.strip(), rows) for part in value.strip().removeprefix("rows").split("..")]
+    first, last = ends
+    if first is None and last is None:
+        raise ValueError(_STRETCH_CURE)
+    if rows and first is not None and first < 1:
+        raise ValueError("rows are counted from 1")
+    if first is not None and last is not None and first >= last:
+        raise ValueError(f"its first end, {first:g}, is not below its last, {last:g}")
+    return Stretch(first, last, rows)
+
+
+def _end(text: str, rows: bool) -> float | None:
+    if not text:
+        return None
+    try:
+        number = float(int(text)) if rows else float(converted(text, "s"))
+    except ValueError as error:
+        problem = "" if rows or split(text) is None else f"{error}; "
+        raise ValueError(f"{problem}{_STRETCH_CURE}") from None
+    if not math.isfinite(number):
+        raise ValueError(_STRETCH_CURE)
+    return number
+
+
+def _use(value: Any) -> Stretch | dict[str, Stretch] | None:
+    if not isinstance(value, dict):
+        return None if value is None else stretch(value)
+    stretches = {}
+    for name, text in value.items():
+        try:
+            stretches[str(name)] = stretch(text)
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}") from None
+    return stretches
+
+
+_STRETCH_SCHEMA = {"type": "string", "pattern": r"^\s*(rows)?[^.]*(\.\d[^.]*)?\s*\.\.\s*.*$"}
+UseSetting = Annotated[
+    Any,
+    BeforeValidator(_use),
+    WithJsonSchema(
+        {"anyOf": [_STRETCH_SCHEMA, {"type": "object", "additionalProperties": _STRETCH_SCHEMA}]}
+    ),
+]
+
+
+@dataclass(frozen=True)
+class RunIn:
+    """The beginning of what is used of a log, in seconds or rows: simulated, not compared."""
+
+    length: float
+    rows: bool = False
+
+
+def _run_in(value: Any) -> RunIn | None:
+    if value is None or isinstance(value, RunIn):
+        return value
+    rows = re.fullmatch(r"\s*(\d+)\s*rows\s*", value) if isinstance(value, str) else None
+    length = float(rows[1]) if rows else converted(value, "s")
+    if not _is_number(length) or length < 0.0:
+        raise ValueError("write a time such as 0.5 s, or a number of rows such as 400 rows")
+    return RunIn(float(length), rows is not None)
+
+
+RunInSetting = Annotated[
+    Any,
+    BeforeValidator(_run_in),
+    WithJsonSchema({"type": ["number", "string"], "minimum": 0, "unit": "s"}),
+]
 
 
 def _one_of(*keys: str) -> dict[str, Any]:
@@ -213,6 +321,20 @@ class IdentificationConfig(Signals):
     )
     hold_back: Part = Field(
         0.0, ge=0.0, lt=1.0, description="part of each log, its end, that validates"
+    )
+    use: UseSetting = Field(
+        None,
+        description="the part of each log that is used, or of logs by name",
+        examples=["0 s .. 20 s", {"day1.csv": "rows 1 .. 4000"}],
+    )
+    run_in: RunInSetting = Field(
+        None,
+        description="beginning of each log that is simulated and not compared, a time or rows",
+        examples=["0.5 s", "400 rows"],
+    )
+    robust: bool = Field(
+        False,
+        description="outliers, clipped and hanging samples count as not measured",
     )
     profile: list[str] = Field(
         default_factory=list,

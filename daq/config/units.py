@@ -21,11 +21,11 @@ from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 # Atomic: 1e3 is no 1 with the unit e3.
-_QUANTITY = re.compile(rf"\s*((?>{_NUMBER}))\s*([^\s\d.,].*?)\s*")
+_QUANTITY = re.compile(rf"\s*((?>{_NUMBER}))(?:\s*([^\s\d.,].*?)|\s+(1/[^\s\d.,].*?))\s*")
 # Bounds in a JSON Schema hold for numbers only, and patterns for text only.
 QUANTITY_SCHEMA: JsonSchemaValue = {
     "type": ["number", "string"],
-    "pattern": rf"^\s*{_NUMBER}\s*[^\s\d.,].*$",
+    "pattern": rf"^\s*{_NUMBER}(\s*[^\s\d.,]|\s+1/[^\s\d.,]).*$",
 }
 
 
@@ -86,9 +86,9 @@ def converted(value: Any, unit: str) -> Any:
 
 
 def split(value: Any) -> tuple[float, str] | None:
-    """Number and unit of a text such as ``5 ms``; None for anything else."""
+    """Number and unit of a text such as ``5 ms`` or ``2 1/m``; None for anything else."""
     parts = _QUANTITY.fullmatch(value) if isinstance(value, str) else None
-    return None if parts is None else (float(parts[1]), parts[2])
+    return None if parts is None else (float(parts[1]), parts[2] or parts[3])
 
 
 def factor(given: str, wanted: str) -> float:
@@ -132,4 +132,7 @@ def _angles(quantity: Any) -> float:
 
 
 def _spelt(unit: str) -> str:
-    return unit.replace("·", "*").replace("^", "**") if unit != "1" else "dimensionless"
+    if unit == "1":
+        return "dimensionless"
+    per = "1" if unit.startswith("/") else ""  # 5/m, as in 5 1/m
+    return per + unit.replace("·", "*").replace("^", "**")

@@ -13,7 +13,7 @@ from typing import Any
 from daq.errors import ConfigError, Terminated
 from daq.files import write_whole
 from daq.identification import records
-from daq.identification.fit import assemble, check_writable, load_logs
+from daq.identification.fit import assemble, check_writable, faults_of, load_logs
 from daq.identification.records import LoggedRecord
 from daq.identification.request import SettingsRequest
 from daq.identification.result import Identification
@@ -187,6 +187,13 @@ def run_all(
     """Run all groups with all seeds, warn of their logs; ConfigError when no run succeeds."""
     warnings = [log.warning for group in groups for log in (*group.training, *group.validation)]
     warn(watch, *dict.fromkeys(warnings))
+    doubts = [
+        fault.sentence
+        for group in groups
+        for fault in faults_of(group.problem, (group.training, group.validation))
+        if fault.severity == "doubt"
+    ]
+    warn(watch, *dict.fromkeys(doubts))
     runs = [run for group in groups for run in group.runs(seeds)]
     finished = 0
 

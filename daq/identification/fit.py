@@ -9,26 +9,34 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
+import numpy as np
+
 from daq.errors import ConfigError, Terminated
 from daq.identification import records, request
 from daq.identification.records import ColumnMapping, LoggedRecord, Split
 from daq.identification.request import SettingsRequest
 from daq.identification.result import FittedLog, Identification
+from daq.identification.selection import EVERYTHING, Selection
 from daq.identification.settings import Problem, gassi_settings, problem_of
 from daq.logs.capture import LOG_NAME
 from daq.logs.recording import Recording, log_path
 from daq.lookup.models import trust_option
-from daq.progress import Progress, Watch, ignore, warn
+from daq.progress import Note, Progress, Watch, ignore, warn
 from sysid import ModelError, ProcessModel, SearchSpace
 from sysid.gassi import GASSI, PRESETS
 from sysid.gassi import Progress as SearchProgress
 from sysid.judging.assessment import examine
+from sysid.judging.plausibility import implausible
+from sysid.problem.copies import shared_samples
 from sysid.problem.data import require_information
+from sysid.problem.faults import DataFault, Part, after_mending, data_faults
 
 if TYPE_CHECKING:
     import pandas as pd
 
     Source = str | Path | Recording | pd.DataFrame
+
+_COPY = 0.99  # of a log's samples that stand in another as well
 
 _STAGES = {
     "search": ("Genetic search", "generation"),
@@ -115,11 +123,15 @@ def fit(
     warn(watch, *(log.warning for log in (*train, *check)))
     train, ends = records.hold_back(train, problem.settings.hold_back)
     _require_information(problem, train)
+    logs = train, [*ends, *check]
+    faults = faults_of(problem, logs)
+    for fault in faults:
+        watch(Note("warning" if fault.severity == "doubt" else "note", fault.sentence))
     if folder is not None and not resume:
         request.remember(folder, problem.request, _paths(training), _paths(validation))
     try:
         estimator = _searched(problem, train, folder, watch, resume)
-        result = assemble(problem, estimator, (train, [*ends, *check]), folder, watch)
+        result = assemble(problem, estimator, logs, folder, watch, faults)
     except (KeyboardInterrupt, Terminated) as stop:
         if folder is not None and (folder / request.CHECKPOINT).exists():
             command = request.resume_command(folder) + trust_option(problem.model_name)
@@ -134,27 +146,49 @@ def fit(
 
 def _require_information(problem: Problem, train: Sequence[LoggedRecord]) -> None:
     """Raise ConfigError, before anything is written, for logs that determine nothing."""
-    settings, model = problem.settings, problem.model
-    space = SearchSpace.of(
-        model, settings.ranges, settings.fixed, tied=settings.tied, scale=settings.scale
-    )
+    names, n_free = problem.model.output_names, len(_space(problem).names)
     try:
-        require_information([log.dataset for log in train], model.output_names, len(space.names))
+        require_information([log.dataset for log in train], names, n_free)
     except ModelError as error:
         raise ConfigError(str(error), file=train[0].path) from None
 
 
 def load_logs(problem: Problem, training: Sequence[Source], validation: Sequence[Source]) -> Split:
-    """Records for training and for validation; ConfigError when a log is given for both."""
+    """Records for training and for validation; ConfigError when a log is given twice.
+
+    That is also what has the samples of another log under a name of its own.
+    """
     train = _records(training, "training", problem)
     check = _records(validation, "validation", problem)
+    problem.selection.check_names([log.path for log in (*train, *check)])
     paths = {log.path.resolve() for log in train}
     for log in check:
         if log.path.resolve() in paths:
-            cure = "a model proves itself only on data it has not seen"
             twice = "the same log is given for training and for validation"
-            raise ConfigError(twice, cure=cure, file=log.path)
+            raise ConfigError(twice, cure=_UNSEEN, file=log.path)
+    _refuse_copies(train, check)
     return train, check
+
+
+_UNSEEN = "a model proves itself only on data it has not seen"
+
+
+def _refuse_copies(train: Sequence[LoggedRecord], check: Sequence[LoggedRecord]) -> None:
+    """Raise ConfigError for a log that has the samples of an earlier one, or of training."""
+    logs = [*train, *check]
+    shares = shared_samples([log.dataset for log in logs]) if len(logs) > 1 else np.zeros((1, 1))
+    for i, log in enumerate(logs):
+        is_validation = i >= len(train)
+        earlier = shares[i, : len(train) if is_validation else i]
+        if np.max(earlier, initial=0.0) < _COPY:
+            continue
+        source = logs[int(np.argmax(earlier))]
+        held = "for training" if is_validation else "already"
+        raise ConfigError(
+            f"its samples are those of {source.path}, which is given {held}",
+            cure=_UNSEEN if is_validation else "leave one out: twice the same tells nothing more",
+            file=log.path,
+        )
 
 
 def default_folder(logs: Sequence[Path], model: str) -> Path:
@@ -176,10 +210,41 @@ def check_writable(folder: Path) -> None:
         raise ConfigError(f"cannot be created: {reason}", cure=cure, file=folder)
 
 
+def faults_of(problem: Problem, logs: Split) -> tuple[DataFault, ...]:
+    """What is wrong with the data of logs for training and for validation, as they were read."""
+    model = problem.model
+    measured = [[log.measured or log.dataset for log in part] for part in logs]
+    faults = data_faults(model, *measured)
+    if problem.selection.robust:
+        faults = after_mending(faults, model)
+    units: list[DataFault] = []
+    parts: tuple[Part, ...] = ("training", "validation")
+    for part, records_of_part in zip(parts, logs, strict=True):
+        if records_of_part:
+            datasets = [log.dataset for log in records_of_part]
+            units += implausible(model, _space(problem), datasets, part)
+    return (*units, *faults)
+
+
+def _space(problem: Problem) -> SearchSpace:
+    settings = problem.settings
+    return SearchSpace.of(
+        problem.model, settings.ranges, settings.fixed, tied=settings.tied, scale=settings.scale
+    )
+
+
 def assemble(
-    problem: Problem, estimator: GASSI, logs: Split, folder: Path | None, watch: Watch
+    problem: Problem,
+    estimator: GASSI,
+    logs: Split,
+    folder: Path | None,
+    watch: Watch,
+    faults: tuple[DataFault, ...] | None = None,
 ) -> Identification:
-    """A fitted estimator with its intervals and profiles, and how it does on every log."""
+    """A fitted estimator with its intervals and profiles, and how it does on every log.
+
+    faults: of the logs, where they have been looked for.
+    """
     datasets = [log.dataset for log in logs[0]]
     refined = PRESETS[estimator.preset].refine and estimator.stopped_ != "interrupted"
     uncertainty = estimator.uncertainty(datasets) if refined else None
@@ -189,15 +254,22 @@ def assemble(
         profiles.append(estimator.profile(name, datasets))
         watch(Progress("Profiles", k + 1, len(names), f"of {name}"))
     training, validation = ([_fitted(log, estimator) for log in part] for part in logs)
-    return Identification(problem, estimator, uncertainty, profiles, training, validation, folder)
+    faults = faults_of(problem, logs) if faults is None else faults
+    return Identification(
+        problem, estimator, uncertainty, profiles, training, validation, folder, faults=faults
+    )
 
 
 def take(
-    source: Source, name: str, model: ProcessModel, mapping: ColumnMapping | None
+    source: Source,
+    name: str,
+    model: ProcessModel,
+    mapping: ColumnMapping | None,
+    selection: Selection = EVERYTHING,
 ) -> LoggedRecord:
     """A record from whatever holds one; name: of a table, which has none of its own."""
     if isinstance(source, str | Path):
-        return records.load(Path(source), model, mapping)
+        return records.load(Path(source), model, mapping, selection)
     if mapping is not None:
         raise ConfigError(
             "its 'columns' are those of files",
@@ -206,8 +278,8 @@ def take(
         )
     try:
         if isinstance(source, Recording):
-            return records.from_recording(source, model)
-        return records.from_frame(source, name, model)
+            return records.from_recording(source, model, selection)
+        return records.from_frame(source, name, model, selection)
     except ModelError as error:
         raise ConfigError(str(error), file=name) from None
 
@@ -243,7 +315,13 @@ def _records(sources: Sequence[Source], name: str, problem: Problem) -> list[Log
         logs += records.expand(Path(source)) if isinstance(source, str | Path) else [source]
     several = len(logs) != 1
     return [
-        take(log, f"{name} {k}" if several else name, problem.model, problem.mapping)
+        take(
+            log,
+            f"{name} {k}" if several else name,
+            problem.model,
+            problem.mapping,
+            problem.selection,
+        )
         for k, log in enumerate(logs, 1)
     ]
 

@@ -15,12 +15,15 @@ from daq.config.units import factor
 from daq.config.yaml_file import Key, YamlFile
 from daq.errors import ConfigError, suggestion
 from daq.hal import FloatArray, IntArray
+from daq.identification.selection import EVERYTHING, Selection
+from daq.logs import matlab
 from daq.logs.capture import LOG_NAME
 from daq.logs.recording import Recording, end_of_run, log_path, read_record
 from daq.logs.recording import load as load_recording
 from daq.logs.table import column_names, read_table
 from daq.logs.time_base import refuse_rows, require_rows, time_base
 from sysid.problem.data import Dataset
+from sysid.problem.faults import mended
 from sysid.problem.model import Input, ModelError, Output, ProcessModel
 
 if TYPE_CHECKING:
@@ -40,11 +43,16 @@ class ColumnMapping:
 
 @dataclass(frozen=True)
 class LoggedRecord:
-    """A log as a record for a model; warning: how a run that did not complete ended."""
+    """A log as a record for a model; warning: how a run that did not complete ended.
+
+    measured: its record with the faulty samples that ``robust`` leaves out of ``dataset``; None
+    where that leaves none out.
+    """
 
     dataset: Dataset
     path: Path
     warning: str | None
+    measured: Dataset | None = None
 
 
 Split = tuple[list[LoggedRecord], list[LoggedRecord]]  # for training, for validation
@@ -54,33 +62,42 @@ def expand(path: Path) -> list[Path]:
     """Logs named on the command line: a folder without a log.csv stands for the CSVs in it."""
     if not path.is_dir() or (path / LOG_NAME).exists():
         return [path]
-    if logs := sorted(path.glob("*.csv")):
+    if logs := sorted((*path.glob("*.csv"), *path.glob(f"*{matlab.SUFFIX}"))):
         return logs
     problem = "neither a capture folder (with log.csv) nor a folder of CSV files"
     raise ConfigError(problem, file=path)
 
 
-def load(path: Path, model: ProcessModel, mapping: ColumnMapping | None) -> LoggedRecord:
+def load(
+    path: Path,
+    model: ProcessModel,
+    mapping: ColumnMapping | None,
+    selection: Selection = EVERYTHING,
+) -> LoggedRecord:
     """One log as a record; ConfigError names the file, line and column of what is wrong."""
     try:
         if mapping is not None:
-            return _load_foreign(log_path(path), model, mapping)
-        return from_recording(load_recording(path), model)
+            return _load_foreign(log_path(path), model, mapping, selection)
+        return from_recording(load_recording(path), model, selection)
     except ModelError as error:
         raise ConfigError(str(error), file=path) from None
 
 
-def from_recording(recording: Recording, model: ProcessModel) -> LoggedRecord:
+def from_recording(
+    recording: Recording, model: ProcessModel, selection: Selection = EVERYTHING
+) -> LoggedRecord:
     """A log that has been read as a record; ConfigError, ModelError."""
-    dataset = _from_log(recording, model, recording.name)
+    dataset = _from_log(recording, model, recording.name, selection)
     # What the offset calibration measured: standard deviations of noise and of zeros.
     noise, zero = np.array([recording.noise(n) for n in model.input_names]).reshape(-1, 2).T
     output_zero = np.array([recording.noise(name)[1] for name in model.output_names])
     dataset = replace(dataset, input_noise=noise, input_zero=zero, output_zero=output_zero)
-    return LoggedRecord(dataset, recording.path, recording.warning)
+    return _mended(LoggedRecord(dataset, recording.path, recording.warning), model, selection)
 
 
-def from_frame(frame: pd.DataFrame, name: str, model: ProcessModel) -> LoggedRecord:
+def from_frame(
+    frame: pd.DataFrame, name: str, model: ProcessModel, selection: Selection = EVERYTHING
+) -> LoggedRecord:
     """A table with time ``t`` [s] and the model's signals by name; ConfigError, ModelError."""
     path, wanted = Path(name), ("t", *model.input_names, *model.output_names)
     for column in wanted:
@@ -103,7 +120,15 @@ def from_frame(frame: pd.DataFrame, name: str, model: ProcessModel) -> LoggedRec
         refuse_rows(path, wrong, "it is not finite", 0, column, cure)
     tick, dt = time_base(path, numbers["t"].to_numpy(), first_line=0)
     log = Recording(path, numbers.assign(tick=tick), dt)
-    return LoggedRecord(_from_log(log, model, name), path, None)
+    record = LoggedRecord(_from_log(log, model, name, selection), path, None)
+    return _mended(record, model, selection)
+
+
+def _mended(log: LoggedRecord, model: ProcessModel, selection: Selection) -> LoggedRecord:
+    """A log without its faulty samples, where ``robust`` wants that."""
+    if not selection.robust:
+        return log
+    return replace(log, dataset=mended(model, log.dataset), measured=log.dataset)
 
 
 def hold_back(logs: list[LoggedRecord], part: float) -> Split:
@@ -134,7 +159,9 @@ def _halves(log: LoggedRecord, part: float) -> tuple[LoggedRecord, LoggedRecord]
                 cure="hold back another part, or validate with another log",
                 file=log.path,
             )
-        halves.append(replace(log, dataset=whole.part(first, last, f"{whole.name} ({share})")))
+        name = f"{whole.name} ({share})"
+        unmended = None if log.measured is None else log.measured.part(first, last, name)
+        halves.append(replace(log, dataset=whole.part(first, last, name), measured=unmended))
     return halves[0], halves[1]
 
 
@@ -171,7 +198,7 @@ def _groups(model: ProcessModel, columns: Columns) -> list[SignalGroup]:
     return [("inputs", columns.inputs, model.inputs), ("outputs", columns.outputs, model.outputs)]
 
 
-def _from_log(log: Recording, model: ProcessModel, title: str) -> Dataset:
+def _from_log(log: Recording, model: ProcessModel, title: str, selection: Selection) -> Dataset:
     columns = list(log.frame.columns)
     for name in (*model.input_names, *model.output_names):
         if name not in columns:
@@ -181,11 +208,30 @@ def _from_log(log: Recording, model: ProcessModel, title: str) -> Dataset:
             raise ConfigError(problem, cure=cure, file=log.path)
     inputs = log.frame[list(model.input_names)].to_numpy(dtype=np.float64)
     outputs = log.frame[list(model.output_names)].to_numpy(dtype=np.float64)
-    tick = log.frame["tick"].to_numpy()
-    return _dataset(log.path, model, inputs, outputs, tick, log.dt, title)
+    tick, rows = log.frame["tick"].to_numpy(), selection.rows(log.path, log.frame["t"].to_numpy())
+    dataset = _dataset(log.path, model, inputs[rows], outputs[rows], tick[rows], log.dt, title)
+    return _without_run_in(dataset, log.path, model, selection)
 
 
-def _load_foreign(path: Path, model: ProcessModel, mapping: ColumnMapping) -> LoggedRecord:
+def _without_run_in(
+    dataset: Dataset, path: Path, model: ProcessModel, selection: Selection
+) -> Dataset:
+    """A record whose run-in is not compared: only its first sample tells where states start."""
+    begin = selection.compared_from(dataset.dt)
+    if begin == 0:
+        return dataset
+    if begin > dataset.n_samples - 2:
+        raise selection.refuse_run_in(path, dataset.n_samples)
+    outputs = dataset.outputs.copy()
+    outputs[1:begin] = np.nan
+    no_starts = [name not in model.state_names for name in model.output_names]
+    outputs[0, no_starts] = np.nan
+    return replace(dataset, outputs=outputs)
+
+
+def _load_foreign(
+    path: Path, model: ProcessModel, mapping: ColumnMapping, selection: Selection
+) -> LoggedRecord:
     columns = mapping.columns
     _check_columns(path, model, mapping)
     gapless = {columns.time.column, *(columns.inputs[name].column for name in model.input_names)}
@@ -195,7 +241,7 @@ def _load_foreign(path: Path, model: ProcessModel, mapping: ColumnMapping) -> Lo
     cure = "mend these cells or remove their lines (removed lines count as lost samples)"
     frame, first_line, torn = read_table(path, used, cure, gaps)
     require_rows(path, len(frame))
-    tick, dt = _foreign_time(path, frame, first_line, mapping)
+    time, tick, dt = _foreign_time(path, frame, first_line, mapping)
 
     def values(group: str, given: dict[str, Column], signals: Sequence[Signal]) -> FloatArray:
         table = np.zeros((len(frame), len(signals)))
@@ -208,12 +254,17 @@ def _load_foreign(path: Path, model: ProcessModel, mapping: ColumnMapping) -> Lo
                 table[:, j] = source.constant * factor
         return table
 
-    inputs, outputs = (values(*group) for group in _groups(model, columns))
-    # The first sample tells where the model starts.
-    first = int(np.argmax(np.isfinite(outputs).all(axis=1)))
-    rows = slice(first, None)
-    dataset = _dataset(path, model, inputs[rows], outputs[rows], tick[rows], dt, path.stem)
-    return LoggedRecord(dataset, path, end_of_run(path, read_record(path), torn))
+    rows = selection.rows(path, time)
+    inputs, outputs = (values(*group)[rows] for group in _groups(model, columns))
+    tick = tick[rows]
+    if selection.run_in is None:
+        # The first sample tells where the model starts.
+        first = int(np.argmax(np.isfinite(outputs).all(axis=1)))
+        inputs, outputs, tick = inputs[first:], outputs[first:], tick[first:]
+    dataset = _dataset(path, model, inputs, outputs, tick, dt, path.stem)
+    dataset = _without_run_in(dataset, path, model, selection)
+    log = LoggedRecord(dataset, path, end_of_run(path, read_record(path), torn))
+    return _mended(log, model, selection)
 
 
 def _check_columns(path: Path, model: ProcessModel, mapping: ColumnMapping) -> None:
@@ -232,27 +283,29 @@ def _check_columns(path: Path, model: ProcessModel, mapping: ColumnMapping) -> N
 
 def _foreign_time(
     path: Path, frame: pd.DataFrame, first_line: int, mapping: ColumnMapping
-) -> tuple[IntArray, float]:
-    """Sequence numbers and sample time [s] of a foreign table's rows."""
+) -> tuple[FloatArray, IntArray, float]:
+    """Times [s] and sequence numbers of a foreign table's rows, and their sample time [s]."""
     time = mapping.columns.time
     if time.column is None:
         assert time.sample_rate is not None
-        return np.arange(len(frame), dtype=np.int64), 1.0 / time.sample_rate
+        tick: IntArray = np.arange(len(frame), dtype=np.int64)
+        return tick / time.sample_rate, tick, 1.0 / time.sample_rate
     seconds = unit_factor(mapping.file, ("columns", "time", "unit"), time.unit, "s")
     values = frame[time.column].to_numpy() * seconds
     cure = (
         "say 'grid: 0.001' (s) in 'columns: time:' to round uneven times to multiples of it, or "
         "resample the log to a constant rate"
     )
-    tick = None
+    places = None
     if time.grid is not None:
-        tick = np.round((values - values[0]) / time.grid)
-        if np.any(np.diff(tick) == 0.0) and np.all(np.diff(values) > 0.0):
+        places = np.round((values - values[0]) / time.grid)
+        if np.any(np.diff(places) == 0.0) and np.all(np.diff(values) > 0.0):
             apart = f"rows of {path} are {np.diff(values).min():g} s apart; take a tenth of that"
             problem = f"{time.grid:g} s is too coarse: {apart}"
             raise mapping.file.error(("columns", "time", "grid"), problem)
-        values = tick * time.grid
-    return time_base(path, values, tick, first_line=first_line, column=time.column, cure=cure)
+        values = values[0] + places * time.grid
+    tick, dt = time_base(path, values, places, first_line=first_line, column=time.column, cure=cure)
+    return values, tick, dt
 
 
 def _dataset(

@@ -65,6 +65,11 @@ class Replay:
         return self._by_output(self.metrics.msd)
 
     @property
+    def rmse_absolute(self) -> dict[str, float]:
+        """Root mean squared error of each output in its unit."""
+        return self._by_output(self.metrics.rmse * self.metrics.scale)
+
+    @property
     def frame(self) -> pd.DataFrame:
         """A table: ``t`` [s], each output as measured, and as ``<output>_simulated``."""
         import pandas as pd

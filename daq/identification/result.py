@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,6 +24,7 @@ from sysid import Metrics, ProcessModel
 from sysid.arrays import FloatArray
 from sysid.gassi import GASSI
 from sysid.judging.assessment import RecordResult, Verdict, judge
+from sysid.problem.faults import DataFault
 from sysid.problem.model import Parameter
 from sysid.uncertainty import Estimate, Profile, Uncertainty
 
@@ -48,12 +49,12 @@ class Identification:
 
     uncertainty: None where the search was not refined to a minimum. profiles: those asked for.
     folder: where ``parameters.yaml`` was written, None where nothing was. seeds: the spread over
-    several seeds, of which this is the best.
+    several seeds, of which this is the best. faults: what is wrong with the data.
 
     >>> from daq import identify, record
     >>> result = identify(record("prbs.yaml"), preset="thesis", generations=2)
     >>> result.save("results").name, list(result.metrics.columns)
-    ('parameters.yaml', ['rmse', 'msd', 'fit_percent'])
+    ('parameters.yaml', ['rmse', 'msd', 'fit_percent', 'rmse_absolute', 'msd_absolute', 'unit'])
     """
 
     problem: Problem
@@ -64,6 +65,7 @@ class Identification:
     validation: Sequence[FittedLog]
     folder: Path | None = None
     seeds: Mapping[str, Any] | None = None
+    faults: tuple[DataFault, ...] = ()
 
     @property
     def model(self) -> ProcessModel:
@@ -75,7 +77,10 @@ class Identification:
         """How far to trust it, and why."""
         parts = self.training, self.validation
         training, validation = ([log.result for log in part] for part in parts)
-        return judge(self.model, training, validation, self.uncertainty, self.estimator.feasible_)
+        feasible = self.estimator.feasible_
+        return judge(
+            self.model, training, validation, self.uncertainty, feasible, faults=self.faults
+        )
 
     @property
     def trust(self) -> str:
@@ -121,6 +126,7 @@ class Identification:
             # How the model was used where not as it declares; ``rig replay`` uses it likewise.
             **{key: value for key, value in signals.items() if value},
             "verdict": {"trust": verdict.trust, "reasons": list(verdict.reasons)},
+            "data_faults": [_fault(fault) for fault in self.faults],
             "parameters": {p.name: _parameter(self, p) for p in self.model.parameters},
             **({"initial_states": starts} if any(starts) else {}),
             **(_uncertainty(self.uncertainty) if self.uncertainty is not None else {}),
@@ -173,12 +179,13 @@ class Identification:
     def metrics(self) -> pd.DataFrame:
         """Errors of the free runs, a row for each part, log and output.
 
-        rmse and msd in parts of the largest measured value, fit_percent 100 for a perfect one.
+        rmse and msd in parts of the largest measured value, rmse_absolute and msd_absolute in the
+        output's unit, fit_percent 100 for a perfect one.
         """
         import pandas as pd
 
         rows = [
-            {"part": part, "log": log.name, "output": output, **errors.figures}
+            {"part": part, "log": log.name, "output": output, **errors.figures, "unit": errors.unit}
             for part, logs in self.rows.logs.items()
             for log in logs
             for output, errors in log.outputs.items()
@@ -191,6 +198,10 @@ class Identification:
         path = Path(folder) / PARAMETERS
         write_whole(path, yaml.safe_dump(self.document, sort_keys=False, allow_unicode=True))
         return path
+
+
+def _fault(fault: DataFault) -> dict[str, Any]:
+    return {**asdict(fault), "records": list(fault.records), "sentence": fault.sentence}
 
 
 def _parameter(identification: Identification, parameter: Parameter) -> dict[str, Any]:
@@ -262,13 +273,18 @@ def _profile(profile: Profile) -> dict[str, Any]:
     }
 
 
-def errors_document(model: ProcessModel, metrics: Metrics) -> dict[str, dict[str, float]]:
-    """Errors of each output on one log."""
+def errors_document(model: ProcessModel, metrics: Metrics) -> dict[str, dict[str, Any]]:
+    """Errors of each output on one log: in parts of max|y|, and absolute in the output's unit."""
     figures = {"rmse": metrics.rmse, "msd": metrics.msd, "fit_percent": metrics.fit}
     figures["max_abs"] = metrics.scale
     return {
-        name: {key: float(values[j]) for key, values in figures.items()}
-        for j, name in enumerate(model.output_names)
+        output.name: {
+            **{key: float(values[j]) for key, values in figures.items()},
+            "rmse_absolute": float(metrics.rmse[j] * metrics.scale[j]),
+            "msd_absolute": float(metrics.msd[j] * metrics.scale[j]),
+            "unit": output.unit,
+        }
+        for j, output in enumerate(model.outputs)
     }
 
 

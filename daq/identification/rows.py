@@ -92,13 +92,17 @@ class AmbiguityRow:
 class OutputErrors:
     """Errors of the free run in one output; rmse and msd in parts of the largest measured value.
 
-    whiteness: share of the residual's autocorrelations inside their 95 % band. independence: by
-    input, share of the cross-correlations inside theirs.
+    rmse_absolute, msd_absolute: the same in the output's unit; NaN in documents without. whiteness:
+    share of the residual's autocorrelations inside their 95 % band. independence: by input, share
+    of the cross-correlations inside theirs.
     """
 
     rmse: float
     msd: float
     fit_percent: float
+    rmse_absolute: float = math.nan
+    msd_absolute: float = math.nan
+    unit: str = ""
     whiteness: float = math.nan
     independence: Mapping[str, float] = field(default_factory=dict)
 
@@ -110,6 +114,9 @@ class OutputErrors:
             _number(entry["rmse"]),
             _number(entry["msd"]),
             _number(entry["fit_percent"]),
+            _number(entry.get("rmse_absolute")),
+            _number(entry.get("msd_absolute")),
+            entry.get("unit", ""),
             _number(entry.get("residual_autocorrelation_in_band")),
             {signal: _number(share) for signal, share in independence.items()},
         )
@@ -122,14 +129,18 @@ class OutputErrors:
             _mean(e.rmse for e in errors),
             _mean(e.msd for e in errors),
             _mean(e.fit_percent for e in errors),
+            _mean(e.rmse_absolute for e in errors),
+            _mean(e.msd_absolute for e in errors),
+            errors[0].unit,
             _mean(e.whiteness for e in errors),
             {s: _mean(e.independence.get(s, math.nan) for e in errors) for s in signals},
         )
 
     @property
     def figures(self) -> dict[str, float]:
-        """RMSE, MSD and fit by name."""
-        return {"rmse": self.rmse, "msd": self.msd, "fit_percent": self.fit_percent}
+        """RMSE, MSD and fit by name, then RMSE and MSD in the output's unit."""
+        names = ("rmse", "msd", "fit_percent", "rmse_absolute", "msd_absolute")
+        return {name: getattr(self, name) for name in names}
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from daq.errors import ConfigError, Mistake, suggestion
 from daq.identification import datasheets, records
 from daq.identification.records import ColumnMapping
 from daq.identification.request import SettingsRequest
+from daq.identification.selection import EVERYTHING, Selection
 from daq.lookup.models import DEFAULT_MODEL, find_model, whole_name
 from daq.progress import Note, Watch, ignore
 from sysid import ModelError, ProcessModel, SearchSpace
@@ -34,7 +35,7 @@ class Problem:
     """What is to be identified, checked before any log is read or rig moved.
 
     sources: where each parameter's range or value stands that is not the model's own. request:
-    what all this was made from.
+    what all this was made from. selection: which samples of its logs count.
     """
 
     model: ProcessModel
@@ -43,6 +44,7 @@ class Problem:
     mapping: ColumnMapping | None
     sources: Mapping[str, str]
     request: SettingsRequest
+    selection: Selection = EVERYTHING
 
 
 def problem_of(
@@ -73,8 +75,10 @@ def problems_of(
         check.refuse_other_kind(written, "an identification's settings")
     file = TypedSettings.of(options, request.settings, written)
     declared = _find_models(config, file, names, record)
+    file, freed = _without_nulls(file, [model for model, _ in declared])
     file, unconverted = in_model_units(file, [model for model, _ in declared])
     settings = check.validate(file, IdentificationConfig, others=unconverted)
+    selection = Selection(settings.use, settings.run_in, settings.robust, file)
     for model, name in declared:
         watch(Note("detail", f"model {name}: {model.description}"))
     models = [_with_outputs(file, settings, model) for model, _ in declared]
@@ -87,7 +91,10 @@ def problems_of(
     entries = datasheets.load([beside / name for name in settings.datasheet], models)
     problems = []
     for (_, name), model in zip(declared, models, strict=True):
-        completed, sources = datasheets.under(_restricted(settings, model), entries, model)
+        given = _restricted(settings, model)
+        sheet = {n: entry for n, entry in entries.items() if n not in freed or n in given.tied}
+        completed, sources = datasheets.under(given, sheet, model)
+        completed = _with_freed(file, completed, model, freed)
         _check_space(file, completed, model)
         if mapping is not None:
             records.check_mapping(model, mapping, spare)
@@ -100,7 +107,8 @@ def problems_of(
             for group in ("ranges", "fixed", "tied")
             for parameter in file.content.get(group) or {}
         }
-        problems.append(Problem(started, name, completed, mapping, sources, request.absolute(name)))
+        origin = request.absolute(name)
+        problems.append(Problem(started, name, completed, mapping, sources, origin, selection))
     return problems
 
 
@@ -126,6 +134,42 @@ def in_model_units(file: File, models: Sequence[ProcessModel]) -> tuple[File, li
                 mistakes.append(file.mistake((group, name), f"{error}; found {value!r}"))
                 del numbers[name]  # said once
     return dataclasses.replace(file, content=content), mistakes
+
+
+def _without_nulls(file: File, models: Sequence[ProcessModel]) -> tuple[File, frozenset[str]]:
+    """The file without entries that are null, ``fixed.R_m=null``; parameters not to be fixed.
+
+    ConfigError for the name of such an entry that no model has.
+    """
+    content, mistakes = dict(file.content), []
+    for group, kind in _KEYED_BY.items():
+        entries, names = content.get(group), _all_names(models, kind)
+        if not isinstance(entries, Mapping):
+            continue
+        for name in entries:
+            if entries[name] is None and name not in names:
+                mistakes.append(file.mistake((group, str(name)), suggestion(str(name), names)))
+        content[group] = {name: value for name, value in entries.items() if value is not None}
+    check.refuse(mistakes)
+    fixed = file.content.get("fixed")
+    freed = [n for n, value in fixed.items() if value is None] if isinstance(fixed, Mapping) else []
+    return dataclasses.replace(file, content=content), frozenset(freed)
+
+
+def _with_freed(
+    file: YamlFile, settings: IdentificationConfig, model: ProcessModel, freed: frozenset[str]
+) -> IdentificationConfig:
+    """Settings in which parameters freed by ``null`` that the model fixes have its range."""
+    ranges = dict(settings.ranges)
+    for parameter in model.parameters:
+        name = parameter.name
+        if not (parameter.fixed and name in freed) or name in ranges or name in settings.tied:
+            continue
+        if not parameter.lower < parameter.upper:
+            problem = f"model {model.name} fixes {name} and has no range to search it in"
+            raise file.error(("fixed", name), problem, f"give one: ranges.{name}=[low, high]")
+        ranges[name] = (parameter.lower, parameter.upper)
+    return settings.model_copy(update={"ranges": ranges})
 
 
 def with_signals(file: YamlFile, signals: Signals, model: ProcessModel) -> ProcessModel:

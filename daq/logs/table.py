@@ -13,6 +13,8 @@ import numpy as np
 
 from daq.errors import ConfigError, suggestion
 from daq.hal import FloatArray
+from daq.logs import matlab
+from daq.logs.capture import is_log
 from daq.logs.time_base import refuse_rows
 
 if TYPE_CHECKING:
@@ -24,6 +26,7 @@ _CURE = "mend or remove these lines (removed lines count as lost samples)"
 _NO_NUMBERS = ("nan", "inf", "-inf")  # what a broken sensor may end a log with
 _HEAD = 1 << 20  # bytes in which a header stands
 _PIECE = 1 << 22  # bytes parsed at a time: what pandas makes of them stays in the processor's cache
+_COMPARED = 20  # lines whose decimals tell how a file is written
 _TEXT_CONTROLS = b"\t\n\r\f"
 
 
@@ -37,14 +40,16 @@ class Layout:
 
 
 def column_names(path: Path) -> list[str]:
-    """Names in a table's header; raises ConfigError for a file without one."""
+    """Names in a table's header, or of a MAT file's columns; ConfigError for a file without."""
+    if path.suffix.lower() == matlab.SUFFIX:
+        return list(matlab.columns_of(path))
     return _layout_with(path, ()).names
 
 
 def read_table(
     path: Path, columns: Sequence[str] = (), cure: str = _CURE, gaps: Collection[str] = ()
 ) -> tuple[pd.DataFrame, int, bool]:
-    """Read a CSV of numbers with a header line.
+    """Read a CSV of numbers with a header line, or a MAT file.
 
     The columns as numbers, the line of the first row, and whether the last line was cut, or broken
     by a measurement that is no number, and is left out.
@@ -59,6 +64,8 @@ def read_table(
     """
     import pandas as pd
 
+    if path.suffix.lower() == matlab.SUFFIX:
+        return _matlab_table(path, columns, cure, gaps), 1, False
     layout = _layout_with(path, columns)
     names = list(columns) or [name for name in layout.names if name]
     first_line = layout.line + 1
@@ -66,7 +73,7 @@ def read_table(
     if plain is not None:
         frame, torn = plain
         return frame[names], first_line, torn
-    text, torn = _complete_lines(path)
+    text, torn = _complete_lines(path, layout=layout)
     cells = _cells(path, text, layout)
     without_gaps = [name for name in names if name not in gaps]
     if len(cells) and cells[without_gaps].iloc[-1].str.strip().str.lower().isin(_NO_NUMBERS).any():
@@ -77,6 +84,29 @@ def read_table(
         for name in names
     }
     return pd.DataFrame(numbers), first_line, torn
+
+
+def _matlab_table(
+    path: Path, columns: Sequence[str], cure: str, gaps: Collection[str]
+) -> pd.DataFrame:
+    """Columns of a MAT file; ConfigError, whose line is the row from 1, as for a CSV."""
+    import pandas as pd
+
+    arrays = matlab.columns_of(path)
+    names = list(columns) or list(arrays)
+    for name in names:
+        if name not in arrays:
+            problem = f"it has no array {name!r}"
+            raise ConfigError(problem, cure=suggestion(name, list(arrays)), file=path)
+    lengths = {name: len(arrays[name]) for name in names}
+    if len(set(lengths.values())) > 1:
+        shown = ", ".join(f"{name} has {length}" for name, length in lengths.items())
+        cure = "name arrays of one length in the 'columns' section"
+        raise ConfigError(f"its arrays differ in length: {shown}", cure=cure, file=path)
+    for name in names:
+        wrong = np.isinf(arrays[name]) if name in gaps else ~np.isfinite(arrays[name])
+        refuse_rows(path, wrong, "it is not a finite number", 1, name, cure)
+    return pd.DataFrame({name: arrays[name] for name in names})
 
 
 def _cells(path: Path, text: str, layout: Layout) -> pd.DataFrame:
@@ -140,6 +170,8 @@ def _plain_numbers(path: Path, layout: Layout) -> tuple[pd.DataFrame, bool] | No
             while piece := file.read(_PIECE) + file.readline():
                 rows = piece[: piece.rfind(b"\n") + 1]
                 torn = bool(piece[len(rows) :].strip())
+                if torn and _is_whole(path, piece.decode("latin-1"), layout):
+                    rows, torn = piece, False
                 if len(piece) < _PIECE:
                     rows = rows.rstrip(b"\r\n")  # the file's end: empty lines there are no rows
                 if rows:
@@ -178,8 +210,34 @@ def _names(line: str, separator: str) -> list[str]:
     return [name.strip().strip('"').strip() for name in line.split(separator)]
 
 
-def _complete_lines(path: Path, n_bytes: int = -1) -> tuple[str, bool]:
-    """Text of a file's first bytes, -1 for all, to its last whole line; whether any was cut off."""
+def _is_whole(path: Path, text: str, layout: Layout) -> bool:
+    """Whether the last line of a text that ends without a newline has lost nothing.
+
+    A capture's log ends with one unless its run was killed. In another file the line is whole when
+    it has every column, and no fewer decimals at its end than all lines before.
+    """
+    *before, last = text.rstrip().rsplit("\n", _COMPARED + 1)[-_COMPARED - 1 :]
+    cells = last.split(layout.separator)
+    readable = all(_is_number(cell) or cell.strip().lower() in _NOTHING for cell in cells)
+    if is_log(path) or len(cells) != len(layout.names) or not (readable and _is_number(cells[-1])):
+        return False
+    ends = [line.rstrip().rpartition(layout.separator)[2] for line in before]
+    decimals = {_decimals(end) for end in ends if _is_number(end)}
+    return len(decimals) != 1 or decimals == {_decimals(cells[-1])}
+
+
+def _decimals(cell: str) -> int:
+    """Digits behind the point of a number's text."""
+    return len(cell.strip().replace(",", ".").partition(".")[2])
+
+
+def _complete_lines(
+    path: Path, n_bytes: int = -1, layout: Layout | None = None
+) -> tuple[str, bool]:
+    """Text of a file's first bytes, -1 for all, to its last whole line; whether any was cut off.
+
+    layout: with it, a last line without its newline is kept where it is whole.
+    """
     try:
         with path.open("rb") as file:
             data = file.read(n_bytes)
@@ -199,6 +257,8 @@ def _complete_lines(path: Path, n_bytes: int = -1) -> tuple[str, bool]:
         raise ConfigError("the log is empty", cure=cure, file=path)
     # A last line without its newline may lack digits even where it has every column.
     cut = text.rfind("\n") + 1
+    if layout is not None and text[cut:].strip() and _is_whole(path, text, layout):
+        cut = len(text)
     complete = text[:cut] or text
     if "\0" in complete:
         line = complete[: complete.index("\0")].count("\n") + 1

@@ -42,6 +42,8 @@ def view(model: ProcessModel, document: Mapping[str, Any], rows: Rows) -> dict[s
         "determined": _determined(document, rows),
         "data_sentence": _data_sentence(document["reproduction"]["logs"]),
         "tables": {part: _errors(rows, baseline, part) for part in ("training", "validation")},
+        "log_rows": _log_rows(document["reproduction"]["logs"], rows),
+        "log_outputs": list(logs[0].outputs),
         "baseline": baseline,
         "baseline_sentence": _baseline_sentence(comparison),
         "meanings": {p.name: p.description for p in model.parameters},
@@ -106,6 +108,19 @@ def _errors(rows: Rows, baseline: Mapping[str, Any] | None, part: str) -> list[d
     if baseline is not None:
         columns.append(mean_errors(logs_of(baseline["metrics"], part)))
     return [{"name": name, "cells": [column[name] for column in columns]} for name in columns[0]]
+
+
+def _log_rows(fingerprints: Sequence[Mapping[str, Any]], rows: Rows) -> list[dict[str, Any]]:
+    """A row for every log: its length, and the errors of each output."""
+    errors = {(use, log.name): log.outputs for use, logs in rows.logs.items() for log in logs}
+    return [
+        {
+            **{key: log[key] for key in ("name", "use", "samples")},
+            "seconds": log["samples"] / log["sample_rate"],
+            "outputs": list(errors[log["use"], log["name"]].values()),
+        }
+        for log in fingerprints
+    ]
 
 
 def _baseline_sentence(comparison: Mapping[str, Any]) -> str:

@@ -3,10 +3,9 @@
 from collections.abc import Sequence
 
 from daq import notation
-from daq.identification.rows import ParameterRow, QuantityRow, Rows
+from daq.identification.rows import ParameterRow, QuantityRow, Rows, mean_errors
 
-_HEAD = r"""% Parameters of an identification: \input{parameters.tex} where the table is to stand.
-% With \usepackage{booktabs} its rules are those of booktabs, without it plain ones.
+_RULES = r"""% With \usepackage{booktabs} its rules are those of booktabs, without it plain ones.
 \providecommand{\toprule}{\hline}
 \providecommand{\midrule}{\hline}
 \providecommand{\bottomrule}{\hline}
@@ -20,9 +19,30 @@ def latex(rows: Rows) -> str:
     table, columns = [heads, *map(_cells, quantities)], "llrrl"
     if not any(row.description for row in rows.parameters):
         table, columns = [[cells[0], *cells[2:]] for cells in table], "lrrl"
+    return _tabular("Parameters of an identification", "parameters.tex", table, columns)
+
+
+def latex_errors(rows: Rows) -> str:
+    """Errors of each output in training and validation, mean over the logs."""
+    heads = ["Output", "Data", r"RMSE / $\max|y|$", "RMSE", "Unit", r"Fit [\%]"]
+    table = [heads]
+    for part, logs in rows.logs.items():
+        for name, errors in mean_errors(logs).items():
+            figures = (errors.rmse, errors.rmse_absolute, errors.fit_percent)
+            relative, absolute, fit = (
+                notation.number_tex(notation.number(value, 3)) for value in figures
+            )
+            unit = notation.unit_tex(errors.unit)
+            table.append([notation.tex(name), part, relative, absolute, unit, fit])
+    return _tabular("Errors of an identification", "errors.tex", table, "llrrlr")
+
+
+def _tabular(content: str, file: str, table: Sequence[Sequence[str]], columns: str) -> str:
+    """A table, heads first."""
     head, *body = (" & ".join(cells) + " \\\\\n" for cells in table)
     return (
-        f"{_HEAD}\\begin{{tabular}}{{{columns}}}\n\\toprule\n{head}\\midrule\n{''.join(body)}"
+        f"% {content}: \\input{{{file}}} where the table is to stand.\n{_RULES}"
+        f"\\begin{{tabular}}{{{columns}}}\n\\toprule\n{head}\\midrule\n{''.join(body)}"
         "\\bottomrule\n\\end{tabular}\n"
     )
 

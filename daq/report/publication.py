@@ -18,12 +18,13 @@ from daq.identification.result import Identification, errors_document
 from daq.logs.recording import read_record, settings_of
 from daq.lookup.models import DEFAULT_MODEL
 from daq.progress import Progress, Watch, ignore
-from daq.report.latex import latex
+from daq.report.latex import latex, latex_errors
 from daq.report.page import Drawing, Picture, page
 from daq.report.pictures import Subject, pictures
 
 DATA, FIGURES = "report.json", "figures"
 _PAGE, _TABLE = "report.html", "parameters.tex"
+_ERRORS_TABLE, _ERRORS = "errors.tex", "errors.csv"
 # What a report takes, for the progress display; a few figures more or fewer do no harm.
 _STEPS = 18
 
@@ -50,6 +51,8 @@ def publish(result: Identification, folder: Path, watch: Watch = ignore) -> dict
         "report": (_PAGE, page(result.model, document, subject.rows, drawings)),
         "data": (DATA, json.dumps(document, indent=1) + "\n"),
         "latex": (_TABLE, latex(subject.rows)),
+        "latex_errors": (_ERRORS_TABLE, latex_errors(subject.rows)),
+        "errors": (_ERRORS, result.metrics.to_csv(lineterminator="\n")),
     }
     for name, content in pages.values():
         write_whole(folder / name, content)
@@ -138,6 +141,7 @@ def _reproduction(result: Identification, logs: Split) -> dict[str, Any]:
         "folder": str(Path.cwd()),
         "columns": problem.request.config if problem.mapping is not None else None,
         "hold_back": problem.settings.hold_back,
+        "selection": problem.selection.document,
         "logs": fingerprints(logs),
         "runs": [
             _run(record)

@@ -12,6 +12,7 @@ from daq.identification import records
 from daq.identification.baseline import Baseline, baseline_of
 from daq.identification.records import LoggedRecord, Split
 from daq.identification.replay import read_parameters
+from daq.identification.selection import Selection
 from daq.identification.settings import columns_of
 from daq.progress import Progress, Watch, ignore
 from daq.report.pictures import Subject, pictures
@@ -87,6 +88,7 @@ def _restored(document: Mapping[str, Any], source: Path, trust: bool) -> Subject
 def _logs(reproduction: Mapping[str, Any], model: ProcessModel) -> Split:
     """The logs as they were used; ConfigError for one that is gone or another now."""
     columns = columns_of(Path(reproduction["columns"]) if reproduction["columns"] else None, model)
+    selection = Selection.of(reproduction.get("selection", {}))
     root = Path(reproduction["folder"])
     logs: dict[str, dict[Path, LoggedRecord]] = {"training": {}, "validation": {}}
     for entry in reproduction["logs"]:
@@ -95,7 +97,7 @@ def _logs(reproduction: Mapping[str, Any], model: ProcessModel) -> Split:
             raise ConfigError("this log of the report is gone", cure=_AGAIN, file=path)
         if hashlib.sha256(path.read_bytes()).hexdigest() != entry["sha256"]:
             raise ConfigError("this log is another than the report's", cure=_AGAIN, file=path)
-        logs[entry["use"]][path] = records.load(path, model, columns)
+        logs[entry["use"]][path] = records.load(path, model, columns, selection)
     training, ends = records.hold_back(list(logs["training"].values()), reproduction["hold_back"])
     # Of a log that is in both, the end was held back.
     others = [log for path, log in logs["validation"].items() if path not in logs["training"]]

@@ -142,6 +142,7 @@ def test_files_are_there_and_named_after_the_printed_result(result, work):
     assert result.stdout.index("Report: found/report.html") > printed
     assert {path.name for path in (work / "found").iterdir()} == {
         "parameters.yaml", "report.html", "report.json", "parameters.tex", "figures",
+            "errors.csv", "errors.tex",
     }  # fmt: skip
     assert re.search(r"^Report: \d+ figures \([\d.]+ s\)$", result.stderr, re.MULTILINE)
 
@@ -189,7 +190,7 @@ def test_numbers_of_the_page_are_those_of_the_document(page, document):
 
 def test_errors_stand_beside_those_of_a_linear_model(page, document):
     shown = [values for given, values in page.rows if given.get("data-output") == "y"]
-    keys = ("rmse", "msd", "fit_percent")
+    keys = ("rmse", "msd", "rmse_absolute", "fit_percent")
     linear = document["comparison"]["metrics"]
     expected = [
         [log["outputs"]["y"][key] for log in (document["metrics"][part][0], linear[part][0])
@@ -198,7 +199,7 @@ def test_errors_stand_beside_those_of_a_linear_model(page, document):
     ]  # fmt: skip
     assert shown == expected
     # The system is linear: neither beats the other by much.
-    ours, theirs = expected[0][0], expected[0][3]
+    ours, theirs = expected[0][0], expected[0][4]
     assert ours == pytest.approx(theirs, rel=0.3)
 
 
