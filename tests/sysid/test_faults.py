@@ -49,6 +49,9 @@ CORRECT = {
     "rest, then a step": driven((TIME > 5.0).astype(float), noise=0.0),
     "a sine": driven(wave(), noise=0.0),
     "an impulse": driven((np.arange(N) == 500).astype(float), noise=0.0, tau=0.02),
+    "pulses of a sample, now and then": driven(
+        (np.arange(N) % 97 == 5) * np.linspace(0.5, 1.0, N), noise=0.001, tau=0.002
+    ),
     "fine quantisation": replace(
         driven(wave()), outputs=np.round(driven(wave(), 0.0).outputs, 2)
     ),
@@ -71,6 +74,10 @@ def test_a_correct_record_has_no_fault(name):
     for log in (model(), model("foh")):
         faults = data_faults(log, [CORRECT[name]], [driven(levels(99), seed=99)])
         assert [fault.sentence for fault in faults if fault.severity == "doubt"] == []
+
+
+def test_ramps_and_levels_of_a_command_are_meant():
+    assert data_faults(model(), [CORRECT["a trapezoid, again and again"]]) == ()
 
 
 def changed(record, change):
