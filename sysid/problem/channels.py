@@ -167,6 +167,11 @@ def spikes(values: FloatArray, inputs: FloatArray) -> Spikes | None:
     returned = np.abs(after - before) < 0.3 * np.minimum(
         np.abs(middle - before), np.abs(middle - after)
     )
+    # Or so far beyond two neighbours on either side as these are apart, as where a step is.
+    around = np.stack([np.roll(values, k)[1:-1] for k in (-2, -1, 1, 2)])
+    low, high = around.min(axis=0), around.max(axis=0)
+    beyond = np.maximum(middle - high, low - middle)
+    returned |= beyond > 0.9 * (high - low)
     finite = away[np.isfinite(away)]
     if len(finite) < 20:
         return None
