@@ -220,9 +220,13 @@ def faults_of(problem: Problem, logs: Split) -> tuple[DataFault, ...]:
     units: list[DataFault] = []
     parts: tuple[Part, ...] = ("training", "validation")
     for part, records_of_part in zip(parts, logs, strict=True):
-        if records_of_part:
-            datasets = [log.dataset for log in records_of_part]
+        if not records_of_part:
+            continue
+        datasets = [log.dataset for log in records_of_part]
+        try:
             units += implausible(model, _space(problem), datasets, part)
+        except ModelError as error:
+            raise ConfigError(str(error)) from None
     return (*units, *faults)
 
 

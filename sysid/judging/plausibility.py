@@ -16,6 +16,7 @@ from sysid.problem.data import Dataset
 from sysid.problem.faults import DataFault, Part
 from sysid.problem.model import ProcessModel
 from sysid.problem.space import SearchSpace
+from sysid.time_limit import AT_A_POINT, time_limit
 
 _DRAWS = 32
 _ROWS = 1000  # of a record's beginning that are simulated
@@ -51,6 +52,7 @@ def implausible(
     if rates:
         return rates
     record = records[0].part(0, min(_ROWS, records[0].n_samples), records[0].name)
+    model.require_ends(space.full(np.array([space.lower, space.upper])))
     simulator = BatchSimulator(model, accuracy=1e-2, max_steps=32)
     runs = _runs(simulator, _draws(space), record)
     # Ranges in which few sets simulate tell nothing.
@@ -153,9 +155,10 @@ def _kinematic_pairs(model: ProcessModel) -> list[tuple[int, int]]:
         u = rng.uniform(0.1, 1.0, len(model.inputs))
         p = rng.uniform(lower, upper)
         try:
-            slope = model.derivative(tuple(x), tuple(u), tuple(p))
-        except (ArithmeticError, ValueError):
-            return []
+            with time_limit(AT_A_POINT):
+                slope = model.derivative(tuple(x), tuple(u), tuple(p))
+        except Exception:
+            return []  # what a user's own function raises is said where it is simulated
         pairs = {(a, b) for a, b in pairs if slope[places[a]] == x[places[b]]}
     names = model.output_names
     return [(names.index(a), names.index(b)) for a, b in sorted(pairs)]
