@@ -8,7 +8,10 @@ ARMAX gets what can be given to it: orders by free runs over the end of the trai
 combinations, also an input acting on its own row), refitted to all of it; stable poles; an offset;
 its start on the validation log fitted to that log, every lag of every output, where the physical
 models estimate one state. Beside it stands the best of all orders on the validation log itself,
-for each output by itself, which nobody could know beforehand.
+for each output by itself, which nobody could know beforehand. OE is the linear model whose free run
+errs least on the training log, orders of each output chosen likewise, by itself and with the
+measured brake current times the sign of the speed as one more input. Two bounds say what a linear
+model can do at all: OE fitted to the validation log itself, and ARMAX one sample ahead.
 
 python -m benchmarks.friction [--json] [--seeds 3] [--searches 2]
 """
@@ -24,6 +27,7 @@ from benchmarks._common import arguments, report, simulated_logs, timed
 from sim_rig.actuator import actuator
 from sysid import (
     ARMAX,
+    OE,
     BatchSimulator,
     Candidate,
     campaign,
@@ -35,8 +39,10 @@ from sysid import (
 )
 from sysid.judging.comparison import Row
 from sysid.linear.selection import TRIED, tuned
+from sysid.problem.regressors import with_regressors
 
 WITH, WITHOUT, LINEAR = "with friction", "without friction", "ARMAX"
+OUTPUT_ERROR, INFORMED = "OE", "OE, brake current * sign(omega)"
 # Table 4.3: the thesis's own figures on its own rig.
 THESIS = {
     "GASSI": {"current_motor": 0.0112, "current_brake": 0.136, "omega": 0.151},
@@ -76,11 +82,20 @@ def measure(
         for (name, _), outcome in found.best().items()
         if outcome.estimator is not None
     ]
-    linear = tuned(ARMAX(stable=True), training, **orders)
+    armax = ARMAX(stable=True)
+    linear = tuned(armax, training, **_of(armax, orders))
     candidates.append(Candidate.of(LINEAR, linear.model, [training], [validation]))
+    for name, extended in ((OUTPUT_ERROR, False), (INFORMED, True)):
+        logs = [training, validation]
+        if extended:
+            logs = [with_regressors(models[WITH], record)[0] for record in logs]
+        output_error = tuned(OE(), logs[0], **_of(OE(), orders))
+        candidates.append(Candidate.of(name, output_error.model, logs[:1], logs[1:]))
     result = compare(candidates, [training], [validation])
-    hindsight = select_orders(ARMAX(stable=True), training, validation, **orders)
+    hindsight = select_orders(armax, training, validation, **_of(armax, orders))
     names = models[WITH].output_names
+    ahead = evaluate(validation.outputs, linear.model.predict_ahead(validation))
+    best = OE(nf=6, nb=4).fit(validation)
     truth = actuator(friction="cyclic", parameters="rig")
     floor = evaluate(validation.outputs, free_run(BatchSimulator(truth), truth.nominal, validation))
     return {
@@ -89,11 +104,20 @@ def measure(
         "hindsight": _named(
             names, np.nanmin([c.rmse for c in hindsight.candidates if c.stable], axis=0)
         ),
+        "fitted_to_validation": _named(
+            names, evaluate(validation.outputs, best.predict(validation)).rmse
+        ),
+        "one_sample_ahead": _named(names, ahead.rmse),
         "true_parameters": _named(names, floor.rmse),
         "armax_orders": linear.best.orders,
         "preferred": result.preferred,
         "verdict": result.verdict,
     }
+
+
+def _of(estimator: ARMAX | OE, orders: Mapping[str, Iterable[Any]]) -> dict[str, Any]:
+    """Those of the orders that an estimator has."""
+    return {name: orders[name] for name in orders.keys() & estimator.get_params()}
 
 
 def demands(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -144,7 +168,7 @@ def show(figures: dict[str, Any]) -> None:
     print(f"\nValidation, free run, mean over {len(runs)} seed(s) of noise (as in table 4.3)")
     print(f"{'':34}" + "".join(f"{name:>24}" for name in outputs))
     print(f"{'':34}" + f"{'RMSE':>14}{'MSD':>10}" * len(outputs))
-    for name in (WITH, WITHOUT, LINEAR):
+    for name in (WITH, WITHOUT, LINEAR, OUTPUT_ERROR, INFORMED):
         cells = ""
         for output in outputs:
             rmse = np.mean([run["structures"][name]["rmse"][output] for run in runs])
@@ -153,6 +177,8 @@ def show(figures: dict[str, Any]) -> None:
         print(f"{name:34}{cells}")
     for label, key in (
         ("ARMAX, orders by hindsight", "hindsight"),
+        ("OE fitted to the validation log", "fitted_to_validation"),
+        ("ARMAX, one sample ahead", "one_sample_ahead"),
         ("true parameters", "true_parameters"),
     ):
         means = [np.mean([run[key][output] for run in runs]) for output in outputs]

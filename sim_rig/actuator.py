@@ -8,6 +8,8 @@ The brushes of the torque sensor, where their friction is modelled, rub on its b
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+
 from sim_rig.guesses import guesses
 from sim_rig.physics import electrical, options, values
 from sim_rig.physics.friction import FRICTIONS
@@ -17,6 +19,7 @@ from sim_rig.physics.options import Design
 from sim_rig.physics.parameters import Layout, fixed, log_range
 from sim_rig.plots import operating_points, plots
 from sysid import Input, ModelError, Output, ProcessModel, State
+from sysid.arrays import FloatArray
 from sysid.problem.model import picker
 
 OUTPUTS = (
@@ -88,6 +91,13 @@ def actuator(
     return model.with_parameters(**changes)
 
 
+def regressors(record: Any) -> dict[str, FloatArray]:
+    """The brake's torque but for its constant, which a linear model of the actuator cannot form."""
+    if "current_brake" not in record or "omega" not in record:
+        return {}
+    return {"current_brake*sign(omega)": record["current_brake"] * np.sign(record["omega"])}
+
+
 class _Assembly:
     """Parts of one design, their parameters behind one another.
 
@@ -130,6 +140,7 @@ class _Assembly:
             guesses=guesses(design),
             plots=plots,
             operating_points=operating_points,
+            regressors=regressors,
             equations=self._equations(),
         )
 

@@ -27,12 +27,13 @@ from sysid.response.linearization import LinearModel, equilibrium, jacobian, lin
 
 if TYPE_CHECKING:
     from sysid.gassi import GASSI
-    from sysid.linear import ARMAX, ARX, select_orders
+    from sysid.linear import ARMAX, ARX, OE, select_orders
 
 __all__ = [
     "ARMAX",
     "ARX",
     "GASSI",
+    "OE",
     "BatchResult",
     "BatchSimulator",
     "Campaign",
@@ -78,6 +79,7 @@ _LAZY = {
     "ARMAX": "sysid.linear",
     "ARX": "sysid.linear",
     "GASSI": "sysid.gassi",
+    "OE": "sysid.linear",
     "select_orders": "sysid.linear",
 }
 

@@ -42,6 +42,10 @@ def identify(
     settings: options.Settings = None,
     arx: Annotated[bool, Option("--arx", help="Compare with an ARX model.")] = False,
     armax: Annotated[bool, Option("--armax", help="Compare with an ARMAX model.")] = False,
+    oe: Annotated[
+        bool,
+        Option("--oe", help="Compare with output-error models: the best linear free run."),
+    ] = False,
     seeds: options.Seeds = None,
     jobs: options.Jobs = None,
     dask: options.Dask = None,
@@ -82,7 +86,7 @@ def identify(
         "profile": profile,
     }
     request = SettingsRequest(None if config is None else str(config), chosen, settings or [])
-    baselines = [name for name, wanted in (("ARX", arx), ("ARMAX", armax)) if wanted]
+    baselines = [name for name, wanted in (("ARX", arx), ("ARMAX", armax), ("OE", oe)) if wanted]
     if len(model or []) > 1 or baselines or seeds is not None:
         from daq.identification.campaign import Workers
         from daq.identification.comparison import ComparisonRequest, compare

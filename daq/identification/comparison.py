@@ -26,10 +26,20 @@ from daq.identification.result import Identification
 from daq.identification.settings import problems_of
 from daq.progress import Watch, ignore, warn
 from daq.provenance import software_versions
-from sysid import Campaign, Candidate, Comparison, ModelError, Outcome, Spread
+from sysid import (
+    Campaign,
+    Candidate,
+    Comparison,
+    Dataset,
+    ModelError,
+    Outcome,
+    ProcessModel,
+    Spread,
+)
 from sysid import compare as compare_candidates
 from sysid.judging.comparison import Row
-from sysid.linear import ARMAX, ARX, tuned
+from sysid.linear import ARMAX, ARX, OE, Orders, tuned
+from sysid.problem.regressors import with_regressors
 
 _FORMULA = (
     "AIC = n_e ln det S + 2 k, BIC = n_e ln det S + k ln n_e; S: mean square of the training "
@@ -41,7 +51,7 @@ _FORMULA = (
 class ComparisonRequest:
     """Structures to be compared on logs: models by name, linear baselines, several seeds.
 
-    baselines: ``ARX``, ``ARMAX``. seeds: ``0:10`` for 0 to 9, or ``3,5,8``.
+    baselines: ``ARX``, ``ARMAX``, ``OE``. seeds: ``0:10`` for 0 to 9, or ``3,5,8``.
 
     >>> ComparisonRequest([Path("runs/a")], models=["actuator"], baselines=["ARX"]).seeds is None
     True
@@ -198,16 +208,44 @@ def _candidates(
         estimator = best[name].estimator
         assert estimator is not None
         candidates.append(Candidate.of(name, estimator, *group.datasets))
-    training, validation = groups[0].datasets
     for kind in baselines:
-        try:
-            selection = tuned({"ARX": ARX, "ARMAX": ARMAX}[kind](stable=True), training)
-        except ModelError as error:
-            warn(watch, f"{kind} is left out: {error}")
-            continue
-        orders = ",".join(f"{name}={order}" for name, order in selection.best.orders.items())
-        candidates.append(Candidate.of(f"{kind}:{orders}", selection.model, training, validation))
+        for extended in (False, True) if kind == "OE" else (False,):
+            try:
+                candidates += _linear(kind, groups[0], extended)
+            except ModelError as error:
+                warn(watch, f"{kind} is left out: {error}")
     return candidates
+
+
+def _linear(kind: str, group: Group, extended: bool) -> list[Candidate]:
+    """A linear model of chosen orders; extended: with the model's regressors, none without any."""
+    training, validation = group.datasets
+    names: tuple[str, ...] = ()
+    if extended:
+        model = group.problem.model
+        (training, names), (validation, _) = (
+            _extended(model, records) for records in (training, validation)
+        )
+        if not names:
+            return []
+    estimator = {"ARX": ARX(stable=True), "ARMAX": ARMAX(stable=True), "OE": OE()}[kind]
+    selection = tuned(estimator, training)
+    name = "+".join((f"{kind}:{_orders_text(selection.best.orders)}", *names))
+    return [Candidate.of(name, selection.model, training, validation)]
+
+
+def _extended(
+    model: ProcessModel, records: Sequence[Dataset]
+) -> tuple[list[Dataset], tuple[str, ...]]:
+    extended = [with_regressors(model, record) for record in records]
+    return [record for record, _ in extended], extended[0][1] if extended else ()
+
+
+def _orders_text(orders: Orders) -> str:
+    """``nf=2/4,nb=1``: an output's own orders between slashes, in the outputs' order."""
+    each = {k: order if isinstance(order, list) else [order] for k, order in orders.items()}
+    texts = {k: o[:1] if len(set(o)) == 1 else o for k, o in each.items()}
+    return ",".join(f"{k}={'/'.join(map(str, o))}" for k, o in texts.items())
 
 
 def _rank(group: Group, candidates: Sequence[Candidate]) -> Comparison:

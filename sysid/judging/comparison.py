@@ -40,7 +40,7 @@ from sysid.problem.model import ModelError
 
 if TYPE_CHECKING:
     from sysid.gassi import GASSI
-    from sysid.linear import ARMAX, ARX
+    from sysid.linear import ARMAX, ARX, OE
 
 # Squared errors larger by no more than this share make no difference in practice.
 _MARGIN = 0.01
@@ -81,7 +81,7 @@ class Candidate:
     def of(
         cls,
         name: str,
-        estimator: GASSI | ARX | ARMAX,
+        estimator: GASSI | ARX | ARMAX | OE,
         training: Sequence[Dataset],
         validation: Sequence[Dataset] = (),
     ) -> Candidate:

@@ -1,14 +1,24 @@
 """ARX and ARMAX models as scikit-learn regressors: identification, free runs, predictions."""
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from sklearn.utils.validation import check_is_fitted
 
 from sysid.arrays import BoolArray, FloatArray
-from sysid.linear.polynomials import Layout, Order, filtered, innovations, poles, reflect_poles
+from sysid.linear.output_error import Drive, OutputErrorFit, fit_output_error
+from sysid.linear.polynomials import (
+    Layout,
+    Order,
+    filtered,
+    innovations,
+    order_table,
+    poles,
+    reflect_poles,
+)
 from sysid.linear.prediction_error import EquationFit, Stack, fit_equation, influence
 from sysid.problem.data import Dataset
 from sysid.problem.metrics import evaluate
@@ -19,6 +29,9 @@ from sysid.threads import one_thread
 _UNSTABLE_GROWTH = 1e6  # of a response over its start, beyond which the model is unstable
 
 
+Fit = EquationFit | OutputErrorFit
+
+
 @dataclass(repr=False, eq=False)
 class PolynomialModel(RecordEstimator):
     """A(q) y = B(q) u + offset + C(q) e, at rest at an operating point before each record."""
@@ -26,6 +39,9 @@ class PolynomialModel(RecordEstimator):
     _: KW_ONLY
     offset: bool = True
     stable: bool = False
+
+    # Whether no output acts on another, so that each may have orders of its own.
+    separate: ClassVar[bool] = False
 
     def fit(
         self, X: Data, y: FloatArray | None = None, *, records: Any = None, dt: float | None = None
@@ -142,9 +158,7 @@ class PolynomialModel(RecordEstimator):
         lag, limit = max(lag, layout.lag), getattr(self, "max_iterations", 1)
         if limit < 1:
             raise ModelError(f"max_iterations is {limit}; it must be 1 or more")
-        equations = stack.equations(layout, lag)
-        starts = stack.first_guesses(layout, equations)
-        fits = [fit_equation(*row, limit) for row in zip(equations, layout.nc, starts, strict=True)]
+        fits = self._fits(data, stack, layout, lag, limit)
         self.theta_ = np.concatenate([np.append(fit.theta, fit.c) for fit in fits])
         A = layout.polynomials(self.theta_)[0]
         self.A_ = reflect_poles(A) if self.stable else A
@@ -167,8 +181,16 @@ class PolynomialModel(RecordEstimator):
         self.input_mean_ = self.offset * np.vstack([r.inputs for r in data]).mean(axis=0)
         self.output_mean_ = self.offset * np.nanmean(stack.outputs, axis=0)
 
+    def _fits(
+        self, data: list[Dataset], stack: Stack, layout: Layout, lag: int, limit: int
+    ) -> list[Fit]:
+        """The best coefficients of each output's equation."""
+        equations = stack.equations(layout, lag)
+        starts = stack.first_guesses(layout, equations)
+        return [fit_equation(*row, limit) for row in zip(equations, layout.nc, starts, strict=True)]
+
     def _set_precision(
-        self, layout: Layout, fits: list[EquationFit], estimated: BoolArray, n: int
+        self, layout: Layout, fits: Sequence[Fit], estimated: BoolArray, n: int
     ) -> None:
         """Set covariances, standard errors and likelihood; Ljung, sections 9.2 and 9.3."""
         row, q, p = np.nonzero(layout.free)[0], len(fits), len(estimated)
@@ -367,3 +389,66 @@ class ARMAX(PolynomialModel):
     nk: Order = 1
     _: KW_ONLY
     max_iterations: int = 50
+
+
+def _rows(order: Any, m: int) -> Any:
+    """A number for each output as a row of m; other orders as they are."""
+    return [[number] * m for number in order] if np.ndim(order) == 1 else order
+
+
+@dataclass(repr=False, eq=False)
+class OE(PolynomialModel):
+    """Identify y = B(q) / F(q) u + e by minimising the error of the free run, output by output.
+
+    What ``ARMAX`` with C = A is when all that is not simulated is noise on the sensors: no other
+    linear model of these orders has a smaller free-run error on the records of ``fit``. F is
+    common to an output's inputs, its roots always inside the unit circle. Standard errors hold for
+    white e. See ``sysid.linear.output_error``.
+
+    Parameters
+    ----------
+    nf : coefficients of F: one number, or (n_outputs,).
+    nb, nk : as of ``ARX``; or (n_outputs,), one number for all inputs of an output.
+    offset : as of ``ARX``.
+    max_iterations : limit of the evaluations that search each output's F.
+
+    Attributes
+    ----------
+    A_, B_, C_ : F on the diagonal of A, and as C: predictions of any horizon are the free run.
+    iterations_, converged_ : as of ``ARMAX``. The rest as of ``ARX``.
+
+    >>> import numpy as np
+    >>> from scipy.signal import lfilter
+    >>> u, e = np.random.default_rng(0).normal(size=(2, 500))
+    >>> y = lfilter([0.0, 0.2], [1.0, -0.9], u) + 0.1 * e
+    >>> model = OE(nf=1, nb=1).fit(u[:, None], y)
+    >>> model.A_[1, 0].round(2), model.B_[1, 0].round(2)
+    (array([-0.9]), array([0.2]))
+    """
+
+    nf: Order = 2
+    nb: Order = 2
+    nk: Order = 1
+    _: KW_ONLY
+    max_iterations: int = 100
+
+    separate: ClassVar[bool] = True
+
+    def _layout(self, record: Dataset) -> Layout:
+        q, m = record.outputs.shape[1], record.inputs.shape[1]
+        nf, nb, nk = order_table("nf", self.nf, (q,)), *(_rows(o, m) for o in (self.nb, self.nk))
+        return Layout(q, m, na=np.diag(nf), nb=nb, nc=0, nk=nk, offset=self.offset)
+
+    def _fits(
+        self, data: list[Dataset], stack: Stack, layout: Layout, lag: int, limit: int
+    ) -> list[Fit]:
+        fits: list[Fit] = []
+        for j, (free, nf) in enumerate(zip(layout.free, np.diag(layout.na), strict=True)):
+            drive = Drive(data, j, free[len(layout.free) : -1], int(nf), lag)
+            fits.append(fit_output_error(drive, int(nf), limit))
+        return fits
+
+    def _fit_rows(self, *args: Any, **more: Any) -> None:
+        super()._fit_rows(*args, **more)
+        self.C_ = np.einsum("lii->li", self.A_)
+        self.C_std_ = np.einsum("lii->li", self.A_std_)

@@ -29,8 +29,8 @@ class Layout:
     """
 
     def __init__(self, q: int, m: int, *, offset: bool, na: Order, nb: Order, nc: Order, nk: Order):
-        self.na, self.nb = _table("na", na, (q, q)), _table("nb", nb, (q, m))
-        self.nc, self.nk = _table("nc", nc, (q,)), _table("nk", nk, (q, m))
+        self.na, self.nb = order_table("na", na, (q, q)), order_table("nb", nb, (q, m))
+        self.nc, self.nk = order_table("nc", nc, (q,)), order_table("nk", nk, (q, m))
         self.offset = bool(offset)
         first = np.column_stack((np.ones((q, q)), self.nk, np.zeros(q), np.ones(q)))
         counts = np.column_stack((self.na, self.nb, np.full(q, self.offset), self.nc))
@@ -63,7 +63,8 @@ class Layout:
         return table[:a, :, :q], table[:b, :, q:-2], table[:c, :, -1], table[0, :, -2]
 
 
-def _table(name: str, order: Order, shape: tuple[int, ...]) -> IntArray:
+def order_table(name: str, order: Order, shape: tuple[int, ...]) -> IntArray:
+    """An order as whole numbers of a shape; ModelError for one that makes no sense."""
     try:
         values = np.asarray(order)
     except ValueError:
@@ -71,7 +72,8 @@ def _table(name: str, order: Order, shape: tuple[int, ...]) -> IntArray:
     if values.dtype.kind not in "iu":
         raise ModelError(f"{name} is {order!r}; it must be a whole number or a table of them")
     if values.ndim and values.shape != shape:
-        meaning = {"na": "outputs x outputs", "nc": "one per output"}.get(name, "outputs x inputs")
+        each = "one per output"
+        meaning = {"na": "outputs x outputs", "nc": each, "nf": each}.get(name, "outputs x inputs")
         raise ModelError(f"{name} has shape {values.shape}; give one number, or {meaning}: {shape}")
     if np.any(values < 0):
         raise ModelError(f"{name} is {order!r}; it must be 0 or more")

@@ -24,7 +24,13 @@ Grid = Iterable[Order]
 Records = Dataset | Sequence[Dataset]
 
 # Orders that ``tuned`` tries.
-TRIED: dict[str, Any] = {"na": range(1, 7), "nb": range(1, 5), "nc": range(4), "nk": (0, 1)}
+TRIED: dict[str, Any] = {
+    "na": range(1, 7),
+    "nf": range(1, 7),
+    "nb": range(1, 5),
+    "nc": range(4),
+    "nk": (0, 1),
+}
 
 
 @dataclass(frozen=True)
@@ -83,13 +89,15 @@ def select_orders(
     nb: Grid | None = None,
     nc: Grid | None = None,
     nk: Grid | None = None,
+    nf: Grid | None = None,
     threads: int = 1,
 ) -> Selection:
     """Fit every combination of the orders given and choose the best stable one.
 
-    estimator: ARX or ARMAX with the settings that stay; orders not given are its own. criterion:
-    ``fit``, the ``score`` over the validation records, or ``bic`` or ``aic`` of the training ones.
-    All candidates are trained and judged on the rows that the longest has a past for. Unstable
+    estimator: ARX, ARMAX or OE with the settings that stay; orders not given are its own.
+    criterion: ``fit``, the ``score`` over the validation records; ``bic`` or ``aic`` of training.
+    All candidates are trained and judged on the rows that the longest has a past for. Of OE, by
+    ``fit``, each output's own best orders are a further candidate. Unstable
     ones come last and are never chosen; stable=True mends them. The result does not depend on
     threads. Raises ModelError without a validation record for ``fit``, or when no candidate is
     stable. Ljung, System Identification, section 16.4.
@@ -113,11 +121,13 @@ def select_orders(
         )
     if threads < 1:
         raise ModelError(f"threads is {threads}; it must be 1 or more")
-    grid = _grid(estimator, {"na": na, "nb": nb, "nc": nc, "nk": nk})
+    grid = _grid(estimator, {"nf": nf, "na": na, "nb": nb, "nc": nc, "nk": nk})
     lag = max(clone(estimator).set_params(**orders)._layout(train[0]).lag for orders in grid)
     judge = _Judge(estimator, train, test, lag)
     with one_thread(), ThreadPoolExecutor(threads) as pool:
         candidates = list(pool.map(judge.candidate, grid))
+        if estimator.separate and criterion == "fit":
+            candidates += judge.mixed(candidates)
         candidates.sort(key=lambda candidate: (candidate.cost(criterion), candidate.n_parameters))
         if not np.isfinite(candidates[0].cost(criterion)):
             problems = [f"can be used; the first: {c.problem}" for c in candidates if c.problem]
@@ -132,7 +142,7 @@ def tuned(
     """Choose orders by free runs over the ends of the records, then fit them to the whole.
 
     held_back: the part of each record that candidates are judged by and not fitted to. orders,
-    errors: as of ``select_orders``; default na to 6, nb to 4, nc to 3, nk 0 and 1.
+    errors: as of ``select_orders``; default na and nf to 6, nb to 4, nc to 3, nk 0 and 1.
     """
     first, last = [], []
     for record in (data := _datasets("records", records)):
@@ -157,6 +167,17 @@ class _Judge(NamedTuple):
         model._fit_rows(self.lag, self.training)
         return model
 
+    def mixed(self, candidates: Sequence[OrderCandidate]) -> list[OrderCandidate]:
+        """Each output with the orders that serve it best, of a model whose outputs are separate."""
+        usable = [candidate for candidate in candidates if not candidate.problem]
+        if not usable:
+            return []
+        best = [usable[j].orders for j in np.argmax([c.fit for c in usable], axis=0)]
+        orders: Orders = {
+            name: [of_output(orders[name], j) for j, orders in enumerate(best)] for name in best[0]
+        }
+        return [self.candidate(orders)]
+
     def candidate(self, orders: Orders) -> OrderCandidate:
         nothing = np.full(self.training[0].outputs.shape[1], np.nan)
         try:
@@ -175,6 +196,11 @@ class _Judge(NamedTuple):
             float(mean_known(fits)) / 100.0,
             **{name: getattr(model, f"{name}_") for name in attributes},
         )
+
+
+def of_output(order: Any, j: int) -> Any:
+    """What an order, one for all outputs or a table, says of output j."""
+    return order if np.ndim(order) == 0 else order[j]
 
 
 def _datasets(name: str, records: Any) -> list[Dataset]:

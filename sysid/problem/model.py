@@ -169,6 +169,8 @@ class ProcessModel:
     ``plots(model, evidence)`` shows more than the outputs, see ``sysid.problem.plots``, and
     ``operating_points(model, records)`` says where to linearise: values of states to hold, by a
     label; without it the mean inputs decide.
+    ``regressors(record)`` computes signals that linear baselines may have as inputs, see
+    ``sysid.problem.regressors``.
     ``equations`` say to people what the functions compute, one text each.
 
     Raises ModelError when names repeat, an output has no state, or a function returns the
@@ -198,6 +200,7 @@ class ProcessModel:
     guesses: Callable[[Any, Any], Mapping[str, Any]] | None = None
     plots: Callable[[Any, Any], Iterable[Any]] | None = None
     operating_points: Callable[[Any, Any], Mapping[str, Mapping[str, float]]] | None = None
+    regressors: Callable[[Any], Mapping[str, Any]] | None = None
     equations: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

@@ -81,9 +81,11 @@ def short(name):
 @pytest.mark.soak
 def test_structures_and_a_linear_model_are_ranked_on_validation(folder):
     models = ("--model", DOUBLE, "--model", TWOFOLD, "--model", LAG)
-    report = document(folder, "--validate", "validation.csv", *models, "--armax", "--out", "found")
-    rows = {short(row["name"]).split(":na")[0]: row for row in report["structures"]}
-    assert set(rows) == {DOUBLE, TWOFOLD, LAG, "ARMAX"}
+    report = document(
+        folder, "--validate", "validation.csv", *models, "--armax", "--oe", "--out", "found"
+    )
+    rows = {re.sub(":n[af].*", "", short(row["name"])): row for row in report["structures"]}
+    assert set(rows) == {DOUBLE, TWOFOLD, LAG, "ARMAX", "OE"}
     # One product of two parameters acts: as good as the lag, and no worse for its third number.
     assert [rows[n]["free_parameters"] for n in (LAG, TWOFOLD)] == [1, 2]
     assert [rows[n]["effective_parameters"] for n in (LAG, TWOFOLD)] == [1, 1]
@@ -91,11 +93,11 @@ def test_structures_and_a_linear_model_are_ranked_on_validation(folder):
     assert rows[DOUBLE]["squared_errors_relative"]["interval_95"][0] > 10.0
     assert rows[DOUBLE]["squared_errors_relative"]["p_value"] < 0.01
     assert short(report["preferred"]) in (LAG, TWOFOLD)
-    for row in (rows[LAG], rows["ARMAX"]):
+    for row in (rows[LAG], rows["ARMAX"], rows["OE"]):
         # Noise of 0.01 in parts of max|y|, and the lag starts at a noisy sample.
         assert row["outputs"]["y"]["rmse"] < 0.015 and row["outputs"]["y"]["fit_percent"] > 95.0
     assert rows[LAG]["dbic"] < rows["ARMAX"]["dbic"] < rows[DOUBLE]["dbic"]
-    assert report["verdict"].count("times those of") == 3
+    assert report["verdict"].count("times those of") == 4
     # What is printed is kept, and each model's result is one that other commands read.
     kept = yaml.safe_load((folder / report["files"]["comparison"]).read_text())
     assert kept["structures"] == report["structures"]
