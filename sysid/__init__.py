@@ -11,6 +11,7 @@ from sysid.engine.stepper import Stepper
 from sysid.fitting.free_run import free_run
 from sysid.judging.comparison import Candidate, Comparison, compare
 from sysid.problem.data import Dataset, output_scale
+from sysid.problem.given import Given
 from sysid.problem.guesses import Guess, guess_ranges, regression
 from sysid.problem.metrics import Metrics, evaluate, fit_percent, msd, rmse
 from sysid.problem.model import (
@@ -41,6 +42,7 @@ __all__ = [
     "Comparison",
     "Constraint",
     "Dataset",
+    "Given",
     "Guess",
     "Input",
     "LinearModel",

@@ -39,6 +39,13 @@ def identify(
     datasheet: Annotated[
         list[str] | None, Option(metavar="FILE.yaml", help="Data-sheet values; may be repeated.")
     ] = None,
+    given: Annotated[
+        list[str] | None,
+        Option(
+            metavar="RESULT",
+            help="Keep what an earlier identification found, with its covariance; may be repeated.",
+        ),
+    ] = None,
     settings: options.Settings = None,
     arx: Annotated[bool, Option("--arx", help="Compare with an ARX model.")] = False,
     armax: Annotated[bool, Option("--armax", help="Compare with an ARMAX model.")] = False,
@@ -83,6 +90,7 @@ def identify(
         "hold_back": hold_back,
         "guess": guess or None,
         "datasheet": datasheet,
+        "given": given,
         "profile": profile,
     }
     request = SettingsRequest(None if config is None else str(config), chosen, settings or [])

@@ -295,6 +295,12 @@ class IdentificationConfig(Signals):
             examples=["motor.yaml"],
         )
     )
+    given: Annotated[list[str], BeforeValidator(_several), WithJsonSchema(_NAMES_SCHEMA)] = Field(
+        default_factory=list,
+        description="results of earlier identifications whose parameters are kept, with their "
+        "covariance",
+        examples=["runs/motor/identification/parameters.yaml"],
+    )
     guess: bool = Field(
         False, description="ranges from the logs themselves, where nothing else is said"
     )

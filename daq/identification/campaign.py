@@ -67,7 +67,7 @@ class Group:
 
     def runs(self, seeds: Sequence[int]) -> list[Run]:
         """One run for each seed."""
-        problem, settings = self.problem, gassi_settings(self.problem.settings)
+        problem, settings = self.problem, gassi_settings(self.problem)
         names, (training, validation) = (problem.model_name, self.name), self.datasets
         return [Run(problem.model, training, settings, seed, *names, validation) for seed in seeds]
 

@@ -232,8 +232,9 @@ def faults_of(problem: Problem, logs: Split) -> tuple[DataFault, ...]:
 
 def _space(problem: Problem) -> SearchSpace:
     settings = problem.settings
+    fixed = {**settings.fixed, **(problem.given.values if problem.given else {})}
     return SearchSpace.of(
-        problem.model, settings.ranges, settings.fixed, tied=settings.tied, scale=settings.scale
+        problem.model, settings.ranges, fixed, tied=settings.tied, scale=settings.scale
     )
 
 
@@ -303,7 +304,7 @@ def _searched(
 
     checkpoint = folder / request.CHECKPOINT if folder is not None else None
     try:
-        estimator = GASSI(problem.model, **gassi_settings(problem.settings))
+        estimator = GASSI(problem.model, **gassi_settings(problem))
         datasets = [log.dataset for log in train]
         start = checkpoint if resume else None
         return estimator.fit(datasets, on_progress=report, checkpoint=checkpoint, resume=start)

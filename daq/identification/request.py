@@ -15,6 +15,7 @@ from daq.files import make_folder, write_whole
 
 CHECKPOINT = "search.ckpt"  # the search's state, in the folder of its results
 FILE = "search.json"
+PARAMETERS = "parameters.yaml"  # the result
 _ANEW = "delete it and identify anew"
 
 
@@ -33,8 +34,9 @@ class SettingsRequest:
     def absolute(self, model: str) -> SettingsRequest:
         """The same from any folder; model: whole name of the one that was looked up."""
         options = {**self.options, "model": model}
-        if options.get("datasheet"):
-            options["datasheet"] = _absolute(options["datasheet"])
+        for files in ("datasheet", "given"):
+            if options.get(files):
+                options[files] = _absolute(options[files])
         config = None if self.config is None else _absolute([self.config])[0]
         return SettingsRequest(config, options, list(self.settings))
 

@@ -15,7 +15,7 @@ import yaml
 from daq.config.identification import Signals
 from daq.files import make_folder, write_whole
 from daq.identification.records import LoggedRecord
-from daq.identification.request import resume_command
+from daq.identification.request import PARAMETERS, resume_command
 from daq.identification.rows import Rows
 from daq.identification.settings import Problem
 from daq.lookup.models import trust_option
@@ -31,7 +31,14 @@ from sysid.uncertainty import Estimate, Profile, Uncertainty
 if TYPE_CHECKING:
     import pandas as pd
 
-PARAMETERS = "parameters.yaml"
+
+class _Row(list[float]):
+    """Numbers that stand in one line of a YAML file."""
+
+
+yaml.SafeDumper.add_representer(
+    _Row, lambda dumper, row: dumper.represent_sequence("tag:yaml.org,2002:seq", row, True)
+)
 
 
 @dataclass(frozen=True)
@@ -262,6 +269,18 @@ def _uncertainty(uncertainty: Uncertainty) -> dict[str, Any]:
         ],
         **({"rivals": [dict(rival) for rival in uncertainty.rivals]} if uncertainty.rivals else {}),
         "correlations": pairs,
+        "covariance": _covariance(uncertainty),
+    }
+
+
+def _covariance(uncertainty: Uncertainty) -> dict[str, Any]:
+    """A factor of the parameters' covariance, for a later stage of identification."""
+    names = [estimate.name for estimate in uncertainty.parameters]
+    return {
+        "parameters": names,
+        "meaning": "each row a change of one standard deviation, in the parameters' units, "
+        "independent of the others; the covariance is the sum of their products",
+        "factor": [_Row(float(f"{x:.6g}") for x in row) for row in uncertainty.factor],
     }
 
 

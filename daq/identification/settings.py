@@ -11,13 +11,13 @@ from daq.config.identification import IdentificationConfig, Signals
 from daq.config.units import converted
 from daq.config.yaml_file import TypedSettings, YamlFile
 from daq.errors import ConfigError, Mistake, suggestion
-from daq.identification import datasheets, records
+from daq.identification import datasheets, records, stages
 from daq.identification.records import ColumnMapping
 from daq.identification.request import SettingsRequest
 from daq.identification.selection import EVERYTHING, Selection
 from daq.lookup.models import DEFAULT_MODEL, find_model, whole_name
 from daq.progress import Note, Watch, ignore
-from sysid import ModelError, ProcessModel, SearchSpace
+from sysid import Given, ModelError, ProcessModel, SearchSpace
 
 File = TypeVar("File", bound=YamlFile)
 
@@ -35,7 +35,8 @@ class Problem:
     """What is to be identified, checked before any log is read or rig moved.
 
     sources: where each parameter's range or value stands that is not the model's own. request:
-    what all this was made from. selection: which samples of its logs count.
+    what all this was made from. selection: which samples of its logs count. given: what earlier
+    identifications found.
     """
 
     model: ProcessModel
@@ -45,6 +46,7 @@ class Problem:
     sources: Mapping[str, str]
     request: SettingsRequest
     selection: Selection = EVERYTHING
+    given: Given | None = None
 
 
 def problem_of(
@@ -89,13 +91,18 @@ def problems_of(
     # Typed names are relative to where they are typed, those in a file to that file.
     beside = config.parent if config is not None and "datasheet" not in file.typed else Path()
     entries = datasheets.load([beside / name for name in settings.datasheet], models)
+    beside = config.parent if config is not None and "given" not in file.typed else Path()
+    results = stages.load([beside / name for name in settings.given])
     problems = []
     for (_, name), model in zip(declared, models, strict=True):
         given = _restricted(settings, model)
+        earlier, sources = stages.under(given, results, model, freed)
         sheet = {n: entry for n, entry in entries.items() if n not in freed or n in given.tied}
-        completed, sources = datasheets.under(given, sheet, model)
+        sheet = {n: entry for n, entry in sheet.items() if n not in sources}
+        completed, of_sheets = datasheets.under(given, sheet, model)
+        sources |= of_sheets
         completed = _with_freed(file, completed, model, freed)
-        _check_space(file, completed, model)
+        _check_space(file, completed, model, earlier)
         if mapping is not None:
             records.check_mapping(model, mapping, spare)
         started = _with_starts(file, completed, model)
@@ -108,7 +115,8 @@ def problems_of(
             for parameter in file.content.get(group) or {}
         }
         origin = request.absolute(name)
-        problems.append(Problem(started, name, completed, mapping, sources, origin, selection))
+        problem = Problem(started, name, completed, mapping, sources, origin, selection, earlier)
+        problems.append(problem)
     return problems
 
 
@@ -194,13 +202,15 @@ def columns_of(config: Path | None, model: ProcessModel) -> ColumnMapping | None
     return mapping
 
 
-def gassi_settings(settings: IdentificationConfig) -> dict[str, Any]:
+def gassi_settings(problem: Problem) -> dict[str, Any]:
     """Arguments of ``GASSI``, all but the model."""
+    settings = problem.settings
     search = ("preset", "population", "generations", "elite_percent", "accuracy", "max_steps")
     space = ("ranges", "fixed", "tied", "scale", "guess")
     error = ("per_log", "balance", "criterion")
     arguments = {name: getattr(settings, name) for name in (*search, *space, *error)}
-    return {**arguments, "weights": settings.weights or None, "random_state": settings.seed}
+    arguments |= {"given": problem.given, "random_state": settings.seed}
+    return {**arguments, "weights": settings.weights or None}
 
 
 def _find_models(
@@ -281,7 +291,9 @@ def _restricted(settings: IdentificationConfig, model: ProcessModel) -> Identifi
     return settings.model_copy(update=update)
 
 
-def _check_space(file: YamlFile, settings: IdentificationConfig, model: ProcessModel) -> None:
+def _check_space(
+    file: YamlFile, settings: IdentificationConfig, model: ProcessModel, earlier: Given | None
+) -> None:
     ranges, fixed, tied, scale = settings.ranges, settings.fixed, settings.tied, settings.scale
     # One parameter at a time first, so that the message can point at it.
     for name in ranges:
@@ -294,7 +306,8 @@ def _check_space(file: YamlFile, settings: IdentificationConfig, model: ProcessM
         _try_space(file, ("tied", name), model, tied={name: tied[name]})
     groups = ("tied", "fixed", "scale", "ranges")
     group = next((key for key in groups if file.content.get(key)), "ranges")
-    space = _try_space(file, (group,), model, ranges, fixed, tied=tied, scale=scale)
+    values = {**fixed, **(earlier.values if earlier else {})}
+    space = _try_space(file, (group,), model, ranges, values, tied=tied, scale=scale)
     for name in settings.profile:
         if name not in space.names:
             problem = f"{name} is not searched, so it has no profile; free it by a range"

@@ -57,7 +57,8 @@ class Objective:
     Several records count as one long one, or with ``balance`` "logs" each alike: the mean under
     the root is then one of the records' means. ``weights``: (n_outputs,), relative importance of
     the outputs, default equal. ``scales``: divisors of the residuals, per record (n_outputs,):
-    max|y|, times a factor that balances the records.
+    max|y|, times a factor that balances the records. ``given``: (n, n_parameters), independent
+    changes of the fixed parameters, one standard deviation each, which the intervals count.
     """
 
     def __init__(
@@ -69,7 +70,10 @@ class Objective:
         per_log: bool = False,
         balance: Balance = "samples",
         weights: FloatArray | None = None,
+        given: FloatArray | None = None,
     ) -> None:
+        n_parameters = len(simulator.model.parameters)
+        self.given = np.zeros((0, n_parameters)) if given is None else given
         self.simulator = simulator
         self.space = space
         self.records = list(records)

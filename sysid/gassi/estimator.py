@@ -19,6 +19,7 @@ from sysid.gassi.genetic_search import PRESETS, GeneticSearch, Preset, PresetNam
 from sysid.gassi.likelihood import fit_likelihood
 from sysid.gassi.search_run import Best, SearchRun
 from sysid.problem.data import Dataset, require_information
+from sysid.problem.given import Given
 from sysid.problem.guesses import Guess, guess_ranges
 from sysid.problem.metrics import fit_percent
 from sysid.problem.model import ModelError, ProcessModel, Scale
@@ -64,6 +65,8 @@ class GASSI(RecordEstimator):
         be None: then the other is a bound, and this one only where the search starts.
     fixed : {name: value}, parameters not searched.
     tied : {name: "0.5 * other"}, parameters that are multiples of others.
+    given : ``Given``, parameters not searched since an earlier identification found them; its
+        covariance widens the intervals.
     guess : narrow the ranges of parameters without a range or value here, by what the model's
         ``guesses`` function reads from the records.
     scale : {name: "log" or "linear"}, scales to search on in place of the model's.
@@ -125,6 +128,7 @@ class GASSI(RecordEstimator):
     ranges: Mapping[str, Range] | None = None
     fixed: Mapping[str, float] | None = None
     tied: Mapping[str, str] | None = None
+    given: Given | None = None
     scale: Mapping[str, Scale] | None = None
     guess: bool = False
     elite_percent: float = 0.5
@@ -167,13 +171,17 @@ class GASSI(RecordEstimator):
         """
         data = self._records(X, y, records, None, reset=True)
         model, preset = self._model(), self._preset()
+        fixed = dict(self.fixed or {})
+        if self.given is not None:
+            self.given.check(model, fixed)
+            fixed |= self.given.values
         self.guesses_: dict[str, Guess] = {}
         if self.guess:
-            self.guesses_ = guess_ranges(model, data, self.ranges, self.fixed, self.tied)
+            self.guesses_ = guess_ranges(model, data, self.ranges, fixed, self.tied)
         ranges = {name: (guess.low, guess.high) for name, guess in self.guesses_.items()}
         ranges |= self.ranges or {}
         self.space_ = SearchSpace.of(
-            model, ranges, self.fixed, preset.log_scale, tied=self.tied, scale=self.scale
+            model, ranges, fixed, preset.log_scale, tied=self.tied, scale=self.scale
         )
         model.require_ends(self.space_.full(np.array([self.space_.lower, self.space_.upper])))
         objective = self._objective(data)
@@ -318,6 +326,7 @@ class GASSI(RecordEstimator):
             per_log=self.per_log,
             balance=self.balance,
             weights=self._weights(),
+            given=self.given.changes(self._model()) if self.given else None,
         )
 
     def _model(self) -> ProcessModel:

@@ -66,7 +66,7 @@ def _delayed(name: str, signal: object, record: Dataset) -> FloatArray:
             f"{record.name}: regressor {name!r} has shape {values.shape}; give {record.n_samples} "
             "numbers, one for each row, NaN where one was lost"
         )
-    known = np.flatnonzero(np.isfinite(values))
+    measured = np.flatnonzero(np.isfinite(values))
     rows = np.arange(-1, record.n_samples - 1)
-    place = np.searchsorted(known, rows, side="right") - 1
-    return np.asarray(values[known[np.maximum(place, 0)]], dtype=np.float64)
+    place = np.searchsorted(measured, rows, side="right") - 1
+    return np.asarray(values[measured[np.maximum(place, 0)]], dtype=np.float64)

@@ -8,7 +8,7 @@ data do determine (products, sums) do.
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -16,6 +16,7 @@ from scipy.linalg import null_space
 
 from sysid.arrays import FloatArray, IntArray
 from sysid.fitting.objective import Objective
+from sysid.problem.given import covariance_factor
 from sysid.uncertainty.directions import PART, Directions, directions
 from sysid.uncertainty.estimate import Z95, Estimate, Why
 from sysid.uncertainty.expressions import product_text, product_unit, sum_text
@@ -61,7 +62,9 @@ class Uncertainty:
     (n_free, n_free) of the coordinates (logarithms where searched so, else parts of the value),
     undetermined directions and parameters on a bound left out. singular_values: of the scaled
     sensitivity, falling. rank: how many directions the data determine. rivals: free parameters
-    of other minima that the data do not tell from this one.
+    of other minima that the data do not tell from this one. factor: (n, n_free), independent
+    changes of the parameters, one standard deviation each, and a unit of every exact tie: what a
+    later stage is ``Given``.
     """
 
     parameters: tuple[Estimate, ...]
@@ -70,6 +73,7 @@ class Uncertainty:
     singular_values: FloatArray
     rank: int
     rivals: tuple[Mapping[str, float], ...] = ()
+    factor: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
 
     def correlation(self) -> FloatArray:
         """Correlation of the free parameters, NaN where there is no variance."""
@@ -106,6 +110,7 @@ def uncertainty(
         determined.covariance,
         determined.singular_values,
         determined.rank,
+        factor=analysis.factor(),
     )
     named = [dict(zip(objective.space.names, rival.tolist(), strict=True)) for rival in rivals]
     return _among_rivals(result, named)
@@ -156,6 +161,11 @@ class _Analysis:
         # Relative change of each parameter per unit of its coordinate; none of what is zero.
         divisors = np.where(self.chromosome != 0.0, self.chromosome, np.inf)
         self.relative_increments = self.increments / divisors
+
+    def factor(self) -> FloatArray:
+        """As of ``Uncertainty``."""
+        ties = np.array([relation.vector for relation in self.exact]).reshape(-1, len(self.names))
+        return covariance_factor(self.determined.covariance, ties, self.increments)
 
     def parameter(self, j: int) -> Estimate:
         """Estimate of a free parameter."""

@@ -83,7 +83,10 @@ def coordinate_units(objective: Objective, chromosome: FloatArray) -> FloatArray
 
 
 def zero_errors(sensitivity: Sensitivity) -> Iterator[FloatArray]:
-    """Changes (n_residuals, n_outputs) by a standard deviation of each channel's zero error."""
+    """Changes (n_residuals, n_outputs) by a standard deviation of each channel's zero error.
+
+    And of parameters that were given, which are as constant.
+    """
     objective = sensitivity.objective
     for k, rows in enumerate(record_rows(sensitivity.lengths)):
         record = objective.records[k]
@@ -93,6 +96,30 @@ def zero_errors(sensitivity: Sensitivity) -> Iterator[FloatArray]:
             yield change
         errors = [error for error in np.diag(record.input_zero) if error.any()]
         yield from _input_changes(sensitivity, k, errors)
+    yield from given_errors(sensitivity)
+
+
+def given_errors(sensitivity: Sensitivity) -> Iterator[FloatArray]:
+    """Changes (n_residuals, n_outputs) by a standard deviation of what ``Objective.given`` holds.
+
+    They shift all samples of all records together, as errors of a sensor's zero do.
+    """
+    objective, chromosomes = sensitivity.objective, sensitivity.chromosome[None]
+    space, records = objective.space, objective.records
+    declared = [record.initial_state(objective.simulator.model) for record in records]
+    starts = [space.starts(chromosomes.repeat(2, axis=0), k, x) for k, x in enumerate(declared)]
+    steps = np.repeat([sensitivity.steps], 2, axis=0)
+    for change in objective.given:
+        size = np.max(np.abs(change) / np.maximum(np.abs(space.base), 1e-300), initial=1e-300)
+        bases = [space.base + sign * _PERTURBATION / size * change for sign in (1.0, -1.0)]
+        vectors = np.concatenate([replace(space, base=base).full(chromosomes) for base in bases])
+        up, down = np.moveaxis(
+            objective.simulator.residuals(vectors, records, objective.scales, steps, starts).values,
+            -1,
+            0,
+        )
+        slope = (up - down) / (2.0 * _PERTURBATION / size)
+        yield np.where(np.isfinite(slope), slope, 0.0)
 
 
 def input_noises(sensitivity: Sensitivity) -> Iterator[FloatArray]:
