@@ -30,6 +30,10 @@ RunsFolder = Annotated[Path, Option(metavar="DIR", help="Where capture folders g
 _model = functools.partial(Option, metavar="NAME|FILE.py:OBJECT", autocompletion=completion.models)
 ModelName = Annotated[str | None, _model(help="Process model; see rig models.")]
 ModelNames = Annotated[list[str] | None, _model(help="Process model; may be repeated.")]
+ModelsWithValues = Annotated[
+    list[str] | None,
+    _model(help="In place of a result a model at its own values; may be repeated."),
+]
 ConfigFile = Annotated[
     Path | None, Option(metavar="ID.yaml", help="Search settings and column names.")
 ]

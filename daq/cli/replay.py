@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -25,6 +26,7 @@ def replay(
             help="Result of an identification; default the simulated rig's own values.",
         ),
     ] = None,
+    model: options.ModelsWithValues = None,
     config: options.ConfigFile = None,
     figure: Annotated[
         Path | None, Option(metavar="FILE.png|pdf|svg", help="Default beside the log.")
@@ -41,58 +43,78 @@ def replay(
     """Simulate a log's commands, and say how well that fits it.
 
     The model is given the applied commands and the measured load torque, never the outputs.
+    Several models are drawn together: --model actuator:parameters=A --model actuator:parameters=B.
     """
     from daq.identification.replay import replay as simulate
-    from daq.identification.result import errors_document
 
     bounds = _bounds(fail_under or [])
-    result = simulate(log, parameters, rig, config, trust=trust)
-    model = result.model
-    for name in bounds:
-        if name not in result.fit:
-            problem = f"--fail-under {name}: model {model.name} has no such output"
-            raise ConfigError(problem, cure=suggestion(name, model.output_names))
-    if result.warning is not None:
-        terminal.report("warning", result.warning)
-    drawn = _draw(result, figure)
-    missed = result.below(bounds)
-    errors = errors_document(model, result.metrics)
+    names: Sequence[str | None] = model or [None]
+    results = [simulate(log, parameters, rig, config, model=name, trust=trust) for name in names]
+    first = results[0]
+    _require_outputs(results, bounds)
+    if first.warning is not None:
+        terminal.report("warning", first.warning)
+    drawn = _draw(results, figure)
+    documents = [_document(result, bounds) for result in results]
     if json:
-        document = {
-            "log": result.path,
-            "model": model.name,
-            "parameters": result.source,
-            "outputs": errors,
-            "figure": drawn,
-            "fail_under": bounds,
-            "passed": not missed,
-        }
-        terminal.print_json(document)
+        several = {"models": documents} if len(results) > 1 else documents[0]
+        passed = all(document["passed"] for document in documents)
+        shared = {"log": first.path, "figure": drawn, "fail_under": bounds, "passed": passed}
+        terminal.print_json({**several, **shared})
     else:
-        through = f"{result.path} through {model.name} with the parameters of {result.source}"
-        _show(through, errors, drawn)
-        if not missed:
+        for result, document in zip(results, documents, strict=True):
+            through = f"{result.path} through {result.title}"
+            _show(through, document["outputs"])
+        if drawn is not None:
+            print(f"Figure: {drawn}")
+        if all(document["passed"] for document in documents):
             columns = f" --config {config}" if config is not None else ""
             trusted = " --trust" if trust else ""
             again = f"rig replay ANOTHER_LOG --parameters {parameters}{columns}{trusted}"
             terminal.print_next(again if parameters else f"rig identify {log}")
-    if missed:
-        shortfalls = (
-            f"fit of {name} is {result.fit[name]:.1f} %, below {least:g} %"
-            for name, least in missed.items()
-        )
-        raise RunError(f"{result.path}: {'; '.join(shortfalls)}")
+    shortfalls = [
+        f"fit of {name} is {result.fit[name]:.1f} %, below {least:g} %"
+        + (f" ({result.source})" if len(results) > 1 else "")
+        for result in results
+        for name, least in result.below(bounds).items()
+    ]
+    if shortfalls:
+        raise RunError(f"{first.path}: {'; '.join(shortfalls)}")
 
 
-def _show(title: str, errors: dict[str, dict[str, Any]], drawn: Path | None) -> None:
+def _require_outputs(results: Sequence[Replay], bounds: Mapping[str, float]) -> None:
+    """Raise ConfigError unless all models have the same outputs, and those that have a bound."""
+    first = results[0].model
+    for result in results[1:]:
+        if result.model.output_names != first.output_names:
+            outputs, others = (", ".join(m.output_names) for m in (first, result.model))
+            problem = f"{results[0].source} has the outputs {outputs}, {result.source} {others}"
+            raise ConfigError(problem, cure="choose the same ones", key="--model")
+    for name in bounds:
+        if name not in first.output_names:
+            problem = f"--fail-under {name}: model {first.name} has no such output"
+            raise ConfigError(problem, cure=suggestion(name, first.output_names))
+
+
+def _document(result: Replay, bounds: Mapping[str, float]) -> dict[str, Any]:
+    """One model's errors, as JSON can hold them."""
+    from daq.identification.result import errors_document
+
+    return {
+        "model": result.model.name,
+        "parameters": result.source,
+        "outputs": errors_document(result.model, result.metrics),
+        "passed": not result.below(bounds),
+    }
+
+
+def _show(title: str, errors: dict[str, dict[str, Any]]) -> None:
     from daq.cli.identification import print_errors
     from daq.identification.rows import OutputErrors
 
     print(title)
     shown = {name: OutputErrors.of(each) for name, each in errors.items()}
     print_errors(shown, label="replay")
-    if drawn is not None:
-        print(f"Figure: {drawn}")
 
 
 def _bounds(texts: list[str]) -> dict[str, float]:
@@ -110,15 +132,16 @@ def _bounds(texts: list[str]) -> dict[str, float]:
     return bounds
 
 
-def _draw(result: Replay, path: Path | None) -> Path | None:
+def _draw(results: Sequence[Replay], path: Path | None) -> Path | None:
     """The figure at a path; without one beside the log, if that can be."""
+    result = results[0]
     from daq.logs.capture import LOG_NAME
     from daq.report.pictures import draw_replay
 
     beside = "replay.png" if result.path.name == LOG_NAME else f"{result.path.stem}-replay.png"
     chosen = path or result.path.with_name(beside)
     try:
-        draw_replay(result, chosen)
+        draw_replay(results, chosen)
     except RunError as error:
         if path is not None:
             raise ConfigError(str(error), cure="or choose another with --figure FILE.png") from None

@@ -15,7 +15,7 @@ from daq.hal import FloatArray
 _DEEPEST = 1e-4  # of the largest line: what is below it is rounding or leakage
 _FEW = 200  # lines that are drawn one by one
 _EXCESS = 4.0  # times the first model's residual that another's is drawn to
-# Of the first simulated line, and of any other.
+# Of the first simulated line and the second; further ones have colours of their own.
 _LOOKS: tuple[dict[str, Any], ...] = (
     {"color": style.IDENTIFIED, "lw": 0.8, "zorder": 3},
     {"color": style.BASELINE, "lw": 0.6, "zorder": 2, "ls": (0, (3, 1))},
@@ -80,7 +80,7 @@ def _respond(time: FloatArray, output: Panel, above: Axes, below: Axes) -> None:
     above.plot(*style.thinned(time, measured), color=style.MEASURED, lw=1.5, label="measured")
     residuals = [measured - values for values in simulated]
     for k, (name, values) in enumerate(zip(list(output.lines)[1:], simulated, strict=True)):
-        look = _LOOKS[min(k, 1)]
+        look = _LOOKS[k] if k < len(_LOOKS) else {**_LOOKS[1], "color": f"C{k}"}
         above.plot(*style.thinned(time, values), label=name, **look)
         below.plot(*style.thinned(time, residuals[k]), **look)
     # A model that runs away must flatten neither what was measured nor the other's residual.

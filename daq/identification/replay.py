@@ -15,11 +15,13 @@ from daq.config.identification import Signals
 from daq.errors import ConfigError, suggestion
 from daq.hal import FloatArray, Simulation
 from daq.identification.fit import take
+from daq.identification.request import SettingsRequest
 from daq.identification.result import Identification
-from daq.identification.settings import columns_of, with_signals
+from daq.identification.settings import Problem, columns_of, problem_of, with_signals
 from daq.lookup.models import find_model
 from daq.lookup.rigs import DEFAULT_RIG, load_rig
 from sysid import BatchSimulator, Metrics, ModelError, ProcessModel, evaluate, free_run
+from sysid.problem.ranges import ties
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -48,6 +50,13 @@ class Replay:
     simulated: FloatArray
     metrics: Metrics
     warning: str | None
+
+    @property
+    def title(self) -> str:
+        """The model, and where its parameters come from."""
+        if self.source.partition(":")[0] == self.model.name:
+            return f"{self.source} at its own values"
+        return f"{self.model.name} with the parameters of {self.source}"
 
     @property
     def fit(self) -> dict[str, float]:
@@ -96,30 +105,58 @@ def replay(
     rig: str | Path = DEFAULT_RIG,
     config: str | Path | None = None,
     *,
+    model: str | None = None,
     trust: bool = False,
 ) -> Replay:
     """Simulate a model under the applied commands and the measured load of a log.
 
-    log: as for ``identify``. parameters: an identification or its ``parameters.yaml``; by default
-    those of the simulated ``rig``. config: names the columns of a foreign log. trust: run the
-    Python file of a model that ``parameters.yaml`` names. Raises ConfigError.
+    log: as for ``identify``. parameters: an identification or its ``parameters.yaml``. model: in
+    place of parameters a model by name, at its own values, such as ``actuator:parameters=A``.
+    config: settings of ``identify``, of which the columns of a foreign log count, and without
+    parameters its model, fixed and tied values, outputs and starts. Without any of these the
+    parameters are those of the simulated ``rig``. trust: run the Python file of a model that
+    ``parameters.yaml`` names. Raises ConfigError.
 
     >>> from daq import record, replay
     >>> result = replay(record("prbs.yaml"))  # through the simulated rig's own model
     >>> result.fit["current_motor"] > 95.0
     True
     """
-    model, values, source = _parameters(parameters, str(rig), trust)
-    mapping = columns_of(Path(config) if config is not None else None, model)
-    logged = take(log, "data", model, mapping)
+    file = Path(config) if config is not None else None
+    if parameters is None and (model is not None or (file is not None and _names_model(file))):
+        problem = problem_of(SettingsRequest(None if file is None else str(file), {"model": model}))
+        chosen, values, source = problem.model, _declared(problem), problem.model_name
+        mapping = problem.mapping
+    elif model is not None:
+        raise ConfigError(
+            "a result names its own model", cure="give --parameters or --model", key="--model"
+        )
+    else:
+        chosen, values, source = _parameters(parameters, str(rig), trust)
+        mapping = columns_of(file, chosen)
+    logged = take(log, "data", chosen, mapping)
     record = logged.dataset
     try:
-        simulated = free_run(BatchSimulator(model), model.vector(values), record)
+        simulated = free_run(BatchSimulator(chosen), chosen.vector(values), record)
     except ModelError as error:
         raise ConfigError(str(error)) from None
     time = np.arange(record.n_samples, dtype=np.float64) * record.dt
     metrics, measured = evaluate(record.outputs, simulated), record.outputs
-    return Replay(logged.path, model, source, time, measured, simulated, metrics, logged.warning)
+    return Replay(logged.path, chosen, source, time, measured, simulated, metrics, logged.warning)
+
+
+def _names_model(config: Path) -> bool:
+    return yaml_file.load(config).content.get("model") is not None
+
+
+def _declared(problem: Problem) -> dict[str, float]:
+    """A model's own values, but for those that the settings fix, are given or tie."""
+    model, settings = problem.model, problem.settings
+    fixed = {**settings.fixed, **(problem.given.values if problem.given else {})}
+    vector = model.vector(fixed)
+    for tie in ties(model, settings.tied):
+        vector[tie.index] = tie.factor * vector[tie.source]
+    return dict(zip(model.parameter_names, vector.tolist(), strict=True))
 
 
 def _parameters(

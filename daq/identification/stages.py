@@ -43,8 +43,8 @@ def under(
     """Parameters of a model that were found earlier, and the line that each comes from.
 
     Found are those with a narrow interval, and those of which a combination has one. What the
-    settings say of a parameter, or that it is freed, goes before. Raises ConfigError for a parameter that two files
-    tell, a file without any of the model's, or numbers that are none.
+    settings say of a parameter goes before, also that it is freed. Raises ConfigError for a
+    parameter that two files tell, a file without any of the model's, or numbers that are none.
     """
     settled = {*settings.ranges, *settings.fixed, *settings.tied, *freed}
     values: dict[str, float] = {}

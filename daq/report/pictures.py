@@ -1,5 +1,6 @@
 """The figures of an identification's report: which are drawn, from which arrays."""
 
+import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -383,19 +384,22 @@ def _columns(log: LoggedRecord) -> dict[str, FloatArray]:
     return {name: frame[name].to_numpy(dtype=np.float64) for name in UNITS}
 
 
-def draw_replay(replay: Replay, path: Path) -> None:
-    """Measured and simulated outputs in a figure at a path.
+def draw_replay(replays: Sequence[Replay], path: Path) -> None:
+    """Measured outputs, and those that one or several models simulate, in a figure at a path.
 
     Raises ConfigError for an unknown format, RunError if the file cannot be written.
     """
-    outputs = [
-        Panel(
-            output.name,
-            output.unit,
-            {"measured": replay.measured[:, j], "simulated": replay.simulated[:, j]},
-            note=f"fit {replay.metrics.fit[j]:.1f} %",
-        )
-        for j, output in enumerate(replay.model.outputs)
-    ]
+    first, labels = replays[0], ["simulated"]
+    if len(replays) > 1:
+        # What they have in common, up to an option, need not stand in the legend.
+        alike = os.path.commonprefix([replay.source for replay in replays])  # noqa: RUF071
+        common = re.split(r"[^:,=]*$", alike)[0]
+        labels = [replay.source.removeprefix(common) or replay.source for replay in replays]
+    outputs = []
+    for j, output in enumerate(first.model.outputs):
+        lines = {"measured": first.measured[:, j]}
+        lines |= {k: r.simulated[:, j] for k, r in zip(labels, replays, strict=True)}
+        fits = ", ".join(f"{replay.metrics.fit[j]:.1f}" for replay in replays)
+        outputs.append(Panel(output.name, output.unit, lines, note=f"fit {fits} %"))
     kind = style.format_of(path)
-    write_whole(path, style.render(responses(replay.time, outputs), kind))
+    write_whole(path, style.render(responses(first.time, outputs), kind))

@@ -13,6 +13,7 @@ import pandas as pd
 import pytest
 import yaml
 
+from sim_rig.actuator import actuator
 from sim_rig.plant import Plant
 from tests.daq.support import environment, forked_rig, only_capture, write_experiment, write_rig
 from tests.soak import mostly_soak
@@ -83,6 +84,65 @@ def test_a_mistake_is_answered_with_the_cure(rig, capture, tmp_path, options, me
     assert result.returncode == 2
     assert message in result.stderr
     assert "Traceback" not in result.stderr
+
+
+# --- models at their own values ---------------------------------------------------------------
+
+
+def test_rows_of_a_table_side_by_side(rig, capture, tmp_path):
+    sets = [f"actuator:parameters={name}" for name in "AC"]
+    options = [word for name in sets for word in ("--model", name)]
+    result = rig("replay", capture, *options, "--figure", "both.svg", "--json", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    document = json.loads(result.stdout)
+    assert [each["parameters"] for each in document["models"]] == sets
+    fits = [each["outputs"]["current_motor"]["fit_percent"] for each in document["models"]]
+    # The rig's motor driver is of the order of row C; row A's settles with a fifth of its gain.
+    assert fits[0] < 80.0 < fits[1] and document["passed"]
+    figure = (tmp_path / "both.svg").read_text()
+    assert figure.count("<!-- A -->") == figure.count("<!-- C -->") == 1
+    gate = ("--fail-under", "current_motor=80")
+    failed = rig("replay", capture, *options, *gate, cwd=tmp_path)
+    assert failed.returncode == 1 and failed.stderr.count("below 80 %") == 1
+    assert f"({sets[0]})" in failed.stderr
+
+
+def test_the_model_and_fixed_values_of_a_configuration_count(rig, capture, tmp_path):
+    model = actuator(parameters="rig")
+    values = dict(zip(model.parameter_names, model.nominal.tolist(), strict=True))
+    changed = values | {"L_m": 3e-3, "R_b": 100.0 * values["R_m"]}
+    by_hand = {"model": "actuator", "parameters": changed}
+    (tmp_path / "parameters.yaml").write_text(yaml.safe_dump(by_hand))
+    settings = {"model": "actuator:parameters=rig", "fixed": {"L_m": "3 mH"},
+                "tied": {"R_b": "100 * R_m"}}  # fmt: skip
+    (tmp_path / "id.yaml").write_text(yaml.safe_dump(settings))
+    expected, named, plain = (
+        json.loads(rig("replay", capture, *options, "--json", cwd=tmp_path).stdout)
+        for options in (("--parameters", "parameters.yaml"), ("--config", "id.yaml"), ())
+    )
+    assert named["outputs"] == expected["outputs"] != plain["outputs"]
+    assert named["parameters"] == "actuator:parameters=rig"
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--model", "actuator", "--parameters", "p.yaml"],
+         "--model: a result names its own model; give --parameters or --model"),
+        pytest.param(
+            ["--model", "actuator", "--model", "actuator:outputs=omega"],
+            "has the outputs current_motor, current_brake, omega, actuator:outputs=omega omega",
+            marks=pytest.mark.soak,  # another kernel
+        ),
+        (["--model", "actuator:parameters=Q"], "parameters=Q"),
+        (["--config", "wrong.yaml"], "wrong.yaml:2:9: fixed.R_x: model actuator has no such name"),
+    ],
+)  # fmt: skip
+def test_a_mistaken_model_is_answered_with_the_cure(rig, capture, tmp_path, options, message):
+    (tmp_path / "wrong.yaml").write_text("model: actuator\nfixed: {R_x: 1}\n")
+    result = rig("replay", capture, *options, cwd=tmp_path)
+    assert result.returncode == 2 and "Traceback" not in result.stderr
+    assert message in " ".join(result.stderr.split())
 
 
 # --- faults of the connection -----------------------------------------------------------------
