@@ -271,7 +271,10 @@ class IdentificationConfig(Signals):
         512, ge=1, le=1_000_000, description="integration steps a sample may take"
     )
     elite_percent: Percent = Field(
-        0.5, ge=0.0, lt=100.0, description="share of the population replaced by the best (r_elite)"
+        0.5,
+        ge=0.0,
+        lt=100.0,
+        description="share of the population replaced by the best (r_elite); 0: none",
     )
     ranges: dict[str, Range] = Field(
         default_factory=dict,

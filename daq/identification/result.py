@@ -22,7 +22,7 @@ from daq.lookup.models import trust_option
 from daq.provenance import software_versions
 from sysid import Metrics, ProcessModel
 from sysid.arrays import FloatArray
-from sysid.gassi import GASSI
+from sysid.gassi import GASSI, PRESETS
 from sysid.judging.assessment import RecordResult, Verdict, judge
 from sysid.problem.faults import DataFault
 from sysid.problem.model import Parameter
@@ -30,6 +30,10 @@ from sysid.uncertainty import Estimate, Profile, Uncertainty
 
 if TYPE_CHECKING:
     import pandas as pd
+
+
+_RMSE = "mean over outputs of the RMSE on outputs normalised by max|y|"
+_CEGA = "mean over outputs of squares by range, weighed by the size of the velocity (4.6)"
 
 
 class _Row(list[float]):
@@ -140,7 +144,7 @@ class Identification:
             **({"profiles": profiles} if profiles else {}),
             "error": {
                 "value": estimator.error_,
-                "meaning": "mean over outputs of the RMSE on outputs normalised by max|y|",
+                "meaning": _CEGA if PRESETS[estimator.preset].squares else _RMSE,
                 "before_refinement": estimator.search_error_,
             },
             "metrics": {

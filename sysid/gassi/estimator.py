@@ -14,6 +14,7 @@ from sysid.engine.simulation import BatchSimulator
 from sysid.fitting.descent import Point
 from sysid.fitting.free_run import free_run
 from sysid.fitting.objective import Balance, Objective
+from sysid.gassi.cega_objective import CegaObjective
 from sysid.gassi.checkpoint import Checkpoint, load, origin
 from sysid.gassi.genetic_search import PRESETS, GeneticSearch, Preset, PresetName
 from sysid.gassi.likelihood import fit_likelihood
@@ -58,7 +59,7 @@ class GASSI(RecordEstimator):
     model : ProcessModel; its ``with_outputs``, ``with_initial`` and ``with_holds`` choose which
         outputs count, where its states start, and how inputs run between samples.
     preset : ``default``, ``thesis`` (Algorithms 2 to 5 with the penalty (4.13)-(4.20), as
-        written), ``cega`` (the same without penalty) or ``classic`` (Algorithm 1).
+        written), ``cega`` (Algorithm 2 with its own error (4.6)) or ``classic`` (Algorithm 1).
     population, generations : chromosomes per generation, generations evaluated. Their product is
         the number of simulations that search and local refinement share.
     ranges : {name: (lower, upper)}, search ranges in place of the model's. One of the ends may
@@ -70,7 +71,7 @@ class GASSI(RecordEstimator):
     guess : narrow the ranges of parameters without a range or value here, by what the model's
         ``guesses`` function reads from the records.
     scale : {name: "log" or "linear"}, scales to search on in place of the model's.
-    elite_percent : share of the population replaced by the elite, r_elite.
+    elite_percent : share of the population replaced by the elite, r_elite; 0 for none.
     minimum_generations, termination_ratio : i_min and r_termination of (4.11).
     weights : {output: weight}, relative importance of the outputs.
     per_log : normalise each record by its own max|y| instead of the maximum over all.
@@ -93,7 +94,8 @@ class GASSI(RecordEstimator):
     space_ : SearchSpace that was searched; estimated initial states stand behind the parameters.
     output_weights_ : (n_outputs,), final weights of the outputs.
     rivals_ : parameters in each further minimum that explains the data as well as the result.
-    error_ : mean over outputs of the RMSE normalised by max|y| (see ``Objective``).
+    error_ : mean over outputs of the RMSE normalised by max|y| (see ``Objective``); of ``cega``
+        (4.6) (see ``CegaObjective``).
     search_error_ : the lowest error before local refinement.
     feasible_ : whether all constraints hold.
     history_ : (n_generations,), the best error after each ``population`` simulations.
@@ -319,7 +321,8 @@ class GASSI(RecordEstimator):
 
     def _objective(self, records: Sequence[Dataset]) -> Objective:
         """The error that ``fit`` minimises over ``space_``."""
-        return Objective(
+        kind = CegaObjective if self._preset().squares else Objective
+        return kind(
             self._simulator(),
             self.space_,
             records,

@@ -29,6 +29,7 @@ class Preset:
     starts in the ranges. spread: population that the mutation noise is taken from. stratified:
     Latin-hypercube start. collapse: share of the initial spread below which the population
     starts anew, away from the elite. local_share: of the simulations, left to local refinement.
+    squares: whether the error is (4.6), else (4.22).
     """
 
     operators: Literal["adaptive", "classic"]
@@ -39,6 +40,7 @@ class Preset:
     stratified: bool = False
     collapse: float = 0.0
     local_share: float = 0.0
+    squares: bool = False
 
     @property
     def refine(self) -> bool:
@@ -48,7 +50,7 @@ class Preset:
 
 PRESETS: dict[PresetName, Preset] = {
     "classic": Preset(operators="classic", penalty=False),
-    "cega": Preset(operators="adaptive", penalty=False),
+    "cega": Preset(operators="adaptive", penalty=False, squares=True),
     "thesis": Preset(operators="adaptive", penalty=True),
     "default": Preset(
         operators="adaptive",

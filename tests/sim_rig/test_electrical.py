@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import signal
 
+from sim_rig.actuator import actuator
 from sim_rig.physics.electrical import (
     MAX_CURRENT,
     SUPPLY,
@@ -177,3 +178,19 @@ def test_a_free_motor_runs_up_to_the_back_emf_of_the_supply_and_no_further():
     speed = follow(model, inputs, 1.0, quiet)["omega"]
     top = SUPPLY / model.parameter("K_m").nominal
     assert 0.99 * top < speed.max() < top * (1.0 + 1e-6)
+
+
+@pytest.mark.parametrize("row", ["A", "B", "C", "D"])
+def test_the_default_ranges_hold_every_row_of_table_4_1(row):
+    # As printed there: K_cmd_m, omega_cmd_m [rad/s], R_m [ohm], L_m [mH], K_m [N m/A].
+    table = {
+        "A": (10.0, 400.0, 1.18, 4.80, 0.141),
+        "B": (29.6, 1046.0, 3.44, 0.912, 0.373),
+        "C": (112.0, 1828.0, 6.61, 1.18, 0.0597),
+        "D": (379.0, 4517.0, 0.255, 0.768, 0.0985),
+    }
+    model = actuator()
+    for name, value in zip(("K_dm", "omega_dm", "R_m", "L_m", "K_m"), table[row], strict=True):
+        parameter = model.parameter(name)
+        si = 1e-3 * value if name == "L_m" else value
+        assert 1.05 * parameter.lower < si < parameter.upper / 1.05
