@@ -50,9 +50,9 @@ class CegaObjective(Objective):
     def _emphasis(self) -> FloatArray:
         """|v_k| of every row, records one after another, (n_rows,)."""
         model = self.simulator.model
-        signals = (*model.inputs, *model.outputs)
+        units = [signal.unit for signal in model.inputs] + [y.unit for y in model.outputs]
         tables = [np.column_stack((record.inputs, record.outputs)) for record in self.records]
-        place = next((j for j, signal in enumerate(signals) if signal.unit in VELOCITIES), None)
+        place = next((j for j, unit in enumerate(units) if unit in VELOCITIES), None)
         if place is None:
             return np.ones(sum(map(len, tables)))
         velocity = np.concatenate(tables)[:, place]
