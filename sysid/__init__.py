@@ -9,6 +9,8 @@ from sysid.campaigns.runs import Campaign, Outcome, Run, Spread, campaign, combi
 from sysid.engine.simulation import BatchResult, BatchSimulator, Status
 from sysid.engine.stepper import Stepper
 from sysid.fitting.free_run import free_run
+from sysid.identifiability.analysis import Identifiability, TiedGroup, identifiability
+from sysid.identifiability.combination import Combination
 from sysid.judging.comparison import Candidate, Comparison, compare
 from sysid.problem.data import Dataset, output_scale
 from sysid.problem.given import Given
@@ -39,11 +41,13 @@ __all__ = [
     "BatchSimulator",
     "Campaign",
     "Candidate",
+    "Combination",
     "Comparison",
     "Constraint",
     "Dataset",
     "Given",
     "Guess",
+    "Identifiability",
     "Input",
     "LinearModel",
     "Metrics",
@@ -58,6 +62,7 @@ __all__ = [
     "State",
     "Status",
     "Stepper",
+    "TiedGroup",
     "campaign",
     "combinations",
     "compare",
@@ -66,6 +71,7 @@ __all__ = [
     "fit_percent",
     "free_run",
     "guess_ranges",
+    "identifiability",
     "jacobian",
     "linearize",
     "msd",

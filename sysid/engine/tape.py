@@ -4,7 +4,7 @@ A tape may stand at a point, with values of states, inputs and parameters. Then 
 a value too, and conditions in the equations can be decided; the tape keeps their outcomes.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
 from sysid.engine.arithmetic import arrays, constant, operation
@@ -25,10 +25,17 @@ class Tape:
 
     point: values of the states, inputs and parameters by name, floats or arrays of many; without
     it the code knows no values. decisions: conditions met on the way and their outcomes there.
+    arithmetic: the function that a form of so many operands stands for, where values are none of
+    these.
     """
 
-    def __init__(self, point: Mapping[str, Any] | None = None) -> None:
+    def __init__(
+        self,
+        point: Mapping[str, Any] | None = None,
+        arithmetic: Callable[[str, int], Callable[..., Any]] = operation,
+    ) -> None:
         self.decisions: dict[str, bool] = {}
+        self._arithmetic = arithmetic
         self._values = None if point is None else dict(point)
         self._lines: dict[str, Line] = {}  # by text: what is computed twice is written once
         self._by_name: dict[str, Line] = {}
@@ -48,7 +55,8 @@ class Tape:
             line = Line(f"t{len(self._lines)}", form, operands, text, fixed)
             self._lines[text] = self._by_name[line.name] = line
             if self._values is not None:
-                self._values[line.name] = operation(form, len(operands))(*map(self.value, operands))
+                compute = self._arithmetic(form, len(operands))
+                self._values[line.name] = compute(*map(self.value, operands))
         return self._lines[text].name
 
     def decide(self, form: str, *operands: str) -> bool:

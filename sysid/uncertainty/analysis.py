@@ -16,10 +16,10 @@ from scipy.linalg import null_space
 
 from sysid.arrays import FloatArray, IntArray
 from sysid.fitting.objective import Objective
+from sysid.problem.expressions import measuring_effort, product_text, product_unit, sum_text
 from sysid.problem.given import covariance_factor
 from sysid.uncertainty.directions import PART, Directions, directions
 from sysid.uncertainty.estimate import Z95, Estimate, Why
-from sysid.uncertainty.expressions import product_text, product_unit, sum_text
 from sysid.uncertainty.relations import (
     Kind,
     main_parameters,
@@ -32,9 +32,6 @@ from sysid.uncertainty.sensitivity import Sensitivity, sensitivity
 
 _ALIKE = 0.05  # rivals closer than this are one
 _WHOLE = 1e-3  # a factor this close to a whole number is meant to be one
-
-# Units of what a lab measures with a meter, a scale or a data sheet, easiest first.
-_MEASURABLE = ("ohm", "H", "kg", "m", "N*m/A", "V*s/rad", "kg*m^2", "N/m")
 
 
 @dataclass(frozen=True)
@@ -123,7 +120,7 @@ def _among_rivals(result: Uncertainty, rivals: Sequence[Mapping[str, float]]) ->
         return any(estimate.excludes(rival) for rival in rivals)
 
     several = [e for e in result.parameters if disputed(e)]
-    names = tuple(e.name for e in sorted(several, key=lambda e: _effort(e.unit)))
+    names = tuple(e.name for e in sorted(several, key=lambda e: measuring_effort(e.unit)))
     parameters = tuple(
         replace(e, std=None, low=None, high=None, why="rival") if e in several else e
         for e in result.parameters
@@ -226,7 +223,7 @@ class _Analysis:
     def _ambiguity(
         self, kind: Kind, group: IntArray, vectors: FloatArray, determined: list[Estimate]
     ) -> Ambiguity:
-        group = np.array(sorted(group, key=lambda i: _effort(self.units[i])))
+        group = np.array(sorted(group, key=lambda i: measuring_effort(self.units[i])))
         measure: list[int] = []
         for i in group.tolist():
             if np.linalg.matrix_rank(vectors[:, [*measure, i]]) > len(measure):
@@ -267,11 +264,6 @@ class _Analysis:
         """Whether the data determine what changes so with the coordinates."""
         outside = np.sum((self.determined.undetermined @ direction) ** 2) / np.sum(direction**2)
         return bool(outside < PART)
-
-
-def _effort(unit: str) -> int:
-    """Rank of a unit by how easily a lab measures what has it."""
-    return _MEASURABLE.index(unit) if unit in _MEASURABLE else len(_MEASURABLE)
 
 
 def _simple_exponents(n: int) -> Iterator[FloatArray]:

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sysid.uncertainty.expressions import product_unit
+from sysid.problem.expressions import product_unit
 
 KNOWN = pint.UnitRegistry()
 UNITS = ["1", "A", "1/rad", "N*m/A", "N*m*s/(rad*A)", "kg*m^2", "ohm", "H", "1/s", "V/A"]

@@ -1,4 +1,4 @@
-"""Products and sums of parameters: their texts, and the units of products."""
+"""Products and sums of parameters: their texts and units, and how easily a unit is measured."""
 
 import re
 from collections import Counter
@@ -9,9 +9,18 @@ _UNIT = re.compile(r"(?P<above>[^/()]+)(?:/(?:\((?P<several>[^/()]+)\)|(?P<singl
 # (unit, unit that it cancels, units that the first is made of)
 _DERIVED: tuple[tuple[str, str, dict[str, int]], ...] = (
     ("H", "ohm", {"ohm": 1, "s": 1}),
+    ("H", "V", {"V": 1, "s": 1, "A": -1}),
     ("ohm", "V", {"V": 1, "A": -1}),
     ("N", "kg", {"kg": 1, "m": 1, "s": -2}),
 )
+
+# Units of what a lab measures with a meter, a scale or a data sheet, easiest first.
+_MEASURABLE = ("ohm", "H", "kg", "m", "N*m/A", "V*s/rad", "kg*m^2", "N/m")
+
+
+def measuring_effort(unit: str) -> int:
+    """Rank of a unit by how easily a lab measures what has it."""
+    return _MEASURABLE.index(unit) if unit in _MEASURABLE else len(_MEASURABLE)
 
 
 def product_text(powers: Iterable[tuple[str, float]], times: str = " ", over: str = " / ") -> str:

@@ -1,0 +1,229 @@
+"""What a model's equations alone can tell of its parameters, without any data.
+
+A parameter is structurally identifiable where no other value of it, whatever the rest does, gives
+the same outputs in every record. Inputs are any functions of time, starts are as the model
+declares, the point is one like any other in the parameters' ranges: what holds there holds
+everywhere but in exceptions without extent (Walter & Pronzato, "Identification of Parametric
+Models", 1997; Sedoglavic, "A probabilistic algorithm to test local algebraic observability in
+polynomial time", 2002). It is a local property: several isolated values may be left.
+"""
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sysid.arrays import BoolArray, FloatArray
+from sysid.identifiability.combination import Combination
+from sysid.identifiability.directions import directions_at
+from sysid.identifiability.germ import Equations
+from sysid.identifiability.invariants import Sample, combinations_of
+from sysid.identifiability.points import PointSource
+from sysid.identifiability.records import RecordPlan
+from sysid.problem.expressions import measuring_effort
+from sysid.problem.model import ModelError, ProcessModel
+
+_FURTHER = 2  # points anywhere in the ranges, beside one near the nominal values
+
+
+@dataclass(frozen=True)
+class TiedGroup:
+    """Parameters, and starts such as ``z(0)``, that the outputs show only together.
+
+    count: how many independent combinations of them the outputs determine. combinations: those
+    with a simple form, at most count. directions: (k, n_members), how the members move at
+    ``values`` without any output showing it. fix: members whose values, measured by other means,
+    determine all the others, what is easiest to measure first. sensors: by state, the members
+    that measuring it as well would determine; states that would determine none are left out.
+    """
+
+    parameters: tuple[str, ...]
+    count: int
+    combinations: tuple[Combination, ...]
+    directions: FloatArray
+    values: Mapping[str, float]
+    fix: tuple[str, ...]
+    sensors: Mapping[str, tuple[str, ...]]
+
+
+@dataclass(frozen=True)
+class Identifiability:
+    """What outputs of a model determine, if inputs and records are rich enough.
+
+    outputs, unknown_starts: for which this holds. identifiable: parameters and starts that have
+    a value of their own. tied: the others, by groups. unseen: those that act on no output.
+    gap: decades between what was counted as a change of the outputs and what as none.
+    """
+
+    outputs: tuple[str, ...]
+    unknown_starts: tuple[str, ...]
+    identifiable: tuple[str, ...]
+    tied: tuple[TiedGroup, ...]
+    unseen: tuple[str, ...]
+    gap: float
+
+
+@dataclass(frozen=True)
+class _Place:
+    """What is tied at a point: parameters (n_parameters,), values (n_columns,) of the free ones
+    and the unknown starts, directions (k, n_columns).
+    """
+
+    parameters: FloatArray
+    values: FloatArray
+    directions: FloatArray
+    gap: float
+
+
+def identifiability(model: ProcessModel, *, seed: int = 0) -> Identifiability:
+    """Which parameters of a model its outputs determine, which only together, and how.
+
+    Parameters that are not ``fixed`` are free. Starts that the model estimates are unknown, those
+    of measured outputs known, and the rest where the model declares. Use ``with_outputs``,
+    ``with_initial`` and ``with_parameters`` to ask about other choices. Raises ModelError where
+    the equations cannot be followed.
+
+    >>> from sysid import Input, Output, Parameter, ProcessModel, State
+    >>> shaft = ProcessModel(
+    ...     "shaft", [State("omega", "rad/s")], [Input("torque", "N*m")],
+    ...     [Output("omega", "rad/s")],
+    ...     [Parameter(name, "kg*m^2", 1e-4, 1e-5, 1e-3, "log") for name in ("J_m", "J_b")],
+    ...     lambda x, u, p: (u[0] / (p[0] + p[1]),),
+    ... )
+    >>> (group,) = identifiability(shaft).tied
+    >>> group.parameters, [c.text for c in group.combinations], group.fix
+    (('J_m', 'J_b'), ['J_m + J_b'], ('J_m',))
+    """
+    return _Analysis(model, seed).result()
+
+
+class _Analysis:
+    """Tied directions of one model, at as many points as it takes."""
+
+    def __init__(self, model: ProcessModel, seed: int) -> None:
+        self._model, self._rng = model, np.random.default_rng(seed)
+        self._equations = Equations(model)
+        self._points = PointSource(model, self._rng)
+        self._free = [i for i, p in enumerate(model.parameters) if not p.fixed]
+        self._unknown = [i for i, s in enumerate(model.states) if s.initial_range is not None]
+        parameters = [model.parameters[i] for i in self._free]
+        starts = [model.states[i] for i in self._unknown]
+        self._names = [p.name for p in parameters] + [f"{s.name}(0)" for s in starts]
+        units = [p.unit for p in parameters] + [s.unit for s in starts]
+        self._units = {p.name: p.unit for p in model.parameters}
+        self._units |= dict(zip(self._names, units, strict=True))
+        if not self._names:
+            raise ModelError(f"model {model.name}: every parameter is fixed; free at least one")
+        # All points see the same records, so that each visits every branch of the equations.
+        plan = RecordPlan(self._equations, self._unknown, self._rng)
+        self._records = plan.records(self._points.nearby())
+
+    def result(self) -> Identifiability:
+        """The whole analysis."""
+        points = [self._points.nearby(), *(self._points.anywhere() for _ in range(_FURTHER))]
+        # Where more is tied than elsewhere the point is an exception.
+        places = [self._tied(self._equations, point, self._free) for point in points]
+        place = min(places, key=lambda place: len(place.directions))
+        moving = np.any(place.directions != 0.0, axis=0)
+        groups = [
+            sorted(group, key=self._effort)
+            for group in _components(place.directions)
+            if len(group) > 1
+        ]
+        grouped = set(itertools.chain(*groups))
+        sensors = self._sensors(place.parameters) if groups else {}
+        return Identifiability(
+            self._model.output_names,
+            tuple(self._model.state_names[i] for i in self._unknown),
+            tuple(self._names[i] for i in np.flatnonzero(~moving)),
+            tuple(self._group(group, place, sensors) for group in groups),
+            tuple(self._names[i] for i in np.flatnonzero(moving) if i not in grouped),
+            min(place.gap for place in places),
+        )
+
+    def _tied(self, equations: Equations, parameters: FloatArray, free: Sequence[int]) -> _Place:
+        starts = [self._points.start(self._model.states[i]) for i in self._unknown]
+        first, *others = self._records
+        records = [first.started(starts, self._unknown), *others]
+        tied = directions_at(equations, parameters, free, records, len(starts), self._rng)
+        return _Place(parameters, np.array([*parameters[list(free)], *starts]), *tied)
+
+    def _sensors(self, parameters: FloatArray) -> dict[str, BoolArray]:
+        """What would be determined, by the further state that would be measured for it."""
+        determined: dict[str, BoolArray] = {}
+        for name in self._model.state_names:
+            if name not in self._model.output_names:
+                model = self._model.with_outputs((*self._model.output_names, name))
+                place = self._tied(Equations(model), parameters, self._free)
+                determined[name] = ~np.any(place.directions != 0.0, axis=0)
+        return determined
+
+    def _group(
+        self, members: Sequence[int], place: _Place, sensors: Mapping[str, BoolArray]
+    ) -> TiedGroup:
+        names = tuple(self._names[i] for i in members)
+        directions = _of_members(place.directions, members)
+        count = len(members) - len(directions)
+        samples: list[Sample] = []
+
+        def sampled(n: int) -> list[Sample]:
+            while len(samples) < n:
+                sample = self._sample(members)
+                if len(sample.directions) == len(directions):
+                    samples.append(sample)
+            return samples[:n]
+
+        resolved = {
+            state: tuple(self._names[i] for i in members if determined[i])
+            for state, determined in sensors.items()
+        }
+        return TiedGroup(
+            names,
+            count,
+            tuple(combinations_of(names, self._units, count, sampled)),
+            directions,
+            dict(zip(names, place.values[list(members)].tolist(), strict=True)),
+            self._to_fix(names, directions),
+            {state: parameters for state, parameters in resolved.items() if parameters},
+        )
+
+    def _sample(self, members: Sequence[int]) -> Sample:
+        """How the members of a group are tied at another point."""
+        n_free = len(self._free)
+        free = [self._free[i] for i in members if i < n_free]
+        place = self._tied(self._equations, self._points.nearby(), free)
+        columns = [*range(len(free)), *(len(free) + i - n_free for i in members if i >= n_free)]
+        return Sample(place.values[columns], _of_members(place.directions, columns))
+
+    def _effort(self, column: int) -> tuple[bool, int]:
+        """Rank by how easily it is measured, starts behind parameters."""
+        is_start = column >= len(self._free)
+        return is_start, measuring_effort(self._units[self._names[column]])
+
+    @staticmethod
+    def _to_fix(names: Sequence[str], directions: FloatArray) -> tuple[str, ...]:
+        """Members that, held, leave no direction: the first that do."""
+        scaled = directions / np.max(np.abs(directions), axis=0)
+        fixed: list[int] = []
+        for k in range(len(names)):
+            if np.linalg.matrix_rank(scaled[:, [*fixed, k]], tol=1e-9) > len(fixed):
+                fixed.append(k)
+        return tuple(names[k] for k in fixed)
+
+
+def _of_members(directions: FloatArray, members: Sequence[int]) -> FloatArray:
+    """The directions in which some of the members move, (k, n_members)."""
+    columns = directions[:, list(members)]
+    moving: FloatArray = columns[np.any(columns != 0.0, axis=1)]
+    return moving
+
+
+def _components(basis: FloatArray) -> list[list[int]]:
+    """Columns that hang together through rows in which they move."""
+    groups: list[set[int]] = []
+    for row in basis:
+        group = set(np.flatnonzero(row).tolist())
+        apart = [g for g in groups if not g & group]
+        groups = [*apart, group.union(*(g for g in groups if g & group))]
+    return sorted(map(sorted, groups))
