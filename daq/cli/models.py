@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from typer import Argument
+from typer import Argument, BadParameter, Option
 
 from daq.cli import completion, options, terminal
 
 if TYPE_CHECKING:
-    from sysid import ProcessModel
+    from daq.identification.structure import Structure
+    from sysid import ProcessModel, TiedGroup
     from sysid.problem.model import Parameter, State
 
 
@@ -22,12 +24,24 @@ def models(
             autocompletion=completion.models,
         ),
     ] = None,
+    identifiable: Annotated[
+        bool,
+        Option("--identifiable", help="Say which parameters its outputs determine, without data."),
+    ] = False,
+    config: options.ConfigFile = None,
+    settings: options.Settings = None,
     json: options.AsJson = False,
 ) -> None:
     """List the installed models, or describe one.
 
-    With its states, signals, parameters, units, ranges and options.
+    With its states, signals, parameters, units, ranges and options; or, with --identifiable, what
+    no log could tell of its parameters, and what would.
     """
+    if identifiable:
+        _identifiable(name, config, settings or [], json)
+        return
+    if config is not None or settings:
+        raise BadParameter("--config and --set go with --identifiable")
     from daq.lookup.models import describe, find_model, model_options
     from daq.plugins import installed
 
@@ -43,6 +57,88 @@ def models(
         _show_list(installed_models)
     else:
         _show(name, installed_models[name], model_options(name))
+
+
+def _identifiable(name: str | None, config: Path | None, settings: list[str], json: bool) -> None:
+    from daq.identification.request import SettingsRequest
+    from daq.identification.structure import examine
+
+    where = None if config is None else str(config)
+    if name is None and where is None:
+        raise BadParameter("--identifiable needs a model: rig models NAME --identifiable")
+    structure = examine(SettingsRequest(where, {"model": name}, settings))
+    if json:
+        terminal.print_json(structure.document)
+    else:
+        _show_identifiable(structure)
+
+
+def _show_identifiable(structure: Structure) -> None:
+    model, result = structure.model, structure.identifiability
+    print(f"{model.name}: {model.description}")
+    measured = f"Measured: {', '.join(result.outputs)}."
+    if result.unknown_starts:
+        measured += f" Unknown at the start of a record: {', '.join(result.unknown_starts)}."
+    fixed = [f"{name} {value:g}" for name, value in structure.fixed.items()]
+    fixed += [f"{name} = {expression}" for name, expression in structure.ties.items()]
+    if fixed:
+        measured += f" Fixed: {', '.join(fixed)}."
+    terminal.print_text(measured)
+    print()
+    names = ", ".join(result.identifiable) or "none"
+    terminal.print_text(f"Identifiable by themselves: {names}.")
+    if result.unseen:
+        terminal.print_text(f"Without effect on any output: {', '.join(result.unseen)}.")
+    if not result.tied:
+        return
+    print()
+    head = ["act only together", "determined", "unit"]
+    rows = [row for group in result.tied for row in _combination_rows(group)]
+    terminal.print_table("What logs can tell of the others, however many", head, rows, text=head)
+    for group in result.tied:
+        _show_directions(group)
+    head = ["to tell apart", "measure otherwise", "or log as well"]
+    rows = [_separation_row(group) for group in result.tied]
+    terminal.print_table("What would tell them apart", head, rows, text=head)
+    terminal.print_text(
+        f"What counts as a change of the outputs is at least {result.gap:.0f} decades above what "
+        "counts as none."
+    )
+    terminal.print_next("rig identify LOG --set fixed.NAME=VALUE, with what was measured")
+
+
+def _combination_rows(group: TiedGroup) -> list[list[str]]:
+    rows = [["", c.text, c.unit] for c in group.combinations]
+    missing = group.count - len(group.combinations)
+    if missing:
+        rows.append(["", f"{missing} of no simple form", ""])
+    if not rows:
+        rows.append(["", "none", ""])
+    rows[0][0] = ", ".join(group.parameters)
+    return rows
+
+
+def _show_directions(group: TiedGroup) -> None:
+    """The directions of a group of which some combinations have no simple form."""
+    if len(group.combinations) == group.count:
+        return
+    number = terminal.number
+    at = ", ".join(f"{name} {number(value)}" for name, value in group.values.items())
+    for direction in group.directions:
+        steps = (
+            f"{name} {number(step)}"
+            for name, step in zip(group.parameters, direction, strict=True)
+            if step
+        )
+        terminal.print_text(f"At {at} nothing changes along {', '.join(steps)}.")
+
+
+def _separation_row(group: TiedGroup) -> list[str]:
+    sensors = [
+        state if len(names) == len(group.parameters) else f"{state} (for {', '.join(names)})"
+        for state, names in group.sensors.items()
+    ]
+    return [", ".join(group.parameters), " and ".join(group.fix), "; ".join(sensors) or "-"]
 
 
 def _show_list(models: dict[str, ProcessModel]) -> None:

@@ -111,8 +111,8 @@ class _Analysis:
         starts = [model.states[i] for i in self._unknown]
         self._names = [p.name for p in parameters] + [f"{s.name}(0)" for s in starts]
         units = [p.unit for p in parameters] + [s.unit for s in starts]
-        self._units = {p.name: p.unit for p in model.parameters}
-        self._units |= dict(zip(self._names, units, strict=True))
+        self._units = dict(zip(self._names, units, strict=True))
+        self._fixed = {p.name: p.nominal for p in model.parameters if p.fixed}
         if not self._names:
             raise ModelError(f"model {model.name}: every parameter is fixed; free at least one")
         # All points see the same records, so that each visits every branch of the equations.
@@ -181,7 +181,7 @@ class _Analysis:
         return TiedGroup(
             names,
             count,
-            tuple(combinations_of(names, self._units, count, sampled)),
+            tuple(combinations_of(names, self._units, self._fixed, count, sampled)),
             directions,
             dict(zip(names, place.values[list(members)].tolist(), strict=True)),
             self._to_fix(names, directions),

@@ -1,10 +1,13 @@
 """What outputs show of parameters that act only together: ``J_m + J_b``, ``K + R B / K``."""
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from sysid.problem.expressions import product_text, product_unit, sum_text
+
+_ALIKE = 1e-9  # a coefficient this close to a product of fixed values is that product
 
 
 @dataclass(frozen=True)
@@ -24,6 +27,18 @@ class Term:
         product: float = math.prod([values[name] ** power for name, power in self.powers])
         return self.coefficient * product
 
+    def named(self, fixed: Mapping[str, float]) -> "Term":
+        """The same with the coefficient as a product of one or two of these values, if it is."""
+        usable = {name: value for name, value in fixed.items() if abs(value) not in (0.0, 1.0)}
+        for size in (1, 2):
+            for names in itertools.combinations(usable, size):
+                for powers in itertools.product((1.0, -1.0, 2.0, -2.0), repeat=size):
+                    factors = tuple(zip(names, powers, strict=True))
+                    product = math.prod([abs(usable[name]) ** power for name, power in factors])
+                    if math.isclose(product, abs(self.coefficient), rel_tol=_ALIKE):
+                        return replace(self, factors=factors)
+        return self
+
     @property
     def text(self) -> str:
         """The powers, without a numeric coefficient."""
@@ -32,7 +47,7 @@ class Term:
 
 @dataclass(frozen=True)
 class Combination:
-    """A sum of terms that the outputs determine, with its unit: that of a term of coefficient 1.
+    """A sum of terms that the outputs determine, with its unit: that of its first term.
 
     unit: empty where it cannot be written in the parameters' own units.
 
@@ -47,13 +62,18 @@ class Combination:
     unit: str
 
     @classmethod
-    def of(cls, terms: Sequence[Term], units: Mapping[str, str]) -> "Combination":
-        """With the unit that follows from the parameters' and starts'."""
-        plain = next((term for term in terms if term.coefficient == 1.0), terms[0])
-        powers = [*plain.factors, *plain.powers]
-        if len(powers) == 1 and powers[0][1] == 1.0:
-            return cls(tuple(terms), units[powers[0][0]])
-        return cls(tuple(terms), product_unit((units[name], power) for name, power in powers))
+    def of(
+        cls, terms: Sequence[Term], units: Mapping[str, str], fixed: Mapping[str, float]
+    ) -> "Combination":
+        """With the unit that follows from the parameters' and starts', the first coefficient one.
+
+        fixed: values of parameters that are not free; a coefficient between terms of unlike units
+        is named after those that it is the product of.
+        """
+        first, *others = terms
+        unit = _unit(first, units)
+        named = [term if _unit(term, units) == unit else term.named(fixed) for term in others]
+        return cls((first, *named), unit)
 
     @property
     def text(self) -> str:
@@ -85,3 +105,10 @@ class Combination:
                 rest = [(n, q - 1.0 if n == name else q) for n, q in term.powers]
                 slopes[name] += power * Term(tuple(rest), term.coefficient).value(values)
         return slopes
+
+
+def _unit(term: Term, units: Mapping[str, str]) -> str:
+    (name, power), *others = term.powers
+    if not others and power == 1.0:
+        return units[name]
+    return product_unit((units[name], power) for name, power in term.powers)

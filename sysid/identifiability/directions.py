@@ -140,7 +140,8 @@ class _Stack:
         wide = np.full((len(table), len(self.scale)), arb(0), dtype=object)
         wide[:, : self._n_free] = table[:, : self._n_free]
         wide[:, place : place + table.shape[1] - self._n_free] = table[:, self._n_free :]
-        return wide * self.scale
+        wide *= self.scale
+        return wide
 
 
 def _as_floats(rows: Rows) -> FloatArray:

@@ -77,7 +77,7 @@ class Equations:
         try:
             slopes = differentiate(tape, names, zeros)
             table = {place: coefficients(tape.value(name)) for place, name in slopes.items()}
-        except (NameError, AttributeError, TypeError) as error:
+        except TypeError as error:
             raise self._untraceable(error) from error
         return _variations(table, n, len(names), len(free), starts, order)
 
@@ -104,9 +104,9 @@ class Equations:
 
     def _untraceable(self, error: Exception) -> ModelError:
         return ModelError(
-            f"model {self.model.name}: its equations cannot be followed symbolically "
-            f"({type(error).__name__}: {error}). Write them with plain arithmetic, if, abs, min, "
-            "max and functions of math, on scalars"
+            f"model {self.model.name}: its equations cannot be followed step by step "
+            f"({type(error).__name__}: {error}); write them with arithmetic, if, abs, min, max and "
+            "functions of math on single numbers, without tables, int(), float() or NumPy"
         )
 
 

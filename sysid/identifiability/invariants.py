@@ -1,8 +1,9 @@
 """Combinations that stay the same along tied directions, in their simplest form.
 
 A combination is determined where its gradient is orthogonal to the tied directions at every
-point. Products are sought first, then sums, then sums of two monomials, then of more: for each
-form a linear problem over random points.
+point. Each smallest set of members whose directions leave room for such a gradient has just one:
+for it a product is sought first, then a sum, then sums of two monomials, and of more, each a linear
+problem over random points.
 """
 
 import itertools
@@ -16,9 +17,9 @@ from sysid.arrays import FloatArray
 from sysid.identifiability.combination import Combination, Term
 
 _ZERO = 1e-9  # what double precision leaves of an exact zero
+_MOST_MEMBERS = 5  # of a combination
 _MOST_TERMS = 6  # a longer sum says less than numbers
 _MOST_MONOMIALS = 45  # in one ansatz, each of which needs a point
-_MOST_PAIRED = 7  # members of a group whose monomials are tried in pairs
 
 Powers = tuple[float, ...]
 
@@ -30,44 +31,105 @@ class Sample:
     values: FloatArray
     directions: FloatArray
 
+    def of(self, members: Sequence[int]) -> "Sample":
+        """What it says of some of the members."""
+        return Sample(self.values[list(members)], self.directions[:, list(members)])
+
+    @property
+    def slopes(self) -> FloatArray:
+        """The tied directions of the members' logarithms, each of length one."""
+        slopes = self.directions / self.values
+        lengths = np.linalg.norm(slopes, axis=1, keepdims=True)
+        moving: FloatArray = slopes / np.where(lengths > 0.0, lengths, 1.0)
+        return moving
+
+
+# Gives so many points at which a group is tied.
+Sampler = Callable[[int], list[Sample]]
+
 
 def combinations_of(
     names: Sequence[str],
     units: Mapping[str, str],
+    fixed: Mapping[str, float],
     count: int,
-    samples: Callable[[int], list[Sample]],
+    samples: Sampler,
 ) -> list[Combination]:
     """Up to ``count`` independent combinations of the members of a group, the simplest first.
 
-    samples: gives so many points at which the group is tied.
+    units: by name, in the order in which the names stand in a product. fixed: values of the
+    model's fixed parameters. samples: gives so many points at which the group is tied.
     """
     chosen: list[Combination] = []
-    gradients: list[FloatArray] = []
-    for powers, coefficients in _candidates(len(names), samples):
+    gradients = np.zeros((0, len(names)))
+    for members, gradient in _circuits(samples(1)[0].slopes):
         if len(chosen) == count:
             break
-        terms = [
-            Term(tuple((n, q) for n, q in zip(names, row, strict=True) if q), coefficient)
-            for row, coefficient in zip(powers, coefficients, strict=True)
-        ]
-        sample = samples(1)[0]
-        slope = _slopes(sample.values, np.array(powers)).T @ np.array(coefficients) * sample.values
-        trial = [*gradients, slope / np.linalg.norm(slope)]
-        if np.linalg.matrix_rank(np.array(trial), tol=1e-6) > len(chosen):
-            chosen.append(Combination.of(terms, units))
+        trial = np.vstack([gradients, gradient])
+        if np.linalg.matrix_rank(trial, tol=1e-6) == len(chosen):
+            continue
+        terms = _terms(members, samples)
+        if terms:
+            named = [
+                Term(
+                    tuple((names[i], row[i]) for i in _as_declared(names, units) if row[i]), factor
+                )
+                for row, factor in terms
+            ]
+            chosen.append(Combination.of(named, units, fixed))
             gradients = trial
     return chosen
 
 
-def _candidates(
-    m: int, samples: Callable[[int], list[Sample]]
-) -> Iterator[tuple[list[Powers], list[float]]]:
+def _as_declared(names: Sequence[str], units: Mapping[str, str]) -> list[int]:
+    order = list(units)
+    return sorted(range(len(names)), key=lambda i: order.index(names[i]))
+
+
+def _circuits(slopes: FloatArray) -> Iterator[tuple[tuple[int, ...], FloatArray]]:
+    """Smallest sets of members of which something is determined, and its gradient, (m,).
+
+    slopes: (k, m), the tied directions of the logarithms. What is determined of such a set is one
+    combination, whose gradient is orthogonal to the directions; that of the logarithms is given.
+    """
+    m = slopes.shape[1]
+    for size in range(2, min(m, _MOST_MEMBERS) + 1):
+        for members in itertools.combinations(range(m), size):
+            null = _null_rows(slopes[:, members])
+            if len(null) == 1 and np.all(null[0] != 0.0):
+                gradient = np.zeros(m)
+                gradient[list(members)] = null[0] / np.linalg.norm(null[0])
+                yield members, gradient
+
+
+def _terms(members: Sequence[int], samples: Sampler) -> list[tuple[Powers, float]]:
+    """Powers of all of the group, and coefficients, of the simplest form of a circuit's invariant.
+
+    Empty where none of the forms fits.
+    """
+    m = samples(1)[0].directions.shape[1]
+
+    def sampled(n: int) -> list[Sample]:
+        return [sample.of(members) for sample in samples(n)]
+
+    form = next(_forms(len(members), sampled), None)
+    if form is None:
+        return []
+    terms = []
+    for row, coefficient in zip(*form, strict=True):
+        powers = [0.0] * m
+        for place, power in zip(members, row, strict=True):
+            powers[place] = power
+        terms.append((tuple(powers), coefficient))
+    return terms
+
+
+def _forms(m: int, samples: Sampler) -> Iterator[tuple[list[Powers], list[float]]]:
     """Powers and coefficients of the terms of invariants, the simplest forms first."""
     for exponents in _products(m, samples(3)):
         yield [exponents], [1.0]
     yield from _sums(_plain(m), samples)
-    if m <= _MOST_PAIRED:
-        yield from _pairs(m, samples(4))
+    yield from _pairs(m, samples(4))
     for powers in (_polynomials(m), _ratios(m)):
         if len(powers) <= _MOST_MONOMIALS:
             yield from _sums(powers, samples)
@@ -75,24 +137,18 @@ def _candidates(
 
 def _products(m: int, samples: Sequence[Sample]) -> Iterator[Powers]:
     """Exponents that are orthogonal to the directions of the logarithms."""
-    rows = np.concatenate([sample.directions / sample.values for sample in samples])
-    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
-    for exponents in _simple_exponents(m):
-        if np.max(np.abs(rows @ exponents)) < _ZERO:
-            yield tuple(exponents)
+    rows = np.concatenate([sample.slopes for sample in samples])
     for row in _null_rows(rows):
         whole = _as_whole(row)
         if whole is not None:
             yield whole
 
 
-def _sums(
-    powers: Sequence[Powers], samples: Callable[[int], list[Sample]]
-) -> Iterator[tuple[list[Powers], list[float]]]:
+def _sums(powers: Sequence[Powers], samples: Sampler) -> Iterator[tuple[list[Powers], list[float]]]:
     """Invariants that are linear in these monomials, those of the fewest terms first."""
-    k = len(samples(1)[0].directions)
     table = np.array(powers)
-    points = samples(-(-len(powers) // k) + 2)
+    per_point = table.shape[1] - 1  # a circuit moves in all directions but one
+    points = samples(-(-len(powers) // per_point) + 3)
     rows = np.concatenate([s.directions @ _slopes(s.values, table).T for s in points])
     sizes = np.max(np.abs(rows), axis=0)
     sizes[sizes == 0.0] = 1.0
@@ -101,7 +157,7 @@ def _sums(
     rows = rows / np.where(lengths > 0.0, lengths, 1.0)
     basis = [row / sizes for row in _null_rows(rows)]
     for row in sorted(basis, key=np.count_nonzero):
-        used = np.flatnonzero(row)
+        used = np.flatnonzero(row).tolist()
         if len(used) <= _MOST_TERMS:
             yield [powers[i] for i in used], _tidy(row[used])
 
@@ -211,15 +267,3 @@ def _monomials(m: int) -> list[Powers]:
                     powers[place] = float(power)
                 monomials.append(tuple(powers))
     return monomials
-
-
-def _simple_exponents(m: int) -> Iterator[FloatArray]:
-    """Exponents of simple products of m factors, the simplest first: squares after all others."""
-    for powers in ((1.0, -1.0), (1.0, -1.0, 2.0, -2.0)):
-        for size in (1, 2, 3):
-            for places in itertools.combinations(range(m), size):
-                for chosen in itertools.product(powers, repeat=size):
-                    if chosen[0] > 0.0 and min(map(abs, chosen)) == 1.0:
-                        exponents = np.zeros(m)
-                        exponents[list(places)] = chosen
-                        yield exponents

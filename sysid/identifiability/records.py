@@ -1,5 +1,6 @@
 """Records that a model is looked at in: starts, inputs, and every branch of its conditions."""
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,6 +20,28 @@ _ATTEMPTS = 50  # to find a point at which the equations can be evaluated
 
 # A condition, by what it compares, and how it is decided.
 Outcome = tuple[int, float]
+# Two of them together: what tells gamma |omega| z from beta omega |z| is a z against the motion.
+Pair = tuple[Outcome, Outcome]
+
+
+def _sign(operand: float, value: float) -> float:
+    return math.copysign(1.0, operand)
+
+
+def _step(operand: float, value: float) -> float:
+    """The step on which a staircase stands, those far out alike."""
+    return float(min(max(value, -2.0), 2.0))
+
+
+# What switches without a condition: how its branch is named, and by which operand.
+_SWITCHES = {
+    "abs({})": (_sign, 0),
+    "math.fabs({})": (_sign, 0),
+    "math.copysign({}, {})": (_sign, 1),
+    "math.floor({})": (_step, 0),
+    "math.ceil({})": (_step, 0),
+    "{} // {}": (_step, 0),
+}
 
 
 @dataclass(frozen=True)
@@ -57,7 +80,9 @@ class RecordPlan:
         ]
 
     def records(self, parameters: FloatArray, starts: FloatArray | None = None) -> list[Record]:
-        """Records that begin as declared, then those that visit every branch of the conditions.
+        """Records that begin as declared, then some that visit the branches of all conditions.
+
+        Every two conditions are decided in every way in which they are at some point.
 
         starts: (n_records, n_unknown), values of the unknown starts of the first records.
         """
@@ -70,7 +95,7 @@ class RecordPlan:
         if not any(outcomes for _, outcomes in drawn):
             return records
         candidates = [self._evaluable(parameters, True) for _ in range(_CANDIDATES)]
-        visited: set[Outcome] = set()
+        visited: set[Pair] = set()
         while True:
             record, outcomes = max(candidates, key=lambda c: len(c[1] - visited))
             if outcomes <= visited:
@@ -78,12 +103,14 @@ class RecordPlan:
             visited |= outcomes
             records.append(record)
 
-    def _evaluable(self, parameters: FloatArray, late: bool) -> tuple[Record, set[Outcome]]:
+    def _evaluable(self, parameters: FloatArray, late: bool) -> tuple[Record, set[Pair]]:
         """A record at whose start the equations have values, and how conditions are decided."""
         for _ in range(_ATTEMPTS):
             record = self._drawn(late)
             try:
                 return record, self._outcomes(parameters, record)
+            except ModelError:
+                raise
             except (ArithmeticError, ValueError):
                 continue
         raise ModelError(
@@ -108,7 +135,7 @@ class RecordPlan:
         inputs[:, 0] = [_magnitude(rng, spread) * rng.choice((-1.0, 1.0)) for _ in range(n_inputs)]
         return Record(start, unknown, inputs)
 
-    def _outcomes(self, parameters: FloatArray, record: Record) -> set[Outcome]:
+    def _outcomes(self, parameters: FloatArray, record: Record) -> set[Pair]:
         point = {f"p{j}": value for j, value in enumerate(parameters.tolist())}
         point |= {f"x{i}": value for i, value in enumerate(record.start.tolist())}
         point |= {f"u{j}": value for j, value in enumerate(record.inputs[:, 0].tolist())}
@@ -119,8 +146,8 @@ class RecordPlan:
         return _decided(tape)
 
 
-def _decided(tape: Tape) -> set[Outcome]:
-    """Conditions of a tape at its point, and signs of what it takes the size of."""
+def _decided(tape: Tape) -> set[Pair]:
+    """How all that switches on a tape stands at its point, two by two."""
     keys: dict[str, int] = {}
     outcomes: set[Outcome] = set()
     for line in tape.lines:
@@ -128,9 +155,10 @@ def _decided(tape: Tape) -> set[Outcome]:
         keys[line.name] = key
         if line.name in tape.decisions:
             outcomes.add((key, float(tape.decisions[line.name])))
-        elif line.form in ("abs({})", "math.fabs({})"):
-            outcomes.add((key, math.copysign(1.0, tape.value(line.operands[0]))))
-    return outcomes
+        elif line.form in _SWITCHES:
+            switch, place = _SWITCHES[line.form]
+            outcomes.add((key, switch(tape.value(line.operands[place]), tape.value(line.name))))
+    return set(itertools.combinations_with_replacement(sorted(outcomes), 2))
 
 
 def _start(state: State, spread: tuple[float, float], rng: np.random.Generator) -> float:

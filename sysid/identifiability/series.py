@@ -5,7 +5,6 @@ Coefficients are balls of FLINT's ``arb``: what is not zero is proven so, whatev
 
 import functools
 import math
-import types
 from collections.abc import Callable
 from typing import Any
 
@@ -18,7 +17,7 @@ from flint import arb, arb_series, ctx
 def series_operation(form: str, count: int) -> Callable[..., Any]:
     """The function of ``count`` numbers that a line's form stands for.
 
-    Calling it raises NameError or TypeError where no such function of series is known.
+    Calling it raises TypeError where no such function of series is known.
     """
     if form in _FORMS:
         return _FORMS[form]
@@ -137,8 +136,19 @@ _MATH: dict[str, Any] = {
     "copysign": lambda a, b: _absolute(a) * (sign(b) or 1),
     "pi": math.pi, "e": math.e, "tau": math.tau,
 }  # fmt: skip
+
+
+class _Library:
+    """What stands for the module ``math``."""
+
+    def __getattr__(self, name: str) -> Any:
+        if name not in _MATH:
+            raise TypeError(f"math.{name} has no known power series")
+        return _MATH[name]
+
+
 _SCOPE: dict[str, Any] = {
-    "math": types.SimpleNamespace(**_MATH),
+    "math": _Library(),
     "abs": _absolute,
     "sign": sign,
     "select": lambda condition, first, second: first if condition else second,

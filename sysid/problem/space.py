@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from sysid.arrays import BoolArray, FloatArray
 from sysid.problem.data import Dataset
-from sysid.problem.model import ModelError, Parameter, ProcessModel, Scale
+from sysid.problem.model import Function, ModelError, Parameter, ProcessModel, Scale
 from sysid.problem.ranges import Range, Tie, ties, with_search_range
 from sysid.time_limit import AT_A_POINT, time_limit
 
@@ -171,6 +171,20 @@ class SearchSpace:
             named[record][self.model.states[i].name] = float(value)
         return named
 
+    def as_model(self) -> ProcessModel:
+        """The model whose free parameters are those searched, the tied ones in its equations."""
+        free = dict(zip(self.index, self.parameters, strict=False))
+        rest = zip(self.model.parameters, self.base.tolist(), strict=True)
+        parameters = [
+            free.get(i) or replace(p, nominal=value, fixed=True)
+            for i, (p, value) in enumerate(rest)
+        ]
+        derivative = _with_ties(self.model.derivative, self.ties)
+        output = self.model.output and _with_ties(self.model.output, self.ties)
+        return replace(
+            self.model, parameters=tuple(parameters), derivative=derivative, output=output
+        )
+
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the free parameters, in order."""
@@ -269,6 +283,20 @@ class SearchSpace:
             except TimeoutError as error:
                 raise ModelError(f"constraint {constraint.text!r}: {error}") from error
         return values
+
+
+def _with_ties(function: Function, ties: Sequence[Tie]) -> Function:
+    """A model's function that works out the tied parameters itself."""
+    if not ties:
+        return function
+
+    def tied(x: Any, u: Any, p: Any) -> tuple[Any, ...]:
+        values = list(p)
+        for tie in ties:
+            values[tie.index] = tie.factor * values[tie.source]
+        return function(x, u, tuple(values))
+
+    return tied
 
 
 def _check_conflicts(*settings: Mapping[str, object]) -> None:
