@@ -16,7 +16,7 @@ import numpy as np
 
 from sysid.arrays import BoolArray, FloatArray
 from sysid.identifiability.combination import Combination
-from sysid.identifiability.directions import directions_at
+from sysid.identifiability.directions import directions_at, telling_records
 from sysid.identifiability.germ import Equations
 from sysid.identifiability.invariants import Sample, combinations_of
 from sysid.identifiability.points import PointSource
@@ -25,6 +25,7 @@ from sysid.problem.expressions import measuring_effort
 from sysid.problem.model import ModelError, ProcessModel
 
 _FURTHER = 2  # points anywhere in the ranges, beside one near the nominal values
+_ATTEMPTS = 4  # times as many points as are to be such that no more is tied than in general
 
 
 @dataclass(frozen=True)
@@ -116,8 +117,9 @@ class _Analysis:
         if not self._names:
             raise ModelError(f"model {model.name}: every parameter is fixed; free at least one")
         # All points see the same records, so that each visits every branch of the equations.
-        plan = RecordPlan(self._equations, self._unknown, self._rng)
-        self._records = plan.records(self._points.nearby())
+        point = self._points.nearby()
+        records = RecordPlan(self._equations, self._unknown, self._rng).records(point)
+        self._records = telling_records(self._equations, point, self._free, records, self._rng)
 
     def result(self) -> Identifiability:
         """The whole analysis."""
@@ -168,11 +170,13 @@ class _Analysis:
         samples: list[Sample] = []
 
         def sampled(n: int) -> list[Sample]:
-            while len(samples) < n:
+            for _ in range(_ATTEMPTS * n):
+                if len(samples) >= n:
+                    return samples[:n]
                 sample = self._sample(members)
                 if len(sample.directions) == len(directions):
                     samples.append(sample)
-            return samples[:n]
+            raise ArithmeticError("at most points more is tied")
 
         resolved = {
             state: tuple(self._names[i] for i in members if determined[i])

@@ -1,13 +1,14 @@
 """Directions in which parameters and unknown starts move without any output showing it."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import NamedTuple
 
 import numpy as np
 from flint import arb, ctx
 
 from sysid.arrays import FloatArray
-from sysid.identifiability.elimination import Rows, null_space, reduced
+from sysid.identifiability.elimination import Elimination, Rows, null_space, reduced
 from sysid.identifiability.germ import Equations, Point
 from sysid.identifiability.records import Record, RecordPlan
 from sysid.problem.model import ModelError, ProcessModel
@@ -74,29 +75,68 @@ def directions_at(
 
     n_shown: how many of the records' unknown starts, the first of them, the directions name.
     """
-    n_states = len(equations.model.states)
-    most = len(free) + 3 * n_states + 2
-    cap, prec = ctx.cap, ctx.prec
-    try:
-        ctx.prec = _BITS
-        order = min(most, n_states + 3 + -(-len(free) // len(equations.model.outputs)))
-        while True:
-            stack = _Stack(equations, parameters, free, records, order)
-            elimination = null_space(*stack.rows(n_states + 1), rng)
-            if elimination.settled or order == most:
-                break
-            order = min(most, order + -(-order // 2))
+    with _precision():
+        stack, elimination = _settled(equations, parameters, free, records, rng)
         shown = len(free) + n_shown
         basis = reduced(elimination.basis[:, :shown])
         return TiedDirections(_as_floats(basis * stack.scale[:shown]), elimination.gap)
+
+
+def telling_records(
+    equations: Equations,
+    parameters: FloatArray,
+    free: Sequence[int],
+    records: Sequence[Record],
+    rng: np.random.Generator,
+) -> list[Record]:
+    """The first record, whose start may be anywhere, and those that tell all without it."""
+    with _precision():
+        stack, _ = _settled(equations, parameters, free, records, rng)
+        kept: list[int] = []
+        least = len(free) + 1
+        for k in range(1, len(records)):
+            basis = null_space(*stack.rows([*kept, k]), rng).basis
+            n_tied = len(reduced(basis[:, : len(free)]))
+            if n_tied < least:
+                kept, least = [*kept, k], n_tied
+    return [records[k] for k in (0, *kept)]
+
+
+def _settled(
+    equations: Equations,
+    parameters: FloatArray,
+    free: Sequence[int],
+    records: Sequence[Record],
+    rng: np.random.Generator,
+) -> tuple["_Stack", Elimination]:
+    """Sensitivities of so many orders that further ones would add nothing, and their null space."""
+    n_states = len(equations.model.states)
+    most = len(free) + 3 * n_states + 2
+    order = min(most, n_states + 3 + -(-len(free) // len(equations.model.outputs)))
+    while True:
+        stack = _Stack(equations, parameters, free, records, order)
+        elimination = null_space(*stack.rows(range(len(records))), rng)
+        if elimination.settled or order == most:
+            return stack, elimination
+        order = min(most, order + -(-order // 2))
+
+
+@contextmanager
+def _precision() -> Iterator[None]:
+    """Within it numbers have all their bits; series are as long as they are set to be."""
+    cap, prec = ctx.cap, ctx.prec
+    ctx.prec = _BITS
+    try:
+        yield
     finally:
         ctx.cap, ctx.prec = cap, prec
 
 
 class _Stack:
-    """Sensitivities of all records' outputs, each record's starts in columns of their own.
+    """Sensitivities of several records' outputs, each record's starts in columns of their own.
 
-    Columns are in parts of the parameters' and starts' values, ``scale``.
+    Columns are in parts of the parameters' and starts' values; scale: those of the parameters,
+    then of each record's starts.
     """
 
     def __init__(
@@ -107,10 +147,11 @@ class _Stack:
         records: Sequence[Record],
         order: int,
     ) -> None:
-        self._n_outputs, self._order = len(equations.model.outputs), order
-        values = [*parameters[list(free)]]
-        self._blocks: list[tuple[int, Rows]] = []
+        n_late = len(equations.model.states) + 1
+        self._n_early = (order - n_late) * len(equations.model.outputs)
         self._n_free = len(free)
+        self._tables: list[Rows] = []
+        values = [*parameters[list(free)]]
         for record in records:
             inputs = record.inputs[:, :order].tolist()
             point = Point(parameters.tolist(), record.start.tolist(), inputs)
@@ -118,30 +159,36 @@ class _Stack:
                 rows = equations.sensitivities(point, free, record.unknown, order)
             except ArithmeticError:
                 rows = []  # it has no power series there, as a root at zero: others must tell
-            table = np.array(rows, dtype=object).reshape(len(rows), -1)
-            if rows:
-                self._blocks.append((len(values), table))
-            values += [*record.start[list(record.unknown)]]
-        if not self._blocks:
+            starts = record.start[list(record.unknown)]
+            table = np.array(rows, dtype=object).reshape(len(rows), len(free) + len(starts))
+            self._tables.append(table * _scale([*parameters[list(free)], *starts]))
+            values += [*starts]
+        self.scale = _scale(values)
+        if not any(map(len, self._tables)):
             raise ModelError(
                 f"model {equations.model.name}: at no start that was tried do its equations have "
                 "a power series in time; declare starts at which roots and divisions are defined"
             )
-        self.scale = np.array([arb(v) if v else arb(1) for v in values], dtype=object)
 
-    def rows(self, n_late: int) -> tuple[Rows, Rows]:
-        """All rows but those of the last orders, and these."""
-        split = (self._order - n_late) * self._n_outputs
-        early = [self._widened(place, table[:split]) for place, table in self._blocks]
-        late = [self._widened(place, table[split:]) for place, table in self._blocks]
+    def rows(self, records: Sequence[int]) -> tuple[Rows, Rows]:
+        """Rows of some of the records, all but those of the last orders, and these."""
+        n = self._n_free
+        width = n + sum(self._tables[k].shape[1] - n for k in records)
+        early, late, place = [np.zeros((0, width), object)], [np.zeros((0, width), object)], n
+        for k in records:
+            table = self._tables[k]
+            wide = np.full((len(table), width), arb(0), dtype=object)
+            wide[:, :n] = table[:, :n]
+            end = place + table.shape[1] - n
+            wide[:, place:end] = table[:, n:]
+            place = end
+            early.append(wide[: self._n_early])
+            late.append(wide[self._n_early :])
         return np.concatenate(early), np.concatenate(late)
 
-    def _widened(self, place: int, table: Rows) -> Rows:
-        wide = np.full((len(table), len(self.scale)), arb(0), dtype=object)
-        wide[:, : self._n_free] = table[:, : self._n_free]
-        wide[:, place : place + table.shape[1] - self._n_free] = table[:, self._n_free :]
-        wide *= self.scale
-        return wide
+
+def _scale(values: Sequence[float]) -> Rows:
+    return np.array([arb(value) if value else arb(1) for value in values], dtype=object)
 
 
 def _as_floats(rows: Rows) -> FloatArray:

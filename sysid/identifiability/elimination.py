@@ -83,13 +83,14 @@ def _size(entries: Rows) -> arb:
 def _largest(work: Rows, pivots: Sequence[tuple[int, int]]) -> tuple[int, int] | None:
     """Place of the largest entry that is not zero, in no row or column of a pivot."""
     rows, columns = ({place[axis] for place in pivots} for axis in (0, 1))
-    sizes = {
-        (i, j): e.abs_lower()
-        for (i, j), e in np.ndenumerate(work)
-        if i not in rows and j not in columns
-    }
-    place = max(sizes, key=lambda place: sizes[place], default=None)
-    return None if place is None or sizes[place] == 0 else place
+    rest = [j for j in range(work.shape[1]) if j not in columns]
+    largest, place = arb(0), None
+    for i in range(len(work)):
+        for j in rest if i not in rows else ():
+            size = work[i, j].abs_lower()
+            if size > largest:
+                largest, place = size, (i, j)
+    return place
 
 
 def _eliminate(work: Rows, pivots: Sequence[tuple[int, int]]) -> None:

@@ -44,7 +44,9 @@ class Sample:
         return moving
 
 
-# Gives so many points at which a group is tied.
+# Powers and coefficients of the terms of a sum.
+Form = tuple[list[Powers], list[float]]
+# Gives so many points at which a group is tied alike; ArithmeticError where there are not so many.
 Sampler = Callable[[int], list[Sample]]
 
 
@@ -60,37 +62,59 @@ def combinations_of(
     units: by name, in the order in which the names stand in a product. fixed: values of the
     model's fixed parameters. samples: gives so many points at which the group is tied.
     """
+    order = sorted(range(len(names)), key=lambda i: list(units).index(names[i]))
     chosen: list[Combination] = []
     gradients = np.zeros((0, len(names)))
-    for members, gradient in _circuits(samples(1)[0].slopes):
-        if len(chosen) == count:
-            break
-        trial = np.vstack([gradients, gradient])
-        if np.linalg.matrix_rank(trial, tol=1e-6) == len(chosen):
-            continue
-        terms = _terms(members, samples)
-        if terms:
-            named = [
-                Term(
-                    tuple((names[i], row[i]) for i in _as_declared(names, units) if row[i]), factor
-                )
-                for row, factor in terms
-            ]
-            chosen.append(Combination.of(named, units, fixed))
-            gradients = trial
+
+    def independent(gradient: FloatArray) -> bool:
+        trial = np.vstack([gradients, gradient / np.linalg.norm(gradient)])
+        return bool(np.linalg.matrix_rank(trial, tol=1e-6) == len(trial))
+
+    try:
+        values = samples(1)[0].values
+        for powers, coefficients in _simplest(samples, independent):
+            gradient = np.array(coefficients) @ _slopes(values, np.array(powers)) * values
+            if independent(gradient):
+                gradients = np.vstack([gradients, gradient / np.linalg.norm(gradient)])
+                terms = [
+                    Term(tuple((names[i], row[i]) for i in order if row[i]), coefficient)
+                    for row, coefficient in zip(powers, coefficients, strict=True)
+                ]
+                chosen.append(Combination.of(terms, units, fixed))
+            if len(chosen) == count:
+                break
+    except ArithmeticError:
+        pass  # elsewhere the group is tied in another way: no form holds throughout
     return chosen
 
 
-def _as_declared(names: Sequence[str], units: Mapping[str, str]) -> list[int]:
-    order = list(units)
-    return sorted(range(len(names)), key=lambda i: order.index(names[i]))
+def _simplest(samples: Sampler, independent: Callable[[FloatArray], bool]) -> Iterator[Form]:
+    """Forms of invariants of a group: of the smallest sets of members first, then of all.
+
+    independent: whether a gradient, by the logarithms, says more than those before it.
+    """
+    slopes = samples(1)[0].slopes
+    m = slopes.shape[1]
+    for members, gradient in _circuits(slopes):
+        if independent(gradient):
+
+            def of_members(n: int, members: tuple[int, ...] = members) -> list[Sample]:
+                return [sample.of(members) for sample in samples(n)]
+
+            for few, coefficients in itertools.islice(_forms(len(members), of_members), 1):
+                powers = np.zeros((len(few), m))
+                powers[:, members] = few
+                yield list(map(tuple, powers.tolist())), coefficients
+    for exponents in _products(samples(3)):
+        yield [exponents], [1.0]
+    yield from _sums(_plain(m), samples)
 
 
 def _circuits(slopes: FloatArray) -> Iterator[tuple[tuple[int, ...], FloatArray]]:
-    """Smallest sets of members of which something is determined, and its gradient, (m,).
+    """Smallest sets of members that do not move in all directions, and the way they never move.
 
-    slopes: (k, m), the tied directions of the logarithms. What is determined of such a set is one
-    combination, whose gradient is orthogonal to the directions; that of the logarithms is given.
+    slopes: (k, m), the tied directions of the logarithms. Some combination of such a set may be
+    determined; then that way, (m,), is its gradient.
     """
     m = slopes.shape[1]
     for size in range(2, min(m, _MOST_MEMBERS) + 1):
@@ -98,35 +122,13 @@ def _circuits(slopes: FloatArray) -> Iterator[tuple[tuple[int, ...], FloatArray]
             null = _null_rows(slopes[:, members])
             if len(null) == 1 and np.all(null[0] != 0.0):
                 gradient = np.zeros(m)
-                gradient[list(members)] = null[0] / np.linalg.norm(null[0])
+                gradient[list(members)] = null[0]
                 yield members, gradient
 
 
-def _terms(members: Sequence[int], samples: Sampler) -> list[tuple[Powers, float]]:
-    """Powers of all of the group, and coefficients, of the simplest form of a circuit's invariant.
-
-    Empty where none of the forms fits.
-    """
-    m = samples(1)[0].directions.shape[1]
-
-    def sampled(n: int) -> list[Sample]:
-        return [sample.of(members) for sample in samples(n)]
-
-    form = next(_forms(len(members), sampled), None)
-    if form is None:
-        return []
-    terms = []
-    for row, coefficient in zip(*form, strict=True):
-        powers = [0.0] * m
-        for place, power in zip(members, row, strict=True):
-            powers[place] = power
-        terms.append((tuple(powers), coefficient))
-    return terms
-
-
-def _forms(m: int, samples: Sampler) -> Iterator[tuple[list[Powers], list[float]]]:
-    """Powers and coefficients of the terms of invariants, the simplest forms first."""
-    for exponents in _products(m, samples(3)):
+def _forms(m: int, samples: Sampler) -> Iterator[Form]:
+    """Forms of the invariant of a circuit of m members, the simplest first."""
+    for exponents in _products(samples(3)):
         yield [exponents], [1.0]
     yield from _sums(_plain(m), samples)
     yield from _pairs(m, samples(4))
@@ -135,7 +137,7 @@ def _forms(m: int, samples: Sampler) -> Iterator[tuple[list[Powers], list[float]
             yield from _sums(powers, samples)
 
 
-def _products(m: int, samples: Sequence[Sample]) -> Iterator[Powers]:
+def _products(samples: Sequence[Sample]) -> Iterator[Powers]:
     """Exponents that are orthogonal to the directions of the logarithms."""
     rows = np.concatenate([sample.slopes for sample in samples])
     for row in _null_rows(rows):
@@ -144,7 +146,7 @@ def _products(m: int, samples: Sequence[Sample]) -> Iterator[Powers]:
             yield whole
 
 
-def _sums(powers: Sequence[Powers], samples: Sampler) -> Iterator[tuple[list[Powers], list[float]]]:
+def _sums(powers: Sequence[Powers], samples: Sampler) -> Iterator[Form]:
     """Invariants that are linear in these monomials, those of the fewest terms first."""
     table = np.array(powers)
     per_point = table.shape[1] - 1  # a circuit moves in all directions but one
@@ -162,7 +164,7 @@ def _sums(powers: Sequence[Powers], samples: Sampler) -> Iterator[tuple[list[Pow
             yield [powers[i] for i in used], _tidy(row[used])
 
 
-def _pairs(m: int, samples: Sequence[Sample]) -> Iterator[tuple[list[Powers], list[float]]]:
+def _pairs(m: int, samples: Sequence[Sample]) -> Iterator[Form]:
     """Invariant sums of two monomials, whose slopes along the directions are in one ratio."""
     powers = sorted(_monomials(m), key=_complexity)
     table = np.array(powers)

@@ -3,23 +3,18 @@
 import itertools
 import math
 
-import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
 from sim_rig.actuator import actuator
 from sysid import (
     Input,
-    ModelError,
     Output,
     Parameter,
     ProcessModel,
-    SearchSpace,
     State,
     identifiability,
 )
-from sysid.examples import lag
-from sysid.identifiability import null_directions
 
 
 def process(states, inputs, parameters, derivative, outputs, output=None, starts=None):
@@ -119,8 +114,7 @@ PUBLISHED = {
         {"gamma"},
         {"K S(0)", "K I(0)", "beta / (N K)"},
     ),
-    # SIWR of Lee, Eisenberg et al., "Model distinguishability and inference robustness in
-    # mechanisms of cholera transmission", 2017, in its scaled form.
+    # A textbook case: the predators may be counted in any unit.
     "Lotka and Volterra, the prey": (
         process(
             "prey predator", "", "a b c d",
@@ -159,7 +153,7 @@ PUBLISHED = {
     # Verdiere et al. 2005, benchmark "Pharm" of StructuralIdentifiability.jl: all of it.
     "pharmacokinetics": (
         process("x0 x1 x2 x3", "", "a1 a2 b1 b2 ka kc n", pharmacokinetics, "x0"),
-        set("a1 a2 b1 b2 ka kc n x0(0) x1(0) x2(0) x3(0)".split()),
+        set(["a1", "a2", "b1", "b2", "ka", "kc", "n", "x0(0)", "x1(0)", "x2(0)", "x3(0)"]),
         set(),
     ),
     # Conradi & Shiu 2018, benchmark "CRN" of StructuralIdentifiability.jl: all of it.
@@ -337,12 +331,12 @@ def check_design(design):
     assert result.gap > 100.0
 
 
-@pytest.mark.parametrize("design", [DESIGNS[0], DESIGNS[-1]], ids=str)
+@pytest.mark.parametrize("design", [DESIGNS[0]], ids=str)
 def test_the_actuator(design):
     check_design(design)
 
 
 @pytest.mark.soak
-@pytest.mark.parametrize("design", DESIGNS[1:-1], ids=lambda d: "-".join(map(str, d.values())))
+@pytest.mark.parametrize("design", DESIGNS[1:], ids=lambda d: "-".join(map(str, d.values())))
 def test_every_combination_of_the_actuator(design):
     check_design(design)
