@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -75,7 +76,7 @@ def _identifiable(name: str | None, config: Path | None, settings: list[str], js
 
 def _show_identifiable(structure: Structure) -> None:
     model, result = structure.model, structure.identifiability
-    print(f"{model.name}: {model.description}")
+    terminal.print_text(f"{model.name}: {model.description}")
     measured = f"Measured: {', '.join(result.outputs)}."
     if result.unknown_starts:
         measured += f" Unknown at the start of a record: {', '.join(result.unknown_starts)}."
@@ -89,56 +90,62 @@ def _show_identifiable(structure: Structure) -> None:
     terminal.print_text(f"Identifiable by themselves: {names}.")
     if result.unseen:
         terminal.print_text(f"Without effect on any output: {', '.join(result.unseen)}.")
-    if not result.tied:
-        return
-    print()
-    head = ["act only together", "determined", "unit"]
-    rows = [row for group in result.tied for row in _combination_rows(group)]
-    terminal.print_table("What logs can tell of the others, however many", head, rows, text=head)
     for group in result.tied:
-        _show_directions(group)
-    head = ["to tell apart", "measure otherwise", "or log as well"]
-    rows = [_separation_row(group) for group in result.tied]
-    terminal.print_table("What would tell them apart", head, rows, text=head)
-    terminal.print_text(
-        f"What counts as a change of the outputs is at least {result.gap:.0f} decades above what "
-        "counts as none."
-    )
-    terminal.print_next("rig identify LOG --set fixed.NAME=VALUE, with what was measured")
+        print()
+        _show_group(group)
+    if result.tied:
+        print()
+        terminal.print_text(
+            f"What counts as a change of the outputs is at least {result.gap:.0f} decades above "
+            "what counts as none."
+        )
+        terminal.print_next("rig identify LOG --set fixed.NAME=VALUE, with what was measured")
 
 
-def _combination_rows(group: TiedGroup) -> list[list[str]]:
-    rows = [["", c.text, c.unit] for c in group.combinations]
+def _show_group(group: TiedGroup) -> None:
+    terminal.print_text(f"{', '.join(group.parameters)} act only together. Outputs determine")
+    width = max((len(c.text) for c in group.combinations), default=0)
+    for combination in group.combinations:
+        print(f"    {combination.text:<{width}}  {combination.unit}".rstrip())
     missing = group.count - len(group.combinations)
     if missing:
-        rows.append(["", f"{missing} of no simple form", ""])
-    if not rows:
-        rows.append(["", "none", ""])
-    rows[0][0] = ", ".join(group.parameters)
-    return rows
+        _show_directions(group, missing)
+    elif not group.count:
+        print("    nothing of them")
+    terminal.print_text(f"  {_separation(group)}")
 
 
-def _show_directions(group: TiedGroup) -> None:
-    """The directions of a group of which some combinations have no simple form."""
-    if len(group.combinations) == group.count:
-        return
+def _show_directions(group: TiedGroup, missing: int) -> None:
+    """How the members move where some combinations have no simple form."""
     number = terminal.number
     at = ", ".join(f"{name} {number(value)}" for name, value in group.values.items())
+    several = "combination" if missing == 1 else "combinations"
+    terminal.print_text(f"    {missing} {several} of no simple form. At {at} nothing changes along")
     for direction in group.directions:
-        steps = (
-            f"{name} {number(step)}"
-            for name, step in zip(group.parameters, direction, strict=True)
-            if step
-        )
-        terminal.print_text(f"At {at} nothing changes along {', '.join(steps)}.")
+        steps = zip(group.parameters, direction, strict=True)
+        moved = ", ".join(f"{name} {number(step)}" for name, step in steps if step)
+        terminal.print_text(f"      {moved}")
 
 
-def _separation_row(group: TiedGroup) -> list[str]:
-    sensors = [
-        state if len(names) == len(group.parameters) else f"{state} (for {', '.join(names)})"
-        for state, names in group.sensors.items()
-    ]
-    return [", ".join(group.parameters), " and ".join(group.fix), "; ".join(sensors) or "-"]
+def _separation(group: TiedGroup) -> str:
+    """What tells the members of a group apart."""
+    values = [name for name in group.fix if not name.endswith("(0)")]
+    starts = [name for name in group.fix if name.endswith("(0)")]
+    keys = ["'fixed'"] * bool(values) + ["'initial'"] * bool(starts)
+    pronoun = "it" if len(group.fix) == 1 else "them"
+    text = f"To tell them apart, measure {_listed(group.fix, 'and')} by other means and give "
+    text += f"{pronoun} under {_listed(keys, 'and')}"
+    whole = [state for state, names in group.sensors.items() if names == group.parameters]
+    text += f", or log {_listed(whole, 'or')} as well" if whole else ""
+    for state, names in group.sensors.items():
+        if state not in whole:
+            text += f"; {state}, logged as well, tells {_listed(names, 'and')}"
+    return f"{text}."
+
+
+def _listed(names: Sequence[str], word: str) -> str:
+    """``a, b and c``."""
+    return f" {word} ".join(filter(None, [", ".join(names[:-1]), *names[-1:]]))
 
 
 def _show_list(models: dict[str, ProcessModel]) -> None:
