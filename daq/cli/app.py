@@ -42,7 +42,7 @@ _COMMANDS: tuple[tuple[Callable[..., None], str], ...] = (
     (figures, "rig figures runs/20260101T120000Z-prbs --format pdf --format png"),
     (init, "rig init my_rig"),
     (schema, "rig schema schemas"),
-    (models, "rig models actuator --json"),
+    (models, "rig models actuator --identifiable"),
     (emulate, "rig emulate --fault drop=0.01 --fault disconnect@run+0.5"),
     (scope, "rig scope"),
     (ports, "rig ports"),

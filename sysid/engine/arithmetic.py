@@ -13,7 +13,7 @@ import numpy as np
 _SAME_NAMES = (
     "exp expm1 log log1p log2 log10 sqrt fabs hypot copysign sin cos tan sinh cosh tanh floor ceil"
 )
-_UFUNCS = {
+UFUNCS = {
     **{name: getattr(np, name) for name in _SAME_NAMES.split()},
     **{"asin": np.arcsin, "acos": np.arccos, "atan": np.arctan, "atan2": np.arctan2},
     "pow": np.power,
@@ -101,7 +101,7 @@ def _exponent_slope(a: Any, power: Any, db: Any) -> Any:
 _SCOPE: dict[str, Any] = {
     "math": types.SimpleNamespace(
         **{
-            name: _elementwise(item, _UFUNCS.get(name)) if callable(item) else item
+            name: _elementwise(item, UFUNCS.get(name)) if callable(item) else item
             for name, item in vars(math).items()
         }
     ),

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import math
 import numbers
+import operator
 import types
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+
+from sysid.engine.arithmetic import UFUNCS
 from sysid.engine.substitution import Copier
 from sysid.engine.tape import Tape
 
@@ -31,9 +35,6 @@ class Trace:
 
     __slots__ = ("name", "tape")
 
-    # A NumPy number on the left leaves arithmetic to the reflected methods here.
-    __array_ufunc__ = None
-
     def __init__(self, tape: Tape, name: str) -> None:
         self.tape = tape
         self.name = name
@@ -54,6 +55,17 @@ class Trace:
     __eq__, __ne__ = _condition("=="), _condition("!=")
     __hash__ = object.__hash__
 
+    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **options: Any) -> Any:
+        """A NumPy number on the left, or at a point NumPy's function of single numbers."""
+        if method != "__call__" or options:
+            return NotImplemented
+        numbers = [a if isinstance(a, Trace) else float(a) for a in inputs]
+        if ufunc in _ARITHMETIC:
+            return _ARITHMETIC[ufunc](*numbers)
+        if ufunc in _AT_A_POINT and self.tape.single(map(operand, numbers)):
+            return _AT_A_POINT[ufunc](*numbers)
+        return NotImplemented
+
     def __neg__(self) -> Trace:
         return self.result("-{}", self)
 
@@ -65,6 +77,16 @@ class Trace:
 
     def __bool__(self) -> bool:
         return self != 0.0
+
+
+# What the operators of a NumPy number call.
+_ARITHMETIC: dict[np.ufunc, Callable[..., Any]] = {
+    np.add: operator.add, np.subtract: operator.sub, np.multiply: operator.mul,
+    np.divide: operator.truediv, np.floor_divide: operator.floordiv, np.remainder: operator.mod,
+    np.power: operator.pow, np.less: operator.lt, np.less_equal: operator.le,
+    np.greater: operator.gt, np.greater_equal: operator.ge, np.equal: operator.eq,
+    np.not_equal: operator.ne,
+}  # fmt: skip
 
 
 def followed(function: Any) -> Callable[..., tuple[Any, ...]]:
@@ -107,3 +129,14 @@ def _traceable(function: Callable[..., Any]) -> Callable[..., Any]:
         return first.result(f"{prefix}{function.__name__}({places})", *args)
 
     return call
+
+
+# NumPy's functions of single numbers, as they are followed where the numbers have values.
+_AT_A_POINT: dict[np.ufunc, Callable[..., Any]] = {
+    **{ufunc: _traceable(getattr(math, name)) for name, ufunc in UFUNCS.items()},
+    np.absolute: abs,
+    np.square: lambda a: a * a,
+    np.sign: lambda a: float(a > 0.0) - float(a < 0.0),
+    np.minimum: min,
+    np.maximum: max,
+}

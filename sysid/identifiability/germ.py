@@ -106,7 +106,7 @@ class Equations:
         return ModelError(
             f"model {self.model.name}: its equations cannot be followed step by step "
             f"({type(error).__name__}: {error}); write them with arithmetic, if, abs, min, max and "
-            "functions of math on single numbers, without tables, int(), float() or NumPy"
+            "functions of math on single numbers, without tables, int() or float()"
         )
 
 

@@ -243,6 +243,7 @@ def motor(sign):
 
 SIGNS = {
     "jump": lambda omega: 1.0 if omega > 0.0 else -1.0,
+    "NumPy's": np.sign,
     "smooth": lambda omega: math.tanh(omega / 0.1),
 }
 

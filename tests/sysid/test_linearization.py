@@ -21,7 +21,7 @@ from sysid import (
     linearize,
 )
 from sysid.response.linearization import jacobians
-from tests.sysid.support import motor, motor_matrices, outputs_of
+from tests.sysid.support import lag, motor, motor_matrices, outputs_of
 
 MODELS = {
     "motor": motor(),
@@ -258,3 +258,13 @@ def test_wrong_shapes_are_named(wrong):
     arguments = {"x": np.zeros(2), "u": np.zeros(2), "p": motor().nominal} | wrong
     with pytest.raises(ModelError, match="shape"):
         linearize(motor(), **arguments)
+
+
+def test_numpys_functions_have_derivatives_too():
+    def derivative(x, u, p):
+        return (np.float64(2.0) * u[0] - np.sign(x[0]) * np.tanh(x[0] * p[0]),)
+
+    model = lag(derivative=derivative)
+    linear = linearize(model, np.array([-0.3]), np.zeros(1), np.array([2.0, 1.0]))
+    assert linear.A.item() == pytest.approx(2.0 / np.cosh(0.6) ** 2)
+    assert linear.B.item() == 2.0
