@@ -9,7 +9,7 @@ from flint import arb, ctx
 
 from sysid.arrays import FloatArray
 from sysid.identifiability.elimination import Elimination, Rows, null_space, reduced
-from sysid.identifiability.germ import Equations, Point
+from sysid.identifiability.germ import Equations, ExpansionPoint
 from sysid.identifiability.records import Record, RecordPlan
 from sysid.problem.model import ModelError, ProcessModel
 
@@ -154,7 +154,7 @@ class _Stack:
         values = [*parameters[list(free)]]
         for record in records:
             inputs = record.inputs[:, :order].tolist()
-            point = Point(parameters.tolist(), record.start.tolist(), inputs)
+            point = ExpansionPoint(parameters.tolist(), record.start.tolist(), inputs)
             try:
                 rows = equations.sensitivities(point, free, record.unknown, order)
             except ArithmeticError:

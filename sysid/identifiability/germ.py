@@ -22,7 +22,7 @@ _PATIENCE = 3  # times as many turns as orders before conditions that flicker ar
 
 
 @dataclass(frozen=True)
-class Point:
+class ExpansionPoint:
     """Where outputs are expanded: parameters (n_parameters,), start (n_states,), inputs.
 
     inputs: (n_inputs, n_orders), coefficients of their power series.
@@ -61,7 +61,7 @@ class Equations:
         return values + [f"x{i}" for i in model.output_states or ()]
 
     def sensitivities(
-        self, point: Point, free: Sequence[int], starts: Sequence[int], order: int
+        self, point: ExpansionPoint, free: Sequence[int], starts: Sequence[int], order: int
     ) -> list[list[arb]]:
         """Derivatives of the outputs' coefficients by free parameters and starts.
 
@@ -81,7 +81,7 @@ class Equations:
             raise self._untraceable(error) from error
         return _variations(table, n, len(names), len(free), starts, order)
 
-    def _solve(self, point: Point, order: int) -> tuple[Tape, list[str]]:
+    def _solve(self, point: ExpansionPoint, order: int) -> tuple[Tape, list[str]]:
         """The tape at the solution, its numbers being power series of so many orders."""
         states = [[arb(value)] for value in point.start]
         outcomes: dict[str, bool] = {}

@@ -75,7 +75,8 @@ def test_machines_read_the_same(folder):
 def test_other_outputs_are_asked_about_with_set(tmp_path):
     given = ("--set", "fixed.R_b=126", "--set", "tied.J_b=J_m/2", "--set", "initial.z=0")
     result = rig("models", "actuator", "--identifiable", *given, cwd=tmp_path)
-    assert "J_b = J_m/2." in result.stdout and "Unknown at the start" not in result.stdout
+    assert "Fixed: R_b 126, K_v2i 0.5, n_c -1, J_b = J_m/2." in result.stdout
+    assert "Unknown at the start" not in result.stdout
     alone = result.stdout.split("Identifiable by themselves: ")[1].split(".\n")[0].split(", ")
     assert {"L_b", "K_db", "J_m"} <= set(alone)
     assert "B_m, c0 act only together" in result.stdout
