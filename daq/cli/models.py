@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -95,10 +96,11 @@ def _show_identifiable(structure: Structure) -> None:
         _show_group(group)
     if result.tied:
         print()
-        terminal.print_text(
-            f"What counts as a change of the outputs is at least {result.gap:.0f} decades above "
-            "what counts as none."
-        )
+        if math.isfinite(result.gap):
+            terminal.print_text(
+                f"What counts as a change of the outputs is at least {result.gap:.0f} decades "
+                "above what counts as none."
+            )
         terminal.print_next("rig identify LOG --set fixed.NAME=VALUE, with what was measured")
 
 
