@@ -18,6 +18,7 @@ import numpy as np
 from sysid.arrays import FloatArray
 from sysid.fitting.descent import Point
 from sysid.fitting.free_run import FINER, FINEST
+from sysid.fitting.innovations import Compensated, Innovations
 from sysid.fitting.objective import Objective
 from sysid.fitting.refinement import refine, refine_each
 from sysid.gassi.lookalikes import lookalikes
@@ -58,11 +59,16 @@ class Optimum:
 
 
 def fit_likelihood(
-    objective: Objective, minima: Sequence[FloatArray], watch: Watch | None = None
+    objective: Objective,
+    minima: Sequence[FloatArray],
+    watch: Watch | None = None,
+    *,
+    kind: type[Innovations | Compensated] | None = None,
 ) -> tuple[Optimum, tuple[FloatArray, ...]]:
     """The likeliest of some minima (n_free,) of the mean RMSE and of their lookalikes.
 
-    And its rivals: chromosomes far from it that the data do not tell from it.
+    And its rivals: chromosomes far from it that the data do not tell from it. kind: of objective
+    that all of them are refitted by in the end, where inputs are noisy.
     """
     objective = _resolved(objective, minima[0])
     optima = _Optima(objective)
@@ -86,7 +92,11 @@ def fit_likelihood(
             if optima.new(end.chromosome) and optima.deviance(rough, best) < _CONCEIVABLE:
                 optima.add(_weighed(objective, end.chromosome, watch))
     best, *others = optima.ranked()
-    best = _exact(best)
+    if kind is None:
+        best = _exact(best)
+    else:
+        optima = _refitted(kind, objective, [best, *others], optima, watch)
+        best, *others = optima.ranked()
     rivals = [optimum for optimum in others if optima.deviance(optimum, best) < _TOLD_APART]
     return best, tuple(rival.chromosome for rival in rivals)
 
@@ -191,6 +201,48 @@ def _weighed(objective: Objective, chromosome: FloatArray, watch: Watch | None) 
         if steady:
             break
     return _optimum(objective, chromosome, rms)
+
+
+def _refitted(
+    kind: type[Innovations | Compensated],
+    objective: Objective,
+    ranked: Sequence[Optimum],
+    by_error: _Optima,
+    watch: Watch | None,
+) -> _Optima:
+    """The best optimum and those not told from it by the error, refitted for noisy inputs."""
+    optima = _Optima(objective)
+    first: Optimum | None = None
+    for optimum in ranked:
+        if by_error.deviance(optimum, ranked[0]) < _CONCEIVABLE:
+            refitted = _noisy_input_fit(kind, objective, optimum, watch)
+            first = first or refitted
+            # Compared at the same noise, that of the first.
+            rms = first.objective.rms(refitted.chromosome[None])[0]
+            optima.add(_optimum(refitted.objective, refitted.chromosome, rms))
+    return optima
+
+
+def _noisy_input_fit(
+    kind: type[Innovations | Compensated],
+    objective: Objective,
+    optimum: Optimum,
+    watch: Watch | None,
+) -> Optimum:
+    """The minimum for noisy inputs from one of the error: weights, noise, parameters in turn."""
+    chromosome, rms = optimum.chromosome, optimum.rms
+    fitted: Innovations | Compensated = kind.starting(optimum.objective, chromosome)
+    for _ in range(_ROUNDS):
+        rms = fitted.rms(chromosome[None])[0]
+        weights = objective.weights / np.maximum(rms, max(_LEAST_SHARE * rms.max(), 1e-300))
+        weighed = fitted.weighed(weights)
+        steady = np.allclose(weighed.weights, fitted.weights, rtol=_STEADY)
+        end = refine(weighed, chromosome, on_iteration=watch)
+        chromosome, rms, fitted = end.chromosome, end.rms, weighed
+        if steady:
+            break
+        fitted = fitted.settled(chromosome)
+    return _optimum(fitted, chromosome, rms)
 
 
 def _optimum(objective: Objective, chromosome: FloatArray, rms: FloatArray) -> Optimum:

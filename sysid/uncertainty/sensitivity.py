@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from sysid.arrays import BoolArray, FloatArray
+from sysid.fitting.innovations import Innovations
 from sysid.fitting.objective import Objective
 from sysid.problem.data import Dataset
 from sysid.uncertainty.colour import record_rows
@@ -91,6 +92,10 @@ def zero_errors(sensitivity: Sensitivity) -> Iterator[FloatArray]:
     for k, rows in enumerate(record_rows(sensitivity.lengths)):
         record = objective.records[k]
         for j in np.flatnonzero(record.output_zero):
+            if isinstance(objective, Innovations):
+                shift = record.output_zero * (np.arange(len(record.output_zero)) == j)
+                yield _innovation_change(sensitivity, k, outputs=record.outputs + shift)
+                continue
             change = np.zeros_like(sensitivity.residual)
             change[rows, j] = record.output_zero[j] / objective.scales[k][j]
             yield change
@@ -125,8 +130,11 @@ def given_errors(sensitivity: Sensitivity) -> Iterator[FloatArray]:
 def input_noises(sensitivity: Sensitivity) -> Iterator[FloatArray]:
     """Changes of all residuals whose outer products sum to the covariance by input noise.
 
-    Each is (n_residuals, n_outputs), by noise that is drawn at random, always the same.
+    Each is (n_residuals, n_outputs), by noise that is drawn at random, always the same. None for
+    innovations, which hold it already.
     """
+    if isinstance(sensitivity.objective, Innovations):
+        return
     rng = np.random.default_rng(0)
     for k, record in enumerate(sensitivity.objective.records):
         if np.any(record.input_noise):
@@ -141,6 +149,10 @@ def _input_changes(
 ) -> Iterator[FloatArray]:
     """Changes of all residuals by errors of record k's inputs, (n_samples, n_inputs) or a row."""
     objective, record = sensitivity.objective, sensitivity.objective.records[k]
+    if isinstance(objective, Innovations):
+        for error in errors:
+            yield _innovation_change(sensitivity, k, inputs=record.inputs + error)
+        return
     rows = record_rows(sensitivity.lengths)[k]
     chromosomes = sensitivity.chromosome[None]
     vectors = objective.space.full(chromosomes)
@@ -160,3 +172,13 @@ def _input_changes(
         change = np.zeros_like(sensitivity.residual)
         change[rows] = np.where(np.isfinite(difference), difference, 0.0)
         yield change
+
+
+def _innovation_change(sensitivity: Sensitivity, k: int, **signals: FloatArray) -> FloatArray:
+    """Change of all innovations where record k had other signals."""
+    objective = sensitivity.objective
+    records = list(objective.records)
+    records[k] = replace(records[k], **signals)
+    moved = objective.on(records).residuals(sensitivity.chromosome[None], sensitivity.steps)
+    change = moved.values[..., 0] - sensitivity.residual
+    return np.where(np.isfinite(change), change, 0.0)
