@@ -12,8 +12,8 @@ section 6.4): with the row C of g's Jacobian and the variance r of the output
     e = y - g      s = C P C' + r      (x, n) += P C' e / s      P -= P C' C P / s
 
 and what is kept of e, the innovation, is e sqrt(r / s): without noise on the inputs the error of
-the free run. As r grows the gain vanishes: e is that error again, and C P C' the variance that the
-inputs' noise gives it. Chromosomes are lanes, as in the batch kernel.
+the free run. With ``corrects`` zero nothing is taken in: e is that error whatever the noise, and s
+its variance. Chromosomes are lanes, as in the batch kernel.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -31,8 +31,7 @@ class FilterKernel(BatchKernel):
     """Text of the filter; needs what the batch kernel needs, and the program of a variation.
 
     Behind the rows of lanes of the batch kernel the work area holds P's upper triangle, of the
-    reached states and then of the noisy inputs, the estimate of each noise, and sums of C P C' in
-    parts of the output's scale.
+    reached states and then of the noisy inputs, and the estimate of each noise.
     """
 
     def __init__(self, model: ProcessModel, variation: Variation) -> None:
@@ -44,8 +43,7 @@ class FilterKernel(BatchKernel):
         self._pairs = [(a, b) for a in range(self._size) for b in range(a, self._size)]
         self._covariance = self.work_rows
         self._noises = self._covariance + len(self._pairs)
-        self._caused = self._noises + self.n_noises
-        self.work_rows = self._caused + self.n_outputs
+        self.work_rows = self._noises + self.n_noises
 
     def text(self, *, many_registers: bool = False) -> str:
         """Python text of ``innovations``."""
@@ -63,7 +61,6 @@ class FilterKernel(BatchKernel):
             *block(EACH_LANE, self._predicted()),
         ]
         sums = f"sums[j, l] = X[({self._sums} + j) * {LANES} + l]"
-        caused = f"sums[{2 * q} + j, l] = X[({self._caused} + j) * {LANES} + l]"
         body = [
             "wide_vectors()",
             "n_samples = u.shape[0]",
@@ -73,11 +70,10 @@ class FilterKernel(BatchKernel):
             *block(EACH_LANE, self._uncertain_start()),
             *block("for k in range(n_samples):", sample),
             *block(f"for j in range({2 * q}):", block(EACH_LANE, [sums])),
-            *block(f"for j in range({q}):", block(EACH_LANE, [caused])),
         ]
         head = (
-            "def innovations(X, rows, tables, u, y, w, r, s, drift, spread, start, p, dt, n_steps, "
-            "sums, record):"
+            "def innovations(X, rows, tables, u, y, w, r, s, spread, corrects, start, p, dt, "
+            "n_steps, sums, record):"
         )
         return "\n".join(block(head, body))
 
@@ -89,8 +85,7 @@ class FilterKernel(BatchKernel):
         """P before the first sample: ``spread`` of the states, and the noises' variances."""
         n = len(self.reached)
         variances = {(a, a): f"spread[{a}]" if a < n else f"s[{a - n}]" for a in range(self._size)}
-        nothing = [f"{at(self._caused + j)} = 0.0" for j in range(self.n_outputs)]
-        return self._stored(variances) + nothing
+        return self._stored(variances)
 
     def _corrected(self) -> list[str]:
         """The outputs of a sample taken in, and their innovations kept."""
@@ -113,10 +108,8 @@ class FilterKernel(BatchKernel):
         if gains:
             lines += [f"shared{a} = {_sum(_products(gains, _covariance_with(a)))}" for a in size]
             lines += [
-                f"caused = {_sum(_products(gains, 'shared{}'.format))}",
-                f"{at(self._caused + j)} += caused * w{j} * w{j}",
-                f"variance = caused + r[{j}]",
-                f"gain = seen{j} / variance",
+                f"variance = {_sum(_products(gains, 'shared{}'.format))} + r[{j}]",
+                f"gain = seen{j} * corrects / variance",
             ]
             lines += [f"d{a} -= shared{a} * (gain * e)" for a in size]
             lines += [f"P{a}_{b} -= shared{a} * (gain * shared{b})" for a, b in self._pairs]
@@ -164,7 +157,6 @@ class FilterKernel(BatchKernel):
                     for k in range(self.n_noises)
                     if (a, k) in gamma and (b, k) in gamma
                 ]
-                terms += [f"drift[{a}]"] if a == b else []
                 variances[a, b] = _sum(terms)
             for k in range(self.n_noises):
                 if (a, k) in gamma:

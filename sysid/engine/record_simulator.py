@@ -28,7 +28,6 @@ _PILOT_LEAST = 32  # samples
 # Steps per sample come from a ladder so that chromosomes of like need share a block, while
 # each one's result depends on nothing but itself.
 _LADDER = np.unique(np.round(2.0 ** np.arange(0, 20.01, 0.5)).astype(np.int64))
-_ENDLESS = 1e60  # variance
 _ALL_LANES = np.arange(LANES)
 
 
@@ -142,17 +141,17 @@ class RecordSimulator:
         self,
         kalman: Filter,
         noise: FloatArray,
+        corrects: bool,
         parameters: FloatArray,
         starts: FloatArray | None,
         rows: slice,
         n_steps: int,
         values: FloatArray,
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """As ``residuals``, of the innovations of a filter.
+    ) -> tuple[FloatArray, FloatArray]:
+        """As ``residuals``, of the innovations of a filter, in parts of the outputs' noise.
 
-        noise: (n_outputs,), standard deviations; infinite for the errors of a free run. A state
-        that starts at the first sample of an output has that sample's error. Returns as well the
-        sums over samples of the variance that the inputs' noise gives each, (n, n_outputs).
+        noise: (n_outputs,), standard deviations. corrects: whether the filter takes outputs in. A
+        state that starts at the first sample of an output has that sample's error.
         """
         record, kernel, model = self.record, kalman.kernel, self.kernels.model
         lanes = np.arange(rows.start, rows.stop)
@@ -160,26 +159,22 @@ class RecordSimulator:
         first = record.starts_at_samples(model)
         weights = self._weights.copy()
         weights[0, [j for j in first if j is not None]] = 0.0
-        # What is added to it is lost in it, and a gain of one over it is none.
-        variance = np.minimum(noise**2, _ENDLESS)
-        known = np.where(np.isfinite(noise), variance, 0.0)
-        spread = [0.0 if (j := first[i]) is None else known[j] for i in kernel.reached]
+        spread = [0.0 if (j := first[i]) is None else noise[j] ** 2 for i in kernel.reached]
         of_inputs = record.input_noise[list(kernel.variation.noisy)] ** 2
         start = np.zeros((kernel.n_states, LANES))
         start[: len(model.states)] = self._initial(starts, padded)
         kept = np.empty((record.n_samples, len(noise), LANES))
-        sums = np.empty((3 * len(noise), LANES))
+        sums = np.empty((2 * len(noise), LANES))
         work = work_area(kernel.work_rows * LANES)
         with explained_errors(model):
             kalman.innovations(
                 work, work.reshape(-1, LANES), kernel.tables, self._inputs, self._measured,
-                weights, variance, of_inputs, np.zeros(len(kernel.reached)), np.array(spread),
-                start, np.ascontiguousarray(parameters[padded].T), record.dt, n_steps, sums, kept,
+                weights, noise**2, of_inputs, np.array(spread), float(corrects), start,
+                np.ascontiguousarray(parameters[padded].T), record.dt, n_steps, sums, kept,
             )  # fmt: skip
         values[:] = kept[..., : len(lanes)]
-        sse, estimates, caused = (part.T[: len(lanes)] for part in np.split(sums, 3))
-        taken = np.full(len(lanes), n_steps * len(kept))
-        return sse, self._excess(sse, estimates, taken), caused
+        sse, estimates = (half.T[: len(lanes)] for half in np.split(sums, 2))
+        return sse, self._excess(sse, estimates, np.full(len(lanes), n_steps * len(kept)))
 
     def block(
         self,

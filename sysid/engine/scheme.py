@@ -58,7 +58,7 @@ class Scheme:
         self.n_recorded = len(model.inputs)
         self.recorded_slopes = [j for j, u in enumerate(model.inputs) if u.hold != "zoh"]
         # Whatever stands behind a record's inputs rises within a sample.
-        self.interpolated = self.recorded_slopes + [*range(self.n_recorded, self.n_inputs)]
+        self.interpolated = [*self.recorded_slopes, *range(self.n_recorded, self.n_inputs)]
         self.splines = [j for j, u in enumerate(model.inputs) if u.hold == "spline"]
         self.counts = {
             "remainder": self.n_states,

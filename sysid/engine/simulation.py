@@ -5,7 +5,6 @@ from __future__ import annotations
 import enum
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -60,14 +59,12 @@ class Residuals:
     values: (n_residuals, n_outputs, n_chromosomes), records one after another, 0 where a sample
     was lost; not finite where a simulation failed. sse: (n_chromosomes, n_records, n_outputs),
     their sums of squares. excess: (n_chromosomes, n_records), error estimates in parts of what
-    the accuracy allows: up to 1 the steps were enough. caused: as sse, the part of it that the
-    noise of the inputs accounts for on average, zero where nobody asked.
+    the accuracy allows: up to 1 the steps were enough.
     """
 
     values: FloatArray
     sse: FloatArray
     excess: FloatArray
-    caused: FloatArray
 
 
 class BatchSimulator:
@@ -185,9 +182,9 @@ class BatchSimulator:
 
         def simulate(
             r: int, simulator: RecordSimulator, part: FloatArray, rows: slice, steps: int
-        ) -> tuple[Any, ...]:
+        ) -> tuple[FloatArray, FloatArray]:
             values = part[..., rows]
-            return *simulator.residuals(parameters, starts[r], rows, steps, values), 0.0
+            return simulator.residuals(parameters, starts[r], rows, steps, values)
 
         parameters = self._check(parameters, records)
         return self._gathered(simulate, parameters, records, scales, n_steps, keep=keep)
@@ -200,23 +197,26 @@ class BatchSimulator:
         n_steps: IntArray,
         starts: Sequence[FloatArray | None],
         noise: FloatArray,
+        *,
+        corrects: bool = True,
     ) -> Residuals:
         """As ``residuals``, of the innovations of an extended Kalman filter.
 
         Noise of the inputs is the records' own; noise: (n_outputs,), standard deviations of the
         outputs. An innovation is scaled by the output's noise over its own standard deviation:
-        where no input is noisy, innovations are the residuals, as they are for infinite noise. See
-        ``filter_kernel``. Raises ModelError for equations that cannot be differentiated.
+        where no input is noisy, innovations are the residuals. Unless it ``corrects`` itself by the
+        outputs, they are those of the free run, scaled so. See ``filter_kernel``. Raises ModelError
+        for equations that cannot be differentiated.
         """
         noisy = noisy_inputs(records)
         kalman = kalman_filter(self.model, noisy)
 
         def simulate(
             r: int, simulator: RecordSimulator, part: FloatArray, rows: slice, steps: int
-        ) -> tuple[Any, ...]:
+        ) -> tuple[FloatArray, FloatArray]:
             values = part[..., rows]
             return simulator.innovations(
-                kalman, noise, parameters, starts[r], rows, steps, values
+                kalman, noise, corrects, parameters, starts[r], rows, steps, values
             )
 
         parameters = self._check(parameters, records)
@@ -224,7 +224,7 @@ class BatchSimulator:
 
     def _gathered(
         self,
-        simulate: Callable[..., tuple[Any, ...]],
+        simulate: Callable[..., tuple[FloatArray, FloatArray]],
         parameters: FloatArray,
         records: Sequence[Dataset],
         scales: Sequence[FloatArray | None],
@@ -234,8 +234,7 @@ class BatchSimulator:
     ) -> Residuals:
         """What is simulated of every parameter vector on every record, in blocks side by side."""
         n, q = len(parameters), len(self.model.outputs)
-        sse, caused = np.empty((2, n, len(records), q))
-        excess = np.empty((n, len(records)))
+        sse, excess = np.empty((n, len(records), q)), np.empty((n, len(records)))
         ends = np.cumsum([record.n_samples for record in records])
         values = np.empty((ends[-1] if keep else 0, q, n))
         tasks = []
@@ -247,10 +246,10 @@ class BatchSimulator:
 
         def run(task: tuple[int, RecordSimulator, FloatArray, slice, int]) -> None:
             r, rows = task[0], task[3]
-            sse[rows, r], excess[rows, r], caused[rows, r] = simulate(*task)
+            sse[rows, r], excess[rows, r] = simulate(*task)
 
         self._workers.each(run, tasks)
-        return Residuals(values, sse, excess, caused)
+        return Residuals(values, sse, excess)
 
     def steps_of_each(
         self, parameters: FloatArray, record: Dataset, starts: FloatArray | None = None

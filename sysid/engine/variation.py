@@ -31,11 +31,12 @@ _Slopes = Mapping[tuple[int, int], str]
 class Variation:
     """Structure of the equations with their variational ones, and where deviations stand.
 
-    n_states: of the model. noisy: inputs with noise, by their places. reached: states with deviations. columns: for each
-    cause the places of the deviations among all states, by the state that deviates. gains: entries (j, k)
-    of the outputs' slopes that are not always zero, k a state's place or behind the states that
-    of a noisy input; their values are what the program's function ``gains`` returns, in order.
-    Behind the model's inputs stands one that rises from 0 to 1 between samples.
+    n_states: of the model. noisy: inputs with noise, by their places. reached: states with
+    deviations. columns: for each cause the places of the deviations among all states, by the state
+    that deviates. gains: entries (j, k) of the outputs' slopes that are not always zero, k a
+    state's place or behind the states that of a noisy input; their values are what the program's
+    function ``gains`` returns, in order. Behind the model's inputs stands one that rises from 0 to
+    1 between samples.
     """
 
     structure: Structure
@@ -55,7 +56,7 @@ def variation(model: ProcessModel, noisy: Sequence[int]) -> Variation:
     n, m = len(model.states), len(model.inputs)
     tape = Tape()
     rates, slopes = _differentiated(model, tape, model.derivative, noisy)
-    gains: _Slopes = {(j, i): "1.0" for j, i in enumerate(model.output_states or ())}
+    gains: _Slopes = dict.fromkeys(enumerate(model.output_states or ()), "1.0")
     outputs: list[str] | None = None
     if model.output is not None:
         outputs, gains = _differentiated(model, tape, model.output, noisy)

@@ -157,7 +157,7 @@ def sign(x: float) -> float:
 
 
 @njit(**_OPTIONS)
-def select(condition: bool, first: float, second: float) -> float:  # noqa: FBT001
+def select(condition: bool, first: float, second: float) -> float:
     """``first`` where a condition holds, else ``second``."""
     always_inline()
     return first if condition else second

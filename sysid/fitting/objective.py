@@ -15,7 +15,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import numpy as np
 
@@ -102,7 +102,7 @@ class Objective:
         """The same objective over another space of the same model; counts go on together."""
         return self._with(space=space)
 
-    def weighed(self, weights: FloatArray) -> Objective:
+    def weighed(self, weights: FloatArray) -> Self:
         """The same objective with other weights of the outputs, (n_outputs,)."""
         return self._with(weights=weights / weights.sum())
 
@@ -183,7 +183,7 @@ class Objective:
             vectors, self.records, self.scales, steps, starts, keep=keep
         )
 
-    def _with(self, **changes: Any) -> Objective:
+    def _with(self, **changes: Any) -> Self:
         variant = copy.copy(self)
         vars(variant).update(changes)
         return variant

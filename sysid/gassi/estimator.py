@@ -14,12 +14,12 @@ from sysid.engine.compiler import kalman_filter
 from sysid.engine.simulation import BatchSimulator, noisy_inputs
 from sysid.fitting.descent import Point
 from sysid.fitting.free_run import free_run
-from sysid.fitting.innovations import Compensated, Innovations
+from sysid.fitting.innovations import Innovations
 from sysid.fitting.objective import Balance, Objective
 from sysid.gassi.cega_objective import CegaObjective
 from sysid.gassi.checkpoint import Checkpoint, load, origin
 from sysid.gassi.genetic_search import PRESETS, GeneticSearch, Preset, PresetName
-from sysid.gassi.likelihood import fit_likelihood
+from sysid.gassi.likelihood import NoisyInputs, fit_likelihood
 from sysid.gassi.search_run import Best, SearchRun
 from sysid.problem.data import Dataset, require_information
 from sysid.problem.given import Given
@@ -34,7 +34,11 @@ from sysid.uncertainty import Profile, Uncertainty, profile, uncertainty
 
 Criterion = Literal["auto", "compensated", "innovations", "likelihood", "error"]
 
-_OF_NOISY_INPUTS = {"compensated": Compensated, "innovations": Innovations}
+_OF_NOISY_INPUTS: Mapping[str, NoisyInputs] = {name: name for name in get_args(NoisyInputs)}
+_OVERWHELMED = (
+    "since the noise of the measured inputs would explain more than all of the free run's error: "
+    "over this record its effect is not small and cannot be taken out; a shorter one may serve"
+)
 
 # Not compared with a checkpoint's: they do not decide the result, or it holds them otherwise.
 _NOT_COMPARED = ("model", "threads", "dt")
@@ -101,8 +105,7 @@ class GASSI(RecordEstimator):
     space_ : SearchSpace that was searched; estimated initial states stand behind the parameters.
     output_weights_ : (n_outputs,), final weights of the outputs.
     criterion_, criterion_reason_ : what it was, and why.
-    output_noise_ : (n_outputs,), noise of the outputs by their innovations, None for another
-        criterion.
+    output_noise_ : (n_outputs,), noise of the outputs, None where that of inputs does not count.
     rivals_ : parameters in each further minimum that explains the data as well as the result.
     error_ : mean over outputs of the RMSE normalised by max|y| (see ``Objective``); of ``cega``
         (4.6) (see ``CegaObjective``).
@@ -244,7 +247,7 @@ class GASSI(RecordEstimator):
 
         try:
             likeliest, self._rivals = fit_likelihood(
-                run.objective, run.minima(), watch, kind=_OF_NOISY_INPUTS.get(self.criterion_)
+                run.objective, run.minima(), watch, noise=_OF_NOISY_INPUTS.get(self.criterion_)
             )
         except KeyboardInterrupt:
             self.stopped_ = "interrupted"
@@ -256,6 +259,8 @@ class GASSI(RecordEstimator):
         self.output_weights_ = likeliest.objective.weights
         if isinstance(likeliest.objective, Innovations):
             self.output_noise_ = likeliest.objective.noise
+        elif self.criterion_ in _OF_NOISY_INPUTS:
+            self.criterion_, self.criterion_reason_ = "likelihood", _OVERWHELMED
         self.n_simulations_ = objective.simulations
 
     def predict(self, X: Dataset | FloatArray, *, records: Any = None) -> FloatArray:
@@ -320,10 +325,10 @@ class GASSI(RecordEstimator):
             raise ModelError("the identification was interrupted, so there are no intervals")
         data = self._records(X, y, records, None, reset=False)
         objective = self._at_final_accuracy(self._objective(data).weighed(self.output_weights_))
-        if self.criterion_ == "compensated":
-            return Compensated.starting(objective, self.chromosome_)
-        noise = self.output_noise_
-        return objective if noise is None else Innovations.of(objective, noise)
+        if self.output_noise_ is None:
+            return objective
+        corrects = self.criterion_ == "innovations"
+        return Innovations.of(objective, self.output_noise_, corrects=corrects)
 
     def _at_final_accuracy(self, objective: Objective) -> Objective:
         """The objective, simulated as accurately as at the end of ``fit``."""

@@ -131,9 +131,9 @@ def input_noises(sensitivity: Sensitivity) -> Iterator[FloatArray]:
     """Changes of all residuals whose outer products sum to the covariance by input noise.
 
     Each is (n_residuals, n_outputs), by noise that is drawn at random, always the same. None for
-    innovations, which hold it already.
+    innovations of a filter that corrects itself, which hold it already.
     """
-    if isinstance(sensitivity.objective, Innovations):
+    if isinstance(sensitivity.objective, Innovations) and sensitivity.objective.corrects:
         return
     rng = np.random.default_rng(0)
     for k, record in enumerate(sensitivity.objective.records):
@@ -149,10 +149,13 @@ def _input_changes(
 ) -> Iterator[FloatArray]:
     """Changes of all residuals by errors of record k's inputs, (n_samples, n_inputs) or a row."""
     objective, record = sensitivity.objective, sensitivity.objective.records[k]
+    share: FloatArray = np.ones_like(sensitivity.residual)
     if isinstance(objective, Innovations):
-        for error in errors:
-            yield _innovation_change(sensitivity, k, inputs=record.inputs + error)
-        return
+        if objective.corrects:
+            for error in errors:
+                yield _innovation_change(sensitivity, k, inputs=record.inputs + error)
+            return
+        share = objective.share(sensitivity.chromosome, np.array(sensitivity.steps))
     rows = record_rows(sensitivity.lengths)[k]
     chromosomes = sensitivity.chromosome[None]
     vectors = objective.space.full(chromosomes)
@@ -170,7 +173,7 @@ def _input_changes(
         disturbed = outputs(replace(record, inputs=record.inputs + error))
         difference = (disturbed - undisturbed) / objective.scales[k]
         change = np.zeros_like(sensitivity.residual)
-        change[rows] = np.where(np.isfinite(difference), difference, 0.0)
+        change[rows] = np.where(np.isfinite(difference), difference, 0.0) * share[rows]
         yield change
 
 

@@ -179,7 +179,7 @@ class Formula:
         sse = np.stack([np.sum(part**2, axis=1) for part in parts], axis=1)
         needed = np.stack([self.steps_of_each(vectors, record) for record in records], axis=1)
         values = np.moveaxis(np.concatenate(parts, axis=1), 0, 2).copy()
-        return Residuals(values, sse, needed / n_steps, np.zeros_like(sse))
+        return Residuals(values, sse, needed / n_steps)
 
     def errors(self, vectors, records, scales, starts):
         needed = np.stack([self.steps_of_each(vectors, record) for record in records], axis=1)

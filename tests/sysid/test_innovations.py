@@ -40,14 +40,13 @@ def kalman_filter(u, y):
     x, P = np.array([y[0], 0.0]), np.diag([OF_OUTPUT**2, OF_INPUT**2])
     innovations = np.zeros(len(y))
     for k in range(1, len(y)):
-        x = F @ (x + [0.0, u[k - 1]])
+        x = F @ (x + np.array([0.0, u[k - 1]]))
         P = F @ P @ F.T + OF_INPUT**2 * np.outer(G, G)
         if np.isfinite(y[k]):
             e, s = x[0] - y[k], P[0, 0] + OF_OUTPUT**2
             x, P = x - P[:, 0] / s * e, P - np.outer(P[:, 0], P[:, 0]) / s
             innovations[k] = e * OF_OUTPUT / np.sqrt(s)
     return innovations
-
 
 
 def pendulum():
@@ -168,19 +167,24 @@ def test_the_bias_that_noise_of_an_input_brings_is_taken_away():
     assert free_run[0] < -0.05  # the gain, as by regression on a noisy input
     for criterion in ("compensated", "innovations"):
         bias = mean_error(criterion, records)
-        assert np.abs(bias).max() < 0.3 * np.abs(free_run).max()
+        assert np.all(np.abs(bias) < 0.5 * np.abs(free_run))
 
 
-def test_a_noisy_input_chooses_the_criterion_and_its_intervals_hold_the_truth():
+def test_a_noisy_input_chooses_the_criterion():
     (record, _) = noisy_records(1)
-    fit = GASSI(lag(), population=20, generations=8).fit(record)
+    fit = GASSI(lag(), population=20, generations=2).fit(record)
     assert fit.criterion_ == "compensated"
     assert "u is measured with noise" in fit.criterion_reason_
-    for criterion in ("auto", "innovations"):
+
+
+@pytest.mark.parametrize("criterion", ["compensated", "innovations"])
+def test_intervals_hold_the_truth(criterion):
+    held = []
+    for record in noisy_records(5, of_input=0.2):
         fit = GASSI(lag(), population=20, generations=8, criterion=criterion).fit(record)
-        gain, tau = fit.uncertainty(record).parameters
-        assert gain.low < GAIN < gain.high
-        assert tau.low < TAU < tau.high
+        estimates = zip(fit.uncertainty(record).parameters, (GAIN, TAU), strict=True)
+        held += [e.low < truth < e.high for e, truth in estimates]
+    assert sum(held) >= 17  # of 20
 
 
 def test_without_noise_of_inputs_there_is_nothing_to_filter():
