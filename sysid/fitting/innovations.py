@@ -81,6 +81,13 @@ class Innovations(Objective):
         return settled
 
     @property
+    def free_run(self) -> Objective:
+        """The objective of the free run's errors, by the same weights."""
+        plain = Objective.__new__(Objective)
+        vars(plain).update(vars(self))
+        return plain
+
+    @property
     def overwhelmed(self) -> BoolArray:
         """Outputs whose errors the noise of the inputs more than explains, (n_outputs,)."""
         few: BoolArray = (self.noise < _NEAR * self.error) & (self.weights > 0.0)
@@ -88,7 +95,7 @@ class Innovations(Objective):
 
     def share(self, chromosome: FloatArray, steps: IntArray) -> FloatArray:
         """Residuals in parts of the free run's where nothing corrects, (n_residuals, n_outputs)."""
-        free_run = super()._simulated(chromosome[None], steps[None]).values[..., 0]
+        free_run = self.free_run._simulated(chromosome[None], steps[None]).values[..., 0]
         scaled = self._simulated(chromosome[None], steps[None]).values[..., 0]
         safe = np.where(free_run == 0.0, 1.0, free_run)
         share: FloatArray = np.where(free_run == 0.0, 1.0, scaled / safe)

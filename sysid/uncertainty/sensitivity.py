@@ -25,7 +25,8 @@ class Sensitivity:
     residual: (n_residuals, n_outputs), simulated minus measured in parts of the output's scale,
     0 where a sample was lost; seen: of the same shape, where none was. slopes: (n_residuals,
     n_outputs, n_free), with respect to the natural logarithm of a parameter searched by
-    logarithm, else to the parameter in units of ``coordinate_units``.
+    logarithm, else to the parameter in units of ``coordinate_units``. share: of the shape of the
+    residuals, their factors where noise of inputs divides them, else ones.
     """
 
     objective: Objective
@@ -34,6 +35,7 @@ class Sensitivity:
     residual: FloatArray
     seen: BoolArray
     slopes: FloatArray
+    share: FloatArray
 
     @property
     def lengths(self) -> tuple[int, ...]:
@@ -56,16 +58,23 @@ def sensitivity(objective: Objective, chromosome: FloatArray) -> Sensitivity:
     """Residuals and slopes at a chromosome, (n_free,), by central differences.
 
     All simulations of a record take as many steps as the most demanding of them needs; one that
-    fails has slope zero.
+    fails has slope zero. Where noise of inputs divides the free run's errors it is held: at kinks
+    of the equations it jumps, which differences would take for slopes.
     """
+    share: FloatArray | float = 1.0
     neighbours = _with_neighbours(objective, chromosome)
     steps = [int(needed) for needed in objective.steps_needed(neighbours).max(axis=0)]
+    if isinstance(objective, Innovations) and not objective.corrects:
+        share = objective.share(chromosome, np.array(steps))
+        objective = objective.free_run
     residuals = objective.residuals(neighbours, steps).values
     n = len(chromosome)
     slopes = (residuals[..., 1 : n + 1] - residuals[..., n + 1 :]) / (2.0 * _PERTURBATION)
     slopes = np.where(np.isfinite(slopes), slopes, 0.0)
     seen = np.concatenate([np.isfinite(record.outputs) for record in objective.records])
-    return Sensitivity(objective, chromosome, steps, residuals[..., 0].copy(), seen, slopes)
+    factors = np.broadcast_to(share, seen.shape)
+    residual, slopes = factors * residuals[..., 0], factors[..., None] * slopes
+    return Sensitivity(objective, chromosome, steps, residual, seen, slopes, factors)
 
 
 def _with_neighbours(objective: Objective, chromosome: FloatArray) -> FloatArray:
@@ -98,7 +107,7 @@ def zero_errors(sensitivity: Sensitivity) -> Iterator[FloatArray]:
                 continue
             change = np.zeros_like(sensitivity.residual)
             change[rows, j] = record.output_zero[j] / objective.scales[k][j]
-            yield change
+            yield change * sensitivity.share
         errors = [error for error in np.diag(record.input_zero) if error.any()]
         yield from _input_changes(sensitivity, k, errors)
     yield from given_errors(sensitivity)
@@ -133,7 +142,7 @@ def input_noises(sensitivity: Sensitivity) -> Iterator[FloatArray]:
     Each is (n_residuals, n_outputs), by noise that is drawn at random, always the same. None for
     innovations of a filter that corrects itself, which hold it already.
     """
-    if isinstance(sensitivity.objective, Innovations) and sensitivity.objective.corrects:
+    if isinstance(sensitivity.objective, Innovations):
         return
     rng = np.random.default_rng(0)
     for k, record in enumerate(sensitivity.objective.records):
@@ -149,13 +158,10 @@ def _input_changes(
 ) -> Iterator[FloatArray]:
     """Changes of all residuals by errors of record k's inputs, (n_samples, n_inputs) or a row."""
     objective, record = sensitivity.objective, sensitivity.objective.records[k]
-    share: FloatArray = np.ones_like(sensitivity.residual)
     if isinstance(objective, Innovations):
-        if objective.corrects:
-            for error in errors:
-                yield _innovation_change(sensitivity, k, inputs=record.inputs + error)
-            return
-        share = objective.share(sensitivity.chromosome, np.array(sensitivity.steps))
+        for error in errors:
+            yield _innovation_change(sensitivity, k, inputs=record.inputs + error)
+        return
     rows = record_rows(sensitivity.lengths)[k]
     chromosomes = sensitivity.chromosome[None]
     vectors = objective.space.full(chromosomes)
@@ -173,8 +179,8 @@ def _input_changes(
         disturbed = outputs(replace(record, inputs=record.inputs + error))
         difference = (disturbed - undisturbed) / objective.scales[k]
         change = np.zeros_like(sensitivity.residual)
-        change[rows] = np.where(np.isfinite(difference), difference, 0.0) * share[rows]
-        yield change
+        change[rows] = np.where(np.isfinite(difference), difference, 0.0)
+        yield change * sensitivity.share
 
 
 def _innovation_change(sensitivity: Sensitivity, k: int, **signals: FloatArray) -> FloatArray:
