@@ -97,15 +97,15 @@ class Innovations(Objective):
         """Residuals in parts of the free run's where nothing corrects, (n_residuals, n_outputs)."""
         free_run = self.free_run._simulated(chromosome[None], steps[None]).values[..., 0]
         scaled = self._simulated(chromosome[None], steps[None]).values[..., 0]
-        safe = np.where(free_run == 0.0, 1.0, free_run)
-        share: FloatArray = np.where(free_run == 0.0, 1.0, scaled / safe)
+        share: FloatArray = np.ones_like(scaled)
+        np.divide(scaled, free_run, out=share, where=free_run != 0.0)
         return share
 
     def evaluate(self, chromosomes: FloatArray) -> tuple[FloatArray, BatchResult]:
         """As ``Objective.evaluate``, at the integration steps that the free runs need."""
         steps = self.steps_needed(chromosomes)
         sse = self._simulated(chromosomes, steps).sse
-        failed = ~np.isfinite(sse).all(axis=(1, 2))
+        failed: BoolArray = ~np.isfinite(sse).all(axis=(1, 2))
         sse = np.where(failed[:, None, None], np.inf, sse)
         status = np.where(failed, Status.UNBOUNDED, Status.OK)
         errors = self.error_of(self._roots(sse.sum(axis=1)))

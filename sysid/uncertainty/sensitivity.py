@@ -102,8 +102,9 @@ def zero_errors(sensitivity: Sensitivity) -> Iterator[FloatArray]:
         record = objective.records[k]
         for j in np.flatnonzero(record.output_zero):
             if isinstance(objective, Innovations):
-                shift = record.output_zero * (np.arange(len(record.output_zero)) == j)
-                yield _innovation_change(sensitivity, k, outputs=record.outputs + shift)
+                outputs = record.outputs.copy()
+                outputs[:, j] += record.output_zero[j]
+                yield _innovation_change(sensitivity, k, replace(record, outputs=outputs))
                 continue
             change = np.zeros_like(sensitivity.residual)
             change[rows, j] = record.output_zero[j] / objective.scales[k][j]
@@ -160,7 +161,8 @@ def _input_changes(
     objective, record = sensitivity.objective, sensitivity.objective.records[k]
     if isinstance(objective, Innovations):
         for error in errors:
-            yield _innovation_change(sensitivity, k, inputs=record.inputs + error)
+            disturbed_record = replace(record, inputs=record.inputs + error)
+            yield _innovation_change(sensitivity, k, disturbed_record)
         return
     rows = record_rows(sensitivity.lengths)[k]
     chromosomes = sensitivity.chromosome[None]
@@ -183,11 +185,11 @@ def _input_changes(
         yield change * sensitivity.share
 
 
-def _innovation_change(sensitivity: Sensitivity, k: int, **signals: FloatArray) -> FloatArray:
-    """Change of all innovations where record k had other signals."""
+def _innovation_change(sensitivity: Sensitivity, k: int, record: Dataset) -> FloatArray:
+    """Change of all innovations with another record k."""
     objective = sensitivity.objective
     records = list(objective.records)
-    records[k] = replace(records[k], **signals)
+    records[k] = record
     moved = objective.on(records).residuals(sensitivity.chromosome[None], sensitivity.steps)
     change = moved.values[..., 0] - sensitivity.residual
     return np.where(np.isfinite(change), change, 0.0)
