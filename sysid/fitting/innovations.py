@@ -105,7 +105,7 @@ class Innovations(Objective):
         """As ``Objective.evaluate``, at the integration steps that the free runs need."""
         steps = self.steps_needed(chromosomes)
         sse = self._simulated(chromosomes, steps).sse
-        failed: BoolArray = ~np.isfinite(sse).all(axis=(1, 2))
+        failed = ~np.isfinite(sse.sum(axis=(1, 2)))
         sse = np.where(failed[:, None, None], np.inf, sse)
         status = np.where(failed, Status.UNBOUNDED, Status.OK)
         errors = self.error_of(self._roots(sse.sum(axis=1)))
