@@ -224,6 +224,9 @@ def _show_notes(result: Identification) -> None:
             "At the end of its range: the data want more room there. Set 'ranges' in a file "
             "given with --config."
         )
+    if rows.refined:
+        criterion = result.document["criterion"]
+        terminal.print_text(f"Criterion: {criterion['name']}, {criterion['reason']}.")
     terminal.print_text(f"Trust: {verdict.trust}. {' '.join(verdict.reasons)}")
     if rows.refined:
         n_combinations = len(rows.combinations)

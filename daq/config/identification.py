@@ -320,10 +320,12 @@ class IdentificationConfig(Signals):
     per_log: bool = Field(
         False, description="normalise each log by its own largest output, not by the overall one"
     )
-    criterion: Literal["likelihood", "error"] = Field(
-        "likelihood",
-        description="likelihood: in the end each output weighs by its own error; "
-        "error: the mean RMSE decides to the end",
+    criterion: Literal["auto", "compensated", "innovations", "likelihood", "error"] = Field(
+        "auto",
+        description="likelihood: in the end each output weighs by its own error; compensated: "
+        "also without what noise of measured inputs does to the errors; innovations: those of an "
+        "extended Kalman filter for that noise; error: the mean RMSE decides to the end; auto: "
+        "compensated where a calibration tells noise of an input, else likelihood",
     )
     balance: Literal["samples", "logs"] = Field(
         "samples", description="logs count by their samples, or each alike"

@@ -136,6 +136,7 @@ class Identification:
             "model": self.problem.model_name,
             # How the model was used where not as it declares; ``rig replay`` uses it likewise.
             **{key: value for key, value in signals.items() if value},
+            "criterion": {"name": estimator.criterion_, "reason": estimator.criterion_reason_},
             "verdict": {"trust": verdict.trust, "reasons": list(verdict.reasons)},
             "data_faults": [_fault(fault) for fault in self.faults],
             "parameters": {p.name: _parameter(self, p) for p in self.model.parameters},

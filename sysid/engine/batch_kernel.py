@@ -17,7 +17,7 @@ from sysid.problem.model import ProcessModel
 _STAGES = {"a": "0.0", "b": "0.5", "c": "1.0"}  # and how much of a step has passed
 # ||J^16||^(1/16) is an upper bound of the spectral radius that is tight to a few per cent.
 _SQUARINGS = 4
-_EACH_LANE = f"for l in range({LANES}):"
+EACH_LANE = f"for l in range({LANES}):"
 
 
 class BatchKernel(Scheme):
@@ -42,10 +42,10 @@ class BatchKernel(Scheme):
         return "\n\n".join((self._simulate(paired), self._spectrum(), ""))
 
     def _place(self, entry: int) -> str:
-        return _at(self.first_row + entry)
+        return at(self.first_row + entry)
 
     def _constants(self) -> str:
-        return "c = " + listed(_at(self.n_states + i) for i in range(self.n_constants))
+        return "c = " + listed(at(self.n_states + i) for i in range(self.n_constants))
 
     def _simulate(self, paired: bool) -> str:
         q = self.n_outputs
@@ -53,20 +53,20 @@ class BatchKernel(Scheme):
         squares = [
             line
             for j in range(q)
-            for line in (f"e = (o{j} - y{j}) * w{j}", f"{_at(self._sums + j)} += e * e")
+            for line in (f"e = (o{j} - y{j}) * w{j}", f"{at(self._sums + j)} += e * e")
         ]
-        total = " + ".join(_at(self._sums + j) for j in range(q))
+        total = " + ".join(at(self._sums + j) for j in range(q))
         sample = [
             *[f"v{j} = u[k, {j}]" for j in range(self.n_inputs)],
             *[f"{name}{j} = {name}[k, {j}]" for name in "yw" for j in range(q)],
-            *block(_EACH_LANE, self._outputs(), squares),
-            *block("if record.shape[0] > 0:", block(_EACH_LANE, self._outputs(), errors)),
+            *block(EACH_LANE, self._outputs(), squares),
+            *block("if record.shape[0] > 0:", block(EACH_LANE, self._outputs(), errors)),
             *block("if k == n_samples - 1:", ["break"]),
             # A block in which all chromosomes have blown up has nothing more to say.
             *block(
                 "if k % 64 == 63:",
                 ["alive = False"],
-                block(_EACH_LANE, [f"total = {total}", "alive = alive or math.isfinite(total)"]),
+                block(EACH_LANE, [f"total = {total}", "alive = alive or math.isfinite(total)"]),
                 block("if not alive:", ["break"]),
             ),
             *self._input_slopes(),
@@ -80,7 +80,7 @@ class BatchKernel(Scheme):
             *STEP_SIZES,
             *self._begin(),
             *block("for k in range(n_samples):", sample),
-            *block(f"for j in range({2 * q}):", block(_EACH_LANE, [sums])),
+            *block(f"for j in range({2 * q}):", block(EACH_LANE, [sums])),
         ]
         head = "def simulate(X, rows, tables, u, y, w, start, p, dt, n_steps, sums, record):"
         return "\n".join(block(head, body))
@@ -89,12 +89,12 @@ class BatchKernel(Scheme):
         """All lanes before the first sample."""
         lane = [
             f"c = constants({listed(f'p[{i}, l]' for i in range(self.n_parameters))})",
-            *[f"{_at(self.n_states + i)} = c[{i}]" for i in range(self.n_constants)],
-            *[f"{_at(i)} = start[{i}, l]" for i in range(self.n_states)],
-            *[f"{_at(self._sums + j)} = 0.0" for j in range(2 * self.n_outputs)],
+            *[f"{at(self.n_states + i)} = c[{i}]" for i in range(self.n_constants)],
+            *[f"{at(i)} = start[{i}, l]" for i in range(self.n_states)],
+            *[f"{at(self._sums + j)} = 0.0" for j in range(2 * self.n_outputs)],
             *self.fill(),
         ]
-        lines = [f"A = np.zeros(({len(self.closure)}, {LANES}))", *block(_EACH_LANE, lane)]
+        lines = [f"A = np.zeros(({len(self.closure)}, {LANES}))", *block(EACH_LANE, lane)]
         if self.n_entries:
             lines.append(f"scheme_matrices(A, np.full({LANES}, h), *tables, rows)")
         return lines
@@ -102,16 +102,16 @@ class BatchKernel(Scheme):
     def _all_lanes(self, paired: bool) -> list[str]:
         """One step of all lanes and their error estimates, as scalars of lane l."""
         lines = [
-            *[f"x{i} = {_at(i)}" for i in range(self.n_states)],
+            *[f"x{i} = {at(i)}" for i in range(self.n_states)],
             self._constants(),
             *self.slope("x", "ua", "m", "k"),
             *self.step(),
-            *[f"{_at(i)} = n{i}" for i in range(self.n_states)],
+            *[f"{at(i)} = n{i}" for i in range(self.n_states)],
             *self._estimate(),
         ]
         if paired:
             return block(f"for l in range({LANES // 2}):", _paired(lines))
-        return block(_EACH_LANE, lines)
+        return block(EACH_LANE, lines)
 
     def _estimate(self) -> list[str]:
         """Add the step's error estimate, as it shows in the outputs, to the lane's sums."""
@@ -135,15 +135,15 @@ class BatchKernel(Scheme):
             shown = [f"o{j} - p{j}" for j in range(self.n_outputs)]
         for j, error in enumerate(shown):
             if error:
-                lines += [f"e = {error}", f"{_at(self._estimates + j)} += e * e"]
+                lines += [f"e = {error}", f"{at(self._estimates + j)} += e * e"]
         return lines
 
     def _input_slopes(self) -> list[str]:
         """Change per step of the interpolated inputs in the interval from sample k."""
-        lines = [f"i{j} = (u[k + 1, {j}] - v{j}) / n_steps" for j in self.interpolated]
+        lines = [f"i{j} = (u[k + 1, {j}] - v{j}) / n_steps" for j in self.recorded_slopes]
         # Behind the inputs stand what squares and cubes count for in the splines (``bends``).
         for column, j in enumerate(self.splines):
-            square = self.n_inputs + 2 * column
+            square = self.n_recorded + 2 * column
             lines += [f"square{j} = u[k, {square}]", f"cube{j} = u[k, {square + 1}]"]
         return lines
 
@@ -161,8 +161,8 @@ class BatchKernel(Scheme):
     def _outputs(self) -> list[str]:
         """Lines that set the outputs o from lane l's state."""
         if self.output_states is not None:
-            return [f"o{j} = {_at(i)}" for j, i in enumerate(self.output_states)]
-        states = [_at(i) for i in range(self.n_states)]
+            return [f"o{j} = {at(i)}" for j, i in enumerate(self.output_states)]
+        states = [at(i) for i in range(self.n_states)]
         return [self._constants(), *self.call("observe", "o", states, "v")]
 
     def _spectrum(self) -> str:
@@ -239,7 +239,7 @@ class BatchKernel(Scheme):
         ]
 
 
-def _at(row: int) -> str:
+def at(row: int) -> str:
     """Lane l in a row of the work area."""
     return f"X[{row * LANES} + l]"
 

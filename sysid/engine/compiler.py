@@ -13,7 +13,7 @@ import sys
 import tempfile
 import types
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,9 +21,11 @@ from typing import Any
 import numpy as np
 
 from sysid.engine.batch_kernel import BatchKernel
+from sysid.engine.filter_kernel import FilterKernel
 from sysid.engine.structure import analyse
 from sysid.engine.substitution import KNOWN_MODULES, Copier, names_in
 from sysid.engine.trajectory_kernel import TrajectoryKernel
+from sysid.engine.variation import variation
 from sysid.problem.model import ModelError, ProcessModel
 
 _OPTIONS: dict[str, Any] = {
@@ -54,16 +56,44 @@ def kernels(model: ProcessModel, *, exact: bool = True) -> Kernels:
     Compilation itself happens at the first call, which belongs in ``explained_errors``. Without
     ``exact`` nothing is integrated exactly.
     """
+    batch, trajectory, text, called = _source(model, exact)
+    functions = ("simulate", "spectrum", "levels", "advance")
+    return Kernels(model, batch, trajectory, *_compiled(model, text, called, functions))
+
+
+@dataclass(frozen=True)
+class Filter:
+    """A model's compiled extended Kalman filter."""
+
+    kernel: FilterKernel
+    innovations: Callable[..., None]
+
+
+@functools.lru_cache(maxsize=8)
+def kalman_filter(model: ProcessModel, noisy: tuple[int, ...]) -> Filter:
+    """Compile a model's filter for noise on some inputs, by their places; as ``kernels``.
+
+    Raises ModelError for equations that cannot be differentiated.
+    """
+    kernel = FilterKernel(model, variation(model, noisy))
+    text = f"{kernel.structure.program}\n\n{kernel.text()}"
+    return Filter(kernel, *_compiled(model, text, {}, ("innovations",)))
+
+
+def _compiled(
+    model: ProcessModel, text: str, called: Mapping[str, Any], functions: Sequence[str]
+) -> list[Any]:
+    """Functions of kernels' text, compiled; called: the model's functions that it calls."""
     # Numba is slow to import.
     from sysid.engine import intrinsics, vector_math
     from sysid.engine.phi import scheme_matrices
 
-    batch, trajectory, text, called = _source(model, exact)
     name = "".join(c if c.isalnum() else "_" for c in model.name)[:40]
     path = _source_file(f"{name}_{_key(text, called)}.py", text)
     scope = {
         "np": np,
         "math": vector_math,
+        **{name: getattr(vector_math, name) for name in vector_math.OF_SLOPES},
         "scheme_matrices": scheme_matrices,
         "wide_vectors": intrinsics.wide_vectors,
         "always_inline": intrinsics.always_inline,
@@ -71,14 +101,10 @@ def kernels(model: ProcessModel, *, exact: bool = True) -> Kernels:
         **{name: machine_code(function) for name, function in called.items()},
     }
     exec(compile(text, str(path or "<kernel>"), "exec"), scope)
-    for name in ("constants", "remainder", "observe", "margins"):
+    for name in ("constants", "remainder", "observe", "margins", "gains"):
         if name in scope:
             scope[name] = _njit(scope[name])
-    compiled = {
-        name: _njit(scope[name], nogil=True, cache=path is not None)
-        for name in ("simulate", "spectrum", "levels", "advance")
-    }
-    return Kernels(model, batch, trajectory, **compiled)
+    return [_njit(scope[name], nogil=True, cache=path is not None) for name in functions]
 
 
 @contextlib.contextmanager

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sysid.arrays import BoolArray, FloatArray, IntArray
-from sysid.engine.compiler import Kernels, explained_errors
+from sysid.engine.compiler import Filter, Kernels, explained_errors
 from sysid.engine.scheme import LANES, work_area
 from sysid.problem.data import Dataset
 from sysid.problem.model import ProcessModel
@@ -136,6 +136,45 @@ class RecordSimulator:
         sse, estimates = self.block(parameters, starts, lanes, n_steps, n_samples, kept)
         values[:] = kept[..., : len(lanes)]
         return sse, self._excess(sse, estimates, np.full(len(lanes), n_steps * (n_samples - 1)))
+
+    def innovations(
+        self,
+        kalman: Filter,
+        noise: FloatArray,
+        corrects: bool,
+        parameters: FloatArray,
+        starts: FloatArray | None,
+        rows: slice,
+        n_steps: int,
+        values: FloatArray,
+    ) -> tuple[FloatArray, FloatArray]:
+        """As ``residuals``, of the innovations of a filter, in parts of the outputs' noise.
+
+        noise: (n_outputs,), standard deviations. corrects: whether the filter takes outputs in. A
+        state that starts at the first sample of an output has that sample's error.
+        """
+        record, kernel, model = self.record, kalman.kernel, self.kernels.model
+        lanes = np.arange(rows.start, rows.stop)
+        padded = lanes.take(_ALL_LANES, mode="wrap")
+        first = record.starts_at_samples(model)
+        weights = self._weights.copy()
+        weights[0, [j for j in first if j is not None]] = 0.0
+        spread = [0.0 if (j := first[i]) is None else noise[j] ** 2 for i in kernel.reached]
+        of_inputs = record.input_noise[list(kernel.variation.noisy)] ** 2
+        start = np.zeros((kernel.n_states, LANES))
+        start[: len(model.states)] = self._initial(starts, padded)
+        kept = np.empty((record.n_samples, len(noise), LANES))
+        sums = np.empty((2 * len(noise), LANES))
+        work = work_area(kernel.work_rows * LANES)
+        with explained_errors(model):
+            kalman.innovations(
+                work, work.reshape(-1, LANES), kernel.tables, self._inputs, self._measured,
+                weights, noise**2, of_inputs, np.array(spread), float(corrects), start,
+                np.ascontiguousarray(parameters[padded].T), record.dt, n_steps, sums, kept,
+            )  # fmt: skip
+        values[:] = kept[..., : len(lanes)]
+        sse, estimates = (half.T[: len(lanes)] for half in np.split(sums, 2))
+        return sse, self._excess(sse, estimates, np.full(len(lanes), n_steps * len(kept)))
 
     def block(
         self,

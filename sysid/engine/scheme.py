@@ -50,13 +50,21 @@ class Scheme:
 
     def __init__(self, model: ProcessModel, structure: Structure) -> None:
         self.structure = structure
-        self.n_states, self.n_inputs = len(model.states), len(model.inputs)
+        self.n_states, self.n_inputs = structure.n_states, structure.n_inputs
         self.n_outputs, self.n_parameters = len(model.outputs), len(model.parameters)
         self.n_constants = structure.n_constants
         self.n_margins = sum(guard.n_limits for guard in structure.guards)
         self.output_states = model.output_states
-        self.interpolated = [j for j, u in enumerate(model.inputs) if u.hold != "zoh"]
+        self.n_recorded = len(model.inputs)
+        self.recorded_slopes = [j for j, u in enumerate(model.inputs) if u.hold != "zoh"]
+        # Whatever stands behind a record's inputs rises within a sample.
+        self.interpolated = [*self.recorded_slopes, *range(self.n_recorded, self.n_inputs)]
         self.splines = [j for j, u in enumerate(model.inputs) if u.hold == "spline"]
+        self.counts = {
+            "remainder": self.n_states,
+            "observe": self.n_outputs,
+            "margins": self.n_margins,
+        }
         self.guarded = sorted({i for guard in structure.guards for i in guard.gains})
         self.closure = self._closure()
         self.entries = [
@@ -114,8 +122,7 @@ class Scheme:
 
         x, u: states and inputs, a name to number or their texts.
         """
-        counts = {"remainder": self.n_states, "observe": self.n_outputs, "margins": self.n_margins}
-        targets = numbered(target, counts[function])
+        targets = numbered(target, self.counts[function])
         states = numbered(x, self.n_states) if isinstance(x, str) else x
         inputs = numbered(u, self.n_inputs) if isinstance(u, str) else u
         comma = "," if len(targets) == 1 else ""

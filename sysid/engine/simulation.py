@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import enum
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from sysid.arrays import FloatArray, IntArray
-from sysid.engine.compiler import kernels
+from sysid.engine.compiler import kalman_filter, kernels
 from sysid.engine.record_simulator import RecordSimulator
 from sysid.engine.scheme import LANES
 from sysid.problem.data import Dataset
@@ -179,7 +179,60 @@ class BatchSimulator:
         residuals are the outputs themselves. Without ``keep`` there are no values, only their
         sums of squares.
         """
+
+        def simulate(
+            r: int, simulator: RecordSimulator, part: FloatArray, rows: slice, steps: int
+        ) -> tuple[FloatArray, FloatArray]:
+            values = part[..., rows]
+            return simulator.residuals(parameters, starts[r], rows, steps, values)
+
         parameters = self._check(parameters, records)
+        return self._gathered(simulate, parameters, records, scales, n_steps, keep=keep)
+
+    def innovations(
+        self,
+        parameters: FloatArray,
+        records: Sequence[Dataset],
+        scales: Sequence[FloatArray],
+        n_steps: IntArray,
+        starts: Sequence[FloatArray | None],
+        noise: FloatArray,
+        *,
+        corrects: bool = True,
+    ) -> Residuals:
+        """As ``residuals``, of the innovations of an extended Kalman filter.
+
+        Noise of the inputs is the records' own; noise: (n_outputs,), standard deviations of the
+        outputs. An innovation is scaled by the output's noise over its own standard deviation:
+        where no input is noisy, innovations are the residuals. Unless it ``corrects`` itself by the
+        outputs, they are those of the free run, scaled so. See ``filter_kernel``. Raises ModelError
+        for equations that cannot be differentiated.
+        """
+        noisy = noisy_inputs(records)
+        kalman = kalman_filter(self.model, noisy)
+
+        def simulate(
+            r: int, simulator: RecordSimulator, part: FloatArray, rows: slice, steps: int
+        ) -> tuple[FloatArray, FloatArray]:
+            values = part[..., rows]
+            return simulator.innovations(
+                kalman, noise, corrects, parameters, starts[r], rows, steps, values
+            )
+
+        parameters = self._check(parameters, records)
+        return self._gathered(simulate, parameters, records, scales, n_steps)
+
+    def _gathered(
+        self,
+        simulate: Callable[..., tuple[FloatArray, FloatArray]],
+        parameters: FloatArray,
+        records: Sequence[Dataset],
+        scales: Sequence[FloatArray | None],
+        n_steps: IntArray,
+        *,
+        keep: bool = True,
+    ) -> Residuals:
+        """What is simulated of every parameter vector on every record, in blocks side by side."""
         n, q = len(parameters), len(self.model.outputs)
         sse, excess = np.empty((n, len(records), q)), np.empty((n, len(records)))
         ends = np.cumsum([record.n_samples for record in records])
@@ -192,9 +245,8 @@ class BatchSimulator:
         tasks.sort(key=lambda task: -task[4] * task[1].record.n_samples)
 
         def run(task: tuple[int, RecordSimulator, FloatArray, slice, int]) -> None:
-            r, on_record, part, rows, steps = task
-            sums = on_record.residuals(parameters, starts[r], rows, steps, part[..., rows])
-            sse[rows, r], excess[rows, r] = sums
+            r, rows = task[0], task[3]
+            sse[rows, r], excess[rows, r] = simulate(*task)
 
         self._workers.each(run, tasks)
         return Residuals(values, sse, excess)
@@ -230,6 +282,12 @@ class BatchSimulator:
                 f"(n, {len(self.model.parameters)})"
             )
         return parameters
+
+
+def noisy_inputs(records: Sequence[Dataset]) -> tuple[int, ...]:
+    """Places of the inputs that are measured with noise in any of the records."""
+    noise = np.max([record.input_noise for record in records], axis=0)
+    return tuple(np.flatnonzero(noise).tolist())
 
 
 def _runs(steps: IntArray) -> list[tuple[slice, int]]:

@@ -8,7 +8,7 @@ the equations branch on a value, nothing is claimed to be linear: N is the user'
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from sysid.engine.program import Writer
 from sysid.engine.split import Clamp, Split, Splitter
@@ -40,8 +40,11 @@ class Structure:
     depends on a state. guards: limits that fast linear parts may run into. shown: states that an
     output depends on directly, so that an error in one of them shows there. program: source text,
     see ``Writer.program``. calls: which of ``derivative`` and ``output`` the program refers to.
+    n_states, n_inputs: how many the program takes.
     """
 
+    n_states: int
+    n_inputs: int
     coefficients: Mapping[tuple[int, int], str]
     driven: tuple[int, ...]
     nonlinear: bool
@@ -55,9 +58,34 @@ class Structure:
 def analyse(model: ProcessModel, *, exact: bool = True) -> Structure:
     """Take a model's equations apart; without ``exact`` all of them are left in N."""
     splitter = Splitter()
-    tape = splitter.tape
-    derivatives = _splits(splitter, model, model.derivative)
-    rows = derivatives or []
+    rows = _splits(splitter, model, model.derivative)
+    outputs = None if model.output is None else _splits(splitter, model, model.output) or ()
+    moving = frozenset(j for j, signal in enumerate(model.inputs) if signal.hold != "zoh")
+    equations = Equations(len(model.states), len(model.inputs), rows, outputs, moving)
+    return structure(model, splitter, equations, exact=exact)
+
+
+@dataclass(frozen=True)
+class Equations:
+    """Derivatives and outputs, split; moving: inputs that change within a sample.
+
+    rows: None where they could not be followed; outputs: None where they are states, empty where
+    they could not be followed. further: functions of the program beside those, by name.
+    """
+
+    n_states: int
+    n_inputs: int
+    rows: Sequence[Split] | None
+    outputs: Sequence[Split] | None
+    moving: frozenset[int]
+    further: Mapping[str, Sequence[Split]] = field(default_factory=dict)
+
+
+def structure(
+    model: ProcessModel, splitter: Splitter, equations: Equations, *, exact: bool = True
+) -> Structure:
+    """The structure of split equations, those of a model or such as contain them."""
+    tape, rows, outputs = splitter.tape, equations.rows or (), equations.outputs
     # The clamps of linear values that the rows contain, by their place among all clamps.
     places = sorted({k for row in rows for k in row.kinks})
     clamps = {k: splitter.clamps[k] for k in places if splitter.clamps[k].base.linear}
@@ -66,10 +94,9 @@ def analyse(model: ProcessModel, *, exact: bool = True) -> Structure:
     gains = {k: {i: row.kinks[k] for i, row in enumerate(rows) if k in row.kinks} for k in clamps}
     functions = {"remainder": [rest for _, rest in parts]}
     shown = frozenset(model.output_states or range(len(model.states)))
-    if model.output is not None:
-        outputs = _splits(splitter, model, model.output)
-        functions["observe"] = [value.total for value in outputs or ()]
-        if outputs is not None:
+    if outputs is not None:
+        functions["observe"] = [value.total for value in outputs]
+        if outputs:
             shown = frozenset[int]().union(*(value.states for value in outputs))
     if clamps:
         functions["margins"] = [
@@ -77,6 +104,9 @@ def analyse(model: ProcessModel, *, exact: bool = True) -> Structure:
             for clamp in clamps.values()
             for limit in clamp.limits
         ]
+    functions |= {
+        name: [value.total for value in values] for name, values in equations.further.items()
+    }
     names = {*linear.values()}
     for k, clamp in clamps.items():
         names |= {*clamp.base.linear.values(), *gains[k].values()}
@@ -85,22 +115,23 @@ def analyse(model: ProcessModel, *, exact: bool = True) -> Structure:
         Guard(len(clamp.limits), writer.placed(clamp.base.linear), writer.placed(gains[k]))
         for k, clamp in clamps.items()
     )
-    driven, nonlinear = _driven(model, derivatives if exact else None, clamps)
+    driven, nonlinear = _driven(equations, clamps, exact)
     return Structure(
+        equations.n_states, equations.n_inputs,
         writer.placed(linear), driven, nonlinear, guards, shown, writer.program(),
         len(writer.constants), writer.calls,
     )  # fmt: skip
 
 
 def _driven(
-    model: ProcessModel, rows: Sequence[Split] | None, clamps: Mapping[int, Clamp]
+    equations: Equations, clamps: Mapping[int, Clamp], exact: bool
 ) -> tuple[tuple[int, ...], bool]:
     """Rows of N that change within a sample, and whether any depends on a state."""
-    if rows is None:
-        return tuple(range(len(model.states))), True
-    moving = {j for j, signal in enumerate(model.inputs) if signal.hold != "zoh"}
+    rows = equations.rows
+    if rows is None or not exact:
+        return tuple(range(equations.n_states)), True
     nonlinear = [bool(row.nonlinear or row.kinks.keys() & clamps.keys()) for row in rows]
-    driven = (i for i, row in enumerate(rows) if nonlinear[i] or row.inputs & moving)
+    driven = (i for i, row in enumerate(rows) if nonlinear[i] or row.inputs & equations.moving)
     return tuple(driven), any(nonlinear)
 
 

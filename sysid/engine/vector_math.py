@@ -143,3 +143,37 @@ def sin(x: float) -> float:
 def cos(x: float) -> float:
     """Cosine."""
     return _sine_and_cosine(x, 1)
+
+
+# What slopes are written with (``gradient``), beside the functions of math.
+OF_SLOPES = ("sign", "select", "power_slope", "exponent_slope")
+
+
+@njit(**_OPTIONS)
+def sign(x: float) -> float:
+    """The derivative of |x|; at zero, where it jumps, the mean of both sides."""
+    always_inline()
+    return 1.0 if x > 0.0 else -1.0 if x < 0.0 else 0.0 * x
+
+
+@njit(**_OPTIONS)
+def select(condition: bool, first: float, second: float) -> float:
+    """``first`` where a condition holds, else ``second``."""
+    always_inline()
+    return first if condition else second
+
+
+@njit(**_OPTIONS)
+def power_slope(x: float, y: float, dx: float) -> float:
+    """y x^(y-1) dx; 0 where y or dx is, even if x^(y-1) is infinite."""
+    always_inline()
+    slope = y * pow(x, y - 1.0) * dx
+    return 0.0 if y * dx == 0.0 else slope
+
+
+@njit(**_OPTIONS)
+def exponent_slope(x: float, power: float, dy: float) -> float:
+    """x^y ln(x) dy, by ``power`` = x^y; 0 at x = 0, as 0^y is for all y > 0."""
+    always_inline()
+    slope = power * log(x) * dy
+    return 0.0 if x == 0.0 or dy == 0.0 else slope

@@ -15,12 +15,12 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import numpy as np
 
 from sysid.arrays import FloatArray, IntArray
-from sysid.engine.simulation import BatchResult, BatchSimulator
+from sysid.engine.simulation import BatchResult, BatchSimulator, Residuals
 from sysid.problem.data import Dataset, output_scale
 from sysid.problem.model import ModelError
 from sysid.problem.space import SearchSpace
@@ -102,9 +102,13 @@ class Objective:
         """The same objective over another space of the same model; counts go on together."""
         return self._with(space=space)
 
-    def weighed(self, weights: FloatArray) -> Objective:
+    def weighed(self, weights: FloatArray) -> Self:
         """The same objective with other weights of the outputs, (n_outputs,)."""
         return self._with(weights=weights / weights.sum())
+
+    def on(self, records: Sequence[Dataset]) -> Objective:
+        """The same objective, scales included, on as many records of the same lengths."""
+        return self._with(records=list(records))
 
     def finer(self, accuracy: float) -> Objective:
         """The same objective by simulations of another accuracy, stiff ones given the steps."""
@@ -130,10 +134,7 @@ class Objective:
         n_steps: (n_records,), or of each chromosome (n, n_records). Without ``keep`` no values.
         """
         steps = np.broadcast_to(n_steps, (len(chromosomes), len(self.records)))
-        vectors, starts = self.space.full(chromosomes), self._starts(chromosomes)
-        simulated = self.simulator.residuals(
-            vectors, self.records, self.scales, steps, starts, keep=keep
-        )
+        simulated = self._simulated(chromosomes, steps, keep=keep)
         self._counter[0] += len(chromosomes)
         rms = self._roots(simulated.sse.sum(axis=1))
         return Responses(simulated.values, rms, simulated.excess.max(axis=1))
@@ -167,7 +168,22 @@ class Objective:
         weights: FloatArray = self.weights * len(residual) / counts / np.maximum(rms, 1e-12)
         return weights
 
-    def _with(self, **changes: Any) -> Objective:
+    def in_units(self, residual: FloatArray) -> FloatArray:
+        """Root mean squares, (n_outputs,), in the outputs' units of residuals without a scale."""
+        lengths = [record.n_samples for record in self.records]
+        scaled = residual * np.repeat(self.scales, lengths, axis=0)
+        return self._roots(np.sum(scaled**2, axis=0))
+
+    def _simulated(
+        self, chromosomes: FloatArray, steps: IntArray, *, keep: bool = True
+    ) -> Residuals:
+        """Residuals at integration steps per sample, (n, n_records)."""
+        vectors, starts = self.space.full(chromosomes), self._starts(chromosomes)
+        return self.simulator.residuals(
+            vectors, self.records, self.scales, steps, starts, keep=keep
+        )
+
+    def _with(self, **changes: Any) -> Self:
         variant = copy.copy(self)
         vars(variant).update(changes)
         return variant

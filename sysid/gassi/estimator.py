@@ -10,14 +10,16 @@ import numpy as np
 from sklearn.utils.validation import check_is_fitted
 
 from sysid.arrays import FloatArray
-from sysid.engine.simulation import BatchSimulator
+from sysid.engine.compiler import kalman_filter
+from sysid.engine.simulation import BatchSimulator, noisy_inputs
 from sysid.fitting.descent import Point
 from sysid.fitting.free_run import free_run
+from sysid.fitting.innovations import Innovations
 from sysid.fitting.objective import Balance, Objective
 from sysid.gassi.cega_objective import CegaObjective
 from sysid.gassi.checkpoint import Checkpoint, load, origin
 from sysid.gassi.genetic_search import PRESETS, GeneticSearch, Preset, PresetName
-from sysid.gassi.likelihood import fit_likelihood
+from sysid.gassi.likelihood import NoisyInputs, fit_likelihood
 from sysid.gassi.search_run import Best, SearchRun
 from sysid.problem.data import Dataset, require_information
 from sysid.problem.given import Given
@@ -30,7 +32,13 @@ from sysid.problem.space import SearchSpace
 from sysid.threads import one_thread
 from sysid.uncertainty import Profile, Uncertainty, profile, uncertainty
 
-Criterion = Literal["likelihood", "error"]
+Criterion = Literal["auto", "compensated", "innovations", "likelihood", "error"]
+
+_OF_NOISY_INPUTS: Mapping[str, NoisyInputs] = {name: name for name in get_args(NoisyInputs)}
+_OVERWHELMED = (
+    "since the noise of the measured inputs would explain more than all of the free run's error: "
+    "over this record its effect is not small and cannot be taken out; a shorter one may serve"
+)
 
 # Not compared with a checkpoint's: they do not decide the result, or it holds them otherwise.
 _NOT_COMPARED = ("model", "threads", "dt")
@@ -76,7 +84,10 @@ class GASSI(RecordEstimator):
     weights : {output: weight}, relative importance of the outputs.
     per_log : normalise each record by its own max|y| instead of the maximum over all.
     criterion : what the default preset ends with: ``likelihood`` weighs every output by its own
-        error; ``error`` stays with the mean RMSE that the search minimises.
+        error; ``compensated`` as well, and takes out what the noise of measured inputs does to
+        the errors; ``innovations`` are those of an extended Kalman filter for that noise;
+        ``error`` stays with the mean RMSE that the search minimises. ``auto`` is ``compensated``
+        where a record has ``input_noise``, else ``likelihood``.
     balance : ``samples``, several records count as one long one; ``logs``, each alike.
     accuracy : normalised RMS error that a simulation aims at.
     max_steps : integration steps a sample may take before a chromosome is flagged.
@@ -93,6 +104,8 @@ class GASSI(RecordEstimator):
     guesses_ : {name: Guess} of the ranges that were read from the records.
     space_ : SearchSpace that was searched; estimated initial states stand behind the parameters.
     output_weights_ : (n_outputs,), final weights of the outputs.
+    criterion_, criterion_reason_ : what it was, and why.
+    output_noise_ : (n_outputs,), noise of the outputs, None where that of inputs does not count.
     rivals_ : parameters in each further minimum that explains the data as well as the result.
     error_ : mean over outputs of the RMSE normalised by max|y| (see ``Objective``); of ``cega``
         (4.6) (see ``CegaObjective``).
@@ -139,7 +152,7 @@ class GASSI(RecordEstimator):
     weights: Mapping[str, float] | None = None
     per_log: bool = False
     balance: Balance = "samples"
-    criterion: Criterion = "likelihood"
+    criterion: Criterion = "auto"
     accuracy: float = 1e-3
     max_steps: int = 512
     threads: int | None = None
@@ -191,13 +204,14 @@ class GASSI(RecordEstimator):
         self.output_weights_: FloatArray = objective.weights
         self._rivals: tuple[FloatArray, ...] = ()
         self._final_accuracy = self.accuracy
+        self.criterion_, self.criterion_reason_ = self._criterion(data, preset)
+        self.output_noise_: FloatArray | None = None
         run = self._search_run(objective, preset)
         checkpoints = self._checkpoints(data, run, checkpoint, resume)
         notify = on_progress or (lambda progress: None)
         self.stopped_ = self._search(run, checkpoints, notify)
         self._set_run(run)
-        likelihood = preset.refine and self.criterion == "likelihood"
-        if likelihood and self.stopped_ != "interrupted":
+        if preset.refine and self.criterion_ != "error" and self.stopped_ != "interrupted":
             self._maximise_likelihood(run, notify)
         return self
 
@@ -232,7 +246,9 @@ class GASSI(RecordEstimator):
             notify(Progress("weigh", done, done, self.error_))
 
         try:
-            likeliest, self._rivals = fit_likelihood(run.objective, run.minima(), watch)
+            likeliest, self._rivals = fit_likelihood(
+                run.objective, run.minima(), watch, noise=_OF_NOISY_INPUTS.get(self.criterion_)
+            )
         except KeyboardInterrupt:
             self.stopped_ = "interrupted"
             return
@@ -241,6 +257,10 @@ class GASSI(RecordEstimator):
         error = float(objective.evaluate(chromosome[None])[0][0])
         self._set_best(Best(objective.space, chromosome, error, likeliest.feasible))
         self.output_weights_ = likeliest.objective.weights
+        if isinstance(likeliest.objective, Innovations):
+            self.output_noise_ = likeliest.objective.noise
+        elif self.criterion_ in _OF_NOISY_INPUTS:
+            self.criterion_, self.criterion_reason_ = "likelihood", _OVERWHELMED
         self.n_simulations_ = objective.simulations
 
     def predict(self, X: Dataset | FloatArray, *, records: Any = None) -> FloatArray:
@@ -304,7 +324,11 @@ class GASSI(RecordEstimator):
         if self.stopped_ == "interrupted":
             raise ModelError("the identification was interrupted, so there are no intervals")
         data = self._records(X, y, records, None, reset=False)
-        return self._at_final_accuracy(self._objective(data).weighed(self.output_weights_))
+        objective = self._at_final_accuracy(self._objective(data).weighed(self.output_weights_))
+        if self.output_noise_ is None:
+            return objective
+        corrects = self.criterion_ == "innovations"
+        return Innovations.of(objective, self.output_noise_, corrects=corrects)
 
     def _at_final_accuracy(self, objective: Objective) -> Objective:
         """The objective, simulated as accurately as at the end of ``fit``."""
@@ -349,6 +373,32 @@ class GASSI(RecordEstimator):
                 raise ModelError(f"unknown {kind} {choice!r}; choose from {', '.join(choices)}")
         return PRESETS[self.preset]
 
+    def _criterion(self, records: Sequence[Dataset], preset: Preset) -> tuple[Criterion, str]:
+        """What the default preset ends with on these records, and why."""
+        model, noisy = self._model(), noisy_inputs(records)
+        if not preset.refine:
+            return "error", f"preset {self.preset} goes by nothing else"
+        names = ", ".join(model.input_names[j] for j in noisy)
+        if self.criterion not in ("auto", *_OF_NOISY_INPUTS):
+            return self.criterion, "as set"
+        if not noisy:
+            if self.criterion == "auto":
+                return "likelihood", "no input is known to be measured with noise"
+            where = ", ".join(record.name for record in records[:3])
+            raise ModelError(
+                f"criterion {self.criterion} needs the noise of a measured input, and {where} "
+                "tells none; give each Dataset its input_noise, or choose criterion likelihood"
+            )
+        try:
+            kalman_filter(model, noisy)
+        except ModelError as error:
+            if self.criterion != "auto":
+                raise
+            return "likelihood", f"{names} is measured with noise, but {error}"
+        if self.criterion != "auto":
+            return self.criterion, "as set"
+        return "compensated", f"{names} is measured with noise, which a free run passes on"
+
     def _weights(self) -> FloatArray | None:
         if self.weights is None:
             return None
@@ -374,7 +424,7 @@ class GASSI(RecordEstimator):
         rng = np.random.default_rng(self.random_state)
         rule = self.elite_percent, self.minimum_generations, self.termination_ratio
         search = GeneticSearch(self.space_, preset, self.population, generations, rng, *rule)
-        return SearchRun(objective, search, self.generations, self.criterion == "likelihood")
+        return SearchRun(objective, search, self.generations, self.criterion_ != "error")
 
     def _checkpoints(
         self, data: Sequence[Dataset], run: SearchRun, checkpoint: Path | None, resume: Path | None

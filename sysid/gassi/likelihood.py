@@ -12,12 +12,14 @@ its errors leaves; those that it cannot tell apart are rivals.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 
 from sysid.arrays import FloatArray
 from sysid.fitting.descent import Point
 from sysid.fitting.free_run import FINER, FINEST
+from sysid.fitting.innovations import Innovations
 from sysid.fitting.objective import Objective
 from sysid.fitting.refinement import refine, refine_each
 from sysid.gassi.lookalikes import lookalikes
@@ -25,6 +27,7 @@ from sysid.uncertainty.colour import colour, longest_memory
 from sysid.uncertainty.sensitivity import Sensitivity, coordinate_units, sensitivity
 
 _ROUNDS = 6  # of weights and parameters in turn
+_NOISE_ROUNDS = 20  # the same of noise, weights and parameters
 _STEADY = 1e-3  # share by which weights may still change
 # An output explained much better than the others keeps this share of the largest error, or the
 # arithmetic of its last digits would decide.
@@ -45,6 +48,7 @@ _EXPLORED = 2  # minima whose lookalikes are descended from
 _ONE = 16.0
 
 Watch = Callable[[Point], None]
+NoisyInputs = Literal["compensated", "innovations"]
 
 
 @dataclass(frozen=True)
@@ -58,11 +62,16 @@ class Optimum:
 
 
 def fit_likelihood(
-    objective: Objective, minima: Sequence[FloatArray], watch: Watch | None = None
+    objective: Objective,
+    minima: Sequence[FloatArray],
+    watch: Watch | None = None,
+    *,
+    noise: NoisyInputs | None = None,
 ) -> tuple[Optimum, tuple[FloatArray, ...]]:
     """The likeliest of some minima (n_free,) of the mean RMSE and of their lookalikes.
 
-    And its rivals: chromosomes far from it that the data do not tell from it.
+    And its rivals: chromosomes far from it that the data do not tell from it. noise: how
+    all of them are refitted in the end, where inputs are noisy.
     """
     objective = _resolved(objective, minima[0])
     optima = _Optima(objective)
@@ -86,7 +95,15 @@ def fit_likelihood(
             if optima.new(end.chromosome) and optima.deviance(rough, best) < _CONCEIVABLE:
                 optima.add(_weighed(objective, end.chromosome, watch))
     best, *others = optima.ranked()
-    best = _exact(best)
+    refitted = None
+    if noise is not None:
+        corrects = noise == "innovations"
+        refitted = _refitted(corrects, objective, [best, *others], optima, watch)
+    if refitted is None:
+        best = _exact(best)
+    else:
+        optima = refitted
+        best, *others = optima.ranked()
     rivals = [optimum for optimum in others if optima.deviance(optimum, best) < _TOLD_APART]
     return best, tuple(rival.chromosome for rival in rivals)
 
@@ -191,6 +208,56 @@ def _weighed(objective: Objective, chromosome: FloatArray, watch: Watch | None) 
         if steady:
             break
     return _optimum(objective, chromosome, rms)
+
+
+def _refitted(
+    corrects: bool,
+    objective: Objective,
+    ranked: Sequence[Optimum],
+    by_error: _Optima,
+    watch: Watch | None,
+) -> _Optima | None:
+    """The best optimum and those not told from it by the error, refitted for noisy inputs.
+
+    None where without corrections the inputs' noise would explain more than there is.
+    """
+    optima = _Optima(objective)
+    first: Optimum | None = None
+    for optimum in ranked:
+        if by_error.deviance(optimum, ranked[0]) < _CONCEIVABLE:
+            refitted = noisy_input_fit(corrects, objective, optimum, watch)
+            if refitted is None and first is None:
+                return None
+            if refitted is not None:
+                first = first or refitted
+                # Compared at the same noise, that of the first.
+                rms = first.objective.rms(refitted.chromosome[None])[0]
+                optima.add(_optimum(refitted.objective, refitted.chromosome, rms))
+    return optima
+
+
+def noisy_input_fit(
+    corrects: bool, objective: Objective, optimum: Optimum, watch: Watch | None = None
+) -> Optimum | None:
+    """The minimum for noisy inputs from one of the error: weights, noise, parameters in turn.
+
+    corrects: as of ``Innovations``. None as of ``_refitted``.
+    """
+    chromosome, rms = optimum.chromosome, optimum.rms
+    fitted = Innovations.starting(optimum.objective, chromosome, corrects=corrects)
+    for _ in range(_NOISE_ROUNDS):
+        if not corrects and fitted.overwhelmed.any():
+            return None
+        rms = fitted.rms(chromosome[None])[0]
+        weights = objective.weights / np.maximum(rms, max(_LEAST_SHARE * rms.max(), 1e-300))
+        weighed = fitted.weighed(weights)
+        steady = np.allclose(weighed.weights, fitted.weights, rtol=_STEADY)
+        end = refine(weighed, chromosome, on_iteration=watch)
+        chromosome, rms, fitted = end.chromosome, end.rms, weighed
+        if steady:
+            break
+        fitted = fitted.settled(chromosome)
+    return _optimum(fitted, chromosome, rms)
 
 
 def _optimum(objective: Objective, chromosome: FloatArray, rms: FloatArray) -> Optimum:

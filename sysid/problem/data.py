@@ -124,6 +124,17 @@ class Dataset:
                 x0[i] = first[state.name]
         return x0
 
+    def starts_at_samples(self, model: ProcessModel) -> list[int | None]:
+        """For each state the output whose first sample it starts at, None where it does not."""
+        places: list[int | None] = []
+        for i, state in enumerate(model.states):
+            named = state.name in model.output_names
+            j = model.output_names.index(state.name) if named else None
+            measured = j is not None and np.isfinite(self.outputs[0, j])
+            estimated = self.initial_range(model, i) is not None
+            places.append(j if measured and state.first_sample and not estimated else None)
+        return places
+
     def initial_range(self, model: ProcessModel, state: int) -> tuple[float, float] | None:
         """Range in which a state's initial value is estimated; None where it is not."""
         declared = model.states[state].initial_range

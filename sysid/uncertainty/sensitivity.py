@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from sysid.arrays import BoolArray, FloatArray
+from sysid.fitting.innovations import Innovations
 from sysid.fitting.objective import Objective
 from sysid.problem.data import Dataset
 from sysid.uncertainty.colour import record_rows
@@ -24,7 +25,8 @@ class Sensitivity:
     residual: (n_residuals, n_outputs), simulated minus measured in parts of the output's scale,
     0 where a sample was lost; seen: of the same shape, where none was. slopes: (n_residuals,
     n_outputs, n_free), with respect to the natural logarithm of a parameter searched by
-    logarithm, else to the parameter in units of ``coordinate_units``.
+    logarithm, else to the parameter in units of ``coordinate_units``. share: of the shape of the
+    residuals, their factors where noise of inputs divides them, else ones.
     """
 
     objective: Objective
@@ -33,6 +35,7 @@ class Sensitivity:
     residual: FloatArray
     seen: BoolArray
     slopes: FloatArray
+    share: FloatArray
 
     @property
     def lengths(self) -> tuple[int, ...]:
@@ -55,16 +58,23 @@ def sensitivity(objective: Objective, chromosome: FloatArray) -> Sensitivity:
     """Residuals and slopes at a chromosome, (n_free,), by central differences.
 
     All simulations of a record take as many steps as the most demanding of them needs; one that
-    fails has slope zero.
+    fails has slope zero. Where noise of inputs divides the free run's errors it is held: at kinks
+    of the equations it jumps, which differences would take for slopes.
     """
+    share: FloatArray | float = 1.0
     neighbours = _with_neighbours(objective, chromosome)
     steps = [int(needed) for needed in objective.steps_needed(neighbours).max(axis=0)]
+    if isinstance(objective, Innovations) and not objective.corrects:
+        share = objective.share(chromosome, np.array(steps))
+        objective = objective.free_run
     residuals = objective.residuals(neighbours, steps).values
     n = len(chromosome)
     slopes = (residuals[..., 1 : n + 1] - residuals[..., n + 1 :]) / (2.0 * _PERTURBATION)
     slopes = np.where(np.isfinite(slopes), slopes, 0.0)
     seen = np.concatenate([np.isfinite(record.outputs) for record in objective.records])
-    return Sensitivity(objective, chromosome, steps, residuals[..., 0].copy(), seen, slopes)
+    factors = np.broadcast_to(share, seen.shape)
+    residual, slopes = factors * residuals[..., 0], factors[..., None] * slopes
+    return Sensitivity(objective, chromosome, steps, residual, seen, slopes, factors)
 
 
 def _with_neighbours(objective: Objective, chromosome: FloatArray) -> FloatArray:
@@ -91,9 +101,14 @@ def zero_errors(sensitivity: Sensitivity) -> Iterator[FloatArray]:
     for k, rows in enumerate(record_rows(sensitivity.lengths)):
         record = objective.records[k]
         for j in np.flatnonzero(record.output_zero):
+            if isinstance(objective, Innovations):
+                outputs = record.outputs.copy()
+                outputs[:, j] += record.output_zero[j]
+                yield _innovation_change(sensitivity, k, replace(record, outputs=outputs))
+                continue
             change = np.zeros_like(sensitivity.residual)
             change[rows, j] = record.output_zero[j] / objective.scales[k][j]
-            yield change
+            yield change * sensitivity.share
         errors = [error for error in np.diag(record.input_zero) if error.any()]
         yield from _input_changes(sensitivity, k, errors)
     yield from given_errors(sensitivity)
@@ -125,8 +140,11 @@ def given_errors(sensitivity: Sensitivity) -> Iterator[FloatArray]:
 def input_noises(sensitivity: Sensitivity) -> Iterator[FloatArray]:
     """Changes of all residuals whose outer products sum to the covariance by input noise.
 
-    Each is (n_residuals, n_outputs), by noise that is drawn at random, always the same.
+    Each is (n_residuals, n_outputs), by noise that is drawn at random, always the same. None for
+    innovations of a filter that corrects itself, which hold it already.
     """
+    if isinstance(sensitivity.objective, Innovations):
+        return
     rng = np.random.default_rng(0)
     for k, record in enumerate(sensitivity.objective.records):
         if np.any(record.input_noise):
@@ -141,6 +159,11 @@ def _input_changes(
 ) -> Iterator[FloatArray]:
     """Changes of all residuals by errors of record k's inputs, (n_samples, n_inputs) or a row."""
     objective, record = sensitivity.objective, sensitivity.objective.records[k]
+    if isinstance(objective, Innovations):
+        for error in errors:
+            disturbed_record = replace(record, inputs=record.inputs + error)
+            yield _innovation_change(sensitivity, k, disturbed_record)
+        return
     rows = record_rows(sensitivity.lengths)[k]
     chromosomes = sensitivity.chromosome[None]
     vectors = objective.space.full(chromosomes)
@@ -159,4 +182,14 @@ def _input_changes(
         difference = (disturbed - undisturbed) / objective.scales[k]
         change = np.zeros_like(sensitivity.residual)
         change[rows] = np.where(np.isfinite(difference), difference, 0.0)
-        yield change
+        yield change * sensitivity.share
+
+
+def _innovation_change(sensitivity: Sensitivity, k: int, record: Dataset) -> FloatArray:
+    """Change of all innovations with another record k."""
+    objective = sensitivity.objective
+    records = list(objective.records)
+    records[k] = record
+    moved = objective.on(records).residuals(sensitivity.chromosome[None], sensitivity.steps)
+    change = moved.values[..., 0] - sensitivity.residual
+    return np.where(np.isfinite(change), change, 0.0)

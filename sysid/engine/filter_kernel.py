@@ -1,0 +1,203 @@
+"""Source text of the kernel that runs an extended Kalman filter over a record.
+
+The states x, the noise n on inputs and the outputs' noise v, white and independent:
+
+    x_(k+1) = F(x_k, u_k + n_k, u_(k+1) + n_(k+1))        y_k = g(x_k, u_k + n_k) + v_k
+
+F is the simulated step of the batch kernel, its Jacobian Phi that of the same step (see
+``variation``). Of the estimate of x_k and n_k from all samples before, with covariance P, the
+outputs of a sample are taken in one after the other (Anderson & Moore, "Optimal filtering",
+section 6.4): with the row C of g's Jacobian and the variance r of the output
+
+    e = y - g      s = C P C' + r      (x, n) += P C' e / s      P -= P C' C P / s
+
+and what is kept of e, the innovation, is e sqrt(r / s): without noise on the inputs the error of
+the free run. With ``corrects`` zero nothing is taken in: e is that error whatever the noise, and s
+its variance. Chromosomes are lanes, as in the batch kernel.
+"""
+
+from collections.abc import Callable, Iterable, Mapping
+
+from sysid.engine.batch_kernel import EACH_LANE, BatchKernel, at
+from sysid.engine.program import block
+from sysid.engine.scheme import LANES, STEP_SIZES
+from sysid.engine.variation import Variation
+from sysid.problem.model import ProcessModel
+
+_Place = tuple[int, int]
+
+
+class FilterKernel(BatchKernel):
+    """Text of the filter; needs what the batch kernel needs, and the program of a variation.
+
+    Behind the rows of lanes of the batch kernel the work area holds P's upper triangle, of the
+    reached states and then of the noisy inputs, and the estimate of each noise.
+    """
+
+    def __init__(self, model: ProcessModel, variation: Variation) -> None:
+        super().__init__(model, variation.structure)
+        self.variation, self.reached = variation, variation.reached
+        self.n_noises = len(variation.noisy)
+        self.counts["gains"] = len(variation.gains)
+        self._size = len(self.reached) + self.n_noises
+        self._pairs = [(a, b) for a in range(self._size) for b in range(a, self._size)]
+        self._covariance = self.work_rows
+        self._noises = self._covariance + len(self._pairs)
+        self.work_rows = self._noises + self.n_noises
+
+    def text(self, *, many_registers: bool = False) -> str:
+        """Python text of ``innovations``."""
+        q, outputs = self.n_outputs, range(self.n_outputs)
+        sample = [
+            *[f"v{j} = u[k, {j}]" for j in range(self.n_recorded)],
+            *[f"v{j} = 0.0" for j in range(self.n_recorded, self.n_inputs)],
+            *[f"{name}{j} = {name}[k, {j}]" for name in "yw" for j in outputs],
+            *[f"seen{j} = 1.0 if w{j} > 0.0 else 0.0" for j in outputs],
+            *block(EACH_LANE, self._corrected()),
+            *block("if k == n_samples - 1:", ["break"]),
+            *self._input_slopes(),
+            *block(EACH_LANE, self._undisturbed()),
+            *block("for step in range(n_steps):", self._stage_inputs(), self._all_lanes(False)),
+            *block(EACH_LANE, self._predicted()),
+        ]
+        sums = f"sums[j, l] = X[({self._sums} + j) * {LANES} + l]"
+        body = [
+            "wide_vectors()",
+            "n_samples = u.shape[0]",
+            "h = dt / n_steps",
+            *STEP_SIZES,
+            *self._begin(),
+            *block(EACH_LANE, self._uncertain_start()),
+            *block("for k in range(n_samples):", sample),
+            *block(f"for j in range({2 * q}):", block(EACH_LANE, [sums])),
+        ]
+        head = (
+            "def innovations(X, rows, tables, u, y, w, r, s, spread, corrects, start, p, dt, "
+            "n_steps, sums, record):"
+        )
+        return "\n".join(block(head, body))
+
+    def _input_slopes(self) -> list[str]:
+        rising = (f"i{j} = 1.0 / n_steps" for j in range(self.n_recorded, self.n_inputs))
+        return [*super()._input_slopes(), *rising]
+
+    def _uncertain_start(self) -> list[str]:
+        """P before the first sample: ``spread`` of the states, and the noises' variances."""
+        n = len(self.reached)
+        variances = {(a, a): f"spread[{a}]" if a < n else f"s[{a - n}]" for a in range(self._size)}
+        return self._stored(variances)
+
+    def _corrected(self) -> list[str]:
+        """The outputs of a sample taken in, and their innovations kept."""
+        n, size = len(self.reached), range(self._size)
+        lines = self._outputs()
+        if self.output_states is None and self.variation.gains:
+            lines += self.call("gains", "g", [at(i) for i in range(self.n_states)], "v")
+        lines += [*self._loaded(), *[f"d{a} = 0.0" for a in size]]
+        for j in range(self.n_outputs):
+            lines += self._taken_in(j)
+        lines += [f"{at(i)} += d{a}" for a, i in enumerate(self.reached)]
+        lines += [f"{at(self._noises + k)} = d{n + k}" for k in range(self.n_noises)]
+        return lines + self._stored({(a, b): f"P{a}_{b}" for a, b in self._pairs})
+
+    def _taken_in(self, j: int) -> list[str]:
+        """Output j taken in; the deviation d is what the sample's outputs have changed so far."""
+        gains, size = self._gains(j), range(self._size)
+        lines = [f"e = {_sum([f'o{j}', *_products(gains, 'd{}'.format)])} - y{j}"]
+        kept = f"e = e * w{j}"
+        if gains:
+            lines += [f"shared{a} = {_sum(_products(gains, _covariance_with(a)))}" for a in size]
+            lines += [
+                f"variance = {_sum(_products(gains, 'shared{}'.format))} + r[{j}]",
+                f"gain = seen{j} * corrects / variance",
+            ]
+            lines += [f"d{a} -= shared{a} * (gain * e)" for a in size]
+            lines += [f"P{a}_{b} -= shared{a} * (gain * shared{b})" for a, b in self._pairs]
+            kept = f"e = e * (w{j} * math.sqrt(r[{j}] / variance))"
+        return [*lines, kept, f"{at(self._sums + j)} += e * e", f"record[k, {j}, l] = e"]
+
+    def _gains(self, j: int) -> dict[int, str]:
+        """Row j of the outputs' Jacobian, by places in P; empty text stands for 1."""
+        model_states = self.variation.n_states
+        row: dict[int, str] = {}
+        for place, (output, k) in enumerate(self.variation.gains):
+            if output == j:
+                behind = len(self.reached) + k - model_states
+                column = self.reached.index(k) if k < model_states else behind
+                row[column] = "" if self.output_states is not None else f"g{place}"
+        return row
+
+    def _undisturbed(self) -> list[str]:
+        """Deviations at the start of an interval: each state's column is its own."""
+        return [
+            f"{at(place)} = {1.0 if cause == ('state', state) else 0.0}"
+            for cause, column in self.variation.columns.items()
+            for state, place in column.items()
+        ]
+
+    def _predicted(self) -> list[str]:
+        """x and P of the next sample."""
+        n = len(self.reached)
+        phi, gamma = self._jacobian_of("state", "begin"), self._jacobian_of("end")
+        lines = self._loaded()
+        for a, i in enumerate(self.reached):
+            by_noise = {k: phi[a, n + k] for k in range(self.n_noises) if (a, n + k) in phi}
+            moves = [f"{text} * {at(self._noises + k)}" for k, text in by_noise.items()]
+            lines += [f"{at(i)} += {_sum(moves)}"] if moves else []
+        for a in range(n):
+            row = {c: phi[a, c] for c in range(self._size) if (a, c) in phi}
+            for b in range(self._size):
+                lines.append(f"M{a}_{b} = {_sum(_products(row, _covariance_with(b)))}")
+        variances: dict[_Place, str] = {}
+        for a in range(n):
+            for b in range(a, n):
+                terms = [f"M{a}_{c} * {phi[b, c]}" for c in range(self._size) if (b, c) in phi]
+                terms += [
+                    f"{gamma[a, k]} * {gamma[b, k]} * s[{k}]"
+                    for k in range(self.n_noises)
+                    if (a, k) in gamma and (b, k) in gamma
+                ]
+                variances[a, b] = _sum(terms)
+            for k in range(self.n_noises):
+                if (a, k) in gamma:
+                    variances[a, n + k] = f"{gamma[a, k]} * s[{k}]"
+        variances |= {(n + k, n + k): f"s[{k}]" for k in range(self.n_noises)}
+        return lines + self._stored(variances)
+
+    def _jacobian_of(self, *kinds: str) -> dict[_Place, str]:
+        """Deviations at the end of an interval by row and cause, those not always zero.
+
+        Causes at the interval's start stand as in P; those at its end are the noises alone.
+        """
+        entries: dict[_Place, str] = {}
+        for (kind, k), column in self.variation.columns.items():
+            if kind in kinds:
+                behind = len(self.reached) + k if kind == "begin" else k
+                b = self.reached.index(k) if kind == "state" else behind
+                for state, place in column.items():
+                    entries[self.reached.index(state), b] = at(place)
+        return entries
+
+    def _loaded(self) -> list[str]:
+        return [f"P{a}_{b} = {self._at_pair(a, b)}" for a, b in self._pairs]
+
+    def _stored(self, variances: Mapping[_Place, str]) -> list[str]:
+        """P's upper triangle set, to zero where nothing is given."""
+        return [f"{self._at_pair(*pair)} = {variances.get(pair, '0.0')}" for pair in self._pairs]
+
+    def _at_pair(self, a: int, b: int) -> str:
+        return at(self._covariance + self._pairs.index((a, b)))
+
+
+def _covariance_with(a: int) -> Callable[[int], str]:
+    """Entries of row a of P, which is symmetric."""
+    return lambda b: f"P{min(a, b)}_{max(a, b)}"
+
+
+def _products(factors: Mapping[int, str], vector: Callable[[int], str]) -> list[str]:
+    """Products of factors, empty for 1, and the entries of a vector at their places."""
+    return [f"{c} * {vector(b)}" if c else vector(b) for b, c in factors.items()]
+
+
+def _sum(terms: Iterable[str]) -> str:
+    return " + ".join(terms) or "0.0"

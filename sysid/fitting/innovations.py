@@ -1,0 +1,120 @@
+"""The objective for inputs that are measured with noise.
+
+A free run is driven by the noise n of its inputs, too, so that minimising |y - G (u0 + n)|^2 also
+minimises |G n|^2: parameters that damp the noise are preferred to the true ones. Here every error
+is divided by the standard deviation that noise gives it, of the inputs as the model passes it on
+and of the outputs: sum e_k^2 / s_k. On average it is the number of samples for the true
+parameters, and more for all others. For a regression this is Deming's. e_k and s_k are, by
+``corrects``,
+
+- off: the error of the free run, and its variance. It asks nothing of the outputs' errors but
+  that they are not the inputs'.
+- on: the innovation of an extended Kalman filter, and its variance. Their sum is the least that
+  white noise of both kinds must have done, min over n of sum n^2 + sum |y - g(u + n)|^2, each in
+  parts of its variance. Estimates vary less, and errors of a sensor that are not white move them
+  more.
+
+The likelihood of Kristensen, Madsen & Jorgensen ("Parameter estimation in stochastic grey-box
+models", Automatica 40, 2004), adds sum log s_k and takes n as independent of the *measured* input.
+Of a measured one that is untrue, and the logarithm brings all of the free run's bias back
+(docs/decisions/0013-innovations.md). The outputs' noise therefore cannot come from the same sum,
+which vanishes as it grows: it is such that the mean of e_k^2 / s_k is one.
+"""
+
+from __future__ import annotations
+
+from typing import Self
+
+import numpy as np
+
+from sysid.arrays import BoolArray, FloatArray, IntArray
+from sysid.engine.simulation import BatchResult, Residuals, Status
+from sysid.fitting.objective import Objective
+
+_ROUNDS, _STEADY = 30, 1e-4  # of the outputs' noise, and its relative change at the end
+# Noise of an output is not below this share of its free run's error; where it comes near, noise
+# of the inputs explains more than there is to explain.
+_LEAST_NOISE, _NEAR = 1e-2, 0.1
+_TINY = 1e-300
+
+
+class Innovations(Objective):
+    """As ``Objective``, of innovations scaled to the outputs' own noise.
+
+    noise: (n_outputs,), standard deviations of the outputs in their units. error: (n_outputs,),
+    the same of the free run's errors at the chromosome that it began with. corrects: whether
+    outputs correct the states.
+    """
+
+    noise: FloatArray
+    error: FloatArray
+    corrects: bool
+
+    @classmethod
+    def of(cls, objective: Objective, noise: FloatArray, *, corrects: bool) -> Self:
+        """An objective's counterpart."""
+        variant = cls.__new__(cls)
+        vars(variant).update(vars(objective))
+        variant.noise = variant.error = np.maximum(noise, _TINY)
+        variant.corrects = corrects
+        return variant
+
+    @classmethod
+    def starting(cls, objective: Objective, chromosome: FloatArray, *, corrects: bool) -> Self:
+        """Its counterpart with the noise that the innovations show at a chromosome, (n_free,)."""
+        steps = objective.steps_needed(chromosome[None])[0]
+        error = objective.in_units(objective.residuals(chromosome[None], steps).values[..., 0])
+        return cls.of(objective, error, corrects=corrects).settled(chromosome)
+
+    def settled(self, chromosome: FloatArray) -> Self:
+        """With the noise that the innovations show at a chromosome, (n_free,)."""
+        steps = self.steps_needed(chromosome[None])[0]
+        settled, least = self, _LEAST_NOISE * self.error
+        for _ in range(_ROUNDS):
+            innovations = settled.residuals(chromosome[None], steps).values[..., 0]
+            before, noise = settled.noise, np.maximum(self.in_units(innovations), least)
+            if not np.isfinite(noise).all():
+                return self
+            settled = self._with(noise=noise)
+            if np.allclose(noise, before, rtol=_STEADY):
+                break
+        return settled
+
+    @property
+    def free_run(self) -> Objective:
+        """The objective of the free run's errors, by the same weights."""
+        plain = Objective.__new__(Objective)
+        vars(plain).update(vars(self))
+        return plain
+
+    @property
+    def overwhelmed(self) -> BoolArray:
+        """Outputs whose errors the noise of the inputs more than explains, (n_outputs,)."""
+        few: BoolArray = (self.noise < _NEAR * self.error) & (self.weights > 0.0)
+        return few
+
+    def share(self, chromosome: FloatArray, steps: IntArray) -> FloatArray:
+        """Residuals in parts of the free run's where nothing corrects, (n_residuals, n_outputs)."""
+        free_run = self.free_run._simulated(chromosome[None], steps[None]).values[..., 0]
+        scaled = self._simulated(chromosome[None], steps[None]).values[..., 0]
+        share: FloatArray = np.ones_like(scaled)
+        np.divide(scaled, free_run, out=share, where=free_run != 0.0)
+        return share
+
+    def evaluate(self, chromosomes: FloatArray) -> tuple[FloatArray, BatchResult]:
+        """As ``Objective.evaluate``, at the integration steps that the free runs need."""
+        steps = self.steps_needed(chromosomes)
+        sse = self._simulated(chromosomes, steps).sse
+        failed = ~np.isfinite(sse.sum(axis=(1, 2)))
+        sse = np.where(failed[:, None, None], np.inf, sse)
+        status = np.where(failed, Status.UNBOUNDED, Status.OK)
+        errors = self.error_of(self._roots(sse.sum(axis=1)))
+        return errors, BatchResult(sse, status, steps.sum(axis=1))
+
+    def _simulated(
+        self, chromosomes: FloatArray, steps: IntArray, *, keep: bool = True
+    ) -> Residuals:
+        vectors, starts = self.space.full(chromosomes), self._starts(chromosomes)
+        return self.simulator.innovations(
+            vectors, self.records, self.scales, steps, starts, self.noise, corrects=self.corrects
+        )
