@@ -106,6 +106,12 @@ class Objective:
         """The same objective with other weights of the outputs, (n_outputs,)."""
         return self._with(weights=weights / weights.sum())
 
+    def on(self, records: Sequence[Dataset]) -> Objective:
+        """The same objective on the first of its records, or their beginnings."""
+        counts = sum(np.isfinite(record.outputs).sum(axis=0) for record in records)
+        scales = self.scales[: len(records)]
+        return self._with(records=list(records), counts=counts, scales=scales)
+
     def finer(self, accuracy: float) -> Objective:
         """The same objective by simulations of another accuracy, stiff ones given the steps."""
         return self._with(simulator=self.simulator.finer(accuracy))
