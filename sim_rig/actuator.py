@@ -5,7 +5,8 @@ with ``sensor="between"``, the motor, the torque sensor, the brake and the load 
 The brushes of the torque sensor, where their friction is modelled, rub on its brake side.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -85,7 +86,7 @@ def actuator(
             )
         outputs = outputs or ("current_motor", "current_brake", "omega")
     outputs = outputs or tuple(output.name for output in OUTPUTS)
-    model = _Assembly(design).model(outputs)
+    model = replace(_Assembly(design).model(outputs), variants=_variants(design, outputs))
     named = values.named(parameters, design)
     changes = {k: {"nominal": v} for k, v in named.items() if k in model.parameter_names}
     return model.with_parameters(**changes)
@@ -96,6 +97,28 @@ def regressors(record: Any) -> dict[str, FloatArray]:
     if "current_brake" not in record or "omega" not in record:
         return {}
     return {"current_brake*sign(omega)": record["current_brake"] * np.sign(record["omega"])}
+
+
+def _variants(design: Design, outputs: tuple[str, ...]) -> Callable[[], Mapping[str, ProcessModel]]:
+    """The actuator with one part more than the design, by the option that adds it.
+
+    Values of what they add are the simulated rig's: where it may be looked for.
+    """
+    more: dict[str, dict[str, Any]] = {}
+    if design.friction == "none":
+        more["friction=stribeck"] = {"friction": "stribeck"}
+    if design.friction != "cyclic":
+        more["friction=cyclic"] = {"friction": "cyclic"}
+    if not design.limits:
+        more["limits=true"] = {"limits": True}
+    if design.hysteresis == "bouc-wen" and design.exponent == 1.0:
+        more["exponent=2"] = {"exponent": 2.0}
+
+    def variants() -> Mapping[str, ProcessModel]:
+        parts = {**asdict(design), "outputs": outputs}
+        return {name: actuator(**{**parts, **changes}) for name, changes in more.items()}
+
+    return variants
 
 
 class _Assembly:

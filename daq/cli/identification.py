@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from daq import notation
@@ -74,6 +74,9 @@ def _show(result: Identification) -> None:
 
 
 def _show_next(result: Identification) -> None:
+    if result.alternative_command is not None:
+        terminal.print_next(result.alternative_command)
+        return
     mapping = result.problem.mapping
     columns = f" --config {mapping.file.path}" if mapping is not None else ""
     log = (*result.validation, *result.training)[0].log.path
@@ -227,7 +230,13 @@ def _show_notes(result: Identification) -> None:
     if rows.refined:
         criterion = result.document["criterion"]
         terminal.print_text(f"Criterion: {criterion['name']}, {criterion['reason']}.")
-    terminal.print_text(f"Trust: {verdict.trust}. {' '.join(verdict.reasons)}")
+    statements = {"Predictions": verdict.predicted, "Parameters": verdict.parameters}
+    for subject, statement in statements.items():
+        terminal.print_text(f"{subject}: {statement.trust}. {' '.join(statement.reasons)}")
+    for note in verdict.notes:
+        terminal.print_text(note)
+    for line in _starts(result):
+        terminal.print_text(line)
     if rows.refined:
         n_combinations = len(rows.combinations)
         plural = "s" if n_combinations != 1 else ""
@@ -236,6 +245,28 @@ def _show_notes(result: Identification) -> None:
             f"Determined: {len(rows.determined)} of {len(rows.free)} free parameters by "
             f"themselves{also}."
         )
+
+
+def _starts(result: Identification) -> Iterator[str]:
+    """Where validations start that were estimated, and what their first samples would give."""
+    for log in result.validation:
+        starts = log.result.starts
+        if starts is None or starts.first_fit is None:
+            continue
+        number = terminal.number
+        where = [
+            f"{s.state} at {number(s.value, 3)} {s.unit}, {number(s.value - s.first, 2)} from its "
+            f"first sample (searched in {number(s.low, 3)} .. {number(s.high, 3)})"
+            for s in starts.estimates
+            if s.first == s.first
+        ]
+        fits = ", ".join(
+            f"{name} {fit:.1f} -> {first:.1f} %"
+            for name, fit, first in zip(
+                result.model.output_names, log.result.metrics.fit, starts.first_fit, strict=True
+            )
+        )
+        yield f"{log.result.name} starts with {'; '.join(where)}. From the first samples: {fits}."
 
 
 def print_errors(

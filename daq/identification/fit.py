@@ -25,11 +25,12 @@ from daq.progress import Note, Progress, Watch, ignore, warn
 from sysid import ModelError, ProcessModel, SearchSpace
 from sysid.gassi import GASSI, PRESETS
 from sysid.gassi import Progress as SearchProgress
-from sysid.judging.assessment import examine
+from sysid.judging.examination import examined, suspected
 from sysid.judging.plausibility import implausible
 from sysid.problem.copies import shared_samples
 from sysid.problem.data import require_information
 from sysid.problem.faults import DataFault, Part, after_mending, data_faults
+from sysid.uncertainty import Uncertainty
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -258,10 +259,14 @@ def assemble(
         watch(Progress("Profiles", k, len(names), f"of {name}"))
         profiles.append(estimator.profile(name, datasets))
         watch(Progress("Profiles", k + 1, len(names), f"of {name}"))
-    training, validation = ([_fitted(log, estimator) for log in part] for part in logs)
+    training, validation = ([_fitted(log, estimator, uncertainty) for log in part] for part in logs)
     faults = faults_of(problem, logs) if faults is None else faults
+    watch(Progress("Verdict", 0, 1, "what the model may lack"))
+    suspicion = suspected(estimator, uncertainty, *([log.dataset for log in part] for part in logs))
+    watch(Progress("Verdict", 1, 1, "what the model may lack"))
+    parts = profiles, training, validation, folder
     return Identification(
-        problem, estimator, uncertainty, profiles, training, validation, folder, faults=faults
+        problem, estimator, uncertainty, *parts, faults=faults, suspicion=suspicion
     )
 
 
@@ -289,9 +294,8 @@ def take(
         raise ConfigError(str(error), file=name) from None
 
 
-def _fitted(log: LoggedRecord, estimator: GASSI) -> FittedLog:
-    run = estimator.predict(log.dataset)
-    return FittedLog(log, run, examine(log.dataset, run))
+def _fitted(log: LoggedRecord, estimator: GASSI, uncertainty: Uncertainty | None) -> FittedLog:
+    return FittedLog(log, *examined(estimator, log.dataset, uncertainty))
 
 
 def _searched(

@@ -90,8 +90,9 @@ def from_recording(
     dataset = _from_log(recording, model, recording.name, selection)
     # What the offset calibration measured: standard deviations of noise and of zeros.
     noise, zero = np.array([recording.noise(n) for n in model.input_names]).reshape(-1, 2).T
-    output_zero = np.array([recording.noise(name)[1] for name in model.output_names])
-    dataset = replace(dataset, input_noise=noise, input_zero=zero, output_zero=output_zero)
+    outputs = np.array([recording.noise(n) for n in model.output_names]).reshape(-1, 2).T
+    calibrated = {"output_noise": outputs[0], "output_zero": outputs[1]}
+    dataset = replace(dataset, input_noise=noise, input_zero=zero, **calibrated)
     return _mended(LoggedRecord(dataset, recording.path, recording.warning), model, selection)
 
 

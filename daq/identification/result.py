@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -24,6 +25,9 @@ from sysid import Metrics, ProcessModel
 from sysid.arrays import FloatArray
 from sysid.gassi import GASSI, PRESETS
 from sysid.judging.assessment import RecordResult, Verdict, judge
+from sysid.judging.examination import Suspicion
+from sysid.judging.score_tests import description
+from sysid.judging.starts import Starts
 from sysid.problem.faults import DataFault
 from sysid.problem.model import Parameter
 from sysid.uncertainty import Estimate, Profile, Uncertainty
@@ -60,7 +64,8 @@ class Identification:
 
     uncertainty: None where the search was not refined to a minimum. profiles: those asked for.
     folder: where ``parameters.yaml`` was written, None where nothing was. seeds: the spread over
-    several seeds, of which this is the best. faults: what is wrong with the data.
+    several seeds, of which this is the best. faults: what is wrong with the data. suspicion: what
+    the model may lack, None where that was not tested.
 
     >>> from daq import identify, record
     >>> result = identify(record("prbs.yaml"), preset="thesis", generations=2)
@@ -77,6 +82,7 @@ class Identification:
     folder: Path | None = None
     seeds: Mapping[str, Any] | None = None
     faults: tuple[DataFault, ...] = ()
+    suspicion: Suspicion | None = None
 
     @property
     def model(self) -> ProcessModel:
@@ -85,17 +91,23 @@ class Identification:
 
     @cached_property
     def verdict(self) -> Verdict:
-        """How far to trust it, and why."""
-        parts = self.training, self.validation
+        """How well outputs are predicted, whether parameters may be used, and why."""
+        parts, suspicion = (self.training, self.validation), self.suspicion
         training, validation = ([log.result for log in part] for part in parts)
-        feasible = self.estimator.feasible_
         return judge(
-            self.model, training, validation, self.uncertainty, feasible, faults=self.faults
+            self.model,
+            training,
+            validation,
+            self.uncertainty,
+            self.estimator.feasible_,
+            faults=self.faults,
+            findings=None if suspicion is None else suspicion.findings,
+            alternative=None if suspicion is None else suspicion.alternative,
         )
 
     @property
     def trust(self) -> str:
-        """The verdict in one word."""
+        """The verdict in one word, of predictions or of parameters, whichever is the lesser."""
         return self.verdict.trust
 
     @property
@@ -121,6 +133,25 @@ class Identification:
         return f"{resume_command(self.folder)}{self.trust_option}"
 
     @property
+    def alternative_command(self) -> str | None:
+        """What to type to identify the variant that explains the data better; None for none."""
+        alternative = None if self.suspicion is None else self.suspicion.alternative
+        if alternative is None or not alternative.better or self.trust_option:
+            return None
+        name = self.problem.model_name
+        logs, checks = (
+            list(dict.fromkeys(str(fitted.log.path) for fitted in part))
+            for part in (self.training, self.validation)
+        )
+        words = ["rig", "identify", *logs]
+        words += [word for path in checks if path not in logs for word in ("--validate", path)]
+        if self.problem.request.config is not None:
+            words += ["--config", self.problem.request.config]
+        return shlex.join(
+            [*words, "--model", f"{name}{',' if ':' in name else ':'}{alternative.name}"]
+        )
+
+    @property
     def parameters_file(self) -> Path | None:
         """Where the parameters were written."""
         return self.folder / PARAMETERS if self.folder is not None else None
@@ -137,7 +168,8 @@ class Identification:
             # How the model was used where not as it declares; ``rig replay`` uses it likewise.
             **{key: value for key, value in signals.items() if value},
             "criterion": {"name": estimator.criterion_, "reason": estimator.criterion_reason_},
-            "verdict": {"trust": verdict.trust, "reasons": list(verdict.reasons)},
+            "verdict": _verdict(verdict),
+            **({"missing": _missing(self)} if self.suspicion is not None else {}),
             "data_faults": [_fault(fault) for fault in self.faults],
             "parameters": {p.name: _parameter(self, p) for p in self.model.parameters},
             **({"initial_states": starts} if any(starts) else {}),
@@ -214,6 +246,56 @@ class Identification:
 
 def _fault(fault: DataFault) -> dict[str, Any]:
     return {**asdict(fault), "records": list(fault.records), "sentence": fault.sentence}
+
+
+def _verdict(verdict: Verdict) -> dict[str, Any]:
+    statements = {"predictions": verdict.predicted, "parameters": verdict.parameters}
+    return {
+        "trust": verdict.trust,
+        "reasons": list(verdict.reasons),
+        **{k: {"trust": s.trust, "reasons": list(s.reasons)} for k, s in statements.items()},
+        "notes": list(verdict.notes),
+    }
+
+
+def _missing(identification: Identification) -> dict[str, Any]:
+    """What score tests found, and the variant that was fitted for it."""
+    suspicion, command = identification.suspicion, identification.alternative_command
+    assert suspicion is not None
+    alternative = suspicion.alternative
+    document: dict[str, Any] = {
+        "findings": [
+            {
+                "what": description(finding),
+                "kind": finding.kind,
+                "name": finding.name,
+                **({"of": finding.of} if finding.of else {}),
+                "amplitude": finding.amplitude,
+                "p_value": float(f"{finding.p_value:.3g}"),
+                "moves": {
+                    move.quantity.name: {
+                        "from": float(move.quantity.value),
+                        "to": float(move.quantity.value + move.change),
+                        "standard_deviations": round(float(move.deviations), 3),
+                    }
+                    for move in finding.moves
+                },
+            }
+            for finding in suspicion.findings
+        ]
+    }
+    if alternative is not None:
+        document["fitted"] = {
+            "name": alternative.name,
+            "better": bool(alternative.better),
+            **({"command": command} if command is not None else {}),
+            "fit_percent": {k: list(pair) for k, pair in alternative.fits.items()},
+            "values": {
+                name: {"from": float(old), "to": float(new), "unit": unit}
+                for name, (old, new, unit) in alternative.values.items()
+            },
+        }
+    return document
 
 
 def _parameter(identification: Identification, parameter: Parameter) -> dict[str, Any]:
@@ -312,16 +394,46 @@ def errors_document(model: ProcessModel, metrics: Metrics) -> dict[str, dict[str
     }
 
 
+def _in_parts_of_noise(result: RecordResult, j: int) -> dict[str, float]:
+    """How large an output's residuals are in parts of what a right model leaves, where known."""
+    if result.floor is None or not result.floor.known[j]:
+        return {}
+    figures = {"ratio": result.floor.ratio[j], "p_value": result.floor.p_value[j]}
+    return {f"residual_to_noise_{key}": float(f"{value:.4g}") for key, value in figures.items()}
+
+
 def _log(model: ProcessModel, log: FittedLog) -> dict[str, Any]:
     """Errors and residual tests of each output on one log."""
     residuals, outputs = log.result.residuals, {}
     for j, (name, errors) in enumerate(errors_document(model, log.result.metrics).items()):
         outputs[name] = {
             **errors,
+            **_in_parts_of_noise(log.result, j),
             "residual_autocorrelation_in_band": float(residuals.white[j]),
             "residual_independent_of": {
                 model.input_names[i]: float(residuals.independent[j, i])
                 for i in np.flatnonzero(residuals.tested)
             },
         }
-    return {"log": str(log.log.path), "name": log.result.name, "outputs": outputs}
+    entry = {"log": str(log.log.path), "name": log.result.name, "outputs": outputs}
+    return {**entry, **_starts(model, log.result.starts)}
+
+
+def _starts(model: ProcessModel, starts: Starts | None) -> dict[str, Any]:
+    """Where a free run started, by state, and its fits from the first sample instead."""
+    if starts is None or not starts.estimates:
+        return {}
+    entries = {
+        start.state: {
+            "value": start.value,
+            "unit": start.unit,
+            **({"first_sample": start.first} if np.isfinite(start.first) else {}),
+            "range": [start.low, start.high],
+            "on_end": start.on_end,
+        }
+        for start in starts.estimates
+    }
+    if starts.first_fit is None:
+        return {"starts": entries}
+    fits = dict(zip(model.output_names, starts.first_fit.tolist(), strict=True))
+    return {"starts": entries, "fit_percent_from_first_sample": fits}

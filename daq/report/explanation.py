@@ -73,7 +73,7 @@ def _determined(document: Mapping[str, Any], rows: Rows) -> str:
         return f"The data determine all {alone} free parameters, each by itself."
     combined = f" and {_count(together, 'combination')} of others" if together else ""
     outputs = "; the model's outputs are as good with any of their values that fit"
-    usable = "" if document["verdict"]["trust"] == "poor" else outputs
+    usable = "" if document["verdict"]["predictions"]["trust"] == "poor" else outputs
     return (
         f"The data determine {alone} of {_count(free, 'free parameter')} by themselves{combined}"
         f". The rest is not to be used one by one{usable}."
@@ -136,8 +136,8 @@ def _baseline_sentence(comparison: Mapping[str, Any]) -> str:
 
 def _steps(document: Mapping[str, Any], rows: Rows) -> list[Step]:
     """What a reader may do with the result, or to better it: the most useful first."""
-    steps = _cures(rows)
-    if document["verdict"]["trust"] != "poor":
+    verdict, steps = document["verdict"], _cures(rows)
+    if verdict["predictions"]["trust"] != "poor":
         use = (
             "Use the model for inputs like those of the logs; it is proven for no others. To "
             "simulate it on another log of the rig:"
@@ -148,6 +148,10 @@ def _steps(document: Mapping[str, Any], rows: Rows) -> list[Step]:
         steps.insert(0, Step(use, command=command + trust_option(document["model"])))
     elif not steps:
         steps.append(Step("See in the residuals below when and where the model errs."))
+    fitted = document.get("missing", {}).get("fitted", {})
+    if fitted.get("better"):
+        lacking = f"Identify with {fitted['name']}, which explains these data better:"
+        steps.insert(0, Step(lacking, command=fitted.get("command", "")))
     if not rows.logs["validation"]:
         judge = "Judge it on data that it has not seen, with another log:"
         steps.insert(0, Step(judge, command="--validate LOG"))

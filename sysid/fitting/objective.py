@@ -107,8 +107,10 @@ class Objective:
         return self._with(weights=weights / weights.sum())
 
     def on(self, records: Sequence[Dataset]) -> Objective:
-        """The same objective, scales included, on as many records of the same lengths."""
-        return self._with(records=list(records))
+        """The same objective, scales included, on the first of its records, or parts of them."""
+        counts = sum(np.isfinite(record.outputs).sum(axis=0) for record in records)
+        scales = self.scales[: len(records)]
+        return self._with(records=list(records), counts=counts, scales=scales)
 
     def finer(self, accuracy: float) -> Objective:
         """The same objective by simulations of another accuracy, stiff ones given the steps."""

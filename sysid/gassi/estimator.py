@@ -271,7 +271,7 @@ class GASSI(RecordEstimator):
         and initial states that the model leaves open are estimated from its outputs.
         """
         check_is_fitted(self, "vector_")
-        simulator = self._simulator()
+        simulator = self.simulator()
         if isinstance(X, Dataset):
             return free_run(simulator, self.vector_, X)
         inputs, parts = self._inputs(X, reset=False), []
@@ -298,7 +298,7 @@ class GASSI(RecordEstimator):
 
         X, y, records: those of ``fit``. Raises ModelError unless refinement ended in a minimum.
         """
-        return uncertainty(self._final_objective(X, y, records), self.chromosome_, self._rivals)
+        return uncertainty(self.final_objective(X, y, records), self.chromosome_, self._rivals)
 
     @one_thread()
     def profile(
@@ -309,15 +309,20 @@ class GASSI(RecordEstimator):
         X, y, records: those of ``fit``. Raises ModelError as ``uncertainty``, and for a parameter
         that is not free.
         """
-        return profile(self._final_objective(X, y, records), self.chromosome_, name)
+        return profile(self.final_objective(X, y, records), self.chromosome_, name)
 
     @property
     def rivals_(self) -> list[dict[str, float]]:
         """All the model's parameters in each further minimum that explains the data as well."""
         return [self._named(self.space_.full(rival)) for rival in self._rivals]
 
-    def _final_objective(self, X: Data, y: FloatArray | None, records: Any) -> Objective:
-        """The objective at whose minimum ``fit`` ended."""
+    def final_objective(
+        self, X: Data, y: FloatArray | None = None, records: Any = None
+    ) -> Objective:
+        """The objective at whose minimum ``fit`` ended.
+
+        X, y, records: those of ``fit``. Raises ModelError as ``uncertainty``.
+        """
         check_is_fitted(self, "vector_")
         if not PRESETS[self.preset].refine:
             raise ModelError(f"preset {self.preset} has no local refinement, so no intervals")
@@ -347,7 +352,7 @@ class GASSI(RecordEstimator):
         """The error that ``fit`` minimises over ``space_``."""
         kind = CegaObjective if self._preset().squares else Objective
         return kind(
-            self._simulator(),
+            self.simulator(),
             self.space_,
             records,
             per_log=self.per_log,
@@ -361,7 +366,8 @@ class GASSI(RecordEstimator):
             raise ModelError("GASSI needs a process model: GASSI(model)")
         return self.model
 
-    def _simulator(self) -> BatchSimulator:
+    def simulator(self) -> BatchSimulator:
+        """The model's simulator, by the estimator's settings."""
         return BatchSimulator(
             self._model(), accuracy=self.accuracy, threads=self.threads, max_steps=self.max_steps
         )

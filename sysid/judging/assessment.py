@@ -1,13 +1,23 @@
-"""How far an identified model may be trusted: its errors, residuals, intervals, in one verdict."""
+"""The verdict on an identification: how well outputs are predicted, and whether parameters hold.
+
+The two are different things. A model of the wrong structure may predict well what is like the
+data, with parameters that are not the plant's; one of the right structure may have every parameter
+right and predict hardly more than noise hides.
+"""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
 
-from sysid.arrays import FloatArray
+from sysid.arrays import BoolArray, FloatArray
+from sysid.judging.alternatives import Alternative
+from sysid.judging.expected_errors import ExpectedErrors, FloorTest, floor_test
 from sysid.judging.residual_tests import ResidualTest, residual_test
+from sysid.judging.score_tests import Finding, description
+from sysid.judging.starts import Starts
 from sysid.problem.data import Dataset
 from sysid.problem.faults import DataFault
 from sysid.problem.metrics import Metrics, evaluate, mean_known
@@ -19,42 +29,101 @@ Trust = Literal["good", "limited", "poor"]
 # Validation errors in parts of the training errors: what chance does, and what is not the same
 # system any more.
 _HARDLY_WORSE, _FAR_WORSE = 1.3, 2.0
+# Of an output's deviation, below which an error, or what is left of an input, is nothing to mend;
+# and below which it says nothing of parameters either.
+_SMALL, _TRACE = 0.01, 5e-3
 _INDEPENDENT = 0.75  # share of lags inside a 95 % band below which something is left
+_BANDS = 3.0  # mean of the first correlations in parts of their bands, above which it is as well
 _FITTED = 50.0  # fit [%] below which a model explains little
-_EXACT = 99.0  # fit [%] above which an error several times as large is still a small one
 # Correlation with an input below which what is left is found in long records, but is nothing to
 # mend: one per cent of the residuals' variance.
 _NOTICEABLE = 0.1
 # Of an output's variance, beyond which what a model leaves may have moved its parameters, and share
 # of the autocorrelations inside their band, below which it is no noise of that output's sensor.
-_MUCH, _WANDERS = 0.05, 0.25
+_MUCH, _WANDERS = 0.025, 0.25
+# Residuals in parts of what is to be expected of a right model, above which there is more in them
+# than noise, and the probability below which it is not by chance.
+_ABOVE_NOISE, _BY_CHANCE = 1.25, 0.01
+# Standard deviations by which what is missing moves a parameter: an interval reaches 1.96. And
+# share of the residuals that it explains, from where it counts whatever it moves.
+_MOVED, _LARGE = 1.5, 0.25
 
 
 @dataclass(frozen=True)
 class RecordResult:
-    """A model's errors on a record; ``simulated``: whether its free run came to the end."""
+    """A model's errors on a record; ``simulated``: whether its free run came to the end.
+
+    floor: residuals in parts of what a right model leaves; None where nothing is known of that.
+    starts: initial states that were estimated from the record.
+    """
 
     name: str
     simulated: bool
     metrics: Metrics
     residuals: ResidualTest
+    floor: FloorTest | None = None
+    starts: Starts | None = None
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """How far to trust, and why: a sentence for each reason, the gravest first."""
+class Statement:
+    """How far to trust something, and why: a sentence for each reason, the gravest first."""
 
     trust: Trust
     reasons: tuple[str, ...]
 
+    @classmethod
+    def of(cls, grave: Sequence[str], light: Sequence[str], praise: str) -> "Statement":
+        """Poor for a grave reason, limited for a light one, else good, for which praise stands."""
+        if grave:
+            return cls("poor", (*grave, *light))
+        return cls("limited", tuple(light)) if light else cls("good", (praise,))
 
-def examine(record: Dataset, simulated: FloatArray) -> RecordResult:
-    """Errors and residual tests of a model's free run, (n_samples, n_outputs), on a record."""
+
+@dataclass(frozen=True)
+class Verdict:
+    """How well outputs are predicted, whether parameters may be used, and what was not tested.
+
+    notes: what was found but takes nothing away, and what could not be tested.
+    """
+
+    predicted: Statement
+    parameters: Statement
+    notes: tuple[str, ...] = ()
+
+    @property
+    def trust(self) -> Trust:
+        """The lesser of both."""
+        order: tuple[Trust, ...] = ("poor", "limited", "good")
+        return min(self.predicted.trust, self.parameters.trust, key=order.index)
+
+    @cached_property
+    def reasons(self) -> tuple[str, ...]:
+        """Reasons why not good, those of predictions first; of a good verdict both praises."""
+        both = self.predicted, self.parameters
+        doubtful = [s for s in both if s.trust != "good"] or both
+        return tuple(dict.fromkeys(reason for s in doubtful for reason in s.reasons))
+
+
+def examine(
+    record: Dataset,
+    simulated: FloatArray,
+    expected: ExpectedErrors | None = None,
+    starts: Starts | None = None,
+) -> RecordResult:
+    """Errors and residual tests of a model's free run, (n_samples, n_outputs), on a record.
+
+    expected: errors that a right model makes on it; None where nothing is known of them.
+    """
+    residual = record.outputs - simulated
+    systematic = None if expected is None else expected.systematic
     return RecordResult(
         record.name,
         bool(np.all(np.isfinite(simulated))),
         evaluate(record.outputs, simulated),
-        residual_test(record.outputs - simulated, record.inputs, record.input_noise),
+        residual_test(residual, record.inputs, record.input_noise, systematic=systematic),
+        None if expected is None else floor_test(residual, expected),
+        starts,
     )
 
 
@@ -64,33 +133,76 @@ def judge(
     validation: Sequence[RecordResult],
     uncertainty: Uncertainty | None,
     feasible: bool = True,
+    *,
+    findings: Sequence[Finding] | None = None,
+    alternative: Alternative | None = None,
     faults: Sequence[DataFault] = (),
 ) -> Verdict:
     """The verdict on an identification.
 
     validation: none where no records were held back. uncertainty: None without intervals.
-    feasible: whether the parameters satisfy the constraints. faults: of the data, those in doubt
-    lower it.
+    feasible: whether the parameters satisfy the constraints. findings: of score tests, None where
+    there were none; alternative: a variant among them that was fitted. faults: of
+    the data, of which those in doubt count.
     """
-    grave = [] if feasible else ["No parameters were found that satisfy all the constraints."]
-    light: list[str] = []
-    grave += _failed_runs(model, (*training, *validation))
-    for name, ratio, fit in _validation_errors(model, training, validation):
-        if fit < _FITTED:
-            grave.append(f"{name} is explained poorly on the validation data (fit {fit:.0f} %).")
-        elif ratio > _HARDLY_WORSE:
-            reasons = grave if ratio > _FAR_WORSE and fit < _EXACT else light
-            reasons.append(f"{name} errs {ratio:.1f} times as much in validation as in training.")
-    if not validation:
-        light.append("No data were held back for validation: the errors are those of the fit.")
-    light += [fault.sentence for fault in faults if fault.severity == "doubt"]
-    light += _input_traces(model, validation or training)
-    light += _wandering_residuals(model, validation or training)
-    if uncertainty is not None:
+    broken = [] if feasible else ["No parameters were found that satisfy all the constraints."]
+    broken += _failed_runs(model, (*training, *validation))
+    predicted = _prediction(model, training, validation, broken, faults)
+    judged = validation or training
+    doubts = [fault for fault in faults if fault.severity == "doubt"]
+    light = [fault.sentence for fault in doubts if not _voids_only(fault)]
+    if alternative is not None and alternative.better:
+        light.append(_lacking(alternative))
+    missing = [f for f in findings or () if f.kind != "variant"]
+    counting = [f for f in missing if f.farthest > _MOVED or f.share > _LARGE]
+    light += map(_moving, counting)
+    if not light:
+        light += _unexplained(model, judged)
+    if uncertainty is None:
+        light.append("The parameters have no intervals, so how surely each is known is not known.")
+    else:
         light += _parameters_on_bounds(uncertainty)
-    if grave:
-        return Verdict("poor", (*grave, *light))
-    return Verdict("limited", tuple(light)) if light else Verdict("good", _praise(validation))
+    grave = list(broken)
+    if predicted.trust == "poor" and not broken:
+        grave.append("Of a model that predicts so poorly the parameters are not the plant's.")
+    parameters = Statement.of(grave, light, _parameter_praise(findings))
+    notes = [
+        f"There, but moving no parameter by more than {_MOVED:g} of its standard deviations: "
+        f"{description(finding)}."
+        for finding in missing
+        if finding not in counting
+    ]
+    return Verdict(predicted, parameters, (*notes, *_untested(model, judged, findings)))
+
+
+def _prediction(
+    model: ProcessModel,
+    training: Sequence[RecordResult],
+    validation: Sequence[RecordResult],
+    broken: Sequence[str],
+    faults: Sequence[DataFault],
+) -> Statement:
+    """How well outputs are predicted."""
+    grave, light = list(broken), list[str]()
+    for name, ratio, fit, beyond, at_floor in _validation_errors(model, training, validation):
+        if fit < _FITTED and not at_floor:
+            grave.append(f"{name} is explained poorly on the validation data (fit {fit:.0f} %).")
+        elif ratio > _HARDLY_WORSE and beyond > _SMALL and not at_floor:
+            reasons = grave if ratio > _FAR_WORSE and beyond > _HARDLY_WORSE * _SMALL else light
+            reasons.append(f"{name} errs {ratio:.1f} times as much in validation as in training.")
+    voided = [f.sentence for f in faults if f.severity == "doubt" and f.voids_validation]
+    if voided:
+        light += voided
+    elif not validation:
+        light.append("No data were held back for validation: the errors are those of the fit.")
+    light += _input_traces(model, validation or training)
+    light += _failing_starts(validation)
+    return Statement.of(grave, light, _praise(model, validation))
+
+
+def _voids_only(fault: DataFault) -> bool:
+    """Whether a fault makes a validation none, and does nothing else."""
+    return fault.voids_validation and not fault.moves_parameters
 
 
 def _failed_runs(model: ProcessModel, results: Sequence[RecordResult]) -> Iterator[str]:
@@ -105,8 +217,12 @@ def _failed_runs(model: ProcessModel, results: Sequence[RecordResult]) -> Iterat
 
 def _validation_errors(
     model: ProcessModel, training: Sequence[RecordResult], validation: Sequence[RecordResult]
-) -> list[tuple[str, float, float]]:
-    """Each output's error in validation in parts of that in training, and its fit [%]."""
+) -> list[tuple[str, float, float, float, bool]]:
+    """Of each output: error in validation in parts of that in training, fit [%], and by how much
+
+    the error in validation is beyond that in training, in parts of the output's deviation; whether
+    it is that of the noise alone.
+    """
     if not validation:
         return []
     # Absolute, because each record has its own largest output.
@@ -114,16 +230,38 @@ def _validation_errors(
         np.sqrt(mean_known([(r.metrics.rmse * r.metrics.scale) ** 2 for r in results], 0))
         for results in (training, validation)
     )
+    fits = mean_known([r.metrics.fit for r in validation], 0)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratios = validated / trained
-    fits = mean_known([r.metrics.fit for r in validation], 0)
-    return list(zip(model.output_names, ratios.tolist(), fits.tolist(), strict=True))
+        # A fit of 90 % is an error of a tenth of the deviation.
+        beyond = (1.0 - fits / 100.0) * np.sqrt(np.maximum(1.0 - 1.0 / ratios**2, 0.0))
+    floor = ~_above_noise(validation) & _known(validation)
+    columns = (ratios, fits, beyond)
+    values = zip(*(column.tolist() for column in columns), floor.tolist(), strict=True)
+    return [(name, *row) for name, row in zip(model.output_names, values, strict=True)]
+
+
+def _known(results: Sequence[RecordResult]) -> BoolArray:
+    """Outputs whose expected errors are known on every record, (n_outputs,)."""
+    if any(result.floor is None for result in results):
+        return np.zeros(len(results[0].metrics.rmse), dtype=bool)
+    everywhere: BoolArray = np.all([r.floor.known for r in results if r.floor is not None], axis=0)
+    return everywhere
+
+
+def _above_noise(results: Sequence[RecordResult]) -> BoolArray:
+    """Outputs that on some record err by more than a right model would, (n_outputs,)."""
+    above = np.zeros(len(results[0].metrics.rmse), dtype=bool)
+    limit = _BY_CHANCE / len(results)
+    for floor in (result.floor for result in results if result.floor is not None):
+        with np.errstate(invalid="ignore"):
+            above |= (floor.ratio > _ABOVE_NOISE) & (floor.p_value < limit)
+    return above
 
 
 def _input_traces(model: ProcessModel, results: Sequence[RecordResult]) -> Iterator[str]:
-    """Reasons: outputs whose residuals still follow an input."""
-    shares, sizes = _input_correlations(results)
-    follows = (shares < _INDEPENDENT) & (sizes > _NOTICEABLE)
+    """Reasons: outputs that could be predicted better from an input."""
+    follows = _follows(results) & (_input_parts(results) > _SMALL)
     for output, following in zip(model.output_names, follows, strict=True):
         if following.any():
             inputs = [model.input_names[i] for i in np.flatnonzero(following)]
@@ -133,6 +271,27 @@ def _input_traces(model: ProcessModel, results: Sequence[RecordResult]) -> Itera
             )
 
 
+def _failing_starts(validation: Sequence[RecordResult]) -> Iterator[str]:
+    """Reasons: records on which a start, not the model, is what fails."""
+    for result in validation:
+        for start in result.starts.estimates if result.starts is not None else ():
+            if start.on_end:
+                yield (
+                    f"On {result.name} {start.state} starts at an end of its range, "
+                    f"{start.value:.3g} {start.unit}: the start may be what fails there. Widen its "
+                    "range under 'initial'."
+                )
+
+
+def _follows(results: Sequence[RecordResult]) -> BoolArray:
+    """Where residuals follow an input by share or by size, noticeably, (n_outputs, n_inputs)."""
+    shares, sizes = _input_correlations(results)
+    bands = mean_known([result.residuals.first_bands for result in results], 0)
+    with np.errstate(invalid="ignore"):
+        follows: BoolArray = ((shares < _INDEPENDENT) | (bands > _BANDS)) & (sizes > _NOTICEABLE)
+    return follows & np.isfinite(shares)
+
+
 def _input_correlations(results: Sequence[RecordResult]) -> tuple[FloatArray, FloatArray]:
     """Share of correlations inside their band and the largest, (n_outputs, n_inputs), means."""
     shares = mean_known([result.residuals.independent for result in results], 0)
@@ -140,17 +299,39 @@ def _input_correlations(results: Sequence[RecordResult]) -> tuple[FloatArray, Fl
     return shares, sizes
 
 
-def _wandering_residuals(model: ProcessModel, results: Sequence[RecordResult]) -> Iterator[str]:
-    """Reasons: outputs with large coloured residuals, whose cause has moved parameters as well."""
+def _input_parts(results: Sequence[RecordResult]) -> FloatArray:
+    """What is left of an input in parts of the output's deviation, (n_outputs, n_inputs)."""
+    _, sizes = _input_correlations(results)
+    left = 1.0 - mean_known([result.metrics.fit for result in results], 0) / 100.0
+    return sizes * left[:, None]
+
+
+def _unexplained(model: ProcessModel, results: Sequence[RecordResult]) -> Iterator[str]:
+    """Reasons: outputs that leave more than noise, by causes that have moved parameters as well."""
     fits = mean_known([result.metrics.fit for result in results], 0)
     shares = np.mean([result.residuals.white for result in results], axis=0)
-    for output, fit, share in zip(model.output_names, fits, shares, strict=True):
-        left = (1.0 - fit / 100.0) ** 2
-        if left > _MUCH and share < _WANDERS:
+    above, calibrated = _above_noise(results), _known(results)
+    follows, parts = _follows(results), _input_parts(results)
+    for j, output in enumerate(model.output_names):
+        left = (1.0 - fits[j] / 100.0) ** 2
+        if above[j]:
+            ratio = max(float(r.floor.ratio[j]) for r in results if r.floor is not None)
+            yield (
+                f"{output} errs {ratio:.1f} times as much as its sensors' noise explains: "
+                "something is missing, and parameters that act on it may be off by more than "
+                "their intervals."
+            )
+        elif left > _MUCH and shares[j] < _WANDERS and not calibrated[j]:
             yield (
                 f"{100.0 * left:.0f} % of {output}'s variance is left, and wanders: noise of "
                 "a measured input that came through the plant, or dynamics that the model lacks. "
                 "Parameters that act on it may be off by more than their intervals."
+            )
+        elif (follows[j] & (parts[j] > _TRACE)).any() and not calibrated[j]:
+            inputs = [model.input_names[i] for i in np.flatnonzero(follows[j])]
+            yield (
+                f"What is left of {output} follows {' and '.join(inputs)}: parameters that act on "
+                "it may be off by more than their intervals."
             )
 
 
@@ -162,17 +343,78 @@ def _parameters_on_bounds(uncertainty: Uncertainty) -> Iterator[str]:
         yield f"{', '.join(names)} {verb} on an end of the range: widen it, or fix the value."
 
 
-def _praise(validation: Sequence[RecordResult]) -> tuple[str]:
-    """The reason for a good verdict."""
+def _lacking(alternative: Alternative) -> str:
+    """Reason: a variant that explains the data better."""
+    fits = [
+        f"{name} {old:.0f} -> {new:.0f} %"
+        for name, (old, new) in alternative.fits.items()
+        if new - old >= 1.0
+    ]
+    moved = [
+        f"{name} {old:.3g} -> {new:.3g}" + (f" {unit}" if unit not in ("", "1") else "")
+        for name, (old, new, unit) in list(alternative.values.items())[:3]
+    ]
+    effect = ", ".join([*fits, *moved]) or "it explains the training data better"
+    return f"The model lacks {alternative.name}; fitted with it: {effect}."
+
+
+def _moving(finding: Finding) -> str:
+    """Reason: something missing that moves parameters."""
+    moved = [
+        f"{m.quantity.name} {m.quantity.value:.3g} -> {m.quantity.value + m.change:.3g}"
+        for m in finding.moves[:3]
+        if abs(m.deviations) > 1.0
+    ]
+    chance = "p < 1e-9" if finding.p_value < 1e-9 else f"p = {finding.p_value:.0e}"
+    text = description(finding)
+    says = "The data ask for " if finding.amplitude is None else ""
+    effect = (
+        f"with that {', '.join(moved)}"
+        if moved
+        else f"{100.0 * finding.share:.0f} % of what is left"
+    )
+    return f"{says}{text} ({chance}); {effect}."
+
+
+def _untested(
+    model: ProcessModel, results: Sequence[RecordResult], findings: Sequence[Finding] | None
+) -> Iterator[str]:
+    """What could not be tested, and for want of what."""
+    tested = _known(results)
+    names = [n for n, is_tested in zip(model.output_names, tested, strict=True) if not is_tested]
+    if names:
+        yield (
+            f"The noise of {', '.join(names)} is not known from a calibration: whether more could "
+            "be explained is not tested."
+        )
+    if findings is None:
+        yield "What the model may lack was not tested."
+
+
+def _parameter_praise(findings: Sequence[Finding] | None) -> str:
+    """The reason for parameters that hold."""
+    if findings is None:
+        return "Nothing speaks against the parameters' intervals."
+    return "Nothing was found missing that would move a parameter beyond its interval."
+
+
+def _praise(model: ProcessModel, validation: Sequence[RecordResult]) -> str:
+    """The reason for good predictions."""
+    if not validation:
+        return ""
     fit = float(mean_known([result.metrics.fit for result in validation]))
     shares, sizes = _input_correlations(validation)
     traces = sizes[shares < _INDEPENDENT]
     reason = (
         f"Data not used in the fit are explained as well as those that were (mean fit {fit:.1f} %)"
     )
+    at_noise = _known(validation) & ~_above_noise(validation)
+    if at_noise.any():
+        names = [n for n, at in zip(model.output_names, at_noise, strict=True) if at]
+        reason += f", {', '.join(names)} down to the noise"
     if len(traces):
         reason += ", and of the inputs no more than a trace is left in the residuals "
         reason += f"(correlations of at most {traces.max():.2f})"
     elif np.isfinite(shares).any():
         reason += ", and nothing of the inputs is left in the residuals"
-    return (f"{reason}.",)
+    return f"{reason}."

@@ -11,6 +11,7 @@ import numpy as np
 from sysid.arrays import BoolArray, FloatArray, IntArray
 from sysid.uncertainty.estimate import Z95
 
+_FIRST = 5  # lags
 _LEAST_VARIANCE = 0.05  # of a correlation, in parts of 1/n: estimated ones can turn out negative
 
 
@@ -40,6 +41,12 @@ class ResidualTest:
         return share
 
     @property
+    def first_bands(self) -> FloatArray:
+        """|mean| of the first correlations with an input, in parts of its band, (q, m)."""
+        first = np.abs(np.mean(self.cross[:_FIRST], axis=0)) / self.cross_band
+        return np.where(self.tested, first, np.nan)
+
+    @property
     def independent(self) -> FloatArray:
         """Share of lags inside the band, (n_outputs, n_inputs), 0.95 expected; NaN if untested."""
         return np.where(self.tested, np.mean(np.abs(self.cross) <= self.cross_band, axis=0), np.nan)
@@ -50,11 +57,14 @@ def residual_test(
     inputs: FloatArray,
     input_noise: FloatArray | None = None,
     n_lags: int = 50,
+    systematic: FloatArray | None = None,
 ) -> ResidualTest:
     """Correlations of measured minus simulated, (n, n_outputs), NaN where a sample was lost.
 
     inputs: (n, n_inputs); input_noise: (n_inputs,), standard deviation of the noise that they were
-    measured with. n_lags: at most a quarter of the record is used.
+    measured with. n_lags: at most a quarter of the record is used. systematic: (n, n_outputs, k),
+    independent errors, by a standard deviation each, that a right model may make and that go with
+    the inputs: its bands are wider by them.
     """
     n_lags = max(2, min(n_lags, len(residual) // 4))
     seen = np.isfinite(residual)
@@ -66,6 +76,8 @@ def residual_test(
     # Both being coloured widens the band: sum over k of R_e(k) R_u(k) / n is the variance.
     widening = 1.0 + 2.0 * np.einsum("ko,ki->oi", auto[1:], driving[1:])
     variance = np.maximum(widening, _LEAST_VARIANCE) / counted[:, None]
+    if systematic is not None:
+        variance = variance + _systematic_variance(systematic, residual, u, n_lags)
     noisy = np.zeros(inputs.shape[1]) if input_noise is None else np.asarray(input_noise)
     return ResidualTest(
         lags=np.arange(n_lags),
@@ -75,6 +87,21 @@ def residual_test(
         cross_band=Z95 * np.sqrt(variance),
         tested=(noisy == 0.0) & np.any(u != 0.0, axis=0),
     )
+
+
+def _systematic_variance(
+    systematic: FloatArray, residual: FloatArray, u: FloatArray, n_lags: int
+) -> FloatArray:
+    """Largest variance, over the lags, of correlations that systematic errors make, (q, m)."""
+    deviation = np.nanstd(residual, axis=0)
+    scaled = systematic / np.where(deviation > 0.0, deviation, np.inf)[:, None]
+    n, q, count = scaled.shape
+    scaled = np.where(np.isfinite(scaled), scaled - scaled.mean(axis=0), 0.0).reshape(n, -1)
+    largest = np.zeros((q, u.shape[1]))
+    for lag in range(n_lags):
+        correlations = (_products(scaled, u, lag) / n).reshape(q, count, u.shape[1])
+        largest = np.maximum(largest, np.sum(correlations**2, axis=1))
+    return largest
 
 
 def _standard(values: FloatArray) -> FloatArray:

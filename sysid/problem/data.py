@@ -19,8 +19,9 @@ class Dataset:
     lost, so that a gap keeps its length in time. SI units, columns in the model's order.
     input_zero, output_zero: (n_inputs,) and (n_outputs,), standard deviation of a constant error
     that the channel may have had throughout, as an offset calibration leaves it; input_noise:
-    (n_inputs,), standard deviation of the white noise on measured inputs. Default none; they
-    widen the intervals of what is identified.
+    (n_inputs,), standard deviation of the white noise on measured inputs; they widen the intervals
+    of what is identified. output_noise: (n_outputs,), that of the outputs, below which no model's
+    errors can be; 0 where it is not known. Default none.
 
     Raises ModelError for mismatched shapes, fewer than two rows, complex numbers, inputs that are
     not finite, or infinite outputs.
@@ -37,6 +38,7 @@ class Dataset:
     input_zero: FloatArray = field(default_factory=lambda: np.zeros(0))
     output_zero: FloatArray = field(default_factory=lambda: np.zeros(0))
     input_noise: FloatArray = field(default_factory=lambda: np.zeros(0))
+    output_noise: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         for name in ("inputs", "outputs"):
@@ -51,7 +53,7 @@ class Dataset:
             raise ModelError(f"{self.name}: sample time {self.dt} s must be positive")
         self._refuse(~np.isfinite(self.inputs), "input", "mend it, or cut the record there")
         self._refuse(np.isinf(self.outputs), "output", "write NaN for a sample that was lost")
-        for name in ("input_zero", "output_zero", "input_noise"):
+        for name in ("input_zero", "output_zero", "input_noise", "output_noise"):
             object.__setattr__(self, name, self._deviations(name))
 
     def _table(self, name: str) -> FloatArray:

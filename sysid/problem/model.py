@@ -171,7 +171,9 @@ class ProcessModel:
     label; without it the mean inputs decide.
     ``regressors(record)`` computes signals that linear baselines may have as inputs, see
     ``sysid.problem.regressors``.
-    ``equations`` say to people what the functions compute, one text each.
+    ``equations`` say to people what the functions compute, one text each. ``variants()`` gives
+    models of the same states and inputs that have what this one may lack, by the option that makes
+    them, such as ``friction=stribeck``.
 
     Raises ModelError when names repeat, an output has no state, or a function returns the
     wrong number of values at the nominal parameters.
@@ -202,6 +204,7 @@ class ProcessModel:
     operating_points: Callable[[Any, Any], Mapping[str, Mapping[str, float]]] | None = None
     regressors: Callable[[Any], Mapping[str, Any]] | None = None
     equations: tuple[str, ...] = ()
+    variants: Callable[[], Mapping[str, ProcessModel]] | None = None
 
     def __post_init__(self) -> None:
         for kind in ("states", "inputs", "outputs", "parameters", "constraints", "equations"):

@@ -138,7 +138,7 @@ def page(result, work):
 
 
 def test_files_are_there_and_named_after_the_printed_result(result, work):
-    printed = result.stdout.index("Trust: ")
+    printed = result.stdout.index("Predictions: ")
     assert result.stdout.index("Report: found/report.html") > printed
     assert {path.name for path in (work / "found").iterdir()} == {
         "parameters.yaml", "report.html", "report.json", "parameters.tex", "figures",
@@ -204,7 +204,8 @@ def test_errors_stand_beside_those_of_a_linear_model(page, document):
 
 
 def test_verdict_in_two_sentences_and_how_to_do_it_again(page, document, work, rig):
-    assert f"Trust: {document['verdict']['trust']}." in page.text
+    for subject in ("predictions", "parameters"):
+        assert f"{subject.capitalize()}: {document['verdict'][subject]['trust']}." in page.text
     assert re.search(r"determine 2 of 4 free parameters by themselves and 1 comb", page.text)
     # What would tell more is known: one of the two that act together.
     (ambiguity,) = document["ambiguities"]

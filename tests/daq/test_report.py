@@ -178,16 +178,20 @@ def test_residual_tests_and_verdict_are_those_of_the_document(told):
     shares = (output["residual_autocorrelation_in_band"], independent["u"], independent["w"])
     assert cells == ["y", *(f"{100.0 * share:.0f} %" for share in shares)]
     assert document["verdict"]["trust"] == "limited"
-    reasons = document["verdict"]["reasons"]
-    assert reasons[-1].startswith("c stands on an end of the range")
-    assert f"Trust: limited. {' '.join(reasons)}" in text
+    for subject in ("predictions", "parameters"):
+        statement = document["verdict"][subject]
+        said = f"{subject.capitalize()}: {statement['trust']}. {' '.join(statement['reasons'])}"
+        assert said in text
+    assert statement["reasons"][-1].startswith("c stands on an end of the range")
+    # Where an end of a range decides, what is left says nothing of what is missing.
+    assert "What the model may lack was not tested." in document["verdict"]["notes"]
 
 
 @pytest.mark.soak
 def test_without_validation_the_residuals_are_those_of_the_training(command, folder):
     result = command(("identify", "training.csv", "--config", "id.yaml", "--out", "alone"), folder)
     assert "Residuals, training: share of correlations" in result.stdout
-    assert "Trust: limited. No data were held back for validation" in result.stdout
+    assert "Predictions: limited. No data were held back for validation" in result.stdout
 
 
 def test_json_is_what_the_file_holds(identify, folder, told):
@@ -224,7 +228,8 @@ def test_fixing_what_should_be_measured_gives_all_the_rest(identify):
 def test_the_thesis_preset_has_no_intervals_and_says_nothing_of_them(identify, folder):
     text = identify("--preset", "thesis", "--out", "thesis")
     assert "95 % interval" not in text and "act only together" not in text
-    assert "Determined" not in text and "Trust: " in text
+    assert "Determined: " not in text and "Parameters: limited. " in text
+    assert "The parameters have no intervals" in text
     document = yaml.safe_load((folder / "thesis" / "parameters.yaml").read_text())
     assert not {"ambiguities", "determined_directions", "correlations"} & set(document)
     for entry in document["parameters"].values():

@@ -1,0 +1,96 @@
+"""A variant of the model, fitted because the residuals ask for it, and whether it is better."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sysid.arrays import FloatArray
+from sysid.gassi import GASSI
+from sysid.judging.comparison import Candidate, Comparison, compare
+from sysid.judging.score_tests import Finding
+from sysid.judging.suspects import variants_of
+from sysid.problem.data import Dataset
+from sysid.problem.metrics import fit_percent, mean_known
+from sysid.problem.model import ModelError
+from sysid.uncertainty import Uncertainty
+
+# A difference of BIC above this is very strong evidence (Kass & Raftery, "Bayes factors",
+# J. American Statistical Association 90, 1995).
+_STRONG = 10.0
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """A variant that was fitted as well.
+
+    name: the option that makes it. better: whether it explains training by more than its further
+    parameters would by chance, and validation no worse. fits: by output, fit [%] of the model and
+    of the variant, on validation where there is any. values: quantities that the model determines
+    and the variant has elsewhere: value of the model, of the variant, unit; the farthest first.
+    """
+
+    name: str
+    better: bool
+    fits: dict[str, tuple[float, float]]
+    values: dict[str, tuple[float, float, str]]
+    comparison: Comparison
+
+
+def best_alternative(
+    findings: Sequence[Finding],
+    estimator: GASSI,
+    uncertainty: Uncertainty,
+    training: Sequence[Dataset],
+    validation: Sequence[Dataset] = (),
+) -> Alternative | None:
+    """The surest variant among findings, fitted with the settings of an estimator.
+
+    None where no variant is among them, or none of its simulations succeeds.
+    """
+    named = [finding.name for finding in findings if finding.kind == "variant"]
+    if not named or estimator.model is None:
+        return None
+    variant = variants_of(estimator.model)[named[0]]
+    settings = {**estimator.get_params(deep=False), "model": variant}
+    try:
+        fitted = GASSI(**settings).fit(list(training))
+    except ModelError:
+        return None
+    pair = [(_MODEL, estimator), (named[0], fitted)]
+    candidates = [Candidate.of(name, e, training, validation) for name, e in pair]
+    comparison = compare(candidates, training, validation)
+    rows = {row.name: row for row in comparison.rows}
+    better = rows[_MODEL].dbic - rows[named[0]].dbic > _STRONG and rows[named[0]].good
+    runs = [c.validation if validation else c.training for c in candidates]
+    fits = [_fits(validation or training, run) for run in runs]
+    names = variant.output_names
+    return Alternative(
+        named[0],
+        better,
+        {n: (float(a), float(b)) for n, a, b in zip(names, *fits, strict=True)},
+        _moved(uncertainty, fitted.parameters_),
+        comparison,
+    )
+
+
+_MODEL = "the model"
+
+
+def _fits(records: Sequence[Dataset], runs: Sequence[FloatArray]) -> FloatArray:
+    pairs = zip(records, runs, strict=True)
+    return mean_known(np.stack([fit_percent(r.outputs, run) for r, run in pairs]), 0)
+
+
+def _moved(
+    uncertainty: Uncertainty, parameters: dict[str, float]
+) -> dict[str, tuple[float, float, str]]:
+    """Determined quantities that the variant has outside of their intervals, the farthest first."""
+    moved = []
+    for estimate in uncertainty.determined():
+        shared = all(name in parameters for name, _ in estimate.terms)
+        if shared and estimate.std and estimate.excludes(parameters):
+            value = estimate.at(parameters)
+            far = abs(value - estimate.value) / estimate.std
+            moved.append((far, estimate.name, (estimate.value, value, estimate.unit)))
+    return {name: values for _, name, values in sorted(moved, key=lambda m: -m[0])}

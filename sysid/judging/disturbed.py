@@ -1,0 +1,159 @@
+"""How outputs move when something is added to a model's equations, without a model of its own.
+
+Of dx/dt = f(x, u, p) + eps phi(x, u) the outputs move by eps times the response of the linearised
+equations to the signal phi(x(t), u(t)) along the undisturbed run, but for terms of eps^2. So one
+compiled model with a further input added to every equation tells what any function in any
+equation would do: the function's values along the run are that input's samples.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from sysid.arrays import FloatArray
+from sysid.engine.stepper import Stepper
+from sysid.problem.data import Dataset
+from sysid.problem.model import Input, ModelError, ProcessModel
+
+_ACCURACY = 1e-6
+_BASE_STEPS = 2
+_SMALL = 1e-3  # a disturbance in parts of what it is added to
+
+
+def with_added_inputs(model: ProcessModel) -> ProcessModel:
+    """The model with an input added to each state's rate, and all its states among the outputs.
+
+    >>> from sysid.examples import lag
+    >>> with_added_inputs(lag()).derivative((1.0,), (0.0, 7.0), (2.0, 0.5))
+    (5.0,)
+    """
+    n, derivative, output = len(model.inputs), model.derivative, model.output
+    names = set(model.output_names)
+    states = [name for name in model.state_names if name not in names]
+    whole = model.with_outputs([*model.output_names, *states])
+    whole_output = whole.output if output is not None else None
+    added = tuple(Input(f"added to d{s.name}/dt", f"{s.unit}/s", "foh") for s in model.states)
+    total = _sum(len(model.states))
+
+    def rates(x: Any, u: Any, p: Any) -> tuple[Any, ...]:
+        return total(derivative(x, u[:n], p), u[n:])
+
+    def outputs(x: Any, u: Any, p: Any) -> tuple[Any, ...]:
+        return whole_output(x, u[:n], p)  # type: ignore[misc]
+
+    return replace(
+        whole,
+        inputs=model.inputs + added,
+        derivative=rates,
+        output=None if whole_output is None else outputs,
+    )
+
+
+def _sum(n: int) -> Callable[[Any, Any], tuple[Any, ...]]:
+    """Sum of two tuples of n numbers, in a form that compiles."""
+    last = n - 1
+    if n == 1:
+        return lambda a, b: (a[last] + b[last],)
+    first = _sum(last)
+    return lambda a, b: (*first(a, b), a[last] + b[last])
+
+
+@dataclass(eq=False)
+class DisturbedRun:
+    """A free run of a record under parameters (n_parameters,), and what disturbances change.
+
+    start: (n_states,), where it begins. states: (n_samples, n_states) and outputs: (n_samples,
+    n_outputs) of the undisturbed run. rates: (n_samples, n_states), its f(x, u, p). Raises
+    ModelError where the run does not stay finite.
+    """
+
+    model: ProcessModel
+    vector: FloatArray
+    record: Dataset
+    start: FloatArray
+
+    def __post_init__(self) -> None:
+        whole = with_added_inputs(self.model)
+        scale = np.maximum(np.abs(self.start), 1e-3)
+        # A first run tells the states' magnitudes, by which accuracy is measured.
+        for _ in range(2):
+            self._stepper = Stepper(
+                whole,
+                self.vector,
+                self.record.dt,
+                n_steps=_BASE_STEPS,
+                scale=scale,
+                accuracy=_ACCURACY,
+            )
+            self._whole_run = self._advance(self.record.inputs, 0.0)
+            places = [whole.output_names.index(name) for name in self.model.state_names]
+            self.states = self._whole_run[:, places]
+            if not np.all(np.isfinite(self._whole_run)):
+                raise ModelError(f"model {self.model.name}: its run on {self.record.name} fails")
+            largest = np.abs(self.states).max(axis=0)
+            scale = np.where(largest > 0.0, largest, 1.0)
+        self.outputs = self._whole_run[:, : len(self.model.outputs)]
+        self.rates = self.rates_of(self.model.derivative, self.vector)
+        self._rate_size = np.sqrt(np.mean(self.rates**2, axis=0))
+
+    def rates_of(self, derivative: Callable[..., Any], vector: FloatArray) -> FloatArray:
+        """Another derivative's values along the run, (n_samples, n_states); NaN where it fails."""
+        p = tuple(vector.tolist())
+        values = np.full(self.states.shape, np.nan)
+        rows = zip(self.states.tolist(), self.record.inputs.tolist(), strict=True)
+        for row, (x, u) in zip(values, rows, strict=True):
+            try:
+                row[:] = derivative(tuple(x), tuple(u), p)
+            except (ArithmeticError, ValueError):
+                continue
+        return values
+
+    def added(self, rates: FloatArray) -> FloatArray:
+        """Change of the outputs per unit of what is added to the rates, both (n_samples, ...)."""
+        size = np.sqrt(np.mean(rates**2, axis=0))
+        moving = size > 0.0
+        if not (moving & (self._rate_size > 0.0)).any() or not np.all(np.isfinite(rates)):
+            return np.zeros_like(self.outputs)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            parts = np.where(moving & (self._rate_size > 0.0), self._rate_size / size, np.inf)
+        eps = _SMALL * float(parts.min())
+        return self._change(self.record.inputs, eps * rates, eps)
+
+    def driven(self, inputs: FloatArray) -> FloatArray:
+        """Change of the outputs per unit of a change of the inputs, (n_samples, n_inputs)."""
+        size = float(np.max(np.sqrt(np.mean(inputs**2, axis=0))))
+        given = np.sqrt(np.mean(self.record.inputs**2, axis=0))
+        changed = np.any(inputs != 0.0, axis=0)
+        if size == 0.0 or not changed.any():
+            return np.zeros_like(self.outputs)
+        eps = _SMALL * (float(given[changed].max()) or 1.0) / size
+        return self._change(self.record.inputs + eps * inputs, 0.0, eps)
+
+    def _change(self, inputs: FloatArray, rates: FloatArray | float, eps: float) -> FloatArray:
+        disturbed = self._advance(inputs, rates)[:, : self.outputs.shape[1]]
+        change: FloatArray = (disturbed - self.outputs) / eps
+        return change if np.all(np.isfinite(change)) else np.zeros_like(self.outputs)
+
+    def _advance(self, inputs: FloatArray, rates: FloatArray | float) -> FloatArray:
+        """Outputs of the model with added inputs, (n_samples, n_outputs of it)."""
+        added = np.broadcast_to(rates, (len(inputs), len(self.model.states)))
+        signals = np.hstack([inputs, added])
+        # Outputs stand at the start of every interval: the last row begins one that goes nowhere.
+        signals = np.vstack([signals, signals[-1:]])
+        return self._stepper.advance(self.start.copy(), np.ascontiguousarray(signals))[1]
+
+
+def stretched(signal: FloatArray) -> FloatArray:
+    """A signal in parts of its largest value, from its middle where it keeps one sign."""
+    low, high = float(signal.min()), float(signal.max())
+    middle = 0.0 if low < 0.0 < high else 0.5 * (low + high)
+    size = max(high - middle, middle - low)
+    return (signal - middle) / size if size > 0.0 else np.zeros_like(signal)
+
+
+def shapes(signal: FloatArray) -> Sequence[FloatArray]:
+    """Functions of a signal that together are like most: its sign, its square, its cube."""
+    z = stretched(signal)
+    return np.tanh(z / 0.03), z * np.abs(z), z**3

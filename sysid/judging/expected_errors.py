@@ -1,0 +1,147 @@
+"""How large the errors of a right model are, and of what they consist: the floor of its residuals.
+
+Noise of the outputs, as a calibration found it; noise of measured inputs, simulated through the
+plant; what the parameters' own uncertainty makes of a free run, and the error of its simulation.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+from scipy.stats import chi2
+
+from sysid.arrays import BoolArray, FloatArray
+from sysid.engine.simulation import BatchSimulator
+from sysid.judging.evidence import independent_samples
+from sysid.problem.data import Dataset
+from sysid.problem.space import SearchSpace
+
+_DRAWS = 24  # realisations of the inputs' noise: they give a variance to within 30 %
+_STEP = 1e-5  # of a search coordinate, for slopes
+_FINER = 1e-2  # part of the accuracy at which the error of a simulation shows
+
+
+class Runs(Protocol):
+    """Free runs, (n, n_samples, n_outputs), of parameter vectors on a record."""
+
+    def __call__(self, vectors: FloatArray, given: Dataset = ...) -> FloatArray:
+        """The runs of vectors, (n, n_parameters)."""
+
+
+@dataclass(frozen=True)
+class ExpectedErrors:
+    """Errors that a right model makes on a record.
+
+    noise: (n_outputs,), variance by the sensors' noise, of inputs and outputs; NaN where that of
+    the output is not known. systematic: (n_samples, n_outputs, k), errors that go with the inputs,
+    each by one standard deviation of what makes it: directions of the parameters, the simulation.
+    """
+
+    noise: FloatArray
+    systematic: FloatArray
+
+    @property
+    def variance(self) -> FloatArray:
+        """Mean square that is to be expected, (n_outputs,); NaN where the noise is not known."""
+        variance: FloatArray = self.noise + np.mean(np.sum(self.systematic**2, axis=2), axis=0)
+        return variance
+
+
+@dataclass(frozen=True)
+class FloorTest:
+    """Residuals in parts of what is to be expected, (n_outputs,) each.
+
+    ratio: root mean squares, NaN without a known noise. p_value: of one so large by chance, with
+    as many degrees of freedom as the colour of the residuals leaves.
+    """
+
+    ratio: FloatArray
+    p_value: FloatArray
+
+    @property
+    def known(self) -> BoolArray:
+        """Outputs that can be tested."""
+        return np.isfinite(self.ratio)
+
+
+def expected_errors(
+    simulator: BatchSimulator,
+    space: SearchSpace,
+    chromosome: FloatArray,
+    record: Dataset,
+    start: FloatArray,
+    covariance: FloatArray | None,
+) -> ExpectedErrors:
+    """Expected errors of a free run under an identified chromosome (n_free,) from a start.
+
+    start: (n_states,). covariance: (n_free, n_free) of its coordinates, as ``Uncertainty`` has it;
+    None for exact parameters.
+    """
+    vector = space.full(chromosome[None])[0]
+
+    def runs(vectors: FloatArray, given: Dataset = record) -> FloatArray:
+        simulated: FloatArray = simulator.trajectories(vectors, given, n_steps, start[None])
+        return np.where(np.isfinite(simulated), simulated, 0.0)
+
+    n_steps = int(simulator.steps_of_each(vector[None], record, start[None]).max())
+    undisturbed = runs(vector[None])[0]
+    systematic = []
+    if covariance is not None:
+        systematic.append(_by_parameters(runs, space, chromosome, covariance))
+    fine = simulator.finer(max(_FINER * simulator.accuracy, 1e-12))
+    exact = fine.trajectories(vector[None], record, None, start[None])[0]
+    error = np.where(np.isfinite(exact), exact - undisturbed, 0.0)
+    systematic.append(error[..., None])
+    noise = np.where(record.output_noise > 0.0, record.output_noise**2, np.nan)
+    if np.any(record.input_noise):
+        noise = noise + _by_input_noise(runs, vector, record, undisturbed)
+    return ExpectedErrors(noise, np.concatenate(systematic, axis=2))
+
+
+def _by_parameters(
+    runs: Runs, space: SearchSpace, chromosome: FloatArray, covariance: FloatArray
+) -> FloatArray:
+    """Errors (n_samples, n_outputs, k) by a deviation of each direction of the parameters."""
+    n = len(space.index)
+    at = space.encode(chromosome)
+    size = np.maximum(np.abs(chromosome), 0.05 * (space.upper - space.lower))
+    moved = np.diag(_STEP * np.where(space.log, 1.0, size))[:n]
+    pairs = space.full(space.decode(np.concatenate([at + moved, at - moved])))
+    up, down = np.split(runs(pairs), 2)
+    slopes = np.moveaxis((up - down) / (2.0 * _STEP), 0, 2)
+    values, vectors = np.linalg.eigh(covariance[:n, :n])
+    errors: FloatArray = slopes @ (vectors * np.sqrt(np.maximum(values, 0.0)))
+    return errors
+
+
+def _by_input_noise(
+    runs: Runs, vector: FloatArray, record: Dataset, undisturbed: FloatArray
+) -> FloatArray:
+    """Variance of each output by noise of the inputs, (n_outputs,)."""
+    rng, total = np.random.default_rng(0), np.zeros(undisturbed.shape[1])
+    for _ in range(_DRAWS):
+        noise = rng.standard_normal(record.inputs.shape) * record.input_noise
+        disturbed = runs(vector[None], replace(record, inputs=record.inputs + noise))[0]
+        total += np.mean((disturbed - undisturbed) ** 2, axis=0)
+    return total / _DRAWS
+
+
+def floor_test(residual: FloatArray, expected: ExpectedErrors) -> FloorTest:
+    """Chi-square tests of residuals (n_samples, n_outputs), NaN where a sample was lost.
+
+    >>> rng = np.random.default_rng(0)
+    >>> noise = rng.standard_normal((1000, 2)) * [1.0, 3.0]
+    >>> test = floor_test(noise, ExpectedErrors(np.ones(2), np.zeros((1000, 2, 0))))
+    >>> test.ratio.round().tolist(), (test.p_value < 0.01).tolist()
+    ([1.0, 3.0], [False, True])
+    """
+    variance = expected.variance
+    ratio, p_value = np.full(len(variance), np.nan), np.full(len(variance), np.nan)
+    for j in np.flatnonzero(variance > 0.0):
+        measured = residual[np.isfinite(residual[:, j]), j : j + 1]
+        if len(measured) < 2:
+            continue
+        square = float(np.mean(measured**2)) / float(variance[j])
+        freedom = independent_samples([measured])
+        ratio[j], p_value[j] = np.sqrt(square), chi2.sf(square * freedom, freedom)
+    return FloorTest(ratio, p_value)

@@ -1,0 +1,443 @@
+"""Score tests of what a model may lack, and how far it would move the parameters.
+
+With e the residuals at the estimate, S the slopes of the outputs over the parameters, and D the
+change of the outputs by a suspect's amplitudes (see ``suspects``), all whitened by the residuals'
+autoregression, e is regressed on S alone and on S and D together. Of the part of D that no change
+of the parameters makes, r = D - S S+ D, the score r'e is zero in the mean where the suspect is
+not there: its square in units of its covariance is a chi-square (the Lagrange multiplier test;
+Breusch & Pagan, Review of Economic Studies 47, 1980). The difference of the two regressions'
+parameters is the Gauss-Newton step by which the suspect, were it fitted as well, moves them.
+
+What is known beforehand keeps the regression from using what is no freedom: a factor of e of each
+parameter, a channel's zero by as much as its calibration left open. The covariance of the score
+is the largest of three, since a whitened residual is white in the mean only: that of white
+residuals; their own, whatever their variance along the record and with what colour is left
+(Newey & West, Econometrica 55, 1987); and that of the known noise of the inputs. The suspect with
+the smallest probability is taken into the regression, and the rest asked again.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import get_args
+
+import numpy as np
+from scipy.linalg import solve_triangular
+from scipy.optimize import nnls
+from scipy.stats import chi2
+
+from sysid.arrays import BoolArray, FloatArray
+from sysid.fitting.objective import Objective
+from sysid.judging.disturbed import DisturbedRun
+from sysid.judging.suspects import (
+    Kind,
+    Suspect,
+    change_suspects,
+    channel_suspects,
+    disturbance_suspects,
+    dominant_shape,
+    function_suspects,
+    head,
+    variant_suspects,
+)
+from sysid.problem.model import ModelError
+from sysid.uncertainty import Estimate, Uncertainty
+from sysid.uncertainty.colour import Autoregression, colour, record_rows
+from sysid.uncertainty.sensitivity import Sensitivity, input_noises, sensitivity, zero_errors
+
+# Probability of a finding by chance, all tests together; a variant is fitted to confirm it.
+_CHANCE: dict[Kind, float] = {
+    **dict.fromkeys(get_args(Kind), 1e-4),
+    "variant": 1e-3,
+}
+_SEVERAL = ("variant", "function", "disturbance")  # have no single amplitude
+_MOST = 5  # findings
+_MOST_SAMPLES = 10_000  # that are tested: beyond, what matters has long been significant
+_LIKELY = 6  # suspects that are tested again by the colour of what they leave
+_LAGS = 20  # of what colour whitening may leave
+_NEW = 1e-2  # share of a suspect that no change of the parameters makes, below which it is theirs
+_FREEDOM = 1.0  # standard deviation of a coordinate before the data: a factor of e
+
+
+@dataclass(frozen=True)
+class Move:
+    """By how much a finding would move a quantity, in its unit and in standard deviations."""
+
+    quantity: Estimate
+    change: float
+    deviations: float
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something that the model lacks: what it is, how sure, and what it would move.
+
+    name, of, unit: as of its suspect. amplitude: of a channel's fault, in the unit; None of
+    others. shape: of a function, which it is most like. p_value: by chance, all tests counted.
+    share: of the whitened residuals' squares that it explains. moves: the farthest first.
+    """
+
+    kind: Kind
+    name: str
+    unit: str
+    amplitude: float | None
+    p_value: float
+    share: float
+    moves: tuple[Move, ...]
+    of: str = ""
+    shape: str = ""
+
+    @property
+    def farthest(self) -> float:
+        """Standard deviations by which it moves what it moves farthest."""
+        return abs(self.moves[0].deviations) if self.moves else 0.0
+
+
+def missing_physics(
+    objective: Objective, chromosome: FloatArray, uncertainty: Uncertainty
+) -> tuple[Finding, ...]:
+    """What the model lacks by the records of an objective at its minimum, the surest first.
+
+    Faults of channels and the model's variants are tried before functions in the equations.
+    Raises ModelError where the free run at the chromosome fails.
+    """
+    model = objective.simulator.model
+    records = head(objective.records, _MOST_SAMPLES)
+    local = sensitivity(objective.on(records), chromosome)
+    if np.max(np.sqrt(np.mean(local.residual**2, axis=0))) < objective.simulator.accuracy:
+        return ()  # what is left is the simulation's
+    runs = _runs(local)
+    noisy = [model.input_names[i] for i in np.flatnonzero(records[0].input_noise)]
+    channels = list(channel_suspects(runs))
+    # Noise of an input makes its gain look smaller: that is no fault.
+    channels = [s for s in channels if s.kind != "gain" or s.name not in noisy]
+    tests = _Tests(local, uncertainty)
+    alone = [e.name for e in uncertainty.determined() if e.name in model.parameter_names]
+    tests.admit([*channels, *variant_suspects(runs), *change_suspects(runs, alone)])
+    named = any(finding.kind == "variant" for finding in tests.findings)
+    # Noise of an input acts through all equations, as do functions of what it drives.
+    if not named and not noisy:
+        tests.admit([*function_suspects(runs), *disturbance_suspects(runs)])
+    return tuple(tests.findings)
+
+
+def _runs(local: Sensitivity) -> list[DisturbedRun]:
+    objective, chromosomes = local.objective, local.chromosome[None]
+    model, vector = objective.simulator.model, objective.space.full(chromosomes)[0]
+    runs = []
+    for k, record in enumerate(objective.records):
+        start = objective.space.starts(chromosomes, k, record.initial_state(model))[0]
+        runs.append(DisturbedRun(model, vector, record, start))
+    return runs
+
+
+class _Tests:
+    """Regression of residuals, to which suspects are admitted one after another.
+
+    Columns are (n_residuals, n_outputs, k), in parts of the outputs' scales.
+    """
+
+    def __init__(self, local: Sensitivity, uncertainty: Uncertainty) -> None:
+        self.findings: list[Finding] = []
+        self._local, self._residual = local, -local.residual
+        self._estimates = [e for e in uncertainty.determined() if e.std]
+        self._gradients = np.array([_gradient(local, e) for e in self._estimates])
+        self._scales = np.concatenate(
+            [
+                np.broadcast_to(scale, (n, len(scale)))
+                for scale, n in zip(local.objective.scales, local.lengths, strict=True)
+            ]
+        )
+        zeros = [zero[..., None] for zero in zero_errors(local)]
+        self._columns = np.concatenate([local.slopes, *zeros], axis=2)
+        self._free = np.concatenate(
+            [np.full(local.slopes.shape[2], 1.0 / _FREEDOM), np.ones(len(zeros))]
+        )
+        noises = list(input_noises(local))
+        self._noises = np.stack(noises, axis=2) if noises else None
+        self._regression = self._coloured_by(self._residual)
+
+    def admit(self, suspects: Sequence[Suspect]) -> None:
+        """Admit the suspects that are there by more than chance, each given those before it."""
+        changes = [s.changes / self._scales[..., None] for s in suspects]
+        left = [i for i, change in enumerate(changes) if np.any(change)]
+        tests = len(left)
+        while left and len(self.findings) < _MOST:
+            first = {
+                i: result
+                for i in left
+                if (result := self._regression.test(changes[i], suspects[i].one_sided)) is not None
+            }
+            likely = sorted(first, key=lambda i: first[i].log_p)[:_LIKELY]
+            results = {i: self._again(changes[i], suspects[i], first[i]) for i in likely}
+            logs = {i: result.log_p + np.log(tests) for i, (result, _) in results.items()}
+            significant = [i for i in logs if logs[i] < np.log(_CHANCE[suspects[i].kind])]
+            if not significant:
+                return
+            surest = min(significant, key=lambda i: logs[i])
+            result, residual = results[surest]
+            self.findings.append(self._finding(suspects[surest], result, logs[surest]))
+            size = np.sqrt(np.mean(changes[surest] ** 2, axis=(0, 1)))
+            admitted = changes[surest][..., size > 0.0] / size[size > 0.0]
+            self._columns = np.concatenate([self._columns, admitted], axis=2)
+            self._free = np.concatenate([self._free, np.zeros(admitted.shape[2])])
+            self._regression = self._coloured_by(residual)
+            left.remove(surest)
+
+    def _again(
+        self, changes: FloatArray, suspect: Suspect, first: "_Result"
+    ) -> tuple["_Result", FloatArray]:
+        """A test by the colour of what the suspect leaves, and what it leaves.
+
+        Where it is there, the residuals' colour is mostly its own, and whitening hides it.
+        """
+        residual = self._left(changes, first)
+        second = self._coloured_by(residual).test(changes, suspect.one_sided)
+        if second is None or second.log_p > first.log_p:
+            return first, residual
+        return second, self._left(changes, second)
+
+    def _left(self, changes: FloatArray, result: "_Result") -> FloatArray:
+        return self._residual - self._columns @ result.coefficients - changes @ result.amplitudes
+
+    def _coloured_by(self, residual: FloatArray) -> "_Regression":
+        whitening = _Whitening.of(self._local, residual)
+        return _Regression(whitening, self._columns, self._free, self._residual, self._noises)
+
+    def _finding(self, suspect: Suspect, result: "_Result", log_p: float) -> Finding:
+        moved = self._gradients @ result.move[: self._gradients.shape[1]]
+        moves = [
+            Move(e, float(change), float(change) / e.std)
+            for e, change in zip(self._estimates, moved, strict=True)
+            if e.std
+        ]
+        moves.sort(key=lambda move: -abs(move.deviations))
+        several, amplitudes = suspect.kind in _SEVERAL, result.amplitudes
+        return Finding(
+            suspect.kind,
+            suspect.name,
+            suspect.unit,
+            None if several else float(amplitudes[0]),
+            float(np.exp(min(log_p, 0.0))),
+            result.share,
+            tuple(moves),
+            suspect.of,
+            dominant_shape(amplitudes) if suspect.kind == "function" else "",
+        )
+
+
+@dataclass(frozen=True)
+class _Result:
+    """A suspect's test: log of its probability, its amplitudes, and what becomes of the rest.
+
+    coefficients: of the regression's columns beside the suspect; move: what they were moved by.
+    """
+
+    log_p: float
+    amplitudes: FloatArray
+    coefficients: FloatArray
+    move: FloatArray
+    share: float
+
+
+class _Regression:
+    """Residuals on columns, whitened; free (p,) says how firmly each column stands at zero."""
+
+    def __init__(
+        self,
+        whitening: "_Whitening",
+        columns: FloatArray,
+        free: FloatArray,
+        residual: FloatArray,
+        noises: FloatArray | None,
+    ) -> None:
+        self._whitening = whitening
+        white, target = whitening(columns), whitening(residual[..., None])
+        self._n, self._more = len(target), len(free)
+        self._basis, self._triangle = np.linalg.qr(np.vstack([white, np.diag(free)]))
+        self._coefficients = self._solved(self._padded(target)[:, 0])
+        self._residual = self._beyond(target)[:, 0]
+        self._noises = None if noises is None else self._beyond(whitening(noises))
+        self._squares = float(self._residual[: self._n] @ self._residual[: self._n])
+
+    def test(self, changes: FloatArray, one_sided: bool) -> _Result | None:
+        """The test of a suspect's changes; None where the parameters do all that it does.
+
+        one_sided: whether only amplitudes above zero are looked for; their statistic has as many
+        degrees of freedom as amplitudes turned out to be (Susko, "Likelihood ratio tests with
+        boundary constraints using data-dependent degrees of freedom", Biometrika 100, 2013).
+        """
+        white = self._whitening(changes)
+        size = np.linalg.norm(white, axis=0)
+        used = np.flatnonzero(size > 0.0)
+        if not len(used):
+            return None
+        columns = white[:, used] / size[used]
+        beyond = self._beyond(columns)
+        left, values, right = np.linalg.svd(beyond, full_matrices=False)
+        new = values > _NEW
+        if not new.any():
+            return None
+        if one_sided:
+            amplitudes = nnls(beyond, self._residual)[0]
+            best = beyond @ amplitudes
+            length = float(np.linalg.norm(best))
+            if length == 0.0:
+                return None
+            left, freedom = (best / length)[:, None], int(np.count_nonzero(amplitudes))
+        else:
+            left, freedom = left[:, new], int(new.sum())
+            amplitudes = right[new].T @ ((left.T @ self._residual) / values[new])
+        score = left.T @ self._residual
+        move = -self._solved(self._padded(columns @ amplitudes))
+        whole = np.zeros(len(size))
+        whole[used] = amplitudes / size[used]
+        return _Result(
+            float(chi2.logsf(self._statistic(left, score), freedom)),
+            whole,
+            self._coefficients + move,
+            move,
+            float(score @ score) / max(self._squares, 1e-300),
+        )
+
+    def _statistic(self, left: FloatArray, score: FloatArray) -> float:
+        """The score's square in units of its covariance, in every direction the larger of three."""
+        rest = self._residual - left @ score
+        terms = (left * rest[:, None])[: self._n]
+        terms = terms.reshape(-1, self._whitening.n_outputs, len(score)).sum(axis=1)
+        covariance = _long_run_covariance(terms - terms.mean(axis=0))
+        if self._noises is not None:
+            pushes = left.T @ self._noises
+            covariance = _larger(covariance, pushes @ pushes.T)
+        return float(score @ np.linalg.solve(_larger(covariance, np.eye(len(score))), score))
+
+    def _solved(self, padded: FloatArray) -> FloatArray:
+        """Coefficients of the columns that come closest to a padded column."""
+        solution: FloatArray = solve_triangular(self._triangle, self._basis.T @ padded)
+        return solution
+
+    def _padded(self, white: FloatArray) -> FloatArray:
+        """Whitened columns with rows for what is known beforehand added."""
+        return np.concatenate([white, np.zeros((self._more, *white.shape[1:]))])
+
+    def _beyond(self, white: FloatArray) -> FloatArray:
+        """What the regression's columns leave of others."""
+        padded = self._padded(white)
+        rest: FloatArray = padded - self._basis @ (self._basis.T @ padded)
+        return rest
+
+
+def _larger(first: FloatArray, second: FloatArray) -> FloatArray:
+    """A covariance as large in every direction as the larger of two."""
+    values, vectors = np.linalg.eigh(first)
+    root = vectors * np.sqrt(np.maximum(values, 1e-9 * max(float(values[-1]), 1e-300)))
+    back = np.linalg.inv(root)
+    ratio, axes = np.linalg.eigh(back @ second @ back.T)
+    whole = root @ axes
+    larger: FloatArray = (whole * np.maximum(ratio, 1.0)) @ whole.T
+    return larger
+
+
+def _long_run_covariance(terms: FloatArray) -> FloatArray:
+    """Covariance of the sum of correlated terms (n, k) of mean zero, with Bartlett's weights."""
+    total: FloatArray = terms.T @ terms
+    for lag in range(1, min(_LAGS, len(terms) // 4)):
+        product = terms[lag:].T @ terms[:-lag]
+        total = total + (1.0 - lag / _LAGS) * (product + product.T)
+    # The weights keep it from being negative but for rounding.
+    return total
+
+
+@dataclass(frozen=True)
+class _Whitening:
+    """Takes the residuals' colour out of columns (n_residuals, n_outputs, k): (n_rows, k).
+
+    kept: rows whose past the autoregression knows. decorrelate: (n_outputs, n_outputs).
+    """
+
+    model: Autoregression
+    lengths: tuple[int, ...]
+    kept: BoolArray
+    decorrelate: FloatArray
+
+    @classmethod
+    def of(cls, local: Sensitivity, residual: FloatArray) -> "_Whitening":
+        """By residuals (n_residuals, n_outputs); of outputs that do not count none are left."""
+        counted = local.objective.weights > 0.0
+        residual = np.where(counted & local.seen, residual, 0.0)
+        model = colour(residual, local.seen, local.lengths)
+        values, vectors = np.linalg.eigh(model.noise)
+        floor = 1e-12 * max(float(values[-1]), 1e-300)
+        roots = np.where(values > floor, 1.0 / np.sqrt(np.maximum(values, floor)), 0.0)
+        whole = np.all(local.seen | ~local.seen.any(axis=0), axis=1)
+        kept, order = whole.copy(), len(model.coefficients)
+        for rows in record_rows(local.lengths):
+            for k in range(1, order + 1):
+                kept[rows][k:] &= whole[rows][:-k]
+            kept[rows][:order] = False
+        return cls(model, local.lengths, kept, (vectors * roots) @ vectors.T)
+
+    @cached_property
+    def n_outputs(self) -> int:
+        """Columns of the residuals."""
+        return len(self.decorrelate)
+
+    def __call__(self, columns: FloatArray) -> FloatArray:
+        """The whitened columns, rows of outputs one after another."""
+        white = columns.copy()
+        for rows in record_rows(self.lengths):
+            part = columns[rows]
+            for k, matrix in enumerate(self.model.coefficients, start=1):
+                white[rows][k:] -= np.einsum("ij,tjm->tim", matrix, part[:-k])
+        white = np.einsum("ij,tjm->tim", self.decorrelate, white[self.kept])
+        whitened: FloatArray = white.reshape(-1, columns.shape[2])
+        return whitened
+
+
+def _gradient(local: Sensitivity, estimate: Estimate) -> FloatArray:
+    """Change of a quantity with each coordinate of the slopes, (n_free,)."""
+    names, gradient = local.objective.space.names, np.zeros(len(local.chromosome))
+    for name, weight in estimate.terms:
+        j = names.index(name)
+        if estimate.form == "sum":
+            gradient[j] = weight * local.increments[j]
+        else:
+            gradient[j] = weight * estimate.value * local.increments[j] / local.chromosome[j]
+    return gradient
+
+
+def describe(findings: Iterable[Finding]) -> list[str]:
+    """Findings in a few words each."""
+    return [description(finding) for finding in findings]
+
+
+_WORDS = {
+    "delay": "{name} comes {late} {amplitude:.3g} s than the model has it",
+    "offset": "{name} is {amplitude:.3g} {unit} off",
+    "drift": "{name} drifts by {amplitude:.3g} {unit} from a record's first to last sample",
+    "saturation": "{name} saturates near its largest values",
+}
+
+
+def description(finding: Finding) -> str:
+    """A finding in a few words."""
+    amplitude, unit = finding.amplitude, "" if finding.unit == "1" else finding.unit
+    if finding.kind == "variant":
+        return finding.name
+    if finding.kind == "function":
+        return f"a term in {finding.of} ({finding.shape}) in d{finding.name}/dt"
+    if finding.kind == "disturbance":
+        return f"a slow signal in d{finding.name}/dt that nobody measured"
+    assert amplitude is not None
+    if finding.kind == "change":
+        change = f"{100.0 * amplitude:+.0f} % of its value"
+        return f"{finding.name} changes by {change} from a record's first to last sample"
+    if finding.kind == "gain":
+        return f"{finding.name} is {1.0 + amplitude:.3g} times what the model has"
+    late = "later" if amplitude > 0.0 else "earlier"
+    text = _WORDS[finding.kind]
+    size = abs(amplitude) if finding.kind == "delay" else amplitude
+    return text.format(name=finding.name, late=late, amplitude=size, unit=unit).replace("  ", " ")
+
+
+__all__ = ["Finding", "ModelError", "Move", "describe", "description", "missing_physics"]

@@ -1,0 +1,271 @@
+"""What a model may lack, each as the change of the outputs that a little of it would make.
+
+Faults of the channels: delay, offset, drift, gain, saturation. What the model's own variants have
+and it has not, in their terms. And functions of every state and input in every equation, which
+need no idea of what is missing.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, Literal
+
+import numpy as np
+
+from sysid.arrays import FloatArray
+from sysid.judging.disturbed import DisturbedRun, shapes, stretched
+from sysid.problem.data import Dataset
+from sysid.problem.model import Input, ProcessModel, State
+
+Kind = Literal[
+    "variant", "delay", "offset", "drift", "gain", "saturation", "change", "function", "disturbance"
+]
+
+_PARTS = (0.5, 2.0)  # of a variant's further parameters
+_KNEE = 0.8  # share of a signal's peak from where its saturation is looked for
+_LEVELS = 8  # of a signal, below which it shows no function
+_JUMPING = 0.05  # mean square of a signal's steps in parts of its variance, from where it jumps
+_PROBE = 1e-3  # part of a parameter that tells how rates follow it
+_PERIODS = (1, 2, 3, 4)  # of a disturbance that nobody measured, in a record
+_POINTS = 50  # at which an equation is asked for what it depends on
+_SHAPES = ("sign", "square", "cube")
+
+
+@dataclass(frozen=True, eq=False)
+class Suspect:
+    """What may be missing: columns of changes per unit of its amplitudes.
+
+    name: of the channel, the variant, or the equation. of: the signal that a function is of.
+    changes: (n_rows, n_outputs, n_amplitudes), records one after another, in the outputs' units.
+    """
+
+    kind: Kind
+    name: str
+    unit: str
+    changes: FloatArray
+    of: str = ""
+
+    @property
+    def one_sided(self) -> bool:
+        """Whether only amplitudes above zero make sense: friction never drives."""
+        return self.kind in ("variant", "saturation")
+
+
+def channel_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
+    """Faults of the outputs' and inputs' channels, the same throughout all records.
+
+    Offsets of channels whose zero was calibrated are left out: how wrong it may be is known.
+    """
+    model = runs[0].model
+    for j, output in enumerate(model.outputs):
+        for kind, unit, signal in _output_faults(runs, j):
+            change = [_column(run.outputs, j, signal(run)) for run in runs]
+            yield Suspect(kind, output.name, unit or output.unit, np.concatenate(change)[..., None])
+    for i, given in enumerate(model.inputs):
+        if not any(np.any(run.record.inputs[:, i]) for run in runs):
+            continue
+        for kind, unit, signal in _input_faults(runs, i):
+            change = [run.driven(_column(run.record.inputs, i, signal(run))) for run in runs]
+            yield Suspect(kind, given.name, unit or given.unit, np.concatenate(change)[..., None])
+
+
+_Fault = tuple[Kind, str, Callable[[DisturbedRun], FloatArray]]
+
+
+def _output_faults(runs: Sequence[DisturbedRun], j: int) -> Iterator[_Fault]:
+    yield "delay", "s", lambda run: -np.gradient(run.outputs[:, j]) / run.record.dt
+    yield from _common_faults(
+        lambda run: run.outputs[:, j], any(run.record.output_zero[j] for run in runs)
+    )
+
+
+def _input_faults(runs: Sequence[DisturbedRun], i: int) -> Iterator[_Fault]:
+    yield "delay", "s", lambda run: _held_back(run.record.inputs[:, i]) / run.record.dt
+    yield from _common_faults(
+        lambda run: run.record.inputs[:, i], any(run.record.input_zero[i] for run in runs)
+    )
+
+
+def _common_faults(signal: Callable[[DisturbedRun], FloatArray], zeroed: bool) -> Iterator[_Fault]:
+    if not zeroed:
+        yield "offset", "", lambda run: np.ones(run.record.n_samples)
+    yield "drift", "", lambda run: np.linspace(-0.5, 0.5, run.record.n_samples)
+    yield "gain", "1", signal
+    yield "saturation", "1", lambda run: _clipped(signal(run))
+
+
+def _held_back(signal: FloatArray) -> FloatArray:
+    """Change of a signal that comes a sample later: of a held one, a late edge moves its mean."""
+    return np.concatenate([signal[:1], signal[:-1]]) - signal
+
+
+def _clipped(signal: FloatArray) -> FloatArray:
+    knee = _KNEE * np.abs(signal).max()
+    clipped: FloatArray = np.clip(signal, -knee, knee) - signal
+    return clipped
+
+
+def _column(like: FloatArray, place: int, values: FloatArray) -> FloatArray:
+    table = np.zeros(like.shape)
+    table[:, place] = values
+    return table
+
+
+def variants_of(model: ProcessModel) -> Mapping[str, ProcessModel]:
+    """The model's variants, used as it is: its outputs, its signals, its starts.
+
+    Variants that lack one of its states are left out: their equations cannot be compared.
+    """
+    if model.variants is None:
+        return {}
+    variants: dict[str, ProcessModel] = {}
+    for name, variant in model.variants().items():
+        if variant.state_names == model.state_names and variant.input_names == model.input_names:
+            like = replace(variant, states=model.states, inputs=model.inputs)
+            variants[name] = like.with_outputs(model.output_names)
+    return variants
+
+
+def variant_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
+    """What the model's variants add to its equations, for several values of their own parameters.
+
+    Every column is a variant of its own, so that a sum of positive parts of them is one as well.
+    """
+    model, vector = runs[0].model, runs[0].vector
+    values = dict(zip(model.parameter_names, vector.tolist(), strict=True))
+    for name, variant in variants_of(model).items():
+        shared = {k: v for k, v in values.items() if k in variant.parameter_names}
+        at = variant.vector(shared)
+        added = [i for i, k in enumerate(variant.parameter_names) if k not in values]
+        free = [i for i in added if not variant.parameters[i].fixed]
+        moved = [at, *(p for i in free for p in _moved(variant, at, i))]
+        columns = []
+        for p in moved:
+            parts = [run.added(run.rates_of(variant.derivative, p) - run.rates) for run in runs]
+            columns.append(np.concatenate(parts))
+        yield Suspect("variant", name, "", np.stack(columns, axis=2))
+
+
+def _moved(variant: ProcessModel, vector: FloatArray, place: int) -> Iterator[FloatArray]:
+    """Parameters, one of which is moved by parts of its value, or both ways from zero."""
+    parameter = variant.parameters[place]
+    beside = 0.1 * (parameter.upper - parameter.lower)
+    values = [vector[place] * part for part in _PARTS] if vector[place] else [-beside, beside]
+    for value in values:
+        moved = vector.copy()
+        moved[place] = value
+        yield moved
+
+
+def function_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
+    """Functions of every state and input, added to every equation that parameters act in.
+
+    Inputs of a few levels show no function, but an offset. Of signals that jump from sample to
+    sample the function between them is not known.
+    """
+    model = runs[0].model
+    signals: list[State | Input] = [*model.states, *model.inputs]
+    for i in _physical_equations(runs[0]):
+        state = model.states[i]
+        for j, signal in enumerate(signals):
+            together = np.concatenate([_signal(run, j) for run in runs])
+            if len(np.unique(together)) < _LEVELS or _jumps(together):
+                continue
+            unit = f"{state.unit}/s"
+            for values in ([stretched(together)], shapes(together)):
+                columns = np.stack([_added(runs, i, shape) for shape in values], axis=2)
+                yield Suspect("function", state.name, unit, columns, signal.name)
+
+
+def disturbance_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
+    """Slow signals that nobody measured, a few periods of a record, added to every equation."""
+    waves = [
+        wave for k in _PERIODS for wave in (partial(_wave, np.sin, k), partial(_wave, np.cos, k))
+    ]
+    for i in _physical_equations(runs[0]):
+        state = runs[0].model.states[i]
+        columns = [
+            np.concatenate([run.added(_column(run.states, i, wave(run))) for run in runs])
+            for wave in waves
+        ]
+        yield Suspect("disturbance", state.name, f"{state.unit}/s", np.stack(columns, axis=2))
+
+
+def _wave(function: np.ufunc, periods: int, run: DisturbedRun) -> FloatArray:
+    n = run.record.n_samples
+    wave: FloatArray = function(2.0 * np.pi * periods * np.arange(n) / n)
+    return wave
+
+
+def change_suspects(runs: Sequence[DisturbedRun], names: Sequence[str]) -> Iterator[Suspect]:
+    """Parameters, by name, that change in proportion to time from a record's begin to its end."""
+    model, vector = runs[0].model, runs[0].vector
+    for name in names:
+        place, moved = model.parameter_names.index(name), vector.copy()
+        moved[place] *= 1.0 + _PROBE
+        columns = []
+        for run in runs:
+            rates = (run.rates_of(model.derivative, moved) - run.rates) / _PROBE
+            columns.append(run.added(rates * np.linspace(-0.5, 0.5, len(rates))[:, None]))
+        yield Suspect("change", name, "1", np.concatenate(columns)[..., None])
+
+
+def _jumps(signal: FloatArray) -> bool:
+    """Whether a signal changes from sample to sample by much of all that it changes."""
+    return float(np.mean(np.diff(signal) ** 2)) > _JUMPING * float(np.var(signal))
+
+
+def _signal(run: DisturbedRun, j: int) -> FloatArray:
+    n = run.states.shape[1]
+    return run.states[:, j] if j < n else run.record.inputs[:, j - n]
+
+
+def _added(runs: Sequence[DisturbedRun], i: int, values: FloatArray) -> FloatArray:
+    """Change by values, of all records' rows, added to equation i."""
+    ends = np.cumsum([run.record.n_samples for run in runs])[:-1]
+    parts = zip(runs, np.split(values, ends), strict=True)
+    return np.concatenate([run.added(_column(run.states, i, part)) for run, part in parts])
+
+
+def _physical_equations(run: DisturbedRun) -> list[int]:
+    """Equations in which a parameter acts: an angle is the integral of its speed and no more."""
+    few: Any = np.linspace(0, run.record.n_samples - 1, _POINTS).astype(np.int64)
+    rates = _rates_at(run, np.unique(few))
+    moved = rates(run.vector * 1.01 + 1e-9)
+    return np.flatnonzero(np.any(moved != rates(run.vector), axis=0)).tolist()
+
+
+def _rates_at(run: DisturbedRun, rows: Any) -> Callable[[FloatArray], FloatArray]:
+    """The model's rates at some rows of a run, as a function of the parameters."""
+    points = list(zip(run.states[rows].tolist(), run.record.inputs[rows].tolist(), strict=True))
+
+    def rates(vector: FloatArray) -> FloatArray:
+        p = tuple(vector.tolist())
+        values = []
+        for x, u in points:
+            try:
+                values.append(run.model.derivative(tuple(x), tuple(u), p))
+            except (ArithmeticError, ValueError):
+                continue
+        return np.array(values).reshape(-1, len(run.model.states))
+
+    return rates
+
+
+def dominant_shape(amplitudes: FloatArray) -> str:
+    """Which of the shapes of a function weighs most."""
+    if len(amplitudes) == 1:
+        return "straight"
+    return _SHAPES[int(np.argmax(np.abs(amplitudes)))]
+
+
+def head(records: Sequence[Dataset], samples: int) -> list[Dataset]:
+    """The first records, and of the last of them the beginning, that hold so many samples."""
+    kept: list[Dataset] = []
+    for record in records:
+        left = samples - sum(r.n_samples for r in kept)
+        if left < 2:
+            break
+        short = record.n_samples <= left
+        kept.append(record if short else record.part(0, left, record.name))
+    return kept

@@ -1,0 +1,94 @@
+"""What a model lacks is named with its size, and a right model is told to lack nothing.
+
+The plants are those of ``benchmarks.stress``, simulated by a scheme of their own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.stress import FRICTION, MODEL, TRUTH, WITH_FRICTION, cases, tried
+from sysid import Dataset
+from sysid.gassi import GASSI
+from sysid.judging.disturbed import DisturbedRun
+from sysid.judging.examination import verdict_of
+from tests.sysid.reference import simulate
+
+CASES = {case.name: case for case in cases()}
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("load half", "load is 1.9"),
+        ("sign of the current", "current is -"),
+        ("current 0.3 A off", "current is 0.28"),
+        ("speed clipped at 80 %", "omega saturates near its largest values"),
+        ("Coulomb friction", "a term in omega"),
+        ("winding warms up", "R changes by +3"),
+    ],
+)
+def test_what_is_wrong_is_named_with_its_size_where_no_noise_is_known(name, words):
+    outcome = tried(CASES[name], 0)
+    said = " ".join((*outcome.verdict.parameters.reasons, *outcome.verdict.notes))
+    assert words in said
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("name", ["motor", "noise not known", "next to no noise, not known"])
+def test_a_right_model_lacks_nothing(name, seed):
+    outcome = tried(CASES[name], seed)
+    assert outcome.verdict.trust == "good", outcome.verdict.reasons
+
+
+def test_with_a_known_noise_all_that_is_above_it_is_told():
+    outcome = tried(replace(CASES["friction along a turn"], known_noise=True), 0)
+    assert outcome.verdict.parameters.trust == "limited"
+    assert outcome.moved
+
+
+def test_a_variant_that_the_data_ask_for_is_fitted_and_ranked():
+    model = replace(MODEL, variants=lambda: {"friction=dry": WITH_FRICTION})
+    training, validation = CASES["Coulomb friction"].records(1)
+    estimator = GASSI(model, population=60, generations=12).fit(training)
+    assert estimator.parameters_["B"] > 2.0 * TRUTH["B"]
+    verdict = verdict_of(estimator, [training], [validation])
+    (reason, *_) = verdict.parameters.reasons
+    assert reason.startswith("The model lacks friction=dry; fitted with it: ")
+    # Damping as it is, now that friction has a term of its own.
+    words = reason.split()
+    damping = float(words[words.index("B") + 3])
+    assert damping == pytest.approx(TRUTH["B"], rel=0.3)
+    # A model that has it asks for nothing.
+    right = replace(WITH_FRICTION, variants=lambda: {"friction=dry": WITH_FRICTION})
+    fitted = GASSI(right, population=60, generations=12).fit(training)
+    assert fitted.parameters_["T_c"] == pytest.approx(FRICTION, rel=0.05)
+    assert verdict_of(fitted, [training], [validation]).trust == "good"
+
+
+def test_what_is_added_to_an_equation_moves_outputs_as_a_model_with_it_would():
+    """A cubic drag, by the disturbed run and by SciPy's integration of a model that has it."""
+    training, _ = CASES["motor"].records(0)
+    record = Dataset(training.inputs[:150], np.zeros((150, 2)), training.dt)
+    vector, start = np.array(list(TRUTH.values())), np.zeros(2)
+    run = DisturbedRun(MODEL, vector, record, start)
+    added = np.zeros_like(run.states)
+    added[:, 1] = -(run.states[:, 1] ** 3)
+    change = run.added(added)
+
+    eps = 1e-5
+
+    def derivative(x, u, p):
+        rates = MODEL.derivative(x, u, p)
+        return (rates[0], rates[1] - eps * x[1] ** 3)
+
+    plain, dragged = (
+        simulate(replace(MODEL, derivative=f), vector, record)
+        for f in (MODEL.derivative, derivative)
+    )
+    expected = (dragged - plain) / eps
+    error = np.abs(change - expected).max(axis=0) / np.abs(expected).max(axis=0)
+    assert np.all(error < 0.05)
