@@ -13,7 +13,7 @@ sqrt(n_samples) times this.
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -87,6 +87,7 @@ class Objective:
         if len(unseen):
             name = simulator.model.output_names[unseen[0]]
             raise ModelError(f"no record has a measured sample of output {name!r}")
+        self.tether: Callable[[FloatArray], FloatArray] | None = None
         self._counter = [0]
 
     @property
@@ -105,6 +106,15 @@ class Objective:
     def weighed(self, weights: FloatArray) -> Objective:
         """The same objective with other weights of the outputs, (n_outputs,)."""
         return self._with(weights=weights / weights.sum())
+
+    def tethered(
+        self, quantity: Callable[[FloatArray], FloatArray], target: float, stiffness: float
+    ) -> Objective:
+        """The same objective with one residual more, which pulls a quantity to a target.
+
+        quantity: (n,) of chromosomes (n, n_free). stiffness: the residual per unit of it.
+        """
+        return self._with(tether=lambda rows: stiffness * (quantity(rows) - target))
 
     def finer(self, accuracy: float) -> Objective:
         """The same objective by simulations of another accuracy, stiff ones given the steps."""
@@ -135,8 +145,15 @@ class Objective:
             vectors, self.records, self.scales, steps, starts, keep=keep
         )
         self._counter[0] += len(chromosomes)
-        rms = self._roots(simulated.sse.sum(axis=1))
-        return Responses(simulated.values, rms, simulated.excess.max(axis=1))
+        sse, values = simulated.sse.sum(axis=1), simulated.values
+        if self.tether is not None:
+            # As one sample more of an output that counts.
+            output, pull = int(np.argmax(self.weights)), self.tether(chromosomes)
+            row = np.zeros((1, *values.shape[1:]))
+            row[0, output] = pull
+            sse[:, output] += pull**2
+            values = np.concatenate([values, row]) if keep else values
+        return Responses(values, self._roots(sse), simulated.excess.max(axis=1))
 
     def steps_needed(self, chromosomes: FloatArray) -> IntArray:
         """Integration steps per sample that each chromosome needs, (n, n_records)."""
