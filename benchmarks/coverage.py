@@ -1,16 +1,20 @@
 """Do the intervals cover the truth, and does a noise-free record give the true parameters?
 
-python -m benchmarks.coverage [--json] [--seeds 100] [--exact 20]
+python -m benchmarks.coverage [--json] [--seeds 200] [--exact 20] [--experiment prbs.yaml ...]
 
-Noise: the shipped experiment on the simulated rig, a new seed of noise, offsets and search each
-time, identified from the shipped ranges; every quantity that gets an interval is asked whether it
-holds the truth. Noise-free: the model's own outputs, identified with another seed of the search
-each time; every determined quantity is compared with the truth.
+Noise: shipped experiments on the simulated rig, a new seed of noise, offsets and search each time,
+identified from the shipped ranges; every quantity that gets an interval is asked whether it holds
+the truth. Strong quantities have an interval by the curvature, weak ones one by the profile
+likelihood, perhaps with one end. The bars: of each strong one 93 to 97 % hold and the mean error
+is below 0.3 standard deviations, of each weak one 90 to 99 %. Noise-free: the model's own outputs,
+identified with another seed of the search each time; every determined quantity is compared with
+the truth.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -21,60 +25,90 @@ from sysid import BatchSimulator, Dataset
 from sysid.arrays import FloatArray
 from sysid.gassi import GASSI
 from sysid.problem.model import ProcessModel
-from sysid.uncertainty import Estimate
+from sysid.uncertainty import Estimate, Uncertainty
+from sysid.uncertainty.estimate import Z95
 
 _HYSTERESIS_START = -1.1  # where the wound load leaves z
+_EXPERIMENTS = ("prbs.yaml", "constant_velocity.yaml", "hysteresis_loop.yaml")
 
 
 def main() -> None:
     parser = arguments(__doc__ or "")
-    parser.add_argument("--seeds", type=int, default=100, help="of noise")
+    parser.add_argument("--seeds", type=int, default=200, help="of noise")
     parser.add_argument("--exact", type=int, default=20, help="seeds of the search without noise")
+    parser.add_argument("--experiment", nargs="+", default=_EXPERIMENTS, help="shipped ones")
     options = parser.parse_args()
     model = actuator()
     figures = {
-        "coverage": coverage(model, options.seeds),
-        "noise_free": noise_free(model, options.exact),
+        "coverage": {name: coverage(model, options.seeds, name) for name in options.experiment},
+        "noise_free": noise_free(model, options.exact) if options.exact else None,
     }
     report(figures, options.json, show)
 
 
-def coverage(model: ProcessModel, seeds: int) -> dict[str, Any]:
+@dataclass
+class _Tally:
+    """What became of one quantity's intervals: how often they held, and errors of strong ones."""
+
+    strong: list[bool] = field(default_factory=list)
+    weak: list[bool] = field(default_factory=list)
+    errors: list[float] = field(default_factory=list)
+
+    def add(self, estimate: Estimate, truth: float) -> bool:
+        """Count an interval; whether it holds."""
+        held = bool(estimate.low is None or estimate.low <= truth)
+        held = held and bool(estimate.high is None or truth <= estimate.high)
+        (self.weak if estimate.std is None else self.strong).append(held)
+        if estimate.std is not None:
+            self.errors.append(_in_deviations(estimate, truth))
+        return held
+
+    def figures(self) -> dict[str, Any]:
+        """Shares that held, and the mean error in standard deviations."""
+        return {
+            "strong": len(self.strong),
+            "strong_coverage": _mean(self.strong),
+            "bias_in_deviations": _mean(self.errors),
+            "weak": len(self.weak),
+            "weak_coverage": _mean(self.weak),
+        }
+
+
+def coverage(model: ProcessModel, seeds: int, experiment: str) -> dict[str, Any]:
     """Share of the 95 % intervals that hold the truth, for each quantity and together."""
     truth = _truth(model)
-    inside: dict[str, list[bool]] = defaultdict(list)
-    deviations: dict[str, list[float]] = defaultdict(list)
-    seconds = []
+    tallies: dict[str, _Tally] = defaultdict(_Tally)
+    seconds, together, nominal, answers = [], [], [], []
     for seed in range(seeds):
-        training, _ = simulated_logs(model, seed)
+        training, _ = simulated_logs(model, seed, experiment)
 
-        def identify(record: Dataset = training, seed: int = seed) -> list[Estimate]:
-            estimator = GASSI(model, random_state=seed).fit(record)
-            return list(estimator.uncertainty(record).determined())
+        def identify(record: Dataset = training, seed: int = seed) -> Uncertainty:
+            return GASSI(model, random_state=seed).fit(record).uncertainty(record)
 
-        duration, estimates = timed(identify)
+        duration, intervals = timed(identify)
         seconds.append(duration)
-        for estimate in estimates:
-            if all(name in truth for name, _ in estimate.terms):
-                value = estimate.at(truth)
-                assert estimate.low is not None and estimate.high is not None
-                inside[estimate.name].append(bool(estimate.low <= value <= estimate.high))
-                deviations[estimate.name].append(_in_deviations(estimate, value))
-    everything = [held for each in inside.values() for held in each]
+        answers.append(1 + len(intervals.rivals))
+        held = [
+            tallies[estimate.name].add(estimate, estimate.at(truth))
+            for estimate in intervals.determined()
+            if "(0)" not in estimate.name
+        ]
+        together.append(all(held))
+        nominal.append(intervals.joint)
     return {
         "seeds": seeds,
-        "coverage": float(np.mean(everything)),
-        "intervals": len(everything),
+        "strong_coverage": _mean([held for t in tallies.values() for held in t.strong]),
+        "weak_coverage": _mean([held for t in tallies.values() for held in t.weak]),
+        "joint_coverage": _mean(together),
+        "joint_coverage_stated": _mean(nominal),
+        "several_answers": _mean([count > 1 for count in answers]),
         "seconds_each": float(np.median(seconds)),
-        "quantities": {
-            name: {
-                "intervals": len(held),
-                "coverage": float(np.mean(held)),
-                "worst_deviation": float(np.max(np.abs(deviations[name]))),
-            }
-            for name, held in inside.items()
-        },
+        "quantities": {name: tally.figures() for name, tally in tallies.items()},
     }
+
+
+def _mean(values: list[Any]) -> float | None:
+    return float(np.mean(values)) if values else None
 
 
 def noise_free(model: ProcessModel, seeds: int) -> dict[str, Any]:
@@ -86,8 +120,9 @@ def noise_free(model: ProcessModel, seeds: int) -> dict[str, Any]:
         duration, estimator = timed(lambda s=seed: GASSI(model, random_state=s).fit(record))
         seconds.append(duration)
         errors.append(estimator.error_)
-        found = estimator.uncertainty(record).determined()
-        worst.append(max(abs(e.value / e.at(truth) - 1.0) for e in found))
+        determined = estimator.uncertainty(record).determined()
+        strong = [e for e in determined if e.std is not None]
+        worst.append(max(abs(e.value / e.at(truth) - 1.0) for e in strong))
     return {
         "seeds": seeds,
         "within_0.1_percent": int(np.sum(np.array(worst) < 1e-3)),
@@ -104,9 +139,12 @@ def _truth(model: ProcessModel) -> dict[str, float]:
 
 
 def _in_deviations(estimate: Estimate, truth: float) -> float:
+    """Error of an estimate in standard deviations, on the scale of its interval."""
+    assert estimate.low is not None and estimate.high is not None
+    if estimate.low * estimate.high > 0.0:
+        width = np.log(estimate.high / estimate.low) / (2.0 * Z95)
+        return float(np.log(estimate.value / truth) / width)
     assert estimate.std is not None
-    if estimate.form == "product" and estimate.value / truth > 0.0:
-        return float(np.log(estimate.value / truth) / (estimate.std / abs(estimate.value)))
     return (estimate.value - truth) / estimate.std
 
 
@@ -123,21 +161,36 @@ def _exact_record(model: ProcessModel) -> Dataset:
 
 
 def show(figures: dict[str, Any]) -> None:
-    noisy = figures["coverage"]
-    print(
-        f"\n{noisy['seeds']} seeds of noise: {100.0 * noisy['coverage']:.1f} % of "
-        f"{noisy['intervals']} intervals hold the truth, {noisy['seconds_each']:.2f} s each"
-    )
-    for name, row in noisy["quantities"].items():
+    for experiment, noisy in figures["coverage"].items():
+        strong, weak, together, stated, several = (
+            _percent(noisy[key])
+            for key in (
+                "strong_coverage", "weak_coverage", "joint_coverage", "joint_coverage_stated",
+                "several_answers",
+            )
+        )  # fmt: skip
         print(
-            f"  {name:<24} {row['intervals']:4d} intervals, {100.0 * row['coverage']:5.1f} %, "
-            f"worst {row['worst_deviation']:.1f} standard deviations off"
+            f"\n{experiment}, {noisy['seeds']} seeds of noise, {noisy['seconds_each']:.1f} s each: "
+            f"{strong} of the strong and {weak} of the weak intervals hold the truth, all at "
+            f"once {together} (stated: {stated}); several answers in {several}"
         )
+        for name, row in noisy["quantities"].items():
+            bias = "" if row["strong"] == 0 else f", off by {row['bias_in_deviations']:+.2f}"
+            print(
+                f"  {name:<24} strong {row['strong']:4d} {_percent(row['strong_coverage'])}{bias}; "
+                f"weak {row['weak']:4d} {_percent(row['weak_coverage'])}"
+            )
     exact = figures["noise_free"]
+    if exact is None:
+        return
     print(
         f"\nNoise-free: every determined quantity within 0.1 % for {exact['within_0.1_percent']} "
         f"of {exact['seeds']} seeds, {exact['seconds_each']:.2f} s each"
     )
+
+
+def _percent(share: float | None) -> str:
+    return "   -" if share is None else f"{100.0 * share:.1f} %"
 
 
 if __name__ == "__main__":

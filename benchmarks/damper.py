@@ -7,6 +7,9 @@ same procedure predicts of logs it has not seen: each log left out in turn, then
 each motion (amplitude and frequency). A refit knows nothing of what was left out: its search
 starts anew from the model's wide ranges, with a seed of its own, on the remaining logs alone.
 
+The intervals from every second log and from the others are printed beside each other: of a model
+that is right they would overlap.
+
 Searches run on thinned logs of about 1000 samples; parameters are then refined, and fits
 counted, on all samples.
 """
@@ -29,6 +32,7 @@ from sysid.arrays import FloatArray
 from sysid.fitting.objective import Objective
 from sysid.fitting.refinement import refine
 from sysid.problem.model import ProcessModel
+from sysid.uncertainty import Estimate
 
 ROOT = Path(__file__).resolve().parent.parent
 CONFIG = ROOT / "examples" / "mr_damper" / "identification.yaml"
@@ -122,8 +126,35 @@ def figures(fitter: Fitter, logs: list[Dataset], seed: int) -> dict[str, Any]:
         "mean_fit": float(np.mean(fits)),
         "fits": dict(zip(names, fits, strict=True)),
         "authors_mean_fit": AUTHORS_FIT,
+        "halves": halves(fitter, logs, seed),
         "left_out": {kind: left_out(fitter, logs, keys, seed) for kind, keys in groups.items()},
     }
+
+
+def halves(fitter: Fitter, logs: list[Dataset], seed: int) -> dict[str, Any]:
+    """Intervals of each parameter from every second log and from the others, None for no end."""
+    intervals = []
+    for half in (logs[::2], logs[1::2]):
+        estimator = GASSI(
+            fitter.model,
+            population=fitter.population,
+            generations=fitter.generations,
+            per_log=True,
+            balance="logs",
+            random_state=seed,
+        ).fit(half)
+        intervals.append(estimator.uncertainty(half).parameters)
+    pairs = {first.name: (first, second) for first, second in zip(*intervals, strict=True)}
+    return {
+        "overlapping": sum(_overlap(*pair) for pair in pairs.values()),
+        "intervals": {name: [[e.low, e.high] for e in pair] for name, pair in pairs.items()},
+    }
+
+
+def _overlap(first: Estimate, second: Estimate) -> bool:
+    ends = [(e.low if e.low is not None else -np.inf, e.high if e.high is not None else np.inf)
+            for e in (first, second)]  # fmt: skip
+    return max(low for low, _ in ends) <= min(high for _, high in ends)
 
 
 def left_out(fitter: Fitter, logs: list[Dataset], keys: list[str], seed: int) -> dict[str, Any]:
@@ -148,6 +179,12 @@ def show(figures: dict[str, Any]) -> None:
         f"mean fit {figures['mean_fit']:.1f} % ({figures['seconds']:.0f} s); "
         f"the original authors' model {figures['authors_mean_fit']} %"
     )
+    intervals = figures["halves"]["intervals"]
+    print(f"\n95 % intervals from halves of the logs: {figures['halves']['overlapping']} of "
+          f"{len(intervals)} overlap")  # fmt: skip
+    for name, pair in intervals.items():
+        written = (" .. ".join("-" if end is None else f"{end:.4g}" for end in i) for i in pair)
+        print(f"  {name:<14} " + "   ".join(f"{text:<24}" for text in written))
     left = figures["left_out"]
     print(f"\n{'fit [%]':<26} {'all logs':>8}" + "".join(f"{f'no such {k}':>16}" for k in left))
     for name, fit in figures["fits"].items():

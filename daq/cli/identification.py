@@ -12,7 +12,14 @@ from daq.cli import terminal
 if TYPE_CHECKING:
     from daq.identification.comparison import ComparisonResult, SeedsResult
     from daq.identification.result import Identification
-    from daq.identification.rows import LogErrors, OutputErrors, ParameterRow, QuantityRow, Rows
+    from daq.identification.rows import (
+        LogErrors,
+        OutputErrors,
+        ParameterRow,
+        QuantityRow,
+        RivalRow,
+        Rows,
+    )
     from sysid import Campaign
     from sysid.judging.comparison import Row
     from sysid.uncertainty import Profile
@@ -122,24 +129,20 @@ def _span(
 
 
 def _interval(row: QuantityRow, scale: float) -> str:
-    if row.interval is None:
-        return "-"
-    return " .. ".join(terminal.number(scale * end, row.digits) for end in row.interval)
+    return row.interval_text(
+        lambda end: terminal.number(scale * end, row.digits), between=" .. ", empty="-"
+    )
 
 
 def _show_open_questions(rows: Rows) -> None:
     """Parameters that the data do not determine, and what measurement would tell them."""
     _show_rivals(rows)
     _show_products(rows)
-    vague = rows.ambiguities_of("vague")
-    if vague:
-        names = "; ".join(" with ".join(a.parameters) for a in vague)
-        terminal.print_text(f"Hardly felt by these data: {names}.")
     strong = [pair for pair, value in rows.correlations.items() if abs(value) > _STRONG]
     if strong:
         pairs = "; ".join(" and ".join(pair) for pair in strong)
         terminal.print_text(f"Known mostly together (correlation above {_STRONG:g}): {pairs}.")
-    if rows.ambiguities_of("product", "sum", "vague") or strong:
+    if rows.ambiguities_of("tied") or strong:
         print()
 
 
@@ -156,29 +159,44 @@ def _show_rivals(rows: Rows) -> None:
         print()
 
 
-def _rival_row(row: ParameterRow, rivals: Sequence[Mapping[str, float]]) -> list[str]:
+def _rival_row(row: ParameterRow, rivals: Sequence[RivalRow]) -> list[str]:
     """One parameter in this result and in each rival, all in the unit of the first."""
     scale, unit = notation.engineering(row.value, row.unit)
-    values = (row.value, *(rival[row.name] for rival in rivals))
-    return [row.name, *(terminal.number(scale * value, 3) for value in values), unit]
+    answers = [(row.value, row.here or (None, None))]
+    answers += [(r.values[row.name], r.intervals.get(row.name, (None, None))) for r in rivals]
+    cells = [terminal.number(scale * value, row.digits) for value, _ in answers]
+    for k, (_, ends) in enumerate(answers):
+        written = ["?" if end is None else terminal.number(scale * end, row.digits) for end in ends]
+        cells[k] += f" ({written[0]} .. {written[1]})"
+    return [row.name, *cells, unit]
 
 
 def _show_products(rows: Rows) -> None:
     """Products and sums that the data determine, of parameters that they do not."""
-    for index, ambiguity in enumerate(rows.ambiguities_of("product", "sum")):
+    for index, ambiguity in enumerate(rows.ambiguities_of("tied")):
         if index == 0:
-            print("What these data cannot tell apart:")
+            print("What no data of these outputs can tell apart:")
         terminal.print_text(f"  {', '.join(ambiguity.parameters)} act only together.")
         for row in ambiguity.determined:
             scale, unit = notation.engineering(row.value, row.unit)
             value = terminal.number(scale * row.value, row.digits)
             quantity = value if unit in {"", "1"} else f"{value} {unit}"
             interval = _interval(row, scale)
-            terminal.print_text(f"    {row.name} = {quantity}, 95 % interval {interval}")
-        terminal.print_text(
-            f"    To tell them apart, measure {' and '.join(ambiguity.measure)} by other means (or "
-            "choose a value) and give it under 'fixed'."
-        )
+            ends = f"95 % interval {interval}" if row.interval else row.undetermined_label
+            terminal.print_text(f"    {row.name} = {quantity}, {ends}")
+        starts = [name for name in ambiguity.measure if "(0)" in name]
+        measure = " and ".join(name for name in ambiguity.measure if name not in starts)
+        if measure:
+            terminal.print_text(
+                f"    To tell them apart, measure {measure} by other means (or choose a value) and "
+                "give it under 'fixed'."
+            )
+        if starts:
+            states = " and ".join(dict.fromkeys(name.partition("(")[0] for name in starts))
+            terminal.print_text(
+                f"    {'Give' if not measure else 'Give also'} the start of {states} under "
+                "'initial'."
+            )
 
 
 def _show_profiles(profiles: Sequence[Profile]) -> None:
@@ -222,10 +240,11 @@ def _show_notes(result: Identification) -> None:
             f"Stopped by Ctrl-C after {len(result.estimator.history_)} generations: "
             "these are the best parameters until then."
         )
-    if any(row.on_bound for row in rows.free):
+    pushed = [row.name for row in rows.free if row.pushed and not row.at_limit]
+    if pushed:
         terminal.print_text(
-            "At the end of its range: the data want more room there. Set 'ranges' in a file "
-            "given with --config."
+            f"The data want {', '.join(pushed)} beyond the end of the range: set 'ranges' in a "
+            "file given with --config."
         )
     if rows.refined:
         criterion = result.document["criterion"]
@@ -238,13 +257,10 @@ def _show_notes(result: Identification) -> None:
     for line in _starts(result):
         terminal.print_text(line)
     if rows.refined:
-        n_combinations = len(rows.combinations)
-        plural = "s" if n_combinations != 1 else ""
-        also = f", and {n_combinations} combination{plural} of others" if n_combinations else ""
-        terminal.print_text(
-            f"Determined: {len(rows.determined)} of {len(rows.free)} free parameters by "
-            f"themselves{also}."
-        )
+        terminal.print_text(rows.determined_sentence)
+        for sentence in (rows.together_sentence, rows.disagreement_sentence):
+            if sentence:
+                terminal.print_text(sentence)
 
 
 def _starts(result: Identification) -> Iterator[str]:

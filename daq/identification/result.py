@@ -205,14 +205,13 @@ class Identification:
     def parameters(self) -> pd.DataFrame:
         """A row for each parameter: value, low and high end of its 95 % interval, unit.
 
-        NaN where there is no interval, and why as a note: such a parameter is not to be used by
-        itself.
+        NaN where the data set no end; of a parameter without any the note says why: it is not to
+        be used by itself.
         """
         import pandas as pd
 
-        nothing = (float("nan"), float("nan"))
         rows = {
-            row.name: [row.value, *(row.interval or nothing), row.unit, row.undetermined_label]
+            row.name: [row.value, *_numbers(row.interval), row.unit, row.undetermined_label]
             for row in self.rows.parameters
         }
         columns = ["value", "low", "high", "unit", "note"]
@@ -321,14 +320,30 @@ def _searched(identification: Identification, place: int) -> dict[str, Any]:
         on_bound = space.on_bound(identification.estimator.chromosome_)
         return {**entry, "on_bound": bool(on_bound[place])}
     estimate = uncertainty.parameters[place]
-    return {**entry, "on_bound": estimate.why == "bound", **_interval(estimate)}
+    ends = parameter.lower, parameter.upper
+    end = min(ends, key=lambda end: abs(end - estimate.value))
+    entry |= {"on_bound": estimate.on_bound, "pushed": estimate.pushed}
+    if estimate.on_bound and end in (parameter.minimum, parameter.maximum):
+        entry["at_limit"] = True
+    return {**entry, **_interval(estimate)}
 
 
 def _interval(estimate: Estimate) -> dict[str, Any]:
-    if estimate.why:
-        return {"undetermined": estimate.why}
-    assert estimate.std is not None and estimate.low is not None and estimate.high is not None
-    return {"std": float(estimate.std), "interval": [float(estimate.low), float(estimate.high)]}
+    """What is said of a quantity beside its value."""
+    ends = [None if end is None else float(end) for end in (estimate.low, estimate.high)]
+    entry: dict[str, Any] = {"undetermined": estimate.why} if estimate.why else {"interval": ends}
+    if estimate.why == "rival":
+        entry["interval_here"] = ends
+    if estimate.std is not None and not estimate.why:
+        entry["std"] = float(estimate.std)
+    if estimate.failing:
+        entry["fails"] = estimate.failing
+    return entry
+
+
+def _numbers(interval: tuple[float | None, float | None] | None) -> tuple[float, float]:
+    low, high = interval or (None, None)
+    return float("nan") if low is None else low, float("nan") if high is None else high
 
 
 def _uncertainty(uncertainty: Uncertainty) -> dict[str, Any]:
@@ -338,6 +353,13 @@ def _uncertainty(uncertainty: Uncertainty) -> dict[str, Any]:
         {"parameters": [first, second], "correlation": round(float(correlation[i, j]), 4)}
         for (i, first), (j, second) in itertools.combinations(determined.items(), 2)
         if np.isfinite(correlation[i, j])
+    ]
+    rivals = [
+        {
+            "parameters": dict(rival.values),
+            "intervals": {name: list(ends) for name, ends in rival.intervals.items()},
+        }
+        for rival in uncertainty.rivals
     ]
     return {
         "determined_directions": uncertainty.rank,
@@ -354,8 +376,13 @@ def _uncertainty(uncertainty: Uncertainty) -> dict[str, Any]:
             }
             for ambiguity in uncertainty.ambiguities
         ],
-        **({"rivals": [dict(rival) for rival in uncertainty.rivals]} if uncertainty.rivals else {}),
+        **({"rivals": rivals} if rivals else {}),
         "correlations": pairs,
+        "together": {
+            "coverage": round(uncertainty.joint, 3),
+            "widening": round(uncertainty.simultaneous, 3),
+        },
+        "disagreement": round(uncertainty.disagreement, 3),
         "covariance": _covariance(uncertainty),
     }
 

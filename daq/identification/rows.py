@@ -7,57 +7,90 @@ Numbers that JSON cannot hold, and errors of outputs that were not measured, are
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
 from daq import notation
 
+_Z95 = 1.96
 LABELS = {  # of undetermined reasons
     "tied": "only with others",
     "vague": "hardly felt",
-    "bound": "at its end",
     "rival": "two answers",
     "": "",
 }
+
+
+Interval = tuple[float | None, float | None]
+"""Ends of an interval, None on a side on which the data set none."""
 
 
 @dataclass(frozen=True)
 class QuantityRow:
     """A parameter or a combination of some: value, unit, and its 95 % interval where it has one.
 
-    undetermined: why there is no interval, a key of ``LABELS``.
+    undetermined: why there is no interval, a key of ``LABELS``. here: the interval around this
+    one of several answers. fails: share of the range in which the model cannot be simulated.
     """
 
     name: str
     value: float
     unit: str
-    interval: tuple[float, float] | None = None
+    interval: Interval | None = None
     std: float | None = None
     undetermined: str = ""
+    here: Interval | None = None
+    fails: float = 0.0
 
     @property
     def digits(self) -> int:
         """Significant digits that the interval supports."""
-        return notation.digits(self.value, self.std)
+        return notation.digits(self.value, self.deviation)
+
+    @property
+    def deviation(self) -> float | None:
+        """Standard deviation, or what an interval of its width would have."""
+        low, high = self.interval or self.here or (None, None)
+        if self.std is not None or low is None or high is None:
+            return self.std
+        return (high - low) / (2.0 * _Z95)
+
+    @property
+    def two_sided(self) -> bool:
+        """Whether it has an interval with both ends."""
+        return self.interval is not None and None not in self.interval
 
     @property
     def undetermined_label(self) -> str:
-        """Why there is no interval, in a few words."""
-        return LABELS[self.undetermined]
+        """Why there is no interval, or what ends it, in a few words."""
+        fails = f"simulations fail in {100.0 * self.fails:.0f} % of the range" if self.fails else ""
+        return ", ".join(filter(None, (LABELS.get(self.undetermined, ""), fails)))
+
+    def interval_text(self, write: Callable[[float], str], between: str, empty: str) -> str:
+        """The interval with its ends written: ``1.0 .. 1.2``, ``< 1.2``, or ``> 1.0``."""
+        low, high = self.interval or (None, None)
+        if low is None and high is None:
+            return empty
+        if low is None or high is None:
+            return f"< {write(high)}" if high is not None else f"> {write(low or 0.0)}"
+        return f"{write(low)}{between}{write(high)}"
 
 
 @dataclass(frozen=True)
 class ParameterRow(QuantityRow):
     """A parameter of the model: searched in a range, tied to others, or fixed.
 
-    source: where its range or value comes from.
+    source: where its range or value comes from. on_bound: whether it stands on an end of its
+    range; pushed: whether the data want it beyond; at_limit: whether that end is a physical limit.
     """
 
     range: tuple[float, float] | None = None
     logarithmic: bool = False
     on_bound: bool = False
+    pushed: bool = False
+    at_limit: bool = False
     tied: str | None = None
     source: str = "model"
     description: str = ""
@@ -70,22 +103,31 @@ class ParameterRow(QuantityRow):
     @property
     def digits(self) -> int:
         """Significant digits: of a fixed or tied one four."""
-        return notation.digits(self.value, self.std) if self.free else 4
+        return super().digits if self.free else 4
 
     @property
     def label(self) -> str:
-        """Why it has no interval, or that an end of its range holds it."""
-        return LABELS[self.undetermined or ("bound" if self.on_bound else "")]
+        """Why it has no interval, and that it stands on an end of its range."""
+        end = "at its limit" if self.at_limit else "at its end"
+        return ", ".join(filter(None, (self.undetermined_label, end if self.on_bound else "")))
 
 
 @dataclass(frozen=True)
 class AmbiguityRow:
-    """Parameters that the data do not tell apart, as ``sysid.uncertainty.Ambiguity`` has them."""
+    """Parameters that cannot be told apart, as ``sysid.uncertainty.Ambiguity`` has them."""
 
     kind: str
     parameters: tuple[str, ...]
     determined: tuple[QuantityRow, ...]
     measure: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class RivalRow:
+    """Another minimum that explains the data as well: its parameters, and their intervals."""
+
+    values: Mapping[str, float]
+    intervals: Mapping[str, tuple[float, float]]
 
 
 @dataclass(frozen=True)
@@ -169,15 +211,19 @@ class Rows:
 
     rivals: other minima that explain the data as well. correlations: of parameters that have an
     interval of their own. logs: ``training`` and ``validation``. refined: whether the search was
-    refined to a minimum, without which nothing has an interval.
+    refined to a minimum, without which nothing has an interval. together: share of repetitions in
+    which all intervals hold, and the factor that widens them until that is 95 %. disagreement:
+    variance between logs, or parts of the only one, in parts of what noise makes.
     """
 
     parameters: tuple[ParameterRow, ...]
     ambiguities: tuple[AmbiguityRow, ...]
-    rivals: tuple[Mapping[str, float], ...]
+    rivals: tuple[RivalRow, ...]
     correlations: Mapping[tuple[str, str], float]
     logs: Mapping[str, tuple[LogErrors, ...]]
     refined: bool
+    together: tuple[float, float] | None = None
+    disagreement: float = 1.0
 
     @classmethod
     def of(cls, document: Mapping[str, Any]) -> Rows:
@@ -185,13 +231,23 @@ class Rows:
         return cls(
             tuple(_parameter(name, entry) for name, entry in document["parameters"].items()),
             tuple(map(_ambiguity, document.get("ambiguities", ()))),
-            tuple(document.get("rivals", ())),
+            tuple(
+                RivalRow(
+                    rival["parameters"],
+                    {name: (ends[0], ends[1]) for name, ends in rival["intervals"].items()},
+                )
+                for rival in document.get("rivals", ())
+            ),
             {
                 (pair["parameters"][0], pair["parameters"][1]): pair["correlation"]
                 for pair in document.get("correlations", ())
             },
             {part: logs_of(document["metrics"], part) for part in ("training", "validation")},
             "determined_directions" in document,
+            (together["coverage"], together["widening"])
+            if (together := document.get("together"))
+            else None,
+            document.get("disagreement", 1.0),
         )
 
     def parameter(self, name: str) -> ParameterRow:
@@ -205,17 +261,65 @@ class Rows:
 
     @cached_property
     def determined(self) -> tuple[ParameterRow, ...]:
-        """Free parameters with an interval of their own."""
-        return tuple(row for row in self.free if row.interval is not None)
+        """Free parameters with an interval of their own, of both ends."""
+        return tuple(row for row in self.free if row.two_sided)
+
+    @cached_property
+    def bounded(self) -> tuple[ParameterRow, ...]:
+        """Free parameters that the data bound on one side."""
+        return tuple(row for row in self.free if row.interval is not None and not row.two_sided)
+
+    @cached_property
+    def weak(self) -> tuple[ParameterRow, ...]:
+        """Free parameters that the data bound on one side or on none."""
+        return tuple(row for row in self.free if row in self.bounded or row.undetermined == "vague")
 
     @cached_property
     def combinations(self) -> tuple[QuantityRow, ...]:
         """Combinations of parameters that have an interval."""
-        return tuple(row for ambiguity in self.ambiguities for row in ambiguity.determined)
+        combined = (row for ambiguity in self.ambiguities for row in ambiguity.determined)
+        return tuple(row for row in combined if row.interval is not None)
 
     def ambiguities_of(self, *kinds: str) -> tuple[AmbiguityRow, ...]:
-        """Ambiguities of some kinds: ``product`` and ``sum`` are exact; ``vague``; ``rival``."""
+        """Ambiguities of some kinds: ``tied``, ``rival``."""
         return tuple(ambiguity for ambiguity in self.ambiguities if ambiguity.kind in kinds)
+
+    @property
+    def determined_sentence(self) -> str:
+        """How many parameters are known by themselves, and how many otherwise."""
+        parts = [f"{len(self.determined)} of {len(self.free)} free parameters by themselves"]
+        if self.bounded:
+            parts.append(f"{len(self.bounded)} on one side")
+        if self.combinations:
+            n = len(self.combinations)
+            parts.append(f"{n} combination{'' if n == 1 else 's'} of others")
+        last = f" and {parts.pop()}" if len(parts) > 1 else ""
+        return f"Determined: {', '.join(parts)}{last}."
+
+    @property
+    def together_sentence(self) -> str:
+        """How surely all intervals hold at once; empty of fewer than two."""
+        n = len(self.determined) + len(self.bounded) + len(self.combinations)
+        if self.together is None or n < 2:
+            return ""
+        coverage, widening = self.together
+        return (
+            f"Each interval holds in 95 of 100 repetitions, all {n} at once in "
+            f"{100.0 * coverage:.0f}; {widening:.2f} times as wide they would in 95."
+        )
+
+    @property
+    def disagreement_sentence(self) -> str:
+        """That logs want parameters of their own; empty where they do not."""
+        if self.disagreement <= 1.0:
+            return ""
+        several = len(self.logs["training"]) > 1
+        parts = "The logs" if several else "Parts of the log"
+        return (
+            f"{parts} want parameters of their own: they differ by {self.disagreement**0.5:.1f} "
+            "times what noise explains, so something is missing from the model. The intervals "
+            "are as wide as that spread."
+        )
 
     @cached_property
     def residuals(self) -> ResidualTable:
@@ -250,6 +354,8 @@ def _parameter(name: str, entry: Mapping[str, Any]) -> ParameterRow:
         range=_ends(entry.get("range")),
         logarithmic=entry.get("scale") == "log",
         on_bound=bool(entry.get("on_bound")),
+        pushed=bool(entry.get("pushed")),
+        at_limit=bool(entry.get("at_limit")),
         tied=entry.get("tied"),
         source=entry.get("source", "model"),
         description=entry.get("description", ""),
@@ -265,6 +371,8 @@ def _quantity(name: str, entry: Mapping[str, Any]) -> dict[str, Any]:
         "interval": _ends(entry.get("interval")),
         "std": entry.get("std"),
         "undetermined": entry.get("undetermined", ""),
+        "here": _ends(entry.get("interval_here")),
+        "fails": entry.get("fails", 0.0),
     }
 
 
@@ -274,7 +382,7 @@ def _ambiguity(entry: Mapping[str, Any]) -> AmbiguityRow:
     return AmbiguityRow(entry["kind"], parameters, determined, measure)
 
 
-def _ends(values: Sequence[float] | None) -> tuple[float, float] | None:
+def _ends(values: Sequence[Any] | None) -> tuple[Any, Any] | None:
     return None if values is None else (values[0], values[1])
 
 

@@ -30,7 +30,7 @@ def view(model: ProcessModel, document: Mapping[str, Any], rows: Rows) -> dict[s
     comparison, search = document["comparison"], document["search"]
     baseline = comparison if "metrics" in comparison else None
     logs = rows.logs["training"]
-    quantities = [*rows.determined, *rows.combinations]
+    quantities = [*rows.determined, *rows.bounded, *rows.combinations]
     names = " ".join(row.name for row in quantities)
     unrefined = f"the preset {search['preset']} does not refine to a minimum"
     interrupted = search["stopped"] == "interrupted"
@@ -71,7 +71,8 @@ def _determined(document: Mapping[str, Any], rows: Rows) -> str:
     alone, free, together = len(rows.determined), len(rows.free), len(rows.combinations)
     if alone == free:
         return f"The data determine all {alone} free parameters, each by itself."
-    combined = f" and {_count(together, 'combination')} of others" if together else ""
+    bounded = f", bound {len(rows.bounded)} more on one side," if rows.bounded else ""
+    combined = f"{bounded} and {_count(together, 'combination')} of others" if together else bounded
     outputs = "; the model's outputs are as good with any of their values that fit"
     usable = "" if document["verdict"]["predictions"]["trust"] == "poor" else outputs
     return (
@@ -160,18 +161,21 @@ def _steps(document: Mapping[str, Any], rows: Rows) -> list[Step]:
 
 def _cures(rows: Rows) -> list[Step]:
     """What would determine more of the parameters."""
-    measure = [name for a in rows.ambiguities_of("product", "sum") for name in a.measure]
-    vague = [name for a in rows.ambiguities_of("vague") for name in a.parameters]
+    measure = dict.fromkeys(name for a in rows.ambiguities_of("tied") for name in a.measure)
+    starts = [name for name in measure if "(0)" in name]
     rival = [a.measure[0] for a in rows.ambiguities_of("rival")]
-    held = [row.name for row in rows.parameters if row.on_bound]
+    held = [row.name for row in rows.parameters if row.pushed and not row.at_limit]
     cures = (
         Step("Give ", held, " more room under `ranges`, or a value under `fixed`: an end of the "
              "range decides now."),
         Step("Measure ", rival, ", to tell which of the sets of parameters below it is."),
-        Step("Measure ", list(dict.fromkeys(measure)), " by other means (an ohmmeter, a scale, a "
-             "data sheet) and give the values under `fixed` in a file for `--config`: then those "
-             "that act together get intervals of their own. To simulate, this is not needed."),
-        Step("Record an experiment that makes ", list(dict.fromkeys(vague)), " matter, larger or "
-             "slower or faster than this one: these data hardly feel them."),
+        Step("Measure ", [name for name in measure if name not in starts], " by other means (an "
+             "ohmmeter, a scale, a data sheet) and give the values under `fixed` in a file for "
+             "`--config`: then those that act together get intervals of their own. To simulate, "
+             "this is not needed."),
+        Step("Give the start of ", list(dict.fromkeys(n.partition("(")[0] for n in starts)),
+             " under `initial` in a file for `--config`."),
+        Step("Record an experiment that makes ", [row.name for row in rows.weak], " matter, larger "
+             "or slower or faster than this one: these data hardly feel them."),
     )  # fmt: skip
     return [step for step in cures if step.names]

@@ -10,6 +10,7 @@ _RULES = r"""% With \usepackage{booktabs} its rules are those of booktabs, witho
 \providecommand{\midrule}{\hline}
 \providecommand{\bottomrule}{\hline}
 """
+_SIGNS = str.maketrans({"<": r"\ensuremath{<}", ">": r"\ensuremath{>}"})
 
 
 def latex(rows: Rows) -> str:
@@ -59,8 +60,11 @@ def _cells(row: QuantityRow) -> list[str]:
 
 def _interval(row: QuantityRow) -> str:
     if row.interval is not None:
-        ends = (notation.number_tex(notation.number(end, row.digits)) for end in row.interval)
-        return " to ".join(ends)
+
+        def write(end: float) -> str:
+            return notation.number_tex(notation.number(end, row.digits))
+
+        return row.interval_text(write, between=" to ", empty="--").translate(_SIGNS)
     if not isinstance(row, ParameterRow):
         return notation.escape_tex(row.undetermined_label) or "--"
     if row.tied is not None:

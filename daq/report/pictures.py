@@ -191,13 +191,13 @@ def _parameters(rows: Rows) -> Iterator[Picture]:
     quantities = {
         row.name: (row.value, *row.interval)
         for row in (*rows.determined, *rows.combinations)
-        if row.interval is not None
+        if row.interval is not None and row.two_sided
     }
     if quantities:
         yield Picture(
             "intervals", "parameters",
-            "95 % intervals of all that the data determine: parameters by themselves, and "
-            "combinations of those that act only together.",
+            "95 % intervals of all that the data determine on both sides: parameters by "
+            "themselves, and combinations of those that act only together.",
             intervals(list(quantities), np.array(list(quantities.values()))),
         )  # fmt: skip
     names = [row.name for row in rows.determined]
@@ -213,7 +213,10 @@ def _parameters(rows: Rows) -> Iterator[Picture]:
 def _scaled_to_range(row: ParameterRow) -> FloatArray:
     """Value and interval on the scale of the search: 0 at the range's low end, 1 at its high."""
     assert row.range is not None
-    values = np.array([row.value, *(row.interval or (np.nan, np.nan)), *row.range])
+    # Where the data set no end the range does.
+    drawn = zip(row.interval, row.range, strict=True) if row.interval else ()
+    ends = [limit if end is None else end for end, limit in drawn] or [np.nan, np.nan]
+    values = np.array([row.value, *ends, *row.range])
     if row.logarithmic:
         values = np.log(np.maximum(values, np.finfo(float).tiny))
     value_and_ends, low, high = values[:3], values[3], values[4]

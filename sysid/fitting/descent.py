@@ -56,7 +56,8 @@ class Descent:
     the neighbours' sake. gain: share of the error that the last iteration took away. failures:
     iterations in a row that gained nothing, or hardly any of what was promised. level: of
     ``PERTURBATIONS``. error_of_round: the error where the present round of levels began.
-    smoothing: which of ``FLOORS``.
+    smoothing: which of ``FLOORS``. backward: coordinates whose neighbours are taken on the other
+    side, because simulations fail on the usual one.
     """
 
     point: Point
@@ -72,6 +73,7 @@ class Descent:
     smoothing: int = 0
     iterations: int = 0
     finished: bool = False
+    backward: tuple[int, ...] = ()
 
     @property
     def floor(self) -> float:

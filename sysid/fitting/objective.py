@@ -13,7 +13,7 @@ sqrt(n_samples) times this.
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Self
 
@@ -87,6 +87,7 @@ class Objective:
         if len(unseen):
             name = simulator.model.output_names[unseen[0]]
             raise ModelError(f"no record has a measured sample of output {name!r}")
+        self.tether: Callable[[FloatArray], FloatArray] | None = None
         self._counter = [0]
 
     @property
@@ -111,6 +112,20 @@ class Objective:
         counts = sum(np.isfinite(record.outputs).sum(axis=0) for record in records)
         scales = self.scales[: len(records)]
         return self._with(records=list(records), counts=counts, scales=scales)
+
+    @property
+    def free_run(self) -> Objective:
+        """The objective of the free run's errors: this one."""
+        return self
+
+    def tethered(
+        self, quantity: Callable[[FloatArray], FloatArray], target: float, stiffness: float
+    ) -> Objective:
+        """The same objective with one residual more, which pulls a quantity to a target.
+
+        quantity: (n,) of chromosomes (n, n_free). stiffness: the residual per unit of it.
+        """
+        return self._with(tether=lambda rows: stiffness * (quantity(rows) - target))
 
     def finer(self, accuracy: float) -> Objective:
         """The same objective by simulations of another accuracy, stiff ones given the steps."""
@@ -138,8 +153,15 @@ class Objective:
         steps = np.broadcast_to(n_steps, (len(chromosomes), len(self.records)))
         simulated = self._simulated(chromosomes, steps, keep=keep)
         self._counter[0] += len(chromosomes)
-        rms = self._roots(simulated.sse.sum(axis=1))
-        return Responses(simulated.values, rms, simulated.excess.max(axis=1))
+        sse, values = simulated.sse.sum(axis=1), simulated.values
+        if self.tether is not None:
+            # As one sample more of an output that counts.
+            output, pull = int(np.argmax(self.weights)), self.tether(chromosomes)
+            row = np.zeros((1, *values.shape[1:]))
+            row[0, output] = pull
+            sse[:, output] += pull**2
+            values = np.concatenate([values, row]) if keep else values
+        return Responses(values, self._roots(sse), simulated.excess.max(axis=1))
 
     def steps_needed(self, chromosomes: FloatArray) -> IntArray:
         """Integration steps per sample that each chromosome needs, (n, n_records)."""

@@ -186,6 +186,9 @@ def _surveyed(
         braced = resumed(objective, descent, "burst")
         if not braced.finished:
             return braced, None
+        turned = tuple(sorted({*descent.backward, *np.flatnonzero(burst).tolist()}))
+        if turned != descent.backward:
+            return replace(descent, backward=turned), None
         # The rest of the parameters go on alone.
         around.values[..., 1:][..., burst] = around.values[..., :1]
     if not np.isfinite(descent.error_of_round):
@@ -243,7 +246,9 @@ def _distance(space: SearchSpace, descent: Descent) -> FloatArray:
     """Distances h of the neighbours, in parts of the ranges, (n_free,)."""
     h = PERTURBATIONS[descent.level]
     # Away from the nearer bound, so that the perturbed chromosome stays in range.
-    return np.where(descent.point.at + h * space.width > space.coded_bounds[1], -h, h)
+    distance = np.where(descent.point.at + h * space.width > space.coded_bounds[1], -h, h)
+    distance[list(descent.backward)] *= -1.0
+    return distance
 
 
 def _neighbourhood(space: SearchSpace, descent: Descent) -> FloatArray:

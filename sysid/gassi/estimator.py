@@ -203,6 +203,7 @@ class GASSI(RecordEstimator):
         require_information(data, model.output_names, len(self.space_.names))
         self.output_weights_: FloatArray = objective.weights
         self._rivals: tuple[FloatArray, ...] = ()
+        self._ridge: tuple[FloatArray, ...] = ()
         self._final_accuracy = self.accuracy
         self.criterion_, self.criterion_reason_ = self._criterion(data, preset)
         self.output_noise_: FloatArray | None = None
@@ -246,12 +247,13 @@ class GASSI(RecordEstimator):
             notify(Progress("weigh", done, done, self.error_))
 
         try:
-            likeliest, self._rivals = fit_likelihood(
+            result = fit_likelihood(
                 run.objective, run.minima(), watch, noise=_OF_NOISY_INPUTS.get(self.criterion_)
             )
         except KeyboardInterrupt:
             self.stopped_ = "interrupted"
             return
+        likeliest, self._rivals, self._ridge = result.optimum, result.rivals, result.ridge
         self._final_accuracy = likeliest.objective.simulator.accuracy
         objective, chromosome = self._at_final_accuracy(run.objective), likeliest.chromosome
         error = float(objective.evaluate(chromosome[None])[0][0])
@@ -298,7 +300,8 @@ class GASSI(RecordEstimator):
 
         X, y, records: those of ``fit``. Raises ModelError unless refinement ended in a minimum.
         """
-        return uncertainty(self.final_objective(X, y, records), self.chromosome_, self._rivals)
+        objective = self.final_objective(X, y, records)
+        return uncertainty(objective, self.chromosome_, self._rivals, self._ridge)
 
     @one_thread()
     def profile(

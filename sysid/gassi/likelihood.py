@@ -9,6 +9,7 @@ likelihood chooses once more, each output counted by as many independent samples
 its errors leaves; those that it cannot tell apart are rivals.
 """
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -24,7 +25,8 @@ from sysid.fitting.objective import Objective
 from sysid.fitting.refinement import refine, refine_each
 from sysid.gassi.lookalikes import lookalikes
 from sysid.uncertainty.colour import colour, longest_memory
-from sysid.uncertainty.sensitivity import Sensitivity, coordinate_units, sensitivity
+from sysid.uncertainty.estimate import Z95
+from sysid.uncertainty.sensitivity import Sensitivity, sensitivity
 
 _ROUNDS = 6  # of weights and parameters in turn
 _NOISE_ROUNDS = 20  # the same of noise, weights and parameters
@@ -42,6 +44,7 @@ _FEWEST = 30.0
 _TOLD_APART = 13.3
 _CONCEIVABLE = 40.0  # the same before a minimum has been refined to its end
 _QUICKLY, _ROUGHLY = 15, 1e-4  # iterations and tolerance until then
+_WAY = np.array([0.25, 0.5, 0.75])  # parts of the way between two minima that are tried
 _EXPLORED = 2  # minima whose lookalikes are descended from
 # Minima are one when the way between them, were all linear, changed twice the log-likelihood by
 # less than this.
@@ -61,17 +64,29 @@ class Optimum:
     feasible: bool
 
 
+@dataclass(frozen=True)
+class Likeliest:
+    """The likeliest minimum, and others that the data do not tell from it, (n_free,) each.
+
+    rivals: minima apart from it. ridge: further points, of the valley in which it lies, that are
+    as good at the 95 % level.
+    """
+
+    optimum: Optimum
+    rivals: tuple[FloatArray, ...]
+    ridge: tuple[FloatArray, ...]
+
+
 def fit_likelihood(
     objective: Objective,
     minima: Sequence[FloatArray],
     watch: Watch | None = None,
     *,
     noise: NoisyInputs | None = None,
-) -> tuple[Optimum, tuple[FloatArray, ...]]:
+) -> Likeliest:
     """The likeliest of some minima (n_free,) of the mean RMSE and of their lookalikes.
 
-    And its rivals: chromosomes far from it that the data do not tell from it. noise: how
-    all of them are refitted in the end, where inputs are noisy.
+    noise: how all of them are refitted in the end, where inputs are noisy.
     """
     objective = _resolved(objective, minima[0])
     optima = _Optima(objective)
@@ -105,7 +120,15 @@ def fit_likelihood(
         optima = refitted
         best, *others = optima.ranked()
     rivals = [optimum for optimum in others if optima.deviance(optimum, best) < _TOLD_APART]
-    return best, tuple(rival.chromosome for rival in rivals)
+    connected = [optima.connected(best, rival) for rival in rivals]
+    apart = list(itertools.compress(rivals, np.logical_not(connected)))
+    valley = itertools.compress(rivals, connected)
+    ridge = [rival for rival in valley if optima.deviance(rival, best) < Z95**2]
+    return Likeliest(best, _chromosomes(apart), _chromosomes(ridge))
+
+
+def _chromosomes(optima: Sequence[Optimum]) -> tuple[FloatArray, ...]:
+    return tuple(optimum.chromosome for optimum in optima)
 
 
 class _Optima:
@@ -125,7 +148,6 @@ class _Optima:
         coded = self._objective.space.encode
         for optimum in self._optima:
             moved = coded(optimum.chromosome) - coded(chromosome)
-            moved /= coordinate_units(self._objective, optimum.chromosome)
             if moved @ self._information @ moved < _ONE:
                 return False
         return True
@@ -140,6 +162,27 @@ class _Optima:
         floor = _LEAST_SHARE * max(optimum.rms.max(), reference.rms.max(), 1e-300)
         ratio = np.log(np.maximum(optimum.rms, floor) / np.maximum(reference.rms, floor))
         return float(2.0 * np.sum(self._independent_samples * ratio))
+
+    def connected(self, optimum: Optimum, rival: Optimum) -> bool:
+        """Whether a way leads from one to the other on which the data rule nothing out.
+
+        The coordinate that differs most is moved in steps, all others are fitted to each.
+        """
+        objective, coded = optimum.objective, self._objective.space.encode
+        begin, end = coded(optimum.chromosome), coded(rival.chromosome)
+        place = int(np.argmax(np.abs(end - begin) / objective.space.width))
+        at = begin
+        for coordinate in begin[place] + _WAY * (end - begin)[place]:
+            at = at + (coordinate - at[place]) / (end - at)[place] * (end - at)
+            held = objective.space.holding(place, float(coordinate))
+            fit = refine(
+                objective.over(held), held.decode(at), max_iterations=_QUICKLY, tolerance=_ROUGHLY
+            )
+            between = _optimum(objective, fit.chromosome, fit.rms)
+            if self.deviance(between, optimum) >= _TOLD_APART:
+                return False
+            at = coded(fit.chromosome)
+        return True
 
     @cached_property
     def _independent_samples(self) -> FloatArray:

@@ -88,7 +88,9 @@ def _moved(
     """Determined quantities that the variant has outside of their intervals, the farthest first."""
     moved = []
     for estimate in uncertainty.determined():
-        shared = all(name in parameters for name, _ in estimate.terms)
+        combination = estimate.combination
+        names = (estimate.name,) if combination is None else combination.names
+        shared = all(name in parameters for name in names)
         if shared and estimate.std and estimate.excludes(parameters):
             value = estimate.at(parameters)
             far = abs(value - estimate.value) / estimate.std

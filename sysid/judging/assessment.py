@@ -337,7 +337,7 @@ def _unexplained(model: ProcessModel, results: Sequence[RecordResult]) -> Iterat
 
 def _parameters_on_bounds(uncertainty: Uncertainty) -> Iterator[str]:
     """Reason: parameters that stand on an end of their range."""
-    names = [p.name for p in uncertainty.parameters if p.why == "bound"]
+    names = [p.name for p in uncertainty.parameters if p.on_bound]
     if names:
         verb = "stands" if len(names) == 1 else "stand"
         yield f"{', '.join(names)} {verb} on an end of the range: widen it, or fix the value."

@@ -86,7 +86,7 @@ def suspected(
 
     validation: on which a variant that is fitted must do no worse.
     """
-    if uncertainty is None or any(p.why == "bound" for p in uncertainty.parameters):
+    if uncertainty is None or any(p.pushed for p in uncertainty.parameters):
         return None  # what an end of a range leaves looks like something missing
     try:
         objective = estimator.final_objective(list(training))

@@ -108,7 +108,7 @@ def _by_parameters(
     moved = np.diag(_STEP * np.where(space.log, 1.0, size))[:n]
     pairs = space.full(space.decode(np.concatenate([at + moved, at - moved])))
     up, down = np.split(runs(pairs), 2)
-    slopes = np.moveaxis((up - down) / (2.0 * _STEP), 0, 2)
+    slopes = np.moveaxis((up - down) / (2.0 * _STEP), 0, 2) / np.where(space.log, 1.0, size)[:n]
     values, vectors = np.linalg.eigh(covariance[:n, :n])
     errors: FloatArray = slopes @ (vectors * np.sqrt(np.maximum(values, 0.0)))
     return errors

@@ -43,7 +43,14 @@ from sysid.judging.suspects import (
 from sysid.problem.model import ModelError
 from sysid.uncertainty import Estimate, Uncertainty
 from sysid.uncertainty.colour import Autoregression, colour, record_rows
-from sysid.uncertainty.sensitivity import Sensitivity, input_noises, sensitivity, zero_errors
+from sysid.uncertainty.sensitivity import (
+    Sensitivity,
+    input_noises,
+    sensitivity,
+    spans,
+    zero_errors,
+)
+from sysid.uncertainty.ties import free_gradient, named_values
 
 # Probability of a finding by chance, all tests together; a variant is fitted to confirm it.
 _CHANCE: dict[Kind, float] = {
@@ -103,7 +110,7 @@ def missing_physics(
     """
     model = objective.simulator.model
     records = head(objective.records, _MOST_SAMPLES)
-    local = sensitivity(objective.on(records), chromosome)
+    local = sensitivity(objective.free_run.on(records), chromosome)
     if np.max(np.sqrt(np.mean(local.residual**2, axis=0))) < objective.simulator.accuracy:
         return ()  # what is left is the simulation's
     runs = _runs(local)
@@ -151,7 +158,7 @@ class _Tests:
         zeros = [zero[..., None] for zero in zero_errors(local)]
         self._columns = np.concatenate([local.slopes, *zeros], axis=2)
         self._free = np.concatenate(
-            [np.full(local.slopes.shape[2], 1.0 / _FREEDOM), np.ones(len(zeros))]
+            [1.0 / (_FREEDOM * spans(local.objective, local.chromosome)), np.ones(len(zeros))]
         )
         noises = list(input_noises(local))
         self._noises = np.stack(noises, axis=2) if noises else None
@@ -396,13 +403,13 @@ class _Whitening:
 
 def _gradient(local: Sensitivity, estimate: Estimate) -> FloatArray:
     """Change of a quantity with each coordinate of the slopes, (n_free,)."""
-    names, gradient = local.objective.space.names, np.zeros(len(local.chromosome))
-    for name, weight in estimate.terms:
-        j = names.index(name)
-        if estimate.form == "sum":
-            gradient[j] = weight * local.increments[j]
-        else:
-            gradient[j] = weight * estimate.value * local.increments[j] / local.chromosome[j]
+    space = local.objective.space
+    if estimate.combination is None:
+        by_parameters = np.eye(len(space.names))[space.names.index(estimate.name)]
+    else:
+        values = named_values(space, local.chromosome)
+        by_parameters = free_gradient(estimate.combination, space, values)
+    gradient: FloatArray = by_parameters * local.increments
     return gradient
 
 

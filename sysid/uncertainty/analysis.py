@@ -1,9 +1,9 @@
 """Intervals of identified parameters, and what the data leave undetermined.
 
-The singular values of the scaled output sensitivity are how far each direction of parameter
-space can move before the outputs show it. Directions that move the outputs less than the noise
-hides are not determined: the parameters in them get no interval, but the combinations that the
-data do determine (products, sums) do.
+What the equations cannot tell is tied: such parameters get no interval, but the combinations that
+the outputs show do. All else has one. Where the slopes at the estimate are a guide it is that of
+the covariance; where it would be wide, or reach the end of a range, it is that of the profile
+likelihood, which may end on one side only.
 """
 
 import itertools
@@ -12,43 +12,48 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
-from scipy.linalg import null_space
 
-from sysid.arrays import FloatArray, IntArray
+from sysid.arrays import BoolArray, FloatArray
 from sysid.fitting.objective import Objective
-from sysid.problem.expressions import measuring_effort, product_text, product_unit, sum_text
+from sysid.problem.expressions import measuring_effort
 from sysid.problem.given import covariance_factor
-from sysid.uncertainty.directions import PART, Directions, directions
-from sysid.uncertainty.estimate import Z95, Estimate, Why
-from sysid.uncertainty.relations import (
-    Kind,
-    main_parameters,
-    overlapping,
-    overlooked_directions,
-    relations,
-    sparse,
-)
+from sysid.uncertainty.covariance import covariance
+from sysid.uncertainty.estimate import Z95, Estimate, Invariant, Why
+from sysid.uncertainty.profile import Tracer
+from sysid.uncertainty.quantities import Coordinate, Expression
 from sysid.uncertainty.sensitivity import Sensitivity, sensitivity
+from sysid.uncertainty.ties import Ties, free_gradient, named_values, ties
 
+# Standard deviation of a logarithm above which the slopes at the estimate are no guide.
+_WEAK = 0.3
+_SAMPLED = 40  # points of a range at which it is tried whether simulations fail
+_DRAWS = 20_000  # of all quantities together
 _ALIKE = 0.05  # rivals closer than this are one
-_WHOLE = 1e-3  # a factor this close to a whole number is meant to be one
+_SIDES = (-1.0, 1.0)
 
 
 @dataclass(frozen=True)
 class Ambiguity:
     """Parameters of which only combinations act on the outputs.
 
-    kind: ``product`` and ``sum`` are exact, tried by moving the parameters along them; ``vague``
-    is a direction that the noise hides; ``rival`` are those that differ between minima that the
-    data do not tell apart. determined: the combinations that have an interval.
-    measure: the parameters whose measurement by other means would resolve it, as many as there
-    are directions to resolve, what is easiest to measure first.
+    kind: ``tied`` by the equations, or ``rival``: they differ between minima that the data do not
+    tell apart. determined: the combinations that have an interval. measure: the parameters whose
+    measurement by other means would resolve it, as many as there are directions to resolve, what
+    is easiest to measure first.
     """
 
-    kind: Kind | Literal["rival"]
+    kind: Literal["tied", "rival"]
     parameters: tuple[str, ...]
     determined: tuple[Estimate, ...]
     measure: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Rival:
+    """Another minimum that explains the data as well: its free parameters, and their intervals."""
+
+    values: Mapping[str, float]
+    intervals: Mapping[str, tuple[float, float]]
 
 
 @dataclass(frozen=True)
@@ -56,12 +61,14 @@ class Uncertainty:
     """Intervals of an identified chromosome, and what the data leave undetermined.
 
     parameters: an estimate for each free parameter (and estimated initial state). covariance:
-    (n_free, n_free) of the coordinates (logarithms where searched so, else parts of the value),
-    undetermined directions and parameters on a bound left out. singular_values: of the scaled
-    sensitivity, falling. rank: how many directions the data determine. rivals: free parameters
-    of other minima that the data do not tell from this one. factor: (n, n_free), independent
-    changes of the parameters, one standard deviation each, and a unit of every exact tie: what a
-    later stage is ``Given``.
+    (n_free, n_free) of the search coordinates (logarithms where searched so, else the values),
+    zero of those without an interval. singular_values: of the sensitivity, its columns of length
+    one, falling. rank: how many directions the data determine. rivals: other minima that the data
+    do not tell from this one. joint: share of repetitions in which all intervals hold at once;
+    simultaneous: factor by which to widen them for that to be 95 %. disagreement: variance of the
+    estimates from single logs (or parts of the only one) in parts of what their noise makes, 1
+    where that is chance. factor: (n, n_free), independent changes of the parameters, one standard
+    deviation each, and a unit of every tie: what a later stage is ``Given``.
     """
 
     parameters: tuple[Estimate, ...]
@@ -69,7 +76,10 @@ class Uncertainty:
     covariance: FloatArray
     singular_values: FloatArray
     rank: int
-    rivals: tuple[Mapping[str, float], ...] = ()
+    rivals: tuple[Rival, ...] = ()
+    joint: float = 0.95
+    simultaneous: float = 1.0
+    disagreement: float = 1.0
     factor: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
 
     def correlation(self) -> FloatArray:
@@ -82,197 +92,231 @@ class Uncertainty:
     def determined(self) -> tuple[Estimate, ...]:
         """All quantities with an interval: parameters, then combinations."""
         combined = itertools.chain(*(a.determined for a in self.ambiguities))
-        return (*(p for p in self.parameters if not p.why), *combined)
+        return tuple(e for e in (*self.parameters, *combined) if not e.why)
 
 
 def uncertainty(
-    objective: Objective, chromosome: FloatArray, rivals: Sequence[FloatArray] = ()
+    objective: Objective,
+    chromosome: FloatArray,
+    rivals: Sequence[FloatArray] = (),
+    ridge: Sequence[FloatArray] = (),
+    structure: Ties | None = None,
 ) -> Uncertainty:
     """Intervals, ambiguities and what is determined at an identified chromosome, (n_free,).
 
     The estimate is taken as the minimum of the objective; the colour of its residuals and the
-    records' zero errors enter the covariance. rivals: other minima that explain the data as well;
-    a parameter with another value there has no interval.
+    records' zero errors enter the covariance. rivals: other minima that explain the data as well.
+    ridge: further points of the valley that the chromosome lies in. structure: what the equations
+    leave undetermined, by default what the model's do.
     """
     local = sensitivity(objective, chromosome)
-    determined = directions(local)
-    inert = overlooked_directions(local, determined.undetermined, rivals)
-    if len(inert):
-        local = replace(local, slopes=local.slopes - local.slopes @ inert.T @ inert)
-        determined = directions(local)
-    analysis = _Analysis(local, determined)
-    result = Uncertainty(
-        tuple(analysis.parameter(j) for j in range(len(chromosome))),
-        tuple(analysis.ambiguities()),
-        determined.covariance,
-        determined.singular_values,
-        determined.rank,
-        factor=analysis.factor(),
-    )
-    named = [dict(zip(objective.space.names, rival.tolist(), strict=True)) for rival in rivals]
-    return _among_rivals(result, named)
-
-
-def _among_rivals(result: Uncertainty, rivals: Sequence[Mapping[str, float]]) -> Uncertainty:
-    """Without the intervals that exclude the value in a rival minimum."""
+    analysis = _Analysis(local, structure or ties(local), ridge)
+    minima = [analysis.rival(rival) for rival in analysis.unlike(rivals)]
 
     def disputed(estimate: Estimate) -> bool:
-        return any(estimate.excludes(rival) for rival in rivals)
+        return not estimate.why and any(estimate.excludes(rival.values) for rival in minima)
 
-    several = [e for e in result.parameters if disputed(e)]
-    names = tuple(e.name for e in sorted(several, key=lambda e: measuring_effort(e.unit)))
-    parameters = tuple(
-        replace(e, std=None, low=None, high=None, why="rival") if e in several else e
-        for e in result.parameters
-    )
+    def judged(estimate: Estimate) -> Estimate:
+        return replace(estimate, why="rival") if disputed(estimate) else estimate
+
+    parameters = [judged(analysis.parameter(j)) for j in range(len(chromosome))]
     ambiguities = [
-        replace(a, determined=tuple(e for e in a.determined if not disputed(e)))
-        for a in result.ambiguities
+        replace(a, determined=tuple(map(judged, a.determined))) for a in analysis.ambiguities()
     ]
-    if names:
+    apart = [e for e in parameters if e.why == "rival"]
+    apart.sort(key=lambda e: measuring_effort(e.unit))
+    if apart:
+        names = tuple(e.name for e in apart)
         ambiguities.insert(0, Ambiguity("rival", names, (), names[:1]))
-    # Of those that differ in no disputed parameter the first stands for all.
-    unlike: list[Mapping[str, float]] = []
-    values: list[list[float]] = []
-    for rival in rivals:
-        named = [rival[name] for name in names]
-        apart = any(e.excludes(rival) for e in several)
-        if apart and not any(np.allclose(named, before, rtol=_ALIKE) for before in values):
-            unlike.append(rival)
-            values.append(named)
-    return replace(
-        result, parameters=parameters, ambiguities=tuple(ambiguities), rivals=tuple(unlike)
+    spread = analysis.covariance.spread
+    result = Uncertainty(
+        tuple(parameters),
+        tuple(ambiguities),
+        analysis.reported_covariance(parameters),
+        analysis.covariance.singular_values,
+        analysis.covariance.rank,
+        tuple(rival for rival in minima if any(e.excludes(rival.values) for e in apart)),
+        disagreement=spread.ratio if spread else 1.0,
+        factor=analysis.factor(),
     )
+    joint, simultaneous = analysis.together([e.name for e in result.determined()])
+    return replace(result, joint=joint, simultaneous=simultaneous)
 
 
 class _Analysis:
-    """Estimates and ambiguities from the directions that the data determine."""
+    """Estimates and ambiguities: by the covariance, or where that is no guide by profiles."""
 
-    def __init__(self, local: Sensitivity, determined: Directions) -> None:
-        self.determined = determined
-        self.exact, self.vague = relations(local, determined)
-        self.chromosome, self.increments = local.chromosome, local.increments
-        self.log = local.objective.space.log
-        self.names = local.objective.space.names
-        self.units = [parameter.unit for parameter in local.objective.space.parameters]
-        # Relative change of each parameter per unit of its coordinate; none of what is zero.
-        divisors = np.where(self.chromosome != 0.0, self.chromosome, np.inf)
-        self.relative_increments = self.increments / divisors
+    def __init__(
+        self, local: Sensitivity, structure: Ties, ridge: Sequence[FloatArray] = ()
+    ) -> None:
+        self.local, self.ties = local, structure
+        self.objective, self.space = local.objective, local.objective.space
+        self.chromosome, self.coded = local.chromosome, self.space.encode(local.chromosome)
+        self.ridge = [self.space.encode(point) for point in ridge]
+        self.named = named_values(self.space, self.chromosome)
+        self.on_bound = self.space.on_bound(self.chromosome)
+        self.free = covariance(local, structure.directions)
+        self.pushed = self._pushed()
+        self.covariance = self.free
+        if self.pushed.any():
+            self.covariance = covariance(local, structure.directions, self.pushed)
+        self.gradients: dict[str, FloatArray] = {}
 
     def factor(self) -> FloatArray:
         """As of ``Uncertainty``."""
-        ties = np.array([relation.vector for relation in self.exact]).reshape(-1, len(self.names))
-        return covariance_factor(self.determined.covariance, ties, self.increments)
+        matrix, increments = self.covariance.matrix, self.local.increments
+        return covariance_factor(matrix, self.ties.directions, increments)
 
     def parameter(self, j: int) -> Estimate:
         """Estimate of a free parameter."""
-        why: Why = ""
-        if self.determined.held[j]:
-            why = "bound"
-        elif any(relation.vector[j] for relation in self.exact):
-            why = "tied"
-        elif self.determined.undetermined_share[j] > PART:
-            why = "vague"
-        if why:
-            value, terms = float(self.chromosome[j]), ((self.names[j], 1.0),)
-            return Estimate(self.names[j], self.units[j], value, terms, "product", why=why)
-        weights = np.eye(len(self.chromosome))[j]
-        return self._product(weights) if self.log[j] else self._sum(weights)
+        parameter, gradient = self.space.parameters[j], np.eye(len(self.coded))[j]
+        estimate = Estimate(
+            parameter.name,
+            parameter.unit,
+            float(self.chromosome[j]),
+            on_bound=bool(self.on_bound[j]),
+            pushed=bool(self.pushed[j]),
+        )
+        if self.ties.bound[j]:
+            return replace(estimate, why="tied")
+        self.gradients[parameter.name] = gradient
+        deviation = self.covariance.deviation(gradient)
+        if not self._is_guide(j, deviation):
+            spread = self.free if self.pushed[j] else self.covariance
+            tracer = Tracer(self.local, spread, gradient, Coordinate(self.space, j))
+            valley = [self._decoded(j, point[j]) for point in self.ridge]
+            estimate = self._profiled(estimate, tracer, valley)
+            failing = tracer.failed or self.local.failing[j]
+            return replace(estimate, failing=self._failing(j)) if failing else estimate
+        low, high = (self._decoded(j, self.coded[j] + sign * Z95 * deviation) for sign in _SIDES)
+        std = deviation * abs(float(self.local.increments[j]))
+        return replace(estimate, std=std, low=low, high=high)
 
     def ambiguities(self) -> Iterator[Ambiguity]:
-        """Exact relations that share parameters together, each vague direction by itself."""
-        for places in overlapping([relation.vector != 0.0 for relation in self.exact]):
-            members = [self.exact[i] for i in places]
-            vectors = np.stack([relation.vector for relation in members])
-            group = np.flatnonzero(vectors.any(axis=0))
-            if all(relation.kind == "sum" for relation in members):
-                yield self._ambiguity("sum", group, vectors, self._sums(group, vectors[:, group]))
-            else:
-                products = self._products(group, len(group) - len(members))
-                yield self._ambiguity("product", group, vectors, products)
-        for vector in self.vague:
-            yield self._ambiguity("vague", main_parameters(vector), vector[None], [])
+        """Parameters that hang together by the equations, and what is known of them."""
+        for places, directions in self.ties.groups():
+            units = [parameter.unit for parameter in self.space.parameters]
+            by_effort = sorted(places, key=lambda j: measuring_effort(units[j]))
+            measure: list[int] = []
+            for j in by_effort:
+                columns = directions[:, [*measure, j]]
+                if np.linalg.matrix_rank(columns / np.abs(columns).max(axis=0)) > len(measure):
+                    measure.append(j)
+            names = {self.space.names[j] for j in places}
+            combined = [self._combination(c) for c in self.ties.combinations if names & {*c.names}]
+            parameters, measured = (
+                tuple(self.space.names[j] for j in chosen) for chosen in (by_effort, measure)
+            )
+            yield Ambiguity("tied", parameters, tuple(combined), measured)
 
-    def _product(self, exponents: FloatArray) -> Estimate:
-        """Estimate of a product of powers of the parameters."""
-        used = np.flatnonzero(exponents)
-        value = float(np.prod(self.chromosome[used] ** exponents[used]))
-        deviation = self._deviation(exponents * self.relative_increments)
-        low, high = sorted(value * np.exp(factor * deviation) for factor in (-Z95, Z95))
-        unit = self.units[used[0]]
-        if len(used) > 1:
-            unit = product_unit((self.units[i], exponents[i]) for i in used)
-        terms, std = self._terms(exponents), abs(value) * deviation
-        return Estimate(product_text(terms), unit, value, terms, "product", std, low, high)
+    def unlike(self, chromosomes: Sequence[FloatArray]) -> list[FloatArray]:
+        """Those that differ in what is not tied, of each kind the first."""
+        free = ~np.array(self.ties.bound, dtype=bool)
+        kept: list[FloatArray] = []
+        for chromosome in chromosomes:
+            alike = (np.allclose(chromosome[free], c[free], rtol=_ALIKE) for c in kept)
+            if not any(alike):
+                kept.append(chromosome)
+        return kept
 
-    def _sum(self, factors: FloatArray) -> Estimate:
-        """Estimate of a weighted sum of the parameters."""
-        value = float(factors @ self.chromosome)
-        deviation = self._deviation(factors * self.increments)
-        low, high = value - Z95 * deviation, value + Z95 * deviation
-        unit = self.units[np.flatnonzero(factors)[0]]
-        terms = self._terms(factors)
-        return Estimate(sum_text(terms), unit, value, terms, "sum", deviation, low, high)
+    def rival(self, chromosome: FloatArray) -> Rival:
+        """Another minimum, with intervals by the covariance there."""
+        local, intervals = sensitivity(self.objective, chromosome), {}
+        spread = covariance(local, self.ties.directions)
+        for j, name in enumerate(self.space.names):
+            at = float(self.space.encode(chromosome)[j])
+            deviation = spread.deviation(np.eye(len(chromosome))[j])
+            if not self.ties.bound[j] and np.isfinite(deviation):
+                ends = [at + sign * Z95 * deviation for sign in _SIDES]
+                low, high = np.clip(ends, *(bounds[j] for bounds in self.space.coded_bounds))
+                intervals[name] = self._decoded(j, low), self._decoded(j, high)
+        return Rival(dict(zip(self.space.names, chromosome.tolist(), strict=True)), intervals)
 
-    def _terms(self, weights: FloatArray) -> tuple[tuple[str, float], ...]:
-        return tuple((self.names[i], float(weights[i])) for i in np.flatnonzero(weights))
+    def reported_covariance(self, parameters: Sequence[Estimate]) -> FloatArray:
+        """Covariance (n_free, n_free) of the parameters that have an interval, else zero."""
+        matrix = self.covariance.matrix
+        deviations = np.array(
+            [0.0 if e.why else self.covariance.deviation(g)
+             for e, g in zip(parameters, np.eye(len(matrix)), strict=True)]
+        )  # fmt: skip
+        plain = np.sqrt(np.diag(matrix))
+        usable = np.isfinite(deviations) & (plain > 0.0)
+        widening = np.divide(deviations, plain, out=np.zeros_like(plain), where=usable)
+        return matrix * np.outer(widening, widening)
 
-    def _deviation(self, direction: FloatArray) -> float:
-        return float(np.sqrt(max(float(direction @ self.determined.covariance @ direction), 0.0)))
+    def together(self, names: Sequence[str]) -> tuple[float, float]:
+        """Share of repetitions in which all these intervals hold, and how to make it 95 %."""
+        values, axes = np.linalg.eigh(self.covariance.matrix)
+        root = axes * np.sqrt(np.maximum(values, 0.0))
+        gradients = [self.gradients[name] for name in names]
+        rows = np.reshape(gradients, (len(names), len(self.coded))) @ root
+        lengths = np.linalg.norm(rows, axis=1, keepdims=True)
+        correlated = np.isfinite(lengths[:, 0]) & (lengths[:, 0] > 0.0)
+        rng = np.random.default_rng(0)
+        common = (
+            rng.standard_normal((_DRAWS, rows.shape[1]))
+            @ (rows[correlated] / lengths[correlated]).T
+        )
+        alone = rng.standard_normal((_DRAWS, int((~correlated).sum())))
+        largest = np.abs(np.concatenate([common, alone], axis=1)).max(axis=1, initial=0.0)
+        joint, widest = float(np.mean(largest <= Z95)), float(np.quantile(largest, 0.95))
+        return joint, max(widest / Z95, 1.0)
 
-    def _ambiguity(
-        self, kind: Kind, group: IntArray, vectors: FloatArray, determined: list[Estimate]
-    ) -> Ambiguity:
-        group = np.array(sorted(group, key=lambda i: measuring_effort(self.units[i])))
-        measure: list[int] = []
-        for i in group.tolist():
-            if np.linalg.matrix_rank(vectors[:, [*measure, i]]) > len(measure):
-                measure.append(i)
-        parameters, measured = (tuple(self.names[i] for i in places) for places in (group, measure))
-        return Ambiguity(kind, parameters, tuple(determined), measured)
+    def _pushed(self) -> BoolArray:
+        """Parameters that the data push against an end of their range, (n_free,)."""
+        step, (lower, upper) = self.free.newton_step, self.space.coded_bounds
+        outwards = np.where(self.coded - lower < upper - self.coded, -step, step)
+        deviations = np.array([self.free.deviation(g) for g in np.eye(len(step))])
+        free = ~np.array(self.ties.bound, dtype=bool)
+        pushed: BoolArray = self.on_bound & free & (outwards > Z95 * deviations)
+        return pushed
 
-    def _sums(self, group: IntArray, vectors: FloatArray) -> list[Estimate]:
-        """Sums of the group's parameters that the data determine, orthogonal to the vectors."""
-        sums = []
-        for direction in sparse(null_space(vectors).T):
-            factors = np.zeros(len(self.chromosome))
-            factors[group] = direction / self.increments[group]
-            used = factors[np.flatnonzero(factors)]
-            # Factors in parts of the smallest, the first of them positive.
-            factors /= np.min(np.abs(used)) * np.sign(used[0])
-            whole = np.round(factors)
-            factors = np.where(np.abs(factors - whole) < _WHOLE, whole, factors)
-            if self._is_determined(factors * self.increments):
-                sums.append(self._sum(factors))
-        return sums
+    def _is_guide(self, j: int, deviation: float) -> bool:
+        """Whether the slopes at the estimate tell how far a parameter may be from it."""
+        low, high = (self.coded[j] + sign * Z95 * deviation for sign in _SIDES)
+        lower, upper = (float(bounds[j]) for bounds in self.space.coded_bounds)
+        inside = lower < low and high < upper
+        valley = any(not low <= point[j] <= high for point in self.ridge)
+        narrow = deviation < _WEAK if self.space.log[j] else True
+        return inside and narrow and not valley and not self.local.failing[j]
 
-    def _products(self, group: IntArray, count: int) -> list[Estimate]:
-        """Simple products of the group's parameters that the data determine, at most count."""
-        chosen: list[FloatArray] = []
-        for powers in _simple_exponents(len(group)):
-            if len(chosen) == count:
-                break
-            exponents = np.zeros(len(self.chromosome))
-            exponents[group] = powers
-            trial = np.array([*chosen, exponents])
-            is_determined = self._is_determined(exponents * self.relative_increments)
-            if is_determined and np.linalg.matrix_rank(trial) > len(chosen):
-                chosen.append(exponents)
-        return [self._product(exponents) for exponents in chosen]
+    def _combination(self, combination: Invariant) -> Estimate:
+        """Estimate of a combination of tied parameters."""
+        text, value = combination.text, float(combination.value(self.named))
+        estimate = Estimate(text, combination.unit, value, combination=combination)
+        gradient = free_gradient(combination, self.space, self.named) * self.local.increments
+        self.gradients[text] = gradient
+        deviation = self.covariance.deviation(gradient)
+        positive = bool(np.all(self.space.log[gradient != 0.0])) and value > 0.0
+        if not (np.isfinite(deviation) and (not positive or deviation < _WEAK * value)):
+            moved = gradient / value if positive else gradient
+            quantity = Expression(self.space, combination, positive)
+            return self._profiled(estimate, Tracer(self.local, self.covariance, moved, quantity))
+        product = " + " not in text and " - " not in text
+        if product and deviation < _WEAK * abs(value):
+            low, high = sorted(value * np.exp(sign * Z95 * deviation / value) for sign in _SIDES)
+        else:
+            low, high = (value + sign * Z95 * deviation for sign in _SIDES)
+        return replace(estimate, std=deviation, low=float(low), high=float(high))
 
-    def _is_determined(self, direction: FloatArray) -> bool:
-        """Whether the data determine what changes so with the coordinates."""
-        outside = np.sum((self.determined.undetermined @ direction) ** 2) / np.sum(direction**2)
-        return bool(outside < PART)
+    def _profiled(
+        self, estimate: Estimate, tracer: Tracer, valley: Sequence[float] = ()
+    ) -> Estimate:
+        """An estimate by its profile likelihood, and wide enough for the rest of a valley."""
+        low, high = (tracer.bound(sign) for sign in _SIDES)
+        low = None if low is None else min([low, *valley])
+        high = None if high is None else max([high, *valley])
+        why: Why = "vague" if low is None and high is None else ""
+        return replace(estimate, low=low, high=high, why=why)
 
+    def _failing(self, place: int) -> float:
+        """Share of a parameter's range in which the model cannot be simulated."""
+        lower, width = self.space.coded_lower[place], self.space.width[place]
+        trial = np.repeat(self.coded[None], _SAMPLED, axis=0)
+        trial[:, place] = lower + width * (np.arange(_SAMPLED) + 0.5) / _SAMPLED
+        errors, _ = self.objective.evaluate(self.space.decode(trial))
+        return float(np.mean(~np.isfinite(errors)))
 
-def _simple_exponents(n: int) -> Iterator[FloatArray]:
-    """Exponents of simple products of n factors, the simplest first: squares after all others."""
-    for powers in ((1.0, -1.0), (1.0, -1.0, 2.0, -2.0)):
-        for size in (1, 2, 3):
-            for places in itertools.combinations(range(n), size):
-                for chosen in itertools.product(powers, repeat=size):
-                    if chosen[0] > 0.0 and min(map(abs, chosen)) == 1.0:
-                        exponents = np.zeros(n)
-                        exponents[list(places)] = chosen
-                        yield exponents
+    def _decoded(self, place: int, coordinate: float) -> float:
+        """The value of a parameter at a coordinate."""
+        return float(np.exp(coordinate)) if self.space.log[place] else float(coordinate)

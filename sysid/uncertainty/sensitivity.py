@@ -24,9 +24,11 @@ class Sensitivity:
 
     residual: (n_residuals, n_outputs), simulated minus measured in parts of the output's scale,
     0 where a sample was lost; seen: of the same shape, where none was. slopes: (n_residuals,
-    n_outputs, n_free), with respect to the natural logarithm of a parameter searched by
-    logarithm, else to the parameter in units of ``coordinate_units``. share: of the shape of the
-    residuals, their factors where noise of inputs divides them, else ones.
+    n_outputs, n_free), with respect to the search coordinates: the natural logarithm of a
+    parameter searched by logarithm, else the parameter. share: of the shape of the residuals,
+    their factors where noise of inputs divides them, else ones. failing: (n_free,), parameters
+    next to whose value a simulation fails, so that their slopes are one-sided. criterion: the
+    objective that was minimised; ``objective`` is that of the free run where noise divides it.
     """
 
     objective: Objective
@@ -36,6 +38,8 @@ class Sensitivity:
     seen: BoolArray
     slopes: FloatArray
     share: FloatArray
+    failing: BoolArray
+    criterion: Objective
 
     @property
     def lengths(self) -> tuple[int, ...]:
@@ -50,46 +54,44 @@ class Sensitivity:
     @cached_property
     def increments(self) -> FloatArray:
         """Change of each parameter per unit of its coordinate, (n_free,)."""
-        units = coordinate_units(self.objective, self.chromosome)
-        return np.where(self.objective.space.log, self.chromosome, units)
+        return np.where(self.objective.space.log, self.chromosome, 1.0)
 
 
 def sensitivity(objective: Objective, chromosome: FloatArray) -> Sensitivity:
     """Residuals and slopes at a chromosome, (n_free,), by central differences.
 
-    All simulations of a record take as many steps as the most demanding of them needs; one that
-    fails has slope zero. Where noise of inputs divides the free run's errors it is held: at kinks
-    of the equations it jumps, which differences would take for slopes.
+    All simulations of a record take as many steps as the most demanding of them needs. Where one
+    on one side fails the difference is that on the other side; where both do the slope is zero.
+    Where noise of inputs divides the free run's errors it is held: at kinks of the equations it
+    jumps, which differences would take for slopes.
     """
     share: FloatArray | float = 1.0
-    neighbours = _with_neighbours(objective, chromosome)
-    steps = [int(needed) for needed in objective.steps_needed(neighbours).max(axis=0)]
+    criterion, distance = objective, _PERTURBATION * spans(objective, chromosome)
+    at, shift = objective.space.encode(chromosome), np.diag(distance)
+    around = objective.space.decode(np.concatenate([at[None], at + shift, at - shift]))
+    steps = [int(needed) for needed in objective.steps_needed(around).max(axis=0)]
     if isinstance(objective, Innovations) and not objective.corrects:
         share = objective.share(chromosome, np.array(steps))
         objective = objective.free_run
-    residuals = objective.residuals(neighbours, steps).values
-    n = len(chromosome)
-    slopes = (residuals[..., 1 : n + 1] - residuals[..., n + 1 :]) / (2.0 * _PERTURBATION)
-    slopes = np.where(np.isfinite(slopes), slopes, 0.0)
+    values = objective.residuals(around, steps).values
+    centre, n = values[..., :1], len(chromosome)
+    runs: BoolArray = np.all(np.isfinite(values[..., 1:]), axis=(0, 1))
+    changes = np.where(runs, values[..., 1:] - centre, 0.0)
+    sides = runs[:n].astype(int) + runs[n:]
+    slopes = (changes[..., :n] - changes[..., n:]) / (np.maximum(sides, 1) * distance)
     seen = np.concatenate([np.isfinite(record.outputs) for record in objective.records])
     factors = np.broadcast_to(share, seen.shape)
-    residual, slopes = factors * residuals[..., 0], factors[..., None] * slopes
-    return Sensitivity(objective, chromosome, steps, residual, seen, slopes, factors)
+    residual, slopes = factors * centre[..., 0], factors[..., None] * slopes
+    return Sensitivity(
+        objective, chromosome, steps, residual, seen, slopes, factors, sides < 2, criterion
+    )
 
 
-def _with_neighbours(objective: Objective, chromosome: FloatArray) -> FloatArray:
-    """A chromosome, then it with each coordinate moved up, then down, (1 + 2 n_free, n_free)."""
+def spans(objective: Objective, chromosome: FloatArray) -> FloatArray:
+    """Changes of the search coordinates that are neither small nor large, (n_free,)."""
     space = objective.space
-    at, units = space.encode(chromosome), coordinate_units(objective, chromosome)
-    moved = np.diag(_PERTURBATION * units)
-    return space.decode(np.concatenate([at[None], at + moved, at - moved]))
-
-
-def coordinate_units(objective: Objective, chromosome: FloatArray) -> FloatArray:
-    """Size in search coordinates of a unit of each coordinate of the slopes, (n_free,)."""
-    space = objective.space
-    size = np.maximum(np.abs(chromosome), 0.05 * (space.upper - space.lower))
-    return np.where(space.log, 1.0, size)
+    linear = np.maximum(np.abs(chromosome), 0.05 * (space.upper - space.lower))
+    return np.where(space.log, 1.0, linear)
 
 
 def zero_errors(sensitivity: Sensitivity) -> Iterator[FloatArray]:

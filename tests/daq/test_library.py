@@ -56,7 +56,8 @@ def test_an_identification_is_the_one_the_command_makes(recorded, found):
     assert list(table.columns) == ["value", "low", "high", "unit", "note"]
     for name, entry in told["parameters"].items():
         assert table.loc[name, "value"] == entry["value"]
-        low, high = entry.get("interval") or (np.nan, np.nan)
+        ends = entry.get("interval") or (None, None)
+        low, high = (np.nan if end is None else end for end in ends)
         np.testing.assert_equal(table.loc[name, ["low", "high"]].tolist(), [low, high])
     fit = found.metrics.loc[("validation", validation.name, "omega"), "fit_percent"]
     assert fit == told["metrics"]["validation"][0]["outputs"]["omega"]["fit_percent"]

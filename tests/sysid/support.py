@@ -158,6 +158,8 @@ class Formula:
     formula: (p, u) -> (n_samples, n_outputs), p a mapping of names to values.
     """
 
+    accuracy = 1e-10
+
     def __init__(self, model, formula):
         self.model, self.formula = model, formula
 

@@ -44,14 +44,16 @@ def result(seed, error=(NOISE, NOISE), left=0.0, size=1.0, **noise):
 
 
 def estimate(name, why=""):
+    if why == "bound":
+        return Estimate(name, "1", 1.0, high=1.2, on_bound=True)
     interval = (None, None, None) if why else (0.1, 0.8, 1.2)
-    return Estimate(name, "1", 1.0, ((name, 1.0),), "product", *interval, why=why)
+    return Estimate(name, "1", 1.0, *interval, why=why)
 
 
 def told(*whys):
     parameters = tuple(estimate(f"p{i}", why) for i, why in enumerate(whys))
     n = len(whys)
-    vague = Ambiguity("vague", ("p0",), (), ("p0",))
+    vague = Ambiguity("tied", ("p0",), (), ("p0",))
     return Uncertainty(parameters, (vague,), np.eye(n), np.ones(n), n)
 
 

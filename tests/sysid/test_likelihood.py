@@ -12,7 +12,8 @@ from sysid.gassi.likelihood import fit_likelihood
 from sysid.gassi.lookalikes import lookalikes
 from sysid.problem.space import SearchSpace
 from sysid.response.linearization import jacobian
-from tests.sysid.support import prbs
+from sysid.uncertainty import uncertainty
+from tests.sysid.support import Formula, prbs
 
 
 def oscillator_derivative(x, u, p):
@@ -108,9 +109,9 @@ def test_a_minimum_among_aliases_is_found_from_any_other(seed):
     target = objective_of(model, record)
     start = lookalikes(target, model.nominal)
     wrong = max(start, key=lambda c: float(target.evaluate(c[None])[0][0]))
-    likeliest, rivals = fit_likelihood(target, [wrong])
+    result = fit_likelihood(target, [wrong])
     # Under the noise an alias may explain the record as well; the truth is never left out.
-    ends = [likeliest.chromosome, *rivals]
+    ends = [result.optimum.chromosome, *result.rivals]
     assert any(chromosome == pytest.approx(model.nominal, rel=0.1) for chromosome in ends)
 
 
@@ -118,7 +119,7 @@ def test_a_minimum_among_aliases_is_found_from_any_other(seed):
 
 
 @pytest.mark.soak
-def test_lags_that_may_change_places_have_no_intervals_of_their_own():
+def test_lags_that_may_change_places_have_an_interval_for_each_answer():
     record = record_of(lags(), 0.01, noise=0.02)
     fitted = GASSI(lags(), population=40, generations=8).fit(record)
     here = sorted(fitted.parameters_[name] for name in ("first", "second"))
@@ -129,6 +130,9 @@ def test_lags_that_may_change_places_have_no_intervals_of_their_own():
     intervals = fitted.uncertainty(record)
     assert [estimate.why for estimate in intervals.parameters] == ["rival", "rival"]
     assert intervals.determined() == ()
+    (other,) = intervals.rivals
+    second = intervals.parameters[1]
+    assert other.intervals["first"] == pytest.approx((second.low, second.high), rel=0.1)
     (ambiguity,) = intervals.ambiguities
     assert ambiguity.kind == "rival" and set(ambiguity.parameters) == {"first", "second"}
 
@@ -140,6 +144,52 @@ def test_a_measured_one_tells_them_apart():
     (second,) = fitted.uncertainty(record).parameters
     assert fitted.rivals_ == [] and second.why == ""
     assert second.low < 0.12 < second.high
+
+
+def formula_objective(formula, low, high):
+    """The objective of y = formula(a, b) u0, a and b searched linearly, and noise."""
+    model = ProcessModel(
+        name="formula",
+        states=(State("x", "1"),),
+        inputs=(Input("u0", "1"), Input("u1", "1")),
+        outputs=(Output("x", "1"),),
+        parameters=tuple(
+            Parameter(name, "1", 2.0, low, high, minimum=-np.inf) for name in ("a", "b")
+        ),
+        derivative=twice_derivative,
+    )
+
+    def outputs(p, u):
+        return (formula(p["a"], p["b"]) * u[:, 0])[:, None]
+
+    rng = np.random.default_rng(0)
+    u = rng.standard_normal((300, 2))
+    y = outputs({"a": 2.0, "b": 2.0}, u) + 0.1 * rng.standard_normal((300, 1))
+    return Objective(Formula(model, outputs), SearchSpace.of(model), [Dataset(u, y, 0.01)])
+
+
+def test_a_curved_valley_is_one_answer_and_its_hull_the_interval():
+    target = formula_objective(lambda a, b: a * b, 0.5, 10.0)
+    ends = [np.array([1.0, 4.0]), np.array([4.0, 1.0])]
+    result = fit_likelihood(target, ends)
+    assert result.rivals == () and len(result.ridge) == 1
+    intervals = uncertainty(result.optimum.objective, result.optimum.chromosome, (), result.ridge)
+    for j, estimate in enumerate(intervals.parameters):
+        assert estimate.why in ("", "vague")
+        assert (estimate.low or 0.5) <= min(end[j] for end in ends) + 0.1
+        assert (estimate.high or 10.0) >= max(end[j] for end in ends) - 0.1
+
+
+def test_minima_with_a_wall_between_them_are_rivals_each_with_an_interval():
+    target = formula_objective(lambda a, b: a * a, -5.0, 5.0)
+    result = fit_likelihood(target, [np.array([2.0, 1.0]), np.array([-2.0, 1.0])])
+    assert len(result.rivals) == 1 and result.ridge == ()
+    intervals = uncertainty(result.optimum.objective, result.optimum.chromosome, result.rivals)
+    a = intervals.parameters[0]
+    (rival,) = intervals.rivals
+    assert a.why == "rival" and a.low < abs(a.value) * np.sign(a.value) < a.high
+    low, high = rival.intervals["a"]
+    assert (low, high) == pytest.approx((-a.high, -a.low), rel=1e-3)
 
 
 def test_what_the_data_tell_apart_is_no_rival():
@@ -179,6 +229,6 @@ def test_the_likelihood_weighs_each_output_by_its_own_error():
         return float(np.prod(np.sqrt(np.mean((gain * u - outputs) ** 2, axis=0))))
 
     exact = minimize_scalar(product, bounds=(0.5, 2.0), method="bounded", options={"xatol": 1e-9})
-    likeliest, _ = fit_likelihood(target, [np.array([1.2])])
+    likeliest = fit_likelihood(target, [np.array([1.2])]).optimum
     assert likeliest.chromosome[0] == pytest.approx(exact.x, abs=1e-4)
     assert likeliest.objective.weights[0] > 5.0 * likeliest.objective.weights[1]

@@ -367,6 +367,22 @@ def test_the_rest_of_the_parameters_go_on_where_one_cannot_be_moved():
     assert refined.chromosome[1] == pytest.approx(np.mean(1.7 * SINE))
 
 
+def test_a_parameter_moves_on_the_side_where_simulations_run():
+    """The root of what is negative beyond the start: forward neighbours all fail."""
+
+    def formula(p, u):
+        with np.errstate(invalid="ignore"):
+            return np.sqrt(0.3 - p["gain"]) * u
+
+    model = lag(
+        parameters=(Parameter("gain", "1", 0.1, 0.0, 1.0),), derivative=lambda x, u, p: (p[0],)
+    )
+    records = [Dataset(SINE, 0.3 * SINE, 0.01)]
+    target = Objective(Formula(model, formula), SearchSpace.of(model), records)
+    refined = refine(target, np.array([0.3 - 1e-8]))
+    assert refined.chromosome[0] == pytest.approx(0.21, abs=1e-5)
+
+
 STAIR = 0.02  # a hundredth of the range is more than half of it
 
 

@@ -1,0 +1,110 @@
+"""How much the estimates of single logs differ, where that is more than their noise lets them.
+
+Of a model that is not quite right every log wants parameters of its own, and no colour of the
+residuals tells by how much. The spread of what is estimated without each log in turn does (the
+infinitesimal jackknife by clusters; Bell & McCaffrey, "Bias reduction in standard errors for
+linear regression with multi-stage samples", Survey Methodology 28, 2002). It counts where
+Cochran's test finds the logs to disagree ("The combination of estimates from different
+experiments", Biometrics 10, 1954). A single log is cut into parts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import linalg, stats
+
+from sysid.arrays import FloatArray
+from sysid.uncertainty.colour import record_rows
+from sysid.uncertainty.estimate import Z95
+from sysid.uncertainty.sensitivity import Sensitivity
+
+_PARTS = 8  # of a single log
+# Of a correct model's logs, and of its logs' parts, that the test calls at odds.
+_CHANCE, _CHANCE_OF_PARTS = 0.01, 1e-4
+# Share of what all logs tell of a direction above which the rest tell nothing of it.
+_ALONE = 0.98
+_FEWEST = 3.0  # logs, of like information, whose spread says something
+
+
+@dataclass(frozen=True)
+class LogSpread:
+    """Estimates without one log each, as they differ from that of all.
+
+    influence: (n_logs, n_free), in search coordinates. information: (n_logs, n_free, n_free),
+    parts of the covariance that each log's share of the curvature stands for. ratio: the spread's
+    variance in parts of what noise makes.
+    """
+
+    influence: FloatArray
+    information: FloatArray
+    ratio: float
+
+    def deviation(self, gradient: FloatArray, noise: float) -> float:
+        """Standard deviation of what changes so (n_free,) with the coordinates.
+
+        noise: that by the noise. The normal distribution's 95 % interval of the result is Student's
+        of the spread. Of what too few logs inform, whose spread says little, it is at least that
+        by noise widened as much as those of all quantities together (Birge's ratio).
+        """
+        moves = self.influence @ gradient
+        n = len(moves)
+        variance = (n - 1) / n * np.sum((moves - moves.mean()) ** 2)
+        shares = np.einsum("p,kpr,r->k", gradient, self.information, gradient)
+        if np.sum(shares) ** 2 > _FEWEST * np.sum(shares**2):
+            quantile = stats.t.ppf(0.975, _freedom(shares / shares.sum())) / Z95
+            return max(noise, float(quantile * np.sqrt(variance)))
+        return max(noise * float(np.sqrt(self.ratio)), float(np.sqrt(variance)))
+
+
+def spread(
+    sensitivity: Sensitivity, weighted: FloatArray, back: FloatArray, score: FloatArray
+) -> LogSpread | None:
+    """The spread between logs, or parts of one, where it is more than chance.
+
+    weighted: (n_residuals, n_outputs, n_free), slopes times weights. back: (n_free, rank), in
+    whose directions the curvature is one. score: (n_free, n_free), its covariance by noise.
+    """
+    logs = len(sensitivity.lengths) > 1
+    lengths = sensitivity.lengths if logs else _parts(sensitivity.lengths[0])
+    rank = back.shape[1]
+    if rank == 0 or len(lengths) < 2:
+        return None
+    noise, axes = np.linalg.eigh(back.T @ score @ back)
+    back = back @ axes
+    moves, leverages = np.empty((len(lengths), rank)), np.empty((len(lengths), rank, rank))
+    for k, rows in enumerate(record_rows(lengths)):
+        part = weighted[rows]
+        push = np.einsum("tip,ti->p", part, sensitivity.residual[rows])
+        leverages[k] = back.T @ np.einsum("tip,tir->pr", part, sensitivity.slopes[rows],
+                                          optimize=True) @ back  # fmt: skip
+        moves[k] = _without(leverages[k], back.T @ push)
+    freedom = np.array([_freedom(shares) for shares in np.diagonal(leverages, axis1=1, axis2=2).T])
+    n = len(lengths)
+    variance = (n - 1) / n * np.sum((moves - moves.mean(axis=0)) ** 2, axis=0)
+    ratios = variance / np.maximum(noise, 1e-12 * noise[-1])
+    chance = _CHANCE if logs else _CHANCE_OF_PARTS
+    if stats.chi2.sf(freedom @ ratios, freedom.sum()) > chance:
+        return None
+    information = np.einsum("pi,kij,rj->kpr", back, leverages, back, optimize=True)
+    return LogSpread(moves @ back.T, information, float(freedom @ ratios / freedom.sum()))
+
+
+def _without(leverage: FloatArray, push: FloatArray) -> FloatArray:
+    """Move of the estimate without a log, by its leverage (rank, rank) and its score (rank,)."""
+    share, axes = linalg.eigh(leverage)
+    left = np.where(share < _ALONE, 1.0 - share, np.inf)
+    moved: FloatArray = axes @ ((axes.T @ push) / left)
+    return moved
+
+
+def _freedom(shares: FloatArray) -> float:
+    """Degrees of freedom of a spread of logs with these shares of the information."""
+    return max(1.0 / float(np.sum(shares**2)) - 1.0, 1.0)
+
+
+def _parts(length: int) -> list[int]:
+    """Lengths of the parts that a log is cut into."""
+    ends = np.linspace(0, length, min(_PARTS, length) + 1).astype(int)
+    return [int(n) for n in np.diff(ends)]
