@@ -61,12 +61,12 @@ def analyse(model: ProcessModel, *, exact: bool = True) -> Structure:
     rows = _splits(splitter, model, model.derivative)
     outputs = None if model.output is None else _splits(splitter, model, model.output) or ()
     moving = frozenset(j for j, signal in enumerate(model.inputs) if signal.hold != "zoh")
-    equations = Equations(len(model.states), len(model.inputs), rows, outputs, moving)
+    equations = SplitEquations(len(model.states), len(model.inputs), rows, outputs, moving)
     return structure(model, splitter, equations, exact=exact)
 
 
 @dataclass(frozen=True)
-class Equations:
+class SplitEquations:
     """Derivatives and outputs, split; moving: inputs that change within a sample.
 
     rows: None where they could not be followed; outputs: None where they are states, empty where
@@ -82,7 +82,7 @@ class Equations:
 
 
 def structure(
-    model: ProcessModel, splitter: Splitter, equations: Equations, *, exact: bool = True
+    model: ProcessModel, splitter: Splitter, equations: SplitEquations, *, exact: bool = True
 ) -> Structure:
     """The structure of split equations, those of a model or such as contain them."""
     tape, rows, outputs = splitter.tape, equations.rows or (), equations.outputs
@@ -124,7 +124,7 @@ def structure(
 
 
 def _driven(
-    equations: Equations, clamps: Mapping[int, Clamp], exact: bool
+    equations: SplitEquations, clamps: Mapping[int, Clamp], exact: bool
 ) -> tuple[tuple[int, ...], bool]:
     """Rows of N that change within a sample, and whether any depends on a state."""
     rows = equations.rows

@@ -16,7 +16,7 @@ from typing import Literal
 
 from sysid.engine.gradient import differentiate
 from sysid.engine.split import Splitter
-from sysid.engine.structure import Equations, Structure, structure
+from sysid.engine.structure import SplitEquations, Structure, structure
 from sysid.engine.tape import Tape
 from sysid.engine.trace import followed, operand, traces
 from sysid.problem.model import Function, ModelError, ProcessModel
@@ -81,7 +81,7 @@ def variation(model: ProcessModel, noisy: Sequence[int]) -> Variation:
     split_outputs = None if outputs is None else splitter.split(tape, outputs)
     moving = {j for j, signal in enumerate(model.inputs) if signal.hold != "zoh"} | {m}
     further = {"gains": splitter.split(tape, telling.values())} if telling else {}
-    equations = Equations(place, m + 1, rows_of, split_outputs, frozenset(moving), further)
+    equations = SplitEquations(place, m + 1, rows_of, split_outputs, frozenset(moving), further)
     whole = structure(model, splitter, equations)
     return Variation(whole, n, tuple(noisy), reached, columns, tuple(telling))
 

@@ -63,12 +63,12 @@ def best_alternative(
     rows = {row.name: row for row in comparison.rows}
     better = rows[_MODEL].dbic - rows[named[0]].dbic > _STRONG and rows[named[0]].good
     runs = [c.validation if validation else c.training for c in candidates]
-    fits = [_fits(validation or training, run) for run in runs]
+    shares = [fits(validation or training, run) for run in runs]
     names = variant.output_names
     return Alternative(
         named[0],
         better,
-        {n: (float(a), float(b)) for n, a, b in zip(names, *fits, strict=True)},
+        {n: (float(a), float(b)) for n, a, b in zip(names, *shares, strict=True)},
         _moved(uncertainty, fitted.parameters_),
         comparison,
     )
@@ -77,7 +77,8 @@ def best_alternative(
 _MODEL = "the model"
 
 
-def _fits(records: Sequence[Dataset], runs: Sequence[FloatArray]) -> FloatArray:
+def fits(records: Sequence[Dataset], runs: Sequence[FloatArray]) -> FloatArray:
+    """Fit [%] of free runs on records, the mean over them, (n_outputs,)."""
     pairs = zip(records, runs, strict=True)
     return mean_known(np.stack([fit_percent(r.outputs, run) for r, run in pairs]), 0)
 

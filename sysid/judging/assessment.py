@@ -34,7 +34,7 @@ _HARDLY_WORSE, _FAR_WORSE = 1.3, 2.0
 _SMALL, _TRACE = 0.01, 5e-3
 _INDEPENDENT = 0.75  # share of lags inside a 95 % band below which something is left
 _BANDS = 3.0  # mean of the first correlations in parts of their bands, above which it is as well
-_FITTED = 50.0  # fit [%] below which a model explains little
+FITTED = 50.0  # fit [%] below which a model explains little
 # Correlation with an input below which what is left is found in long records, but is nothing to
 # mend: one per cent of the residuals' variance.
 _NOTICEABLE = 0.1
@@ -185,7 +185,7 @@ def _prediction(
     """How well outputs are predicted."""
     grave, light = list(broken), list[str]()
     for name, ratio, fit, beyond, at_floor in _validation_errors(model, training, validation):
-        if fit < _FITTED and not at_floor:
+        if fit < FITTED and not at_floor:
             grave.append(f"{name} is explained poorly on the validation data (fit {fit:.0f} %).")
         elif ratio > _HARDLY_WORSE and beyond > _SMALL and not at_floor:
             reasons = grave if ratio > _FAR_WORSE and beyond > _HARDLY_WORSE * _SMALL else light

@@ -3,11 +3,13 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from sysid.arrays import FloatArray
 from sysid.fitting.free_run import estimate_start
 from sysid.gassi import GASSI, PRESETS
-from sysid.judging.alternatives import Alternative, best_alternative
-from sysid.judging.assessment import RecordResult, Verdict, examine, judge
+from sysid.judging.alternatives import Alternative, best_alternative, fits
+from sysid.judging.assessment import FITTED, RecordResult, Verdict, examine, judge
 from sysid.judging.expected_errors import expected_errors
 from sysid.judging.score_tests import Finding, missing_physics
 from sysid.judging.starts import estimated_starts
@@ -86,7 +88,11 @@ def suspected(
 
     validation: on which a variant that is fitted must do no worse.
     """
-    if uncertainty is None or any(p.pushed for p in uncertainty.parameters):
+    if uncertainty is None:
+        return None
+    ends = any(p.on_bound and not p.why for p in uncertainty.parameters)
+    runs = [estimator.predict(record) for record in training]
+    if ends and np.all(fits(training, runs) > FITTED):
         return None  # what an end of a range leaves looks like something missing
     try:
         objective = estimator.final_objective(list(training))

@@ -148,7 +148,8 @@ class _Tests:
         self.findings: list[Finding] = []
         self._local, self._residual = local, -local.residual
         self._estimates = [e for e in uncertainty.determined() if e.std]
-        self._gradients = np.array([_gradient(local, e) for e in self._estimates])
+        gradients = [_gradient(local, e) for e in self._estimates]
+        self._gradients = np.array(gradients).reshape(-1, local.slopes.shape[2])
         self._scales = np.concatenate(
             [
                 np.broadcast_to(scale, (n, len(scale)))
@@ -337,7 +338,8 @@ class _Regression:
 def _larger(first: FloatArray, second: FloatArray) -> FloatArray:
     """A covariance as large in every direction as the larger of two."""
     values, vectors = np.linalg.eigh(first)
-    root = vectors * np.sqrt(np.maximum(values, 1e-9 * max(float(values[-1]), 1e-300)))
+    floor = 1e-9 * max(float(values[-1]), float(np.trace(second)))
+    root = vectors * np.sqrt(np.maximum(values, floor))
     back = np.linalg.inv(root)
     ratio, axes = np.linalg.eigh(back @ second @ back.T)
     whole = root @ axes
