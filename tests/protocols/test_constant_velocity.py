@@ -412,6 +412,6 @@ def test_the_plan_says_how_far_the_shaft_turns_and_what_the_brake_takes():
     planned = plan(experiment(), RigConfig())
     _, travel, needed = planned.remarks
     assert "turns in all" in travel and "take the load off" in travel
-    assert "3.03 V" in needed
+    assert "2.53 V" in needed
     unknown = plan(experiment(ratings={"brake_constant": None}), RigConfig())
     assert "not known" in unknown.remarks[2]
