@@ -77,7 +77,8 @@ class Group:
         settings = self.problem.settings.model_copy(update={"seed": outcome.run.seed})
         problem = dataclasses.replace(self.problem, settings=settings)
         logs = self.training, self.validation
-        return assemble(problem, outcome.estimator, logs, None, ignore)
+        # Of many runs what each may lack is not worth its time.
+        return assemble(problem, outcome.estimator, logs, None, ignore, test_missing=False)
 
 
 @dataclass(frozen=True)

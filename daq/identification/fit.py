@@ -246,10 +246,13 @@ def assemble(
     folder: Path | None,
     watch: Watch,
     faults: tuple[DataFault, ...] | None = None,
+    *,
+    test_missing: bool = True,
 ) -> Identification:
     """A fitted estimator with its intervals and profiles, and how it does on every log.
 
-    faults: of the logs, where they have been looked for.
+    faults: of the logs, where they have been looked for. test_missing: whether what the model may
+    lack is tested, and the surest variant fitted.
     """
     datasets = [log.dataset for log in logs[0]]
     refined = PRESETS[estimator.preset].refine and estimator.stopped_ != "interrupted"
@@ -261,9 +264,12 @@ def assemble(
         watch(Progress("Profiles", k + 1, len(names), f"of {name}"))
     training, validation = ([_fitted(log, estimator, uncertainty) for log in part] for part in logs)
     faults = faults_of(problem, logs) if faults is None else faults
-    watch(Progress("Verdict", 0, 1, "what the model may lack"))
-    suspicion = suspected(estimator, uncertainty, *([log.dataset for log in part] for part in logs))
-    watch(Progress("Verdict", 1, 1, "what the model may lack"))
+    suspicion = None
+    if test_missing:
+        watch(Progress("Verdict", 0, 1, "what the model may lack"))
+        datasets_of = [[log.dataset for log in part] for part in logs]
+        suspicion = suspected(estimator, uncertainty, *datasets_of)
+        watch(Progress("Verdict", 1, 1, "what the model may lack"))
     parts = profiles, training, validation, folder
     return Identification(
         problem, estimator, uncertainty, *parts, faults=faults, suspicion=suspicion

@@ -111,10 +111,12 @@ def uncertainty(
     """
     local = sensitivity(objective, chromosome)
     analysis = _Analysis(local, structure or ties(local), ridge)
-    minima = [analysis.rival(rival) for rival in analysis.unlike(rivals)]
+    others = list(analysis.unlike(rivals))
+    minima = [analysis.rival(rival) for rival in others]
+    places = [named_values(analysis.space, rival) for rival in others]
 
     def disputed(estimate: Estimate) -> bool:
-        return not estimate.why and any(estimate.excludes(rival.values) for rival in minima)
+        return not estimate.why and any(estimate.excludes(place) for place in places)
 
     def judged(estimate: Estimate) -> Estimate:
         return replace(estimate, why="rival") if disputed(estimate) else estimate

@@ -78,9 +78,11 @@ def test_the_rigs_own_values_are_within_it(kind):
         ]
         found = guess_ranges(model, logs)
         check(model, model.nominal, found)
-        assert {"K_dm", "c0"} <= set(found)
+        assert {"K_dm", "R_m"} <= set(found)
         assert "in 2 logs" in found["K_dm"].source
-        assert "moments of steady speed in" in found["c0"].source
+        with_constant = guess_ranges(model, logs, fixed={"K_m": model.parameter("K_m").nominal})
+        check(model, model.nominal, with_constant)
+        assert "moments of steady speed in" in with_constant["c0"].source
 
 
 def test_a_resistance_from_a_data_sheet_tells_gain_and_motor_constant():
