@@ -92,13 +92,14 @@ class _Place:
     gap: float
 
 
-def identifiability(model: ProcessModel, *, seed: int = 0) -> Identifiability:
+def identifiability(model: ProcessModel, *, seed: int = 0, sensors: bool = True) -> Identifiability:
     """Which parameters of a model its outputs determine, which only together, and how.
 
     Parameters that are not ``fixed`` are free. Starts that the model estimates are unknown, those
     of measured outputs known, and the rest where the model declares. Use ``with_outputs``,
-    ``with_initial`` and ``with_parameters`` to ask about other choices. Raises ModelError where
-    the equations cannot be followed.
+    ``with_initial`` and ``with_parameters`` to ask about other choices. sensors: whether it is
+    tried what measuring further states would determine, which takes most of the time. Raises
+    ModelError where the equations cannot be followed.
 
     >>> from sysid import Input, Output, Parameter, ProcessModel, State
     >>> shaft = ProcessModel(
@@ -111,7 +112,7 @@ def identifiability(model: ProcessModel, *, seed: int = 0) -> Identifiability:
     >>> group.parameters, [c.text for c in group.combinations], group.fix
     (('J_m', 'J_b'), ['J_m + J_b'], ('J_m',))
     """
-    return _Analysis(model, seed).result()
+    return _Analysis(model, seed).result(sensors)
 
 
 class _Analysis:
@@ -136,8 +137,8 @@ class _Analysis:
         records = RecordPlan(self._equations, self._unknown, self._rng).records(point)
         self._records = telling_records(self._equations, point, self._free, records, self._rng)
 
-    def result(self) -> Identifiability:
-        """The whole analysis."""
+    def result(self, with_sensors: bool) -> Identifiability:
+        """The whole analysis, but for sensors where they are not asked for."""
         points = [self._points.nearby(), *(self._points.anywhere() for _ in range(_FURTHER))]
         # Where more is tied than elsewhere the point is an exception.
         places = [self._tied(self._equations, point, self._free) for point in points]
@@ -149,7 +150,7 @@ class _Analysis:
             if len(group) > 1
         ]
         grouped = set(itertools.chain(*groups))
-        sensors = self._sensors(place.parameters) if groups else {}
+        sensors = self._sensors(place.parameters) if groups and with_sensors else {}
         return Identifiability(
             self._model.output_names,
             tuple(self._model.state_names[i] for i in self._unknown),

@@ -72,7 +72,8 @@ def ties(sensitivity: Sensitivity) -> Ties:
     space, model = objective.space, _as_searched(objective.simulator.model, objective.space)
     counted = np.flatnonzero(objective.weights > 0.0)
     try:
-        result = identifiability(model.with_outputs([model.output_names[j] for j in counted]))
+        shown = model.with_outputs([model.output_names[j] for j in counted])
+        result = identifiability(shown, sensors=False)
     except (ModelError, ArithmeticError):
         return Ties(np.zeros((0, len(space.names))))
     combinations = [
