@@ -14,6 +14,7 @@ import numpy as np
 from pydantic import Field, PrivateAttr
 
 from daq.config.base import Section
+from daq.config.metadata import Metadata
 from daq.config.units import Amperes, Hertz, Seconds, Turns
 from daq.findings import Chart, Findings, Heatmap
 from daq.hal import CHANNELS, FloatArray, Mode, Samples
@@ -107,6 +108,9 @@ class Experiment(Section, abc.ABC):
     validation: dict[str, Any] = Field(
         default_factory=dict,
         description="keys that differ in the validation run of rig run --identify",
+    )
+    metadata: Metadata = Field(
+        Metadata(), description="what to note of the run: who, on what, why; any keys"
     )
     # Where its file lies, for the names of other files in it.
     _folder: Path = PrivateAttr(default=Path())

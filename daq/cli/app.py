@@ -23,6 +23,7 @@ from daq.cli.models import models
 from daq.cli.ports import ports
 from daq.cli.replay import replay
 from daq.cli.run import run
+from daq.cli.runs import runs
 from daq.cli.schema import schema
 from daq.cli.scope import scope
 from daq.cli.terminal import Volume, output
@@ -39,6 +40,7 @@ _COMMANDS: tuple[tuple[Callable[..., None], str], ...] = (
         "rig replay runs/20260101T120000Z-prbs "
         "--parameters runs/20260101T120000Z-prbs/identification/parameters.yaml",
     ),
+    (runs, "rig runs protocol=prbs --parameters K_m --sort K_m"),
     (figures, "rig figures runs/20260101T120000Z-prbs --format pdf --format png"),
     (init, "rig init my_rig"),
     (schema, "rig schema schemas"),

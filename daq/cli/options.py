@@ -26,6 +26,14 @@ PortName = Annotated[
     str | None,
     Option(metavar="PORT", help="Port of a serial rig in place of its file's; see rig ports."),
 ]
+Notes = Annotated[
+    list[str] | None,
+    Option(
+        "--note",
+        metavar="TEXT|KEY=VALUE",
+        help="Note this of the run, as operator=Ann; may be repeated.",
+    ),
+]
 RunsFolder = Annotated[Path, Option(metavar="DIR", help="Where capture folders go.")]
 _model = functools.partial(Option, metavar="NAME|FILE.py:OBJECT", autocompletion=completion.models)
 ModelName = Annotated[str | None, _model(help="Process model; see rig models.")]

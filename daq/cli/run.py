@@ -25,6 +25,7 @@ def run(
     ] = False,
     model: options.ModelName = None,
     config: options.ConfigFile = None,
+    note: options.Notes = None,
     realtime: Annotated[
         bool, Option("--realtime", help="Keep a simulated rig at the pace of the clock.")
     ] = False,
@@ -35,7 +36,7 @@ def run(
     from daq.recording.session import open_session
 
     with terminal.watching(json) as watch:
-        session = open_session(experiment, rig, port, realtime, watch=watch)
+        session = open_session(experiment, rig, port, realtime, watch=watch).noting(note or [])
         # A mistake in the model must show before the rig moves.
         problem = _problem(config, model, watch) if identify else None
         result = session.record(out, validation=identify, watch=watch)

@@ -12,8 +12,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from daq.config.metadata import Metadata
 from daq.errors import ConfigError, RunError
 from daq.files import make_folder, write_whole
+from daq.logs.metadata import write_metadata
 from daq.provenance import software_versions
 
 LOG_NAME = "log.csv"
@@ -36,8 +38,13 @@ class Capture:
     record: dict[str, Any]
 
     @classmethod
-    def create(cls, root: Path, name: str, record: dict[str, Any]) -> Capture:
-        """Make ``<root>/<UTC time>-<name>/`` and note in it that the run has begun."""
+    def create(
+        cls, root: Path, name: str, record: dict[str, Any], metadata: Metadata | None = None
+    ) -> Capture:
+        """Make ``<root>/<UTC time>-<name>/`` and note in it that the run has begun.
+
+        metadata: what a person says of it.
+        """
         now = datetime.datetime.now(datetime.UTC)
         facts = {
             "status": RUNNING,
@@ -52,6 +59,7 @@ class Capture:
         capture = cls(folder, facts)
         try:
             capture.save()
+            write_metadata(folder, metadata or Metadata())
             capture._reserve()
         except BaseException:
             shutil.rmtree(folder, ignore_errors=True)  # nothing has been recorded in it

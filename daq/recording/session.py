@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+from daq.config.metadata import changes_of
 from daq.config.rig import RigConfig
 from daq.diagnose import currents
 from daq.errors import ConfigError, together
@@ -15,6 +16,7 @@ from daq.experiment import Plan
 from daq.findings import Findings
 from daq.hal import Device, Phase
 from daq.logs.capture import LOG_NAME
+from daq.logs.metadata import amended
 from daq.logs.recording import Recording, load
 from daq.lookup.experiments import LoadedExperiment, load_experiment
 from daq.lookup.rigs import load_rig, rig_for
@@ -42,6 +44,12 @@ class Session:
     rig: RigConfig
     device: Device
     plan: Plan
+
+    def noting(self, notes: Iterable[str]) -> Session:
+        """The same with notes as they are typed, over those of its file. Raises ConfigError."""
+        notes = list(notes)
+        validation = None if self.validation is None else _noting(self.validation, notes)
+        return replace(self, loaded=_noting(self.loaded, notes), validation=validation)
 
     def record(self, out: Path, *, validation: bool, watch: Watch) -> SessionResult:
         """Run the experiment, and then its validation run where there is one and it is wanted.
@@ -101,14 +109,16 @@ def record(
     out: str | Path = "runs",
     validation: bool = False,
     options: Mapping[str, Any] | None = None,
+    notes: Iterable[str] = (),
     *,
     watch: Watch = ignore,
 ) -> Recording:
     """Run an experiment on a rig; what it logged, ``frame`` as a table.
 
     Files as for ``rig run``, shipped ones among them. validation: the experiment with what its
-    ``validation`` section changes. options: of the rig's backend, over those of its file. Raises
-    RigError with cause and cure, and a note on whether the outputs were read as zero then.
+    ``validation`` section changes. options: of the rig's backend, over those of its file. notes: of
+    the run, each ``KEY=VALUE`` or text. Raises RigError with cause and cure, and a note on whether
+    the outputs were read as zero then.
 
     >>> from daq import record
     >>> run = record("prbs.yaml", options={"seed": 1})
@@ -122,10 +132,16 @@ def record(
             problem = "it has no 'validation' section"
             raise ConfigError(problem, cure="add one", file=loaded.file.path)
         loaded = changed
+    loaded = _noting(loaded, list(notes))
     name = str(rig or rig_for(str(experiment), watch))
     config, device = load_rig(name, options, watch)
     together(partial(loaded.plan, config), partial(_require_port, config, name))
     return load(_run(loaded, config, device, Path(out), watch).folder)
+
+
+def _noting(loaded: LoadedExperiment, notes: list[str]) -> LoadedExperiment:
+    metadata = amended(loaded.experiment.metadata, changes_of(notes))
+    return replace(loaded, experiment=loaded.experiment.model_copy(update={"metadata": metadata}))
 
 
 def _rig_on(rig: str, port: str | None, realtime: bool, watch: Watch) -> tuple[RigConfig, Device]:

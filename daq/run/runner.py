@@ -78,7 +78,7 @@ def run_experiment(
     record = {"experiment": description, "rig": rig_config.model_dump(mode="json")}
     sampling = Sampling(Rig(device, rig_config), limits, experiment.sample_rate, watch)
     with SignalHandling() as signals:
-        capture = Capture.create(root, name, record)
+        capture = Capture.create(root, name, record, experiment.metadata)
         realtime = RealTime(overrun=signals.end_by)
         return _Run(experiment, planned, dialogue, sampling, capture, signals, realtime).execute()
 

@@ -1,0 +1,102 @@
+"""Several runs beside each other: their parameters in a table, and all in one figure."""
+
+from __future__ import annotations
+
+import datetime
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daq.catalogue.entries import RunEntry
+from daq.errors import ConfigError, RunError, suggestion
+from daq.files import write_whole
+from daq.identification.rows import QuantityRow
+from daq.progress import Note, Watch, ignore
+
+if TYPE_CHECKING:
+    from daq.figures.history import Overlay, Trend
+
+_SIGNALS = ("current_motor", "current_brake", "torque", "omega")
+_MOST_LINES = 12  # runs whose signals are drawn over each other
+_MOST_TRENDS = 12  # parameters that are drawn where none are named
+
+
+def quantities_of(entries: Sequence[RunEntry], names: Sequence[str] = ()) -> list[str]:
+    """Parameters and combinations with an interval of both ends in any of the runs.
+
+    names: those wanted, in this order. Raises ConfigError for one that no run has.
+    """
+    rows = [row for entry in entries for row in entry.quantities]
+    present = dict.fromkeys(row.name for row in rows)
+    for name in names:
+        if name not in present:
+            cure = suggestion(name, list(present))
+            raise ConfigError(f"no run has {name!r}", cure=cure, key="--parameters")
+    return list(names) or list(dict.fromkeys(row.name for row in rows if row.two_sided))
+
+
+def draw_comparison(
+    root: Path, entries: Sequence[RunEntry], names: Sequence[str], path: Path, watch: Watch = ignore
+) -> None:
+    """Signals of runs over each other, and parameters over their dates, in a figure at a path.
+
+    names: of the parameters; default those with intervals in two runs at least. Raises ConfigError
+    where there is nothing to draw, or no file can be.
+    """
+    from daq.figures import style
+    from daq.figures.history import history
+
+    kind = style.format_of(path)
+    figure = history(_overlays(root, entries, watch), _trends(entries, names))
+    try:
+        write_whole(path, style.render(figure, kind))
+    except RunError as error:
+        raise ConfigError(str(error), cure="or choose another place with --plot FILE.png") from None
+
+
+def _overlays(root: Path, entries: Sequence[RunEntry], watch: Watch) -> list[Overlay]:
+    from daq.figures.history import Overlay
+    from daq.logs.columns import UNITS
+    from daq.logs.recording import load
+
+    if len(entries) > _MOST_LINES:
+        watch(
+            Note("note", f"signals of the last {_MOST_LINES} of {len(entries)} runs are drawn only")
+        )
+    frames = {entry.folder: load(root / entry.folder).frame for entry in entries[-_MOST_LINES:]}
+    return [
+        Overlay(
+            signal,
+            UNITS[signal],
+            {
+                name: (frame["t"].to_numpy(), frame[signal].to_numpy())
+                for name, frame in frames.items()
+            },
+        )
+        for signal in _SIGNALS
+    ]
+
+
+def _trends(entries: Sequence[RunEntry], names: Sequence[str]) -> list[Trend]:
+    from daq.figures.history import Trend
+
+    trends = []
+    for name in quantities_of(entries, names):
+        rows = [
+            (entry, row)
+            for entry in entries
+            if entry.started and (row := entry.quantity(name)) is not None
+        ]
+        dates = [datetime.datetime.fromisoformat(entry.started) for entry, _ in rows]
+        values = np.array([(row.value, *_ends(row)) for _, row in rows], dtype=np.float64)
+        if len(rows) > 1 or (names and rows):
+            trends.append(Trend(name, rows[0][1].unit, dates, values))
+    return trends if names else trends[:_MOST_TRENDS]
+
+
+def _ends(row: QuantityRow) -> tuple[float, float]:
+    low, high = row.interval or (None, None)
+    return math.nan if low is None else low, math.nan if high is None else high

@@ -1,0 +1,184 @@
+"""What a catalogue knows of a run, read from the files in its folder."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Self
+
+from daq.config import json_file, yaml_file
+from daq.errors import RigError
+from daq.identification.request import PARAMETERS
+from daq.identification.rows import ParameterRow, QuantityRow, Rows
+from daq.logs.capture import LOG_NAME, RUN_NAME
+from daq.logs.metadata import METADATA_NAME, read_metadata
+from daq.logs.recording import settings_of
+
+_IDENTIFICATION = "identification"  # the folder of a run's own identification
+_FILES = (RUN_NAME, METADATA_NAME, f"{_IDENTIFICATION}/{PARAMETERS}")
+
+
+@dataclass(frozen=True)
+class RunEntry:
+    """A run: where it is, what it was, what is noted of it, what was identified from it.
+
+    folder: below the catalogue's, with ``/`` between names. started: ISO 8601 in UTC. trust: the
+    verdict's word, then of predictions and of parameters. quantities: identified parameters and
+    combinations. problems: what of its files could not be read, and why.
+    """
+
+    folder: str
+    started: str = ""
+    status: str = ""
+    reason: str = ""
+    protocol: str = ""
+    rig: str = ""
+    device: str = ""
+    model: str = ""
+    trust: str = ""
+    predictions: str = ""
+    parameters: str = ""
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+    quantities: tuple[QuantityRow, ...] = ()
+    problems: tuple[str, ...] = ()
+
+    @cached_property
+    def facts(self) -> dict[str, Any]:
+        """Everything that can be asked for, by key: its own, metadata, values of quantities."""
+        values = {row.name: row.value for row in self.quantities}
+        texts = {key: value for key, value in vars(self).items() if key not in _GROUPS}
+        return {**values, **self.metadata, **texts}
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """The same for machines."""
+        return asdict(self)
+
+    @classmethod
+    def of(cls, document: Mapping[str, Any]) -> Self:
+        """From its document."""
+        quantities = tuple(_quantity(entry) for entry in document["quantities"])
+        problems = tuple(document["problems"])
+        return cls(**{**document, "quantities": quantities, "problems": problems})
+
+    def quantity(self, name: str) -> QuantityRow | None:
+        """An identified parameter or combination; None where it has none of that name."""
+        return next((row for row in self.quantities if row.name == name), None)
+
+
+_GROUPS = ("metadata", "quantities", "problems")
+
+
+def captures(root: Path) -> Iterator[tuple[str, str]]:
+    """Capture folders below a folder, and what tells that their files have changed.
+
+    Each by its name below the folder, in order. What is in a capture is not looked through.
+    """
+    # Of strings: ten thousand runs take three times as long by Path objects.
+    yield from _captures(str(root), "")
+
+
+def _captures(root: str, below: str) -> Iterator[tuple[str, str]]:
+    with os.scandir(f"{root}/{below}") as entries:
+        names = sorted(e.name for e in entries if not e.name.startswith(".") and e.is_dir())
+    for name in names:
+        folder = f"{below}/{name}" if below else name
+        stamp = _stamp(f"{root}/{folder}")
+        if stamp:
+            yield folder, stamp
+        else:
+            yield from _captures(root, folder)
+
+
+def _stamp(folder: str) -> str:
+    """Times and sizes of a capture's files; empty of a folder that is none."""
+    stamps = [_time_and_size(f"{folder}/{name}") for name in _FILES]
+    if not stamps[0] and not _time_and_size(f"{folder}/{LOG_NAME}"):
+        return ""
+    return "|".join((*stamps, "."))
+
+
+def _time_and_size(path: str) -> str:
+    try:
+        facts = os.stat(path)  # noqa: PTH116
+    except OSError:
+        return ""
+    return f"{facts.st_mtime_ns}:{facts.st_size}"
+
+
+def read_entry(root: Path, folder: str) -> RunEntry:
+    """A run from its files; what cannot be read is told in ``problems``."""
+    path, problems, facts = root / folder, [], {}
+    for read in (_run, _noted, _identified):
+        try:
+            facts |= read(path)
+        except RigError as error:
+            problems.append(str(error))
+        except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+            problems.append(f"{path}: not as it was written ({type(error).__name__}: {error})")
+    return RunEntry(folder, **facts, problems=tuple(problems))
+
+
+def _run(folder: Path) -> dict[str, Any]:
+    if not (folder / RUN_NAME).exists():
+        return {"status": "unknown"}  # a log without its record
+    record = json_file.load(folder / RUN_NAME, "run record", "move it away to go without")
+    experiment, rig = settings_of(record)
+    facts = {
+        "started": record.get("started"),
+        "status": record.get("status"),
+        "reason": record.get("reason"),
+        "protocol": experiment.get("protocol"),
+        "rig": rig.get("name"),
+        "device": record.get("device"),
+    }
+    return {key: str(value) for key, value in facts.items() if value is not None}
+
+
+def _noted(folder: Path) -> dict[str, Any]:
+    return {"metadata": read_metadata(folder).content}
+
+
+def _identified(folder: Path) -> dict[str, Any]:
+    path = folder / _IDENTIFICATION / PARAMETERS
+    if not path.exists():
+        return {}
+    document = yaml_file.load(path).content
+    verdict, rows = document["verdict"], Rows.of(document)
+    statements = {
+        name: verdict[name]["trust"] for name in ("predictions", "parameters") if name in verdict
+    }
+    searched = [row for row in rows.parameters if isinstance(row, ParameterRow) and row.free]
+    quantities = tuple(_plain(row) for row in (*searched, *rows.combinations))
+    return {
+        "model": str(document["model"]),
+        "trust": str(verdict["trust"]),
+        **statements,
+        "quantities": quantities,
+    }
+
+
+def _plain(row: QuantityRow) -> QuantityRow:
+    """A row without what only a table of parameters shows."""
+    return QuantityRow(
+        row.name, row.value, row.unit, row.interval, row.std, row.undetermined, row.here, row.fails
+    )
+
+
+def _quantity(entry: Mapping[str, Any]) -> QuantityRow:
+    ends = {key: None if entry[key] is None else tuple(entry[key]) for key in ("interval", "here")}
+    return QuantityRow(**{**entry, **ends})
+
+
+def to_text(entry: RunEntry) -> str:
+    """An entry as one line of JSON."""
+    return json.dumps(entry.document, separators=(",", ":"))
+
+
+def from_text(text: str) -> RunEntry:
+    """An entry from its line. Raises ValueError, TypeError or KeyError for what is none."""
+    return RunEntry.of(json.loads(text))

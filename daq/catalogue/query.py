@@ -1,0 +1,159 @@
+"""Which runs somebody means: conditions on what is known of them, words, or their folders."""
+
+from __future__ import annotations
+
+import fnmatch
+import operator
+import re
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from daq.catalogue.entries import RunEntry
+from daq.errors import ConfigError, suggestion
+
+_CONDITION = re.compile(r"\s*([^<>=!]+?)\s*(<=|>=|!=|=|<|>)\s*(.*?)\s*", re.DOTALL)
+_ORDERS: dict[str, Callable[[Any, Any], bool]] = {
+    "<": operator.lt,
+    "<=": operator.le,
+    ">": operator.gt,
+    ">=": operator.ge,
+}
+_SINGULAR = {"tag": "tags", "run": "folder"}  # other names of facts
+
+
+@dataclass(frozen=True)
+class Condition:
+    """``KEY OPERATOR VALUE``: ``=`` and ``!=`` know ``*``, the others numbers or dates."""
+
+    key: str
+    operator: str
+    value: str
+
+    def holds(self, entry: RunEntry) -> bool:
+        """Whether it does for a run; never for one of which the key is not known."""
+        fact = entry.facts.get(self.key)
+        if fact is None or fact == "":
+            return self.operator == "!=" and self.value != ""
+        facts = fact if isinstance(fact, list | tuple) else [fact]
+        if self.operator in ("=", "!="):
+            return any(_equals(each, self.value) for each in facts) == (self.operator == "=")
+        return any(self._ordered(each) for each in facts)
+
+    def _ordered(self, fact: Any) -> bool:
+        compare = _ORDERS[self.operator]
+        if isinstance(fact, str):
+            return compare(fact.casefold(), self.value.casefold())
+        return compare(float(fact), float(self.value))
+
+
+def _equals(fact: Any, value: str) -> bool:
+    if isinstance(fact, bool):
+        return str(fact).casefold() == value.casefold()
+    if isinstance(fact, int | float):
+        try:
+            return float(value) == fact
+        except ValueError:
+            return False
+    return fnmatch.fnmatchcase(str(fact).casefold(), value.casefold())
+
+
+@dataclass(frozen=True)
+class Query:
+    """Folders of runs, of which any may be meant; conditions and words, which must all hold."""
+
+    folders: frozenset[str]
+    conditions: tuple[Condition, ...]
+    words: tuple[str, ...]
+
+    def matches(self, entry: RunEntry) -> bool:
+        """Whether a run is meant."""
+        if self.folders and entry.folder not in self.folders:
+            return False
+        if not all(condition.holds(entry) for condition in self.conditions):
+            return False
+        texts = _texts(entry) if self.words else ()
+        return all(any(word in text for text in texts) for word in self.words)
+
+
+def select(root: Path, entries: Sequence[RunEntry], terms: Iterable[str]) -> list[RunEntry]:
+    """The runs that terms mean, in their order. Raises ConfigError for terms that mean none.
+
+    A term is a capture folder (any of several is meant), ``KEY=VALUE`` and its like, or a word to
+    stand anywhere in what is known of a run.
+    """
+    query = _parsed(root, entries, terms)
+    return [entry for entry in entries if query.matches(entry)]
+
+
+def ordered(entries: Sequence[RunEntry], key: str) -> list[RunEntry]:
+    """Runs by a fact, those without it first. Raises ConfigError for a key that none has."""
+    key = _require_key(entries, key, "--sort")
+    facts = [entry.facts.get(key) for entry in entries]
+    numbers = all(isinstance(fact, int | float) for fact in facts if fact is not None)
+
+    def place(entry: RunEntry) -> tuple[bool, Any]:
+        fact = entry.facts.get(key)
+        if fact is None:
+            return False, 0.0 if numbers else ""
+        return True, fact if numbers else str(fact).casefold()
+
+    return sorted(entries, key=place)
+
+
+def _parsed(root: Path, entries: Sequence[RunEntry], terms: Iterable[str]) -> Query:
+    folders, conditions, words = set(), [], []
+    for term in terms:
+        condition = _CONDITION.fullmatch(term)
+        folder = _folder(root, term)
+        if folder is not None:
+            if folder not in {entry.folder for entry in entries}:
+                problem, cure = f"no run below {root}", "name the folder it is in with --in"
+                raise ConfigError(problem, cure=cure, file=term)
+            folders.add(folder)
+        elif condition is not None:
+            key = _require_key(entries, condition[1], term)
+            conditions.append(_checked(entries, Condition(key, condition[2], condition[3])))
+        else:
+            words.append(term.casefold())
+    return Query(frozenset(folders), tuple(conditions), tuple(words))
+
+
+def _folder(root: Path, term: str) -> str | None:
+    """A term as the name of a folder below the root, as ``RunEntry`` has it; None for none."""
+    for path in (Path(term), root / term):
+        if term and path.is_dir():
+            try:
+                return path.resolve().relative_to(root.resolve()).as_posix()
+            except ValueError:
+                return path.as_posix()
+    return None
+
+
+def _checked(entries: Sequence[RunEntry], condition: Condition) -> Condition:
+    """A condition that can be asked; ConfigError where an order wants a number and has none."""
+    facts = [entry.facts[condition.key] for entry in entries if condition.key in entry.facts]
+    numbers = any(isinstance(fact, int | float) for fact in facts)
+    if numbers and condition.operator in _ORDERS:
+        try:
+            float(condition.value)
+        except ValueError:
+            problem = f"{condition.value!r} is no number, as {condition.key} is"
+            raise ConfigError(problem, cure=f"for example '{condition.key}>0.1'") from None
+    return condition
+
+
+def _require_key(entries: Sequence[RunEntry], key: str, place: str) -> str:
+    key = _SINGULAR.get(key, key)
+    keys = list(dict.fromkeys(k for entry in entries for k in entry.facts))
+    if entries and key not in keys:
+        raise ConfigError(f"no run has {key!r}", cure=suggestion(key, keys), key=place)
+    return key
+
+
+def _texts(entry: RunEntry) -> list[str]:
+    names = [row.name for row in entry.quantities]
+    facts = [fact for key, fact in entry.facts.items() if key not in names]
+    parts = [part for fact in facts for part in (fact if isinstance(fact, list) else [fact])]
+    return [str(part).casefold() for part in parts]

@@ -1,0 +1,177 @@
+"""``rig runs``: the runs of a folder, those that are asked for, beside each other, noted upon."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from typer import Argument, BadParameter, Option
+
+from daq.cli import options, terminal
+
+if TYPE_CHECKING:
+    from daq.catalogue.entries import RunEntry
+    from daq.identification.rows import QuantityRow
+
+_FACTS = ("protocol", "rig", "status", "trust")
+_MOST_COLUMNS = 6  # runs beside each other in a table
+
+
+def runs(
+    terms: Annotated[
+        list[str] | None,
+        Argument(
+            metavar="[TERM...]",
+            help="Runs that all of these hold of: a word, KEY=VALUE with *, '<KEY>0.1' and the "
+            "like, or capture folders; keys are facts, metadata, parameters.",
+        ),
+    ] = None,
+    folder: Annotated[
+        Path, Option("--in", metavar="DIR", help="Folder that the runs are in.")
+    ] = Path("runs"),
+    sort: Annotated[str, Option(metavar="KEY", help="Sort by this, largest last.")] = "started",
+    last: Annotated[int | None, Option(metavar="N", min=1, help="Only the last so many.")] = None,
+    parameters: Annotated[
+        str | None,
+        Option(metavar="NAME,NAME", help="Show these parameters, or combinations of some."),
+    ] = None,
+    details: Annotated[bool, Option("--details", help="All that is known of each run.")] = False,
+    compare: Annotated[
+        bool, Option("--compare", help="Parameters of the runs beside each other.")
+    ] = False,
+    plot: Annotated[
+        Path | None,
+        Option(metavar="FILE.png", help="Draw signals over each other, parameters over the dates."),
+    ] = None,
+    note: options.Notes = None,
+    tag: Annotated[
+        list[str] | None, Option(metavar="TAG", help="Give the runs this tag; may be repeated.")
+    ] = None,
+    untag: Annotated[
+        list[str] | None, Option(metavar="TAG", help="Take this tag away; may be repeated.")
+    ] = None,
+    json: options.AsJson = False,
+) -> None:
+    """List recorded runs, search and compare them, note something of them."""
+    from daq.catalogue.annotation import annotate
+    from daq.catalogue.comparison import draw_comparison, quantities_of
+    from daq.catalogue.index import catalogue
+    from daq.catalogue.query import ordered, select
+
+    names = [name.strip() for name in (parameters or "").split(",") if name.strip()]
+    with terminal.watching(json) as watch:
+        entries = catalogue(folder, watch)
+        chosen = ordered(select(folder, entries, terms or []), sort)[-(last or 0) :]
+        if note or tag or untag:
+            if not terms:
+                raise BadParameter("say of which runs; name them, or a word that they have")
+            chosen = annotate(folder, chosen, note or [], tag or [], untag or [])
+        if plot is not None and chosen:
+            draw_comparison(folder, chosen, names, plot, watch)
+    names = quantities_of(chosen, names) if compare or names else []
+    if json:
+        terminal.print_json({"folder": str(folder), "runs": [run.document for run in chosen]})
+        return
+    if not chosen:
+        hint = "Record one:  rig run prbs.yaml" if not entries else "rig runs lists them all."
+        print(f"None of the {len(entries)} runs in {folder} is meant. {hint}")
+    elif details:
+        for entry in chosen:
+            _show(entry, folder)
+    elif compare:
+        _compare(chosen, names)
+    else:
+        _list(chosen, names, f"{len(chosen)} of {len(entries)} runs in {folder}")
+    for problem in (problem for entry in chosen for problem in entry.problems):
+        terminal.report("warning", problem)
+    if plot is not None and chosen:
+        print(f"Figure: {plot}")
+
+
+def _list(entries: Sequence[RunEntry], names: Sequence[str], title: str) -> None:
+    """A row for each run; what none of them has is left out."""
+    noted = list(dict.fromkeys(key for entry in entries for key in entry.metadata))
+    head = ["run", "date (UTC)", *_FACTS, *names, *noted]
+    rows = [
+        [
+            entry.folder,
+            entry.started[:16].replace("T", " "),
+            *(str(getattr(entry, fact)) for fact in _FACTS),
+            *(_quantity(entry.quantity(name)) for name in names),
+            *(_text(entry.metadata.get(key, "")) for key in noted),
+        ]
+        for entry in entries
+    ]
+    kept = [k for k in range(len(head)) if any(row[k] for row in rows)]
+    texts = [name for name in head if name not in names]
+    terminal.print_table(
+        title, [head[k] for k in kept], [[row[k] for k in kept] for row in rows], text=texts
+    )
+
+
+def _compare(entries: Sequence[RunEntry], names: Sequence[str]) -> None:
+    """A row for each parameter, a column for each run."""
+    if len(entries) > _MOST_COLUMNS:
+        terminal.report(
+            "note", f"of {len(entries)} runs the last {_MOST_COLUMNS} are compared; --plot has all"
+        )
+    shown = entries[-_MOST_COLUMNS:]
+    head = ["parameter", "unit", *(entry.folder for entry in shown)]
+    rows = [["trust", "", *(entry.trust for entry in shown)]]
+    for name in names:
+        quantities = [entry.quantity(name) for entry in shown]
+        unit = next(row.unit for row in quantities if row is not None) if any(quantities) else ""
+        rows.append([name, unit, *(_quantity(row, interval=True) for row in quantities)])
+    terminal.print_table("Parameters, with their 95 % intervals", head, rows, text=["unit"])
+    if not names:
+        terminal.report("note", "nothing has been identified from them; try rig identify RUN")
+
+
+def _show(entry: RunEntry, folder: Path) -> None:
+    """Everything that is known of a run."""
+    path = folder / entry.folder
+    facts = {
+        "run": str(path),
+        "started": entry.started,
+        "status": ": ".join(filter(None, (entry.status, entry.reason))),
+        "protocol": entry.protocol,
+        "rig": entry.rig,
+        "device": entry.device,
+        **{key: _text(value) for key, value in entry.metadata.items()},
+        "model": entry.model,
+        "predictions": entry.predictions or entry.trust,
+        "parameters": entry.parameters or entry.trust,
+    }
+    for key, value in facts.items():
+        if value:
+            terminal.print_text(f"{key}: {value}")
+    if entry.quantities:
+        rows = [
+            [row.name, *_cells(row), row.unit, row.undetermined_label] for row in entry.quantities
+        ]
+        head = ["name", "value", "95 % interval", "unit", "note"]
+        terminal.print_table("Parameters", head, rows, text=["unit", "note"])
+    else:
+        print()
+
+
+def _quantity(row: QuantityRow | None, interval: bool = False) -> str:
+    """A value, and its interval in brackets where that is wanted; empty where there is none."""
+    if row is None:
+        return ""
+    value, ends = _cells(row)
+    if not ends:
+        return f"({value})"  # no data stand behind it
+    return f"{value} ({ends})" if interval else value
+
+
+def _cells(row: QuantityRow) -> tuple[str, str]:
+    def write(value: float) -> str:
+        return terminal.number(value, row.digits)
+
+    return write(row.value), row.interval_text(write, " .. ", "")
+
+
+def _text(value: object) -> str:
+    return ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)

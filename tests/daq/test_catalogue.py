@@ -1,0 +1,250 @@
+"""``rig runs``: recorded runs listed, searched, noted upon and compared."""
+
+import datetime
+import json
+import os
+import sqlite3
+
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from daq.catalogue.entries import RunEntry
+from daq.catalogue.index import INDEX_NAME
+from daq.catalogue.query import ordered, select
+from tests.daq.support import rig, write_experiment
+
+# The current follows its command by a gain and a lag: identified in a second.
+MODEL = """
+from sysid import Input, Output, Parameter, ProcessModel, State
+
+coil = ProcessModel(
+    name="coil",
+    states=(State("current_motor", "A"),),
+    inputs=(Input("applied_voltage_motor", "V"),),
+    outputs=(Output("current_motor", "A"),),
+    parameters=(
+        Parameter("gain", "A/V", 0.5, 0.1, 2.0, "log"),
+        Parameter("tau", "s", 1e-3, 1e-4, 1e-2, "log"),
+    ),
+    derivative=lambda x, u, p: ((p[0] * u[0] - x[0]) / p[1],),
+)
+"""
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory):
+    """Three runs, of which two were identified, by two operators."""
+    folder = tmp_path_factory.mktemp("lab")
+    (folder / "coil.py").write_text(MODEL)
+    noted = {"operator": "Ann", "sample": "MRB-1", "tags": ["new", "warm"], "temperature": 21.5}
+    write_experiment(folder / "first.yaml", metadata=noted)
+    write_experiment(folder / "second.yaml", motor={"seed": 5})
+    commands = (
+        ("run", "first.yaml"),
+        ("run", "second.yaml", "--note", "operator=Bob", "--note", "brushes replaced"),
+        ("run", "first.yaml", "--note", "temperature=30", "--note", "sample="),
+    )
+    for command in commands:
+        result = rig(*command, cwd=folder)
+        assert result.returncode == 0, result.stderr
+    for capture in captures(folder)[:2]:
+        words = ("--model", "coil.py:coil", "--population", 10, "--generations", 5)
+        result = rig("identify", capture, *words, cwd=folder)
+        assert result.returncode == 0, result.stderr
+    return folder
+
+
+def listed(lab, *words):
+    """What ``rig runs --json`` prints of the runs."""
+    result = rig("runs", *words, "--json", cwd=lab)
+    assert result.returncode == 0, result.stderr
+    return json.loads(result.stdout)["runs"]
+
+
+def captures(lab):
+    """Folders of the runs, the oldest first."""
+    return [f"runs/{run['folder']}" for run in listed(lab)]
+
+
+def operators(runs):
+    return [run["metadata"].get("operator") for run in runs]
+
+
+def test_a_run_is_listed_with_what_it_was_and_what_came_of_it(lab):
+    first, second, third = listed(lab)
+    assert (first["protocol"], first["rig"], first["status"]) == (
+        "prbs",
+        "simulated rig",
+        "completed",
+    )
+    assert first["metadata"] == {
+        "operator": "Ann", "sample": "MRB-1", "tags": ["new", "warm"], "temperature": 21.5,
+    }  # fmt: skip
+    assert second["metadata"] == {"operator": "Bob", "note": "brushes replaced"}
+    assert third["metadata"] == {"operator": "Ann", "tags": ["new", "warm"], "temperature": 30}
+    parameters = yaml.safe_load(
+        (lab / "runs" / first["folder"] / "identification" / "parameters.yaml").read_text()
+    )
+    gain = next(row for row in first["quantities"] if row["name"] == "gain")
+    assert gain["value"] == parameters["parameters"]["gain"]["value"]
+    assert gain["interval"] == parameters["parameters"]["gain"]["interval"]
+    assert first["trust"] == parameters["verdict"]["trust"]
+    assert (third["trust"], third["quantities"]) == ("", [])
+
+
+@pytest.mark.parametrize(
+    ("terms", "expected"),
+    [
+        ((), ["Ann", "Bob", "Ann"]),
+        (("operator=ann",), ["Ann", "Ann"]),
+        (("operator!=Ann",), ["Bob"]),
+        (("temperature>25",), ["Ann"]),
+        (("temperature<=30", "sample=MRB-*"), ["Ann"]),
+        (("tag=warm", "--last", "1"), ["Ann"]),
+        (("brushes",), ["Bob"]),
+        (("gain>0.1",), ["Ann", "Bob"]),
+        (("started>2020-01-01", "nothing of that kind"), []),
+        (("--sort", "operator"), ["Ann", "Ann", "Bob"]),
+        (("--sort", "temperature", "--last", "1"), ["Ann"]),
+    ],
+)
+def test_runs_are_selected_by_what_is_known_of_them(lab, terms, expected):
+    assert operators(listed(lab, *terms)) == expected
+
+
+def test_of_several_folders_any_is_meant(lab):
+    first, second, _ = captures(lab)
+    assert operators(listed(lab, first, lab / second)) == ["Ann", "Bob"]
+    assert operators(listed(lab, first.removeprefix("runs/"), "operator=Bob")) == []
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (("oprator=Ann",), "did you mean 'operator'?"),
+        (("--sort", "gian"), "did you mean 'gain'?"),
+        (("gain>high",), "'high' is no number, as gain is"),
+        (("--parameters", "gian"), "did you mean 'gain'?"),
+        (("--in", "nowhere"), "record a run"),
+        (("--tag", "x"), "say of which runs"),
+        (("ann", "--tag", " "), "is no tag"),
+        (("ann", "--note", "tags=" + "x" * 90), "at most 80 letters"),
+        (("--plot", "runs.bmp"), "figures are written as svg, pdf, png"),
+        ((".",), "no run below runs"),
+    ],
+)
+def test_what_cannot_be_asked_is_refused_with_the_cure(lab, words, complaint):
+    result = rig("runs", *words, cwd=lab)
+    assert result.returncode == 2
+    assert complaint in " ".join(result.stderr.replace("│", " ").split())
+
+
+def test_runs_stand_beside_each_other_in_a_table_and_in_a_figure(lab, tmp_path):
+    picture = tmp_path / "runs.png"
+    result = rig("runs", "--compare", "--plot", picture, cwd=lab)
+    assert result.returncode == 0, result.stderr
+    row = next(line for line in result.stdout.splitlines() if line.strip().startswith("gain"))
+    first, second, _ = listed(lab)
+    for run in (first, second):
+        value = next(q["value"] for q in run["quantities"] if q["name"] == "gain")
+        assert f"{value:.4f}"[:5] in row
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_tags_and_notes_are_put_on_runs_and_taken_away(lab):
+    (run,) = listed(lab, "brushes", "--tag", "ageing", "--note", "operator=", "--note", "brake=3")
+    assert run["metadata"] == {"note": "brushes replaced", "tags": ["ageing"], "brake": 3}
+    path = lab / "runs" / run["folder"] / "metadata.yaml"
+    assert yaml.safe_load(path.read_text()) == run["metadata"]
+    (again,) = listed(
+        lab, "brake=3", "--untag", "ageing", "--note", "brake=", "--note", "operator=Bob"
+    )
+    assert again["metadata"] == {"note": "brushes replaced", "operator": "Bob"}
+    assert operators(listed(lab)) == ["Ann", "Bob", "Ann"]
+
+
+def test_what_is_edited_by_hand_counts_at_once(lab):
+    path = lab / "runs" / listed(lab)[0]["folder"] / "metadata.yaml"
+    before = path.read_text()
+    path.write_text(before + "humidity: 40\n")
+    assert len(listed(lab, "humidity=40")) == 1
+    path.write_text(before)
+    assert rig("runs", "humidity=40", cwd=lab).returncode == 2
+
+
+@pytest.mark.parametrize("damage", ["deleted", "no database", "a folder", "another layout"])
+def test_the_index_can_be_lost(lab, damage):
+    before = listed(lab)
+    index = lab / "runs" / INDEX_NAME
+    assert index.exists()
+    if damage == "another layout":
+        connection = sqlite3.connect(index)
+        with connection:
+            connection.execute("UPDATE layout SET name = 'older'")
+            connection.execute("UPDATE runs SET entry = '{}'")
+        connection.close()
+    else:
+        index.unlink()
+    if damage == "no database":
+        index.write_bytes(os.urandom(5000))
+    elif damage == "a folder":
+        index.mkdir()
+    assert listed(lab) == before
+    if damage == "a folder":
+        index.rmdir()
+
+
+def test_a_folder_that_cannot_be_read_as_a_run_hides_no_other(lab):
+    odd = lab / "runs" / "odd" / "deeper"
+    odd.mkdir(parents=True)
+    (odd / "run.json").write_text('{"status": "running", "experiment": 3')
+    (odd / "metadata.yaml").write_text("operator: [unfinished")
+    (odd / "identification").mkdir()
+    (odd / "identification" / "parameters.yaml").write_text("verdict: none\n")
+    result = rig("runs", cwd=lab)
+    assert result.returncode == 0
+    assert "odd/deeper" in result.stdout
+    for name in ("run.json", "metadata.yaml", "odd/deeper: not as it was written"):
+        assert name in result.stderr
+    for path in sorted(odd.rglob("*"), reverse=True):
+        path.rmdir() if path.is_dir() else path.unlink()
+    odd.rmdir()
+    odd.parent.rmdir()
+    assert len(listed(lab)) == 3
+
+
+def test_metadata_of_an_experiment_is_checked_with_it(tmp_path):
+    write_experiment(tmp_path / "bad.yaml", metadata={"operator": ["Ann"], "tags": ["a,b"]})
+    result = rig("check", "bad.yaml", cwd=tmp_path)
+    assert result.returncode == 2
+    assert "metadata.operator" in result.stderr
+    assert "metadata.tags" in result.stderr
+
+
+_DATES = st.datetimes(
+    datetime.datetime(2000, 1, 1), datetime.datetime(2100, 1, 1), timezones=st.just(datetime.UTC)
+)
+
+
+@given(st.lists(st.tuples(_DATES, st.none() | st.floats(-1e6, 1e6)), max_size=8), st.data())
+def test_conditions_and_orders_are_those_of_numbers_and_dates(tmp_path_factory, runs, data):
+    root = tmp_path_factory.getbasetemp()
+    entries = [
+        RunEntry(str(k), date.isoformat(), metadata={} if size is None else {"size": size})
+        for k, (date, size) in enumerate(runs)
+    ]
+    if any(size is not None for _, size in runs):
+        limit = data.draw(st.floats(-1e6, 1e6))
+        larger = [k for k, (_, size) in enumerate(runs) if size is not None and size > limit]
+        selected = select(root, entries, [f"size>{limit!r}"])
+        assert [int(entry.folder) for entry in selected] == larger
+        sizes = [entry.facts.get("size") for entry in ordered(entries, "size")]
+        present = [size for size in sizes if size is not None]
+        assert sizes == [None] * (len(sizes) - len(present)) + sorted(present)
+    if runs:
+        day = data.draw(_DATES).date()
+        since = [k for k, (date, _) in enumerate(runs) if date.date() >= day]
+        selected = select(root, entries, [f"started>={day.isoformat()}"])
+        assert [int(entry.folder) for entry in selected] == since
