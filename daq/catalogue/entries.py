@@ -112,7 +112,8 @@ def _time_and_size(path: str) -> str:
 
 def read_entry(root: Path, folder: str) -> RunEntry:
     """A run from its files; what cannot be read is told in ``problems``."""
-    path, problems, facts = root / folder, [], {}
+    path, problems = root / folder, []
+    facts: dict[str, Any] = {}
     for read in (_run, _noted, _identified):
         try:
             facts |= read(path)

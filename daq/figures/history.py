@@ -78,7 +78,7 @@ def _draw_overlay(axis: Axes, overlay: Overlay) -> None:
 
 
 def _draw_trend(axis: Axes, trend: Trend) -> None:
-    when = np.asarray(date2num(list(trend.dates)), dtype=np.float64)
+    when: FloatArray = date2num(list(trend.dates))  # type: ignore[no-untyped-call]
     value, low, high = trend.values.T
     bars = np.nan_to_num(np.vstack([value - low, high - value]), nan=0.0)
     axis.errorbar(
@@ -89,7 +89,8 @@ def _draw_trend(axis: Axes, trend: Trend) -> None:
     name = f"{notation.label(trend.name)} {notation.bracketed(trend.unit)}"
     axis.text(0.0, 1.04, name, transform=axis.transAxes, va="bottom")
     axis.yaxis.set_major_formatter(lambda value, _: notation.number(value, _DIGITS))
-    locator = AutoDateLocator(maxticks=_DATES)
+    locator = AutoDateLocator(maxticks=_DATES)  # type: ignore[no-untyped-call]
     axis.xaxis.set_major_locator(locator)
-    axis.xaxis.set_major_formatter(ConciseDateFormatter(locator, tz=datetime.UTC))
+    formatter = ConciseDateFormatter(locator, tz=datetime.UTC)  # type: ignore[no-untyped-call]
+    axis.xaxis.set_major_formatter(formatter)
     axis.margins(x=0.06, y=0.15)
