@@ -14,14 +14,10 @@ _KEY = re.compile(r"[^\W\d]\w*")
 _ASSIGNMENT = re.compile(rf"\s*({_KEY.pattern})\s*=(.*)", re.DOTALL)
 _LONGEST = 2000  # characters of a value
 
-Value = str | int | float | bool
-
-
 class Metadata(Section):
     """Operator, sample, note and tags of a run, and any keys of a lab's own."""
 
     model_config = ConfigDict(extra="allow")
-    __pydantic_extra__: dict[str, Value] = Field(init=False)
 
     operator: str = Field("", max_length=200, description="who runs it")
     sample: str = Field(
@@ -40,9 +36,11 @@ class Metadata(Section):
 
     @model_validator(mode="after")
     def _keys_can_be_asked_for(self) -> Self:
-        for key, value in (self.__pydantic_extra__ or {}).items():
+        for key, value in (self.model_extra or {}).items():
             if not _KEY.fullmatch(key):
                 raise ValueError(f"{key!r} is no key; write letters, digits and underscores")
+            if not isinstance(value, str | int | float):
+                raise ValueError(f"{key}: {value!r} is neither text nor a number")
             if isinstance(value, str) and len(value) > _LONGEST:
                 raise ValueError(f"{key}: at most {_LONGEST} characters are possible")
         return self
