@@ -14,6 +14,7 @@ _KEY = re.compile(r"[^\W\d]\w*")
 _ASSIGNMENT = re.compile(rf"\s*({_KEY.pattern})\s*=(.*)", re.DOTALL)
 _LONGEST = 2000  # characters of a value
 
+
 class Metadata(Section):
     """Operator, sample, note and tags of a run, and any keys of a lab's own."""
 

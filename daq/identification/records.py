@@ -59,12 +59,17 @@ Split = tuple[list[LoggedRecord], list[LoggedRecord]]  # for training, for valid
 
 
 def expand(path: Path) -> list[Path]:
-    """Logs named on the command line: a folder without a log.csv stands for the CSVs in it."""
+    """Logs named on the command line: a folder that is no capture stands for what is in it.
+
+    That is the CSV and MAT files, or else the capture folders.
+    """
     if not path.is_dir() or (path / LOG_NAME).exists():
         return [path]
     if logs := sorted((*path.glob("*.csv"), *path.glob(f"*{matlab.SUFFIX}"))):
         return logs
-    problem = "neither a capture folder (with log.csv) nor a folder of CSV files"
+    if captures := sorted(log.parent for log in path.glob(f"*/{LOG_NAME}")):
+        return captures
+    problem = "neither a capture folder (with log.csv) nor a folder of CSV files or captures"
     raise ConfigError(problem, file=path)
 
 

@@ -436,7 +436,7 @@ CASES = [
     Case("missing log", ["identify", "absent.csv"],
          ["absent.csv: there is no such log; name a capture folder or a CSV file"]),
     Case("a folder without logs", ["identify", "folder"],
-         ["folder: neither a capture folder (with log.csv) nor a folder of CSV files"]),
+         ["folder: neither a capture folder (with log.csv) nor a folder of CSV files or captures"]),
     log("an empty log", "", "log.csv: the log is empty; it must start with a line of column names"),
     log("a log with one row", original_text(1), "log.csv: it holds 1 sample; at least 2"),
     log("a log with a column missing", original_text().replace("torque", "torq"),

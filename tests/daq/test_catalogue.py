@@ -41,10 +41,11 @@ def lab(tmp_path_factory):
     noted = {"operator": "Ann", "sample": "MRB-1", "tags": ["new", "warm"], "temperature": 21.5}
     write_experiment(folder / "first.yaml", metadata=noted)
     write_experiment(folder / "second.yaml", motor={"seed": 5})
+    write_experiment(folder / "third.yaml", metadata=noted, motor={"seed": 6})
     commands = (
         ("run", "first.yaml"),
         ("run", "second.yaml", "--note", "operator=Bob", "--note", "brushes replaced"),
-        ("run", "first.yaml", "--note", "temperature=30", "--note", "sample="),
+        ("run", "third.yaml", "--note", "temperature=30", "--note", "sample="),
     )
     for command in commands:
         result = rig(*command, cwd=folder)
@@ -172,6 +173,14 @@ def test_what_is_edited_by_hand_counts_at_once(lab):
     assert len(listed(lab, "humidity=40")) == 1
     path.write_text(before)
     assert rig("runs", "humidity=40", cwd=lab).returncode == 2
+
+
+def test_a_folder_of_runs_is_identified_together(lab):
+    words = ("--model", "coil.py:coil", "--population", 10, "--generations", 5, "--json")
+    result = rig("identify", "runs", *words, "--out", "together", cwd=lab)
+    assert result.returncode == 0, result.stderr
+    logs = json.loads(result.stdout)["metrics"]["training"]
+    assert [f"runs/{log['name']}" for log in logs] == sorted(captures(lab))
 
 
 @pytest.mark.parametrize("damage", ["deleted", "no database", "a folder", "another layout"])
