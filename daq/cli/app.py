@@ -4,12 +4,13 @@ import functools
 import os
 import sys
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, nullcontext, suppress
 from inspect import Parameter, signature
 from typing import Annotated, Any
 
 from typer import BadParameter, Exit, Option, Typer
 
+from daq.cli import terminal
 from daq.cli.analyse import analyse
 from daq.cli.campaign import campaign
 from daq.cli.check import check
@@ -27,7 +28,7 @@ from daq.cli.runs import runs
 from daq.cli.schema import schema
 from daq.cli.scope import scope
 from daq.cli.terminal import Volume, output
-from daq.errors import ConfigError
+from daq.errors import ConfigError, RigError
 
 _COMMANDS: tuple[tuple[Callable[..., None], str], ...] = (
     (run, "rig run prbs.yaml --identify"),
@@ -72,8 +73,13 @@ def _with_volume(function: Callable[..., None]) -> Callable[..., None]:
             raise BadParameter("give --quiet or --verbose, not both")
         level = Volume.QUIET if quiet else Volume.VERBOSE if verbose else Volume.NORMAL
         with output(level, options.get("json", False)), _interruptible(function):
-            _secure_cache()
-            function(*args, **options)
+            try:
+                _secure_cache()
+                function(*args, **options)
+            except RigError as error:
+                with suppress(OSError):  # its reader is gone; what went wrong comes first
+                    terminal.print_json_error(error)
+                raise
 
     # Typer reads the options from the signature and the annotations.
     plain = signature(function, eval_str=True)

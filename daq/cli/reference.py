@@ -24,7 +24,9 @@ are not in the table are mistakes.
 """
 _STATUS = (
     "`rig COMMAND --help` says the same. Exit status: 0 done, 1 the run failed or an interlock "
-    "tripped, 2 wrong usage or configuration."
+    "tripped, 2 wrong usage or configuration. With `--json` a command that fails prints a document "
+    "as well: `exit_status`; `errors`, each with `error`, `file`, `line`, `column`, `key`, `cure`; "
+    "and `notes`, such as where the log of an interrupted run is."
 )
 _BOUNDS = {
     "minimum": "at least",

@@ -15,6 +15,7 @@ from typing import Any, TextIO
 
 from daq import notation
 from daq.documents import plain
+from daq.errors import RigError
 from daq.progress import Event, Level, Note, Progress, Watch, ignore
 
 number = notation.number  # pages and tables print numbers alike
@@ -30,6 +31,7 @@ class Volume(IntEnum):
 
 _volume: ContextVar[Volume] = ContextVar("volume", default=Volume.NORMAL)
 _documents: ContextVar[TextIO | None] = ContextVar("documents", default=None)
+_has_document: ContextVar[bool] = ContextVar("has_document", default=False)
 _VOLUMES = {"warning": Volume.QUIET, "note": Volume.NORMAL, "detail": Volume.VERBOSE}
 _VERBOSE_PERIOD = 1.0  # s between lines of progress
 
@@ -41,6 +43,7 @@ def output(level: Volume, documents_alone: bool) -> Iterator[None]:
     What else is printed, such as by a user's own protocol, then goes to standard error.
     """
     before = _volume.set(level), _documents.set(sys.stdout if documents_alone else None)
+    _has_document.set(False)
     try:
         with (
             warnings.catch_warnings(),
@@ -106,8 +109,28 @@ def print_steps(steps: Sequence[tuple[str, str]]) -> None:
 def print_json(document: Any) -> None:
     """One JSON document; numbers JSON cannot hold become null."""
     out = _documents.get() or sys.stdout
+    _has_document.set(True)
     out.write(json.dumps(plain(document), indent=2) + "\n")
     out.flush()
+
+
+def print_json_error(error: RigError) -> None:
+    """The document of a command that failed, where it has not printed its own."""
+    if _documents.get() is None or _has_document.get():
+        return
+    errors = [
+        {
+            "error": mistake.problem,
+            "file": None if mistake.file is None else str(mistake.file),
+            "line": mistake.line,
+            "column": mistake.column,
+            "key": mistake.key or None,
+            "cure": mistake.cure or None,
+        }
+        for mistake in error.mistakes
+    ]
+    notes = getattr(error, "__notes__", [])
+    print_json({"exit_status": error.exit_status, "errors": errors, "notes": notes})
 
 
 def print_text(text: str) -> None:

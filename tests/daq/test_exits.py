@@ -5,6 +5,7 @@ also sends the process the signals, at a known place; a limit on the size of fil
 """
 
 import hashlib
+import json
 import os
 import shutil
 import subprocess
@@ -23,6 +24,7 @@ from tests.daq.support import (
     journal_of,
     only_capture,
     record_of,
+    rig,
     running_capture,
     write_experiment,
     write_rig,
@@ -373,3 +375,22 @@ def test_ctrl_c_while_the_program_is_still_being_imported_is_no_traceback():
     )
     assert result.returncode == 1
     assert result.stderr.strip() == "rig: stopped by Ctrl-C"
+
+
+def test_with_json_a_failure_is_a_document_too(tmp_path):
+    write_experiment(tmp_path / "bad.yaml", motor={"amplitude": "much"}, sample_rate=-1)
+    result = rig("check", "bad.yaml", "--json", cwd=tmp_path)
+    document = json.loads(result.stdout)
+    assert result.returncode == document["exit_status"] == 2
+    lines = (tmp_path / "bad.yaml").read_text().splitlines()
+    assert [error["key"] for error in document["errors"]] == ["sample_rate", "motor.amplitude"]
+    for error in document["errors"]:
+        assert error["key"].rpartition(".")[2] in lines[error["line"] - 1]
+        assert error["file"] == "bad.yaml"
+        assert error["error"] in result.stderr
+
+
+def test_a_document_is_printed_once(tmp_path):
+    result = rig("ports", "/dev/no-such-port", "--json", cwd=tmp_path)
+    assert result.returncode == 2
+    assert json.loads(result.stdout)["ports"][0]["name"] == "/dev/no-such-port"
