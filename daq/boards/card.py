@@ -10,8 +10,8 @@ from pydantic import Field
 
 from daq.config.base import Section
 from daq.config.units import Seconds
-from daq.errors import DeviceError
-from daq.hal import CHANNELS, FloatArray
+from daq.errors import ConfigError, DeviceError
+from daq.hal import CHANNELS, FloatArray, Mode
 
 ZERO: FloatArray = np.zeros(len(CHANNELS))  # V, of both outputs
 ZERO.flags.writeable = False
@@ -20,6 +20,16 @@ ZERO.flags.writeable = False
 WATCHDOG_CURE = (
     "see docs/boards.md for what the card may ask for; or write 'watchdog: null' under options and "
     "have a switch in the amplifiers' supply, for nothing then zeroes them when this program dies"
+)
+
+
+NO_PHASE = (
+    "it is not measured how many samples outputs that the card times come behind its inputs, and "
+    "open loops are refused until it is"
+)
+PHASE_CURE = (
+    "measure it with 'rig doctor --rig FILE --loopback' and write it into the rig's file, or write "
+    "'playback: host'"
 )
 
 
@@ -48,6 +58,14 @@ class CardOptions(Section):
     buffer: int = Field(
         8192, ge=256, le=1_000_000, description="samples that the card keeps, either way"
     )
+
+
+def require_phase(options: object, mode: Mode, file: str | None = None) -> None:
+    """Raise ConfigError where a card is to time an open loop, and it is not known when."""
+    if not isinstance(options, CardOptions) or mode is Mode.CLOSED_LOOP:
+        return
+    if options.playback == "board" and options.phase is None:
+        raise ConfigError(NO_PHASE, cure=PHASE_CURE, file=file, key="options.phase")
 
 
 @dataclass(frozen=True)

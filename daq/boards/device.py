@@ -13,15 +13,30 @@ from typing import Any
 import numpy as np
 
 from daq.boards import loopback
-from daq.boards.card import ZERO, Card, CardFacts, CardOptions, Reading
+from daq.boards.card import (
+    NO_PHASE,
+    PHASE_CURE,
+    ZERO,
+    Card,
+    CardFacts,
+    CardOptions,
+    Reading,
+    require_phase,
+)
 from daq.boards.watch import GuardWatch, RateEstimate, Unwrapping
-from daq.errors import ConfigError, DeviceError
+from daq.errors import DeviceError, Mistake
 from daq.hal import CHANNELS, DeviceInfo, Flag, FloatArray, Guard, IntArray, Mode, Phase, RawSamples
 
 _BLOCK = 0.01  # s of samples read at once while the card plays
 _MARGIN = 0.05  # s of commands that are to be with the card; less, and it runs dry
 _DRIFT = 2e-4  # of the card's clock against this computer's, at most
 _SATURATED = 1e-3  # of the range, from its ends
+_UNTRIED = "this backend has been tested on a simulated card, never on hardware"
+_NO_WATCHDOG = (
+    "without a watchdog the outputs may stay at their last volts where this program is killed, "
+    "this computer hangs or the card is cut off, until somebody switches the amplifiers off"
+)
+_JITTER = "commands come when this computer gets to them after each sample: run.json says how late"
 
 
 class CardDevice:
@@ -56,14 +71,7 @@ class CardDevice:
         self._end_sampling()
         self._is_closed_loop = mode is Mode.CLOSED_LOOP
         self._plays = not self._is_closed_loop and self._settings.playback == "board"
-        if self._plays and self._settings.phase is None:
-            raise ConfigError(
-                "it is not known how many samples outputs that the card times come behind its "
-                "inputs",
-                cure="measure it once with 'rig doctor --rig FILE --loopback' and write it there, "
-                "or write 'playback: host'",
-                key="options.phase",
-            )
+        require_phase(self._settings, mode)
         self._rate, self._guard, self._watch = sample_rate, guard, GuardWatch(guard)
         self._unwrapping, self._estimate = Unwrapping(), RateEstimate(sample_rate)
         self._queue: dict[int, FloatArray] = {}  # commands by tick, not handed on yet
@@ -137,33 +145,30 @@ class CardDevice:
             names = ("median", "99 percent", "largest")
             values = np.quantile(self._delays, [0.5, 0.99, 1.0]).tolist()
             delays = {"command_delay_seconds": dict(zip(names, values, strict=True))}
-        self._record |= {"settings": settings, "cannot_promise": self.caveats(), **delays}
+        self._record |= {
+            "settings": settings,
+            "cannot_promise": [caveat.text for caveat in self.caveats()],
+            **delays,
+        }
         return {**self._record, "warnings": warnings}
 
-    def caveats(self) -> list[str]:
-        """What it cannot promise, and what to do about it."""
+    def caveats(self) -> list[Mistake]:
+        """What it cannot promise, each with what to do about it."""
         settings = self._settings
-        texts = [
-            "this backend has been tested on a simulated card, never on hardware: go through "
-            "docs/boards.md first"
-        ]
+        caveats = [Mistake(_UNTRIED, "go through docs/boards.md before amplifiers are on")]
         if settings.watchdog is None:
-            texts.append(
-                "no watchdog: where this program is killed, this computer hangs or the card is cut "
-                "off, the outputs may stay at their last volts until somebody switches the "
-                "amplifiers off; give them a supply that a second person can switch"
-            )
+            caveats.append(Mistake(_NO_WATCHDOG, "have a switch in their supply, and a hand at it"))
         if settings.playback == "board":
-            texts.append(
-                "the card plays open loops by itself: what passes a limit is zeroed some "
-                f"{1e3 * _BLOCK:.0f} ms later, not in the same sample; 'playback: host' does that"
+            later = (
+                f"outputs are zero {1e3 * _BLOCK:.0f} ms after a limit was passed in an open loop, "
+                "not in the same sample, for the card plays by itself"
             )
+            caveats.append(Mistake(later, "write 'playback: host' where that is too late"))
         if settings.playback == "board" and settings.phase is None:
-            texts.append(
-                "options.phase is not measured: open loops are refused; measure it with "
-                "'rig doctor --rig FILE --loopback', or write 'playback: host'"
-            )
-        return texts
+            caveats.append(Mistake(NO_PHASE, PHASE_CURE))
+        if settings.playback == "host":
+            caveats.append(Mistake(_JITTER, "write 'playback: board' for waveforms to identify by"))
+        return caveats
 
     def measure_phase(self) -> list[float]:
         """Delays [samples] of outputs played by the card behind its inputs, of some starts.
@@ -179,10 +184,10 @@ class CardDevice:
             # A tail keeps the card from running dry before all is read.
             self._card.start(loopback.RATE, np.concatenate([volts, np.zeros_like(volts)]))
             try:
-                shown = self._card.read(len(volts)).analog[:, 0]
+                blocks = [self._next_block(loopback.RATE).analog for _ in range(len(volts) // 10)]
             finally:
                 self._card.stop()
-            delays.append(loopback.delay(volts[:, 0], shown))
+            delays.append(loopback.delay(volts[:, 0], np.concatenate(blocks)[:, 0]))
         return delays
 
     def _require_open(self) -> None:
@@ -215,7 +220,7 @@ class CardDevice:
 
     def _single(self) -> RawSamples:
         """A sample, and right after it the command for its tick."""
-        reading = self._read(1)
+        reading = self._noted(self._guarded(1))
         tick = self._tick
         counts, rates = self._counted(reading)
         command, flags = self._queue.pop(tick, None), Flag(0)
@@ -243,7 +248,7 @@ class CardDevice:
 
     def _block(self) -> RawSamples | None:
         """Samples while the card plays by itself; None where all came before tick 0."""
-        reading = self._read(max(1, round(_BLOCK * self._rate)))
+        reading = self._noted(self._next_block(self._rate))
         n = len(reading.counts)
         ticks = np.arange(self._tick + 1 - n, self._tick + 1)
         early = max(0, -int(ticks[0]))
@@ -291,14 +296,22 @@ class CardDevice:
         self._played = {tick: volts for tick, volts in self._played.items() if tick < zero_from}
         return zero_from
 
-    def _read(self, n: int) -> Reading:
+    def _next_block(self, sample_rate: float) -> Reading:
+        return self._guarded(max(1, round(_BLOCK * sample_rate)))
+
+    def _guarded(self, n: int) -> Reading:
+        """The next n samples, after which the watchdog is fed."""
         reading = self._card.read(n)
+        self._card.feed()
+        return reading
+
+    def _noted(self, reading: Reading) -> Reading:
+        """Count the ticks of what has just been read."""
         arrival = self._clock()
         self._tick += reading.lost + len(reading.counts)
         # Some samples come promptly: the earliest tell when tick 0 was, the clocks' drift aside.
         drifted = self._origin + _DRIFT * len(reading.counts) / self._rate
         self._origin = min(arrival - self._tick / self._rate, drifted)
-        self._card.feed()
         return reading
 
     def _now(self) -> int:

@@ -20,7 +20,10 @@ _DELAYS = range(-9, 10)  # samples
 _WIRE, _LOOSE = 0.05, 0.1  # pole of what is no RC; share of the signal that is not the output's
 _SPREAD = 0.1  # samples, from start to start
 _EARLY, _LATE = 0.02, 0.25  # of a sample, from a sample's latch to the change of the outputs
-_WIRING = "wire the motor's output over 10 kilohm to the motor's current input, and 100 nF from there to ground, amplifiers unplugged"  # fmt: skip
+_WIRING = (
+    "with the amplifiers unplugged, wire the motor's output over 10 kilohm to the motor's current "
+    "input, and 100 nF from there to ground"
+)
 
 
 def sequence(seed: int) -> FloatArray:
@@ -35,8 +38,8 @@ def delay(played: FloatArray, shown: FloatArray) -> float:
     """Samples from a row of the input to the change of the output that was played for it.
 
     played: (n,) [V]; shown: (n,) [V] at the other end of the RC. With the delay p + f, p whole, the
-    row behind k is y = a y_k + b1 u_(k-p-1) + b0 u_(k-p), where b0 / (b0 + b1) has charged for 1 - f
-    of a sample. Raises DeviceError where that is not what is shown.
+    row behind k is y = a y_k + b1 u_(k-p-1) + b0 u_(k-p), where u_(k-p) has charged it for 1 - f of
+    a sample. Raises DeviceError where that is not what is shown.
     """
     inner = np.arange(-_DELAYS[0], len(shown) - _DELAYS[-1] - 1)
     y, following, ones = shown[inner], shown[inner + 1], np.ones(len(inner))
@@ -63,7 +66,7 @@ def delay(played: FloatArray, shown: FloatArray) -> float:
 
 def phase(delays: Sequence[float]) -> int:
     """The whole samples of delays, one a start. DeviceError where outputs cannot be trusted."""
-    shown = ", ".join(f"{value:.2f}" for value in delays)
+    shown = ", ".join(f"{round(value, 2) + 0.0:.2f}" for value in delays)
     cure = "write 'playback: host' under options, and leave 'phase' out"
     if max(delays) - min(delays) > _SPREAD:
         problem = f"outputs come {shown} samples behind inputs, another delay at each start"

@@ -29,8 +29,8 @@ class Settings:
     times come behind its inputs; a list has one for each start. loopback: what the motor's current
     input is wired to: nothing, the motor's output by a wire, or over an RC. fault: (method, n): at
     the n-th call of the method of a library the card is gone. hand: starts in which somebody winds
-    the load by ``turns``. journal: file of what became of the outputs. watchdog, overwrites: whether
-    the card has the one, and can go on where its buffer is full.
+    the load by ``turns``. journal: file of what became of the outputs. watchdog, overwrites:
+    whether the card has the one, and can go on where its buffer is full.
     """
 
     time: str = "virtual"
@@ -66,24 +66,24 @@ def forget():
     _worlds.clear()
 
 
-class Misuse(AssertionError):
+class MisuseError(AssertionError):
     """A call that the maker's documentation does not allow, and for which it names no error."""
 
 
-class Unplugged(Exception):
+class UnpluggedError(Exception):
     """The card is gone."""
 
 
 @dataclass
 class Writer:
-    """Samples to put out. first: the clock's edge of the first; None until it is started."""
+    """Samples to put out. first: the clock's edge of the first; None before it is started."""
 
     capacity: int
     rows: deque = field(default_factory=deque)
     first: int | None = None
     offset: int = 0  # substeps behind the edge
     ran_dry: bool = False
-    generated: int = 0
+    again: bool = False  # put out for ever, as some cards do unless told otherwise
 
 
 @dataclass
@@ -133,12 +133,12 @@ class World:
             time.sleep(seconds)
 
     def count_call(self, name):
-        """A call of a library's method; Unplugged from the one on at which the card is gone."""
+        """A call of a library; UnpluggedError from the one on at which the card is gone."""
         self.calls[name] = self.calls.get(name, 0) + 1
         method, at = self.settings.fault
         if self.gone or (name == method and self.calls[name] == at):
             self.gone = True
-            raise Unplugged(name)
+            raise UnpluggedError(name)
         self.sync()
 
     # --- clock --------------------------------------------------------------------------
@@ -147,7 +147,7 @@ class World:
         """Edges from now on, the first a period away; a clock that runs keeps running."""
         if self._rate is not None:
             if rate != self._rate:
-                raise Misuse(f"the clock runs at {self._rate} Hz already")
+                raise MisuseError(f"the clock runs at {self._rate} Hz already")
             return
         self._rate, self._origin = rate, self.now()
         self._edge, self._substep = -1, SUBSTEPS  # nothing before the first edge
@@ -206,7 +206,7 @@ class World:
     def wait_for_edge(self):
         """Block until the clock's next edge."""
         if self._rate is None:
-            raise Misuse("waiting for a clock that does not run would never end")
+            raise MisuseError("waiting for a clock that does not run would never end")
         due = self._origin + (self._edge + 2) / self._rate
         if self.settings.time == "virtual":
             self._now = max(self._now, due)
@@ -256,8 +256,10 @@ class World:
         if not writer.rows:
             writer.ran_dry = True  # and the converters keep what they had
             return
-        writer.generated += 1
-        self.set_outputs(writer.rows.popleft())
+        row = writer.rows.popleft()
+        if writer.again:
+            writer.rows.append(row)
+        self.set_outputs(row)
 
     def _latch(self, raw, charge):
         analog = raw.analog[0].copy()

@@ -2,15 +2,15 @@
 
 Arguments are checked as the C library and its Python layer describe them: channels are arrays of
 32-bit whole numbers with as many elements as are named beside them, volts and rates arrays of
-float64, counts of int32, all long enough for the samples asked for. What the documentation names an
-error for raises ``HILError`` with that error; what it forbids without naming one is a ``Misuse``.
+float64, counts of int32, all long enough for the samples asked for. What the documentation names
+an error for raises ``HILError`` with it; what it forbids without naming one is a ``MisuseError``.
 """
 
 import array
 
 import bench_world
 import numpy as np
-from bench_world import Misuse, Reader, Unplugged, Writer
+from bench_world import MisuseError, Reader, UnpluggedError, Writer
 
 from quanser.hardware.enumerations import BufferOverflowMode, Clock, EncoderQuadratureMode
 
@@ -62,7 +62,7 @@ def _call(method):
         try:
             self._world.count_call(method.__name__)
             return method(self, *args)
-        except Unplugged:
+        except UnpluggedError:
             raise HILError(108) from None
 
     checked.__name__, checked.__doc__ = method.__name__, method.__doc__
@@ -88,7 +88,9 @@ def _elements(values, codes, dtype, n, what):
     else:
         raise TypeError(f"{what} must be an array, not {type(values).__name__}")
     if len(values) < n:
-        raise Misuse(f"{what} has {len(values)} elements where {n} are read or written: memory")
+        raise MisuseError(
+            f"{what} has {len(values)} elements where {n} are read or written: memory"
+        )
     return values
 
 
@@ -96,11 +98,11 @@ def _channels(values, n, error, valid, what):
     n = _whole(n, f"number of {what}")
     if values is None:
         if n:
-            raise Misuse(f"{n} {what} without an array of them")
+            raise MisuseError(f"{n} {what} without an array of them")
         return []
     numbers = _elements(values, "iIlL", ["uint32", "int32"], n, what)
     if len(numbers) != n:
-        raise Misuse(f"{len(numbers)} {what} in the array, and {n} said")
+        raise MisuseError(f"{len(numbers)} {what} in the array, and {n} said")
     if any(int(number) not in valid for number in numbers):
         raise HILError(error)
     return [int(number) for number in numbers]
@@ -109,7 +111,7 @@ def _channels(values, n, error, valid, what):
 def _doubles(values, n, what):
     if n == 0:
         if values is not None:
-            raise Misuse(f"{what} without channels")
+            raise MisuseError(f"{what} without channels")
         return None
     return _elements(values, "d", ["float64"], n, what)
 
@@ -146,7 +148,7 @@ class HIL:
         if not isinstance(card_type, str) or not isinstance(card_identifier, str):
             raise TypeError("card_type and card_identifier must be text")
         if self._world is not None:
-            raise Misuse("the card is open already")
+            raise MisuseError("the card is open already")
         if (card_type, card_identifier) not in {("qpid", "0"), ("qpid_e", "0")}:
             raise HILError(108)
         world = bench_world.world(card_type)
@@ -154,7 +156,7 @@ class HIL:
             raise HILError(109)
         try:
             world.count_call("open")
-        except Unplugged:
+        except UnpluggedError:
             raise HILError(108) from None
         world.owner, self._world = self, world
         self._offset, self._mode, self._states = 0, 0, {}
@@ -197,7 +199,7 @@ class HIL:
         numbers = _channels(channels, num_channels, 121, range(_ANALOG), "analog outputs")
         volts = _volts(buffer, len(numbers), "volts")
         if any(task.item in self._world.writers for task in self._tasks):
-            raise Misuse("a writer task puts out volts at the same time")
+            raise MisuseError("a writer task puts out volts at the same time")
         outputs = self._world.outputs.copy()
         for number, value in zip(numbers, volts, strict=True):
             if number < len(outputs):
@@ -219,9 +221,9 @@ class HIL:
         )
         other = _channels(other_channels, num_other_channels, 130, _OTHER, "other inputs")
         if digital_channels is not None or _whole(num_digital_channels, "number of lines"):
-            raise Misuse("this bench has no digital lines")
+            raise MisuseError("this bench has no digital lines")
         if encoders and self._mode != EncoderQuadratureMode.X4:
-            raise Misuse("the encoder is read before it was set to count four a cycle")
+            raise MisuseError("the encoder is read before it was set to count four a cycle")
         reader = Reader(_whole(samples_in_buffer, "samples_in_buffer"))
         return self._task(reader, analog=analog, encoders=encoders, other=other)
 
@@ -241,7 +243,7 @@ class HIL:
             (other_channels, num_other_channels),
         ):
             if channels is not None or n != 0:
-                raise Misuse("this bench has analog outputs only")
+                raise MisuseError("this bench has analog outputs only")
         return self._task(Writer(_whole(samples_in_buffer, "samples_in_buffer")), analog=analog)
 
     @_call
@@ -266,15 +268,17 @@ class HIL:
         """Begin at the next edge of a clock."""
         self._valid(task)
         if clock != Clock.HARDWARE_CLOCK_0:
-            raise Misuse("samples that another clock times than the card's first")
+            raise MisuseError("samples that another clock times than the card's first")
         if not 0.0 < float(frequency) <= 1e5:
             raise HILError(3)
         if _whole(num_samples, "num_samples") != HIL.INFINITE:
-            raise Misuse("a run of so many samples ends by itself")
+            raise MisuseError("a run of so many samples ends by itself")
         if task.rate is not None:
-            raise Misuse("the task has been started")
+            raise MisuseError("the task has been started")
         if isinstance(task.item, Writer) and not task.item.rows:
-            raise Misuse("a writer is filled before it is started, or puts out nothing at first")
+            raise MisuseError(
+                "a writer is filled before it is started, or puts out nothing at first"
+            )
         task.rate = frequency
         self._world.start_clock(frequency)
         self._world.begin(task.item)
@@ -289,12 +293,12 @@ class HIL:
         if not isinstance(reader, Reader):
             raise HILError(105)
         if n < 1 or n > reader.capacity:
-            raise Misuse(f"{n} samples at once of a buffer for {reader.capacity}")
+            raise MisuseError(f"{n} samples at once of a buffer for {reader.capacity}")
         analog = _doubles(analog_buffer, n * len(channels["analog"]), "analog_buffer")
         rates = _doubles(other_buffer, n * len(channels["other"]), "other_buffer")
         counts = _elements(encoder_buffer, "il", ["int32"], n, "encoder_buffer")
         if digital_buffer is not None:
-            raise Misuse("digital_buffer without channels")
+            raise MisuseError("digital_buffer without channels")
         if task.rate is None:
             return 0  # a task that does not run has no samples
         while len(reader.rows) < n and not reader.failed:
@@ -325,14 +329,16 @@ class HIL:
         n_channels = len(task.channels["analog"])
         volts = _volts(analog_buffer, n * n_channels, "analog_buffer").reshape(n, n_channels)
         if (pwm_buffer, digital_buffer, other_buffer) != (None, None, None):
-            raise Misuse("a buffer without channels")
+            raise MisuseError("a buffer without channels")
         if n < 1 or n > writer.capacity:
-            raise Misuse(f"{n} samples at once into a buffer for {writer.capacity}")
+            raise MisuseError(f"{n} samples at once into a buffer for {writer.capacity}")
         if writer.ran_dry:
             raise HILError(_BUFFER_OVERFLOW)
         while len(writer.rows) + n > writer.capacity:
             if task.rate is None:
-                raise Misuse("a buffer is overfilled that nobody empties: this would never end")
+                raise MisuseError(
+                    "a buffer is overfilled that nobody empties: this would never end"
+                )
             self._world.wait_for_edge()
         writer.rows.extend(volts)
         return n
@@ -349,7 +355,7 @@ class HIL:
         """Give a task back."""
         self._valid(task)
         if task.rate is not None:
-            raise Misuse("a task is deleted while it runs")
+            raise MisuseError("a task is deleted while it runs")
         task.deleted = True
         self._tasks.remove(task)
 
@@ -360,7 +366,7 @@ class HIL:
         numbers = _channels(channels, num_channels, 121, range(_ANALOG), "analog outputs")
         volts = _doubles(voltages, len(numbers), "voltages")
         if self._world.armed:
-            raise Misuse("expiration states are set before the watchdog is started")
+            raise MisuseError("expiration states are set before the watchdog is started")
         if any(volts):
             raise HILError(601)
         self._states = dict(zip(numbers, volts, strict=False))
@@ -380,7 +386,7 @@ class HIL:
         """Whether it was in time."""
         self._supported(597)
         if not self._world.armed:
-            raise Misuse("a watchdog is reloaded that was not started")
+            raise MisuseError("a watchdog is reloaded that was not started")
         return self._world.reload()
 
     @_call
