@@ -29,8 +29,9 @@ class Settings:
     times come behind its inputs; a list has one for each start. loopback: what the motor's current
     input is wired to: nothing, the motor's output by a wire, or over an RC. fault: (method, n): at
     the n-th call of the method of a library the card is gone. hand: starts in which somebody winds
-    the load by ``turns``. journal: file of what became of the outputs. watchdog, overwrites:
-    whether the card has the one, and can go on where its buffer is full.
+    the load by ``turns``; let_down: those before which it was let down. journal: file of what became
+    of the outputs. watchdog, overwrites: whether the card has the one, and goes on where its buffer
+    is full.
     """
 
     time: str = "virtual"
@@ -39,6 +40,7 @@ class Settings:
     loopback: str = ""
     fault: tuple = ("", 0)
     hand: tuple = ()
+    let_down: tuple = ()
     turns: float = 5.0
     journal: str = ""
     watchdog: bool = True
@@ -151,11 +153,13 @@ class World:
             return
         self._rate, self._origin = rate, self.now()
         self._edge, self._substep = -1, SUBSTEPS  # nothing before the first edge
+        self.starts += 1
+        if self.starts in self.settings.let_down:
+            self._device.open()
         wide = np.full(3, 1e9)
         guard = Guard(np.full(2, -20.0), np.full(2, 20.0), -wide, wide)
         self._device.start(rate * SUBSTEPS, Mode.CLOSED_LOOP, guard)
         self._tick = 0
-        self.starts += 1
         winds = self.starts in self.settings.hand
         self._device.announce(Phase.HOMING if winds else Phase.RUN, self.settings.turns)
 
