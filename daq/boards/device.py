@@ -8,6 +8,7 @@ in the very sample, and the computer's punctuality is in the outputs.
 
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -57,7 +58,12 @@ class CardDevice:
     def open(self) -> DeviceInfo:
         """Connect; outputs are zero."""
         self.close()
-        facts = self._card.open()
+        try:
+            facts = self._card.open()
+        except BaseException:
+            with suppress(DeviceError):
+                self._card.close()  # what was opened until then
+            raise
         self._facts, self._record = facts, {"card": facts.name}
         queue, step = self._settings.buffer, facts.step_out
         return DeviceInfo(facts.name, facts.max_rate, queue, facts.volts, step_out=step)
@@ -83,6 +89,7 @@ class CardDevice:
         self._last = ZERO
         self._dry: int | None = None  # tick from which nothing was there to play
         self._latched = False
+        self._record.pop("command_delay_seconds", None)  # of an earlier sampling
         self._delays: list[float] = []  # s from a sample to its command
         self._sampling = True
 
@@ -140,17 +147,9 @@ class CardDevice:
             return {}
         warnings = [self._unsafe] if self._unsafe else []
         settings = self._settings.model_dump(mode="json")
-        delays = {}
-        if self._sampling and self._delays:
-            names = ("median", "99 percent", "largest")
-            values = np.quantile(self._delays, [0.5, 0.99, 1.0]).tolist()
-            delays = {"command_delay_seconds": dict(zip(names, values, strict=True))}
-        self._record |= {
-            "settings": settings,
-            "cannot_promise": [caveat.text for caveat in self.caveats()],
-            **delays,
-        }
-        return {**self._record, "warnings": warnings}
+        promises = [caveat.text for caveat in self.caveats()]
+        facts = {"settings": settings, "cannot_promise": promises, "warnings": warnings}
+        return {**self._record, **facts}
 
     def caveats(self) -> list[Mistake]:
         """What it cannot promise, each with what to do about it."""
@@ -202,6 +201,10 @@ class CardDevice:
     def _end_sampling(self) -> None:
         self.safe()
         going, self._sampling, self._going = self._going, False, False
+        if going and self._delays:
+            names = ("median", "99 percent", "largest")
+            values = np.quantile(self._delays, [0.5, 0.99, 1.0]).tolist()
+            self._record["command_delay_seconds"] = dict(zip(names, values, strict=True))
         if going:
             self._card.stop()
 

@@ -21,6 +21,7 @@ from daq.hal import ANALOG_INPUTS, CHANNELS, FloatArray
 _BITS = 16  # of the outputs
 _MOST_RATE = 10_000.0  # Hz, up to which Python has been seen to keep up
 _RATE_TOLERANCE = 5e-5  # as good as a quartz
+_EXPIRED = (-200644, -200678)  # errors by which a watchdog is known to have expired
 _PATIENCE = 1.0  # s beyond the time that samples take
 
 
@@ -70,6 +71,7 @@ class NidaqmxCard:
         self._playing: Any = None  # of outputs that the card times
         self._direct: Any = None  # of outputs that are written at once
         self._watchdog: Any = None
+        self._expired = False
 
     def open(self) -> CardFacts:
         """Connect, outputs zero."""
@@ -166,33 +168,32 @@ class NidaqmxCard:
     def zero(self) -> None:
         """End the task of outputs that the card times, if there is one, and put out zeros."""
         playing, self._playing = self._playing, None
-        zeros = np.zeros(len(CHANNELS))
-        all_steps([partial(self._release, playing), partial(self.write, zeros)])
+        steps = [partial(self._release, playing)]
+        if not self._expired:  # the watchdog has done it, and allows nobody to write
+            steps.append(partial(self.write, np.zeros(len(CHANNELS))))
+        all_steps(steps)
 
     def stop(self) -> None:
         """Zero outputs, then no task and no watchdog any more."""
-        tasks = [self._inputs, self._counter, self._watchdog]
-        self._inputs = self._counter = self._watchdog = None
+        tasks = [self._inputs, self._counter]
+        self._inputs = self._counter = None
         steps: list[Callable[[], None]] = [self.zero]
-        all_steps([*steps, *(partial(self._release, task) for task in tasks)])
+        steps += [partial(self._release, task) for task in tasks]
+        all_steps([*steps, self._end_watchdog])
 
     def close(self) -> None:
         """Disconnect; the outputs keep the zeros that were put out last."""
         if self._ni is None:
             return
         try:
-            self.stop()
+            all_steps([self.stop, self._end_direct])
         finally:
-            direct, self._direct = self._direct, None
-            self._release(direct)
             self._ni = None
 
     def _prepare_outputs(self, sample_rate: float, trigger: str, clocked: dict[str, Any]) -> None:
         """A task that plays each sample once, from the start of the inputs on."""
         constants, options = self._ni.constants, self._options
-        # The outputs belong to one task at a time.
-        direct, self._direct = self._direct, None
-        self._release(direct)
+        self._end_direct()
         self._playing = outputs = self._output_task()
         outputs.timing.cfg_samp_clk_timing(sample_rate, **clocked)
         outputs.out_stream.output_buf_size = options.buffer
@@ -217,9 +218,7 @@ class NidaqmxCard:
         ni, seconds = self._ni, self._options.watchdog
         if seconds is None:
             return
-        # Nor may a task hold the outputs.
-        direct, self._direct = self._direct, None
-        self._release(direct)
+        self._end_direct()
         volts = ni.constants.WatchdogAOExpirState.VOLTAGE
         outputs = [self._physical(getattr(self._options.outputs, name)) for name in CHANNELS]
         with self._words("starting the watchdog", WATCHDOG_CURE):
@@ -227,6 +226,19 @@ class NidaqmxCard:
             states = [ni.AOExpirationState(output, 0.0, volts) for output in outputs]
             self._watchdog.cfg_watchdog_ao_expir_states(states)
             self._watchdog.start()
+
+    def _end_watchdog(self) -> None:
+        watchdog, self._watchdog = self._watchdog, None
+        if self._expired:
+            self._expired = False
+            with self._words("clearing the watchdog", "reset the card in NI MAX"):
+                watchdog.clear_expiration()
+        self._release(watchdog)
+
+    def _end_direct(self) -> None:
+        """Give the outputs back, which belong to one task at a time."""
+        direct, self._direct = self._direct, None
+        self._release(direct)
 
     def _require_rate(self, actual: float, sample_rate: float) -> None:
         if abs(actual / sample_rate - 1.0) > _RATE_TOLERANCE:
@@ -250,6 +262,7 @@ class NidaqmxCard:
         try:
             yield
         except self._ni.DaqError as error:
+            self._expired |= self._watchdog is not None and error.error_code in _EXPIRED
             raise DeviceError(
                 f"{what} failed: {str(error).strip().splitlines()[0]} ({error.error_code})",
                 cure=cure

@@ -233,11 +233,30 @@ def test_a_command_that_comes_too_late_is_held_and_never_played(make):
         rows += [device.receive() for _ in range(30)]
     applied = np.concatenate([row.applied for row in rows])[:, 0]
     held = np.array([bool(row.flags[0] & int(Flag.HELD)) for row in rows])
-    assert held.tolist() == [20 <= k < 30 for k in range(50)]
-    expected = [0.19 if 20 <= k < 30 else 0.01 * k for k in range(50)]
+    # Tick 29 was half over by then: its command is late, but still its own.
+    assert held.tolist() == [20 <= k < 29 for k in range(50)]
+    expected = [0.19 if 20 <= k < 29 else 0.01 * k for k in range(50)]
     np.testing.assert_allclose(applied, expected, atol=1e-12)
     volts = [round(volts[0], 9) for _, volts in world.history]
-    assert not {round(0.01 * k, 9) for k in range(20, 30)} & set(volts)
+    assert not {round(0.01 * k, 9) for k in range(20, 29)} & set(volts)
+
+
+@both_cards
+def test_how_late_commands_come_is_recorded(make):
+    with fakes() as bench_world:
+        device = make(watchdog=None)
+        device.open()
+        device.start(RATE, CLOSED, guard_of())
+        device.send(0, levels(300))
+        (world,) = bench_world._worlds.values()
+        for k in range(200):
+            if k == 100:
+                world.pass_time(1.2 / RATE)
+            device.receive()
+        device.stop()
+    delays = device.report()["command_delay_seconds"]
+    assert delays["median"] == pytest.approx(0.0, abs=1e-6)
+    assert delays["largest"] == pytest.approx(0.2 / RATE, rel=5e-3)
 
 
 def test_a_waveform_that_the_host_plays_too_late_ends_in_zeros():
@@ -272,8 +291,8 @@ def test_a_rate_that_the_clock_of_a_card_cannot_have_is_refused():
     with fakes():
         device = nidaqmx()
         device.open()
-        device.start(97_654.3, CLOSED, guard_of())
-        with pytest.raises(DeviceError, match=r"cannot be divided.*97656\.25 Hz.*sample_rate"):
+        device.start(97_000.0, CLOSED, guard_of())
+        with pytest.raises(DeviceError, match=r"cannot be divided.*96993\.2105 Hz.*sample_rate"):
             device.receive()
 
 
@@ -320,10 +339,9 @@ def test_a_run_on_a_fake_card_is_recorded_with_what_cannot_be_promised(tmp_path,
     assert result.returncode == 0, result.stderr
     record = record_of(only_capture(tmp_path))
     assert record["status"] == "completed" and record["outputs"]["confirmed"]
-    assert record["timing"]["flags"] == {}
+    assert not record["timing"].get("flags")
     connection = record["connection"]
     assert any("never on hardware" in text for text in connection["cannot_promise"])
-    assert connection["command_delay_seconds"]["median"] < 0.01
 
 
 def test_an_open_loop_without_a_measured_phase_is_refused_before_anything(tmp_path):

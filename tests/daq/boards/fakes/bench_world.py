@@ -29,9 +29,9 @@ class Settings:
     times come behind its inputs; a list has one for each start. loopback: what the motor's current
     input is wired to: nothing, the motor's output by a wire, or over an RC. fault: (method, n): at
     the n-th call of the method of a library the card is gone. hand: starts in which somebody winds
-    the load by ``turns``; let_down: those before which it was let down. journal: file of what became
-    of the outputs. watchdog, overwrites: whether the card has the one, and goes on where its buffer
-    is full.
+    the load by ``turns``; let_down: those before which it was let down. journal: file of what
+    became of the outputs. watchdog, overwrites: whether the card has the one, and goes on where its
+    buffer is full.
     """
 
     time: str = "virtual"
@@ -311,6 +311,12 @@ class World:
             return not self.expired
         self._deadline = self.now() + self._timeout
         return True
+
+    def clear(self):
+        """Forget that the watchdog has expired; one that runs begins anew."""
+        self.expired = False
+        if self._deadline is not None:
+            self._deadline = self.now() + self._timeout
 
     def disarm(self):
         self._timeout = self._deadline = None

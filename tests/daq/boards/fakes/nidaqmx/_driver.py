@@ -544,7 +544,7 @@ class WatchdogTask:
     def clear_expiration(self):
         """Allow outputs again."""
         self._alive("clear_expiration")
-        _world().expired = False
+        _world().clear()
 
     def stop(self):
         """End watching."""

@@ -399,7 +399,7 @@ class HIL:
     def watchdog_clear(self):
         """Allow outputs again."""
         self._supported(599)
-        self._world.expired = False
+        self._world.clear()
 
     @_call
     def watchdog_stop(self):
