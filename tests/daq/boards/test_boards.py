@@ -168,6 +168,14 @@ def test_the_phase_is_measured_by_a_loop_back(phase):
     assert loopback.phase(delays) == int(np.floor(phase))
 
 
+def test_outputs_of_a_card_of_national_instruments_come_behind_all_conversions():
+    with fakes(loopback="rc"):
+        device = nidaqmx(phase=None, delay=2e-4)
+        device.open()
+        # 0.2 ms, of a sample at 1 kHz.
+        np.testing.assert_allclose(device.measure_phase(), 0.2, atol=0.02)
+
+
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
