@@ -82,6 +82,27 @@ def test_a_card_that_is_gone_at_any_call_is_an_error_in_words_and_never_another(
     assert tried > 25
 
 
+@pytest.mark.parametrize(
+    ("make", "method"), [(quanser, "write_analog"), (nidaqmx, "write_one_sample")]
+)
+def test_a_stop_of_which_a_step_fails_takes_all_others(make, method):
+    with fakes(once=True) as bench_world:
+        device = make()
+        device.open()
+        device.start(RATE, CLOSED, guard_of())
+        device.send(0, levels(20))
+        device.receive()
+        (world,) = bench_world._worlds.values()
+        # Behind the zeros of safe: those of the stop itself.
+        world.settings.fault = (method, world.calls[method] + 2)
+        with pytest.raises(DeviceError, match="failed"):
+            device.stop()
+        assert not world.readers and not world.armed
+        device.start(RATE, CLOSED, guard_of())
+        device.send(0, levels(20, motor=0.1))
+        assert device.receive().applied[0, 0] == 0.1
+
+
 @both_cards
 @pytest.mark.parametrize("mode", [OPEN, CLOSED])
 def test_outputs_move_only_while_a_watchdog_would_zero_them(make, mode, tmp_path):
@@ -99,6 +120,24 @@ def test_outputs_move_only_while_a_watchdog_would_zero_them(make, mode, tmp_path
             assert armed is not None
             moved += 1
     assert moved >= 2
+
+
+@both_cards
+@pytest.mark.parametrize("playback", ["board", "host"])
+def test_a_waveform_that_ends_leaves_zeros_and_not_its_last_volts(make, playback):
+    with fakes() as bench_world:
+        device = make(playback=playback)
+        device.open()
+        device.start(RATE, OPEN, guard_of())
+        device.send(0, levels(100, motor=0.5))
+        ticks = 0
+        while ticks < 400:
+            ticks += len(device.receive().tick)
+        (world,) = bench_world._worlds.values()
+    on = [time for time, volts in world.history if volts[0] == 0.5]
+    off = next(time for time, volts in world.history if time > on[0] and not any(volts))
+    assert off - on[0] == pytest.approx(100 / RATE)
+    assert not world.outputs.any()
 
 
 @both_cards

@@ -28,10 +28,10 @@ class Settings:
     time: virtual or real. phase: samples, whole or with a tenth, by which outputs that the card
     times come behind its inputs; a list has one for each start. loopback: what the motor's current
     input is wired to: nothing, the motor's output by a wire, or over an RC. fault: (method, n): at
-    the n-th call of the method of a library the card is gone. hand: starts in which somebody winds
-    the load by ``turns``; let_down: those before which it was let down. journal: file of what
-    became of the outputs. watchdog, overwrites: whether the card has the one, and goes on where its
-    buffer is full.
+    the n-th call of the method of a library the card is gone, or once only. hand: starts in which
+    somebody winds the load by ``turns``; let_down: those before which it was let down. journal: a
+    file of what became of the outputs. watchdog, overwrites: whether the card has the one, and goes
+    on where its buffer is full.
     """
 
     time: str = "virtual"
@@ -39,6 +39,7 @@ class Settings:
     phase: float | list = 0.0
     loopback: str = ""
     fault: tuple = ("", 0)
+    once: bool = False
     hand: tuple = ()
     let_down: tuple = ()
     turns: float = 5.0
@@ -139,7 +140,7 @@ class World:
         self.calls[name] = self.calls.get(name, 0) + 1
         method, at = self.settings.fault
         if self.gone or (name == method and self.calls[name] == at):
-            self.gone = True
+            self.gone = not self.settings.once
             raise UnpluggedError(name)
         self.sync()
 
