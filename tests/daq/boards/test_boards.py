@@ -50,8 +50,15 @@ def calls_of_a_life(make, **options):
         return dict(world.calls)
 
 
-@both_cards
-@pytest.mark.parametrize("playback", ["board", "host"])
+@pytest.mark.parametrize(
+    ("make", "playback"),
+    [
+        (quanser, "host"),
+        pytest.param(quanser, "board", marks=pytest.mark.soak),
+        pytest.param(nidaqmx, "host", marks=pytest.mark.soak),
+        pytest.param(nidaqmx, "board", marks=pytest.mark.soak),
+    ],
+)
 def test_a_card_that_is_gone_at_any_call_is_an_error_in_words_and_never_another(make, playback):
     calls = calls_of_a_life(make, playback=playback)
     assert sum(calls.values()) > 60
@@ -59,7 +66,7 @@ def test_a_card_that_is_gone_at_any_call_is_an_error_in_words_and_never_another(
     for method, count in calls.items():
         if method == "close":
             continue
-        for at in sorted({1, 2, max(1, count // 2), count}):
+        for at in sorted({1, max(1, count // 2), count}):
             if at > count:
                 continue
             with fakes(fault=(method, at)):
@@ -79,7 +86,7 @@ def test_a_card_that_is_gone_at_any_call_is_an_error_in_words_and_never_another(
                 device.close()
                 device.safe()
             tried += 1
-    assert tried > 25
+    assert tried > 20
 
 
 @pytest.mark.parametrize(
@@ -195,7 +202,10 @@ def test_outputs_that_come_behind_inputs_are_shifted_into_their_ticks(make, phas
     assert np.array_equal(shown[1:], commands[:199, 0])
 
 
-@pytest.mark.parametrize("phase", [-1.0, 0.0, 0.2, 1.0, 2.1])
+@pytest.mark.parametrize(
+    "phase",
+    [0.2, *(pytest.param(value, marks=pytest.mark.soak) for value in (-1.0, 0.0, 1.0, 2.1))],
+)
 def test_the_phase_is_measured_by_a_loop_back(phase):
     with fakes(phase=phase, loopback="rc"):
         device = quanser(phase=None)
@@ -402,7 +412,9 @@ def test_an_open_loop_without_a_measured_phase_is_refused_before_anything(tmp_pa
     assert not (tmp_path / "runs").exists()
 
 
-@pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    "ending", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.soak)]
+)
 def test_a_signal_zeroes_the_outputs_of_a_card(tmp_path, ending):
     write_experiment(tmp_path / "e.yaml", duration=60)
     without_seed(rig_file(tmp_path))
@@ -417,7 +429,7 @@ def test_a_signal_zeroes_the_outputs_of_a_card(tmp_path, ending):
     assert any(outputs[-2]["volts"]) and not any(outputs[-1]["volts"])
 
 
-@pytest.mark.parametrize("backend", list(CARDS))
+@pytest.mark.parametrize("backend", ["quanser", pytest.param("nidaqmx", marks=pytest.mark.soak)])
 def test_a_killed_host_leaves_an_armed_watchdog_behind(tmp_path, backend):
     write_experiment(tmp_path / "e.yaml", duration=60)
     without_seed(rig_file(tmp_path, backend))
