@@ -17,6 +17,8 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, FiniteFloat
 
+from daq.errors import Mistake
+
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
@@ -146,6 +148,14 @@ class Reporting(Protocol):
 
     def report(self) -> dict[str, Any]:
         """Facts about device and connection that JSON can hold; at any time, also when closed."""
+
+
+@runtime_checkable
+class Disclosing(Protocol):
+    """A device that says beforehand what it cannot promise."""
+
+    def caveats(self) -> list[Mistake]:
+        """What it cannot promise, each with what to do about it; at any time."""
 
 
 class Device(Protocol):

@@ -69,6 +69,8 @@ def _show(checked: Preview) -> None:
             f"{experiment.homing.turns:g} turns to wind within {experiment.homing.timeout:g} s"
         )
     print(f"Before it: {', '.join(before)}.")
+    for caveat in checked.caveats:
+        print(f"Caveat: {caveat.text}.")
     if not plan.excites:
         print("Its commands are zero throughout: it excites nothing, and logs everything.")
     elif checked.concludes:

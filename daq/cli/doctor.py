@@ -1,12 +1,17 @@
 """``rig doctor``: does this computer suit a rig in real time, and what to do where it does not."""
 
-from pathlib import Path
-from typing import Annotated
+from __future__ import annotations
 
-from typer import Argument
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from typer import Argument, Option
 
 from daq.cli import options, terminal
-from daq.errors import RunError
+from daq.errors import ConfigError, RunError
+
+if TYPE_CHECKING:
+    from daq.diagnose.computer import Check
 
 
 def doctor(
@@ -14,6 +19,16 @@ def doctor(
         list[str] | None,
         Argument(metavar="[PORT...]", help="Device names; default all that exist."),
     ] = None,
+    rig: Annotated[
+        str | None, Option(metavar="RIG.yaml", help="Open this rig, outputs at zero, and ask it.")
+    ] = None,
+    loopback: Annotated[
+        bool,
+        Option(
+            "--loopback",
+            help="Measure when outputs come: +-0.5 V on the motor's, amplifiers unplugged.",
+        ),
+    ] = False,
     out: options.RunsFolder = Path("runs"),
     json: options.AsJson = False,
 ) -> None:
@@ -24,7 +39,12 @@ def doctor(
     from daq.diagnose.computer import diagnose
     from daq.serial.ports import ports_of
 
-    checks = diagnose(ports_of(names or []), out)
+    if loopback and rig is None:
+        raise ConfigError("--loopback: no rig is named", cure="add --rig RIG.yaml")
+    if rig is None or names:
+        checks = diagnose(ports_of(names or []), out)
+    else:
+        checks = [*_of_rig(rig, loopback), *diagnose(None, out)]
     bad = [check.subject for check in checks if check.verdict == "bad"]
     if json:
         rows = [
@@ -42,3 +62,11 @@ def doctor(
     if bad:
         problem = f"not fit for a rig in real time: {', '.join(bad)}"
         raise RunError(problem, cure="the cures stand above")
+
+
+def _of_rig(name: str, loopback: bool) -> list[Check]:
+    from daq.diagnose.card import diagnose_rig
+    from daq.lookup.rigs import load_rig
+
+    _, device = load_rig(name, watch=terminal.report_event)
+    return diagnose_rig(device, name, loopback)

@@ -25,7 +25,7 @@ def init(
         str,
         Option(
             metavar="NAME",
-            help="Shipped rig to begin with; serial for hardware, with limits at a tenth.",
+            help="Shipped rig to begin with; serial, quanser or nidaqmx for hardware, at a tenth.",
             autocompletion=rig_names,
         ),
     ] = "simulated",
@@ -54,7 +54,7 @@ def init(
     experiment = f"{protocol or DEFAULT_PROTOCOL}.yaml"
     if starter.hardware:
         terminal.print_next(*there)
-        terminal.print_steps(_first_evening(experiment))
+        terminal.print_steps(_first_evening(experiment, starter.on_port))
         return
     # An experiment without a validation run is mostly not for an identification.
     identify = f" --identify --config {SETTINGS}" if starter.validated else ""
@@ -65,13 +65,20 @@ def init(
     )
 
 
-def _first_evening(experiment: str) -> list[tuple[str, str]]:
+def _first_evening(experiment: str, on_port: bool) -> list[tuple[str, str]]:
     """What to do from the port to the experiment, and what each step is for."""
     from daq.lookup.starter import FIRST_EXPERIMENTS, RIG
 
     zero, first = FIRST_EXPERIMENTS
+    first_steps = [("rig ports", f"who answers where: write the port into {RIG}")]
+    if not on_port:
+        doctor = f"rig doctor --rig {RIG}"
+        first_steps = [
+            (doctor, "who answers, and what it cannot promise"),
+            (f"{doctor} --loopback", f"amplifiers unplugged: write the phase into {RIG}"),
+        ]
     return [
-        ("rig ports", f"who answers where: write the port into {RIG}"),
+        *first_steps,
         (f"rig check {zero}.yaml --rig {RIG}", "reads the files, energises nothing"),
         (f"rig run {zero}.yaml --rig {RIG}", "amplifiers off: what the sensors read"),
         (f"rig run {first}.yaml --rig {RIG}", "no load, a hand at the switch: first commands"),

@@ -34,10 +34,13 @@ class Check:
     cure: str = ""
 
 
-def diagnose(ports: Sequence[PortFacts], out: Path) -> list[Check]:
-    """Check these ports, scheduling and memory, and the disk of the folder for logs."""
-    checks = [check for port in ports for check in _port(port)]
-    if not ports:
+def diagnose(ports: Sequence[PortFacts] | None, out: Path) -> list[Check]:
+    """Check these ports, scheduling and memory, and the disk of the folder for logs.
+
+    ports: None where the rig is on none.
+    """
+    checks = [check for port in ports or () for check in _port(port)]
+    if ports is not None and not ports:
         checks = [Check("ports", "could be better", "there are none", "plug the device in")]
     return [*checks, *_real_time(), _disk(out)]
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from daq.errors import ConfigError, RunError, suggestion
 from daq.files import make_folder
 from daq.lookup import schemas
+from daq.lookup.rigs import load_rig
 from daq.lookup.shipped import shipped_files
 from daq.progress import Watch, ignore
 
@@ -27,13 +28,14 @@ class Starter:
     """What lies in a folder to begin with.
 
     written, kept: files written, and files kept as they were. hardware: whether the rig begins with
-    ``FIRST_EXPERIMENTS`` and limits for them. validated: whether the experiment that was asked for
-    has a validation run.
+    ``FIRST_EXPERIMENTS`` and limits for them. on_port: whether that hardware is on a port.
+    validated: whether the experiment that was asked for has a validation run.
     """
 
     written: list[Path]
     kept: list[Path]
     hardware: bool
+    on_port: bool
     validated: bool
 
 
@@ -60,7 +62,8 @@ def write_starter(folder: Path, protocol: str | None, rig: str, watch: Watch = i
     written = [folder / name for name, text in texts.items() if _write_new(folder / name, text)]
     kept = [folder / name for name in texts if folder / name not in written]
     schemas.write_schemas(folder / schemas.FOLDER, watch)
-    return Starter(written, kept, hardware, validated)
+    on_port = hardware and hasattr(load_rig(str(rigs[f"{first_rig}.yaml"]))[0].options, "port")
+    return Starter(written, kept, hardware, on_port, validated)
 
 
 def settings_text() -> str:

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from daq.config.rig import RigConfig
-from daq.errors import ConfigError, RunError
+from daq.errors import ConfigError, Mistake, RunError
 from daq.experiment import ClosedLoop, Experiment, Plan
 from daq.files import write_whole
-from daq.hal import CHANNELS, FloatArray
+from daq.hal import CHANNELS, Disclosing, FloatArray
 from daq.logs.columns import UNITS
 from daq.progress import Watch, ignore
 from daq.recording.session import Session, open_session
@@ -85,6 +85,12 @@ class Preview:
         return {**UNITS, **experiment.columns} if isinstance(experiment, ClosedLoop) else {}
 
     @property
+    def caveats(self) -> list[Mistake]:
+        """What the rig's device cannot promise, each with what to do about it."""
+        device = self.session.device
+        return device.caveats() if isinstance(device, Disclosing) else []
+
+    @property
     def document(self) -> dict[str, Any]:
         """The same for machines."""
         plan, experiment = self.plan, self.experiment
@@ -104,6 +110,7 @@ class Preview:
             "experiment": str(self.session.loaded.file.path),
             "validation_run": self.session.validation is not None,
             "rig": self.session.rig.name,
+            "cannot_promise": [caveat.text for caveat in self.caveats],
         }
 
 

@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from daq.boards.card import require_phase
 from daq.config.metadata import changes_of
 from daq.config.rig import RigConfig
 from daq.diagnose import currents
@@ -98,7 +99,9 @@ def open_session(
     validation = loaded.validation()
     runs = [run for run in (loaded, validation) if run is not None]
     plans = together(
-        *[partial(run.plan, config) for run in runs], partial(_require_port, config, name)
+        *[partial(run.plan, config) for run in runs],
+        partial(_require_port, config, name),
+        partial(require_phase, config.options, loaded.experiment.mode, name),
     )
     return Session(loaded, validation, config, device, plans[0])
 
@@ -135,7 +138,11 @@ def record(
     loaded = _noting(loaded, list(notes))
     name = str(rig or rig_for(str(experiment), watch))
     config, device = load_rig(name, options, watch)
-    together(partial(loaded.plan, config), partial(_require_port, config, name))
+    together(
+        partial(loaded.plan, config),
+        partial(_require_port, config, name),
+        partial(require_phase, config.options, loaded.experiment.mode, name),
+    )
     return load(_run(loaded, config, device, Path(out), watch).folder)
 
 

@@ -1,0 +1,5 @@
+"""Writers of samples."""
+
+from nidaqmx._driver import AnalogMultiChannelWriter
+
+__all__ = ["AnalogMultiChannelWriter"]

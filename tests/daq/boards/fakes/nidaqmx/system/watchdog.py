@@ -1,0 +1,5 @@
+"""Watchdogs of cards."""
+
+from nidaqmx._driver import WatchdogTask
+
+__all__ = ["WatchdogTask"]
