@@ -51,6 +51,7 @@ class Rig:
         self._scale = np.array([item.sign * item.scale for item in inputs])
         self.sampling = False
         self.call: tuple[str, float] | None = None
+        self.returned = 0.0  # when the last call of the backend ended, by the monotonic clock
         self._unsafe = ""  # why the device could not be told to zero its outputs
         self._device = device
         self._info: DeviceInfo | None = None
@@ -184,7 +185,7 @@ class Rig:
         try:
             return call(method, *args)
         finally:
-            self.call = None
+            self.call, self.returned = None, time.monotonic()
 
     def _largest_step(self) -> FloatArray | None:
         """Largest change of each command from tick to tick, (2,) [V]; None without a slew limit."""

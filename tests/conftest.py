@@ -27,8 +27,17 @@ def pytest_configure(config):
 
 def pytest_collection_modifyitems(items):
     # The longest begin first, so that no process waits for one alone at the end.
-    first = "test_tutorial", "test_combinations", "test_friction_identification", "test_docstrings"
-    items.sort(key=lambda item: not any(name in item.nodeid for name in first))
+    longest = [
+        "test_tutorial", "test_friction_identification", "test_cli", "test_combinations",
+        "test_campaigns", "faults/test_analysis", "test_compile", "faults/test_device",
+        "test_guesses", "test_docstrings",
+    ]  # fmt: skip
+
+    def place(item):
+        path = item.path.as_posix()
+        return next((n for n, name in enumerate(longest) if f"{name}.py" in path), len(longest))
+
+    items.sort(key=place)
 
 
 def _keep_bytecode():

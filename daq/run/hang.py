@@ -6,6 +6,7 @@ from types import TracebackType
 
 from daq.errors import DeviceError
 from daq.rig import Rig
+from daq.run.realtime import RealTime
 from daq.run.signals import SignalHandling
 
 _LONGEST = 5.0  # s of a call
@@ -16,13 +17,16 @@ _LOOK = 0.25  # s between looks
 class HangGuard:
     """Ends a run whose device does not return from a call. Use as a context manager.
 
+    So it does one whose program computes in real time without a pause, as ``RealTime`` says.
     DeviceError is raised in the main thread, out of the call. Where that does not hear of it, being
     in a library's own code or in a call that zeroes the outputs, the process is ended, and the
     device's watchdog zeroes the outputs.
     """
 
-    def __init__(self, rig: Rig, signals: SignalHandling, sample_rate: float) -> None:
-        self._rig, self._signals = rig, signals
+    def __init__(
+        self, rig: Rig, signals: SignalHandling, realtime: RealTime, sample_rate: float
+    ) -> None:
+        self._rig, self._signals, self._realtime = rig, signals, realtime
         # The next sample may be a long time away.
         self._longest = max(_LONGEST, 3.0 / sample_rate)
         self._ended = threading.Event()
@@ -43,6 +47,9 @@ class HangGuard:
     def _watch(self) -> None:
         interrupted = False
         while not self._ended.wait(_LOOK):
+            overrun = self._realtime.overrun_since(self._rig.returned)
+            if overrun is not None:
+                self._signals.interrupt(overrun)
             call = self._rig.call
             # A computed plant may take its time, and nobody is near it.
             if call is None or self._rig.info.virtual_time:

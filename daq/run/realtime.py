@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable
 from types import FrameType
 from typing import Any
@@ -23,6 +24,7 @@ _END = 4  # s after which the system ends a program that does not hear of that
 _LOCK = 1 | 2 | 4  # MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT: what is touched stays in memory
 _HIGH_PRIORITY_CLASS = 0x80
 _NORMAL_PRIORITY_CLASS = 0x20
+_MAIN = threading.main_thread()
 _CURE = (
     "allow it to this user with two lines in /etc/security/limits.d/rig.conf, "
     "'@GROUP - rtprio 50' and '@GROUP - memlock unlimited', and log in again; or start it by "
@@ -44,6 +46,7 @@ class RealTime:
         self.refused: dict[str, str] = {}
         self._overrun = overrun
         self._undo = contextlib.ExitStack()
+        self._returned = self._busy = 0.0
 
     def begin(self, wanted: Realtime) -> None:
         """Obtain what there is. Raises ConfigError, with the cure, when it is required."""
@@ -59,6 +62,20 @@ class RealTime:
             missing = "; ".join(f"{name}: {reason}" for name, reason in self.refused.items())
             problem = f"required, but not granted: {missing}. Cure: {_CURE}"
             raise ConfigError(problem, key="realtime")
+
+    def overrun_since(self, returned: float) -> RunError | None:
+        """From another thread, several times a second: the error of a second without a pause.
+
+        The system counts anew whenever the main thread waits for another one to let it go on, as
+        it does many times a second where a terminal shows progress. returned: when the device's
+        last call ended, which is what a pause is here.
+        """
+        if sys.platform != "linux" or "scheduler" not in self.granted:
+            return None
+        busy = time.clock_gettime(time.pthread_getcpuclockid(_MAIN.ident or 0))
+        if returned != self._returned:
+            self._returned, self._busy = returned, busy
+        return self._give_back() if busy - self._busy > _LONGEST else None
 
     def undo(self) -> None:
         """Back to ordinary scheduling, in reverse order; never raises."""
@@ -120,10 +137,13 @@ class RealTime:
 
     def _exceeded(self, number: int, frame: FrameType | None) -> None:
         self.undo()
+        self._overrun(self._give_back())
+
+    def _give_back(self) -> RunError:
         problem = f"the program computed for {_LONGEST} s without a pause"
         self.granted.pop("scheduler", None)
         self.refused["scheduler"] = f"given back: {problem}"
-        self._overrun(RunError(f"{problem}, in which no sample was answered"))
+        return RunError(f"{problem}, in which no sample was answered")
 
     def _lock_memory(self) -> None:
         library = ctypes.CDLL(None, use_errno=True)

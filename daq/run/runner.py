@@ -134,7 +134,7 @@ class _Run:
     def _all_phases(self, log: LogWriter) -> None:
         rig = self.sampling.rig
         try:
-            with HangGuard(rig, self.signals, self.experiment.sample_rate):
+            with HangGuard(rig, self.signals, self.realtime, self.experiment.sample_rate):
                 try:
                     try:
                         self._phases_under_power(log)

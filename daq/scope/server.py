@@ -6,10 +6,10 @@ import secrets
 import signal
 import socket
 import sys
-import warnings
 from collections.abc import Callable
 from types import FrameType
 from typing import Any
+from weakref import WeakSet
 
 from bokeh.application import Application
 from bokeh.application.handlers.function import FunctionHandler
@@ -19,6 +19,7 @@ from bokeh.server.tornado import BokehTornado
 from tornado.httpserver import HTTPServer
 from tornado.httputil import HTTPServerRequest
 from tornado.ioloop import IOLoop
+from tornado.iostream import IOStream
 from tornado.web import RequestHandler
 
 from daq.errors import ConfigError
@@ -48,7 +49,6 @@ def serve(watch: Watch, port: int | None, ready: Callable[[str], None]) -> None:
     # A tab that is closed while it is written to is no error; what goes wrong in a page it says.
     for name in ("bokeh", "tornado"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
-    warnings.filterwarnings("ignore", "coroutine 'WSHandler", RuntimeWarning)
     asyncio.run(_serve(watch, port, ready))
 
 
@@ -63,7 +63,7 @@ async def _serve(watch: Watch, port: int, ready: Callable[[str], None]) -> None:
 
     key = secrets.token_urlsafe()
     pages = _PrivatePages(Application(FunctionHandler(make_page)), key, port)
-    http = HTTPServer(pages)
+    http = _ClosingServer(pages)
     http.listen(port, HOST)
     server = BaseServer(IOLoop.current(), pages, http)
     before = [(number, signal.signal(number, end)) for number in (signal.SIGINT, signal.SIGTERM)]
@@ -73,8 +73,29 @@ async def _serve(watch: Watch, port: int, ready: Callable[[str], None]) -> None:
         await ended.wait()
     finally:
         server.stop()
+        http.close_streams()
+        # Whoever waited for a tab to read has heard of that once the page is free again.
+        await asyncio.gather(*(each.with_document_locked(int) for each in server.get_sessions()))
         for number, handler in before:
             signal.signal(number, handler)
+
+
+class _ClosingServer(HTTPServer):
+    """A server that can hang up, also on sockets of pages, which Tornado leaves open."""
+
+    def initialize(self, *args: Any, **kwargs: Any) -> None:
+        super().initialize(*args, **kwargs)
+        self._streams: WeakSet[IOStream] = WeakSet()
+
+    def handle_stream(self, stream: IOStream, address: tuple[Any, ...]) -> None:
+        """Answer what is asked on a connection."""
+        self._streams.add(stream)
+        super().handle_stream(stream, address)
+
+    def close_streams(self) -> None:
+        """End all connections at once, whatever is on its way."""
+        for stream in list(self._streams):
+            stream.close()
 
 
 class _PrivatePages(BokehTornado):

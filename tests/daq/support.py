@@ -14,6 +14,8 @@ from pathlib import Path
 
 import yaml
 
+from sim_rig.actuator import actuator
+
 RIG = (sys.executable, "-m", "daq.cli")
 
 # Short, without homing, so that a run takes no longer than the interpreter's start.
@@ -48,6 +50,20 @@ def write_experiment(path, **changes):
 
 def write_rig(path, **changes):
     return write_yaml(path, RIG_FILE, **changes)
+
+
+def few_free(*free, **parts):
+    """Settings of an identification of the actuator in which only ``free`` are searched.
+
+    The others stand at what the simulated rig has. For tests of something else: intervals of what
+    data hardly tell apart, which a whole actuator has many of, cost tens of seconds. parts: of the
+    actuator.
+    """
+    model = actuator(**parts, parameters="rig")
+    values = zip(model.parameter_names, model.nominal.tolist(), strict=True)
+    free = free or ("R_m", "K_m", "B_m")
+    fixed = {name: value for name, value in values if name not in free}
+    return {"population": 16, "generations": 2, "seed": 1, "fixed": fixed}
 
 
 def environment(**extra):

@@ -17,11 +17,13 @@ import yaml
 from tests.daq.support import (
     RIG,
     environment,
+    few_free,
     only_capture,
     rig,
     until,
     write_experiment,
     write_rig,
+    write_yaml,
 )
 from tests.daq.test_bad_input import MODEL
 
@@ -35,6 +37,7 @@ def captured(tmp_path_factory):
     root = tmp_path_factory.mktemp("captured")
     write_experiment(root / "e.yaml", validation={"motor": {"seed": 77}})
     write_rig(root / "rig.yaml", options={"ideal": True})
+    write_yaml(root / "few.yaml", few_free())
     assert rig("run", "e.yaml", "--rig", "rig.yaml", cwd=root).returncode == 0
     return root, only_capture(root)
 
@@ -77,7 +80,7 @@ def test_the_installed_command_is_the_module(tmp_path):
 @pytest.mark.soak
 def test_json_of_a_run_with_identification_is_one_document(tmp_path):
     write_experiment(tmp_path / "e.yaml", duration=0.2, validation={"motor": {"seed": 77}})
-    (tmp_path / "id.yaml").write_text("population: 20\ngenerations: 2\n")
+    write_yaml(tmp_path / "id.yaml", few_free())
     result = rig("run", "e.yaml", "--identify", "--config", "id.yaml", "--json", cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     document = json.loads(result.stdout)
@@ -93,7 +96,7 @@ def test_json_of_a_run_with_identification_is_one_document(tmp_path):
 def test_json_of_identify_check_models_and_replay(captured, tmp_path):
     root, folder = captured
     out = tmp_path / "out"
-    small = ("--population", 20, "--generations", 2, "--seed", 1, "--out", out)
+    small = ("--config", "few.yaml", "--out", out)
     identified = rig("identify", folder, *small, "--json", cwd=root)
     assert identified.returncode == 0, identified.stderr
     report = json.loads(identified.stdout)
@@ -320,8 +323,9 @@ def test_uneven_times_and_cells_without_a_number_are_taken_as_they_are(tmp_path)
 def test_theta_in_place_of_omega(captured, tmp_path, chosen):
     root, folder = captured
     out = tmp_path / "out"
-    result = rig("identify", folder, *chosen, "--set", "initial.omega=[-1,1]", "--population", 100,
-                 "--generations", 10, "--out", out, "--json", cwd=root)  # fmt: skip
+    few = write_yaml(tmp_path / "few.yaml", few_free(hysteresis="dahl"))
+    result = rig("identify", folder, "--config", few, *chosen, "--set", "initial.omega=[-1,1]",
+                 "--out", out, "--json", cwd=root)  # fmt: skip
     assert result.returncode == 0, result.stderr
     report = json.loads(result.stdout)
     (trained,) = report["metrics"]["training"]
@@ -360,7 +364,7 @@ def test_an_output_that_does_not_count_needs_no_column(tmp_path):
 def test_the_end_of_each_log_is_held_back(captured, tmp_path):
     root, folder = captured
     whole = np.genfromtxt(folder / "log.csv", delimiter=",", names=True)
-    small = ("--population", 20, "--generations", 2, "--json", "--out", tmp_path / "out")
+    small = ("--config", "few.yaml", "--json", "--out", tmp_path / "out")
     result = rig("identify", folder, "--hold-back", 0.25, *small, cwd=root)
     assert result.returncode == 0, result.stderr
     metrics = json.loads(result.stdout)["metrics"]
@@ -509,7 +513,8 @@ def test_results_of_a_folder_of_logs_do_not_go_into_that_folder(tmp_path, captur
     folder = tmp_path / "logs"
     folder.mkdir()
     shutil.copy(captured[1] / "log.csv", folder / "one.csv")
-    result = rig("identify", "logs", "--population", "8", "--generations", "1", cwd=tmp_path)
+    few = write_yaml(tmp_path / "few.yaml", few_free())
+    result = rig("identify", "logs", "--config", few, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert [path.name for path in folder.iterdir()] == ["one.csv"]
     assert len(list(tmp_path.glob("runs/*-identify-*/identification/parameters.yaml"))) == 1

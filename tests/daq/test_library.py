@@ -12,9 +12,9 @@ import pytest
 
 import daq
 from daq import ConfigError, identify, load, record, replay
-from tests.daq.support import environment, rig, write_experiment, write_rig
+from tests.daq.support import environment, few_free, rig, write_experiment, write_rig, write_yaml
 
-QUICK = {"population": 16, "generations": 2, "seed": 1}
+QUICK = few_free()
 NOTEBOOK = Path(__file__).parents[2] / "examples" / "notebook.ipynb"
 
 
@@ -32,7 +32,7 @@ def recorded(tmp_path_factory):
 @pytest.fixture(scope="module")
 def found(recorded):
     _, training, validation = recorded
-    return identify(training, validation, fixed={"R_m": 1.2}, **QUICK)
+    return identify(training, validation, **QUICK)
 
 
 def test_a_recorded_run_is_the_one_the_command_records(recorded):
@@ -48,9 +48,9 @@ def test_a_recorded_run_is_the_one_the_command_records(recorded):
 @pytest.mark.soak
 def test_an_identification_is_the_one_the_command_makes(recorded, found):
     root, training, validation = recorded
-    options = [f"--{name}={value}" for name, value in QUICK.items()]
-    options += ["--set", "fixed.R_m=1.2", "--validate", validation.folder]
-    result = rig("identify", training.folder, *options, "--json", cwd=root)
+    config = write_yaml(root / "id.yaml", QUICK)
+    options = ["--config", config, "--validate", validation.folder, "--json"]
+    result = rig("identify", training.folder, *options, cwd=root)
     told = json.loads(result.stdout)
     table = found.parameters
     assert list(table.columns) == ["value", "low", "high", "unit", "note"]
@@ -140,8 +140,8 @@ def test_the_notebook_does_what_it_shows(tmp_path, monkeypatch):
     assert not any(out["output_type"] == "error" for cell in code for out in cell["outputs"])
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(os.environ, "MPLBACKEND", "agg")
-    names = {}
+    names = {"QUICK": QUICK}
     for cell in code:
-        source = "".join(cell["source"]).replace("seed=0", "population=16, generations=2, seed=0")
+        source = "".join(cell["source"]).replace("seed=0", "**QUICK")
         exec(source, names)
     assert names["found"].parameters.loc["K_m", "unit"] == "N*m/A"

@@ -8,9 +8,17 @@ import subprocess
 import pytest
 import yaml
 
-from tests.daq.support import RIG, environment, rig, until, write_experiment
+from tests.daq.support import (
+    RIG,
+    environment,
+    few_free,
+    rig,
+    until,
+    write_experiment,
+    write_yaml,
+)
 
-SEARCH = ("--population", 80, "--generations", 120, "--seed", 3)
+SIZE = ("--population", 80, "--generations", 120)
 
 
 @pytest.fixture(scope="module")
@@ -21,6 +29,13 @@ def captured(tmp_path_factory):
     assert result.returncode == 0, result.stderr
     (folder,) = (root / "runs").iterdir()
     return root, folder
+
+
+@pytest.fixture(scope="module")
+def few(tmp_path_factory):
+    """Options of an identification that takes no longer than it must."""
+    # In a folder of its own, for files are named as seen from where a command was given.
+    return "--config", write_yaml(tmp_path_factory.mktemp("settings") / "few.yaml", few_free())
 
 
 def begin(root, *args):
@@ -37,11 +52,11 @@ def parameters(folder):
 
 @pytest.mark.soak
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no SIGKILL here")
-def test_a_killed_identification_goes_on_to_the_same_result(captured, tmp_path):
+def test_a_killed_identification_goes_on_to_the_same_result(captured, few, tmp_path):
     root, folder = captured
     whole, cut = tmp_path / "whole", tmp_path / "cut"
-    assert rig("identify", folder, *SEARCH, "--out", whole, cwd=root).returncode == 0
-    process = begin(root, folder.relative_to(root), *SEARCH, "--out", cut)
+    assert rig("identify", folder, *few, *SIZE, "--out", whole, cwd=root).returncode == 0
+    process = begin(root, folder.relative_to(root), *few, *SIZE, "--out", cut)
     checkpoint = cut / "search.ckpt"
     until(checkpoint.exists, "a checkpoint")
     first = checkpoint.stat().st_mtime_ns
@@ -57,10 +72,10 @@ def test_a_killed_identification_goes_on_to_the_same_result(captured, tmp_path):
 
 
 @pytest.mark.soak
-def test_ctrl_c_says_how_to_go_on(captured, tmp_path):
+def test_ctrl_c_says_how_to_go_on(captured, few, tmp_path):
     root, folder = captured
     out = tmp_path / "out"
-    process = begin(root, folder, *SEARCH[:3], 5000, "--out", out)
+    process = begin(root, folder, *few, *SIZE[:-1], 5000, "--out", out)
     until((out / "search.ckpt").exists, "a checkpoint")
     first = (out / "search.ckpt").stat().st_mtime_ns
     until(lambda: (out / "search.ckpt").stat().st_mtime_ns > first, "a later checkpoint")
@@ -73,12 +88,9 @@ def test_ctrl_c_says_how_to_go_on(captured, tmp_path):
 
 
 @pytest.mark.soak
-def test_nothing_is_left_of_an_identification_that_ended(captured, tmp_path):
+def test_nothing_is_left_of_an_identification_that_ended(captured, few, tmp_path):
     root, folder = captured
-    result = rig(
-        "identify", folder, "--population", 20, "--generations", 2, "--out", tmp_path / "o",
-        cwd=root,
-    )  # fmt: skip
+    result = rig("identify", folder, *few, "--out", tmp_path / "o", cwd=root)
     assert result.returncode == 0, result.stderr
     assert [path.name for path in (tmp_path / "o").iterdir()] == ["parameters.yaml"]
     result = rig("identify", "--resume", tmp_path / "o", cwd=root)
@@ -86,11 +98,11 @@ def test_nothing_is_left_of_an_identification_that_ended(captured, tmp_path):
 
 
 @pytest.mark.soak
-def test_what_has_changed_meanwhile_is_named(captured, tmp_path):
+def test_what_has_changed_meanwhile_is_named(captured, few, tmp_path):
     root, folder = captured
     log = tmp_path / "log.csv"
     shutil.copy(folder / "log.csv", log)
-    process = begin(root, log, *SEARCH, "--out", tmp_path / "o")
+    process = begin(root, log, *few, *SIZE, "--out", tmp_path / "o")
     until((tmp_path / "o" / "search.ckpt").exists, "a checkpoint")
     process.kill()
     process.communicate()

@@ -1,5 +1,6 @@
 """What the scope reads and keeps of a log, and its command; the page itself needs a browser."""
 
+import contextlib
 import http.client
 import json
 import signal
@@ -345,33 +346,43 @@ def page_address(tmp_path_factory):
     process.communicate(timeout=30)
 
 
-def request(address, path=None, **headers):
-    """Status and body of what a server answers over a plain socket."""
+@contextlib.contextmanager
+def asking(address, path=None, **headers):
+    """A plain socket on which a server has been asked for a page."""
     url = urlsplit(address)
     lines = {"Host": url.netloc, **headers}
     head = [f"GET {url.path if path is None else path} HTTP/1.1"]
     head += [f"{name.replace('_', '-')}: {value}" for name, value in lines.items()]
     with socket.create_connection((url.hostname, url.port), timeout=30) as connection:
         connection.sendall("\r\n".join([*head, "", ""]).encode())
-        with connection.makefile("rb") as answer:
-            status = int(answer.readline().split()[1])
-            length = int(http.client.parse_headers(answer).get("Content-Length", 0))
-            return status, answer.read(length)
+        yield connection
 
 
-def upgrade(address, path=None, **headers):
-    """Status of what a server answers to a WebSocket's request."""
+def request(address, path=None, **headers):
+    """Status and body of what a server answers."""
+    with asking(address, path, **headers) as connection, connection.makefile("rb") as answer:
+        status = int(answer.readline().split()[1])
+        length = int(http.client.parse_headers(answer).get("Content-Length", 0))
+        return status, answer.read(length)
+
+
+def socket_of(address):
+    """Path and headers with which a page's WebSocket is asked for."""
     url = urlsplit(address)
-    if path is None:
-        path = f"{url.path}ws"
-    socket_headers = {
+    return {
+        "path": f"{url.path}ws",
         "Connection": "Upgrade",
         "Upgrade": "websocket",
         "Sec_WebSocket_Version": "13",
         "Sec_WebSocket_Key": "dGhlIHNhbXBsZSBub25jZQ==",
         "Sec_WebSocket_Protocol": f"bokeh, {generate_jwt_token('any')}",
+        "Origin": f"http://{url.netloc}",
     }
-    return request(address, path, **{**socket_headers, "Origin": f"http://{url.netloc}", **headers})
+
+
+def upgrade(address, path=None, **headers):
+    """Status of what a server answers to a WebSocket's request."""
+    return request(address, **(socket_of(address) | ({"path": path} if path else {}) | headers))
 
 
 @pytest.mark.parametrize("name", ["127.0.0.1", "localhost", "LOCALHOST", "[::1]"])
@@ -423,6 +434,41 @@ def test_another_site_is_refused_even_with_the_key(page_address, knock, foreign)
     assert status == 403
     words = f"this page answers to 127.0.0.1:{port}, localhost:{port}, [::1]:{port} alone; open"
     assert body.startswith(words.encode())
+
+
+# Has more to say than a reader takes who stands still.
+FLOOD = """
+import daq.scope.server
+from bokeh.models import ColumnDataSource
+
+class Flood:
+    def __init__(self, document, watch):
+        self.source = ColumnDataSource({"x": []})
+        document.add_root(self.source)
+        document.add_periodic_callback(self.update, 10)
+
+    def update(self):
+        for _ in range(4):
+            self.source.data = {"x": ["x" * 10_000_000]}
+
+daq.scope.server.Page = Flood
+from daq.cli import main
+main()
+"""
+
+
+@pytest.mark.parametrize("number", ["SIGINT", "SIGTERM"])
+def test_a_tab_that_does_not_read_leaves_no_word_at_the_end(tmp_path, number):
+    process = subprocess.Popen(
+        [sys.executable, "-c", FLOOD, "scope", "--no-browser", "--port", "0"],
+        cwd=tmp_path, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    address = process.stdout.readline().split()[0]
+    with asking(address, **socket_of(address)) as tab, tab.makefile("rb") as stream:
+        assert len(stream.read(1_000_000)) == 1_000_000
+        process.send_signal(getattr(signal, number))
+        _, errors = process.communicate(timeout=30)
+    assert (process.returncode, errors) == (0, "")
 
 
 @pytest.mark.parametrize(

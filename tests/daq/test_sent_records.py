@@ -10,7 +10,14 @@ import yaml
 
 from daq import ConfigError, analyse, identify, replay, resume
 from daq.pytest_plugin import Replayer, SimulatedRig
-from tests.daq.support import only_capture, record_of, rig, write_experiment
+from tests.daq.support import (
+    few_free,
+    only_capture,
+    record_of,
+    rig,
+    write_experiment,
+    write_yaml,
+)
 from tests.daq.test_scope import request, start_scope
 
 _MARK = """
@@ -180,9 +187,10 @@ def test_in_python(sent, tmp_path):
 @pytest.mark.soak
 def test_commands_that_need_only_the_log_of_such_a_run(sent, tmp_path):
     name_protocol(sent, "theirs.py:Rest")
+    write_yaml(tmp_path / "few.yaml", few_free())
     for command in (
         ("replay", "sent"),
-        ("identify", "sent", "--population", 8, "--generations", 1, "--out", "found"),
+        ("identify", "sent", "--config", "few.yaml", "--out", "found"),
     ):
         result = rig(*command, cwd=tmp_path)
         assert result.returncode == 0, result.stderr
