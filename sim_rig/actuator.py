@@ -17,7 +17,7 @@ from sim_rig.physics.friction import FRICTIONS
 from sim_rig.physics.hysteresis import hysteresis as hysteresis_model
 from sim_rig.physics.loads import LOADS
 from sim_rig.physics.options import Design
-from sim_rig.physics.parameters import Layout, fixed, log_range
+from sim_rig.physics.parameters import Layout, constraints, fixed, log_range
 from sim_rig.plots import operating_points, plots
 from sysid import Input, ModelError, Output, ProcessModel, State
 from sysid.arrays import FloatArray
@@ -55,6 +55,10 @@ def actuator(
     *,
     driver_motor: options.MotorDriver = "closed",
     driver_brake: options.BrakeDriver = "closed",
+    order_motor: options.MotorOrder = 1,
+    order_brake: options.BrakeOrder = 1,
+    output_resistance_motor: options.MotorOutputResistance = False,
+    output_resistance_brake: options.BrakeOutputResistance = False,
     hysteresis: options.Hysteresis = "bouc-wen",
     exponent: options.Exponent = 1.0,
     smooth: options.Smooth = False,
@@ -76,8 +80,9 @@ def actuator(
     ('omega',)
     """
     design = Design(
-        driver_motor, driver_brake, hysteresis, exponent, smooth, friction, load, sensor, limits
-    )
+        driver_motor, driver_brake, order_motor, order_brake, output_resistance_motor,
+        output_resistance_brake, hysteresis, exponent, smooth, friction, load, sensor, limits,
+    )  # fmt: skip
     if load == "measured":
         if sensor != "load":
             raise ModelError(
@@ -133,32 +138,53 @@ class _Assembly:
         self._hysteresis = hysteresis_model(design.hysteresis, design.smooth, design.exponent)
         self._friction = FRICTIONS[design.friction]
         self._load = LOADS[design.load]
-        self._layout = Layout(
-            driver_motor=electrical.MOTOR_DRIVERS[design.driver_motor],
-            driver_brake=electrical.BRAKE_DRIVERS[design.driver_brake],
+        motor, brake = design.order_motor, design.order_brake
+        self._parameters = Layout(
+            driver_motor=electrical.driver_parameters("motor", design.driver_motor, motor),
+            driver_brake=electrical.driver_parameters("brake", design.driver_brake, brake),
             windings=electrical.WINDINGS,
+            output_motor=electrical.output_resistance("motor", design.output_resistance_motor),
+            output_brake=electrical.output_resistance("brake", design.output_resistance_brake),
             rotors=_ROTORS,
             hysteresis=self._hysteresis.parameters,
             friction=self._friction.parameters,
             load=self._load.parameters,
             constants=_CONSTANTS,
         )
+        z = State(
+            "z",
+            self._hysteresis.z_unit,
+            description="hysteresis variable",
+            initial_range=self._hysteresis.z_range,
+        )
+        self._states = Layout(
+            driver_motor=electrical.voltages("motor", motor),
+            driver_brake=electrical.voltages("brake", brake),
+            currents=(State("current_motor", "A"), State("current_brake", "A")),
+            shaft=(
+                State("omega", "rad/s", description="shaft speed"),
+                z,
+                State("theta", "rad", description="shaft angle"),
+            ),
+            load=self._load.states,
+        )
+        self._inputs = Layout(commands=_COMMANDS, load=self._load.inputs)
 
     def model(self, outputs: tuple[str, ...]) -> ProcessModel:
         """The process model with outputs by name."""
-        design, layout, shaft = self._design, self._layout, self._shaft()
+        design, places, shaft = self._design, self._parameters.slices, self._shaft()
         return ProcessModel(
             name="actuator",
             description=_description(design),
-            states=self._states(),
-            inputs=_COMMANDS + self._load.inputs,
+            states=self._states.members,
+            inputs=self._inputs.members,
             outputs=_chosen(outputs, measured=design.load == "measured"),
-            parameters=layout.parameters,
+            parameters=self._parameters.members,
             derivative=self._derivative(shaft),
-            output=_output(outputs, shaft) if "torque" in outputs else None,
+            output=self._output(outputs, shaft) if "torque" in outputs else None,
             constraints=(  # section 3.4.2
-                *layout.constraints("hysteresis", self._hysteresis.constraints),
-                *layout.constraints("friction", self._friction.constraints),
+                *constraints(places["hysteresis"], self._hysteresis.constraints),
+                *constraints(places["friction"], self._friction.constraints),
             ),
             guesses=guesses(design),
             plots=plots,
@@ -167,42 +193,38 @@ class _Assembly:
             equations=self._equations(),
         )
 
-    def _states(self) -> tuple[State, ...]:
-        unit, initial = self._hysteresis.z_unit, self._hysteresis.z_range
-        return (
-            State("voltage_motor", "V", description="amplifier output at the motor"),
-            State("voltage_brake", "V", description="amplifier output at the brake coil"),
-            State("current_motor", "A"),
-            State("current_brake", "A"),
-            State("omega", "rad/s", description="shaft speed"),
-            State("z", unit, description="hysteresis variable", initial_range=initial),
-            State("theta", "rad", description="shaft angle"),
-            *self._load.states,
-        )
-
     def _derivative(self, shaft: _Shaft) -> Callable[..., tuple[Any, ...]]:
-        design, place = self._design, self._layout.slices
-        driver_m = electrical.driver(design.driver_motor, design.limits)
-        driver_b = electrical.driver(design.driver_brake, design.limits)
+        design, place, states = self._design, self._parameters.slices, self._states.slices
+        drive_m = electrical.drive(design.driver_motor, design.limits)
+        drive_b = electrical.drive(design.driver_brake, design.limits)
+        amplifier = electrical.amplifier
         winding = electrical.limited_winding if design.limits else electrical.winding
         rate, locked = self._hysteresis.rate, self._locked
         of_driver_m, of_driver_b = place["driver_motor"], place["driver_brake"]
+        of_output_m, of_output_b = place["output_motor"], place["output_brake"]
         of_windings, of_constants = place["windings"], place["constants"]
         of_hysteresis = place["hysteresis"]
+        voltages_m, voltages_b = states["driver_motor"], states["driver_brake"]
+        currents, on_shaft = states["currents"], states["shaft"]
+        commands = self._inputs.slices["commands"]
 
         def derivative(x: Any, u: Any, p: Any) -> tuple[Any, ...]:
-            v_m, v_b, i_m, i_b, omega, z, _theta = x[:7]
+            v_m, v_b = x[voltages_m], x[voltages_b]
+            i_m, i_b = x[currents]
+            omega, z, _theta = x[on_shaft]
             if locked:
                 omega = 0.0  # also where noise in a first sample says otherwise
-            command_m, command_b = u[:2]
+            command_m, command_b = u[commands]
+            gain_m, *cutoffs_m = p[of_driver_m]
+            gain_b, *cutoffs_b = p[of_driver_b]
             R_m, L_m, K_m, R_b, L_b = p[of_windings]
             K_v2i, n_c = p[of_constants]
             acceleration, _torque, load_rates = shaft(x, u, p)
             return (
-                driver_m(v_m, i_m, command_m, K_v2i, p[of_driver_m]),
-                driver_b(v_b, i_b, command_b, K_v2i, p[of_driver_b]),
-                winding(i_m, v_m, -n_c * K_m * omega, R_m, L_m),
-                winding(i_b, v_b, 0.0, R_b, L_b),
+                *amplifier(v_m, drive_m(i_m, command_m, K_v2i, gain_m), cutoffs_m),
+                *amplifier(v_b, drive_b(i_b, command_b, K_v2i, gain_b), cutoffs_b),
+                winding(i_m, v_m[0], -n_c * K_m * omega, sum(p[of_output_m], R_m), L_m),
+                winding(i_b, v_b[0], 0.0, sum(p[of_output_b], R_b), L_b),
                 acceleration,
                 rate(omega, z, p[of_hysteresis]),
                 omega,
@@ -213,22 +235,29 @@ class _Assembly:
 
     def _shaft(self) -> _Shaft:
         """Newton's second law for all that turns (3.22), and what the torque sensor sees of it."""
-        place, locked, at_load = self._layout.slices, self._locked, self._design.sensor == "load"
+        place, locked = self._parameters.slices, self._locked
+        at_load = self._design.sensor == "load"
         rate, brake_torque = self._hysteresis.rate, self._hysteresis.torque
         brush_torque, load_torque = self._friction.torque, self._load.torque
         load_inertia = self._load.inertia
-        of_rotors, of_hysteresis = place["rotors"], place["hysteresis"]
+        of_rotors, of_hysteresis, of_windings = (
+            place["rotors"],
+            place["hysteresis"],
+            place["windings"],
+        )
         of_friction, of_load, of_constants = place["friction"], place["load"], place["constants"]
-        motor_constant = place["windings"].start + 2
+        states, pushes = self._states.slices, self._inputs.slices["load"]
+        currents, on_shaft, load_states = states["currents"], states["shaft"], states["load"]
 
         def shaft(x: Any, u: Any, p: Any) -> tuple[Any, Any, tuple[Any, ...]]:
-            i_m, i_b, omega, z, theta = x[2:7]
+            i_m, i_b = x[currents]
+            omega, z, theta = x[on_shaft]
             if locked:
                 omega = 0.0
             J_m, B_m, J_b = p[of_rotors]
-            K_m = p[motor_constant]
+            _R_m, _L_m, K_m, _R_b, _L_b = p[of_windings]
             _K_v2i, n_c = p[of_constants]
-            from_load = load_torque(theta, omega, x[7:], u[2:], p[of_load])
+            from_load = load_torque(theta, omega, x[load_states], u[pushes], p[of_load])
             J_load = load_inertia(p[of_load])
             q = p[of_hysteresis]
             brake = brake_torque(i_b, omega, z, rate(omega, z, q), q)
@@ -243,6 +272,18 @@ class _Assembly:
             return acceleration, motor - n_c * n_c * J_m * acceleration, from_load[1:]
 
         return shaft
+
+    def _output(self, names: tuple[str, ...], shaft: _Shaft) -> Callable[..., tuple[Any, ...]]:
+        order = [output.name for output in OUTPUTS]
+        pick = picker([order.index(name) for name in names])
+        currents, on_shaft = self._states.slices["currents"], self._states.slices["shaft"]
+
+        def output(x: Any, u: Any, p: Any) -> tuple[Any, ...]:
+            i_m, i_b = x[currents]
+            omega, _z, theta = x[on_shaft]
+            return pick((i_m, i_b, shaft(x, u, p)[1], theta, omega))
+
+        return output
 
     def _equations(self) -> tuple[str, ...]:
         """The equations as text, for people: one line each, in the parameters' names.
@@ -261,9 +302,11 @@ class _Assembly:
             inertia, torque = f"{inertia} + J_load", f"{torque} + tau_load"
             of_load = ("tau_load and J_load: torque and inertia of the load",)
         return (
-            electrical.driver_equation(design.driver_motor, "m"),
-            electrical.driver_equation(design.driver_brake, "b"),
-            *electrical.WINDING_EQUATIONS,
+            *electrical.driver_equations(design.driver_motor, design.order_motor, "m"),
+            *electrical.driver_equations(design.driver_brake, design.order_brake, "b"),
+            *electrical.winding_equations(
+                design.output_resistance_motor, design.output_resistance_brake
+            ),
             *self._hysteresis.equations,
             *filter(None, [brushes]),
             "domega/dt = 0" if self._locked else f"({inertia}) domega/dt = {torque}",
@@ -287,22 +330,23 @@ def _chosen(names: tuple[str, ...], measured: bool) -> tuple[Output, ...]:
     return tuple(available[name] for name in names)
 
 
-def _output(names: tuple[str, ...], shaft: _Shaft) -> Callable[..., tuple[Any, ...]]:
-    order = [output.name for output in OUTPUTS]
-    pick = picker([order.index(name) for name in names])
-
-    def output(x: Any, u: Any, p: Any) -> tuple[Any, ...]:
-        i_m, i_b, omega, _z, theta = x[2:7]
-        return pick((i_m, i_b, shaft(x, u, p)[1], theta, omega))
-
-    return output
-
-
 def _description(design: Design) -> str:
-    drivers = f"{design.driver_motor}-loop drivers"
-    if design.driver_motor != design.driver_brake:
-        drivers = f"{design.driver_motor}-loop motor and {design.driver_brake}-loop brake driver"
+    motor = _driver(design.driver_motor, design.order_motor, design.output_resistance_motor)
+    brake = _driver(design.driver_brake, design.order_brake, design.output_resistance_brake)
+    drivers = f"{motor[0]} drivers{motor[1]}"
+    if motor != brake:
+        drivers = f"{motor[0]} motor driver{motor[1]} and {brake[0]} brake driver{brake[1]}"
     kind = {"bouc-wen": "Bouc-Wen", "dahl": "Dahl", "lugre": "LuGre"}[design.hysteresis]
-    brake = f"magnetorheological brake with {'smooth ' if design.smooth else ''}{kind} hysteresis"
+    hysteresis = (
+        f"magnetorheological brake with {'smooth ' if design.smooth else ''}{kind} hysteresis"
+    )
     friction = FRICTIONS[design.friction].name
-    return ", ".join(filter(None, [drivers, "DC motor", brake, friction, f"{design.load} load"]))
+    return ", ".join(
+        filter(None, [drivers, "DC motor", hysteresis, friction, f"{design.load} load"])
+    )
+
+
+def _driver(kind: options.DriverKind, order: int, output_resistance: bool) -> tuple[str, str]:
+    """Adjectives of an amplifier, and what follows its noun."""
+    word = "" if order == 1 else f"{('second', 'third')[order - 2]}-order "
+    return f"{word}{kind}-loop", " with output resistance" if output_resistance else ""

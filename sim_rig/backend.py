@@ -23,7 +23,6 @@ from sysid import ProcessModel, Stepper
 
 _BLOCK = 256  # ticks simulated at once in open loop
 _REAL_TIME_BLOCK = 0.02  # s between deliveries of a device in real time
-_THETA = 6  # the plant's state
 _ACCURACY = 1e-4  # of the plant's states in parts of what matters: a tenth of the noise and below
 _INTERLOCK = int(hal.Flag.INTERLOCK)
 _OUTPUT_BITS, _IDEAL_BITS = 16, 24  # of the converters that a board would have
@@ -114,6 +113,7 @@ class SimulatedDevice:
     def __init__(self, options: Simulation) -> None:
         self.options = options
         self._plant = options.plant.build()
+        self._theta = self._plant.state_names.index("theta")
         self._user = SimulatedUser(options.plant.load == "hand", options.hand)
         self._rng = np.random.default_rng(options.seed)
         worst = 0.0 if options.ideal else options.imperfections.offset
@@ -153,7 +153,7 @@ class SimulatedDevice:
         """The simulated user winds the handle when asked to, and otherwise keeps off."""
         self._user.stop()
         if phase is Phase.HOMING and turns > 0.0:
-            self._user.wind(turns, self._clock, float(self._x[_THETA]))
+            self._user.wind(turns, self._clock, float(self._x[self._theta]))
         if phase is Phase.RUN:
             self._user.move(self._clock)
 
@@ -294,7 +294,8 @@ class SimulatedDevice:
         n, tick, per_tick = len(applied), self._queue.tick, self._stepper.n_steps
         trace, true = self._stepper.advance(self._x, self._inputs(applied))
         times = self._origin, tick * per_tick, 1.0 / (self._rate * per_tick), per_tick
-        counts, rates = self._encoder.latch(trace[:, _THETA], self._x[_THETA], *times)
+        theta = self._theta
+        counts, rates = self._encoder.latch(trace[:, theta], self._x[theta], *times)
         if self.options.ideal:
             per_radian = self._encoder.counts_per_turn / (2.0 * math.pi)
             counts, rates = true[:, 3] * per_radian, true[:, 4] * per_radian

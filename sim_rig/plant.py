@@ -10,14 +10,14 @@ from daq.config.base import Section
 from daq.config.units import Quantity, converted
 from sim_rig.actuator import actuator
 from sim_rig.physics import options
-from sim_rig.physics.electrical import MAX_CURRENT, SUPPLY
+from sim_rig.physics.electrical import HIGHEST_ORDER, MAX_CURRENT, SUPPLY, voltages
 from sysid import ModelError, ProcessModel
 from sysid.arrays import FloatArray
 
 # Sizes of the states that matter, for the accuracy of the simulation.
 _SIZES = {
-    "voltage_motor": SUPPLY,
-    "voltage_brake": SUPPLY,
+    **{state.name: SUPPLY for state in voltages("motor", HIGHEST_ORDER)},
+    **{state.name: SUPPLY for state in voltages("brake", HIGHEST_ORDER)},
     "current_motor": MAX_CURRENT,
     "current_brake": 0.2,
     "omega": 10.0,
@@ -32,6 +32,10 @@ class Plant(Section):
 
     driver_motor: options.MotorDriver = "closed"
     driver_brake: options.BrakeDriver = "closed"
+    order_motor: options.MotorOrder = 1
+    order_brake: options.BrakeOrder = 1
+    output_resistance_motor: options.MotorOutputResistance = False
+    output_resistance_brake: options.BrakeOutputResistance = False
     hysteresis: options.Hysteresis = "bouc-wen"
     exponent: options.Exponent = 1.0
     smooth: options.Smooth = False

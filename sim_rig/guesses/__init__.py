@@ -17,8 +17,12 @@ def guesses(design: Design) -> Guesses:
 
     def guess(records: Sequence[Measured], assumed: Known) -> dict[str, Guess]:
         ranges = Ranges(assumed)
-        electrical.narrow(ranges, records, "motor", design.driver_motor)
-        brake_delay = electrical.narrow(ranges, records, "brake", design.driver_brake)
+        electrical.narrow(
+            ranges, records, "motor", design.driver_motor, design.output_resistance_motor
+        )
+        brake_delay = electrical.narrow(
+            ranges, records, "brake", design.driver_brake, design.output_resistance_brake
+        )
         if design.friction == "none" and design.load in ("measured", "free"):
             damping.narrow(ranges, records, brake_delay)
         return ranges.guesses

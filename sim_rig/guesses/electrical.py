@@ -13,7 +13,8 @@ and the mean delay d [s] of a current's response are, with f = 1 + K/R for a clo
 
 so that resistance, driver gain and motor constant follow up to a common factor, and of
 inductance and driver cutoff how large and how small they may be. What is assumed of one narrows
-the others.
+the others. R is the winding's resistance and the driver's output resistance in series; of a driver
+of higher order omega_d is the first cutoff, by which alone its mean delay is.
 """
 
 import math
@@ -62,13 +63,21 @@ def current_response(records: Sequence[Measured], channel: str) -> CurrentRespon
     return CurrentResponse(gain, delay, _overlap(per_speeds) if per_speeds else None, source)
 
 
-def narrow(ranges: Ranges, records: Sequence[Measured], channel: str, driver: DriverKind) -> float:
+def narrow(
+    ranges: Ranges,
+    records: Sequence[Measured],
+    channel: str,
+    driver: DriverKind,
+    output_resistance: bool,
+) -> float:
     """Narrow what the response of a channel, motor or brake, ties together; its longest delay."""
     response = current_response(records, channel)
     if response is None:
         return 0.0
     index, where = channel[0], f"in {response.source}"
     resistance = f"R_{index}"
+    if output_resistance:
+        resistance = ranges.add(f"R_{index}", f"R_o{index}")
     gain = response.gain
     source = f"current_{channel} over its command, {_text(gain)} A/V {where}"
     ratio, factor = gain, (1.0, 1.0)
@@ -94,6 +103,8 @@ def narrow(ranges: Ranges, records: Sequence[Measured], channel: str, driver: Dr
     ranges.narrow(f"L_{index}", 0.0, highest, f"{source}, {ranges.text(resistance)}")
     if longest > 0.0:
         ranges.narrow(f"omega_d{index}", 1.0 / longest, math.inf, source)
+    if output_resistance:
+        ranges.resolve(f"R_{index}", f"R_o{index}")
     return delay
 
 

@@ -39,6 +39,24 @@ class Ranges:
             below = low / scale[1] if math.isfinite(scale[1]) else 0.0
             self.narrow(factor, below, high / scale[0], f"{source}, {self.text(product)}")
 
+    def add(self, first: str, second: str) -> str:
+        """Name of the sum of two parameters, to be narrowed like one."""
+        name = f"{first} + {second}"
+        ends = zip(self.intervals[first], self.intervals[second], strict=True)
+        low, high = (a + b for a, b in ends)
+        self.intervals[name] = low, high
+        return name
+
+    def resolve(self, first: str, second: str) -> None:
+        """Narrow both parameters of a sum by what the sum was narrowed to."""
+        total = f"{first} + {second}"
+        guess, (lowest, highest) = self.guesses.pop(total, None), self.intervals[total]
+        if guess is None:
+            return
+        for name, partner in ((first, second), (second, first)):
+            low, high = self.intervals[partner]
+            self.narrow(name, max(lowest - high, 0.0), highest - low, guess.source)
+
     def text(self, name: str) -> str:
         """A range as part of a guess's source."""
         low, high = self.intervals[name]

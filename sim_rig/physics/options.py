@@ -16,6 +16,14 @@ MotorDriver = Annotated[
     Field(description="motor amplifier: closed controls its current, open gives a voltage"),
 ]
 BrakeDriver = Annotated[DriverKind, Field(description="brake amplifier: likewise")]
+MotorOrder = Annotated[int, Field(ge=1, le=3, description="order of the motor amplifier")]
+BrakeOrder = Annotated[int, Field(ge=1, le=3, description="order of the brake amplifier")]
+MotorOutputResistance = Annotated[
+    bool, Field(description="output resistance of the motor amplifier; only its sum with R_m acts")
+]
+BrakeOutputResistance = Annotated[
+    bool, Field(description="output resistance of the brake amplifier; only its sum with R_b acts")
+]
 Hysteresis = Annotated[
     Literal["bouc-wen", "dahl", "lugre"], Field(description="hysteresis model of the brake")
 ]
@@ -54,6 +62,10 @@ class Design:
 
     driver_motor: MotorDriver = "closed"
     driver_brake: BrakeDriver = "closed"
+    order_motor: MotorOrder = 1
+    order_brake: BrakeOrder = 1
+    output_resistance_motor: MotorOutputResistance = False
+    output_resistance_brake: BrakeOutputResistance = False
     hysteresis: Hysteresis = "bouc-wen"
     exponent: Exponent = 1.0
     smooth: Smooth = False

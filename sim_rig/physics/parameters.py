@@ -1,18 +1,20 @@
-"""Parameters of the parts, and where each part finds its own in the assembled model's tuple.
+"""Parameters of the parts, and where each part finds its own in the assembled model's tuples.
 
-A part declares its parameters in the order in which its equations take them apart. The model
-keeps one long tuple; a ``Layout`` has each part's slice of it, so that no equation ever counts
-through the parameters of another.
+A part declares its parameters, states and inputs in the order in which its equations take them
+apart. The model keeps one long tuple of each kind; a ``Layout`` has each part's slice of it, so
+that no equation ever counts through those of another.
 """
 
 import itertools
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 from sysid import Constraint, Parameter
 
 # Text and function of an inequality g(p) <= 0 on one part's own parameters.
 PartConstraint = tuple[str, Callable[[Any], Any]]
+
+T = TypeVar("T")
 
 
 def log_range(
@@ -29,22 +31,22 @@ def fixed(name: str, unit: str, value: float, description: str, minimum: float =
     )
 
 
-class Layout:
-    """Parameters of all parts behind one another, and each part's slice of them."""
+class Layout(Generic[T]):
+    """Parameters, states or inputs of all parts behind one another, and each part's slice."""
 
-    def __init__(self, **parts: tuple[Parameter, ...]) -> None:
-        self.parameters = tuple(itertools.chain(*parts.values()))
+    def __init__(self, **parts: tuple[T, ...]) -> None:
+        self.members = tuple(itertools.chain(*parts.values()))
         ends = itertools.accumulate(map(len, parts.values()))
         self.slices = {
             name: slice(end - len(part), end)
             for (name, part), end in zip(parts.items(), ends, strict=True)
         }
 
-    def constraints(self, part: str, declared: Sequence[PartConstraint]) -> list[Constraint]:
-        """Constraints of the model from those of one part."""
-        place = self.slices[part]
 
-        def on_model(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
-            return lambda p: function(p[place])
+def constraints(place: slice, declared: Sequence[PartConstraint]) -> list[Constraint]:
+    """Constraints of the model from those of the part whose parameters are at ``place``."""
 
-        return [Constraint(text, on_model(function)) for text, function in declared]
+    def on_model(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
+        return lambda p: function(p[place])
+
+    return [Constraint(text, on_model(function)) for text, function in declared]

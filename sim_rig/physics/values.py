@@ -4,6 +4,7 @@ Each value of the rig has the reason for it beside it. "Assumed" ones stand in n
 Identification models have none of them unless a set is named.
 """
 
+from sim_rig.physics.electrical import FOLDBACK
 from sim_rig.physics.options import Design, ParameterSet
 
 # Motor and its driver; what a row does not name stays as the rig has it.
@@ -30,6 +31,8 @@ RIG = {
     "F_cos": 0.006,  # assumed: a worn ring, half of F_c in all
     "F_sin": 0.004,  # assumed: see F_cos
     "K_v2i": 0.5,  # amplifier data sheet
+    "R_om": 0.1,  # amplifier data sheet: under 0.2 ohm
+    "R_ob": 0.1,  # the same amplifier
     "n_c": -1.0,  # motor and brake on one shaft
 }
 
@@ -87,6 +90,21 @@ _BRAKES = {
 }
 
 
+_FURTHER = 3.0  # assumed: cutoffs of a higher order, in parts of the least that is stable
+
+
+def _further_cutoffs(values: dict[str, float], index: str) -> dict[str, float]:
+    """Cutoffs of a higher order at which an amplifier's loop with its winding is stable.
+
+    With R, L of the winding, gain K and first cutoff w1, (R + L s)(1 + s/w1 + s^2/(w1 w2)) + K is
+    stable, by Routh, above about w2 = (R + K) w1 / (L w1 + R).
+    """
+    K, cutoff = values.get(f"K_d{index}", FOLDBACK), values[f"omega_d{index}"]
+    R, L = values[f"R_{index}"], values[f"L_{index}"]
+    second = _FURTHER * (R + K) * cutoff / (L * cutoff + R)
+    return {f"omega_d{index}2": second, f"omega_d{index}3": 2.0 * second}
+
+
 def named(name: ParameterSet, design: Design) -> dict[str, float]:
     """Values of a named set for a design's parts, by parameter; "nominal" changes none."""
     if name == "nominal":
@@ -95,4 +113,5 @@ def named(name: ParameterSet, design: Design) -> dict[str, float]:
     rig = RIG | drivers | _BRAKES[design.hysteresis]
     for shape in {"gamma", "beta"} & set(rig):
         rig[shape] *= _YIELD ** (1.0 - design.exponent)
-    return rig | TABLE_4_1.get(name, {})
+    rig |= TABLE_4_1.get(name, {})
+    return rig | _further_cutoffs(rig, "m") | _further_cutoffs(rig, "b")

@@ -45,22 +45,30 @@ def electrical_rates(parts, q, x, u):
     """(3.7) or (3.10) with (3.1) for the motor and (3.3) for the brake; the amplifier's limits."""
     found = {}
     for channel, k, emf in (("motor", "m", q["n_c"] * q["K_m"] * x["omega"]), ("brake", "b", 0.0)):
-        v, i = x[f"voltage_{channel}"], x[f"current_{channel}"]
-        command, cutoff = u[f"applied_voltage_{channel}"], q[f"omega_d{k}"]
+        i, command = x[f"current_{channel}"], u[f"applied_voltage_{channel}"]
+        order = getattr(parts, f"order_{channel}")
+        names = [f"voltage_{channel}", f"voltage_{channel}_2", f"voltage_{channel}_3"][:order]
+        cutoffs = [q[f"omega_d{k}{n}"] for n in ("", "2", "3")[:order]]
+        cutoff, fed_back = cutoffs[-1], [-cutoffs[-1] * x[name] for name in names]
+        for n in range(order - 1):
+            found[names[n]] = [cutoffs[n] * x[names[n + 1]]]
         if getattr(parts, f"driver_{channel}") == "closed":
             K, asked = q[f"K_d{k}"], q["K_v2i"] * command
             if parts.limits:
                 asked = within(asked, MAX_CURRENT)
-            found[f"voltage_{channel}"] = [-cutoff * v, -K * cutoff * i, K * cutoff * asked]
+            found[names[-1]] = [*fed_back, -K * cutoff * i, K * cutoff * asked]
         else:
             beyond = i - within(i, MAX_CURRENT) if parts.limits else 0.0
-            found[f"voltage_{channel}"] = [
-                -cutoff * v,
+            found[names[-1]] = [
+                *fed_back,
                 q[f"G_d{k}"] * cutoff * command,
                 -FOLDBACK * cutoff * beyond,
             ]
+        v = x[f"voltage_{channel}"]
         across = within(v, SUPPLY) if parts.limits else v
         R, L = q[f"R_{k}"], q[f"L_{k}"]
+        if getattr(parts, f"output_resistance_{channel}"):
+            R += q[f"R_o{k}"]
         found[f"current_{channel}"] = [emf / L, -R / L * i, across / L]
     return found
 

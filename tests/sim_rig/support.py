@@ -37,14 +37,20 @@ class Parts:
     load: str = "measured"
     sensor: str = "load"
     limits: bool = False
+    order_motor: int = 1
+    order_brake: int = 1
+    output_resistance_motor: bool = False
+    output_resistance_brake: bool = False
 
     def build(self, **settings):
         return _build(self, tuple(sorted(settings.items())))
 
     def __str__(self):
         exponent = f"^{self.exponent:g}" if self.hysteresis == "bouc-wen" else ""
+        motor = f"{self.driver_motor}{self.order_motor}{'R' * self.output_resistance_motor}"
+        brake = f"{self.driver_brake}{self.order_brake}{'R' * self.output_resistance_brake}"
         return (
-            f"{self.driver_motor}-{self.driver_brake}-{'smooth-' * self.smooth}{self.hysteresis}"
+            f"{motor}-{brake}-{'smooth-' * self.smooth}{self.hysteresis}"
             f"{exponent}-{self.friction}-{self.load}-{self.sensor}{'-limits' * self.limits}"
         )
 
@@ -54,8 +60,16 @@ def _build(parts, settings):
     return actuator(**asdict(parts), **dict(settings))
 
 
+AMPLIFIER = ("order_motor", "order_brake", "output_resistance_motor", "output_resistance_brake")
+AMPLIFIERS = tuple(itertools.product((1, 2, 3), (1, 2, 3), (False, True), (False, True)))
+
+
 def combinations(**kept):
-    """Every combination of parts that goes together, some of the choices kept."""
+    """Every combination of parts that goes together, some of the choices kept.
+
+    Each once with plain amplifiers, and once with those of one of the kinds that there are, in
+    turn: of all with all there would be a hundred thousand.
+    """
     choices = {
         "driver_motor": ("closed", "open"),
         "driver_brake": ("closed", "open"),
@@ -66,11 +80,13 @@ def combinations(**kept):
         "sensor": ("load", "between"),
         "limits": (False, True),
     } | {name: (value,) for name, value in kept.items()}
+    kinds = itertools.cycle(AMPLIFIERS[1:])
     for values in itertools.product(*choices.values()):
         chosen = dict(zip(choices, values, strict=True))
         chosen["hysteresis"], chosen["exponent"] = chosen["hysteresis"]
         if (chosen["load"], chosen["sensor"]) != ("measured", "between"):
             yield Parts(**chosen)
+            yield Parts(**chosen, **dict(zip(AMPLIFIER, next(kinds), strict=True)))
 
 
 ALL = tuple(combinations())
@@ -133,6 +149,7 @@ def random_point(model, rng):
     x = {
         "voltage_motor": either((0.1, 20.0), (26.0, 60.0)),
         "voltage_brake": either((0.1, 20.0), (26.0, 60.0)),
+        **{name: side(0.1, 60.0) for name in model.state_names if name[-2:] in ("_2", "_3")},
         "current_motor": either((0.05, 2.3), (2.7, 5.0)),
         "current_brake": either((0.01, 0.5), (2.7, 3.0)),
         "omega": either((0.02, 0.3), (1.0, 30.0)),

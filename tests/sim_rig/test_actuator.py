@@ -10,9 +10,17 @@ import numpy as np
 import pytest
 
 from sim_rig.actuator import actuator
-from sysid import ModelError, SearchSpace, equilibrium
+from sysid import ModelError, SearchSpace, equilibrium, linearize
 from tests.sim_rig import equations
-from tests.sim_rig.support import HYSTERESES, LOADS, Parts, constant, follow, random_point
+from tests.sim_rig.support import (
+    AMPLIFIER,
+    HYSTERESES,
+    LOADS,
+    Parts,
+    constant,
+    follow,
+    random_point,
+)
 from tests.sysid.support import outputs_of
 
 ALL_OUTPUTS = ("current_motor", "current_brake", "torque", "theta", "omega")
@@ -65,6 +73,7 @@ def test_outputs_may_be_chosen_in_any_order(load):
         ({"sensor": "between"}, "sensor between"),
         ({"hysteresis": "dahl", "exponent": 2.0}, "not dahl"),
         ({"exponent": 0.5}, "at least 1"),
+        ({"order_brake": 4}, "order_brake 4: write 1 to 3"),
     ],
 )
 def test_what_does_not_go_together_is_refused(settings, message):
@@ -79,6 +88,15 @@ def test_the_description_says_what_was_chosen():
     plain = Parts().build().description
     assert "closed-loop drivers" in plain
     assert not any(word in plain for word in ("smooth", "friction", "open", "Dahl"))
+
+
+def test_amplifiers_of_higher_order_are_described():
+    same = Parts(order_motor=2, order_brake=2).build().description
+    assert "second-order closed-loop drivers" in same
+    differ = Parts(driver_brake="open", order_brake=3, output_resistance_motor=True)
+    text = differ.build().description
+    assert "closed-loop motor driver with output resistance" in text
+    assert "and third-order open-loop brake driver, DC motor" in text
 
 
 # --- named sets -----------------------------------------------------------------------------
@@ -103,16 +121,30 @@ def test_a_row_of_table_4_1_is_exactly_its_numbers_and_else_the_rig(row, kind, n
     assert found == pytest.approx(expected, rel=1e-15)
 
 
+@pytest.mark.parametrize("order", [2, 3])
+@pytest.mark.parametrize("name", ["nominal", "rig", *TABLE_4_1])
+def test_currents_settle_whatever_the_order_of_the_amplifiers(name, order):
+    for motor, brake in itertools.product(("closed", "open"), repeat=2):
+        parts = Parts(motor, brake, load="locked", order_motor=order, order_brake=order)
+        model = parts.build(parameters=name)
+        zeros = [np.zeros(len(part)) for part in (model.states, model.inputs)]
+        A = linearize(model, *zeros).A
+        electrical = [i for i, s in enumerate(model.state_names) if s[:4] in ("volt", "curr")]
+        assert np.linalg.eigvals(A[np.ix_(electrical, electrical)]).real.max() < 0.0
+
+
 @pytest.mark.parametrize(("kind", "n"), HYSTERESES)
 @pytest.mark.parametrize("friction", ["none", "cyclic"])
 def test_the_rigs_own_values_are_feasible_and_within_the_ranges_of_a_search(kind, n, friction):
-    for motor, brake in itertools.product(("closed", "open"), repeat=2):
-        model = Parts(motor, brake, kind, n, friction=friction).build(parameters="rig")
+    for motor, brake, order in itertools.product(("closed", "open"), ("closed", "open"), (1, 3)):
+        amplifiers = dict(zip(AMPLIFIER, (order, order, order > 1, order > 1), strict=True))
+        parts = Parts(motor, brake, kind, n, friction=friction, **amplifiers)
+        model = parts.build(parameters="rig")
         space = SearchSpace.of(model)
         values = model.nominal[list(space.index)]
         assert np.all((values > space.lower) & (values < space.upper))
         assert np.all(space.violations(values[None]) == 0.0)
-        nominal = Parts(motor, brake, kind, n, friction=friction).build()
+        nominal = parts.build()
         differing = nominal.nominal != model.nominal
         assert differing.sum() > 10  # identification does not start from the truth
 

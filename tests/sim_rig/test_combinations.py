@@ -11,7 +11,17 @@ import pytest
 from sim_rig.actuator import actuator
 from sysid import BatchSimulator, Dataset, ModelError, SearchSpace
 from tests.sim_rig import equations
-from tests.sim_rig.support import ALL, HYSTERESES, LOADS, PLANTS, Parts, combinations, random_point
+from tests.sim_rig.support import (
+    ALL,
+    AMPLIFIER,
+    AMPLIFIERS,
+    HYSTERESES,
+    LOADS,
+    PLANTS,
+    Parts,
+    combinations,
+    random_point,
+)
 from tests.sysid.reference import simulate as reference
 from tests.sysid.support import outputs_of
 
@@ -55,7 +65,20 @@ def assert_sum(value, terms, what, further=0.0):
 
 
 def test_there_are_as_many_combinations_as_the_choices_say():
-    assert len(ALL) == len(set(ALL)) == 2 * 2 * 5 * 2 * 3 * (6 * 2 - 1) * 2
+    assert len(ALL) == len(set(ALL)) == 2 * 2 * 2 * 5 * 2 * 3 * (6 * 2 - 1) * 2
+
+
+OTHER_PARTS = (
+    ("driver_motor",), ("driver_brake",), ("hysteresis", "exponent"), ("smooth",), ("friction",),
+    ("load",), ("sensor",), ("limits",),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("choice", OTHER_PARTS, ids=str)
+def test_every_amplifier_meets_every_other_part(choice):
+    there = {tuple(getattr(parts, name) for name in (*AMPLIFIER, *choice)) for parts in ALL}
+    values = {tuple(getattr(parts, name) for name in choice) for parts in ALL}
+    assert there == {(*amplifier, *value) for amplifier in AMPLIFIERS for value in values}
 
 
 def test_at_rest_nothing_moves_but_a_mass_that_falls_onto_its_cable():
@@ -68,10 +91,12 @@ def test_at_rest_nothing_moves_but_a_mass_that_falls_onto_its_cable():
 
 @pytest.mark.parametrize("name", ["nominal", "rig", "A", "B", "C", "D"])
 def test_every_combination_takes_every_named_set(name):
+    amplifiers = itertools.cycle(AMPLIFIERS)
     for motor, brake, (hysteresis, exponent), friction in itertools.product(
         ("closed", "open"), ("closed", "open"), HYSTERESES, ("none", "cyclic")
     ):
         model = actuator(
+            **dict(zip(AMPLIFIER, next(amplifiers), strict=True)),
             driver_motor=motor,
             driver_brake=brake,
             hysteresis=hysteresis,
@@ -94,10 +119,10 @@ def test_a_measured_load_has_its_sensor_at_the_load():
 # A machine-code model takes seconds to build. These few have, with the plants of the simulated
 # device's tests, every part and the pairs below.
 COMPILED = (
-    Parts("open", "closed", "bouc-wen", 1.5, True, "cyclic", "measured", "load", False),
-    Parts("closed", "closed", "lugre", 1.0, False, "stribeck", "measured", "load", False),
-    Parts("closed", "open", "dahl", 1.0, True, "none", "free", "between", False),
-    Parts("open", "closed", "lugre", 1.0, True, "stribeck", "pulley", "load", True),
+    Parts("open", "closed", "bouc-wen", 1.5, True, "cyclic", "measured", "load", False, 2, 3),
+    Parts("closed", "closed", "lugre", 1.0, False, "stribeck", "measured", "load", False, 3, 2),
+    Parts("closed", "open", "dahl", 1.0, True, "none", "free", "between", False, 2, 1, True, True),
+    Parts("open", "closed", "lugre", 1.0, True, "stribeck", "pulley", "load", True, 1, 2),
 )
 PAIRS = (
     ("driver_motor", "driver_brake"),
@@ -121,7 +146,8 @@ def of_device(settings):
 
 def test_the_compiled_ones_have_every_part_and_the_pairs_that_meet_in_an_equation():
     compiled = [*COMPILED, of_device({}), *map(of_device, PLANTS.values())]
-    for choices in [("exponent",), ("load",), ("hysteresis", "smooth"), *PAIRS]:
+    parts_alone = [("exponent",), ("load",), *((name,) for name in AMPLIFIER)]
+    for choices in [*parts_alone, ("hysteresis", "smooth"), *PAIRS]:
         there, possible = (
             {tuple(getattr(parts, name) for name in choices) for parts in which}
             for which in (compiled, ALL)

@@ -14,15 +14,16 @@ from sim_rig.actuator import actuator
 from sim_rig.physics.electrical import (
     MAX_CURRENT,
     SUPPLY,
-    closed_loop_driver,
-    driver,
+    amplifier,
+    closed_loop_drive,
+    drive,
     excess,
     limited_winding,
-    open_loop_driver,
+    open_loop_drive,
     saturate,
     winding,
 )
-from tests.sim_rig.support import Parts, constant, follow
+from tests.sim_rig.support import AMPLIFIER, Parts, constant, follow
 
 volts, amperes = st.floats(-60.0, 60.0), st.floats(-6.0, 6.0)
 GAIN = 0.5  # A/V
@@ -30,25 +31,37 @@ GAIN = 0.5  # A/V
 
 def test_drivers_and_winding_by_hand():
     # 100 (50 (0.5*2 - 0.4) - 7), 100 (3*2 - 7) and (7 - 3*0.4 - 0.8)/0.02.
-    assert closed_loop_driver(7.0, 0.4, 2.0, 0.5, (50.0, 100.0)) == pytest.approx(2300.0)
-    assert open_loop_driver(7.0, 0.4, 2.0, 0.5, (3.0, 100.0)) == pytest.approx(-100.0)
+    closed, opened = closed_loop_drive(0.4, 2.0, 0.5, 50.0), open_loop_drive(0.4, 2.0, 0.5, 3.0)
+    assert amplifier((7.0,), closed, (100.0,)) == pytest.approx((2300.0,))
+    assert amplifier((7.0,), opened, (100.0,)) == pytest.approx((-100.0,))
     assert winding(0.4, 7.0, 0.8, 3.0, 0.02) == pytest.approx(250.0)
 
 
 def from_command_to_current(kind, q, k):
-    """Numerator and denominator from (3.6) or (3.8) to (3.9) and the winding's 1/(L s + R)."""
-    R, L, cutoff = q[f"R_{k}"], q[f"L_{k}"], q[f"omega_d{k}"]
+    """Numerator and denominator from (3.6) or (3.8) to (3.9) and the winding's 1/(L s + R).
+
+    With the lag 1 + s/w1 + s^2/(w1 w2) + ... of an amplifier of higher order, and its output
+    resistance in series with the winding's.
+    """
+    R, L = q[f"R_{k}"] + q.get(f"R_o{k}", 0.0), q[f"L_{k}"]
+    cutoffs = [q[f"omega_d{k}{n}"] for n in ("", "2", "3") if f"omega_d{k}{n}" in q]
+    lag = [1.0 / np.prod(cutoffs[:n]) for n in range(len(cutoffs), -1, -1)]
     if kind == "closed":
         K = q[f"K_d{k}"]
-        return [cutoff * K * q["K_v2i"]], [L, R + cutoff * L, cutoff * (R + K)]
-    return [cutoff * q[f"G_d{k}"]], [L, R + cutoff * L, cutoff * R]
+        return [K * q["K_v2i"]], np.polyadd(np.polymul(lag, [L, R]), [K])
+    return [q[f"G_d{k}"]], np.polymul(lag, [L, R])
 
 
 @pytest.mark.parametrize(
     ("motor", "brake"), [("closed", "closed"), ("open", "closed"), ("closed", "open")]
 )
-def test_a_step_of_the_command_gives_the_transfer_functions_step_response(motor, brake):
-    model = Parts(driver_motor=motor, driver_brake=brake, load="locked").build(parameters="rig")
+@pytest.mark.parametrize(
+    "amplifier", [(1, 1, False, False), (2, 3, True, False), (3, 2, True, True)]
+)
+def test_a_step_of_the_command_gives_the_transfer_functions_step_response(motor, brake, amplifier):
+    amplifiers = dict(zip(AMPLIFIER, amplifier, strict=True))
+    parts = Parts(driver_motor=motor, driver_brake=brake, load="locked", **amplifiers)
+    model = parts.build(parameters="rig")
     q = dict(zip(model.parameter_names, model.nominal, strict=True))
     steps = {"motor": 1.5, "brake": 0.2}
     inputs = constant(model, **{f"applied_voltage_{k}": v for k, v in steps.items()})
@@ -78,8 +91,7 @@ def test_a_value_is_what_is_kept_of_it_and_its_excess(value, limit):
 )
 @pytest.mark.parametrize("kind", ["closed", "open"])
 def test_within_its_range_a_limited_amplifier_is_the_plain_one(kind, voltage, current, command):
-    p = (7.0, 300.0)
-    plain, limited = (driver(kind, limits)(voltage, current, command, GAIN, p) for limits in (0, 1))
+    plain, limited = (drive(kind, limits)(current, command, GAIN, 7.0) for limits in (0, 1))
     assert limited == pytest.approx(plain, rel=1e-12, abs=1e-9)
     assert limited_winding(current, voltage, 0.3, 2.0, 0.01) == winding(
         current, voltage, 0.3, 2.0, 0.01
@@ -89,17 +101,14 @@ def test_within_its_range_a_limited_amplifier_is_the_plain_one(kind, voltage, cu
 @given(voltage=volts, current=amperes, command=st.floats(-12.0, 12.0))
 def test_beyond_its_range_it_gives_way(voltage, current, command):
     at_end = math.copysign(min(abs(command), MAX_CURRENT / GAIN), command)
-    closed = driver("closed", True)
-    p = (7.0, 300.0)
-    assert closed(voltage, current, command, GAIN, p) == pytest.approx(
-        closed_loop_driver(voltage, current, at_end, GAIN, p), rel=1e-12, abs=1e-9
+    closed, opened = drive("closed", True), drive("open", True)
+    assert closed(current, command, GAIN, 7.0) == pytest.approx(
+        closed_loop_drive(current, at_end, GAIN, 7.0), rel=1e-12, abs=1e-9
     )
-    less = open_loop_driver(voltage, current, command, GAIN, p) - driver("open", True)(
-        voltage, current, command, GAIN, p
-    )
+    less = open_loop_drive(current, command, GAIN, 7.0) - opened(current, command, GAIN, 7.0)
     # 100 V for each ampere beyond the limit, against the current.
     beyond = max(abs(current) - MAX_CURRENT, 0.0)
-    assert less == pytest.approx(math.copysign(300.0 * 100.0 * beyond, current), abs=1e-6)
+    assert less == pytest.approx(math.copysign(100.0 * beyond, current), abs=1e-6)
     across = math.copysign(min(abs(voltage), SUPPLY), voltage)
     assert limited_winding(current, voltage, 0.3, 2.0, 0.01) == pytest.approx(
         winding(current, across, 0.3, 2.0, 0.01)

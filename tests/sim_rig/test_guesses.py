@@ -100,6 +100,20 @@ def test_a_resistance_from_a_data_sheet_tells_gain_and_motor_constant():
 
 
 @pytest.mark.soak
+def test_an_output_resistance_shares_what_is_told_of_both():
+    model = actuator(
+        order_motor=2, output_resistance_motor=True, output_resistance_brake=True, parameters="rig"
+    )
+    log = record(model, model.nominal, 0, n=2000)
+    loose = guess_ranges(model, [log])
+    check(model, model.nominal, loose)
+    assert "R_m + R_om" in loose["K_dm"].source
+    assert set(loose) <= set(model.parameter_names)
+    plain = guess_ranges(model, [log], fixed={"R_m": 1.18})
+    assert "R_m + R_om in 1.19 .. 2.18" in plain["K_dm"].source
+
+
+@pytest.mark.soak
 def test_a_fast_log_tells_the_cutoff_and_the_inductance_of_an_open_driver():
     model = actuator(driver_motor="open", parameters="rig")
     found = guess_ranges(model, [record(model, model.nominal, 0, rate=8000, n=8000)])

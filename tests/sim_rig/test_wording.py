@@ -10,7 +10,15 @@ import pytest
 from sim_rig.actuator import actuator
 
 FUNCTIONS = {"abs": abs, "tanh": math.tanh, "exp": math.exp, "cos": math.cos, "sin": math.sin}
-STATES = ("v_m", "v_b", "i_m", "i_b", "omega", "z", "theta")
+SYMBOLS = {"voltage_motor": "v_m", "voltage_brake": "v_b", "current_motor": "i_m"}
+SYMBOLS |= {"current_brake": "i_b"}
+SIZES = {"voltage": 5.0, "current_motor": 1.0, "current_brake": 0.1, "omega": 3.0, "z": 0.5}
+
+
+def symbol(state):
+    """``voltage_motor_2`` is v_m2 in the text."""
+    name, _, number = state.rpartition("_") if state[-1].isdigit() else (state, "", "")
+    return SYMBOLS.get(name, name) + number
 
 
 def evaluated(text, known):
@@ -21,7 +29,8 @@ def evaluated(text, known):
 
 def derivative(model, x, u):
     """The text's own: definitions first, then each dX/dt."""
-    known = dict(zip(STATES, x, strict=True))
+    symbols = [symbol(name) for name in model.state_names]
+    known = dict(zip(symbols, x, strict=True))
     known |= dict(zip(("u_m", "u_b", "torque"), u, strict=False))
     known |= dict(zip(model.parameter_names, model.nominal, strict=True))
     pairs = [line.split(" = ") for line in model.equations if " = " in line]
@@ -36,7 +45,7 @@ def derivative(model, x, u):
         slope = evaluated(right, known) / (evaluated(found[1], known) if found[1] else 1.0)
         slopes[found[2]] = slope
         known[f"d{found[2]}_dt"] = slope
-    return np.array([slopes[name] for name in STATES])
+    return np.array([slopes[name] for name in symbols])
 
 
 CASES = [
@@ -50,6 +59,8 @@ CASES = [
     {"exponent": 2.0, "smooth": True},
     {"driver_motor": "open"},
     {"driver_brake": "open", "load": "free"},
+    {"order_motor": 2, "output_resistance_brake": True},
+    {"driver_motor": "open", "order_motor": 3, "order_brake": 2, "output_resistance_motor": True},
 ]
 
 
@@ -60,7 +71,8 @@ def test_the_text_says_what_is_computed(options):
         model = model.with_parameters(F_cos={"nominal": 0.01}, F_sin={"nominal": -0.004})
     rng = np.random.default_rng(1)
     for _ in range(5):
-        x = rng.normal(size=7) * (5.0, 5.0, 1.0, 0.1, 3.0, 0.5, 2.0)
+        sizes = [SIZES.get(name, SIZES.get(name[:7], 2.0)) for name in model.state_names]
+        x = rng.normal(size=len(sizes)) * sizes
         u = rng.normal(size=len(model.inputs))
         computed = model.derivative(tuple(x.tolist()), tuple(u.tolist()), tuple(model.nominal))
         assert derivative(model, x.tolist(), u.tolist()) == pytest.approx(computed, rel=1e-9)
