@@ -327,6 +327,12 @@ class IdentificationConfig(Signals):
         "extended Kalman filter for that noise; error: the mean RMSE decides to the end; auto: "
         "compensated where a calibration tells noise of an input, else likelihood",
     )
+    process_noise: dict[str, Annotated[float, Field(ge=0.0, allow_inf_nan=False)]] = Field(
+        default_factory=dict,
+        description="white noise that drives states, for criterion innovations: standard deviation "
+        "in the state's unit over sqrt(s)",
+        examples=[{"omega": 2.0}],
+    )
     balance: Literal["samples", "logs"] = Field(
         "samples", description="logs count by their samples, or each alike"
     )

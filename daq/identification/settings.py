@@ -26,6 +26,7 @@ _KEYED_BY = {
     **dict.fromkeys(("ranges", "fixed", "tied", "scale"), "parameter_names"),
     "weights": "output_names",
     "initial": "state_names",
+    "process_noise": "state_names",
     "hold": "input_names",
 }
 
@@ -210,7 +211,8 @@ def gassi_settings(problem: Problem) -> dict[str, Any]:
     error = ("per_log", "balance", "criterion")
     arguments = {name: getattr(settings, name) for name in (*search, *space, *error)}
     arguments |= {"given": problem.given, "random_state": settings.seed}
-    return {**arguments, "weights": settings.weights or None}
+    optional = {"weights": settings.weights, "process_noise": settings.process_noise}
+    return {**arguments, **{name: value or None for name, value in optional.items()}}
 
 
 def _find_models(

@@ -70,12 +70,14 @@ class Filter:
 
 
 @functools.lru_cache(maxsize=8)
-def kalman_filter(model: ProcessModel, noisy: tuple[int, ...]) -> Filter:
-    """Compile a model's filter for noise on some inputs, by their places; as ``kernels``.
+def kalman_filter(
+    model: ProcessModel, noisy: tuple[int, ...], driven: tuple[int, ...] = ()
+) -> Filter:
+    """Compile a model's filter for noise on some inputs and states; as ``kernels``.
 
-    Raises ModelError for equations that cannot be differentiated.
+    noisy, driven: their places. Raises ModelError for equations that cannot be differentiated.
     """
-    kernel = FilterKernel(model, variation(model, noisy))
+    kernel = FilterKernel(model, variation(model, noisy, driven))
     text = f"{kernel.structure.program}\n\n{kernel.text()}"
     return Filter(kernel, *_compiled(model, text, {}, ("innovations",)))
 

@@ -1,18 +1,21 @@
 """Source text of the kernel that runs an extended Kalman filter over a record.
 
-The states x, the noise n on inputs and the outputs' noise v, white and independent:
+The states x, the noise n on inputs, that of the process w and the outputs' v, white and
+independent:
 
-    x_(k+1) = F(x_k, u_k + n_k, u_(k+1) + n_(k+1))        y_k = g(x_k, u_k + n_k) + v_k
+    x_(k+1) = F(x_k, u_k + n_k, u_(k+1) + n_(k+1)) + w_k        y_k = g(x_k, u_k + n_k) + v_k
 
-F is the simulated step of the batch kernel, its Jacobian Phi that of the same step (see
-``variation``). Of the estimate of x_k and n_k from all samples before, with covariance P, the
-outputs of a sample are taken in one after the other (Anderson & Moore, "Optimal filtering",
-section 6.4): with the row C of g's Jacobian and the variance r of the output
+w_k is the response to noise of given intensities in the states' rates. F is the simulated step of
+the batch kernel, its Jacobian Phi that of the same step (see ``variation``). Of the estimate of x_k
+and n_k from all samples before, with covariance P, the outputs of a sample are taken in one after
+the other (Anderson & Moore, "Optimal filtering", section 6.4): with the row C of g's Jacobian and
+the variance r of the output
 
     e = y - g      s = C P C' + r      (x, n) += P C' e / s      P -= P C' C P / s
 
-and what is kept of e, the innovation, is e sqrt(r / s): without noise on the inputs the error of
-the free run. With ``corrects`` zero nothing is taken in: e is that error whatever the noise, and s
+and what is kept of e, the innovation, is e sqrt(r / s): without noise of inputs and process the
+error of the free run. With noise of the process the sum of log(s / r) stands behind the sum of
+their squares. With ``corrects`` zero nothing is taken in: e is that error whatever the noise, and s
 its variance. Chromosomes are lanes, as in the batch kernel.
 """
 
@@ -21,10 +24,11 @@ from collections.abc import Callable, Iterable, Mapping
 from sysid.engine.batch_kernel import EACH_LANE, BatchKernel, at
 from sysid.engine.program import block
 from sysid.engine.scheme import LANES, STEP_SIZES
-from sysid.engine.variation import Variation
+from sysid.engine.variation import Cause, Variation
 from sysid.problem.model import ProcessModel
 
 _Place = tuple[int, int]
+_ROOT_3 = repr(3.0**0.5)
 
 
 class FilterKernel(BatchKernel):
@@ -72,8 +76,8 @@ class FilterKernel(BatchKernel):
             *block(f"for j in range({2 * q}):", block(EACH_LANE, [sums])),
         ]
         head = (
-            "def innovations(X, rows, tables, u, y, w, r, s, spread, corrects, start, p, dt, "
-            "n_steps, sums, record):"
+            "def innovations(X, rows, tables, u, y, w, r, s, intensity, spread, corrects, start, "
+            "p, dt, n_steps, sums, record):"
         )
         return "\n".join(block(head, body))
 
@@ -114,6 +118,9 @@ class FilterKernel(BatchKernel):
             lines += [f"d{a} -= shared{a} * (gain * e)" for a in size]
             lines += [f"P{a}_{b} -= shared{a} * (gain * shared{b})" for a, b in self._pairs]
             kept = f"e = e * (w{j} * math.sqrt(r[{j}] / variance))"
+            if self.variation.driven:
+                logarithm = f"seen{j} * math.log(variance / r[{j}])"
+                lines.append(f"{at(self._sums + self.n_outputs + j)} += {logarithm}")
         return [*lines, kept, f"{at(self._sums + j)} += e * e", f"record[k, {j}, l] = e"]
 
     def _gains(self, j: int) -> dict[int, str]:
@@ -139,7 +146,8 @@ class FilterKernel(BatchKernel):
         """x and P of the next sample."""
         n = len(self.reached)
         phi, gamma = self._jacobian_of("state", "begin"), self._jacobian_of("end")
-        lines = self._loaded()
+        lines = [*self._loaded(), *self._tilted()]
+        process = self._process()
         for a, i in enumerate(self.reached):
             by_noise = {k: phi[a, n + k] for k in range(self.n_noises) if (a, n + k) in phi}
             moves = [f"{text} * {at(self._noises + k)}" for k, text in by_noise.items()]
@@ -157,12 +165,34 @@ class FilterKernel(BatchKernel):
                     for k in range(self.n_noises)
                     if (a, k) in gamma and (b, k) in gamma
                 ]
+                terms += [
+                    f"intensity[{k}] * ({level[a]} * {level[b]} + T{k}_{a} * T{k}_{b})"
+                    for k, level in enumerate(process)
+                    if a in level and b in level
+                ]
                 variances[a, b] = _sum(terms)
             for k in range(self.n_noises):
                 if (a, k) in gamma:
                     variances[a, n + k] = f"{gamma[a, k]} * s[{k}]"
         variances |= {(n + k, n + k): f"s[{k}]" for k in range(self.n_noises)}
         return lines + self._stored(variances)
+
+    def _process(self) -> list[dict[int, str]]:
+        """Responses to a level rate of each driven state, by row."""
+        return [self._column(("level", i)) for i in self.variation.driven]
+
+    def _tilted(self) -> list[str]:
+        """Responses to sqrt(3) (2 r - 1) in the rates, with r from 0 to 1 along the interval."""
+        lines = []
+        for k, i in enumerate(self.variation.driven):
+            level, slope = self._column(("level", i)), self._column(("slope", i))
+            lines += [f"T{k}_{a} = {_ROOT_3} * (2.0 * {slope[a]} - {level[a]})" for a in level]
+        return lines
+
+    def _column(self, cause: Cause) -> dict[int, str]:
+        """Deviations at the end of an interval by a cause, by row."""
+        column = self.variation.columns[cause]
+        return {self.reached.index(state): at(place) for state, place in column.items()}
 
     def _jacobian_of(self, *kinds: str) -> dict[_Place, str]:
         """Deviations at the end of an interval by row and cause, those not always zero.

@@ -141,6 +141,7 @@ class RecordSimulator:
         self,
         kalman: Filter,
         noise: FloatArray,
+        process: FloatArray,
         corrects: bool,
         parameters: FloatArray,
         starts: FloatArray | None,
@@ -150,8 +151,11 @@ class RecordSimulator:
     ) -> tuple[FloatArray, FloatArray]:
         """As ``residuals``, of the innovations of a filter, in parts of the outputs' noise.
 
-        noise: (n_outputs,), standard deviations. corrects: whether the filter takes outputs in. A
-        state that starts at the first sample of an output has that sample's error.
+        noise: (n_outputs,), standard deviations. process: (n_states,), those of the states' rates
+        over the root of a second. corrects: whether the filter takes outputs in. A state that
+        starts at the first sample of an output has that sample's error. Returns with the sums of
+        squares those of the logarithms of the innovations' variances in parts of the outputs',
+        (n, n_outputs).
         """
         record, kernel, model = self.record, kalman.kernel, self.kernels.model
         lanes = np.arange(rows.start, rows.stop)
@@ -160,6 +164,7 @@ class RecordSimulator:
         weights = self._weights.copy()
         weights[0, [j for j in first if j is not None]] = 0.0
         spread = [0.0 if (j := first[i]) is None else noise[j] ** 2 for i in kernel.reached]
+        intensity = process[list(kernel.variation.driven)] ** 2 / record.dt
         of_inputs = record.input_noise[list(kernel.variation.noisy)] ** 2
         start = np.zeros((kernel.n_states, LANES))
         start[: len(model.states)] = self._initial(starts, padded)
@@ -169,12 +174,12 @@ class RecordSimulator:
         with explained_errors(model):
             kalman.innovations(
                 work, work.reshape(-1, LANES), kernel.tables, self._inputs, self._measured,
-                weights, noise**2, of_inputs, np.array(spread), float(corrects), start,
+                weights, noise**2, of_inputs, intensity, np.array(spread), float(corrects), start,
                 np.ascontiguousarray(parameters[padded].T), record.dt, n_steps, sums, kept,
             )  # fmt: skip
         values[:] = kept[..., : len(lanes)]
-        sse, estimates = (half.T[: len(lanes)] for half in np.split(sums, 2))
-        return sse, self._excess(sse, estimates, np.full(len(lanes), n_steps * len(kept)))
+        sse, logarithms = (half.T[: len(lanes)] for half in np.split(sums, 2))
+        return sse, logarithms
 
     def block(
         self,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -198,29 +198,47 @@ class BatchSimulator:
         starts: Sequence[FloatArray | None],
         noise: FloatArray,
         *,
+        process: FloatArray | None = None,
         corrects: bool = True,
+        balanced: bool = True,
     ) -> Residuals:
         """As ``residuals``, of the innovations of an extended Kalman filter.
 
         Noise of the inputs is the records' own; noise: (n_outputs,), standard deviations of the
-        outputs. An innovation is scaled by the output's noise over its own standard deviation:
-        where no input is noisy, innovations are the residuals. Unless it ``corrects`` itself by the
+        outputs; process: (n_states,), intensities of the process's noise, standard deviations of
+        the states' rates over the root of a second. An innovation is scaled by the output's noise
+        over its own standard deviation: without noise of inputs and process innovations are the
+        residuals. With noise of the process, where ``balanced``, all of an output are multiplied by
+        the geometric mean of those deviations: their sum of squares is then least where the
+        likelihood of an output of unknown noise is largest. Unless it ``corrects`` itself by the
         outputs, they are those of the free run, scaled so. See ``filter_kernel``. Raises ModelError
         for equations that cannot be differentiated.
         """
-        noisy = noisy_inputs(records)
-        kalman = kalman_filter(self.model, noisy)
+        process = np.zeros(len(self.model.states)) if process is None else process
+        driven = tuple(np.flatnonzero(process).tolist())
+        kalman = kalman_filter(self.model, noisy_inputs(records), driven)
+        logarithms = np.zeros((len(parameters), len(records), len(noise)))
 
         def simulate(
             r: int, simulator: RecordSimulator, part: FloatArray, rows: slice, steps: int
         ) -> tuple[FloatArray, FloatArray]:
             values = part[..., rows]
-            return simulator.innovations(
-                kalman, noise, corrects, parameters, starts[r], rows, steps, values
+            sse, logarithms[rows, r] = simulator.innovations(
+                kalman, noise, process, corrects, parameters, starts[r], rows, steps, values
             )
+            return sse, np.where(np.isfinite(sse).all(axis=1), 0.0, np.inf)
 
         parameters = self._check(parameters, records)
-        return self._gathered(simulate, parameters, records, scales, n_steps)
+        innovations = self._gathered(simulate, parameters, records, scales, n_steps)
+        if not (driven and balanced):
+            return innovations
+        samples = sum(np.isfinite(record.outputs).sum(axis=0) for record in records)
+        factor = np.exp(0.5 * logarithms.sum(axis=1) / np.maximum(samples, 1))
+        return replace(
+            innovations,
+            values=innovations.values * factor.T,
+            sse=innovations.sse * factor[:, None] ** 2,
+        )
 
     def _gathered(
         self,

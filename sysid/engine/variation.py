@@ -1,13 +1,19 @@
-"""A model's equations together with their variational equations, for noise on its inputs.
+"""A model's equations together with their variational equations, for noise that drives them.
 
-With noise n on some inputs, small against what the equations bend over, the states deviate by d:
+With noise n on some inputs and w of the process, small against what the equations bend over, the
+states deviate by d:
 
-    d' = f_x(x, u) d + f_u(x, u) n(t)
+    d' = f_x(x, u) d + f_u(x, u) n(t) + w(t)
 
 Columns of deviations, each from one cause, are integrated as states beside x by the scheme that
 integrates x. Since that commutes with differentiation they are, to rounding, the Jacobian of the
 simulated step, not an approximation of it. Only states that the noise reaches and that reach an
 output have deviations.
+
+White noise w of unit intensity over an interval of length T is a series of independent normal
+numbers, each with one of the functions that are orthonormal there (Loeve, "Probability theory"):
+with r from 0 to 1 along the interval the first two are 1 / sqrt(T) and sqrt(3 / T) (2 r - 1). Their
+response holds the covariance of d up to the fourth power of T over the time constants.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,8 +28,10 @@ from sysid.engine.trace import followed, operand, traces
 from sysid.problem.model import Function, ModelError, ProcessModel
 
 # What a column of deviations comes from: a deviation of a state at the start of the interval, or
-# an input's error at the sample where it starts, or at that where it ends.
-Cause = tuple[Literal["state", "begin", "end"], int]
+# an input's error at the sample where it starts, or at that where it ends, or a state's rate
+# throughout the interval, or one that rises from 0 to 1.
+Cause = tuple[Literal["state", "begin", "end", "level", "slope"], int]
+_OF_RATES = ("level", "slope")
 _Slopes = Mapping[tuple[int, int], str]
 
 
@@ -31,7 +39,8 @@ _Slopes = Mapping[tuple[int, int], str]
 class Variation:
     """Structure of the equations with their variational ones, and where deviations stand.
 
-    n_states: of the model. noisy: inputs with noise, by their places. reached: states with
+    n_states: of the model. noisy: inputs with noise, by their places. driven: states with noise of
+    the process. reached: states with
     deviations. columns: for each cause the places of the deviations among all states, by the state
     that deviates. gains: entries (j, k) of the outputs' slopes that are not always zero, k a
     state's place or behind the states that of a noisy input; their values are what the program's
@@ -42,16 +51,18 @@ class Variation:
     structure: Structure
     n_states: int
     noisy: tuple[int, ...]
+    driven: tuple[int, ...]
     reached: tuple[int, ...]
     columns: Mapping[Cause, Mapping[int, int]]
     gains: tuple[tuple[int, int], ...]
 
 
-def variation(model: ProcessModel, noisy: Sequence[int]) -> Variation:
-    """The equations of a model and of the deviations that noise on some inputs causes.
+def variation(model: ProcessModel, noisy: Sequence[int], driven: Sequence[int] = ()) -> Variation:
+    """The equations of a model and of the deviations that noise causes.
 
-    noisy: places of the inputs. Raises ModelError for equations that cannot be differentiated
-    without a point: those that branch, look up or call what has no known derivative.
+    noisy: places of inputs with noise. driven: places of states with noise of the process. Raises
+    ModelError for equations that cannot be differentiated without a point: those that branch, look
+    up or call what has no known derivative.
     """
     n, m = len(model.states), len(model.inputs)
     tape = Tape()
@@ -60,8 +71,8 @@ def variation(model: ProcessModel, noisy: Sequence[int]) -> Variation:
     outputs: list[str] | None = None
     if model.output is not None:
         outputs, gains = _differentiated(model, tape, model.output, noisy)
-    reached = tuple(sorted(_reached(slopes, n, noisy) & _telling(slopes, gains, n)))
-    causes = _causes(model, reached, noisy)
+    reached = tuple(sorted(_reached(slopes, n, noisy, driven) & _telling(slopes, gains, n)))
+    causes = _causes(model, reached, noisy, driven)
     columns: dict[Cause, dict[int, int]] = {}
     place = n
     for cause in causes:
@@ -73,7 +84,7 @@ def variation(model: ProcessModel, noisy: Sequence[int]) -> Variation:
     for cause, column in columns.items():
         kind, k = cause
         held = kind == "begin" and model.inputs[noisy[k]].hold == "zoh"
-        share = "1.0" if held else falling if kind == "begin" else rising
+        share = "1.0" if held or kind == "level" else falling if kind == "begin" else rising
         rates += [_rate(tape, slopes, cause, column, i, n, share) for i in column]
     telling = {k: name for k, name in sorted(gains.items()) if k[1] >= n or k[1] in reached}
     splitter = Splitter()
@@ -83,7 +94,7 @@ def variation(model: ProcessModel, noisy: Sequence[int]) -> Variation:
     further = {"gains": splitter.split(tape, telling.values())} if telling else {}
     equations = SplitEquations(place, m + 1, rows_of, split_outputs, frozenset(moving), further)
     whole = structure(model, splitter, equations)
-    return Variation(whole, n, tuple(noisy), reached, columns, tuple(telling))
+    return Variation(whole, n, tuple(noisy), tuple(driven), reached, columns, tuple(telling))
 
 
 def _differentiated(
@@ -105,10 +116,11 @@ def _differentiated(
         ) from error
 
 
-def _reached(slopes: _Slopes, n: int, noisy: Sequence[int]) -> set[int]:
+def _reached(slopes: _Slopes, n: int, noisy: Sequence[int], driven: Sequence[int]) -> set[int]:
     """States that the noise reaches."""
     sources = range(n, n + len(noisy))
-    return _closed({i for i, k in slopes if k in sources}, ((k, i) for i, k in slopes if k < n))
+    first = {i for i, k in slopes if k in sources} | {*driven}
+    return _closed(first, ((k, i) for i, k in slopes if k < n))
 
 
 def _telling(slopes: _Slopes, gains: _Slopes, n: int) -> set[int]:
@@ -119,7 +131,8 @@ def _telling(slopes: _Slopes, gains: _Slopes, n: int) -> set[int]:
 def _moved(slopes: _Slopes, reached: Sequence[int], cause: Cause, n: int) -> list[int]:
     """States that a cause moves, among those that are reached."""
     kind, k = cause
-    first = {k} if kind == "state" else {i for i, j in slopes if j == n + k}
+    direct = kind == "state" or kind in _OF_RATES
+    first = {k} if direct else {i for i, j in slopes if j == n + k}
     moved = _closed(first & {*reached}, ((j, i) for i, j in slopes if i in reached and j < n))
     return [i for i in reached if i in moved]
 
@@ -132,12 +145,16 @@ def _closed(first: set[int], arrows: Iterator[tuple[int, int]]) -> set[int]:
     return closed
 
 
-def _causes(model: ProcessModel, reached: Sequence[int], noisy: Sequence[int]) -> list[Cause]:
+def _causes(
+    model: ProcessModel, reached: Sequence[int], noisy: Sequence[int], driven: Sequence[int]
+) -> list[Cause]:
     causes: list[Cause] = [("state", i) for i in reached]
     for k, j in enumerate(noisy):
         causes.append(("begin", k))
         if model.inputs[j].hold != "zoh":
             causes.append(("end", k))
+    for i in driven:
+        causes += [("level", i), ("slope", i)]
     return causes
 
 
@@ -150,6 +167,8 @@ def _rate(
         if (i, j) in slopes:
             total = tape.join("+", total, tape.multiply(slopes[i, j], f"x{place}"))
     kind, k = cause
-    if kind != "state" and (i, n + k) in slopes:
+    if kind in _OF_RATES and i == k:
+        total = tape.join("+", total, share)
+    if kind in ("begin", "end") and (i, n + k) in slopes:
         total = tape.join("+", total, tape.multiply(slopes[i, n + k], share))
     return total or "0.0"

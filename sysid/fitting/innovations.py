@@ -19,6 +19,9 @@ models", Automatica 40, 2004), adds sum log s_k and takes n as independent of th
 Of a measured one that is untrue, and the logarithm brings all of the free run's bias back
 (docs/decisions/0013-innovations.md). The outputs' noise therefore cannot come from the same sum,
 which vanishes as it grows: it is such that the mean of e_k^2 / s_k is one.
+
+Noise of the process is independent of all that is measured. Where there is some, the logarithm
+belongs to the sum: without it, parameters that pass on more of that noise would seem better.
 """
 
 from __future__ import annotations
@@ -35,6 +38,7 @@ _ROUNDS, _STEADY = 30, 1e-4  # of the outputs' noise, and its relative change at
 # Noise of an output is not below this share of its free run's error; where it comes near, noise
 # of the inputs explains more than there is to explain.
 _LEAST_NOISE, _NEAR = 1e-2, 0.1
+_LEAST_OF_PROCESS = 1e-4
 _TINY = 1e-300
 
 
@@ -43,35 +47,56 @@ class Innovations(Objective):
 
     noise: (n_outputs,), standard deviations of the outputs in their units. error: (n_outputs,),
     the same of the free run's errors at the chromosome that it began with. corrects: whether
-    outputs correct the states.
+    outputs correct the states. process: (n_states,), noise of the states' rates, in their units
+    over the root of a second.
     """
 
     noise: FloatArray
     error: FloatArray
     corrects: bool
+    process: FloatArray
 
     @classmethod
-    def of(cls, objective: Objective, noise: FloatArray, *, corrects: bool) -> Self:
+    def of(
+        cls,
+        objective: Objective,
+        noise: FloatArray,
+        *,
+        corrects: bool,
+        process: FloatArray | None = None,
+    ) -> Self:
         """An objective's counterpart."""
         variant = cls.__new__(cls)
         vars(variant).update(vars(objective))
         variant.noise = variant.error = np.maximum(noise, _TINY)
         variant.corrects = corrects
+        n_states = len(objective.simulator.model.states)
+        variant.process = np.zeros(n_states) if process is None else process
         return variant
 
     @classmethod
-    def starting(cls, objective: Objective, chromosome: FloatArray, *, corrects: bool) -> Self:
+    def starting(
+        cls,
+        objective: Objective,
+        chromosome: FloatArray,
+        *,
+        corrects: bool,
+        process: FloatArray | None = None,
+    ) -> Self:
         """Its counterpart with the noise that the innovations show at a chromosome, (n_free,)."""
         steps = objective.steps_needed(chromosome[None])[0]
         error = objective.in_units(objective.residuals(chromosome[None], steps).values[..., 0])
-        return cls.of(objective, error, corrects=corrects).settled(chromosome)
+        variant = cls.of(objective, error, corrects=corrects, process=process)
+        return variant.settled(chromosome)
 
     def settled(self, chromosome: FloatArray) -> Self:
         """With the noise that the innovations show at a chromosome, (n_free,)."""
-        steps = self.steps_needed(chromosome[None])[0]
-        settled, least = self, _LEAST_NOISE * self.error
+        steps = self.steps_needed(chromosome[None])
+        # Noise of the process may explain nearly all of a free run's error.
+        least = (_LEAST_OF_PROCESS if self.process.any() else _LEAST_NOISE) * self.error
+        settled = self
         for _ in range(_ROUNDS):
-            innovations = settled.residuals(chromosome[None], steps).values[..., 0]
+            innovations = settled._simulated(chromosome[None], steps, balanced=False).values[..., 0]
             before, noise = settled.noise, np.maximum(self.in_units(innovations), least)
             if not np.isfinite(noise).all():
                 return self
@@ -112,9 +137,17 @@ class Innovations(Objective):
         return errors, BatchResult(sse, status, steps.sum(axis=1))
 
     def _simulated(
-        self, chromosomes: FloatArray, steps: IntArray, *, keep: bool = True
+        self, chromosomes: FloatArray, steps: IntArray, *, keep: bool = True, balanced: bool = True
     ) -> Residuals:
         vectors, starts = self.space.full(chromosomes), self._starts(chromosomes)
         return self.simulator.innovations(
-            vectors, self.records, self.scales, steps, starts, self.noise, corrects=self.corrects
+            vectors,
+            self.records,
+            self.scales,
+            steps,
+            starts,
+            self.noise,
+            process=self.process,
+            corrects=self.corrects,
+            balanced=balanced,
         )

@@ -1,6 +1,7 @@
 """GASSI as a scikit-learn estimator over any process model."""
 
 import itertools
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
@@ -87,7 +88,11 @@ class GASSI(RecordEstimator):
         error; ``compensated`` as well, and takes out what the noise of measured inputs does to
         the errors; ``innovations`` are those of an extended Kalman filter for that noise;
         ``error`` stays with the mean RMSE that the search minimises. ``auto`` is ``compensated``
-        where a record has ``input_noise``, else ``likelihood``.
+        where a record has ``input_noise``, ``innovations`` with ``process_noise``, else
+        ``likelihood``.
+    process_noise : {state: intensity} of white noise that drives states, for ``innovations``:
+        standard deviation of the state after a second, were it to do nothing but sum that noise,
+        in its unit over sqrt(s).
     balance : ``samples``, several records count as one long one; ``logs``, each alike.
     accuracy : normalised RMS error that a simulation aims at.
     max_steps : integration steps a sample may take before a chromosome is flagged.
@@ -105,7 +110,8 @@ class GASSI(RecordEstimator):
     space_ : SearchSpace that was searched; estimated initial states stand behind the parameters.
     output_weights_ : (n_outputs,), final weights of the outputs.
     criterion_, criterion_reason_ : what it was, and why.
-    output_noise_ : (n_outputs,), noise of the outputs, None where that of inputs does not count.
+    output_noise_ : (n_outputs,), noise of the outputs, None where that of inputs and process does
+        not count.
     rivals_ : parameters in each further minimum that explains the data as well as the result.
     error_ : mean over outputs of the RMSE normalised by max|y| (see ``Objective``); of ``cega``
         (4.6) (see ``CegaObjective``).
@@ -153,6 +159,7 @@ class GASSI(RecordEstimator):
     per_log: bool = False
     balance: Balance = "samples"
     criterion: Criterion = "auto"
+    process_noise: Mapping[str, float] | None = None
     accuracy: float = 1e-3
     max_steps: int = 512
     threads: int | None = None
@@ -248,7 +255,11 @@ class GASSI(RecordEstimator):
 
         try:
             result = fit_likelihood(
-                run.objective, run.minima(), watch, noise=_OF_NOISY_INPUTS.get(self.criterion_)
+                run.objective,
+                run.minima(),
+                watch,
+                noise=_OF_NOISY_INPUTS.get(self.criterion_),
+                process=self._process(),
             )
         except KeyboardInterrupt:
             self.stopped_ = "interrupted"
@@ -336,7 +347,9 @@ class GASSI(RecordEstimator):
         if self.output_noise_ is None:
             return objective
         corrects = self.criterion_ == "innovations"
-        return Innovations.of(objective, self.output_noise_, corrects=corrects)
+        return Innovations.of(
+            objective, self.output_noise_, corrects=corrects, process=self._process()
+        )
 
     def _at_final_accuracy(self, objective: Objective) -> Objective:
         """The objective, simulated as accurately as at the end of ``fit``."""
@@ -388,6 +401,9 @@ class GASSI(RecordEstimator):
         if not preset.refine:
             return "error", f"preset {self.preset} goes by nothing else"
         names = ", ".join(model.input_names[j] for j in noisy)
+        if self._process().any():
+            self._check_filter(noisy)
+            return "innovations", "noise of the process is given"
         if self.criterion not in ("auto", *_OF_NOISY_INPUTS):
             return self.criterion, "as set"
         if not noisy:
@@ -404,9 +420,31 @@ class GASSI(RecordEstimator):
             if self.criterion != "auto":
                 raise
             return "likelihood", f"{names} is measured with noise, but {error}"
-        if self.criterion != "auto":
-            return self.criterion, "as set"
-        return "compensated", f"{names} is measured with noise, which a free run passes on"
+        reason = f"{names} is measured with noise, which a free run passes on"
+        return ("compensated", reason) if self.criterion == "auto" else (self.criterion, "as set")
+
+    def _check_filter(self, noisy: tuple[int, ...]) -> None:
+        """Raise ModelError where no filter can serve for the noise of the process."""
+        if self.criterion not in ("auto", "innovations"):
+            raise ModelError(
+                f"process_noise is for criterion innovations, not {self.criterion}; leave out one"
+            )
+        driven = tuple(np.flatnonzero(self._process()).tolist())
+        reached = kalman_filter(self._model(), noisy, driven).kernel.reached
+        if silent := [self._model().state_names[i] for i in driven if i not in reached]:
+            raise ModelError(
+                f"process_noise of {', '.join(silent)} reaches no output; leave it out"
+            )
+
+    def _process(self) -> FloatArray:
+        """Noise of the states' rates, (n_states,)."""
+        names, noise = self._model().state_names, dict(self.process_noise or {})
+        for name, intensity in noise.items():
+            if name not in names:
+                raise ModelError(f"process_noise: no state {name!r}; there are {', '.join(names)}")
+            if not (math.isfinite(intensity) and intensity >= 0.0):
+                raise ModelError(f"process_noise of {name}: {intensity} is no standard deviation")
+        return np.array([noise.get(name, 0.0) for name in names])
 
     def _weights(self) -> FloatArray | None:
         if self.weights is None:

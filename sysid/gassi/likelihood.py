@@ -12,7 +12,7 @@ its errors leaves; those that it cannot tell apart are rivals.
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Literal
 
 import numpy as np
@@ -83,10 +83,12 @@ def fit_likelihood(
     watch: Watch | None = None,
     *,
     noise: NoisyInputs | None = None,
+    process: FloatArray | None = None,
 ) -> Likeliest:
     """The likeliest of some minima (n_free,) of the mean RMSE and of their lookalikes.
 
-    noise: how all of them are refitted in the end, where inputs are noisy.
+    noise: how all of them are refitted in the end, where inputs or the process are noisy. process:
+    as of ``Innovations``.
     """
     objective = _resolved(objective, minima[0])
     optima = _Optima(objective)
@@ -112,8 +114,8 @@ def fit_likelihood(
     best, *others = optima.ranked()
     refitted = None
     if noise is not None:
-        corrects = noise == "innovations"
-        refitted = _refitted(corrects, objective, [best, *others], optima, watch)
+        fit = partial(noisy_fit, noise == "innovations", process, objective)
+        refitted = _refitted(fit, objective, [best, *others], optima, watch)
     if refitted is None:
         best = _exact(best)
     else:
@@ -254,7 +256,7 @@ def _weighed(objective: Objective, chromosome: FloatArray, watch: Watch | None) 
 
 
 def _refitted(
-    corrects: bool,
+    fit: Callable[[Optimum, Watch | None], Optimum | None],
     objective: Objective,
     ranked: Sequence[Optimum],
     by_error: _Optima,
@@ -268,7 +270,7 @@ def _refitted(
     first: Optimum | None = None
     for optimum in ranked:
         if by_error.deviance(optimum, ranked[0]) < _CONCEIVABLE:
-            refitted = noisy_input_fit(corrects, objective, optimum, watch)
+            refitted = fit(optimum, watch)
             if refitted is None and first is None:
                 return None
             if refitted is not None:
@@ -279,15 +281,19 @@ def _refitted(
     return optima
 
 
-def noisy_input_fit(
-    corrects: bool, objective: Objective, optimum: Optimum, watch: Watch | None = None
+def noisy_fit(
+    corrects: bool,
+    process: FloatArray | None,
+    objective: Objective,
+    optimum: Optimum,
+    watch: Watch | None = None,
 ) -> Optimum | None:
-    """The minimum for noisy inputs from one of the error: weights, noise, parameters in turn.
+    """The minimum for noise from one of the error: weights, noise of outputs, parameters in turn.
 
-    corrects: as of ``Innovations``. None as of ``_refitted``.
+    corrects, process: as of ``Innovations``. None as of ``_refitted``.
     """
     chromosome, rms = optimum.chromosome, optimum.rms
-    fitted = Innovations.starting(optimum.objective, chromosome, corrects=corrects)
+    fitted = Innovations.starting(optimum.objective, chromosome, corrects=corrects, process=process)
     for _ in range(_NOISE_ROUNDS):
         if not corrects and fitted.overwhelmed.any():
             return None

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.linalg import expm
 
 from sysid import (
     GASSI,
@@ -125,13 +126,123 @@ def extended_kalman_filter(model, p, record, noise):
     return innovations
 
 
-def simulate(model, p, record, noise, steps):
+def simulate(model, p, record, noise, steps, **options):
     """Innovations (n_samples, n_outputs) at unit scale."""
     q = len(model.outputs)
     simulated = BatchSimulator(model).innovations(
-        np.array([p]), [record], [np.ones(q)], np.array([[steps]]), [None], np.array(noise)
-    )
+        np.array([p]), [record], [np.ones(q)], np.array([[steps]]), [None], np.array(noise),
+        **options,
+    )  # fmt: skip
     return simulated.values[..., 0]
+
+
+def oscillator():
+    """A mass on a spring, its speed driven by noise; position and speed are measured."""
+    return ProcessModel(
+        "oscillator",
+        (State("position", "m", first_sample=False), State("speed", "m/s", first_sample=False)),
+        (Input("force", "N", "zoh"),),
+        (Output("position", "m"), Output("speed", "m/s")),
+        tuple(Parameter(name, "1", 1.0, 0.1, 100.0) for name in ("k", "d")),
+        lambda x, u, p: (x[1], u[0] - p[0] * x[0] - p[1] * x[1]),
+    )
+
+
+def test_noise_of_the_process_is_that_of_a_kalman_filter():
+    """Of a linear model, with Van Loan's exact covariance of an interval."""
+    rng, model, dt, intensity = np.random.default_rng(2), oscillator(), 0.05, 1.0
+    p, noise, of_input = np.array([20.0, 1.5]), np.array([0.1, 0.3]), 0.4
+    u, y = prbs(rng, 60, -3.0, 3.0), rng.standard_normal((60, 2)) * (0.3, 1.0)
+    y[7, 0] = np.nan
+    record = Dataset(u, y, dt, input_noise=np.array([of_input]))
+    drives = {"process": np.array([0.0, intensity]), "balanced": False}
+    innovations = simulate(model, p, record, noise, 4, **drives)
+    # States, and the force and its noise behind them, which stay for the interval.
+    A = np.array([[0.0, 1.0, 0.0], [-p[0], -p[1], 1.0], [0.0, 0.0, 0.0]])
+    block = np.block([[-A, np.diag([0.0, intensity**2, 0.0])], [np.zeros((3, 3)), A.T]])
+    loan = expm(block * dt)
+    F = loan[3:, 3:].T
+    Q = (F @ loan[:3, 3:])[:2, :2]
+    x, P, variances = np.zeros(3), np.diag([0.0, 0.0, of_input**2]), []
+    expected = np.zeros_like(y)
+    for k in range(len(y)):
+        for j in range(2):
+            e, s = x[j] - y[k, j], P[j, j] + noise[j] ** 2
+            if np.isfinite(e):
+                x, P = x - P[:, j] / s * e, P - np.outer(P[:, j], P[:, j]) / s
+                expected[k, j] = e * noise[j] / np.sqrt(s)
+                variances.append((j, s / noise[j] ** 2))
+        x = F @ (x + np.array([0.0, 0.0, u[k]]))
+        P = F @ P @ F.T
+        P[:2, :2] += Q
+        x[2], P[2], P[:, 2] = 0.0, 0.0, 0.0
+        P[2, 2] = of_input**2
+    assert innovations == pytest.approx(expected, abs=3e-6)
+    assert np.std(expected) > 0.05
+    # Balanced: times the geometric mean of the deviations, those of the missing sample left out.
+    means = [np.sqrt(np.exp(np.mean(np.log([s for i, s in variances if i == j])))) for j in (0, 1)]
+    balanced = simulate(model, p, record, noise, 4, process=drives["process"])
+    assert balanced == pytest.approx(innovations * means, rel=1e-5, abs=1e-12)
+    assert min(means) > 1.01
+
+
+def drag():
+    """A body that a force drives against turbulent drag."""
+    return ProcessModel(
+        "drag",
+        (State("speed", "m/s"),),
+        (Input("force", "N", "zoh"),),
+        (Output("speed", "m/s"),),
+        (
+            Parameter("b", "1/kg", 1.0, 0.3, 10.0, "log"),
+            Parameter("c", "1/m", 1.0, 0.1, 10.0, "log"),
+        ),
+        lambda x, u, p: (p[0] * u[0] - p[1] * abs(x[0]) * x[0],),
+    )
+
+
+def gusty_record(b, c, intensity, seed, n=1500, dt=0.05, steps=20):
+    """Speeds under gusts, integrated in steps much shorter than the samples."""
+    rng = np.random.default_rng(seed)
+    force, h = prbs(rng, n, -1.0, 1.5, hold=25), dt / steps
+    speed, speeds = 0.0, []
+    for k in range(n):
+        speeds.append(speed)
+        for gust in intensity * math.sqrt(h) * rng.standard_normal(steps):
+            speed += h * (b * force[k] - c * abs(speed) * speed) + gust
+    return Dataset(force, np.array(speeds) + 0.15 * rng.standard_normal(n), dt, "gusty")
+
+
+def test_gusts_bias_the_error_and_not_the_innovations():
+    """Gusts waste speed on a drag that grows with its square: a free run finds more of it."""
+    truth, intensity = {"b": 2.0, "c": 1.5}, 1.0
+    biased, fitted, held = [], [], 0
+    for seed in range(4):
+        record = gusty_record(**truth, intensity=intensity, seed=seed)
+        options = {"population": 20, "generations": 6}
+        by_error = GASSI(drag(), criterion="error", **options).fit(record)
+        fit = GASSI(drag(), process_noise={"speed": intensity}, **options).fit(record)
+        assert fit.criterion_ == "innovations"
+        assert fit.output_noise_ == pytest.approx([0.15], rel=0.25)
+        biased.append([math.log(by_error.parameters_[k] / v) for k, v in truth.items()])
+        fitted.append([math.log(fit.parameters_[k] / v) for k, v in truth.items()])
+        held += sum(e.low < truth[e.name] < e.high for e in fit.uncertainty(record).parameters)
+    assert np.mean(biased, axis=0)[1] > 0.2
+    assert np.all(np.abs(np.mean(fitted, axis=0)) < 0.1)
+    assert held >= 6  # of 8
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"process_noise": {"spede": 1.0}}, "no state 'spede'; there are speed"),
+        ({"process_noise": {"speed": -1.0}}, "-1.0 is no standard deviation"),
+        ({"process_noise": {"speed": 1.0}, "criterion": "likelihood"}, "for criterion innovations"),
+    ],
+)
+def test_noise_of_the_process_that_cannot_be_is_refused(settings, message):
+    with pytest.raises(ModelError, match=message):
+        GASSI(drag(), **settings).fit(gusty_record(2.0, 1.5, 1.0, 0, n=60))
 
 
 def noisy_records(pairs, of_input=0.5, of_output=0.1):
