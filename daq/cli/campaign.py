@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -69,9 +71,14 @@ def _show(result: CampaignResult) -> None:
 
     runs = result.campaign
     print()
-    title = "Error over seeds: mean over outputs of the RMSE in parts of max|y|"
+    title = (
+        "Error over seeds: mean over outputs of the RMSE in parts of max|y|; then the best's RMSE"
+    )
     head = ["model", "log", "runs", "best", "median", "worst", "within 1 %", "fit [%]", "failed"]
-    rows = [_spread_row(spread, result) for spread in runs.spread()]
+    models = [outcome.run.model for outcome in runs.outcomes]
+    units = {output.name: output.unit for model in models for output in model.outputs}
+    head += [f"RMSE of {name} [{unit}]" for name, unit in units.items()]
+    rows = [_spread_row(spread, result, list(units)) for spread in runs.spread()]
     terminal.print_table(title, head, rows, text=["log"])
     for problem in dict.fromkeys(f"{o.run.name}: {o.problem}" for o in runs.failed):
         print(f"Failed: {problem}")
@@ -84,9 +91,11 @@ def _show(result: CampaignResult) -> None:
         terminal.print_next(f"rig replay LOG --parameters {path}{trust_option(model)}")
 
 
-def _spread_row(spread: Spread, result: CampaignResult) -> list[str]:
+def _spread_row(spread: Spread, result: CampaignResult, outputs: Sequence[str]) -> list[str]:
     best, number = result.campaign.best().get((spread.model, spread.data)), terminal.number
     errors = [number(error) for error in (spread.best, spread.median, spread.worst)]
     fit = f"{best.row()['fit']:.1f}" if best is not None else "-"
     counts = [str(spread.agreeing), fit, str(spread.failed)]
-    return [spread.model, spread.data, str(spread.runs), *errors, *counts]
+    absolute = best.rmse_absolute if best is not None else {}
+    in_units = [number(absolute.get(name, math.nan), 3) for name in outputs]
+    return [spread.model, spread.data, str(spread.runs), *errors, *counts, *in_units]

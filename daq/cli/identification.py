@@ -356,6 +356,7 @@ def _show_comparison(result: ComparisonResult) -> None:
         head = ["structure", *result.outputs, "squared errors", "95 % interval", ""]
         rows = [_validation_row(row) for row in comparison.rows]
         terminal.print_table(title, head, rows, text=[""])
+    _print_in_units(result)
     head = ["structure", "free parameters", "effective", "mean RMSE", "dAIC", "dBIC"]
     terminal.print_table("Training", head, [_training_row(row) for row in comparison.rows])
     terminal.print_text(
@@ -368,6 +369,21 @@ def _show_comparison(result: ComparisonResult) -> None:
     for name, path in result.files.items():
         print(f"Parameters of {name}: {path}")
     print(f"Comparison: {result.file}")
+
+
+def _print_in_units(result: ComparisonResult) -> None:
+    """RMSE of every structure and output, in validation and in training."""
+    outputs, number = result.group.problem.model.outputs, terminal.number
+    head, validated = ["structure"], result.comparison.validated
+    if validated:
+        head += [f"{output.name}, validation [{output.unit}]" for output in outputs]
+    head += [f"{output.name}, training [{output.unit}]" for output in outputs]
+    rows = []
+    for row in result.comparison.rows:
+        tested = row.rmse_absolute.tolist() if validated else []
+        values = [*tested, *row.training_rmse_absolute.tolist()]
+        rows.append([row.name, *(number(value, 3) for value in values)])
+    terminal.print_table("RMSE of the free run in the outputs' units", head, rows)
 
 
 def _runs_lines(campaign: Campaign) -> list[str]:

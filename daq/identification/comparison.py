@@ -33,10 +33,12 @@ from sysid import (
     Dataset,
     ModelError,
     Outcome,
+    Output,
     ProcessModel,
     Spread,
 )
 from sysid import compare as compare_candidates
+from sysid.arrays import FloatArray
 from sysid.judging.comparison import Row
 from sysid.linear import ARMAX, ARX, OE, Orders, tuned
 from sysid.problem.regressors import with_regressors
@@ -115,7 +117,7 @@ class ComparisonResult:
         spreads = {spread.model: spread for spread in campaign.spread()}
         structures = []
         for row in comparison.rows:
-            entry = _row_document(row, self.outputs)
+            entry = _row_document(row, group.problem.model.outputs)
             if row.name in spreads:
                 entry["seeds"] = _spread_document(spreads[row.name])
                 entry["parameters_file"] = str(self.files[row.name])
@@ -257,21 +259,24 @@ def _rank(group: Group, candidates: Sequence[Candidate]) -> Comparison:
         raise ConfigError(str(error)) from None
 
 
-def _row_document(row: Row, outputs: Sequence[str]) -> dict[str, Any]:
+def _row_document(row: Row, outputs: Sequence[Output]) -> dict[str, Any]:
     entry: dict[str, Any] = {
         "name": row.name,
         "verdict": row.verdict,
         "free_parameters": row.n_free,
         "effective_parameters": row.n_effective,
         "training_error": row.training_error,
+        "training_rmse_absolute": _by_output(outputs, row.training_rmse_absolute),
         "daic": row.daic,
         "dbic": row.dbic,
     }
     if not np.isnan(row.rmse).all():
-        errors = zip(row.rmse.tolist(), row.msd.tolist(), row.fit.tolist(), strict=True)
+        figures = {"rmse": row.rmse, "msd": row.msd, "fit_percent": row.fit}
+        figures["rmse_absolute"] = row.rmse_absolute
         entry["outputs"] = {
-            name: {"rmse": rmse, "msd": msd, "fit_percent": fit}
-            for name, (rmse, msd, fit) in zip(outputs, errors, strict=True)
+            output.name: {key: float(values[j]) for key, values in figures.items()}
+            | {"unit": output.unit}
+            for j, output in enumerate(outputs)
         }
     if row.ratio is not None:
         entry["squared_errors_relative"] = {
@@ -280,6 +285,10 @@ def _row_document(row: Row, outputs: Sequence[str]) -> dict[str, Any]:
             "p_value": row.ratio.p_value,
         }
     return entry
+
+
+def _by_output(outputs: Sequence[Output], values: FloatArray) -> dict[str, float]:
+    return {output.name: float(value) for output, value in zip(outputs, values, strict=True)}
 
 
 def _spread_document(spread: Spread) -> dict[str, Any]:

@@ -38,6 +38,7 @@ def publish_comparison(result: ComparisonResult) -> str:
     variables = {
         "written": f"{now:%Y-%m-%d %H:%M} UTC",
         "outputs": result.outputs,
+        "units": {output.name: output.unit for output in group.problem.model.outputs},
         "preferred_file": preferred.get("parameters_file"),
         "trust_option": trust_option(preferred["name"]),
         "reproduction": {

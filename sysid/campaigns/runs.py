@@ -89,6 +89,14 @@ class Outcome:
         """The error that was minimised; infinite for a run that failed."""
         return np.inf if self.estimator is None else self.estimator.error_
 
+    @property
+    def rmse_absolute(self) -> dict[str, float]:
+        """Mean over the training records of each output's RMSE, in its unit."""
+        if not self.training:
+            return {}
+        rmse = mean_known([metrics.rmse * metrics.scale for metrics in self.training], 0)
+        return dict(zip(self.run.model.output_names, rmse.tolist(), strict=True))
+
     def row(self) -> dict[str, Any]:
         """The outcome as a flat row of a table."""
         row: dict[str, Any] = {
@@ -98,6 +106,7 @@ class Outcome:
             "error": self.error,
             "fit": float(mean_known([metrics.fit for metrics in self.training])),
             "validation_fit": float(mean_known([metrics.fit for metrics in self.validation])),
+            **{f"rmse_{name}": rmse for name, rmse in self.rmse_absolute.items()},
             "seconds": self.seconds,
             "problem": self.problem,
         }

@@ -106,7 +106,8 @@ class Row:
     """A structure in the comparison; arrays are (n_outputs,).
 
     training_error: mean over outputs of the RMSE in parts of max|y|. rmse, msd, fit: on the
-    validation records, rmse and msd in parts of max|y|; NaN without any. daic, dbic: above the
+    validation records, rmse and msd in parts of max|y|; NaN without any. rmse_absolute,
+    training_rmse_absolute: RMSE in the outputs' units. daic, dbic: above the
     lowest of all structures. ratio: squared errors on validation in parts of the best
     structure's; None for the best itself, without validation, and for a structure whose free run
     left the floating-point range.
@@ -119,6 +120,8 @@ class Row:
     rmse: FloatArray
     msd: FloatArray
     fit: FloatArray
+    rmse_absolute: FloatArray
+    training_rmse_absolute: FloatArray
     daic: float
     dbic: float
     ratio: Ratio | None
@@ -236,6 +239,7 @@ def compare(
         row = Row(
             structure.name, structure.n_free, structure.n_effective,
             trained[i].mean_rmse(importance), quality.rmse, quality.msd, quality.fit,
+            quality.rmse * quality.scale, trained[i].rmse_absolute,
             daic[i], dbic[i], ratios[i], standing,
         )  # fmt: skip
         rows.append(row)
@@ -284,6 +288,12 @@ class _FreeRuns:
         fit = mean_known(list(map(fit_percent, self.measured, self.simulated)), 0)
         rmses, msds = (metric(measured, simulated, self.scale) for metric in (rmse, msd))
         return Metrics(rmses, msds, fit, self.scale)
+
+    @property
+    def rmse_absolute(self) -> FloatArray:
+        """RMSE in the outputs' units, (n_outputs,); NaN of those without a measured sample."""
+        absolute: FloatArray = np.where(self.seen, self.metrics.rmse * self.scale, np.nan)
+        return absolute
 
     def mean_rmse(self, importance: FloatArray) -> float:
         """Mean over the outputs that were measured."""

@@ -89,6 +89,7 @@ def test_every_log_with_every_model_and_seed(folder):
         if row["model"].endswith(LAG):
             truth = {"fast": 0.1, "slow": 0.2}[row["data"]]
             assert row["tau"] == pytest.approx(truth, rel=0.02)
+            assert 0.0 < row["rmse_y"] < 0.02  # m
     table = pd.read_csv(folder / "found" / "campaign.csv")
     assert list(table["tau"]) == pytest.approx([r["tau"] for r in rows], rel=1e-12)
     # The best of each is a result like that of `rig identify`.

@@ -96,6 +96,11 @@ def test_structures_and_a_linear_model_are_ranked_on_validation(folder):
     for row in (rows[LAG], rows["ARMAX"], rows["OE"]):
         # Noise of 0.01 in parts of max|y|, and the lag starts at a noisy sample.
         assert row["outputs"]["y"]["rmse"] < 0.015 and row["outputs"]["y"]["fit_percent"] > 95.0
+    for error in (
+        rows[LAG]["training_rmse_absolute"]["y"],
+        rows[LAG]["outputs"]["y"]["rmse_absolute"],
+    ):
+        assert error == pytest.approx(0.01, rel=0.2)  # m
     assert rows[LAG]["dbic"] < rows["ARMAX"]["dbic"] < rows[DOUBLE]["dbic"]
     assert report["verdict"].count("times those of") == 4
     # What is printed is kept, and each model's result is one that other commands read.
@@ -122,13 +127,16 @@ def test_tables_for_people_and_a_page_that_says_how_to_do_it_again(folder):
              if "data-structure" in given}  # fmt: skip
     for row in kept["structures"]:
         errors = row["outputs"]["y"]
-        assert shown[row["name"]][:2] == [errors["rmse"], errors["fit_percent"]]
+        given = [errors[key] for key in ("rmse", "rmse_absolute", "fit_percent")]
+        assert shown[row["name"]][:3] == given
     (command,) = re.findall(r"rig (identify training.csv .*)", page.text)
     again = rig(*shlex.split(command), "--out", "again", "--json", cwd=folder)
     assert (
         json.loads(again.stdout)["structures"][0]["outputs"] == (kept["structures"][0]["outputs"])
     )
     assert "Validation, free run: RMSE in parts of max|y| (fit in %)" in text
+    assert "RMSE of the free run in the outputs' units" in text
+    assert "y, validation [m]" in text and "y, training [m]" in text
     assert "dAIC" in text and "dBIC" in text and "worse, by more than chance" in text
     assert "ARX:na=" in text and "comparison.yaml" in text
 
@@ -139,6 +147,7 @@ def test_without_validation_bic_ranks_and_that_is_said(folder):
     assert not report["validated"] and short(report["preferred"]) == LAG
     assert report["verdict"].startswith("Without validation data this ranks by BIC")
     assert "outputs" not in report["structures"][0]
+    assert report["structures"][0]["training_rmse_absolute"]["y"] == pytest.approx(0.01, rel=0.2)
 
 
 @pytest.mark.soak
