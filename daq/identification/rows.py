@@ -231,13 +231,7 @@ class Rows:
         return cls(
             tuple(_parameter(name, entry) for name, entry in document["parameters"].items()),
             tuple(map(_ambiguity, document.get("ambiguities", ()))),
-            tuple(
-                RivalRow(
-                    rival["parameters"],
-                    {name: (ends[0], ends[1]) for name, ends in rival["intervals"].items()},
-                )
-                for rival in document.get("rivals", ())
-            ),
+            tuple(map(_rival, document.get("rivals", ()))),
             {
                 (pair["parameters"][0], pair["parameters"][1]): pair["correlation"]
                 for pair in document.get("correlations", ())
@@ -317,8 +311,8 @@ class Rows:
         parts = "The logs" if several else "Parts of the log"
         return (
             f"{parts} want parameters of their own: they differ by {self.disagreement**0.5:.1f} "
-            "times what noise explains, so something is missing from the model. The intervals "
-            "are as wide as that spread."
+            "times what noise explains, so that model or sensors are not quite what they are taken "
+            "for. The intervals are as wide as that spread."
         )
 
     @cached_property
@@ -374,6 +368,13 @@ def _quantity(name: str, entry: Mapping[str, Any]) -> dict[str, Any]:
         "here": _ends(entry.get("interval_here")),
         "fails": entry.get("fails", 0.0),
     }
+
+
+def _rival(entry: Mapping[str, Any]) -> RivalRow:
+    """Of documents written before rivals had intervals, whose entries are the parameters."""
+    if "intervals" not in entry:
+        return RivalRow(entry, {})
+    return RivalRow(entry["parameters"], {k: (v[0], v[1]) for k, v in entry["intervals"].items()})
 
 
 def _ambiguity(entry: Mapping[str, Any]) -> AmbiguityRow:

@@ -172,7 +172,9 @@ def judge(
         for finding in missing
         if finding not in counting
     ]
-    return Verdict(predicted, parameters, (*notes, *_untested(model, judged, findings)))
+    return Verdict(
+        predicted, parameters, (*notes, *_untested(model, judged, findings, uncertainty))
+    )
 
 
 def _prediction(
@@ -377,7 +379,10 @@ def _moving(finding: Finding) -> str:
 
 
 def _untested(
-    model: ProcessModel, results: Sequence[RecordResult], findings: Sequence[Finding] | None
+    model: ProcessModel,
+    results: Sequence[RecordResult],
+    findings: Sequence[Finding] | None,
+    uncertainty: Uncertainty | None,
 ) -> Iterator[str]:
     """What could not be tested, and for want of what."""
     tested = _known(results)
@@ -388,7 +393,10 @@ def _untested(
             "be explained is not tested."
         )
     if findings is None:
-        yield "What the model may lack was not tested."
+        parameters = () if uncertainty is None else uncertainty.parameters
+        ends = [p.name for p in parameters if p.on_bound and not p.why]
+        since = f": {', '.join(ends)} on an end of the range would look like it" if ends else ""
+        yield f"What the model may lack was not tested{since}."
 
 
 def _parameter_praise(findings: Sequence[Finding] | None) -> str:

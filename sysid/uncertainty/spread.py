@@ -25,6 +25,8 @@ _PARTS = 8  # of a single log
 _CHANCE, _CHANCE_OF_PARTS = 0.01, 1e-4
 # Share of what all logs tell of a direction above which the rest tell nothing of it.
 _ALONE = 0.98
+# Errors below this part of the simulation's accuracy are its own.
+_SIMULATION_SHARE = 0.1
 _FEWEST = 3.0  # logs, of like information, whose spread says something
 
 
@@ -64,8 +66,13 @@ def spread(
     """The spread between logs, or parts of one, where it is more than chance.
 
     weighted: (n_residuals, n_outputs, n_free), slopes times weights. back: (n_free, rank), in
-    whose directions the curvature is one. score: (n_free, n_free), its covariance by noise.
+    whose directions the curvature is one. score: (n_free, n_free), its covariance by noise. None
+    where the residuals are the simulation's: they are no noise that logs could differ by.
     """
+    accuracy = sensitivity.objective.simulator.accuracy
+    errors = np.sqrt(np.mean(sensitivity.residual**2, axis=0))
+    if np.max(errors) < _SIMULATION_SHARE * accuracy:
+        return None
     logs = len(sensitivity.lengths) > 1
     lengths = sensitivity.lengths if logs else _parts(sensitivity.lengths[0])
     rank = back.shape[1]

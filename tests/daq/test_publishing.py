@@ -281,6 +281,18 @@ def test_figures_are_drawn_again_in_other_formats(result, work, rig):
 
 
 @pytest.mark.soak
+def test_figures_of_a_report_from_before_rivals_had_intervals(result, work, rig, tmp_path):
+    shutil.copytree(work / "found", tmp_path / "found")
+    data = tmp_path / "found/report.json"
+    document = json.loads(data.read_text())
+    values = {name: 1.1 * entry["value"] for name, entry in document["parameters"].items()}
+    document = {k: v for k, v in document.items() if k not in ("together", "disagreement")}
+    data.write_text(json.dumps({**document, "rivals": [values]}))
+    done = rig(["figures", "found", "--trust", "--json"], cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.soak
 def test_columns_of_a_file_for_another_model_of_the_same_signals_serve(result, work, rig):
     (work / "other.yaml").write_text(CONFIG.replace("my_model.py:model", "actuator"))
     args = ["replay", "check.csv", "--parameters", "found/parameters.yaml", "--trust"]

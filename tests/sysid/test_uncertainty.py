@@ -770,6 +770,13 @@ def test_logs_that_agree_change_nothing():
     assert [e.std for e in result.parameters] == pytest.approx(list(std), rel=0.1)
 
 
+def test_errors_of_the_simulation_are_no_disagreement():
+    """Each log wants other parameters by what double precision rounds, and that is nothing."""
+    slopes = 1.0 + 1e-9 * np.array([-2.0, 1.0, -1.0, 3.0, 0.0, -1.0])
+    result = slopes_problem().tell(records=logs_with(slopes, sigma=1e-11))
+    assert result.disagreement == 1.0
+
+
 def test_logs_that_disagree_widen_to_the_spread_between_them():
     slopes = [0.8, 1.1, 0.9, 1.3, 1.0, 0.9]
     result = slopes_problem().tell(records=logs_with(slopes))
