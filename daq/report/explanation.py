@@ -164,10 +164,10 @@ def _cures(rows: Rows) -> list[Step]:
     measure = dict.fromkeys(name for a in rows.ambiguities_of("tied") for name in a.measure)
     starts = [name for name in measure if "(0)" in name]
     rival = [a.measure[0] for a in rows.ambiguities_of("rival")]
-    held = [row.name for row in rows.parameters if row.pushed and not row.at_limit]
+    held = [row.name for row in rows.parameters if row.on_bound and not row.at_limit]
     cures = (
-        Step("Give ", held, " more room under `ranges`, or a value under `fixed`: an end of the "
-             "range decides now."),
+        Step("Give ", held, " more room under `ranges`, or a value under `fixed`: now an end of "
+             "the range decides."),
         Step("Measure ", rival, ", to tell which of the sets of parameters below it is."),
         Step("Measure ", [name for name in measure if name not in starts], " by other means (an "
              "ohmmeter, a scale, a data sheet) and give the values under `fixed` in a file for "
