@@ -5,32 +5,34 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from sysid.campaigns.runs import Campaign, Outcome, Run, Spread, campaign, combinations
-from sysid.engine.simulation import BatchResult, BatchSimulator, Status
-from sysid.engine.stepper import Stepper
-from sysid.fitting.free_run import free_run
-from sysid.identifiability.analysis import Identifiability, TiedGroup, identifiability
-from sysid.identifiability.combination import Combination
-from sysid.judging.comparison import Candidate, Comparison, compare
-from sysid.problem.data import Dataset, output_scale
-from sysid.problem.given import Given
-from sysid.problem.guesses import Guess, guess_ranges, regression
-from sysid.problem.metrics import Metrics, evaluate, fit_percent, msd, rmse
-from sysid.problem.model import (
-    Constraint,
-    Input,
-    ModelError,
-    Output,
-    Parameter,
-    ProcessModel,
-    State,
-)
-from sysid.problem.space import SearchSpace
-from sysid.response.linearization import LinearModel, equilibrium, jacobian, linearize
+# A folder has its name: it must stand here before anyone asks for it.
+from sysid.identifiability.analysis import identifiability
 
 if TYPE_CHECKING:
+    from sysid.campaigns.runs import Campaign, Outcome, Run, Spread, campaign, combinations
+    from sysid.engine.simulation import BatchResult, BatchSimulator, Status
+    from sysid.engine.stepper import Stepper
+    from sysid.fitting.free_run import free_run
     from sysid.gassi import GASSI
+    from sysid.identifiability.analysis import Identifiability, TiedGroup
+    from sysid.identifiability.combination import Combination
+    from sysid.judging.comparison import Candidate, Comparison, compare
     from sysid.linear import ARMAX, ARX, OE, select_orders
+    from sysid.problem.data import Dataset, output_scale
+    from sysid.problem.given import Given
+    from sysid.problem.guesses import Guess, guess_ranges, regression
+    from sysid.problem.metrics import Metrics, evaluate, fit_percent, msd, rmse
+    from sysid.problem.model import (
+        Constraint,
+        Input,
+        ModelError,
+        Output,
+        Parameter,
+        ProcessModel,
+        State,
+    )
+    from sysid.problem.space import SearchSpace
+    from sysid.response.linearization import LinearModel, equilibrium, jacobian, linearize
 
 __all__ = [
     "ARMAX",
@@ -82,14 +84,26 @@ __all__ = [
 ]
 
 
-# scikit-learn takes most of a second to import; only the estimators need it.
-_LAZY = {
-    "ARMAX": "sysid.linear",
-    "ARX": "sysid.linear",
-    "GASSI": "sysid.gassi",
-    "OE": "sysid.linear",
-    "select_orders": "sysid.linear",
+# What a command does not use it does not import: scikit-learn alone takes most of a second.
+_NAMES = {
+    "sysid.campaigns.runs": "Campaign Outcome Run Spread campaign combinations",
+    "sysid.engine.simulation": "BatchResult BatchSimulator Status",
+    "sysid.engine.stepper": "Stepper",
+    "sysid.fitting.free_run": "free_run",
+    "sysid.gassi": "GASSI",
+    "sysid.identifiability.analysis": "Identifiability TiedGroup",
+    "sysid.identifiability.combination": "Combination",
+    "sysid.judging.comparison": "Candidate Comparison compare",
+    "sysid.linear": "ARMAX ARX OE select_orders",
+    "sysid.problem.data": "Dataset output_scale",
+    "sysid.problem.given": "Given",
+    "sysid.problem.guesses": "Guess guess_ranges regression",
+    "sysid.problem.metrics": "Metrics evaluate fit_percent msd rmse",
+    "sysid.problem.model": "Constraint Input ModelError Output Parameter ProcessModel State",
+    "sysid.problem.space": "SearchSpace",
+    "sysid.response.linearization": "LinearModel equilibrium jacobian linearize",
 }
+_LAZY = {name: module for module, names in _NAMES.items() for name in names.split()}
 
 
 def __getattr__(name: str) -> Any:

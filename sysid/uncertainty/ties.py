@@ -8,7 +8,8 @@ import numpy as np
 from scipy.linalg import null_space
 
 from sysid.arrays import BoolArray, FloatArray
-from sysid.identifiability import identifiability, null_directions
+from sysid.identifiability import null_directions
+from sysid.identifiability.cache import kept_identifiability
 from sysid.problem.model import ModelError, ProcessModel
 from sysid.problem.space import SearchSpace
 from sysid.uncertainty.estimate import Invariant
@@ -53,6 +54,32 @@ class Ties:
         tied: list[bool] = np.any(self.directions != 0.0, axis=0).tolist()
         return tied
 
+    def apart(self, space: SearchSpace, begin: FloatArray, end: FloatArray) -> FloatArray:
+        """How far a chromosome is from another in search coordinates, (n_free,), up to the ties.
+
+        Of what is tied it is the least move that changes the combinations as much: along a valley
+        of the equations, straight or bent, nothing is apart.
+        """
+        moved, tied = space.encode(end) - space.encode(begin), np.array(self.bound, dtype=bool)
+        if len(self.combinations) < np.count_nonzero(tied) - len(self.directions):
+            return moved  # not all of them have a name
+        first, last = named_values(space, begin), named_values(space, end)
+        increments = np.where(space.log, begin, 1.0)
+        rows, changes = [], []
+        for combination in self.combinations:
+            gradient = free_gradient(combination, space, first) * increments
+            before, after = combination.value(first), combination.value(last)
+            ratio = after / before if before else 0.0
+            # The logarithm of a product is straight in logarithms.
+            change = before * np.log(ratio) if ratio > 0.0 else after - before
+            size = float(np.linalg.norm(gradient))
+            if size > 0.0:
+                rows.append(gradient[tied] / size)
+                changes.append(change / size)
+        if rows:
+            moved[tied] = np.linalg.lstsq(np.array(rows), np.array(changes), rcond=1e-9)[0]
+        return moved
+
     def groups(self) -> list[tuple[list[int], FloatArray]]:
         """Places of parameters that hang together, and their directions (k, n_free)."""
         groups: list[tuple[set[int], list[int]]] = []
@@ -73,7 +100,7 @@ def ties(sensitivity: Sensitivity) -> Ties:
     counted = np.flatnonzero(objective.weights > 0.0)
     try:
         shown = model.with_outputs([model.output_names[j] for j in counted])
-        result = identifiability(shown, sensors=False)
+        result = kept_identifiability(shown)
     except (ModelError, ArithmeticError):
         return Ties(np.zeros((0, len(space.names))))
     combinations = [

@@ -1,0 +1,119 @@
+"""What the equations tie: kept on disk between runs, and no distance between minima."""
+
+import math
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sysid import Input, Output, Parameter, ProcessModel, SearchSpace, State
+from sysid.identifiability import cache
+from sysid.identifiability.cache import kept_identifiability
+from sysid.uncertainty.ties import Ties
+
+
+def shaft_derivative(x, u, p):
+    return ((u[0] - p[2] * x[0]) / (p[0] + p[1]),)
+
+
+def heavier_derivative(x, u, p):
+    return ((u[0] - p[2] * p[0] * x[0]) / (p[0] + p[1]),)
+
+
+def shaft(**changes):
+    names = ("J_m", "kg*m^2"), ("J_b", "kg*m^2"), ("B", "N*m*s/rad")
+    settings = {
+        "name": "shaft",
+        "states": (State("omega", "rad/s"),),
+        "inputs": (Input("torque", "N*m"),),
+        "outputs": (Output("omega", "rad/s"),),
+        "parameters": tuple(Parameter(name, unit, 1.0, 0.01, 100.0, "log") for name, unit in names),
+        "derivative": shaft_derivative,
+    }
+    return ProcessModel(**(settings | changes))
+
+
+@pytest.fixture
+def analyses(monkeypatch, tmp_path):
+    """Models that are analysed, with a cache folder that begins empty."""
+    tmp_path.chmod(0o700)
+    monkeypatch.setenv("RIG_CACHE_DIR", str(tmp_path))
+    models, analyse = [], cache.identifiability
+
+    def counted(model, **options):
+        models.append(model)
+        return analyse(model, **options)
+
+    monkeypatch.setattr(cache, "identifiability", counted)
+    return models
+
+
+def combinations(result):
+    return [combination.text for group in result.tied for combination in group.combinations]
+
+
+def test_the_same_equations_are_analysed_once(analyses):
+    first, second = kept_identifiability(shaft()), kept_identifiability(shaft())
+    assert len(analyses) == 1
+    assert combinations(first) == combinations(second) == ["J_m + J_b"]
+    np.testing.assert_array_equal(first.tied[0].directions, second.tied[0].directions)
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        shaft(derivative=heavier_derivative),
+        shaft().with_parameters(J_b={"fixed": True}),
+        shaft().with_parameters(B={"nominal": 2.0}),
+        replace(shaft(), states=(State("omega", "rad/s", initial_range=(-1.0, 1.0)),)),
+    ],
+    ids=["equations", "fixed", "nominal", "start"],
+)
+def test_whatever_changes_in_a_model_it_is_analysed_anew(analyses, changed):
+    kept_identifiability(shaft())
+    kept_identifiability(changed)
+    assert len(analyses) == 2
+
+
+def test_a_file_that_was_cut_short_is_made_anew(analyses, tmp_path):
+    kept_identifiability(shaft())
+    (file,) = tmp_path.glob("identifiability_*.pickle")
+    file.write_bytes(file.read_bytes()[:-20])
+    assert combinations(kept_identifiability(shaft())) == ["J_m + J_b"]
+    kept_identifiability(shaft())
+    assert len(analyses) == 2  # the second time it was whole again
+
+
+def valley():
+    """Ties of the shaft at J_m = 8, J_b = 2, B = 1, and its search space."""
+    space, at = SearchSpace.of(shaft()), np.array([8.0, 2.0, 1.0])
+    (group,) = kept_identifiability(shaft()).tied
+    return Ties.of(space, at, group.combinations, group.parameters), space, at
+
+
+def test_along_a_bent_valley_nothing_is_apart():
+    ties, space, at = valley()
+    # On a logarithmic scale the line of equal sums is bent: its tangent leads away from it.
+    end = np.array([5.0, 5.0, 1.0])
+    straight = space.encode(end) - space.encode(at)
+    assert abs(straight @ [0.8, 0.2, 0.0]) > 0.1
+    assert ties.apart(space, at, end) == pytest.approx(np.zeros(3), abs=1e-9)
+
+
+def test_across_a_valley_it_is_apart_by_what_its_combination_changes():
+    ties, space, at = valley()
+    moved = ties.apart(space, at, np.array([15.0, 5.0, 3.0]))
+    # The sum doubles: by its slopes 0.8 and 0.2 the move makes the logarithm of two.
+    assert moved @ [0.8, 0.2, 0.0] == pytest.approx(math.log(2.0))
+    assert moved[2] == pytest.approx(math.log(3.0))
+
+
+def test_a_process_model_is_made_without_what_identifies_it():
+    code = (
+        "import sys; from sysid import ProcessModel, State; "
+        "print([m for m in ('sklearn', 'scipy.optimize', 'joblib', 'numba') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
