@@ -75,7 +75,8 @@ async def _serve(watch: Watch, port: int, ready: Callable[[str], None]) -> None:
         server.stop()
         http.close_streams()
         # Whoever waited for a tab to read has heard of that once the page is free again.
-        await asyncio.gather(*(each.with_document_locked(int) for each in server.get_sessions()))
+        for session in server.get_sessions():
+            await session.with_document_locked(int)
         for number, handler in before:
             signal.signal(number, handler)
 

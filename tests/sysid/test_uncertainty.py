@@ -772,8 +772,8 @@ def test_logs_that_agree_change_nothing():
 
 def test_errors_of_the_simulation_are_no_disagreement():
     """Each log wants other parameters by what double precision rounds, and that is nothing."""
-    slopes = 1.0 + 1e-9 * np.array([-2.0, 1.0, -1.0, 3.0, 0.0, -1.0])
-    result = slopes_problem().tell(records=logs_with(slopes, sigma=1e-11))
+    slopes = 1.0 + 1e-12 * np.array([-2.0, 1.0, -1.0, 3.0, 0.0, -1.0])
+    result = slopes_problem().tell(records=logs_with(slopes, sigma=1e-14))
     assert result.disagreement == 1.0
 
 
