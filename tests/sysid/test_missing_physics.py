@@ -10,7 +10,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.stress import FRICTION, MODEL, TRUTH, WITH_FRICTION, cases, tried
+from benchmarks._stress_cases import FRICTION, MODEL, TRUTH, WITH_FRICTION, cases
+from benchmarks.stress import tried
 from sysid import Dataset
 from sysid.gassi import GASSI
 from sysid.judging.disturbed import DisturbedRun
@@ -52,7 +53,7 @@ def test_with_a_known_noise_all_that_is_above_it_is_told():
 
 def test_a_variant_that_the_data_ask_for_is_fitted_and_ranked():
     model = replace(MODEL, variants=lambda: {"friction=dry": WITH_FRICTION})
-    training, validation = CASES["Coulomb friction"].records(1)
+    (training,), validation = CASES["Coulomb friction"].records(1)
     estimator = GASSI(model, population=60, generations=12).fit(training)
     assert estimator.parameters_["B"] > 2.0 * TRUTH["B"]
     verdict = verdict_of(estimator, [training], [validation])
@@ -71,9 +72,9 @@ def test_a_variant_that_the_data_ask_for_is_fitted_and_ranked():
 
 def test_what_is_added_to_an_equation_moves_outputs_as_a_model_with_it_would():
     """A cubic drag, by the disturbed run and by SciPy's integration of a model that has it."""
-    training, _ = CASES["motor"].records(0)
+    (training,), _ = CASES["motor"].records(0)
     record = Dataset(training.inputs[:150], np.zeros((150, 2)), training.dt)
-    vector, start = np.array(list(TRUTH.values())), np.zeros(2)
+    vector, start = np.array([TRUTH[name] for name in MODEL.parameter_names]), np.zeros(2)
     run = DisturbedRun(MODEL, vector, record, start)
     added = np.zeros_like(run.states)
     added[:, 1] = -(run.states[:, 1] ** 3)
