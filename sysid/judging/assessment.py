@@ -46,8 +46,9 @@ _MUCH, _WANDERS = 0.025, 0.25
 # than noise, and the probability below which it is not by chance.
 _ABOVE_NOISE, _BY_CHANCE = 1.25, 0.01
 # Correlation of two outputs' residuals that is no sensor's; rank correlation of their size with an
-# output's rate of change; and how far apart parameters of parts of the data are, in parts of chance.
+# output's rate of change; how far apart parameters of parts of the data are, in parts of chance.
 _SHARED, _BY_SPEED, _DISAGREEING = 0.3, 0.2, 1.5
+_ROUNDING = 2e-4  # of an output's deviation, below which errors may be those of a simulation
 # Standard deviations by which what is missing moves a parameter: an interval reaches 1.96. And
 # share of the residuals that it explains, from where it counts whatever it moves.
 _MOVED, _LARGE = 1.5, 0.25
@@ -353,16 +354,14 @@ def _unexplained(model: ProcessModel, results: Sequence[RecordResult]) -> Iterat
 
 def _patterns(model: ProcessModel, results: Sequence[RecordResult]) -> Iterator[str]:
     """Reasons: residuals that are no sensor's noise, whatever their size."""
-    shared, by_speed = (
-        np.max([values for values in column if values is not None], axis=0, initial=0.0)
-        for column in ([r.shared for r in results], [r.by_speed for r in results])
-    )
+    shared = _largest(results, [result.shared for result in results])
+    by_speed = _largest(results, [result.by_speed for result in results])
     together = [n for n, size in zip(model.output_names, shared, strict=True) if size > _SHARED]
     if together:
         yield (
             f"{' and '.join(together)} err together (correlation {shared.max():.2f}), as "
-            "sensors do not: something acts in the plant that the model lacks, and parameters may be off by "
-            "more than their intervals."
+            "sensors do not: something acts in the plant that the model lacks, and parameters may "
+            "be off by more than their intervals."
         )
     for name, size in zip(model.output_names, by_speed, strict=True):
         if size > _BY_SPEED:
@@ -371,6 +370,16 @@ def _patterns(model: ProcessModel, results: Sequence[RecordResult]) -> Iterator[
                 "of sampling that are not those of the log, or a time constant that varies. "
                 "Parameters may be off by more than their intervals."
             )
+
+
+def _largest(results: Sequence[RecordResult], values: Sequence[FloatArray | None]) -> FloatArray:
+    """Of each output the largest over the records where its error is more than rounding."""
+    largest = np.zeros(len(results[0].metrics.fit))
+    for result, sizes in zip(results, values, strict=True):
+        if sizes is not None:
+            noticeable = 1.0 - result.metrics.fit / 100.0 > _ROUNDING
+            largest = np.maximum(largest, np.where(noticeable, sizes, 0.0))
+    return largest
 
 
 def _disagreement(uncertainty: Uncertainty, logs: int) -> Iterator[str]:

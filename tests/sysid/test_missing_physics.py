@@ -12,7 +12,7 @@ import pytest
 
 from benchmarks._stress_cases import FRICTION, MODEL, TRUTH, WITH_FRICTION, cases
 from benchmarks.stress import tried
-from sysid import Dataset
+from sysid import BatchSimulator, Dataset, Input, Output, Parameter, ProcessModel, State
 from sysid.gassi import GASSI
 from sysid.judging.disturbed import DisturbedRun
 from sysid.judging.examination import verdict_of
@@ -93,3 +93,49 @@ def test_what_is_added_to_an_equation_moves_outputs_as_a_model_with_it_would():
     expected = (dragged - plain) / eps
     error = np.abs(change - expected).max(axis=0) / np.abs(expected).max(axis=0)
     assert np.all(error < 0.05)
+
+
+HYSTERESIS = ProcessModel(
+    name="hysteresis",
+    states=(State("z", "m"),),
+    inputs=(Input("velocity", "m/s", "foh"),),
+    outputs=(Output("force", "N"),),
+    parameters=(
+        Parameter("alpha", "N/m", 300.0, 10.0, 10_000.0, "log"),
+        Parameter("gamma", "1/m", 900.0, 50.0, 20_000.0, "log"),
+        Parameter("beta", "1/m", 500.0, 50.0, 20_000.0, "log"),
+        Parameter("c", "N*s/m", 30.0, 1.0, 1_000.0, "log"),
+    ),
+    derivative=lambda x, u, p: (u[0] - p[1] * abs(u[0]) * x[0] - p[2] * u[0] * abs(x[0]),),
+    output=lambda x, u, p: (p[0] * x[0] + p[3] * u[0],),
+)
+
+
+@pytest.mark.parametrize("noise", [0.003, 0.0], ids=["a fit of 99.7 %", "no noise at all"])
+def test_a_perfect_bouc_wen_model_is_good_down_to_rounding(noise):
+    """What is left is noise, or the error of two simulations of unequal accuracy."""
+    logs = [hysteresis_log(seed, noise) for seed in (1, 2)]
+    fitted = GASSI(HYSTERESIS, population=40, generations=8, random_state=0).fit(logs[0])
+    verdict = verdict_of(fitted, logs[:1], logs[1:])
+    fit = mean_fit(fitted, logs[1])
+    assert fit > 99.5 if noise else fit > 99.99
+    assert verdict.trust == "good", verdict.reasons
+
+
+def mean_fit(fitted, log):
+    error, y = log.outputs - fitted.predict(log), log.outputs
+    return 100.0 * (1.0 - np.linalg.norm(error) / np.linalg.norm(y - y.mean()))
+
+
+def hysteresis_log(seed, noise):
+    """Two seconds at 200 Hz of a motion of several sines."""
+    rng, n, dt = np.random.default_rng(seed), 400, 5e-3
+    t = dt * np.arange(n)
+    frequencies = np.array([0.7, 1.9, 4.3])
+    waves = np.sin(2.0 * np.pi * t[:, None] * frequencies + rng.uniform(0.0, 2.0 * np.pi, 3))
+    velocity = 0.02 * waves.sum(axis=1)
+    silent = Dataset(velocity, np.zeros((n, 1)), dt)
+    vector = HYSTERESIS.nominal * [1.3, 0.8, 1.2, 0.7]
+    force = BatchSimulator(HYSTERESIS, accuracy=1e-9).trajectories(vector, silent)[0]
+    force = force + noise * force.std() * rng.standard_normal(force.shape)
+    return Dataset(velocity, force, dt, f"log {seed}")
