@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks._stress_cases import FRICTION, MODEL, TRUTH, WITH_FRICTION, cases
+from benchmarks._stress_cases import FRICTION, MODEL, NOISE, TRUTH, WITH_FRICTION, cases
 from benchmarks.stress import tried
 from sysid import BatchSimulator, Dataset, Input, Output, Parameter, ProcessModel, State
 from sysid.gassi import GASSI
@@ -46,7 +46,7 @@ def test_a_right_model_lacks_nothing(name, seed):
 
 
 def test_with_a_known_noise_all_that_is_above_it_is_told():
-    outcome = tried(replace(CASES["friction along a turn"], known_noise=True), 0)
+    outcome = tried(replace(CASES["friction along a turn"], calibration=1.0), 0)
     assert outcome.verdict.parameters.trust == "limited"
     assert outcome.moved
 
@@ -139,3 +139,25 @@ def hysteresis_log(seed, noise):
     force = BatchSimulator(HYSTERESIS, accuracy=1e-9).trajectories(vector, silent)[0]
     force = force + noise * force.std() * rng.standard_normal(force.shape)
     return Dataset(velocity, force, dt, f"log {seed}")
+
+
+@pytest.mark.soak
+def test_what_a_search_says_of_ties_and_answers_is_the_same_for_every_seed():
+    """A motor that is told by its speed alone: voltage and load leave combinations."""
+    (training,), _ = CASES["motor"].records(3)
+    model = MODEL.with_outputs(["omega"])
+    alone = replace(
+        training, outputs=training.outputs[:, 1:], output_noise=NOISE[1:], output_zero=np.zeros(1)
+    )
+    says = set()
+    for seed in range(5):
+        fitted = GASSI(model, population=60, generations=12, random_state=seed).fit(alone)
+        uncertainty = fitted.uncertainty([alone])
+        says.add(
+            (
+                tuple((p.name, p.why, p.on_bound) for p in uncertainty.parameters),
+                tuple((a.kind, a.parameters, a.measure) for a in uncertainty.ambiguities),
+                tuple(f"{e.name} {e.low:.2g} {e.high:.2g}" for e in uncertainty.determined()),
+            )
+        )
+    assert len(says) == 1, says
