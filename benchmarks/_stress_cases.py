@@ -162,8 +162,8 @@ def excitation(rng: np.random.Generator) -> FloatArray:
 class Case:
     """The plant, what happens to its data, and the model that is fitted.
 
-    fault: of a record, with ``only_last`` of the last of several training logs. sensor: noise of
-    unit variance, (n, 2). noise: its size in parts of NOISE; calibration: what is said of it, in
+    fault: of a record, with ``only_later`` not of the first log and the validation. sensor: noise
+    of unit variance, (n, 2). noise: its size in parts of NOISE; calibration: what is said of it, in
     parts of the truth, 0 where nothing is. load_noise: of the load, a measured input [N*m].
     motors: whether every seed has a motor of its own. words: one of which names what is wrong.
     """
@@ -181,7 +181,7 @@ class Case:
     load_noise: float = 0.0
     validation: Validation = "another"
     logs: int = 1
-    only_last: bool = False
+    only_later: bool = False
     motors: bool = False
     words: tuple[str, ...] = ()
 
@@ -204,12 +204,12 @@ class Case:
     def records(self, seed: int) -> tuple[list[Dataset], Dataset]:
         """Training and validation."""
         training = [
-            self._record(seed, 1 + 10 * k, f"training {k + 1}", not self.only_last or k > 0)
+            self._record(seed, 1 + 10 * k, f"training {k + 1}", not self.only_later or k > 0)
             for k in range(self.logs)
         ]
         if self.validation == "copy":
             return training, replace(training[0], name="validation")
-        return training, self._record(seed, 2, "validation", not self.only_last)
+        return training, self._record(seed, 2, "validation", not self.only_later)
 
     def _record(self, seed: int, place: int, name: str, faulty: bool = True) -> Dataset:
         rng = np.random.default_rng([seed, place])
@@ -350,7 +350,7 @@ def _in_structure(name: str, plant: Plant, *words: str, **options: Any) -> Case:
     return Case(name, "structure", plant, words=words, **{"calibration": 0.0, **options})
 
 
-_IN_ONE_LOG: dict[str, Any] = {"logs": 3, "only_last": True}
+_IN_LATER_LOGS: dict[str, Any] = {"logs": 3, "only_later": True}
 DATA = (
     _in_data("current clipped at 90 %", each(*CURRENT, _clipped(0.9)), "ends at", "saturates"),
     _in_data("current clipped at 60 %", each(*CURRENT, _clipped(0.6)), "ends at", "saturates"),
@@ -397,11 +397,26 @@ MORE_DATA = (
     _in_data(
         "offset and outliers", both(each(*SPEED, _moved(5.0)), each(*CURRENT, _outliers(1.0)))
     ),
-    _in_data("current 1.3 times in one log", each(*CURRENT, _scaled(1.3)), **_IN_ONE_LOG),
-    _in_data("sign of the load in one log", each(*LOAD, _scaled(-1.0)), **_IN_ONE_LOG),
-    _in_data("speed late in one log", each(*SPEED, _late(2)), **_IN_ONE_LOG),
-    _in_data("current clipped in one log", each(*CURRENT, _clipped(0.6)), **_IN_ONE_LOG),
-    _in_data("load off in one log", each(*LOAD, _moved(0.02)), **_IN_ONE_LOG),
+    _in_data(
+        "current 1.3 times in later logs",
+        each(*CURRENT, _scaled(1.3)),
+        "of training",
+        **_IN_LATER_LOGS,
+    ),
+    _in_data(
+        "sign of the load in later logs",
+        each(*LOAD, _scaled(-1.0)),
+        "of training",
+        **_IN_LATER_LOGS,
+    ),
+    _in_data("speed late in later logs", each(*SPEED, _late(2)), "of training", **_IN_LATER_LOGS),
+    _in_data(
+        "current clipped in later logs",
+        each(*CURRENT, _clipped(0.6)),
+        "of training",
+        **_IN_LATER_LOGS,
+    ),
+    _in_data("load off in later logs", each(*LOAD, _moved(0.02)), "of training", **_IN_LATER_LOGS),
     _in_data("speed late, calibrated", each(*SPEED, _late(2)), "later", calibration=1.0),
     _in_data(
         "load half, noise understated", each(*LOAD, _scaled(0.5)), "times what", calibration=1 / 3

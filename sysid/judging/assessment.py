@@ -168,6 +168,8 @@ def judge(
         light.append(_lacking(alternative))
     missing = [f for f in findings or () if f.kind != "variant"]
     counting = [f for f in missing if f.farthest > _MOVED or f.share > _LARGE]
+    if not counting and _moved_together(missing) > _MOVED:
+        counting = missing
     light += map(_moving, counting)
     if not light:
         light += _unexplained(model, judged)
@@ -215,6 +217,14 @@ def _prediction(
     light += _input_traces(model, validation or training)
     light += _failing_starts(validation)
     return Statement.of(grave, light, _praise(model, validation))
+
+
+def _moved_together(findings: Sequence[Finding]) -> float:
+    """Standard deviations by which findings move a quantity, each given those before it."""
+    totals: dict[str, float] = {}
+    for move in (move for finding in findings for move in finding.moves):
+        totals[move.quantity.name] = totals.get(move.quantity.name, 0.0) + move.deviations
+    return max(map(abs, totals.values()), default=0.0)
 
 
 def _voids_only(fault: DataFault) -> bool:

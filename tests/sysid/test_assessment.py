@@ -284,6 +284,9 @@ def test_what_is_missing_counts_by_how_far_it_moves_parameters():
     assert far.parameters.reasons == (
         "speed comes later 0.002 s than the model has it (p = 1e-06); with that K_m 1 -> 1.25.",
     )
+    both = found([finding("delay", 1.0), finding("offset", 0.8)])
+    assert len(both.parameters.reasons) == 2, "together they move it by 1.8 deviations"
+    assert found([finding("delay", 1.0), finding("offset", -0.8)]).trust == "good"
     near = found([finding("delay", 0.5)])
     assert near.trust == "good" and "speed comes later" in near.notes[0]
     # A variant counts by what its own fit says.

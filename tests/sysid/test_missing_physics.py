@@ -30,9 +30,11 @@ CASES = {case.name: case for case in cases()}
         ("speed clipped at 80 %", "omega saturates near its largest values"),
         ("Coulomb friction", "a term in omega"),
         ("winding warms up", "R changes by +3"),
+        ("Coulomb friction, load's noise", "a term in omega"),
+        ("load off in later logs", "load of training 2 is -0.0"),
     ],
 )
-def test_what_is_wrong_is_named_with_its_size_where_no_noise_is_known(name, words):
+def test_what_is_wrong_is_named_with_its_size(name, words):
     outcome = tried(CASES[name], 0)
     said = " ".join((*outcome.verdict.parameters.reasons, *outcome.verdict.notes))
     assert words in said
@@ -161,3 +163,9 @@ def test_what_a_search_says_of_ties_and_answers_is_the_same_for_every_seed():
             )
         )
     assert len(says) == 1, says
+
+
+@pytest.mark.parametrize("name", ["LuGre friction", "cogging", "winding warms up fast"])
+def test_what_fits_no_function_is_not_good(name):
+    outcome = tried(CASES[name], 2)
+    assert outcome.verdict.parameters.trust == "limited" and outcome.moved
