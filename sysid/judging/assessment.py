@@ -123,20 +123,22 @@ def examine(
 
     expected: errors that a right model makes on it; None where nothing is known of them.
     """
-    residual = record.outputs - simulated
+    residual, finite = record.outputs - simulated, bool(np.all(np.isfinite(simulated)))
     systematic = None if expected is None else expected.systematic
+    shared = by_speed = None
+    if systematic is not None and finite:
+        by_speed = errors_by_speed(residual, simulated, systematic)
+        if not record.input_noise.any():  # which comes through the plant to all outputs
+            shared = shared_errors(residual, systematic)
     return RecordResult(
         record.name,
-        bool(np.all(np.isfinite(simulated))),
+        finite,
         evaluate(record.outputs, simulated),
         residual_test(residual, record.inputs, record.input_noise, systematic=systematic),
         None if expected is None else floor_test(residual, expected),
         starts,
-        # Noise of an input comes through the plant to all outputs.
-        None
-        if systematic is None or record.input_noise.any()
-        else shared_errors(residual, systematic),
-        None if systematic is None else errors_by_speed(residual, simulated, systematic),
+        shared,
+        by_speed,
     )
 
 

@@ -10,6 +10,7 @@ from scipy.stats import spearmanr
 
 from sysid.arrays import BoolArray, FloatArray
 from sysid.judging.residual_tests import residual_test
+from sysid.uncertainty.estimate import Z95
 
 _LAGS = 20  # at which two outputs' residuals are compared
 # Deviations of chance beyond which the largest of so many correlations is none of it.
@@ -30,13 +31,12 @@ def shared_errors(residual: FloatArray, systematic: FloatArray) -> FloatArray:
     [[0.0, 0.0], [0.5, 0.5]]
     """
     q = residual.shape[1]
-    largest = np.zeros(q)
-    filled = np.where(np.isfinite(residual), residual, 0.0)
-    test = residual_test(residual, filled, n_lags=_LAGS)
-    sure = np.abs(test.cross) > _SURE / 1.96 * test.cross_band
+    test = residual_test(residual, np.where(np.isfinite(residual), residual, 0.0), n_lags=_LAGS)
+    sure = np.abs(test.cross) > _SURE / Z95 * test.cross_band
     sizes = np.where(sure, np.abs(test.cross), 0.0).max(axis=0) * ~np.eye(q, dtype=np.bool_)
-    sizes[:, _explained(residual, systematic)] = sizes[_explained(residual, systematic)] = 0.0
-    largest = np.maximum(sizes.max(axis=0, initial=0.0), sizes.max(axis=1, initial=0.0))
+    explained = _explained(residual, systematic)
+    sizes[explained | explained[:, None]] = 0.0
+    largest: FloatArray = np.maximum(sizes, sizes.T).max(axis=0, initial=0.0)
     return largest
 
 
@@ -62,7 +62,9 @@ def errors_by_speed(
 
 def _explained(residual: FloatArray, systematic: FloatArray) -> BoolArray:
     """Outputs whose residuals may be what a right model leaves, (n_outputs,)."""
-    size = np.sqrt(np.nanmean(residual**2, axis=0)) if len(residual) else np.zeros(0)
+    seen = np.isfinite(residual)
+    squares = np.sum(np.where(seen, residual, 0.0) ** 2, axis=0)
+    size = np.sqrt(squares / np.maximum(seen.sum(axis=0), 1))
     expected = np.sqrt(np.mean(np.sum(systematic**2, axis=2), axis=0))
     explained: BoolArray = ~(expected < _EXPECTED * size)
     return explained
