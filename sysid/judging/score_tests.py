@@ -65,6 +65,7 @@ _MOST_SAMPLES = 10_000  # that are tested: beyond, what matters has long been si
 _LIKELY = 6  # suspects that are tested again by the colour of what they leave
 _LAGS = 20  # of what colour whitening may leave
 _NEW = 1e-2  # share of a suspect that no change of the parameters makes, below which it is theirs
+_INEXACT = 1e-2  # of the residuals' deviation, from where a simulation's error shows in them
 _FREEDOM = 1.0  # standard deviation of a coordinate before the data: a factor of e
 
 
@@ -120,7 +121,8 @@ def missing_physics(
     channels = list(channel_suspects(runs))
     # Noise of an input makes its gain look smaller: that is no fault.
     channels = [s for s in channels if s.kind != "gain" or s.name not in noisy]
-    tests = _Tests(local, uncertainty, _foreseen_noise(runs))
+    foreseen = np.concatenate([_foreseen_noise(runs), _simulation_error(runs, local)], axis=2)
+    tests = _Tests(local, uncertainty, foreseen)
     alone = [e.name for e in uncertainty.determined() if e.name in model.parameter_names]
     tests.admit([*channels, *variant_suspects(runs), *change_suspects(runs, alone)])
     tests.admit(list(in_single_records(channels, runs)))
@@ -156,6 +158,21 @@ def _foreseen_noise(runs: Sequence[DisturbedRun]) -> FloatArray:
         columns.append(np.concatenate(parts))
     n = sum(record.n_samples for record in records)
     return np.stack(columns, axis=2) if columns else np.zeros((n, runs[0].outputs.shape[1], 0))
+
+
+def _simulation_error(runs: Sequence[DisturbedRun], local: Sensitivity) -> FloatArray:
+    """What a finer integration changes in the outputs, (n_rows, n_outputs, 1); none if little."""
+    pieces = []
+    for run, rows, scale in zip(
+        runs, record_rows(local.lengths), local.objective.scales, strict=True
+    ):
+        left = local.residual[rows] * scale
+        coarse = np.where(local.seen[rows], run.record.outputs + left, run.outputs)
+        pieces.append(run.outputs - coarse)
+    error = np.concatenate(pieces)[..., None]
+    size = np.sqrt(np.mean(error[..., 0] ** 2, axis=0))
+    left = np.sqrt(np.mean(local.residual**2, axis=0)) * np.mean(local.objective.scales, axis=0)
+    return error if np.any(size > _INEXACT * left) else error[..., :0]
 
 
 class _Tests:

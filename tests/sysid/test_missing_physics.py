@@ -157,7 +157,7 @@ def test_what_a_search_says_of_ties_and_answers_is_the_same_for_every_seed():
         uncertainty = fitted.uncertainty([alone])
         says.add(
             (
-                tuple((p.name, p.why, p.on_bound) for p in uncertainty.parameters),
+                tuple((p.name, p.why) for p in uncertainty.parameters),
                 tuple((a.kind, a.parameters, a.measure) for a in uncertainty.ambiguities),
                 tuple(f"{e.name} {e.low:.2g} {e.high:.2g}" for e in uncertainty.determined()),
             )
