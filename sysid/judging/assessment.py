@@ -15,6 +15,7 @@ import numpy as np
 from sysid.arrays import BoolArray, FloatArray
 from sysid.judging.alternatives import Alternative
 from sysid.judging.expected_errors import ExpectedErrors, FloorTest, floor_test
+from sysid.judging.residual_patterns import errors_by_speed, shared_errors
 from sysid.judging.residual_tests import ResidualTest, residual_test
 from sysid.judging.score_tests import Finding, description
 from sysid.judging.starts import Starts
@@ -44,6 +45,10 @@ _MUCH, _WANDERS = 0.025, 0.25
 # Residuals in parts of what is to be expected of a right model, above which there is more in them
 # than noise, and the probability below which it is not by chance.
 _ABOVE_NOISE, _BY_CHANCE = 1.25, 0.01
+# Correlation of two outputs' residuals that is no sensor's; rank correlation of their size with an
+# output's rate of change; how far apart parameters of parts of the data are, in parts of chance.
+_SHARED, _BY_SPEED, _DISAGREEING = 0.3, 0.2, 1.5
+_ROUNDING = 2e-4  # of an output's deviation, below which errors may be those of a simulation
 # Standard deviations by which what is missing moves a parameter: an interval reaches 1.96. And
 # share of the residuals that it explains, from where it counts whatever it moves.
 _MOVED, _LARGE = 1.5, 0.25
@@ -54,7 +59,8 @@ class RecordResult:
     """A model's errors on a record; ``simulated``: whether its free run came to the end.
 
     floor: residuals in parts of what a right model leaves; None where nothing is known of that.
-    starts: initial states that were estimated from the record.
+    starts: initial states that were estimated from the record. shared, by_speed: (n_outputs,),
+    correlations as of ``shared_errors`` and ``errors_by_speed``; None where they were not tested.
     """
 
     name: str
@@ -63,6 +69,8 @@ class RecordResult:
     residuals: ResidualTest
     floor: FloorTest | None = None
     starts: Starts | None = None
+    shared: FloatArray | None = None
+    by_speed: FloatArray | None = None
 
 
 @dataclass(frozen=True)
@@ -115,15 +123,22 @@ def examine(
 
     expected: errors that a right model makes on it; None where nothing is known of them.
     """
-    residual = record.outputs - simulated
+    residual, finite = record.outputs - simulated, bool(np.all(np.isfinite(simulated)))
     systematic = None if expected is None else expected.systematic
+    shared = by_speed = None
+    if systematic is not None and finite:
+        by_speed = errors_by_speed(residual, simulated, systematic)
+        if not record.input_noise.any():  # which comes through the plant to all outputs
+            shared = shared_errors(residual, systematic)
     return RecordResult(
         record.name,
-        bool(np.all(np.isfinite(simulated))),
+        finite,
         evaluate(record.outputs, simulated),
         residual_test(residual, record.inputs, record.input_noise, systematic=systematic),
         None if expected is None else floor_test(residual, expected),
         starts,
+        shared,
+        by_speed,
     )
 
 
@@ -155,9 +170,15 @@ def judge(
         light.append(_lacking(alternative))
     missing = [f for f in findings or () if f.kind != "variant"]
     counting = [f for f in missing if f.farthest > _MOVED or f.share > _LARGE]
+    if not counting and _moved_together(missing) > _MOVED:
+        counting = missing
     light += map(_moving, counting)
     if not light:
         light += _unexplained(model, judged)
+    if not light:
+        light += _patterns(model, (*training, *validation))
+    if not light and uncertainty is not None:
+        light += _disagreement(uncertainty, len(training))
     if uncertainty is None:
         light.append("The parameters have no intervals, so how surely each is known is not known.")
     else:
@@ -200,6 +221,14 @@ def _prediction(
     light += _input_traces(model, validation or training)
     light += _failing_starts(validation)
     return Statement.of(grave, light, _praise(model, validation))
+
+
+def _moved_together(findings: Sequence[Finding]) -> float:
+    """Standard deviations by which findings move a quantity, each given those before it."""
+    totals: dict[str, float] = {}
+    for move in (move for finding in findings for move in finding.moves):
+        totals[move.quantity.name] = totals.get(move.quantity.name, 0.0) + move.deviations
+    return max(map(abs, totals.values()), default=0.0)
 
 
 def _voids_only(fault: DataFault) -> bool:
@@ -335,6 +364,47 @@ def _unexplained(model: ProcessModel, results: Sequence[RecordResult]) -> Iterat
                 f"What is left of {output} follows {' and '.join(inputs)}: parameters that act on "
                 "it may be off by more than their intervals."
             )
+
+
+def _patterns(model: ProcessModel, results: Sequence[RecordResult]) -> Iterator[str]:
+    """Reasons: residuals that are no sensor's noise, whatever their size."""
+    shared = _largest(results, [result.shared for result in results])
+    by_speed = _largest(results, [result.by_speed for result in results])
+    together = [n for n, size in zip(model.output_names, shared, strict=True) if size > _SHARED]
+    if together:
+        yield (
+            f"{' and '.join(together)} err together (correlation {shared.max():.2f}), as "
+            "sensors do not: something acts in the plant that the model lacks, and parameters may "
+            "be off by more than their intervals."
+        )
+    for name, size in zip(model.output_names, by_speed, strict=True):
+        if size > _BY_SPEED:
+            yield (
+                f"{name} errs more the faster it changes (rank correlation {size:.2f}): instants "
+                "of sampling that are not those of the log, or a time constant that varies. "
+                "Parameters may be off by more than their intervals."
+            )
+
+
+def _largest(results: Sequence[RecordResult], values: Sequence[FloatArray | None]) -> FloatArray:
+    """Of each output the largest over the records where its error is more than rounding."""
+    largest = np.zeros(len(results[0].metrics.fit))
+    for result, sizes in zip(results, values, strict=True):
+        if sizes is not None:
+            noticeable = 1.0 - result.metrics.fit / 100.0 > _ROUNDING
+            largest = np.maximum(largest, np.where(noticeable, sizes, 0.0))
+    return largest
+
+
+def _disagreement(uncertainty: Uncertainty, logs: int) -> Iterator[str]:
+    """Reason: parts of the data that want parameters of their own."""
+    ratio = uncertainty.disagreement**0.5
+    if ratio > _DISAGREEING:
+        parts = "Logs" if logs > 1 else "Parts of the log"
+        yield (
+            f"{parts} want parameters of their own, {ratio:.1f} times as far apart as noise "
+            "explains: something is missing that is not the same throughout."
+        )
 
 
 def _parameters_on_bounds(uncertainty: Uncertainty) -> Iterator[str]:

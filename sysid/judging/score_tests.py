@@ -38,6 +38,8 @@ from sysid.judging.suspects import (
     dominant_shape,
     function_suspects,
     head,
+    in_single_records,
+    likely_noise,
     variant_suspects,
 )
 from sysid.problem.model import ModelError
@@ -63,6 +65,7 @@ _MOST_SAMPLES = 10_000  # that are tested: beyond, what matters has long been si
 _LIKELY = 6  # suspects that are tested again by the colour of what they leave
 _LAGS = 20  # of what colour whitening may leave
 _NEW = 1e-2  # share of a suspect that no change of the parameters makes, below which it is theirs
+_INEXACT = 1e-2  # of the residuals' deviation, from where a simulation's error shows in them
 _FREEDOM = 1.0  # standard deviation of a coordinate before the data: a factor of e
 
 
@@ -118,12 +121,12 @@ def missing_physics(
     channels = list(channel_suspects(runs))
     # Noise of an input makes its gain look smaller: that is no fault.
     channels = [s for s in channels if s.kind != "gain" or s.name not in noisy]
-    tests = _Tests(local, uncertainty)
+    foreseen = np.concatenate([_foreseen_noise(runs), _simulation_error(runs, local)], axis=2)
+    tests = _Tests(local, uncertainty, foreseen)
     alone = [e.name for e in uncertainty.determined() if e.name in model.parameter_names]
     tests.admit([*channels, *variant_suspects(runs), *change_suspects(runs, alone)])
-    named = any(finding.kind == "variant" for finding in tests.findings)
-    # Noise of an input acts through all equations, as do functions of what it drives.
-    if not named and not noisy:
+    tests.admit(list(in_single_records(channels, runs)))
+    if not any(finding.kind == "variant" for finding in tests.findings):
         tests.admit([*function_suspects(runs), *disturbance_suspects(runs)])
     return tuple(tests.findings)
 
@@ -138,13 +141,48 @@ def _runs(local: Sensitivity) -> list[DisturbedRun]:
     return runs
 
 
+def _foreseen_noise(runs: Sequence[DisturbedRun]) -> FloatArray:
+    """What the noise of inputs is likely to have done to the outputs, (n_rows, n_outputs, k).
+
+    Given what was measured, noise is not zero in the mean: a Wiener filter tells what of an input
+    it probably is. Uncorrelated with any linear function of what was measured is only the rest.
+    """
+    records = [run.record for run in runs]
+    columns = []
+    for i in np.flatnonzero(np.any([record.input_noise for record in records], axis=0)):
+        parts = []
+        for run in runs:
+            noise = np.zeros(run.record.inputs.shape)
+            noise[:, i] = likely_noise(run.record.inputs[:, i], float(run.record.input_noise[i]))
+            parts.append(run.driven(noise))
+        columns.append(np.concatenate(parts))
+    n = sum(record.n_samples for record in records)
+    return np.stack(columns, axis=2) if columns else np.zeros((n, runs[0].outputs.shape[1], 0))
+
+
+def _simulation_error(runs: Sequence[DisturbedRun], local: Sensitivity) -> FloatArray:
+    """What a finer integration changes in the outputs, (n_rows, n_outputs, 1); none if little."""
+    pieces = []
+    for run, rows, scale in zip(
+        runs, record_rows(local.lengths), local.objective.scales, strict=True
+    ):
+        left = local.residual[rows] * scale
+        coarse = np.where(local.seen[rows], run.record.outputs + left, run.outputs)
+        pieces.append(run.outputs - coarse)
+    error = np.concatenate(pieces)[..., None]
+    size = np.sqrt(np.mean(error[..., 0] ** 2, axis=0))
+    left = np.sqrt(np.mean(local.residual**2, axis=0)) * np.mean(local.objective.scales, axis=0)
+    return error if np.any(size > _INEXACT * left) else error[..., :0]
+
+
 class _Tests:
     """Regression of residuals, to which suspects are admitted one after another.
 
     Columns are (n_residuals, n_outputs, k), in parts of the outputs' scales.
     """
 
-    def __init__(self, local: Sensitivity, uncertainty: Uncertainty) -> None:
+    def __init__(self, local: Sensitivity, uncertainty: Uncertainty, foreseen: FloatArray) -> None:
+        """foreseen: changes (n_residuals, n_outputs, k) that are there whatever is missing."""
         self.findings: list[Finding] = []
         self._local, self._residual = local, -local.residual
         self._estimates = [e for e in uncertainty.determined() if e.std]
@@ -157,9 +195,14 @@ class _Tests:
             ]
         )
         zeros = [zero[..., None] for zero in zero_errors(local)]
-        self._columns = np.concatenate([local.slopes, *zeros], axis=2)
+        foreseen = foreseen / self._scales[..., None]
+        self._columns = np.concatenate([local.slopes, *zeros, foreseen], axis=2)
         self._free = np.concatenate(
-            [1.0 / (_FREEDOM * spans(local.objective, local.chromosome)), np.ones(len(zeros))]
+            [
+                1.0 / (_FREEDOM * spans(local.objective, local.chromosome)),
+                np.ones(len(zeros)),
+                np.zeros(foreseen.shape[2]),
+            ]
         )
         noises = list(input_noises(local))
         self._noises = np.stack(noises, axis=2) if noises else None

@@ -69,6 +69,42 @@ def channel_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
             yield Suspect(kind, given.name, unit or given.unit, np.concatenate(change)[..., None])
 
 
+def in_single_records(
+    suspects: Sequence[Suspect], runs: Sequence[DisturbedRun]
+) -> Iterator[Suspect]:
+    """Faults of channels as they would be in one of several records alone."""
+    if len(runs) == 1:
+        return
+    ends = np.cumsum([run.record.n_samples for run in runs])
+    for run, end in zip(runs, ends.tolist(), strict=True):
+        rows = slice(end - run.record.n_samples, end)
+        for suspect in suspects:
+            changes = np.zeros_like(suspect.changes)
+            changes[rows] = suspect.changes[rows]
+            yield replace(suspect, name=f"{suspect.name} of {run.record.name}", changes=changes)
+
+
+def likely_noise(signal: FloatArray, deviation: float) -> FloatArray:
+    """What of a signal (n,) is likely to be its white noise of this deviation: Wiener's filter.
+
+    >>> rng = np.random.default_rng(0)
+    >>> noise = 0.1 * rng.standard_normal(1000)
+    >>> likely = likely_noise(np.sin(0.01 * np.arange(1000)) + noise, 0.1)
+    >>> bool(np.corrcoef(likely, noise)[0, 1] > 0.9)
+    True
+    """
+    n = len(signal)
+    spectrum = np.fft.rfft(signal - signal.mean())
+    power = np.abs(spectrum) ** 2 / n
+    width = max(int(np.sqrt(len(power))) // 2, 1)
+    padded = np.pad(power, width, mode="reflect") if len(power) > width else power
+    kernel = np.ones(2 * width + 1) / (2 * width + 1)
+    smooth = np.convolve(padded, kernel, "valid") if len(padded) > len(power) else power
+    share = np.minimum(deviation**2 / np.maximum(smooth, 1e-300), 1.0)
+    likely: FloatArray = np.fft.irfft(spectrum * share, n)
+    return likely
+
+
 _Fault = tuple[Kind, str, Callable[[DisturbedRun], FloatArray]]
 
 

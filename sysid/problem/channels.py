@@ -172,6 +172,10 @@ def spikes(values: FloatArray, inputs: FloatArray) -> Spikes | None:
     low, high = around.min(axis=0), around.max(axis=0)
     beyond = np.maximum(middle - high, low - middle)
     returned |= beyond > 0.9 * (high - low)
+    # A response that rings turns as sharply, but on a curve that its neighbours foretell.
+    far_before, near_before, near_after, far_after = around
+    curve = (4.0 * (near_before + near_after) - far_before - far_after) / 6.0
+    returned[1:-1] &= (np.abs(middle - curve) > 0.5 * np.abs(away))[1:-1]
     finite = away[np.isfinite(away)]
     if len(finite) < 20:
         return None
@@ -205,7 +209,10 @@ def _jumps(inputs: FloatArray) -> BoolArray:
     jumps = np.zeros(len(inputs), dtype=np.bool_)
     for column in inputs.T:
         steps = np.abs(np.diff(column))
-        jumps[1:] |= (steps > 0.05 * steps.max(initial=0.0)) & (steps > 10.0 * np.median(steps))
+        largest = max(float(steps.max(initial=0.0)), float(np.abs(column[0])))
+        jumps[1:] |= (steps > 0.01 * largest) & (steps > 10.0 * np.median(steps))
+        # A record that begins under an input begins with its jump.
+        jumps[0] |= abs(column[0]) > 0.01 * largest > 0.0
     return jumps
 
 

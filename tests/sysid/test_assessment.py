@@ -284,6 +284,9 @@ def test_what_is_missing_counts_by_how_far_it_moves_parameters():
     assert far.parameters.reasons == (
         "speed comes later 0.002 s than the model has it (p = 1e-06); with that K_m 1 -> 1.25.",
     )
+    both = found([finding("delay", 1.0), finding("offset", 0.8)])
+    assert len(both.parameters.reasons) == 2, "together they move it by 1.8 deviations"
+    assert found([finding("delay", 1.0), finding("offset", -0.8)]).trust == "good"
     near = found([finding("delay", 0.5)])
     assert near.trust == "good" and "speed comes later" in near.notes[0]
     # A variant counts by what its own fit says.
@@ -368,3 +371,47 @@ def test_much_that_wanders_makes_parameters_doubtful(size, pole, trust):
     if trust == "limited":
         (reason,) = found.reasons
         assert " % of speed's variance is left, and wanders" in reason
+
+
+def nothing_expected(data):
+    return expected([np.nan, np.nan], data)
+
+
+@pytest.mark.parametrize(("push", "trust"), [(1.0, "limited"), (0.2, "good")])
+def test_an_error_that_two_outputs_share_is_no_sensors(push, trust):
+    def pushed(seed, **noise):
+        data = record(seed, **noise)
+        rng = np.random.default_rng([seed, 4])
+        wrong = rng.standard_normal((N, 2)) + push * rng.standard_normal((N, 1))
+        return examine(data, data.outputs - NOISE * wrong, nothing_expected(data))
+
+    judged = verdict([pushed(1)], [pushed(2)])
+    assert judged.parameters.trust == trust
+    if trust == "limited":
+        assert "speed and current err together (correlation 0." in judged.parameters.reasons[0]
+    # The noise of a measured input comes through the plant to both.
+    torque = {"input_noise": np.array([0.0, 0.1])}
+    assert verdict([pushed(1, **torque)], [pushed(2, **torque)]).trust == "good"
+
+
+def test_errors_that_grow_with_the_rate_of_change_are_no_sensors():
+    def jittered(seed, jitter):
+        data = record(seed)
+        smooth = lfilter([0.1], [1.0, -0.9], data.inputs, axis=0)
+        rng = np.random.default_rng([seed, 5])
+        errors = NOISE * rng.standard_normal((N, 2))
+        errors += jitter * rng.standard_normal((N, 2)) * np.gradient(smooth, axis=0)
+        data = replace(data, outputs=smooth + errors)
+        return examine(data, smooth, nothing_expected(data))
+
+    judged = verdict([jittered(1, 1.0)], [jittered(2, 1.0)])
+    assert judged.predicted.trust == "good"
+    assert judged.parameters.reasons[0].startswith("speed errs more the faster it changes")
+    assert verdict([jittered(1, 0.0)], [jittered(2, 0.0)]).trust == "good"
+
+
+def test_parts_of_a_log_that_want_their_own_parameters_make_them_doubtful():
+    apart = replace(told(""), disagreement=9.0)
+    (reason,) = verdict(uncertainty=apart).parameters.reasons
+    assert reason.startswith("Parts of the log want parameters of their own, 3.0 times")
+    assert verdict(uncertainty=replace(apart, disagreement=2.0)).trust == "good"
