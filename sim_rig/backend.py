@@ -24,6 +24,7 @@ from sysid import ProcessModel, Stepper
 _BLOCK = 256  # ticks simulated at once in open loop
 _REAL_TIME_BLOCK = 0.02  # s between deliveries of a device in real time
 _THETA = 6  # the plant's state
+_MOTION = [_THETA, 4]  # angle and speed
 _ACCURACY = 1e-4  # of the plant's states in parts of what matters: a tenth of the noise and below
 _INTERLOCK = int(hal.Flag.INTERLOCK)
 _OUTPUT_BITS, _IDEAL_BITS = 16, 24  # of the converters that a board would have
@@ -125,8 +126,9 @@ class SimulatedDevice:
         self._n_inputs = len(self._plant.inputs)
         self._single = np.zeros((2, self._n_inputs))
         self._steppers: dict[float, Stepper] = {}
-        # Draws of their own, so that the noise stays what it is without faults.
+        # Draws of their own, so that the noise stays what it is without them.
         self._chance = np.random.default_rng([options.seed, 1])
+        self._phase = float(np.random.default_rng([options.seed, 2]).random())
         self._late: list[tuple[int, FloatArray]] = []
         self._queue = CommandQueue()
         self._clock = 0.0  # device time since it was switched on [s], at the next tick
@@ -139,7 +141,7 @@ class SimulatedDevice:
         self._warm_up()
         self._open = True
         self._x = self._plant.initial_state
-        self._encoder = EncoderCounter(4 * self.options.encoder_cycles)
+        self._encoder = EncoderCounter(4 * self.options.encoder_cycles, self._phase)
         return hal.DeviceInfo(
             name="simulated rig",
             max_rate=20_000.0,
@@ -294,7 +296,7 @@ class SimulatedDevice:
         n, tick, per_tick = len(applied), self._queue.tick, self._stepper.n_steps
         trace, true = self._stepper.advance(self._x, self._inputs(applied))
         times = self._origin, tick * per_tick, 1.0 / (self._rate * per_tick), per_tick
-        counts, rates = self._encoder.latch(trace[:, _THETA], self._x[_THETA], *times)
+        counts, rates = self._encoder.latch(trace[:, _MOTION], self._x[_MOTION], *times)
         if self.options.ideal:
             per_radian = self._encoder.counts_per_turn / (2.0 * math.pi)
             counts, rates = true[:, 3] * per_radian, true[:, 4] * per_radian

@@ -7,6 +7,7 @@ import numpy as np
 from sysid.arrays import BoolArray, FloatArray, IntArray
 from sysid.engine.compiler import Filter, Kernels, explained_errors
 from sysid.engine.scheme import LANES, work_area
+from sysid.engine.windows import average
 from sysid.problem.data import Dataset
 from sysid.problem.model import ProcessModel
 from sysid.threads import Workers
@@ -76,6 +77,8 @@ class RecordSimulator:
         else:
             self._measured, self._weights = outputs, np.where(missing, 0.0, 1.0 / self.scale)
         self._weight = self._weights.max(axis=0)
+        self._windows = record.windows.reshape(-1, outputs.shape[1], 2) / record.dt  # in samples
+        self._averaged = np.flatnonzero(self._windows.any(axis=(0, 2)))
         # Where an input is largest is where a model driven through it is fastest.
         peaks = np.argmax(np.abs(record.inputs), axis=0) if record.inputs.shape[1] else []
         self._extremes = record.inputs[np.unique(np.array([0, *peaks], dtype=np.int64))]
@@ -172,6 +175,9 @@ class RecordSimulator:
                 weights, noise**2, of_inputs, np.array(spread), float(corrects), start,
                 np.ascontiguousarray(parameters[padded].T), record.dt, n_steps, sums, kept,
             )  # fmt: skip
+        if len(self._averaged) and not corrects:
+            kept *= self._averaged_in_instants(parameters, starts, lanes, n_steps)
+            sums[: len(noise)] = np.einsum("kjl,kjl->jl", kept, kept)
         values[:] = kept[..., : len(lanes)]
         sse, estimates = (half.T[: len(lanes)] for half in np.split(sums, 2))
         return sse, self._excess(sse, estimates, np.full(len(lanes), n_steps * len(kept)))
@@ -190,11 +196,59 @@ class RecordSimulator:
         n_samples: how much of the record is simulated. residuals: (n_samples, n_outputs, LANES)
         to fill, or of no size to keep none.
         """
+        if len(self._averaged):
+            return self._averaged_block(parameters, starts, lanes, n_steps, n_samples, residuals)
+        signals = self._measured[:n_samples], self._weights[:n_samples]
+        return self._plain_block(parameters, starts, lanes, n_steps, signals, residuals)
+
+    def _averaged_in_instants(
+        self, parameters: FloatArray, starts: FloatArray | None, lanes: IntArray, n_steps: int
+    ) -> FloatArray:
+        """Residuals over the record's windows in parts of those at the instants."""
+        shape = *self._measured.shape, LANES
+        averaged, instant, share = (np.full(shape, value) for value in (np.nan, np.nan, 1.0))
+        signals = self._measured, self._weights
+        self._averaged_block(parameters, starts, lanes, n_steps, len(averaged), averaged)
+        self._plain_block(parameters, starts, lanes, n_steps, signals, instant)
+        return np.divide(averaged, instant, out=share, where=instant != 0.0)
+
+    def _averaged_block(
+        self,
+        parameters: FloatArray,
+        starts: FloatArray | None,
+        lanes: IntArray,
+        n_steps: int,
+        n_samples: int,
+        residuals: FloatArray,
+    ) -> tuple[FloatArray, FloatArray]:
+        """As ``block``, of outputs over the record's windows."""
+        shape = n_samples, self._measured.shape[1]
+        kept = residuals if len(residuals) else np.full((*shape, LANES), np.nan)
+        signals = np.zeros(shape), np.ones(shape)
+        _, estimates = self._plain_block(parameters, starts, lanes, n_steps, signals, kept)
+        for j in self._averaged:
+            kept[:, j] = average(kept[:, j], self._windows[:n_samples, j])
+        with np.errstate(all="ignore"):
+            kept -= self._measured[:n_samples, :, None]
+            kept *= self._weights[:n_samples, :, None]
+            sse = np.einsum("kjl,kjl->lj", kept, kept)
+        return sse[: len(lanes)], estimates
+
+    def _plain_block(
+        self,
+        parameters: FloatArray,
+        starts: FloatArray | None,
+        lanes: IntArray,
+        n_steps: int,
+        signals: tuple[FloatArray, FloatArray],
+        residuals: FloatArray,
+    ) -> tuple[FloatArray, FloatArray]:
+        """As ``block``, of outputs at their instants. signals: measured outputs and weights."""
         padded = lanes.take(_ALL_LANES, mode="wrap")
         n_outputs = self._measured.shape[1]
         sums = np.empty((2 * n_outputs, LANES))
         work = work_area(self.kernels.batch.work_rows * LANES)
-        record = (signal[:n_samples] for signal in (self._inputs, self._measured, self._weights))
+        record = self._inputs[: len(signals[0])], *signals
         start, p = self._initial(starts, padded), np.ascontiguousarray(parameters[padded].T)
         with explained_errors(self.kernels.model):
             self.kernels.simulate(
