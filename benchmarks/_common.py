@@ -61,7 +61,7 @@ def timed(function: Callable[[], Any]) -> tuple[float, Any]:
 def simulated_logs(
     model: ProcessModel, seed: int | None = None, experiment: str = "prbs.yaml", **plant: Any
 ) -> tuple[Dataset, Dataset]:
-    """Training and validation record of a shipped experiment on the simulated rig.
+    """Training and validation record of a shipped experiment on the rig that it is for.
 
     The validation is the training where the experiment has none of its own. seed: of the rig's
     noise and offsets, default its own. plant: parts other than the rig's own, such as
@@ -69,7 +69,7 @@ def simulated_logs(
     """
     loaded = load_experiment(experiment)
     validation = loaded.validation()
-    rig, device = load_rig("simulated.yaml")
+    rig, device = load_rig(loaded.experiment.rig or "simulated.yaml")
     assert isinstance(device, SimulatedDevice)
     own = device.options
     changes = {"seed": own.seed if seed is None else seed}

@@ -62,7 +62,7 @@ class _Intervals:
             length = 1.0 / np.abs(rate)
         end = latest - 0.5 * np.minimum(latest - earliest, length)
         # An interval begins with the edge that ended the one before; the first row is no edge.
-        timed = np.flatnonzero(np.isfinite(length) & (length > 1.0))
+        timed = np.flatnonzero(np.isfinite(length) & (length > 1.0 + _OFF_TICK))
         timed = timed[timed > 1]
         low = np.maximum(earliest[timed], earliest[timed - 1] + length[timed])
         high = np.minimum(latest[timed], latest[timed - 1] + length[timed])

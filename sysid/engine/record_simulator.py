@@ -169,15 +169,13 @@ class RecordSimulator:
         kept = np.empty((record.n_samples, len(noise), LANES))
         sums = np.empty((2 * len(noise), LANES))
         work = work_area(kernel.work_rows * LANES)
+        measured = self._at_instants(parameters, starts, lanes, n_steps)
         with explained_errors(model):
             kalman.innovations(
-                work, work.reshape(-1, LANES), kernel.tables, self._inputs, self._measured,
-                weights, noise**2, of_inputs, np.array(spread), float(corrects), start,
+                work, work.reshape(-1, LANES), kernel.tables, self._inputs, measured, weights,
+                noise**2, of_inputs, np.array(spread), float(corrects), start,
                 np.ascontiguousarray(parameters[padded].T), record.dt, n_steps, sums, kept,
             )  # fmt: skip
-        if len(self._averaged) and not corrects:
-            kept *= self._averaged_in_instants(parameters, starts, lanes, n_steps)
-            sums[: len(noise)] = np.einsum("kjl,kjl->jl", kept, kept)
         values[:] = kept[..., : len(lanes)]
         sse, estimates = (half.T[: len(lanes)] for half in np.split(sums, 2))
         return sse, self._excess(sse, estimates, np.full(len(lanes), n_steps * len(kept)))
@@ -201,16 +199,22 @@ class RecordSimulator:
         signals = self._measured[:n_samples], self._weights[:n_samples]
         return self._plain_block(parameters, starts, lanes, n_steps, signals, residuals)
 
-    def _averaged_in_instants(
+    def _at_instants(
         self, parameters: FloatArray, starts: FloatArray | None, lanes: IntArray, n_steps: int
     ) -> FloatArray:
-        """Residuals over the record's windows in parts of those at the instants."""
-        shape = *self._measured.shape, LANES
-        averaged, instant, share = (np.full(shape, value) for value in (np.nan, np.nan, 1.0))
-        signals = self._measured, self._weights
-        self._averaged_block(parameters, starts, lanes, n_steps, len(averaged), averaged)
-        self._plain_block(parameters, starts, lanes, n_steps, signals, instant)
-        return np.divide(averaged, instant, out=share, where=instant != 0.0)
+        """Measured outputs for each lane, (n_samples, n_outputs, LANES), at their instants.
+
+        A mean over a window is moved by what the free run says it differs from the instant.
+        """
+        measured = np.repeat(self._measured[..., None], LANES, axis=2)
+        if len(self._averaged):
+            instant = np.full(measured.shape, np.nan)
+            signals = np.zeros_like(self._measured), np.ones_like(self._measured)
+            self._plain_block(parameters, starts, lanes, n_steps, signals, instant)
+            for j in self._averaged:
+                mean = average(instant[:, j], self._windows[:, j])
+                measured[:, j] += instant[:, j] - mean
+        return measured
 
     def _averaged_block(
         self,

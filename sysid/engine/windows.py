@@ -7,6 +7,8 @@ from numba import njit
 
 from sysid.arrays import FloatArray
 
+_INSTANT = 1e-6  # samples that no window is shorter than, unless it is an instant
+
 
 @njit(cache=True, nogil=True)
 def average(outputs: FloatArray, windows: FloatArray) -> FloatArray:
@@ -16,22 +18,20 @@ def average(outputs: FloatArray, windows: FloatArray) -> FloatArray:
     in samples from the sample on; a window of no length is an instant. What would be outside of
     the record is cut off.
     """
-    n, lanes = outputs.shape
-    area = np.empty((n, lanes))  # under the output until each sample
-    area[0] = 0.0
+    n = len(outputs)
+    area = np.zeros_like(outputs)  # under the output until each sample
     for k in range(1, n):
-        for lane in range(lanes):
-            area[k, lane] = area[k - 1, lane] + 0.5 * (outputs[k - 1, lane] + outputs[k, lane])
-    seen = np.empty((n, lanes))
+        area[k] = area[k - 1] + 0.5 * (outputs[k - 1] + outputs[k])
+    means = np.empty_like(outputs)
     for k in range(n):
-        begin, end = (min(max(k + windows[k, i], 0.0), n - 1.0) for i in range(2))
+        begin = min(max(k + windows[k, 0], 0.0), n - 1.0)
+        end = min(max(k + windows[k, 1], 0.0), n - 1.0)
         i, j = min(math.floor(begin), n - 2), min(math.floor(end), n - 2)
         a, b = begin - i, end - j
-        for lane in range(lanes):
-            if end - begin < 1e-6:
-                seen[k, lane] = outputs[j, lane] + b * (outputs[j + 1, lane] - outputs[j, lane])
-            else:
-                before = a * (outputs[i, lane] + 0.5 * a * (outputs[i + 1, lane] - outputs[i, lane]))
-                until = b * (outputs[j, lane] + 0.5 * b * (outputs[j + 1, lane] - outputs[j, lane]))
-                seen[k, lane] = (area[j, lane] + until - area[i, lane] - before) / (end - begin)
-    return seen
+        if end - begin < _INSTANT:
+            means[k] = (1.0 - b) * outputs[j] + b * outputs[j + 1]
+            continue
+        before = area[i] + a * ((1.0 - 0.5 * a) * outputs[i] + 0.5 * a * outputs[i + 1])
+        until = area[j] + b * ((1.0 - 0.5 * b) * outputs[j] + 0.5 * b * outputs[j + 1])
+        means[k] = (until - before) / (end - begin)
+    return means
