@@ -37,7 +37,7 @@ Criterion = Literal["auto", "compensated", "innovations", "likelihood", "error"]
 _OF_NOISY_INPUTS: Mapping[str, NoisyInputs] = {name: name for name in get_args(NoisyInputs)}
 _OVERWHELMED = (
     "since the noise of the measured inputs would explain more than all of the free run's error: "
-    "over this record its effect is not small and cannot be taken out; a shorter one may serve"
+    "what it does adds up over this record, and only the outputs tell it"
 )
 
 # Not compared with a checkpoint's: they do not decide the result, or it holds them otherwise.
@@ -261,8 +261,8 @@ class GASSI(RecordEstimator):
         self.output_weights_ = likeliest.objective.weights
         if isinstance(likeliest.objective, Innovations):
             self.output_noise_ = likeliest.objective.noise
-        elif self.criterion_ in _OF_NOISY_INPUTS:
-            self.criterion_, self.criterion_reason_ = "likelihood", _OVERWHELMED
+            if likeliest.objective.corrects and self.criterion_ == "compensated":
+                self.criterion_, self.criterion_reason_ = "innovations", _OVERWHELMED
         self.n_simulations_ = objective.simulations
 
     def predict(self, X: Dataset | FloatArray, *, records: Any = None) -> FloatArray:

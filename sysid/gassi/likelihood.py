@@ -86,7 +86,8 @@ def fit_likelihood(
 ) -> Likeliest:
     """The likeliest of some minima (n_free,) of the mean RMSE and of their lookalikes.
 
-    noise: how all of them are refitted in the end, where inputs are noisy.
+    noise: how all of them are refitted in the end, where inputs are noisy; by innovations, too,
+    where free runs would not do.
     """
     objective = _resolved(objective, minima[0])
     optima = _Optima(objective)
@@ -112,8 +113,8 @@ def fit_likelihood(
     best, *others = optima.ranked()
     refitted = None
     if noise is not None:
-        corrects = noise == "innovations"
-        refitted = _refitted(corrects, objective, [best, *others], optima, watch)
+        for corrects in (False, True) if noise == "compensated" else (True,):
+            refitted = refitted or _refitted(corrects, objective, [best, *others], optima, watch)
     if refitted is None:
         best = _exact(best)
     else:
