@@ -26,7 +26,7 @@ SPEED = "omega"  # the column that a counter's rate makes
 
 _OFF_COUNT = 0.05  # counts that a printed angle may be off a whole one
 _OFF_TICK = 0.02  # samples that printed speeds may put an edge off
-_FEWEST, _SHARE = 3, 0.9  # of the intervals that can be checked, those that must agree
+_FEWEST, _SHARE = 3, 0.8  # of the intervals that can be checked, those that must agree
 
 
 @dataclass(frozen=True)

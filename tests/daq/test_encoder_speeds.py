@@ -47,7 +47,9 @@ def swinging(t):
 
 def stopping(t):
     # Runs, stands still inside of a count for half a second, and goes on the other way.
-    return 0.4003 * COUNT + np.where(t < 0.3, 0.4 * (t - 0.3), np.where(t > 0.8, 0.3 * (0.8 - t), 0.0))
+    return 0.4003 * COUNT + np.where(
+        t < 0.3, 0.4 * (t - 0.3), np.where(t > 0.8, 0.3 * (0.8 - t), 0.0)
+    )
 
 
 @pytest.mark.parametrize(
