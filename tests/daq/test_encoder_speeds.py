@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from daq.identification.records import from_recording
 from daq.logs.encoder import mean_speeds
-from daq.logs.recording import load as load_recording
-from tests.daq.support import rig
+from daq.logs.recording import load
+from daq.lookup.experiments import load_experiment
+from daq.lookup.rigs import load_rig
+from daq.run.runner import run_experiment
+from sim_rig.actuator import actuator
+from sim_rig.backend import SimulatedDevice
 
 COUNT = 2.0 * math.pi / 8192  # rad
 DT = 1.0 / 800.0  # s
@@ -108,3 +112,18 @@ def smoothed(tick, theta):
 def test_speeds_that_no_edges_made_stay_as_they_are(made):
     tick, theta, _ = logged(swinging, 1.2)
     assert mean_speeds(tick, *made(tick, theta), DT, COUNT) is None
+
+
+@pytest.mark.parametrize("ideal", [False, True])
+def test_a_run_s_speeds_are_averaged_where_its_encoder_made_them(tmp_path, ideal):
+    experiment = load_experiment("prbs.yaml")
+    config, device = load_rig("simulated.yaml")
+    device = SimulatedDevice(device.options.model_copy(update={"ideal": ideal}))
+    folder = run_experiment(experiment.experiment, "run", config, device, tmp_path).folder
+    model, recording = actuator(), load(folder)
+    windows = from_recording(recording, model).dataset.windows
+    averaged = windows.any(axis=(0, 2)).tolist() if windows.size else None
+    assert averaged == (None if ideal else [name == "omega" for name in model.output_names])
+    # A log without its run record says nothing of an encoder.
+    (folder / "run.json").unlink()
+    assert from_recording(load(folder), model).dataset.windows.size == 0
