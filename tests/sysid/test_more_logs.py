@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import pytest
 
 from sysid import GASSI, Parameter
@@ -26,5 +28,5 @@ def test_more_logs_never_determine_less(seed):
         determined = {e.name: e.std for e in fit.uncertainty(records[:n]).determined()}
         assert sorted(determined) == ["gain sense", "tau"]
         widths.append(determined)
-    for fewer, more in zip(widths, widths[1:], strict=False):
+    for fewer, more in pairwise(widths):
         assert all(more[name] < fewer[name] for name in more)
