@@ -86,8 +86,8 @@ class GASSI(RecordEstimator):
     criterion : what the default preset ends with: ``likelihood`` weighs every output by its own
         error; ``compensated`` as well, and takes out what the noise of measured inputs does to
         the errors; ``innovations`` are those of an extended Kalman filter for that noise;
-        ``error`` stays with the mean RMSE that the search minimises. ``auto`` is ``compensated``
-        where a record has ``input_noise``, else ``likelihood``.
+        ``error`` stays with the mean RMSE that the search minimises. ``auto`` is ``likelihood``
+        without ``input_noise``, with it ``compensated``, and ``innovations`` with ``windows`` too.
     balance : ``samples``, several records count as one long one; ``logs``, each alike.
     accuracy : normalised RMS error that a simulation aims at.
     max_steps : integration steps a sample may take before a chromosome is flagged.
@@ -406,7 +406,10 @@ class GASSI(RecordEstimator):
             return "likelihood", f"{names} is measured with noise, but {error}"
         if self.criterion != "auto":
             return self.criterion, "as set"
-        return "compensated", f"{names} is measured with noise, which a free run passes on"
+        timed = any(record.windows.size for record in records)
+        known = "; over which times its outputs were averaged is known" if timed else ""
+        reason = f"{names} is measured with noise, which a free run passes on{known}"
+        return "innovations" if timed else "compensated", reason
 
     def _weights(self) -> FloatArray | None:
         if self.weights is None:

@@ -1,6 +1,7 @@
 """Noise of measured inputs: the filter against plain filters, and the bias that is to vanish."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -175,6 +176,8 @@ def test_a_noisy_input_chooses_the_criterion():
     fit = GASSI(lag(), population=20, generations=2).fit(record)
     assert fit.criterion_ == "compensated"
     assert "u is measured with noise" in fit.criterion_reason_
+    timed = replace(record, windows=np.zeros((*record.outputs.shape, 2)))
+    assert GASSI(lag(), population=20, generations=2).fit(timed).criterion_ == "innovations"
 
 
 def test_where_noise_explains_all_of_a_free_run_a_filter_takes_over():
