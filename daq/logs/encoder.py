@@ -98,8 +98,8 @@ def _at_rows(intervals: _Intervals, tick: IntArray) -> tuple[FloatArray, FloatAr
     after = np.minimum(before + 1, len(intervals.rows) - 1)
     length = intervals.end - intervals.begin
     within = (after > before) & (length[after] > 1.0)
-    told = np.where(within, after, before)
-    rate, begin, end = intervals.speed[told], intervals.begin[told], intervals.end[told]
+    interval = np.where(within, after, before)
+    rate, begin, end = intervals.speed[interval], intervals.begin[interval], intervals.end[interval]
     # Longer ago than the interval took, the shaft has slowed down since.
     silent = ~within & (tick - intervals.end[before] > length[before])
     silent &= tick != tick[intervals.rows[before]]

@@ -407,8 +407,8 @@ class GASSI(RecordEstimator):
         if self.criterion != "auto":
             return self.criterion, "as set"
         timed = any(record.windows.size for record in records)
-        known = "; over which times its outputs were averaged is known" if timed else ""
-        reason = f"{names} is measured with noise, which a free run passes on{known}"
+        remark = "; over which times the outputs were averaged is known" if timed else ""
+        reason = f"{names} is measured with noise, which a free run passes on{remark}"
         return "innovations" if timed else "compensated", reason
 
     def _weights(self) -> FloatArray | None:
