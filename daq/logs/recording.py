@@ -91,8 +91,8 @@ class Recording:
             count = Encoder.model_validate(sensors["encoder"]).count
         except (KeyError, TypeError, ValueError):
             return None
-        columns = (self.frame[name].to_numpy() for name in ("tick", "theta", SPEED))
-        return mean_speeds(*columns, self.dt, count)
+        tick, theta, omega = (self.frame[name].to_numpy() for name in ("tick", "theta", SPEED))
+        return mean_speeds(tick, theta, omega, self.dt, count)
 
 
 def load(path: str | Path, extra: Sequence[str] = ()) -> Recording:

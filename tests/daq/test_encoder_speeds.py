@@ -56,8 +56,13 @@ def stopping(t):
     )
 
 
+def creeping(t):
+    return 0.1 + 0.01 * np.sin(40.0 * t)
+
+
 @pytest.mark.parametrize(
-    ("angle", "error", "at_samples"), [(swinging, 0.008, 0.06), (stopping, 0.001, 0.02)]
+    ("angle", "error", "at_samples"),
+    [(swinging, 0.008, 0.06), (creeping, 0.003, 0.06), (stopping, 0.001, 0.02)],
 )
 def test_speeds_are_the_means_over_their_windows(angle, error, at_samples):
     tick, theta, omega = logged(angle, 1.2)
@@ -75,6 +80,13 @@ def test_a_shaft_that_stands_still_has_no_speed():
     still = (tick * DT > 0.31) & (tick * DT < 0.79)
     assert np.abs(omega[still]).max() > 0.05  # what the counter cannot know better
     assert np.abs(mean_speeds(tick, theta, omega, DT, COUNT).values[still]).max() < 0.005
+
+
+def test_a_shaft_that_has_stopped_for_good_has_no_speed_either():
+    tick, theta, omega = logged(lambda t: stopping(np.minimum(t, 0.7)), 0.7)
+    stopped = tick * DT > 0.31
+    assert np.abs(omega[stopped]).max() > 0.05
+    assert np.all(mean_speeds(tick, theta, omega, DT, COUNT).values[stopped] == 0.0)
 
 
 def test_lost_samples_only_blur_when_edges_came():

@@ -66,9 +66,9 @@ def test_the_rate_is_exact_at_constant_speed(speed):
 
 def test_several_edges_in_a_step_are_timed_each():
     # Evenly faster: a count before the last edge takes what its own mean speed says.
-    _, rates, angles = latch(lambda t: 300.0 * t**2 + 2e-4, 0.05)
+    _, rates, angles = latch(lambda t: 3000.0 * t**2 + 2e-4, 0.05)
     last = np.floor(angles[4:] / COUNT) * COUNT
-    times = np.sqrt((np.stack([last - COUNT, last]) - 2e-4) / 300.0)
+    times = np.sqrt((np.stack([last - COUNT, last]) - 2e-4) / 3000.0)
     np.testing.assert_allclose(rates[4:], 1.0 / np.diff(times, axis=0)[0], rtol=1e-3)
 
 
