@@ -26,6 +26,7 @@ SPEED = "omega"  # the column that a counter's rate makes
 
 _OFF_COUNT = 0.05  # counts that a printed angle may be off a whole one
 _OFF_TICK = 0.02  # samples that printed speeds may put an edge off
+_CREDIBLE = 0.85, 1.2  # change of the speed within an interval that its neighbour can tell
 _FEWEST, _SHARE = 3, 0.8  # of the intervals that can be checked, those that must agree
 
 
@@ -60,7 +61,13 @@ class _Intervals:
         rate = rates[rows]
         with np.errstate(divide="ignore"):
             length = 1.0 / np.abs(rate)
-        end = latest - 0.5 * np.minimum(latest - earliest, length)
+        # The shaft stands anywhere between two edges; how long ago it passed the last depends on its
+        # speed at the sample, which has changed since the interval.
+        change = np.diff(rate, prepend=rate[0]) / np.diff(latest, prepend=latest[0] - 1.0)
+        with np.errstate(invalid="ignore"):
+            growth = np.nan_to_num(1.0 + np.sign(rate) * change * length**2, nan=1.0)
+        growth = np.clip(growth, *_CREDIBLE)
+        end = latest - 0.5 * np.minimum(latest - earliest, length / growth)
         # An interval begins with the edge that ended the one before; the first row is no edge.
         timed = np.flatnonzero(np.isfinite(length) & (length > 1.0 + _OFF_TICK))
         timed = timed[timed > 1]
