@@ -61,8 +61,8 @@ class _Intervals:
         rate = rates[rows]
         with np.errstate(divide="ignore"):
             length = 1.0 / np.abs(rate)
-        # The shaft stands anywhere between two edges; how long ago it passed the last depends on its
-        # speed at the sample, which has changed since the interval.
+        # The shaft stands anywhere between two edges; how long ago it passed the last depends on
+        # its speed at the sample, which has changed since the interval.
         change = np.diff(rate, prepend=rate[0]) / np.diff(latest, prepend=latest[0] - 1.0)
         with np.errstate(invalid="ignore"):
             growth = np.nan_to_num(1.0 + np.sign(rate) * change * length**2, nan=1.0)
