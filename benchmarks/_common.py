@@ -12,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from daq.config.rig import RigConfig
 from daq.identification import records as datasets
 from daq.lookup.experiments import load_experiment
 from daq.lookup.rigs import load_rig
@@ -58,10 +59,18 @@ def timed(function: Callable[[], Any]) -> tuple[float, Any]:
     return time.perf_counter() - start, result
 
 
+def rig_of(experiment: str) -> tuple[RigConfig, SimulatedDevice]:
+    """The simulated rig that a shipped experiment is for."""
+    name = load_experiment(experiment).experiment.rig or "simulated.yaml"
+    rig, device = load_rig(name)
+    assert isinstance(device, SimulatedDevice)
+    return rig, device
+
+
 def simulated_logs(
     model: ProcessModel, seed: int | None = None, experiment: str = "prbs.yaml", **plant: Any
 ) -> tuple[Dataset, Dataset]:
-    """Training and validation record of a shipped experiment on the simulated rig.
+    """Training and validation record of a shipped experiment on the rig that it is for.
 
     The validation is the training where the experiment has none of its own. seed: of the rig's
     noise and offsets, default its own. plant: parts other than the rig's own, such as
@@ -69,8 +78,7 @@ def simulated_logs(
     """
     loaded = load_experiment(experiment)
     validation = loaded.validation()
-    rig, device = load_rig("simulated.yaml")
-    assert isinstance(device, SimulatedDevice)
+    rig, device = rig_of(experiment)
     own = device.options
     changes = {"seed": own.seed if seed is None else seed}
     device = SimulatedDevice(

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks._common import arguments, report, simulated_logs, timed
+from benchmarks._common import arguments, report, rig_of, simulated_logs, timed
 from sim_rig.actuator import actuator
 from sysid import BatchSimulator, Dataset
 from sysid.arrays import FloatArray
@@ -38,10 +38,9 @@ def main() -> None:
     parser.add_argument("--exact", type=int, default=20, help="seeds of the search without noise")
     parser.add_argument("--experiment", nargs="+", default=_EXPERIMENTS, help="shipped ones")
     options = parser.parse_args()
-    model = actuator()
     figures = {
-        "coverage": {name: coverage(model, options.seeds, name) for name in options.experiment},
-        "noise_free": noise_free(model, options.exact) if options.exact else None,
+        "coverage": {name: coverage(options.seeds, name) for name in options.experiment},
+        "noise_free": noise_free(actuator(), options.exact) if options.exact else None,
     }
     report(figures, options.json, show)
 
@@ -74,9 +73,11 @@ class _Tally:
         }
 
 
-def coverage(model: ProcessModel, seeds: int, experiment: str) -> dict[str, Any]:
+def coverage(seeds: int, experiment: str) -> dict[str, Any]:
     """Share of the 95 % intervals that hold the truth, for each quantity and together."""
-    truth = _truth(model)
+    plant = rig_of(experiment)[1].options.plant
+    load = "measured" if plant.sensor == "load" else plant.load
+    model, truth = actuator(load=load, sensor=plant.sensor), _truth(plant.process_model())
     tallies: dict[str, _Tally] = defaultdict(_Tally)
     seconds, together, nominal, answers = [], [], [], []
     for seed in range(seeds):
@@ -114,7 +115,7 @@ def _mean(values: list[Any]) -> float | None:
 def noise_free(model: ProcessModel, seeds: int) -> dict[str, Any]:
     """Worst relative error of the determined quantities, for each seed of the search."""
     record = _exact_record(model)
-    truth = {**_truth(model), "z(0)": _HYSTERESIS_START}
+    truth = {**_truth(actuator(parameters="rig")), "z(0)": _HYSTERESIS_START}
     worst, errors, seconds = [], [], []
     for seed in range(seeds):
         duration, estimator = timed(lambda s=seed: GASSI(model, random_state=s).fit(record))
@@ -133,9 +134,7 @@ def noise_free(model: ProcessModel, seeds: int) -> dict[str, Any]:
 
 
 def _truth(model: ProcessModel) -> dict[str, float]:
-    return dict(
-        zip(model.parameter_names, actuator(parameters="rig").nominal.tolist(), strict=True)
-    )
+    return dict(zip(model.parameter_names, model.nominal.tolist(), strict=True))
 
 
 def _in_deviations(estimate: Estimate, truth: float) -> float:

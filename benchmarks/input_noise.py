@@ -89,7 +89,7 @@ def compare(
         for criterion in CRITERIA:
             begun = time.perf_counter()
             noise = None if criterion == "likelihood" else criterion
-            best, _ = fit_likelihood(objective, [start], noise=noise)  # type: ignore[arg-type]
+            best = fit_likelihood(objective, [start], noise=noise).optimum  # type: ignore[arg-type]
             seconds[criterion].append(time.perf_counter() - begun)
             for estimate in uncertainty(best.objective, best.chromosome).determined():
                 if estimate.name in QUANTITIES:

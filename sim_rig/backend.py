@@ -113,7 +113,7 @@ class SimulatedDevice:
     def __init__(self, options: Simulation) -> None:
         self.options = options
         self._plant = options.plant.build()
-        self._theta = self._plant.state_names.index("theta")
+        self._motion = [self._plant.state_names.index(name) for name in ("theta", "omega")]
         self._user = SimulatedUser(options.plant.load == "hand", options.hand)
         self._rng = np.random.default_rng(options.seed)
         worst = 0.0 if options.ideal else options.imperfections.offset
@@ -125,8 +125,9 @@ class SimulatedDevice:
         self._n_inputs = len(self._plant.inputs)
         self._single = np.zeros((2, self._n_inputs))
         self._steppers: dict[float, Stepper] = {}
-        # Draws of their own, so that the noise stays what it is without faults.
+        # Draws of their own, so that the noise stays what it is without them.
         self._chance = np.random.default_rng([options.seed, 1])
+        self._phase = float(np.random.default_rng([options.seed, 2]).random())
         self._late: list[tuple[int, FloatArray]] = []
         self._queue = CommandQueue()
         self._clock = 0.0  # device time since it was switched on [s], at the next tick
@@ -139,7 +140,7 @@ class SimulatedDevice:
         self._warm_up()
         self._open = True
         self._x = self._plant.initial_state
-        self._encoder = EncoderCounter(4 * self.options.encoder_cycles)
+        self._encoder = EncoderCounter(4 * self.options.encoder_cycles, self._phase)
         return hal.DeviceInfo(
             name="simulated rig",
             max_rate=20_000.0,
@@ -153,7 +154,7 @@ class SimulatedDevice:
         """The simulated user winds the handle when asked to, and otherwise keeps off."""
         self._user.stop()
         if phase is Phase.HOMING and turns > 0.0:
-            self._user.wind(turns, self._clock, float(self._x[self._theta]))
+            self._user.wind(turns, self._clock, float(self._x[self._motion[0]]))
         if phase is Phase.RUN:
             self._user.move(self._clock)
 
@@ -294,8 +295,8 @@ class SimulatedDevice:
         n, tick, per_tick = len(applied), self._queue.tick, self._stepper.n_steps
         trace, true = self._stepper.advance(self._x, self._inputs(applied))
         times = self._origin, tick * per_tick, 1.0 / (self._rate * per_tick), per_tick
-        theta = self._theta
-        counts, rates = self._encoder.latch(trace[:, theta], self._x[theta], *times)
+        motion = self._motion
+        counts, rates = self._encoder.latch(trace[:, motion], self._x[motion], *times)
         if self.options.ideal:
             per_radian = self._encoder.counts_per_turn / (2.0 * math.pi)
             counts, rates = true[:, 3] * per_radian, true[:, 4] * per_radian

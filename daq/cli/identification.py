@@ -249,6 +249,8 @@ def _show_notes(result: Identification) -> None:
     if rows.refined:
         criterion = result.document["criterion"]
         terminal.print_text(f"Criterion: {criterion['name']}, {criterion['reason']}.")
+    for name, how in result.document.get("averaged", {}).items():
+        terminal.print_text(f"Output {name}: {how}.")
     statements = {"Predictions": verdict.predicted, "Parameters": verdict.parameters}
     for subject, statement in statements.items():
         terminal.print_text(f"{subject}: {statement.trust}. {' '.join(statement.reasons)}")

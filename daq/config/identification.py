@@ -325,7 +325,8 @@ class IdentificationConfig(Signals):
         description="likelihood: in the end each output weighs by its own error; compensated: "
         "also without what noise of measured inputs does to the errors; innovations: those of an "
         "extended Kalman filter for that noise; error: the mean RMSE decides to the end; auto: "
-        "compensated where a calibration tells noise of an input, else likelihood",
+        "innovations where a calibration tells noise of an input and the counts when an encoder "
+        "measured, compensated where it tells the noise alone, else likelihood",
     )
     process_noise: dict[str, Annotated[float, Field(ge=0.0, allow_inf_nan=False)]] = Field(
         default_factory=dict,

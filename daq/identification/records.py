@@ -18,6 +18,7 @@ from daq.hal import FloatArray, IntArray
 from daq.identification.selection import EVERYTHING, Selection
 from daq.logs import matlab
 from daq.logs.capture import LOG_NAME
+from daq.logs.encoder import SPEED, MeanSpeeds
 from daq.logs.recording import Recording, end_of_run, log_path, read_record
 from daq.logs.recording import load as load_recording
 from daq.logs.table import column_names, read_table
@@ -92,7 +93,8 @@ def from_recording(
     recording: Recording, model: ProcessModel, selection: Selection = EVERYTHING
 ) -> LoggedRecord:
     """A log that has been read as a record; ConfigError, ModelError."""
-    dataset = _from_log(recording, model, recording.name, selection)
+    speeds = recording.mean_speeds() if SPEED in model.output_names else None
+    dataset = _from_log(recording, model, recording.name, selection, speeds)
     # What the offset calibration measured: standard deviations of noise and of zeros.
     noise, zero = np.array([recording.noise(n) for n in model.input_names]).reshape(-1, 2).T
     outputs = np.array([recording.noise(n) for n in model.output_names]).reshape(-1, 2).T
@@ -204,7 +206,14 @@ def _groups(model: ProcessModel, columns: Columns) -> list[SignalGroup]:
     return [("inputs", columns.inputs, model.inputs), ("outputs", columns.outputs, model.outputs)]
 
 
-def _from_log(log: Recording, model: ProcessModel, title: str, selection: Selection) -> Dataset:
+def _from_log(
+    log: Recording,
+    model: ProcessModel,
+    title: str,
+    selection: Selection,
+    speeds: MeanSpeeds | None = None,
+) -> Dataset:
+    """The model's signals of a log; speeds: what its encoder's are the means of."""
     columns = list(log.frame.columns)
     for name in (*model.input_names, *model.output_names):
         if name not in columns:
@@ -215,7 +224,14 @@ def _from_log(log: Recording, model: ProcessModel, title: str, selection: Select
     inputs = log.frame[list(model.input_names)].to_numpy(dtype=np.float64)
     outputs = log.frame[list(model.output_names)].to_numpy(dtype=np.float64)
     tick, rows = log.frame["tick"].to_numpy(), selection.rows(log.path, log.frame["t"].to_numpy())
+    if speeds is not None:
+        outputs[:, model.output_names.index(SPEED)] = speeds.values
     dataset = _dataset(log.path, model, inputs[rows], outputs[rows], tick[rows], log.dt, title)
+    if speeds is not None:
+        windows = np.zeros((*dataset.outputs.shape, 2))
+        places = tick[rows] - tick[rows][0]
+        windows[places, model.output_names.index(SPEED)] = speeds.windows[rows]
+        dataset = replace(dataset, windows=windows)
     return _without_run_in(dataset, log.path, model, selection)
 
 

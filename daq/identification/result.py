@@ -168,6 +168,7 @@ class Identification:
             # How the model was used where not as it declares; ``rig replay`` uses it likewise.
             **{key: value for key, value in signals.items() if value},
             "criterion": {"name": estimator.criterion_, "reason": estimator.criterion_reason_},
+            **({"averaged": averaged} if (averaged := _averaged(self)) else {}),
             "verdict": _verdict(verdict),
             **({"missing": _missing(self)} if self.suspicion is not None else {}),
             "data_faults": [_fault(fault) for fault in self.faults],
@@ -427,6 +428,17 @@ def _in_parts_of_noise(result: RecordResult, j: int) -> dict[str, float]:
         return {}
     figures = {"ratio": result.floor.ratio[j], "p_value": result.floor.p_value[j]}
     return {f"residual_to_noise_{key}": float(f"{value:.4g}") for key, value in figures.items()}
+
+
+def _averaged(result: Identification) -> dict[str, str]:
+    """Outputs that their sensor averages, and how that is met."""
+    records = [log.log.dataset for log in (*result.training, *result.validation)]
+    return {
+        name: "its samples are means over the time between two edges of the encoder, and so are "
+        "those of the model"
+        for j, name in enumerate(result.model.output_names)
+        if any(record.windows.size and record.windows[:, j].any() for record in records)
+    }
 
 
 def _log(model: ProcessModel, log: FittedLog) -> dict[str, Any]:

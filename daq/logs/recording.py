@@ -11,10 +11,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from daq.config import json_file
+from daq.config.rig import Encoder
 from daq.errors import ConfigError
 from daq.hal import Samples
 from daq.logs.capture import COMPLETED, LOG_NAME, RUN_NAME, RUNNING, further_parts, is_log
 from daq.logs.columns import ATTRIBUTES, COLUMNS, ORIGINAL_COLUMNS
+from daq.logs.encoder import SPEED, MeanSpeeds, mean_speeds
 from daq.logs.table import column_names, read_table
 from daq.logs.time_base import refuse_rows, require_rows, time_base
 
@@ -79,6 +81,18 @@ class Recording:
                 file=self.folder / RUN_NAME,
             ) from None
         return deviation, deviation / math.sqrt(samples)
+
+    def mean_speeds(self) -> MeanSpeeds | None:
+        """What the speeds are means of that an encoder's edges made; None of all others."""
+        if self.record is None:
+            return None
+        try:
+            sensors = settings_of(self.record)[1]["sensors"]
+            count = Encoder.model_validate(sensors["encoder"]).count
+        except (KeyError, TypeError, ValueError):
+            return None
+        tick, theta, omega = (self.frame[name].to_numpy() for name in ("tick", "theta", SPEED))
+        return mean_speeds(tick, theta, omega, self.dt, count)
 
 
 def load(path: str | Path, extra: Sequence[str] = ()) -> Recording:

@@ -17,47 +17,51 @@ class EncoderCounter:
 
     counts_per_turn: four times the encoder's cycles. The rate is one count over the time
     between the last two edges in the same direction, never more than the time since the last
-    edge allows, and zero after a reversal or 0.1 s of silence.
+    edge allows, and zero after a reversal or 0.1 s of silence. phase: where between two counts an
+    angle of zero stands, 0 to 1.
     """
 
     counts_per_turn: int
+    phase: float = 0.0
     # Last count (none yet), time of the last edge, its direction, estimated rate.
     memory: FloatArray = field(default_factory=lambda: np.array([np.nan, -1.0, 0.0, 0.0]))
 
     def latch(
-        self, angles: FloatArray, last: float, origin: float, first: int, step: float, per_tick: int
+        self,
+        motion: FloatArray,
+        last: FloatArray,
+        origin: float,
+        first: int,
+        step: float,
+        per_tick: int,
     ) -> tuple[FloatArray, FloatArray]:
-        """Counts and their rate [1/s] at every ``per_tick``-th of the angles.
+        """Counts and their rate [1/s] at every ``per_tick``-th row of the motion.
 
-        angles: (n,) [rad] at times origin + (first + i) * step, the first at a tick; last: the
-        angle one step behind them, which ends the last interval. Edges in between are timed by
-        interpolation. With a common origin the result does not depend on where a motion is cut
-        into calls.
+        motion: (n, 2), angle [rad] and speed [rad/s] at times origin + (first + i) * step, the
+        first at a tick; last: (2,), those one step behind them, which end the last interval. Edges
+        in between are timed by interpolation. With a common origin the result does not depend on
+        where a motion is cut into calls.
         """
         per_radian = self.counts_per_turn / (2.0 * math.pi)
-        counts, rates = _count(angles, last, per_radian, origin, first, step, per_tick, self.memory)
+        counted = np.vstack([motion, last]) * per_radian
+        counted[:, 0] += self.phase
+        counts, rates = _count(counted, origin, first, step, per_tick, self.memory)
         return counts, rates
 
 
 @njit(cache=True, nogil=True)
 def _count(
-    angles: FloatArray,
-    last: float,
-    per_radian: float,
-    origin: float,
-    first: int,
-    step: float,
-    per_tick: int,
-    memory: FloatArray,
+    motion: FloatArray, origin: float, first: int, step: float, per_tick: int, memory: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    n, there = len(angles), angles[0] * per_radian
+    """Counts and rates at the ticks; motion: (n + 1, 2), in counts and counts per second."""
+    n, there = len(motion) - 1, motion[0, 0]
     counts, rates = np.empty(-(-n // per_tick)), np.empty(-(-n // per_tick))
     if math.isnan(memory[0]):
         memory[0] = math.floor(there)
     count, edge_time, direction, rate = memory[0], memory[1], memory[2], memory[3]
     for i in range(n):
         now = origin + (first + i) * step
-        here, there = there, (angles[i + 1] if i + 1 < n else last) * per_radian
+        here, there = there, motion[i + 1, 0]
         if i % per_tick == 0:
             shown = rate
             if edge_time < 0.0 or now - edge_time > _STANDSTILL:
@@ -75,7 +79,9 @@ def _count(
         share = (boundary - here) / (there - here) if there != here else 1.0
         crossing = now + min(max(share, 0.0), 1.0) * step
         if abs(moved) > 1.0:
-            rate = (there - here) / step
+            # Both edges lie in this step: the speed half a count before the last of them.
+            middle = share - 0.5 / abs(there - here)
+            rate = (there - here) / step + (middle - 0.5) * (motion[i + 1, 1] - motion[i, 1])
         elif direction == sign and crossing > edge_time:
             rate = sign / (crossing - edge_time)
         else:

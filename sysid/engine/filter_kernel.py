@@ -55,7 +55,7 @@ class FilterKernel(BatchKernel):
         sample = [
             *[f"v{j} = u[k, {j}]" for j in range(self.n_recorded)],
             *[f"v{j} = 0.0" for j in range(self.n_recorded, self.n_inputs)],
-            *[f"{name}{j} = {name}[k, {j}]" for name in "yw" for j in outputs],
+            *[f"w{j} = w[k, {j}]" for j in outputs],
             *[f"seen{j} = 1.0 if w{j} > 0.0 else 0.0" for j in outputs],
             *block(EACH_LANE, self._corrected()),
             *block("if k == n_samples - 1:", ["break"]),
@@ -107,7 +107,7 @@ class FilterKernel(BatchKernel):
     def _taken_in(self, j: int) -> list[str]:
         """Output j taken in; the deviation d is what the sample's outputs have changed so far."""
         gains, size = self._gains(j), range(self._size)
-        lines = [f"e = {_sum([f'o{j}', *_products(gains, 'd{}'.format)])} - y{j}"]
+        lines = [f"e = {_sum([f'o{j}', *_products(gains, 'd{}'.format)])} - y[k, {j}, l]"]
         kept = f"e = e * w{j}"
         if gains:
             lines += [f"shared{a} = {_sum(_products(gains, _covariance_with(a)))}" for a in size]

@@ -7,6 +7,7 @@ import numpy as np
 from sysid.arrays import BoolArray, FloatArray, IntArray
 from sysid.engine.compiler import Filter, Kernels, explained_errors
 from sysid.engine.scheme import LANES, work_area
+from sysid.engine.windows import average
 from sysid.problem.data import Dataset
 from sysid.problem.model import ProcessModel
 from sysid.threads import Workers
@@ -76,6 +77,8 @@ class RecordSimulator:
         else:
             self._measured, self._weights = outputs, np.where(missing, 0.0, 1.0 / self.scale)
         self._weight = self._weights.max(axis=0)
+        self._windows = record.windows.reshape(-1, outputs.shape[1], 2) / record.dt  # in samples
+        self._averaged = np.flatnonzero(self._windows.any(axis=(0, 2)))
         # Where an input is largest is where a model driven through it is fastest.
         peaks = np.argmax(np.abs(record.inputs), axis=0) if record.inputs.shape[1] else []
         self._extremes = record.inputs[np.unique(np.array([0, *peaks], dtype=np.int64))]
@@ -171,10 +174,11 @@ class RecordSimulator:
         kept = np.empty((record.n_samples, len(noise), LANES))
         sums = np.empty((2 * len(noise), LANES))
         work = work_area(kernel.work_rows * LANES)
+        measured = self._at_instants(parameters, starts, lanes, n_steps)
         with explained_errors(model):
             kalman.innovations(
-                work, work.reshape(-1, LANES), kernel.tables, self._inputs, self._measured,
-                weights, noise**2, of_inputs, intensity, np.array(spread), float(corrects), start,
+                work, work.reshape(-1, LANES), kernel.tables, self._inputs, measured, weights,
+                noise**2, of_inputs, intensity, np.array(spread), float(corrects), start,
                 np.ascontiguousarray(parameters[padded].T), record.dt, n_steps, sums, kept,
             )  # fmt: skip
         values[:] = kept[..., : len(lanes)]
@@ -195,11 +199,65 @@ class RecordSimulator:
         n_samples: how much of the record is simulated. residuals: (n_samples, n_outputs, LANES)
         to fill, or of no size to keep none.
         """
+        if len(self._averaged):
+            return self._averaged_block(parameters, starts, lanes, n_steps, n_samples, residuals)
+        signals = self._measured[:n_samples], self._weights[:n_samples]
+        return self._plain_block(parameters, starts, lanes, n_steps, signals, residuals)
+
+    def _at_instants(
+        self, parameters: FloatArray, starts: FloatArray | None, lanes: IntArray, n_steps: int
+    ) -> FloatArray:
+        """Measured outputs for each lane, (n_samples, n_outputs, LANES), at their instants.
+
+        A mean over a window is moved by what the free run says it differs from the instant.
+        """
+        measured = np.repeat(self._measured[..., None], LANES, axis=2)
+        if len(self._averaged):
+            instant = np.full(measured.shape, np.nan)
+            signals = np.zeros_like(self._measured), np.ones_like(self._measured)
+            self._plain_block(parameters, starts, lanes, n_steps, signals, instant)
+            for j in self._averaged:
+                mean = average(instant[:, j], self._windows[:, j])
+                measured[:, j] += instant[:, j] - mean
+        return measured
+
+    def _averaged_block(
+        self,
+        parameters: FloatArray,
+        starts: FloatArray | None,
+        lanes: IntArray,
+        n_steps: int,
+        n_samples: int,
+        residuals: FloatArray,
+    ) -> tuple[FloatArray, FloatArray]:
+        """As ``block``, of outputs over the record's windows."""
+        shape = n_samples, self._measured.shape[1]
+        kept = residuals if len(residuals) else np.full((*shape, LANES), np.nan)
+        signals = np.zeros(shape), np.ones(shape)
+        _, estimates = self._plain_block(parameters, starts, lanes, n_steps, signals, kept)
+        for j in self._averaged:
+            kept[:, j] = average(kept[:, j], self._windows[:n_samples, j])
+        with np.errstate(all="ignore"):
+            kept -= self._measured[:n_samples, :, None]
+            kept *= self._weights[:n_samples, :, None]
+            sse = np.einsum("kjl,kjl->lj", kept, kept)
+        return sse[: len(lanes)], estimates
+
+    def _plain_block(
+        self,
+        parameters: FloatArray,
+        starts: FloatArray | None,
+        lanes: IntArray,
+        n_steps: int,
+        signals: tuple[FloatArray, FloatArray],
+        residuals: FloatArray,
+    ) -> tuple[FloatArray, FloatArray]:
+        """As ``block``, of outputs at their instants. signals: measured outputs and weights."""
         padded = lanes.take(_ALL_LANES, mode="wrap")
         n_outputs = self._measured.shape[1]
         sums = np.empty((2 * n_outputs, LANES))
         work = work_area(self.kernels.batch.work_rows * LANES)
-        record = (signal[:n_samples] for signal in (self._inputs, self._measured, self._weights))
+        record = self._inputs[: len(signals[0])], *signals
         start, p = self._initial(starts, padded), np.ascontiguousarray(parameters[padded].T)
         with explained_errors(self.kernels.model):
             self.kernels.simulate(

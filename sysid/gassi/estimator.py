@@ -38,7 +38,7 @@ Criterion = Literal["auto", "compensated", "innovations", "likelihood", "error"]
 _OF_NOISY_INPUTS: Mapping[str, NoisyInputs] = {name: name for name in get_args(NoisyInputs)}
 _OVERWHELMED = (
     "since the noise of the measured inputs would explain more than all of the free run's error: "
-    "over this record its effect is not small and cannot be taken out; a shorter one may serve"
+    "what it does adds up over this record, and only the outputs tell it"
 )
 
 # Not compared with a checkpoint's: they do not decide the result, or it holds them otherwise.
@@ -87,9 +87,9 @@ class GASSI(RecordEstimator):
     criterion : what the default preset ends with: ``likelihood`` weighs every output by its own
         error; ``compensated`` as well, and takes out what the noise of measured inputs does to
         the errors; ``innovations`` are those of an extended Kalman filter for that noise;
-        ``error`` stays with the mean RMSE that the search minimises. ``auto`` is ``compensated``
-        where a record has ``input_noise``, ``innovations`` with ``process_noise``, else
-        ``likelihood``.
+        ``error`` stays with the mean RMSE that the search minimises. ``auto`` is ``likelihood``
+        without ``input_noise``, with it ``compensated``, and ``innovations`` with ``windows`` or
+        ``process_noise``.
     process_noise : {state: intensity} of white noise that drives states, for ``innovations``:
         standard deviation of the state after a second, were it to do nothing but sum that noise,
         in its unit over sqrt(s).
@@ -272,8 +272,8 @@ class GASSI(RecordEstimator):
         self.output_weights_ = likeliest.objective.weights
         if isinstance(likeliest.objective, Innovations):
             self.output_noise_ = likeliest.objective.noise
-        elif self.criterion_ in _OF_NOISY_INPUTS:
-            self.criterion_, self.criterion_reason_ = "likelihood", _OVERWHELMED
+            if likeliest.objective.corrects and self.criterion_ == "compensated":
+                self.criterion_, self.criterion_reason_ = "innovations", _OVERWHELMED
         self.n_simulations_ = objective.simulations
 
     def predict(self, X: Dataset | FloatArray, *, records: Any = None) -> FloatArray:
@@ -400,7 +400,6 @@ class GASSI(RecordEstimator):
         model, noisy = self._model(), noisy_inputs(records)
         if not preset.refine:
             return "error", f"preset {self.preset} goes by nothing else"
-        names = ", ".join(model.input_names[j] for j in noisy)
         if self._process().any():
             self._check_filter(noisy)
             return "innovations", "noise of the process is given"
@@ -414,14 +413,26 @@ class GASSI(RecordEstimator):
                 f"criterion {self.criterion} needs the noise of a measured input, and {where} "
                 "tells none; give each Dataset its input_noise, or choose criterion likelihood"
             )
+        return self._of_noisy_inputs(records, noisy)
+
+    def _of_noisy_inputs(
+        self, records: Sequence[Dataset], noisy: tuple[int, ...]
+    ) -> tuple[Criterion, str]:
+        """What it ends with where inputs are known to be measured with noise, and why."""
+        model = self._model()
+        names = ", ".join(model.input_names[j] for j in noisy)
         try:
             kalman_filter(model, noisy)
         except ModelError as error:
             if self.criterion != "auto":
                 raise
             return "likelihood", f"{names} is measured with noise, but {error}"
-        reason = f"{names} is measured with noise, which a free run passes on"
-        return ("compensated", reason) if self.criterion == "auto" else (self.criterion, "as set")
+        if self.criterion != "auto":
+            return self.criterion, "as set"
+        timed = any(record.windows.size for record in records)
+        remark = "; over which times the outputs were averaged is known" if timed else ""
+        reason = f"{names} is measured with noise, which a free run passes on{remark}"
+        return "innovations" if timed else "compensated", reason
 
     def _check_filter(self, noisy: tuple[int, ...]) -> None:
         """Raise ModelError where no filter can serve for the noise of the process."""

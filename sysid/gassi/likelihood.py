@@ -87,8 +87,8 @@ def fit_likelihood(
 ) -> Likeliest:
     """The likeliest of some minima (n_free,) of the mean RMSE and of their lookalikes.
 
-    noise: how all of them are refitted in the end, where inputs or the process are noisy. process:
-    as of ``Innovations``.
+    noise: how all of them are refitted in the end, where inputs or the process are noisy; by
+    innovations, too, where free runs would not do. process: as of ``Innovations``.
     """
     objective = _resolved(objective, minima[0])
     optima = _Optima(objective)
@@ -114,8 +114,9 @@ def fit_likelihood(
     best, *others = optima.ranked()
     refitted = None
     if noise is not None:
-        fit = partial(noisy_fit, noise == "innovations", process, objective)
-        refitted = _refitted(fit, objective, [best, *others], optima, watch)
+        for corrects in (False, True) if noise == "compensated" else (True,):
+            fit = partial(noisy_fit, corrects, process, objective)
+            refitted = refitted or _refitted(fit, objective, [best, *others], optima, watch)
     if refitted is None:
         best = _exact(best)
     else:

@@ -21,7 +21,9 @@ class Dataset:
     that the channel may have had throughout, as an offset calibration leaves it; input_noise:
     (n_inputs,), standard deviation of the white noise on measured inputs; they widen the intervals
     of what is identified. output_noise: (n_outputs,), that of the outputs, below which no model's
-    errors can be; 0 where it is not known. Default none.
+    errors can be; 0 where it is not known. windows: (n_samples, n_outputs, 2), the time over which
+    a sensor averaged each sample of an output, its begin and end in seconds from the sample on;
+    both 0 where it was sampled at its instant. Simulated outputs are averaged alike. Default none.
 
     Raises ModelError for mismatched shapes, fewer than two rows, complex numbers, inputs that are
     not finite, or infinite outputs.
@@ -39,6 +41,7 @@ class Dataset:
     output_zero: FloatArray = field(default_factory=lambda: np.zeros(0))
     input_noise: FloatArray = field(default_factory=lambda: np.zeros(0))
     output_noise: FloatArray = field(default_factory=lambda: np.zeros(0))
+    windows: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         for name in ("inputs", "outputs"):
@@ -55,6 +58,20 @@ class Dataset:
         self._refuse(np.isinf(self.outputs), "output", "write NaN for a sample that was lost")
         for name in ("input_zero", "output_zero", "input_noise", "output_noise"):
             object.__setattr__(self, name, self._deviations(name))
+        self._check_windows()
+
+    def _check_windows(self) -> None:
+        """Raise ModelError for windows that are none of these outputs'."""
+        if self.windows.size == 0:
+            return
+        if self.windows.shape != (*self.outputs.shape, 2):
+            raise ModelError(
+                f"{self.name}: windows have shape {self.windows.shape}; give begin and end for "
+                f"each sample and output: {(*self.outputs.shape, 2)}"
+            )
+        begin, end = self.windows[..., 0], self.windows[..., 1]
+        if not (np.isfinite(self.windows).all() and np.all(begin <= end)):
+            raise ModelError(f"{self.name}: a window must begin before it ends, at finite times")
 
     def _table(self, name: str) -> FloatArray:
         """Inputs or outputs as real numbers, (n_samples, n); ModelError where they are others."""
@@ -102,7 +119,8 @@ class Dataset:
     def part(self, begin: int, end: int, name: str) -> Dataset:
         """The rows from ``begin`` up to ``end`` as a record."""
         rows = slice(begin, end)
-        return replace(self, inputs=self.inputs[rows], outputs=self.outputs[rows], name=name)
+        inputs, outputs, windows = self.inputs[rows], self.outputs[rows], self.windows[rows]
+        return replace(self, inputs=inputs, outputs=outputs, windows=windows, name=name)
 
     def check(self, model: ProcessModel) -> None:
         """Raise ModelError unless the columns match the model's inputs and outputs."""

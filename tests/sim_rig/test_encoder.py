@@ -15,16 +15,23 @@ STEP = 1.0 / (RATE * PER_TICK)
 COUNT = 2.0 * math.pi / PER_TURN  # rad
 
 
-def latch(angle, duration, cuts=(), origin=0.0):
+def moving_at(angle, t):
+    """Angle and speed, (n, 2)."""
+    return np.stack([angle(t), (angle(t + 1e-6) - angle(t - 1e-6)) / 2e-6], axis=1)
+
+
+def latch(angle, duration, cuts=(), origin=0.0, phase=0.0):
     """Counts and rates of a motion angle(t) [rad], latched in one call or several."""
     ticks = round(duration * RATE)
-    angles = angle(origin + np.arange(ticks * PER_TICK + 1) * STEP)
-    counter = EncoderCounter(PER_TURN)
+    t = origin + np.arange(ticks * PER_TICK + 1) * STEP
+    angles = angle(t)
+    moving = moving_at(angle, t)
+    counter = EncoderCounter(PER_TURN, phase)
     edges = [0, *cuts, ticks]
     parts = [
         counter.latch(
-            angles[a * PER_TICK : b * PER_TICK],
-            angles[b * PER_TICK],
+            moving[a * PER_TICK : b * PER_TICK],
+            moving[b * PER_TICK],
             origin,
             a * PER_TICK,
             STEP,
@@ -55,6 +62,20 @@ def test_the_rate_is_exact_at_constant_speed(speed):
     assert len(settled) > 100
     np.testing.assert_allclose(settled, expected, rtol=1e-6)
     assert np.sign(counts[-1] - counts[0]) == np.sign(speed)
+
+
+def test_several_edges_in_a_step_are_timed_each():
+    # Evenly faster: a count before the last edge takes what its own mean speed says.
+    _, rates, angles = latch(lambda t: 3000.0 * t**2 + 2e-4, 0.05)
+    last = np.floor(angles[4:] / COUNT) * COUNT
+    times = np.sqrt((np.stack([last - COUNT, last]) - 2e-4) / 3000.0)
+    np.testing.assert_allclose(rates[4:], 1.0 / np.diff(times, axis=0)[0], rtol=1e-3)
+
+
+def test_the_phase_moves_the_edges():
+    counts, rates, angles = latch(wobble, 1.0, phase=0.4)
+    np.testing.assert_array_equal(counts, np.floor(angles / COUNT + 0.4))
+    assert np.any(rates != latch(wobble, 1.0)[1])
 
 
 def test_a_tenth_of_a_second_without_an_edge_is_standstill():
@@ -102,10 +123,10 @@ def test_where_a_motion_is_cut_does_not_change_a_bit(cuts):
 
 def test_a_copy_is_independent():
     counter = EncoderCounter(PER_TURN)
-    angles = np.linspace(0.0, 1.0, 5 * PER_TICK + 1)
+    t = np.arange(5 * PER_TICK + 1) * STEP
+    angles, further = (moving_at(lambda t: 160.0 * t, t + later) for later in (0.0, t[-1]))
     counter.latch(angles[:-1], angles[-1], 0.0, 0, STEP, PER_TICK)
-    copy = EncoderCounter(PER_TURN, counter.memory.copy())
-    further = np.linspace(1.0, 2.0, 5 * PER_TICK + 1)
+    copy = EncoderCounter(PER_TURN, memory=counter.memory.copy())
     one = counter.latch(further[:-1], further[-1], 0.0, 5 * PER_TICK, STEP, PER_TICK)
     two = copy.latch(further[:-1], further[-1], 0.0, 5 * PER_TICK, STEP, PER_TICK)
     for a, b in zip(one, two, strict=True):

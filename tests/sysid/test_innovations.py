@@ -1,6 +1,7 @@
 """Noise of measured inputs: the filter against plain filters, and the bias that is to vanish."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -286,6 +287,18 @@ def test_a_noisy_input_chooses_the_criterion():
     fit = GASSI(lag(), population=20, generations=2).fit(record)
     assert fit.criterion_ == "compensated"
     assert "u is measured with noise" in fit.criterion_reason_
+    timed = replace(record, windows=np.zeros((*record.outputs.shape, 2)))
+    assert GASSI(lag(), population=20, generations=2).fit(timed).criterion_ == "innovations"
+
+
+def test_where_noise_explains_all_of_a_free_run_a_filter_takes_over():
+    *_, record = list(noisy_records(2, of_output=0.01))[:3]
+    fit = GASSI(lag(), population=20, generations=8).fit(record)
+    assert fit.criterion_ == "innovations"
+    assert "explain more than all of the free run's error" in fit.criterion_reason_
+    assert fit.parameters_["gain"] == pytest.approx(GAIN, rel=0.01)
+    estimates = fit.uncertainty(record).parameters
+    assert all(e.low < truth < e.high for e, truth in zip(estimates, (GAIN, TAU), strict=True))
 
 
 @pytest.mark.parametrize("criterion", ["compensated", "innovations"])

@@ -1,0 +1,117 @@
+"""When an encoder measured the speed that a log shows.
+
+A counter that times its edges tells the speed as one count over the time between the last two of
+them: a mean over an interval that has ended before the sample. Log and calibration tell where it
+lies,
+
+- its length T from the speed, count / |omega|, or, where the shaft has turned round and the speed
+  is zero, from the edges at its ends;
+- its end from the sample in which the count has changed, to within a sample time, and closer as it
+  began where the interval before it ended. With several edges in a sample the last is half an
+  interval old on average.
+
+Samples within an interval that is longer than a sample are given its mean, which the device could
+not know before it was over; what it showed instead is that of the interval before.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from daq.hal import FloatArray, IntArray
+
+SPEED = "omega"  # the column that a counter's rate makes
+
+_OFF_COUNT = 0.05  # counts that a printed angle may be off a whole one
+_OFF_TICK = 0.02  # samples that printed speeds may put an edge off
+_CREDIBLE = 0.85, 1.2  # change of the speed within an interval that its neighbour can tell
+_FEWEST, _SHARE = 3, 0.8  # of the intervals that can be checked, those that must agree
+
+
+@dataclass(frozen=True)
+class MeanSpeeds:
+    """Speeds as means over known times.
+
+    values: (n,) [rad/s], NaN for samples between edges of which none was timed. windows: (n, 2),
+    begin and end of what each is the mean over [s], from its sample on.
+    """
+
+    values: FloatArray
+    windows: FloatArray
+
+
+@dataclass(frozen=True)
+class _Intervals:
+    """The last interval between edges at each change of the count, times in ticks."""
+
+    rows: IntArray  # of the log, where the count has changed
+    speed: FloatArray
+    begin: FloatArray
+    end: FloatArray
+    agree: bool  # whether lengths and edges do
+
+    @classmethod
+    def of(cls, tick: IntArray, counts: FloatArray, rates: FloatArray) -> _Intervals:
+        """rates: in counts per tick."""
+        rows = np.flatnonzero(np.diff(counts, prepend=np.nan))
+        latest = tick[rows].astype(np.float64)  # the last edge was no later than this
+        earliest = np.append(latest[0] - 1.0, tick[rows[1:] - 1])
+        rate = rates[rows]
+        with np.errstate(divide="ignore"):
+            length = 1.0 / np.abs(rate)
+        # The shaft stands anywhere between two edges; how long ago it passed the last depends on
+        # its speed at the sample, which has changed since the interval.
+        change = np.diff(rate, prepend=rate[0]) / np.diff(latest, prepend=latest[0] - 1.0)
+        with np.errstate(invalid="ignore"):
+            growth = np.nan_to_num(1.0 + np.sign(rate) * change * length**2, nan=1.0)
+        growth = np.clip(growth, *_CREDIBLE)
+        end = latest - 0.5 * np.minimum(latest - earliest, length / growth)
+        # An interval begins with the edge that ended the one before; the first row is no edge.
+        timed = np.flatnonzero(np.isfinite(length) & (length > 1.0 + _OFF_TICK))
+        timed = timed[timed > 1]
+        low = np.maximum(earliest[timed], earliest[timed - 1] + length[timed])
+        high = np.minimum(latest[timed], latest[timed - 1] + length[timed])
+        agreeing = low <= high + _OFF_TICK
+        end[timed[agreeing]] = 0.5 * (low + high)[agreeing]
+        begin = np.where(rate == 0.0, np.append(earliest[0], end[:-1]), end - length)
+        agree = bool(agreeing.sum() >= max(_FEWEST, _SHARE * len(timed)))
+        return cls(rows, rate, begin, end, agree)
+
+
+def mean_speeds(
+    tick: IntArray, theta: FloatArray, omega: FloatArray, dt: float, count: float
+) -> MeanSpeeds | None:
+    """What an encoder's speeds are the means of; None where its edges did not make them.
+
+    tick, theta [rad], omega [rad/s]: (n,), of a log's rows. count: angle of a count [rad].
+    """
+    counts = np.rint(theta / count)
+    if np.abs(theta / count - counts).max() > _OFF_COUNT:
+        return None
+    intervals = _Intervals.of(tick, counts, omega * (dt / count))
+    if not intervals.agree:
+        return None
+    rates, begin, end = _at_rows(intervals, tick)
+    windows = np.stack([begin - tick, end - tick], axis=1) * dt
+    return MeanSpeeds(rates * (count / dt), windows)
+
+
+def _at_rows(intervals: _Intervals, tick: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Mean rate, begin and end of the interval that each row of the log tells of, (n,) each."""
+    n = len(tick)
+    before = np.searchsorted(intervals.rows, np.arange(n), side="right") - 1
+    after = np.minimum(before + 1, len(intervals.rows) - 1)
+    length = intervals.end - intervals.begin
+    within = (after > before) & (length[after] > 1.0)
+    interval = np.where(within, after, before)
+    rate, begin, end = intervals.speed[interval], intervals.begin[interval], intervals.end[interval]
+    # Longer ago than the interval took, the shaft has slowed down since.
+    silent = ~within & (tick - intervals.end[before] > length[before])
+    silent &= tick != tick[intervals.rows[before]]
+    last = before == len(intervals.rows) - 1
+    rate[silent] = np.where(last, 0.0, np.nan)[silent]
+    begin[silent] = np.where(last, intervals.end[before], tick)[silent]
+    end[silent] = np.where(last, float(tick[-1]), tick)[silent]
+    return rate, begin, end

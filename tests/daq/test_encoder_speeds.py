@@ -1,0 +1,141 @@
+"""What an encoder's speeds are the means of, against motions whose angle is known at any time."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from daq.identification.records import from_recording
+from daq.logs.encoder import mean_speeds
+from daq.logs.recording import load
+from daq.lookup.experiments import load_experiment
+from daq.lookup.rigs import load_rig
+from daq.run.runner import run_experiment
+from sim_rig.actuator import actuator
+from sim_rig.backend import SimulatedDevice
+
+COUNT = 2.0 * math.pi / 8192  # rad
+DT = 1.0 / 800.0  # s
+FINE = 1000  # points of a sample
+
+
+def logged(angle, duration):
+    """Ticks, angles and speeds as a counter shows them that times its edges."""
+    n = round(duration / DT)
+    t = np.arange(n * FINE + 1) * (DT / FINE)
+    counts = np.floor(angle(t) / COUNT)
+    places = np.flatnonzero(np.diff(counts)) + 1
+    edges, ways = t[places], np.sign(np.diff(counts)[places - 1])
+    tick, omega = np.arange(n + 1), np.zeros(n + 1)
+    for k, latest in enumerate(np.searchsorted(edges, tick * DT, side="right") - 1):
+        if latest < 1 or ways[latest] != ways[latest - 1]:
+            continue
+        length, silence = edges[latest] - edges[latest - 1], k * DT - edges[latest]
+        omega[k] = ways[latest] * COUNT / max(length, silence) * (silence < 0.1)
+    return tick, counts[::FINE] * COUNT, omega
+
+
+def mean_over(angle, windows):
+    """True mean speeds over windows from the samples on, cut off at the ends of the log."""
+    at = np.clip(np.arange(len(windows))[:, None] * DT + windows, 0.0, (len(windows) - 1) * DT)
+    length = at[:, 1] - at[:, 0]
+    means = np.diff(angle(at), axis=1)[:, 0] / np.where(length > 0.0, length, 1.0)
+    return np.where(length > 0.0, means, 0.0)
+
+
+def swinging(t):
+    return 0.21 + 0.06 * np.sin(12.0 * t) + 0.004 * np.sin(90.0 * t)
+
+
+def stopping(t):
+    # Runs, stands still inside of a count for half a second, and goes on the other way.
+    return 0.4003 * COUNT + np.where(
+        t < 0.3, 0.4 * (t - 0.3), np.where(t > 0.8, 0.3 * (0.8 - t), 0.0)
+    )
+
+
+def creeping(t):
+    return 0.1 + 0.01 * np.sin(40.0 * t)
+
+
+@pytest.mark.parametrize(
+    ("angle", "error", "at_samples"),
+    [(swinging, 0.008, 0.06), (creeping, 0.003, 0.06), (stopping, 0.001, 0.02)],
+)
+def test_speeds_are_the_means_over_their_windows(angle, error, at_samples):
+    tick, theta, omega = logged(angle, 1.2)
+    speeds = mean_speeds(tick, theta, omega, DT, COUNT)
+    assert np.isnan(speeds.values).mean() < 0.01
+    true = mean_over(angle, speeds.windows)
+    assert np.sqrt(np.nanmean((speeds.values - true) ** 2)) < error
+    # What the log shows is as far as this from the speed at the sample.
+    exactly = (angle(tick * DT + 1e-6) - angle(tick * DT - 1e-6)) / 2e-6
+    assert np.sqrt(np.mean((omega - exactly) ** 2)) > at_samples
+
+
+def test_a_shaft_that_stands_still_has_no_speed():
+    tick, theta, omega = logged(stopping, 1.2)
+    still = (tick * DT > 0.31) & (tick * DT < 0.79)
+    assert np.abs(omega[still]).max() > 0.05  # what the counter cannot know better
+    assert np.abs(mean_speeds(tick, theta, omega, DT, COUNT).values[still]).max() < 0.005
+
+
+def test_a_shaft_that_has_stopped_for_good_has_no_speed_either():
+    tick, theta, omega = logged(lambda t: stopping(np.minimum(t, 0.7)), 0.7)
+    stopped = tick * DT > 0.31
+    assert np.abs(omega[stopped]).max() > 0.05
+    assert np.all(mean_speeds(tick, theta, omega, DT, COUNT).values[stopped] == 0.0)
+
+
+def test_lost_samples_only_blur_when_edges_came():
+    tick, theta, omega = logged(swinging, 1.2)
+    kept = np.random.default_rng(3).random(len(tick)) > 0.2
+    speeds = mean_speeds(tick[kept], theta[kept], omega[kept], DT, COUNT)
+    windows = np.zeros((len(tick), 2))
+    windows[kept] = speeds.windows
+    errors = speeds.values - mean_over(swinging, windows)[kept]
+    assert np.sqrt(np.nanmean(errors**2)) < 0.02
+
+
+def test_the_direction_of_the_encoder_does_not_matter():
+    tick, theta, omega = logged(swinging, 1.2)
+    forwards = mean_speeds(tick, theta, omega, DT, COUNT)
+    backwards = mean_speeds(tick, theta, omega, DT, -COUNT)
+    np.testing.assert_array_equal(forwards.values, backwards.values)
+    np.testing.assert_array_equal(forwards.windows, backwards.windows)
+
+
+def exact(tick, theta):
+    return swinging(tick * DT), np.gradient(swinging(tick * DT), DT)
+
+
+def differences(tick, theta):
+    return theta, np.diff(theta, prepend=theta[0]) / DT
+
+
+def smoothed(tick, theta):
+    kernel = np.exp(-np.arange(60) / 15.0)
+    return theta, np.convolve(differences(tick, theta)[1], kernel / kernel.sum())[: len(theta)]
+
+
+@pytest.mark.parametrize("made", [exact, differences, smoothed])
+def test_speeds_that_no_edges_made_stay_as_they_are(made):
+    tick, theta, _ = logged(swinging, 1.2)
+    assert mean_speeds(tick, *made(tick, theta), DT, COUNT) is None
+
+
+@pytest.mark.parametrize("ideal", [False, True])
+def test_a_run_s_speeds_are_averaged_where_its_encoder_made_them(tmp_path, ideal):
+    experiment = load_experiment("prbs.yaml")
+    config, device = load_rig("simulated.yaml")
+    device = SimulatedDevice(device.options.model_copy(update={"ideal": ideal}))
+    folder = run_experiment(experiment.experiment, "run", config, device, tmp_path).folder
+    model, recording = actuator(), load(folder)
+    windows = from_recording(recording, model).dataset.windows
+    averaged = windows.any(axis=(0, 2)).tolist() if windows.size else None
+    assert averaged == (None if ideal else [name == "omega" for name in model.output_names])
+    # A log without its run record says nothing of an encoder.
+    (folder / "run.json").unlink()
+    assert from_recording(load(folder), model).dataset.windows.size == 0

@@ -1,0 +1,81 @@
+"""Outputs that a sensor averages before they are read, against the exact response of a lag."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sysid import GASSI, BatchSimulator, Dataset, ModelError
+from sysid.examples import lag
+
+DT, TAU = 1e-3, 0.05
+N = 300
+
+
+def rising(t):
+    """A unit step's response, and the area under it."""
+    fading = np.exp(-t / TAU)
+    return 1.0 - fading, t - TAU * (1.0 - fading)
+
+
+def averaged_step():
+    """A step's exact response, averaged over times that end up to 4 ms before each sample."""
+    before = np.sort(np.random.default_rng(0).uniform(-0.012, 0.0, (N, 2)), axis=1)
+    before[:, 1] = np.maximum(before[:, 1], before[:, 0] + 1e-4)
+    before[::7] = -0.002  # instants
+    t = np.arange(N) * DT
+    begin, end = np.clip(t[:, None] + before, 0.0, t[-1]).T
+    means = np.diff([rising(begin)[1], rising(end)[1]], axis=0)[0] / np.maximum(end - begin, 1e-9)
+    means = np.where(end - begin < 1e-9, rising(end)[0], means)
+    return Dataset(np.ones(N), means, DT, windows=before[:, None])
+
+
+def test_simulated_outputs_are_averaged_over_the_windows():
+    record = averaged_step()
+    simulator = BatchSimulator(lag(), accuracy=1e-8)
+    simulated = simulator.trajectories(np.array([1.0, TAU]), record)[0]
+    np.testing.assert_allclose(simulated, record.outputs, atol=1e-4)
+    at_samples = simulator.trajectories(np.array([1.0, TAU]), replace(record, windows=np.zeros(0)))
+    assert np.abs(at_samples[0] - record.outputs).max() > 0.1
+    result = simulator.errors(np.array([1.0, TAU]), [record])
+    assert result.sse[0, 0, 0] == pytest.approx(np.sum((simulated - record.outputs) ** 2))
+
+
+def test_a_sensor_that_averages_does_not_slow_the_model_down():
+    record = averaged_step()
+    settings = {"population": 40, "generations": 10, "random_state": 0}
+    exact = GASSI(lag(), **settings).fit(record)
+    assert exact.parameters_["tau"] == pytest.approx(TAU, rel=1e-3)
+    blind = GASSI(lag(), **settings).fit(replace(record, windows=np.zeros(0)))
+    assert blind.parameters_["tau"] > 1.05 * TAU
+
+
+@pytest.mark.parametrize("corrects", [False, True])
+def test_the_filter_sees_them_alike(corrects):
+    record = replace(averaged_step(), input_noise=np.array([1e-9]))
+    model = lag().with_initial({"y": 0.0})  # not a sample, which has noise
+    simulator, p = BatchSimulator(model), np.array([[0.9, 1.1 * TAU]])
+    common = p, [record], [np.ones(1)], np.array([[4]]), [None]
+    plain = simulator.residuals(*common).values
+    filtered = simulator.innovations(*common, np.array([0.1]), corrects=corrects).values
+    np.testing.assert_allclose(filtered[1:], plain[1:], atol=1e-6)
+
+
+def test_a_part_keeps_its_windows():
+    record = averaged_step()
+    np.testing.assert_array_equal(record.part(50, 90, "part").windows, record.windows[50:90])
+
+
+@pytest.mark.parametrize(
+    ("windows", "problem"),
+    [
+        (np.zeros((5, 1)), r"windows have shape \(5, 1\); give .*\(5, 1, 2\)"),
+        (np.ones((5, 1, 2)) * [0.0, -1.0], "a window must begin before it ends"),
+        (np.full((5, 1, 2), np.nan), "finite times"),
+    ],
+)
+def test_windows_that_fit_no_outputs_are_refused(windows, problem):
+    with pytest.raises(ModelError, match=problem):
+        Dataset(np.ones(5), np.zeros(5), DT, windows=windows)
