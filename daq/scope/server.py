@@ -76,7 +76,7 @@ async def _serve(watch: Watch, port: int, ready: Callable[[str], None]) -> None:
         http.close_streams()
         # Whoever waited for a tab to read has heard of that once the page is free again.
         for session in server.get_sessions():
-            await session.with_document_locked(int)
+            await session.with_document_locked(int)  # type: ignore[misc]  # declared without await
         for number, handler in before:
             signal.signal(number, handler)
 

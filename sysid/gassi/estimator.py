@@ -397,7 +397,7 @@ class GASSI(RecordEstimator):
 
     def _criterion(self, records: Sequence[Dataset], preset: Preset) -> tuple[Criterion, str]:
         """What the default preset ends with on these records, and why."""
-        model, noisy = self._model(), noisy_inputs(records)
+        noisy = noisy_inputs(records)
         if not preset.refine:
             return "error", f"preset {self.preset} goes by nothing else"
         if self._process().any():
