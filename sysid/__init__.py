@@ -6,6 +6,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from sysid.campaigns.runs import Campaign, Outcome, Run, Spread, campaign, combinations
+from sysid.design import Design, Excitation, Prior, Setting, design
 from sysid.engine.simulation import BatchResult, BatchSimulator, Status
 from sysid.engine.stepper import Stepper
 from sysid.fitting.free_run import free_run
@@ -45,6 +46,8 @@ __all__ = [
     "Comparison",
     "Constraint",
     "Dataset",
+    "Design",
+    "Excitation",
     "Given",
     "Guess",
     "Identifiability",
@@ -55,9 +58,11 @@ __all__ = [
     "Outcome",
     "Output",
     "Parameter",
+    "Prior",
     "ProcessModel",
     "Run",
     "SearchSpace",
+    "Setting",
     "Spread",
     "State",
     "Status",
@@ -66,6 +71,7 @@ __all__ = [
     "campaign",
     "combinations",
     "compare",
+    "design",
     "equilibrium",
     "evaluate",
     "fit_percent",
