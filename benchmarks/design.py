@@ -227,7 +227,7 @@ def hybrid_actuator(n_rigs: int, seed: int = 0) -> dict[str, Any]:
     prior = Prior(model.nominal[list(space.index)], np.diag(np.full(len(space.index), 0.28**2)))
     begin = time.perf_counter()
     designed = design(
-        model, [commands()], noise=NOISE, runs=RUNS, prior=prior, bench=bench, seed=seed
+        model, [commands()], noise=NOISE, runs=RUNS, prior=prior, bench=bench, draws=2, seed=seed
     )
     seconds = time.perf_counter() - begin
     shipped = load_experiment("prbs.yaml").experiment.plan().commands

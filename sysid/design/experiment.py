@@ -67,6 +67,10 @@ class Design:
     with these outputs tells, with what would (``fix``). information: (n_free, n_free), of the
     search coordinates, of all runs at the values that the design starts from. attempts: runs that
     were simulated; refused: those of them that would have passed a limit.
+
+    >>> run = DesignedRun("step", {"height": 1.0}, np.ones((50, 1)), dt=0.01)
+    >>> Design((run, run), (), (), (), np.eye(2), attempts=64, refused=3).duration
+    1.0
     """
 
     runs: tuple[DesignedRun, ...]

@@ -10,12 +10,14 @@ J = S' S / s and the covariance C of S' e / s its estimate scatters by J^-1 C J^
 the inverse of that.
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.linalg import pinvh
 
-from sysid.arrays import FloatArray, IntArray
+from sysid.arrays import FloatArray
+from sysid.design.disturbance import with_disturbances
 from sysid.engine.simulation import BatchSimulator
 from sysid.identifiability import null_directions
 from sysid.problem.data import Dataset
@@ -24,11 +26,10 @@ from sysid.problem.space import SearchSpace
 
 # Share of the largest information above which a direction that tells nothing is told something.
 _PHANTOM = 1e-10
-# Realisations of the inputs' noise: they give a variance to within a quarter.
-_DRAWS = 32
+# Draws of the inputs' noise: they give a variance to within a third.
+_DRAWS = 16
 
 
-@dataclass(frozen=True)
 class Informant:
     """Computes what a record would tell of the parameters.
 
@@ -36,91 +37,96 @@ class Informant:
     count; input_noise: (n_inputs,), of the white noise on measured inputs.
     """
 
-    simulator: BatchSimulator
-    space: SearchSpace
-    noise: FloatArray
-    input_noise: FloatArray
+    def __init__(
+        self,
+        simulator: BatchSimulator,
+        space: SearchSpace,
+        noise: FloatArray,
+        input_noise: FloatArray,
+    ) -> None:
+        self._simulator, self._space, self._noise = simulator, space, noise
+        self._noisy, self._input_noise = np.flatnonzero(input_noise), input_noise
+        self._disturbed = simulator
+        if len(self._noisy):
+            model = with_disturbances(simulator.model, self._noisy.tolist(), _DRAWS)
+            self._disturbed = BatchSimulator(model, threads=simulator.threads)
 
     def information(self, record: Dataset, chromosomes: FloatArray) -> FloatArray:
         """Of the search coordinates at chromosomes (n, n_free), (n, n_free, n_free).
 
-        Of the record only inputs, first samples and lost samples count. Not finite where a
-        simulation failed.
+        Of the record only inputs and first samples count. Not finite where a simulation failed.
         """
-        vectors, n_free = self.space.full(chromosomes), len(self.space.index)
-        steps = self.simulator.steps_of_each(vectors, record)
-        slopes = self._slopes(record, chromosomes, steps)
-        changes = self._input_changes(record, vectors, steps)
-        joint = [self._joint(*each) for each in zip(slopes, changes, strict=True)]
+        model, n_free = self._simulator.model, len(self._space.index)
+        unknown = [i for i in range(len(model.states)) if record.initial_range(model, i)]
+        slopes = self._slopes(record, chromosomes, unknown)
+        joint = [self._joint(each, n_free + len(unknown)) for each in slopes]
         return np.array([_without_starts(each, n_free) for each in joint])
 
-    def _slopes(self, record: Dataset, chromosomes: FloatArray, steps: IntArray) -> FloatArray:
-        """Tangents by the search coordinates, then by the starts that the record does not tell.
+    def _slopes(
+        self, record: Dataset, chromosomes: FloatArray, unknown: Sequence[int]
+    ) -> FloatArray:
+        """Tangents by search coordinates, unknown starts, and draws of the inputs' noise.
 
-        (n, n_samples, n_outputs, n_free + n_unknown).
+        (n, n_samples, n_outputs, n_free + n_unknown + n_draws).
         """
-        model, vectors = self.simulator.model, self.space.full(chromosomes)
-        n, n_free = len(vectors), len(self.space.index)
-        unknown = [i for i in range(len(model.states)) if record.initial_range(model, i)]
-        by_starts = np.zeros((n, len(unknown), vectors.shape[1]))
-        along = np.concatenate([self._directions(chromosomes), by_starts], axis=1)
-        moved = np.zeros((n, along.shape[1], len(model.states)))
-        moved[:, np.arange(len(unknown)) + n_free, unknown] = 1.0
-        (slopes,) = self.simulator.tangents(
-            vectors, [record], along, steps[:, None], start_directions=[moved]
+        model, vectors = self._disturbed.model, self._space.full(chromosomes)
+        n, n_free, n_starts = len(vectors), len(self._space.index), len(unknown)
+        n_draws = _DRAWS if len(self._noisy) else 0
+        quiet = np.zeros((n, n_draws))
+        along = np.zeros((n, n_free + n_starts + n_draws, len(model.parameters)))
+        along[:, :n_free, : vectors.shape[1]] = self._directions(chromosomes)
+        along[:, n_free + n_starts :, vectors.shape[1] :] = np.eye(n_draws)
+        moved = np.zeros((*along.shape[:2], len(model.states)))
+        moved[:, np.arange(n_starts) + n_free, unknown] = 1.0
+        steps = self._simulator.steps_of_each(vectors, record)[:, None]
+        errors = np.random.default_rng(0).standard_normal(
+            (record.n_samples, len(self._noisy), n_draws)
+        )
+        channels = (errors * self._input_noise[self._noisy, None]).reshape(record.n_samples, -1)
+        with_errors = replace(
+            record,
+            inputs=np.hstack([record.inputs, channels]),
+            input_zero=np.zeros(0),
+            input_noise=np.zeros(0),
+        )
+        (slopes,) = self._disturbed.tangents(
+            np.hstack([vectors, quiet]), [with_errors], along, steps, start_directions=[moved]
         )
         return slopes
 
-    def _input_changes(self, record: Dataset, vectors: FloatArray, steps: IntArray) -> FloatArray:
-        """Changes of the outputs by noise of the inputs, always the same draws of it.
+    def _joint(self, slopes: FloatArray, n: int) -> FloatArray:
+        """Information of n coordinates and unknown starts together.
 
-        (n, n_draws, n_samples, n_outputs), no draws where no input is noisy.
+        slopes: (n_samples, n_outputs, n + n_draws), those by draws of the inputs' noise behind.
         """
-        shape = record.outputs.shape
-        if not self.input_noise.any():
-            return np.zeros((len(vectors), 0, *shape))
-        errors = np.random.default_rng(0).standard_normal((_DRAWS, *record.inputs.shape))
-        disturbed = [replace(record, inputs=record.inputs + self.input_noise * e) for e in errors]
-        records = [record, *disturbed]
-        each = np.repeat(steps[:, None], len(records), axis=1)
-        nothing = [None] * len(records)
-        outputs = self.simulator.residuals(vectors, records, nothing, each, nothing).values
-        runs = np.moveaxis(outputs.reshape(len(records), *shape, len(vectors)), -1, 0)
-        changes: FloatArray = runs[:, 1:] - runs[:, :1]
-        return changes
-
-    def _joint(self, slopes: FloatArray, changes: FloatArray) -> FloatArray:
-        """Information of coordinates and unknown starts together, by slopes (n_samples, n_outputs,
-        n) and changes (n_draws, n_samples, n_outputs).
-        """
-        counted = np.isfinite(self.noise)
-        of_outputs = self.noise[counted] ** 2
-        n_draws, n = len(changes), slopes.shape[-1]
-        slopes, changes = slopes[:, counted], changes[..., counted]
-        variances = of_outputs + np.sum(changes**2, axis=0) / max(n_draws, 1)
+        counted = np.isfinite(self._noise)
+        of_outputs = self._noise[counted] ** 2
+        slopes, changes = slopes[:, counted, :n], slopes[:, counted, n:]
+        n_draws = changes.shape[-1]
+        variances = of_outputs + np.sum(changes**2, axis=-1) / max(n_draws, 1)
         weighted = slopes / variances[..., None]
         curvature: FloatArray = np.einsum("tip,tir->pr", weighted, slopes, optimize=True)
         if not n_draws or not np.isfinite(curvature).all():
             return curvature
-        pushes = changes.reshape(n_draws, -1) @ weighted.reshape(-1, n)
+        pushes = np.einsum("tip,tik->pk", weighted, changes, optimize=True)
         score = np.einsum("tip,i,tir->pr", weighted, of_outputs, weighted, optimize=True)
-        effective: FloatArray = curvature @ pinvh(score + pushes.T @ pushes / n_draws) @ curvature
+        effective: FloatArray = curvature @ pinvh(score + pushes @ pushes.T / n_draws) @ curvature
         return effective
 
     def null_directions(self, chromosome: FloatArray) -> FloatArray:
         """Directions of the search coordinates that no record tells, (k, n_free), of length one."""
-        model, n_free = self.simulator.model, len(self.space.index)
+        model, n_free = self._simulator.model, len(self._space.index)
         counted = [
-            name for name, s in zip(model.output_names, self.noise, strict=True) if s < np.inf
+            name for name, s in zip(model.output_names, self._noise, strict=True) if s < np.inf
         ]
         unknown = tuple(state.name for state in model.states if state.initial_range is not None)
         basis = null_directions(
-            self.space.as_model().with_outputs(counted),
-            self.space.full(chromosome),
-            self.space.names[:n_free],
+            self._space.as_model().with_outputs(counted),
+            self._space.full(chromosome),
+            self._space.names[:n_free],
             unknown,
         )
-        directions = basis[:, :n_free] / np.where(self.space.log, chromosome, 1.0)
+        directions = basis[:, :n_free] / np.where(self._space.log, chromosome, 1.0)
         lengths = np.linalg.norm(directions, axis=1, keepdims=True)
         moving = lengths[:, 0] > 0.0
         normed: FloatArray = directions[moving] / lengths[moving]
@@ -128,7 +134,7 @@ class Informant:
 
     def _directions(self, chromosomes: FloatArray) -> FloatArray:
         """How parameters move with each search coordinate, (n, n_free, n_parameters)."""
-        space = self.space
+        space = self._space
         increments = np.where(space.log, chromosomes, 1.0)
         directions = np.zeros((*chromosomes.shape, len(space.base)))
         for k, place in enumerate(space.index):
