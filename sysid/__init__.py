@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from sysid.campaigns.runs import Campaign, Outcome, Run, Spread, campaign, combinations
     from sysid.engine.simulation import BatchResult, BatchSimulator, Status
     from sysid.engine.stepper import Stepper
+    from sysid.experiments import Design, Excitation, Prior, Setting, design
     from sysid.fitting.free_run import free_run
     from sysid.gassi import GASSI
     from sysid.identifiability.analysis import Identifiability, TiedGroup
@@ -47,6 +48,8 @@ __all__ = [
     "Comparison",
     "Constraint",
     "Dataset",
+    "Design",
+    "Excitation",
     "Given",
     "Guess",
     "Identifiability",
@@ -57,9 +60,11 @@ __all__ = [
     "Outcome",
     "Output",
     "Parameter",
+    "Prior",
     "ProcessModel",
     "Run",
     "SearchSpace",
+    "Setting",
     "Spread",
     "State",
     "Status",
@@ -68,6 +73,7 @@ __all__ = [
     "campaign",
     "combinations",
     "compare",
+    "design",
     "equilibrium",
     "evaluate",
     "fit_percent",
@@ -89,6 +95,7 @@ _NAMES = {
     "sysid.campaigns.runs": "Campaign Outcome Run Spread campaign combinations",
     "sysid.engine.simulation": "BatchResult BatchSimulator Status",
     "sysid.engine.stepper": "Stepper",
+    "sysid.experiments": "Design Excitation Prior Setting design",
     "sysid.fitting.free_run": "free_run",
     "sysid.gassi": "GASSI",
     "sysid.identifiability.analysis": "Identifiability TiedGroup",

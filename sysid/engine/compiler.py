@@ -24,6 +24,7 @@ from sysid.engine.batch_kernel import BatchKernel
 from sysid.engine.filter_kernel import FilterKernel
 from sysid.engine.structure import analyse
 from sysid.engine.substitution import KNOWN_MODULES, Copier, names_in
+from sysid.engine.tangent import TangentKernel
 from sysid.engine.trajectory_kernel import TrajectoryKernel
 from sysid.engine.variation import variation
 from sysid.problem.model import ModelError, ProcessModel
@@ -80,6 +81,27 @@ def kalman_filter(
     kernel = FilterKernel(model, variation(model, noisy, driven))
     text = f"{kernel.structure.program}\n\n{kernel.text()}"
     return Filter(kernel, *_compiled(model, text, {}, ("innovations",)))
+
+
+@dataclass(frozen=True)
+class Tangents:
+    """A model's compiled tangents."""
+
+    kernel: TangentKernel
+    simulate: Callable[..., None]
+
+
+@functools.lru_cache(maxsize=8)
+def tangents(model: ProcessModel) -> Tangents:
+    """Compile the tangents of a model; as ``kernels``.
+
+    Raises ModelError for equations that cannot be differentiated.
+    """
+    from sysid.engine.intrinsics import many_registers
+
+    kernel = TangentKernel(model)
+    text = f"{kernel.structure.program}\n\n{kernel.text(many_registers=many_registers())}"
+    return Tangents(kernel, *_compiled(model, text, {}, ("simulate",)))
 
 
 def _compiled(

@@ -161,6 +161,8 @@ def _tangent(tape: Tape, line: Line, moved: Sequence[Tangent]) -> Tangent:
         return _RULES[line.form](tape, line, *moved)
     if line.form.startswith(("min(", "max(")):
         return _of_extreme(tape, line, moved)
+    if line.form in _CONDITIONS:
+        return {}
     if line.form not in _PARTIALS:
         function = line.form.removeprefix("math.").partition("(")[0]
         raise TypeError(f"the derivative of {function} is not known")
@@ -225,6 +227,17 @@ def _each(operation: Callable[[str], str], tangent: Tangent) -> dict[int, str]:
     return {k: operation(t) for k, t in tangent.items()}
 
 
+def _of_choice(
+    tape: Tape, line: Line, of_condition: Tangent, first: Tangent, second: Tangent
+) -> Tangent:
+    form, condition = "select({}, {}, {})", line.operands[0]
+    return {
+        k: tape.emit(form, condition, first.get(k, "0.0"), second.get(k, "0.0"))
+        for k in [*first, *second]
+    }
+
+
+_CONDITIONS = tuple(f"{{}} {sign} {{}}" for sign in ("<", "<=", ">", ">=", "==", "!="))
 _RULES: dict[str, Callable[..., Tangent]] = {
     "{} + {}": _of_sum,
     "{} - {}": _of_sum,
@@ -233,4 +246,5 @@ _RULES: dict[str, Callable[..., Tangent]] = {
     "{} / {}": _of_quotient,
     "{} ** {}": _of_power,
     "math.pow({}, {})": _of_power,
+    "select({}, {}, {})": _of_choice,
 }

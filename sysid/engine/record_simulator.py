@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sysid.arrays import BoolArray, FloatArray, IntArray
-from sysid.engine.compiler import Filter, Kernels, explained_errors
+from sysid.engine.compiler import Filter, Kernels, Tangents, explained_errors
 from sysid.engine.scheme import LANES, work_area
 from sysid.engine.windows import average
 from sysid.problem.data import Dataset
@@ -184,6 +184,27 @@ class RecordSimulator:
         values[:] = kept[..., : len(lanes)]
         sse, logarithms = (half.T[: len(lanes)] for half in np.split(sums, 2))
         return sse, logarithms
+
+    def tangents(
+        self, tangents: Tangents, parameters: FloatArray, starts: FloatArray, n_steps: int
+    ) -> FloatArray:
+        """Tangents of the outputs of up to LANES rows at so many steps per sample.
+
+        parameters: (n, 2 n_parameters), each behind its own the direction in which they move;
+        starts: likewise (n, 2 n_states). Returns (n_samples, n_outputs, n).
+        """
+        kernel, n = tangents.kernel, len(parameters)
+        padded = np.arange(LANES) % n
+        kept = np.empty((*self._measured.shape, LANES))
+        work = work_area(kernel.work_rows * LANES)
+        with explained_errors(self.kernels.model):
+            tangents.simulate(
+                work, work.reshape(-1, LANES), kernel.tables, self._inputs,
+                np.zeros_like(self._measured), np.ones_like(self._measured),
+                np.ascontiguousarray(starts[padded].T), np.ascontiguousarray(parameters[padded].T),
+                self.record.dt, n_steps, np.empty((2 * kernel.n_outputs, LANES)), kept,
+            )  # fmt: skip
+        return kept[..., :n]
 
     def block(
         self,

@@ -51,10 +51,10 @@ class Scheme:
     def __init__(self, model: ProcessModel, structure: Structure) -> None:
         self.structure = structure
         self.n_states, self.n_inputs = structure.n_states, structure.n_inputs
-        self.n_outputs, self.n_parameters = len(model.outputs), len(model.parameters)
+        self.n_outputs, self.n_parameters = structure.n_outputs, structure.n_parameters
         self.n_constants = structure.n_constants
         self.n_margins = sum(guard.n_limits for guard in structure.guards)
-        self.output_states = model.output_states
+        self.output_states = structure.output_states
         self.n_recorded = len(model.inputs)
         self.recorded_slopes = [j for j, u in enumerate(model.inputs) if u.hold != "zoh"]
         # Whatever stands behind a record's inputs rises within a sample.

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sysid.arrays import FloatArray, IntArray
-from sysid.engine.compiler import kalman_filter, kernels
+from sysid.engine.compiler import kalman_filter, kernels, tangents
 from sysid.engine.record_simulator import RecordSimulator
 from sysid.engine.scheme import LANES
 from sysid.problem.data import Dataset
@@ -240,6 +240,59 @@ class BatchSimulator:
             sse=innovations.sse * factor[:, None] ** 2,
         )
 
+    def tangents(
+        self,
+        parameters: FloatArray,
+        records: Sequence[Dataset],
+        directions: FloatArray,
+        n_steps: IntArray,
+        starts: Sequence[FloatArray | None] | None = None,
+        start_directions: Sequence[FloatArray] | None = None,
+    ) -> list[FloatArray]:
+        """How the outputs of free runs move along directions of the parameters and the starts.
+
+        parameters: (n, n_parameters). directions: (n, n_directions, n_parameters), of each row of
+        them. n_steps: (n, n_records), integration steps per sample, through which the tangents are
+        exact. starts: per record, (n, n_states), default the record's own; start_directions: per
+        record, (n, n_directions, n_states), default zero. Returns for each record
+        (n, n_samples, n_outputs, n_directions), not finite where a simulation failed. Raises
+        ModelError for equations that cannot be differentiated.
+
+        >>> from sysid.examples import lag
+        >>> record = Dataset(np.ones(4), np.zeros(4), dt=0.05)
+        >>> along_gain, steps = np.array([[[1.0, 0.0]]]), np.ones((1, 1), dtype=int)
+        >>> (tangents,) = BatchSimulator(lag()).tangents(lag().nominal, [record], along_gain, steps)
+        >>> tangents.round(3).ravel()
+        array([0.   , 0.632, 0.865, 0.95 ])
+        """
+        parameters, compiled = self._check(parameters, records), tangents(self.model)
+        n, n_directions = directions.shape[:2]
+        lanes = np.concatenate(_each_beside(parameters, directions), axis=1)
+        values: list[FloatArray] = []
+        tasks: list[tuple[int, RecordSimulator, FloatArray, slice, int]] = []
+        for r, record in enumerate(records):
+            start = None if starts is None else starts[r]
+            if start is None:
+                start = record.initial_state(self.model)[None]
+            start = np.broadcast_to(start, (n, len(self.model.states)))
+            moves = np.zeros((n, n_directions, len(self.model.states)))
+            if start_directions is not None:
+                moves = start_directions[r]
+            rows = np.concatenate(_each_beside(start, moves), axis=1)
+            values.append(np.empty((record.n_samples, len(self.model.outputs), len(rows))))
+            steps = np.repeat(n_steps[:, r], n_directions)
+            tasks += [(r, self._on(record), rows, *run) for run in _runs(steps)]
+
+        def run(task: tuple[int, RecordSimulator, FloatArray, slice, int]) -> None:
+            r, simulator, from_starts, rows, steps = task
+            part = simulator.tangents(compiled, lanes[rows], from_starts[rows], steps)
+            values[r][..., rows] = part
+
+        self._workers.each(run, tasks)
+        return [
+            np.moveaxis(value.reshape(*value.shape[:2], n, n_directions), 2, 0) for value in values
+        ]
+
     def _gathered(
         self,
         simulate: Callable[..., tuple[FloatArray, FloatArray]],
@@ -300,6 +353,11 @@ class BatchSimulator:
                 f"(n, {len(self.model.parameters)})"
             )
         return parameters
+
+
+def _each_beside(points: FloatArray, directions: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Points (n, m) repeated for each of their directions (n, d, m), and these, (n d, m) each."""
+    return np.repeat(points, directions.shape[1], axis=0), directions.reshape(-1, points.shape[1])
 
 
 def noisy_inputs(records: Sequence[Dataset]) -> tuple[int, ...]:

@@ -12,9 +12,11 @@ from dataclasses import dataclass, field
 
 from sysid.engine.program import Writer
 from sysid.engine.split import Clamp, Split, Splitter
-from sysid.engine.tape import Tape
+from sysid.engine.tape import Tape, UndecidedError
 from sysid.engine.trace import followed, operand, traces
 from sysid.problem.model import Function, ProcessModel
+
+_MOST_WAYS = 256  # through the conditions of a function
 
 
 @dataclass(frozen=True)
@@ -40,11 +42,15 @@ class Structure:
     depends on a state. guards: limits that fast linear parts may run into. shown: states that an
     output depends on directly, so that an error in one of them shows there. program: source text,
     see ``Writer.program``. calls: which of ``derivative`` and ``output`` the program refers to.
-    n_states, n_inputs: how many the program takes.
+    n_states, n_inputs, n_parameters: how many the program takes; n_outputs: how many it gives,
+    where output_states, the state that each output is, is None.
     """
 
     n_states: int
     n_inputs: int
+    n_parameters: int
+    n_outputs: int
+    output_states: tuple[int, ...] | None
     coefficients: Mapping[tuple[int, int], str]
     driven: tuple[int, ...]
     nonlinear: bool
@@ -89,10 +95,10 @@ def structure(
     # The clamps of linear values that the rows contain, by their place among all clamps.
     places = sorted({k for row in rows for k in row.kinks})
     clamps = {k: splitter.clamps[k] for k in places if splitter.clamps[k].base.linear}
-    parts = [_parts(splitter, row) if exact else ({}, row.total) for row in rows]
-    linear = {(i, j): name for i, (row, _) in enumerate(parts) for j, name in row.items()}
+    pieces = [parts(splitter, row) if exact else ({}, row.total) for row in rows]
+    linear = {(i, j): name for i, (row, _) in enumerate(pieces) for j, name in row.items()}
     gains = {k: {i: row.kinks[k] for i, row in enumerate(rows) if k in row.kinks} for k in clamps}
-    functions = {"remainder": [rest for _, rest in parts]}
+    functions = {"remainder": [rest for _, rest in pieces]}
     shown = frozenset(model.output_states or range(len(model.states)))
     if outputs is not None:
         functions["observe"] = [value.total for value in outputs]
@@ -117,9 +123,9 @@ def structure(
     )
     driven, nonlinear = _driven(equations, clamps, exact)
     return Structure(
-        equations.n_states, equations.n_inputs,
-        writer.placed(linear), driven, nonlinear, guards, shown, writer.program(),
-        len(writer.constants), writer.calls,
+        equations.n_states, equations.n_inputs, len(model.parameters), len(model.outputs),
+        model.output_states, writer.placed(linear), driven, nonlinear, guards, shown,
+        writer.program(), len(writer.constants), writer.calls,
     )  # fmt: skip
 
 
@@ -137,17 +143,56 @@ def _driven(
 
 def _splits(splitter: Splitter, model: ProcessModel, function: Function) -> list[Split] | None:
     """The values of a model's function, split; None where traces cannot follow it."""
-    equations = Tape()
-    sides = zip("xup", (model.states, model.inputs, model.parameters), strict=True)
     try:
-        values = followed(function)(*(traces(equations, name, len(items)) for name, items in sides))
-        return splitter.split(equations, map(operand, values))
+        return split_function(splitter, model, function)
     except Exception:
         # Whatever it does that a trace cannot follow, the compiler may well be able to.
         return None
 
 
-def _parts(splitter: Splitter, row: Split) -> tuple[Mapping[int, str], str]:
+def split_function(
+    splitter: Splitter, model: ProcessModel, function: Function, *, branches: bool = False
+) -> list[Split]:
+    """The values of a model's function, split; raises what it does that traces cannot follow.
+
+    branches: whether it may have conditions, of which both ways are followed.
+    """
+    equations = Tape()
+    follow = branching if branches else traced
+    return splitter.split(equations, follow(equations, model, function))
+
+
+def branching(tape: Tape, model: ProcessModel, function: Function) -> list[str]:
+    """As ``traced``, with the values of both ways of each condition, and a choice of them."""
+    ways = 0
+
+    def follow(decisions: Mapping[str, bool]) -> list[str]:
+        nonlocal ways
+        ways += 1
+        if ways > _MOST_WAYS:
+            raise TypeError(f"its conditions lead more than {_MOST_WAYS} ways")
+        tape.decisions = dict(decisions)
+        try:
+            return traced(tape, model, function)
+        except UndecidedError as undecided:
+            condition = undecided.name
+        true, false = (follow({**decisions, condition: outcome}) for outcome in (True, False))
+        return [
+            a if a == b else tape.emit("select({}, {}, {})", condition, a, b)
+            for a, b in zip(true, false, strict=True)
+        ]
+
+    return follow({})
+
+
+def traced(tape: Tape, model: ProcessModel, function: Function) -> list[str]:
+    """Names on a tape of the values of a model's function; raises what traces cannot follow."""
+    sides = zip("xup", (model.states, model.inputs, model.parameters), strict=True)
+    values = followed(function)(*(traces(tape, name, len(items)) for name, items in sides))
+    return [operand(value) for value in values]
+
+
+def parts(splitter: Splitter, row: Split) -> tuple[Mapping[int, str], str]:
     """Coefficients of a row in A, and its rest in N with all states that enter it nonlinearly."""
     linear = {j: c for j, c in row.linear.items() if j not in row.nonlinear}
     if not linear:

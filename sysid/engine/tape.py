@@ -20,11 +20,20 @@ class Line(NamedTuple):
     fixed: bool
 
 
+class UndecidedError(TypeError):
+    """A condition needs the value of a number; it says the condition's name on the tape."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__("a condition needs the value of a number")
+        self.name = name
+
+
 class Tape:
     """Straight-line code over states x0.., inputs u0.., parameters p0.. and results t0..
 
     point: values of the states, inputs and parameters by name, floats or arrays of many; without
-    it the code knows no values. decisions: conditions met on the way and their outcomes there.
+    it the code knows no values, and conditions raise ``UndecidedError`` unless their outcomes stand
+    in ``decisions``. decisions: conditions met on the way and their outcomes.
     arithmetic: the function that a form of so many operands stands for, where values are none of
     these.
     """
@@ -60,10 +69,12 @@ class Tape:
         return self._lines[text].name
 
     def decide(self, form: str, *operands: str) -> bool:
-        """Whether a condition holds at the tape's point; raises TypeError where it has none."""
-        if self._values is None:
-            raise TypeError("a condition needs the value of a number")
+        """Whether a condition holds at the tape's point; raises UndecidedError without one."""
         name = self.emit(form, *operands)
+        if self._values is None:
+            if name not in self.decisions:
+                raise UndecidedError(name)
+            return self.decisions[name]
         self.decisions[name] = bool(self.value(name))
         return self.decisions[name]
 

@@ -22,9 +22,8 @@ from typing import Literal
 
 from sysid.engine.gradient import differentiate
 from sysid.engine.split import Splitter
-from sysid.engine.structure import SplitEquations, Structure, structure
+from sysid.engine.structure import SplitEquations, Structure, structure, traced
 from sysid.engine.tape import Tape
-from sysid.engine.trace import followed, operand, traces
 from sysid.problem.model import Function, ModelError, ProcessModel
 
 # What a column of deviations comes from: a deviation of a state at the start of the interval, or
@@ -101,19 +100,22 @@ def _differentiated(
     model: ProcessModel, tape: Tape, function: Function, noisy: Sequence[int]
 ) -> tuple[list[str], _Slopes]:
     """A function's values on a tape, and their slopes over states and then noisy inputs."""
-    sides = zip("xup", (model.states, model.inputs, model.parameters), strict=True)
     variables = [f"x{i}" for i in range(len(model.states))] + [f"u{j}" for j in noisy]
     try:
-        values = followed(function)(*(traces(tape, name, len(items)) for name, items in sides))
-        names = [operand(value) for value in values]
+        names = traced(tape, model, function)
         moves = {name: {k: "1.0"} for k, name in enumerate(variables)}
         return names, differentiate(tape, names, moves)
     except Exception as error:
         # Whatever a function may do that traces cannot follow.
-        raise ModelError(
-            f"model {model.name}: its equations cannot be differentiated as they stand ({error}); "
-            "write conditions with abs, min, max and functions of math"
-        ) from error
+        raise not_differentiable(model, error) from error
+
+
+def not_differentiable(model: ProcessModel, error: Exception) -> ModelError:
+    """What to say of equations that cannot be differentiated without a point."""
+    return ModelError(
+        f"model {model.name}: its equations cannot be differentiated as they stand ({error}); "
+        "write conditions with abs, min, max and functions of math"
+    )
 
 
 def _reached(slopes: _Slopes, n: int, noisy: Sequence[int], driven: Sequence[int]) -> set[int]:

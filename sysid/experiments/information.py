@@ -1,0 +1,168 @@
+"""Fisher information of an experiment before it is run.
+
+With the tangents S of the outputs by the search coordinates and white noise of variance r on each
+output it is F = S' S / r. Starts that a record does not tell take their part of it away; the Schur
+complement is left.
+
+Noise of a measured input moves the outputs by G n, which is not white. A fit divides each error by
+the variance s = r + var(G n) of its sample (``criterion: compensated`` of an identification). With
+J = S' S / s and the covariance C of S' e / s its estimate scatters by J^-1 C J^-1; what it tells is
+the inverse of that.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.linalg import pinvh
+
+from sysid.arrays import FloatArray
+from sysid.engine.simulation import BatchSimulator
+from sysid.experiments.disturbance import with_disturbances
+from sysid.identifiability import null_directions
+from sysid.problem.data import Dataset
+from sysid.problem.model import ModelError
+from sysid.problem.space import SearchSpace
+
+# Share of the largest information above which a direction that tells nothing is told something.
+_PHANTOM = 1e-10
+# Draws of the inputs' noise: they give a variance to within a third.
+_DRAWS = 16
+
+
+class Informant:
+    """Computes what a record would tell of the parameters.
+
+    noise: (n_outputs,), standard deviations of the outputs' errors, infinite for one that does not
+    count; input_noise: (n_inputs,), of the white noise on measured inputs.
+    """
+
+    def __init__(
+        self,
+        simulator: BatchSimulator,
+        space: SearchSpace,
+        noise: FloatArray,
+        input_noise: FloatArray,
+    ) -> None:
+        self._simulator, self._space, self._noise = simulator, space, noise
+        self._noisy, self._input_noise = np.flatnonzero(input_noise), input_noise
+        self._disturbed = simulator
+        if len(self._noisy):
+            model = with_disturbances(simulator.model, self._noisy.tolist(), _DRAWS)
+            self._disturbed = BatchSimulator(model, threads=simulator.threads)
+
+    def information(self, record: Dataset, chromosomes: FloatArray) -> FloatArray:
+        """Of the search coordinates at chromosomes (n, n_free), (n, n_free, n_free).
+
+        Of the record only inputs and first samples count. Not finite where a simulation failed.
+        """
+        model, n_free = self._simulator.model, len(self._space.index)
+        unknown = [i for i in range(len(model.states)) if record.initial_range(model, i)]
+        slopes = self._slopes(record, chromosomes, unknown)
+        joint = [self._joint(each, n_free + len(unknown)) for each in slopes]
+        return np.array([_without_starts(each, n_free) for each in joint])
+
+    def _slopes(
+        self, record: Dataset, chromosomes: FloatArray, unknown: Sequence[int]
+    ) -> FloatArray:
+        """Tangents by search coordinates, unknown starts, and draws of the inputs' noise.
+
+        (n, n_samples, n_outputs, n_free + n_unknown + n_draws).
+        """
+        model, vectors = self._disturbed.model, self._space.full(chromosomes)
+        n, n_free, n_starts = len(vectors), len(self._space.index), len(unknown)
+        n_draws = _DRAWS if len(self._noisy) else 0
+        quiet = np.zeros((n, n_draws))
+        along = np.zeros((n, n_free + n_starts + n_draws, len(model.parameters)))
+        along[:, :n_free, : vectors.shape[1]] = self._directions(chromosomes)
+        along[:, n_free + n_starts :, vectors.shape[1] :] = np.eye(n_draws)
+        moved = np.zeros((*along.shape[:2], len(model.states)))
+        moved[:, np.arange(n_starts) + n_free, unknown] = 1.0
+        steps = self._simulator.steps_of_each(vectors, record)[:, None]
+        errors = np.random.default_rng(0).standard_normal(
+            (record.n_samples, len(self._noisy), n_draws)
+        )
+        channels = (errors * self._input_noise[self._noisy, None]).reshape(record.n_samples, -1)
+        with_errors = replace(
+            record,
+            inputs=np.hstack([record.inputs, channels]),
+            input_zero=np.zeros(0),
+            input_noise=np.zeros(0),
+        )
+        (slopes,) = self._disturbed.tangents(
+            np.hstack([vectors, quiet]), [with_errors], along, steps, start_directions=[moved]
+        )
+        return slopes
+
+    def _joint(self, slopes: FloatArray, n: int) -> FloatArray:
+        """Information of n coordinates and unknown starts together.
+
+        slopes: (n_samples, n_outputs, n + n_draws), those by draws of the inputs' noise behind.
+        """
+        counted = np.isfinite(self._noise)
+        of_outputs = self._noise[counted] ** 2
+        slopes, changes = slopes[:, counted, :n], slopes[:, counted, n:]
+        n_draws = changes.shape[-1]
+        variances = of_outputs + np.sum(changes**2, axis=-1) / max(n_draws, 1)
+        weighted = slopes / variances[..., None]
+        curvature: FloatArray = np.einsum("tip,tir->pr", weighted, slopes, optimize=True)
+        if not n_draws or not np.isfinite(curvature).all():
+            return curvature
+        pushes = np.einsum("tip,tik->pk", weighted, changes, optimize=True)
+        score = np.einsum("tip,i,tir->pr", weighted, of_outputs, weighted, optimize=True)
+        effective: FloatArray = curvature @ pinvh(score + pushes @ pushes.T / n_draws) @ curvature
+        return effective
+
+    def null_directions(self, chromosome: FloatArray) -> FloatArray:
+        """Directions of the search coordinates that no record tells, (k, n_free), of length one."""
+        model, n_free = self._simulator.model, len(self._space.index)
+        counted = [
+            name for name, s in zip(model.output_names, self._noise, strict=True) if s < np.inf
+        ]
+        unknown = tuple(state.name for state in model.states if state.initial_range is not None)
+        basis = null_directions(
+            self._space.as_model().with_outputs(counted),
+            self._space.full(chromosome),
+            self._space.names[:n_free],
+            unknown,
+        )
+        directions = basis[:, :n_free] / np.where(self._space.log, chromosome, 1.0)
+        lengths = np.linalg.norm(directions, axis=1, keepdims=True)
+        moving = lengths[:, 0] > 0.0
+        normed: FloatArray = directions[moving] / lengths[moving]
+        return normed
+
+    def _directions(self, chromosomes: FloatArray) -> FloatArray:
+        """How parameters move with each search coordinate, (n, n_free, n_parameters)."""
+        space = self._space
+        increments = np.where(space.log, chromosomes, 1.0)
+        directions = np.zeros((*chromosomes.shape, len(space.base)))
+        for k, place in enumerate(space.index):
+            directions[:, k, place] = increments[:, k]
+        for tie in space.ties:
+            directions[:, :, tie.index] = tie.factor * directions[:, :, tie.source]
+        return directions
+
+
+def refuse_phantoms(information: FloatArray, null: FloatArray) -> None:
+    """Raise ModelError where information (n_free, n_free) tells what no experiment can.
+
+    null: (k, n_free), directions of length one that the equations leave undetermined.
+    """
+    phantom = np.einsum("ki,ij,kj->k", null, information, null)
+    largest = float(np.abs(information).max(initial=0.0))
+    if np.any(phantom > _PHANTOM * largest):
+        raise ModelError(
+            "the simulation tells a direction apart that the equations leave undetermined, with "
+            f"{phantom.max():.2g} of {largest:.2g}: its error passes for information; lower the "
+            "accuracy's figure"
+        )
+
+
+def _without_starts(joint: FloatArray, n_free: int) -> FloatArray:
+    """Information of the first coordinates where the others are unknown, (n_free, n_free)."""
+    alone, cross, others = joint[:n_free, :n_free], joint[:n_free, n_free:], joint[n_free:, n_free:]
+    if not len(others) or not np.isfinite(joint).all():
+        return alone
+    left: FloatArray = alone - cross @ pinvh(others) @ cross.T
+    return left

@@ -1,0 +1,144 @@
+"""The search for runs that together tell most.
+
+A run adds its information to that of the others. So a set of runs is chosen as an exact design is:
+greedily, then by exchanges, each run for whichever candidate serves better (Fedorov, "Theory of
+Optimal Experiments", 1972). Settings of chosen runs are recombined and moved, by less and less, and
+their offspring become candidates.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sysid.arrays import FloatArray
+from sysid.experiments.criteria import Criterion
+from sysid.experiments.excitation import Excitation
+from sysid.problem.model import ModelError
+
+_WIDEST, _FINEST = 0.3, 0.02  # deviation of a moved setting, in parts of its range
+_HALVINGS = 3  # of the way from offspring that pass a limit to one that does not
+_ROUNDS = 20  # of exchanges
+_GAIN = 1e-9  # by which an exchange must lower the loss
+
+
+@dataclass(frozen=True)
+class RunCandidate:
+    """A run that may be chosen: its excitation, places in its settings' ranges, information.
+
+    information: (n_draws, n_free, n_free).
+    """
+
+    excitation: Excitation
+    genes: FloatArray
+    information: FloatArray
+
+
+# Makes a candidate of an excitation and its genes; None where a run would pass a limit.
+Evaluate = Callable[[Excitation, FloatArray], RunCandidate | None]
+
+
+@dataclass
+class Search:
+    """Candidates so far, and the best set of them.
+
+    attempts: runs that were simulated; chosen: the set, as places in ``pool``, the same one perhaps
+    several times.
+    """
+
+    excitations: Sequence[Excitation]
+    evaluate: Evaluate
+    criterion: Criterion
+    rng: np.random.Generator
+    most: int
+
+    def __post_init__(self) -> None:
+        self.pool: list[RunCandidate] = []
+        self.chosen: list[int] = []
+        self.attempts = 0
+
+    def run(
+        self, candidates: int, generations: int, offspring: int, watch: Callable[[str], None] | None
+    ) -> None:
+        """Candidates anywhere, then generations of offspring of the best set.
+
+        Raises ModelError where none of the candidates keeps the limits.
+        """
+        self.scatter(candidates)
+        if not self.pool:
+            raise ModelError(
+                f"each of {candidates} runs that were tried would pass a limit; let the settings "
+                "reach down to less, or know the parameters better"
+            )
+        self.choose()
+        for k in range(generations):
+            if watch is not None:
+                watch(f"generation {k + 1} of {generations}: {len(self.pool)} runs to choose from")
+            self.generation(offspring, k / max(generations - 1, 1))
+            self.choose()
+
+    def scatter(self, n: int) -> None:
+        """Candidates anywhere in the settings' ranges, of each excitation alike many."""
+        for k in range(n):
+            excitation = self.excitations[k % len(self.excitations)]
+            self._add(excitation, self.rng.random(len(excitation.settings)))
+
+    def generation(self, n: int, progress: float) -> None:
+        """Offspring of the chosen; progress: 0 at the first generation, 1 at the last."""
+        width = _WIDEST * (_FINEST / _WIDEST) ** progress
+        for _ in range(n):
+            mother, father = (self.pool[i] for i in self.rng.choice(self.chosen, 2))
+            genes = mother.genes.copy()
+            if father.excitation is mother.excitation and self.rng.random() > progress:
+                from_father = self.rng.random(len(genes)) < 0.5
+                genes[from_father] = father.genes[from_father]
+            moves = width * self.rng.standard_normal(len(genes))
+            moves[self.rng.random(len(genes)) < 0.5] = 0.0
+            self._settle(mother, np.clip(genes + moves, 0.0, 1.0))
+
+    def choose(self) -> None:
+        """The best set that greed and exchanges lead to."""
+        stack = np.array([candidate.information for candidate in self.pool])
+        if not self.chosen:
+            self._greedily(stack)
+        for _ in range(_ROUNDS):
+            exchanged = [self._exchange(stack, place) for place in range(len(self.chosen))]
+            if not any(exchanged):
+                break
+
+    def total(self) -> FloatArray:
+        """Information of the chosen together, (n_draws, n_free, n_free)."""
+        total: FloatArray = np.sum([self.pool[i].information for i in self.chosen], axis=0)
+        return total
+
+    def _greedily(self, stack: FloatArray) -> None:
+        """One run after the other, until there are enough or all targets are met."""
+        total = np.zeros_like(stack[0])
+        while len(self.chosen) < self.most and not self.criterion.met(total):
+            self.chosen.append(int(np.argmin(self.criterion.losses(total + stack))))
+            total = total + stack[self.chosen[-1]]
+
+    def _exchange(self, stack: FloatArray, place: int) -> bool:
+        """Replace a chosen run by the best for its place; whether that was another."""
+        others = self.total() - stack[self.chosen[place]]
+        losses = self.criterion.losses(others + stack)
+        best = int(np.argmin(losses))
+        better = bool(losses[best] < losses[self.chosen[place]] - _GAIN)
+        if better:
+            self.chosen[place] = best
+        return better
+
+    def _settle(self, mother: RunCandidate, genes: FloatArray) -> None:
+        """Add offspring, drawn towards its mother, who keeps the limits, until it does."""
+        for _ in range(_HALVINGS + 1):
+            if self._add(mother.excitation, genes):
+                break
+            genes = 0.5 * (genes + mother.genes)
+
+    def _add(self, excitation: Excitation, genes: FloatArray) -> bool:
+        """Add a candidate if it keeps the limits; whether it does."""
+        self.attempts += 1
+        candidate = self.evaluate(excitation, genes)
+        if candidate is not None:
+            self.pool.append(candidate)
+        return candidate is not None

@@ -1,0 +1,192 @@
+"""Experiments designed for a lag, whose information is known in closed form."""
+
+import numpy as np
+import pytest
+
+from sysid import (
+    BatchSimulator,
+    Excitation,
+    Input,
+    ModelError,
+    Output,
+    Parameter,
+    ProcessModel,
+    SearchSpace,
+    Setting,
+    State,
+    design,
+)
+from sysid.experiments.information import Informant, refuse_phantoms
+from tests.sysid.support import blank
+
+DT = 0.01
+NOISE = {"y": 0.05}
+
+
+def lag(**start):
+    """A lag whose gain is a product of two parameters, of which outputs tell no more."""
+    return ProcessModel(
+        name="two gains",
+        states=(State("y", "m", **start),),
+        inputs=(Input("u", "V"),),
+        outputs=(Output("y", "m"),),
+        parameters=(
+            Parameter("a", "m/N", 2.0, 1.0, 4.0, "log"),
+            Parameter("b", "N/V", 1.5, 1.0, 2.0, "log"),
+            Parameter("tau", "s", 0.2, 0.1, 0.4, "log"),
+        ),
+        derivative=lambda x, u, p: ((p[0] * p[1] * u[0] - x[0]) / p[2],),
+    )
+
+
+def square(size, period):
+    def inputs(settings):
+        k = np.arange(200)
+        wave = np.where(np.sin(2.0 * np.pi * (k + 0.5) * DT / settings["period"]) > 0.0, 1.0, -1.0)
+        return settings["size"] * wave[:, None]
+
+    return Excitation("square", {"size": size, "period": period}, inputs, DT)
+
+
+SQUARE = square(Setting(0.1, 4.0), Setting(0.05, 4.0, log=True))
+QUICK = {"candidates": 12, "generations": 3, "offspring": 6, "draws": 2}
+
+
+def responses_to_step(n=60, gain=3.0, tau=0.2):
+    """Derivatives of the response to a unit step by ln gain, ln tau and the start, (n, 3)."""
+    t = DT * np.arange(n)
+    decay = np.exp(-t / tau)
+    return np.column_stack([gain * (1.0 - decay), -gain * t / tau * decay, decay])
+
+
+def information_of_step(model, input_noise=0.0):
+    noise = np.array([NOISE["y"]]), np.array([input_noise])
+    informant = Informant(BatchSimulator(model), SearchSpace.of(model), *noise)
+    record = blank(model, np.ones((60, 1)), DT)
+    return informant.information(record, model.nominal[None])[0]
+
+
+def test_information_is_that_of_the_closed_form():
+    slopes = responses_to_step()[:, :2] / NOISE["y"]
+    exact = slopes.T @ slopes
+    information = information_of_step(lag())
+    assert information[np.ix_([0, 2], [0, 2])] == pytest.approx(exact, rel=1e-9)
+    assert information[1] == pytest.approx(information[0], rel=1e-12)  # the other gain
+
+
+def test_a_start_that_is_unknown_takes_its_part_of_the_information():
+    slopes = responses_to_step() / NOISE["y"]
+    exact = np.linalg.inv(np.linalg.inv(slopes.T @ slopes)[:2, :2])
+    information = information_of_step(lag(initial_range=(-5.0, 5.0), first_sample=False))
+    assert information[np.ix_([0, 2], [0, 2])] == pytest.approx(exact, rel=1e-9)
+
+
+def test_noise_of_an_input_counts_as_a_fit_that_compensates_it_scatters():
+    slopes, n, sigma = responses_to_step()[:, :2], 60, 0.3
+    decay = np.exp(-DT / 0.2)
+    # The response to a held input's errors, sample by sample.
+    lags = np.subtract.outer(np.arange(n), np.arange(n)) - 1
+    response = np.where(lags >= 0, 3.0 * (1.0 - decay) * decay ** np.maximum(lags, 0), 0.0)
+    variances = NOISE["y"] ** 2 + sigma**2 * np.sum(response**2, axis=1)
+    weighted = slopes / variances[:, None]
+    rng = np.random.default_rng(1)
+    errors = sigma * rng.standard_normal((20_000, n)) @ response.T
+    errors += NOISE["y"] * rng.standard_normal(errors.shape)
+    estimates = errors @ weighted @ np.linalg.inv(slopes.T @ weighted)
+    information = information_of_step(lag(), sigma)[np.ix_([0, 2], [0, 2])]
+    predicted = np.sqrt(np.diag(np.linalg.inv(information)))
+    assert predicted == pytest.approx(estimates.std(axis=0), rel=0.15)
+    without = np.linalg.inv(information_of_step(lag())[np.ix_([0, 2], [0, 2])])
+    assert np.all(predicted > 3.0 * np.sqrt(np.diag(without)))
+
+
+def test_the_designed_runs_tell_more_than_any_of_those_tried_at_random():
+    shared = {"noise": NOISE, "limits": {"u": (-1.0, 1.0)}, "runs": 2, "draws": 2}
+    drawn = design(lag(), [SQUARE], candidates=40, generations=0, **shared)
+    grown = design(lag(), [SQUARE], candidates=40, generations=6, **shared)
+    assert grown.duration == pytest.approx(4.0)
+    assert sum(np.log(q.after) for q in grown.quantities) < sum(
+        np.log(q.after) for q in drawn.quantities
+    )
+    # The best there is uses all that the limit and its margin leave.
+    sizes = [run.settings["size"] for run in grown.runs]
+    assert sizes == pytest.approx([0.9, 0.9], rel=0.05)
+    assert max(sizes) <= 0.9
+
+
+def test_predicted_intervals_are_what_a_repeated_estimate_scatters_by():
+    result = design(lag(), [SQUARE], noise=NOISE, limits={"u": (-1.0, 1.0)}, runs=1, **QUICK)
+    (run,) = result.runs
+    rng, gain, tau = np.random.default_rng(0), 3.0, 0.2
+    y = np.zeros(len(run.inputs))
+    slopes = np.zeros((len(y), 2))
+    decay = np.exp(-DT / tau)
+    for k, u in enumerate(run.inputs[:-1, 0]):  # exact for a held input
+        y[k + 1] = gain * u + (y[k] - gain * u) * decay
+        slopes[k + 1, 0] = gain * u + (slopes[k, 0] - gain * u) * decay
+        slopes[k + 1, 1] = slopes[k, 1] * decay + (y[k] - gain * u) * decay * DT / tau
+    noise = NOISE["y"] * rng.standard_normal((4000, len(y)))
+    estimates = noise @ slopes @ np.linalg.inv(slopes.T @ slopes)
+    scatter = 1.96 * estimates.std(axis=0)
+    after = {quantity.name: quantity.after for quantity in result.quantities}
+    # What the ranges tell beside the run narrows them by less than this.
+    assert [after["a b"], after["tau"]] == pytest.approx(scatter, rel=0.05)
+
+
+def test_no_run_passes_a_limit_with_any_parameters_that_are_plausible():
+    limits = {"y": (-2.0, 2.0)}
+    result = design(lag(), [SQUARE], noise=NOISE, limits=limits, checks=32, runs=2, **QUICK)
+    assert result.refused > 0
+    largest = 4.0 * 2.0  # of the gain, over the ranges
+    for run in result.runs:
+        assert largest * run.settings["size"] < 2.0 * 1.6  # draws seldom reach both corners
+        record = blank(lag(), run.inputs, run.dt)
+        nominal = BatchSimulator(lag()).trajectories(lag().nominal, record)
+        assert np.abs(nominal).max() < 2.0
+
+
+def test_where_every_run_would_pass_a_limit_it_says_so():
+    with pytest.raises(ModelError, match="each of 12 runs that were tried would pass a limit"):
+        design(lag(), [SQUARE], noise=NOISE, limits={"u": (-0.01, 0.01)}, **QUICK)
+
+
+def test_runs_are_added_until_the_targets_are_met():
+    shared = {"noise": NOISE, "limits": {"u": (-1.0, 1.0)}, "runs": 4, **QUICK}
+    easy = design(lag(), [SQUARE], targets={"tau": 0.05}, **shared)
+    assert len(easy.runs) == 1
+    assert easy.met
+    hard = design(lag(), [SQUARE], targets={"tau": 1e-4, "a b": 0.05}, **shared)
+    assert len(hard.runs) == 4
+    assert not hard.met
+    assert [quantity.name for quantity in hard.quantities if not quantity.met] == ["tau"]
+
+
+def test_what_no_experiment_tells_is_refused_with_what_would():
+    with pytest.raises(ModelError, match=r"a: no experiment tells it, .* ask for a b, or fix"):
+        design(lag(), [SQUARE], noise=NOISE, targets={"a": 0.01}, **QUICK)
+    with pytest.raises(ModelError, match="c: there is no such quantity; there are tau, a b"):
+        design(lag(), [SQUARE], noise=NOISE, quantities=["c"], **QUICK)
+
+
+def test_no_design_gains_along_what_the_equations_leave_undetermined():
+    along = np.array([1.0, -1.0, 0.0]) / np.sqrt(2.0)
+    for seed in range(5):
+        result = design(lag(), [SQUARE], noise=NOISE, seed=seed, **QUICK)
+        assert abs(along @ result.information @ along) < 1e-10 * np.abs(result.information).max()
+        assert [group.parameters for group in result.tied] == [("a", "b")]
+
+
+def test_an_error_of_the_simulation_that_passes_for_information_is_refused():
+    null = np.array([[1.0, -1.0]]) / np.sqrt(2.0)
+    refuse_phantoms(np.array([[1.0, 1.0], [1.0, 1.0]]), null)
+    with pytest.raises(ModelError, match="its error passes for information"):
+        refuse_phantoms(np.array([[1.0, 1.0], [1.0, 1.0 + 1e-6]]), null)
+
+
+def test_earlier_information_leaves_less_to_gain():
+    shared = {"noise": NOISE, "limits": {"u": (-1.0, 1.0)}, "runs": 1, **QUICK}
+    first = design(lag(), [SQUARE], **shared)
+    second = design(lag(), [SQUARE], before=first.information, **shared)
+    for once, twice in zip(first.quantities, second.quantities, strict=True):
+        assert twice.before == pytest.approx(once.after, rel=1e-6)
+        assert twice.after < 0.8 * once.after
