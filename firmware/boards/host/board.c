@@ -3,6 +3,7 @@
 #include <string.h>
 
 #define STEP (20.0 / 65536.0) /* V, of 16 bits over +-10 V */
+#define PIECE 600u /* bytes that come between two turns of the main loop: two of them */
 #define LINGER (2u * (uint64_t)HOST_CLOCK)
 
 struct host_board host_board;
@@ -120,6 +121,10 @@ void host_run(struct rig_device *device, uint64_t clock, void (*ticked)(struct r
 void host_feed(struct rig_device *device, const uint8_t *bytes, uint32_t n) {
     for (uint32_t i = 0u; i < n; i++) {
         rig_byte_in(device, bytes[i]);
-        rig_poll(device);
+        if ((i % PIECE == PIECE - 1u) || (i + 1u == n)) {
+            do {
+                rig_poll(device);
+            } while (rig_is_busy(device));
+        }
     }
 }

@@ -4,6 +4,7 @@
  *   0  u16 n, n bytes                    from the line
  *   1  u32                               ticks of the clock that pass
  *   2  3 x i32, i32, i32, f32, u8        inputs: analog, count, its increment, rate, at the end
+ *   3  u8                                whether the line takes no more bytes from now on
  * Its trace is u32 n and n bytes: for every event
  *   u32 n, n bytes                       to the line
  *   u16 n, n x (u32 tick, 2 x i16)       ticks, and what each applied
@@ -23,6 +24,7 @@ static uint8_t trace[LONGEST];
 static uint32_t traced;
 static uint8_t ticks[LONGEST];
 static uint32_t ticked_bytes;
+static bool blocked;
 
 static void reserve(uint32_t used, uint32_t n) {
     if (LONGEST - used < n) {
@@ -47,7 +49,15 @@ static void put32(uint32_t value) {
     put16((uint16_t)(value >> 16));
 }
 
+static void drain(void) {
+    uint8_t byte;
+    while (!blocked && rig_byte_out(&device, &byte)) {
+        put8(byte);
+    }
+}
+
 static void note_tick(struct rig_device *ticking) {
+    drain();
     reserve(ticked_bytes, 8u);
     rig_put32(ticks + ticked_bytes, ticking->run.tick - 1u);
     rig_put16(ticks + ticked_bytes + 4, (uint16_t)host_board.outputs[0]);
@@ -56,7 +66,6 @@ static void note_tick(struct rig_device *ticking) {
 }
 
 static uint32_t play(const uint8_t *event, uint32_t place) {
-    uint8_t byte;
     ticked_bytes = 0u;
     const uint32_t sent_at = traced;
     put32(0u);
@@ -71,6 +80,10 @@ static uint32_t play(const uint8_t *event, uint32_t place) {
         host_run(&device, host_board.clock + rig_get32(event + 1), note_tick);
         place += 5u;
         break;
+    case 3:
+        blocked = event[1] != 0u;
+        place += 2u;
+        break;
     default:
         for (uint32_t i = 0u; i < RIG_INPUTS; i++) {
             host_board.inputs.analog[i] = rig_signed32(rig_get32(event + 1u + 4u * i));
@@ -82,9 +95,7 @@ static uint32_t play(const uint8_t *event, uint32_t place) {
         place += 26u;
         break;
     }
-    while (rig_byte_out(&device, &byte)) {
-        put8(byte);
-    }
+    drain();
     rig_put32(trace + sent_at, traced - sent_at - 4u);
     put16((uint16_t)(ticked_bytes / 8u));
     for (uint32_t i = 0u; i < ticked_bytes; i++) {
@@ -109,6 +120,7 @@ int main(void) {
         }
         host_reset(&device);
         traced = 0u;
+        blocked = false;
         for (uint32_t place = 0u; place < n;) {
             place = play(events + place, place);
         }
