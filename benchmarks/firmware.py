@@ -1,6 +1,6 @@
 """The firmware's core beside the Python device, on as many random sequences as one likes.
 
-    python -m benchmarks.firmware [--sequences 1000000] [--frames 10000000] [--workers 2] [--json]
+    python -m benchmarks.firmware [--sequences 1000000] [--first 0] [--frames 10000000] [--workers 2] [--json]
 
 Sequences of bytes, waits and inputs are played to both (tests/firmware/sequences.py), the firmware
 built for this computer under the address and the undefined-behaviour sanitizer. What is compared
@@ -44,10 +44,10 @@ def fuzz(program: Path, frames: int, seed: int) -> dict[str, int]:
     return counts
 
 
-def measure(sequences: int, frames: int, workers: int) -> dict[str, Any]:
+def measure(first: int, sequences: int, frames: int, workers: int) -> dict[str, Any]:
     """All of it, in processes."""
     folder = make("native") / "native"
-    shares = range(0, sequences, _SHARE)
+    shares = range(first, first + sequences, _SHARE)
     with ProcessPoolExecutor(workers) as pool:
         seconds, results = timed(
             lambda: list(pool.map(play, [folder / "replay"] * len(shares), shares))
@@ -87,10 +87,12 @@ def show(figures: dict[str, Any]) -> None:
 def main() -> None:
     parser = arguments(__doc__ or "")
     parser.add_argument("--sequences", type=int, default=1_000_000)
+    parser.add_argument("--first", type=int, default=0, help="number of the first sequence")
     parser.add_argument("--frames", type=int, default=10_000_000)
     parser.add_argument("--workers", type=int, default=2, help="processes")
     options = parser.parse_args()
-    report(measure(options.sequences, options.frames, options.workers), options.json, show)
+    figures = measure(options.first, options.sequences, options.frames, options.workers)
+    report(figures, options.json, show)
 
 
 if __name__ == "__main__":
