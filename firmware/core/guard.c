@@ -1,7 +1,5 @@
 #include "guard.h"
 
-#include <math.h>
-
 bool rig_guard_read(struct rig_guard *guard, const uint8_t *start,
                     const int16_t lowest[RIG_OUTPUTS], const int16_t highest[RIG_OUTPUTS]) {
     bool legal = true;
@@ -55,7 +53,8 @@ bool rig_guard_beyond(struct rig_guard *guard, const struct rig_inputs *inputs) 
     const uint32_t step = magnitude(count - guard->before);
     guard->before = count;
     bool beyond = (travel < guard->count_low) || (travel > guard->count_high) ||
-                  (step > guard->step) || !(fabsf(inputs->rate) <= guard->rate);
+                  (step > guard->step) ||
+                  !((inputs->rate >= -guard->rate) && (inputs->rate <= guard->rate));
     for (uint32_t i = 0u; i < RIG_INPUTS; i++) {
         const int32_t code = inputs->analog[i];
         beyond = beyond || (code < guard->analog_low[i]) || (code > guard->analog_high[i]);

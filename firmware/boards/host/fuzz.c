@@ -7,7 +7,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "board.h"
+#include "host.h"
 
 #define ROOM 1024u
 

@@ -14,7 +14,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 
-#include "board.h"
+#include "host.h"
 
 #define LONGEST (1u << 24)
 

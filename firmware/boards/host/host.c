@@ -1,4 +1,4 @@
-#include "board.h"
+#include "host.h"
 
 #include <string.h>
 

@@ -1,6 +1,6 @@
 /* A board that is memory: its clock stands where a test puts it. */
-#ifndef HOST_BOARD_H
-#define HOST_BOARD_H
+#ifndef HOST_H
+#define HOST_H
 
 #include <stdbool.h>
 
