@@ -98,7 +98,7 @@ class Host:
         return self._until(line.REPLY)[1]
 
     def play(self, n, commands, limits, closed=True, watchdog=100, at_tick=lambda tick: None):
-        """A run of n ticks: ``commands`` (codes) from tick 0 on; at_tick(tick) is called at each."""
+        """A run of n ticks: ``commands`` (codes) from tick 0 on; ``at_tick(tick)`` at each."""
         self._run, self._played, self._at_tick = self._run % 65535 + 1, Played(), at_tick
         played = self._played
         assert self.request(line.START, limits.pack(self._run, int(closed), watchdog)) == line.OK

@@ -23,7 +23,7 @@ ZERO = (0, 0)
 class Bench:
     """Inputs that a test writes."""
 
-    reading: Reading = Reading((0, 0, 0), 0, 0.0)
+    reading: Reading
 
     def read(self, ticks, outputs):
         return self.reading
@@ -53,7 +53,7 @@ def running():
 
 @pytest.fixture
 def host(running):
-    host = Host(running, Bench())
+    host = Host(running, Bench(QUIET))
     host.connect()
     host.request(line.CLEAR)
     return host

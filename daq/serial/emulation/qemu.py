@@ -26,7 +26,7 @@ _PROGRAM = "qemu-system-arm"
 _MACHINE = ("-M", "netduinoplus2", "-display", "none", "-monitor", "none")
 _SEMIHOSTING = ("-semihosting-config", "enable=on,target=native")
 _VIRTUAL_TIME = ("-icount", "shift=3,sleep=off")
-_OUT = struct.Struct("<I2hBBBBfH2x")
+_OUT = struct.Struct("<I2hBBBBfIHBxHH")
 _IN = struct.Struct("<3iifBBH")
 _PATIENCE = 20.0  # s for QEMU to begin, and between two exchanges
 _LOOK = 0.01  # s
@@ -36,8 +36,9 @@ class Exchange(NamedTuple):
     """What the firmware tells its plant.
 
     ticks: of its clock since the exchange before, during which the outputs (codes of motor and
-    brake) have been as they are here. announced: how many phases, modulo 256, the last being
-    ``phase`` with ``turns``. line: bytes to the host, in virtual time.
+    brake) have been as they are here. announced, runs: how many phases and runs there were, modulo
+    256; ``phase`` with ``turns`` is the last phase, ``period`` [ticks] that of the last run. late:
+    by how much this comes after its time [s]. line: bytes to the host, in virtual time.
     """
 
     ticks: int
@@ -47,6 +48,10 @@ class Exchange(NamedTuple):
     phase: int
     announced: int
     turns: float
+    period: int
+    session: int
+    runs: int
+    late: float
     line: bytes
 
 
@@ -99,9 +104,8 @@ class EmulatedFirmware:
 
     def exchange(self) -> Exchange:
         """Wait for what the firmware tells next; it waits for the answer."""
-        *values, n = _OUT.unpack(self._read(_OUT.size))
-        ticks, motor, brake, *others = values
-        return Exchange(ticks, (motor, brake), *others, self._read(n))
+        ticks, motor, brake, *others, n, late = _OUT.unpack(self._read(_OUT.size))
+        return Exchange(ticks, (motor, brake), *others, 1e-3 * late, self._read(n))
 
     def answer(self, reading: Reading, line: bytes = b"") -> None:
         """The inputs as they are now. line: bytes from the host, in virtual time; 512 at most."""

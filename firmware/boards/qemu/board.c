@@ -2,7 +2,7 @@
  *
  * TIM2 is the clock (QEMU lets it count at 1 GHz before the prescaler), SysTick the tick's interrupt,
  * set anew for the next instant that matters. Where the emulator was late, ticks follow each other
- * at once, and their number stays right. There is no independent watchdog. */
+ * sooner, and their number stays right. There is no independent watchdog. */
 #include "board.h"
 
 #include "device.h"
@@ -32,7 +32,8 @@
 #define CORE_CLOCK 168u /* per tick of CLOCK */
 #define WATCH 1000u     /* ticks between two looks, at most */
 #define IDLE_REAL 10000u /* ticks between two exchanges while nothing runs */
-#define CATCH_UP 64u    /* ticks that follow each other at once, at most */
+#define CATCH_UP 4u     /* ticks that follow each other at once, at most */
+#define REST 100u       /* ticks for the main loop behind them, at least */
 #define RXNE (1u << 5)
 #define STEP (20.0 / 65536.0) /* V */
 
@@ -99,6 +100,7 @@ void board_zero(void) {
 uint64_t board_timer_start(uint32_t ticks) {
     due = board_clock();
     period = ticks;
+    plant_run();
     ICSR = PENDSTSET;
     return due;
 }
@@ -122,9 +124,9 @@ void board_announce(uint8_t phase, float turns) {
     plant_announce(phase, turns);
 }
 
-static void exchange_at(uint64_t now) {
-    plant_exchange(&device, (uint32_t)(now - exchanged));
-    exchanged = now;
+static void exchange_at(uint64_t instant) {
+    plant_exchange(&device, (uint32_t)(instant - exchanged), board_clock() - instant);
+    exchanged = instant;
 }
 
 void systick_handler(void);
@@ -146,7 +148,7 @@ void systick_handler(void) {
     }
     uint32_t wait = WATCH;
     if (period != 0u) {
-        wait = (due <= now) ? 1u : ((due - now < WATCH) ? (uint32_t)(due - now) : WATCH);
+        wait = (due <= now) ? REST : ((due - now < WATCH) ? (uint32_t)(due - now) : WATCH);
     }
     SYST_RVR = wait * CORE_CLOCK - 1u;
     SYST_CVR = 0u;

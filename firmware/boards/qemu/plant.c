@@ -3,8 +3,9 @@
 #include "semihosting.h"
 
 /* To the plant: u32 ticks, 2 x i16 outputs, u8 state, u8 latch, u8 phase, u8 announcements,
- * f32 turns, u16 n, u16 0, n bytes of the line. */
-#define OUT_HEAD 20u
+ * f32 turns, u32 period, u16 session, u8 runs, u8 0, u16 n,
+ * u16 late in milliseconds, n bytes of the line. */
+#define OUT_HEAD 28u
 #define OUT_BYTES 1024u
 /* From the plant: 3 x i32 analog, i32 count, f32 rate, u8 at the end, u8 carries, u16 n, n bytes
  * of the line. */
@@ -20,6 +21,7 @@ static int16_t outputs[RIG_OUTPUTS];
 static uint8_t phase;
 static uint8_t announcements;
 static float turns;
+static uint8_t runs;
 
 static void read_whole(uint8_t *bytes, uint32_t n) {
     uint32_t left = n;
@@ -38,10 +40,10 @@ void plant_connect(struct rig_device *device) {
     if ((out_pipe < 0) || (in_pipe < 0)) {
         semihosting_exit(GONE);
     }
-    plant_exchange(device, 0u);
+    plant_exchange(device, 0u, 0u);
 }
 
-void plant_exchange(struct rig_device *device, uint32_t ticks) {
+void plant_exchange(struct rig_device *device, uint32_t ticks, uint64_t late) {
     uint32_t n = 0u;
     while (plant_carries() && (n < OUT_BYTES) && rig_byte_out(device, &out[OUT_HEAD + n])) {
         n++;
@@ -54,8 +56,12 @@ void plant_exchange(struct rig_device *device, uint32_t ticks) {
     out[10] = phase;
     out[11] = announcements;
     rig_put32(out + 12, rig_float_bits(turns));
-    rig_put16(out + 16, (uint16_t)n);
-    rig_put16(out + 18, 0u);
+    rig_put32(out + 16, device->run.period);
+    rig_put16(out + 20, device->session);
+    out[22] = runs;
+    out[23] = 0u;
+    rig_put16(out + 24, (uint16_t)n);
+    rig_put16(out + 26, (uint16_t)((late < 65535000u) ? late / 1000u : 65535u));
     if (semihosting_write(out_pipe, out, OUT_HEAD + n) != 0u) {
         semihosting_exit(GONE);
     }
@@ -88,6 +94,10 @@ void plant_announce(uint8_t begun, float asked) {
     phase = begun;
     turns = asked;
     announcements++;
+}
+
+void plant_run(void) {
+    runs++;
 }
 
 bool plant_carries(void) {

@@ -10,9 +10,10 @@
 void plant_connect(struct rig_device *device);
 
 /* Outputs as they have been for `ticks` of the clock go out, inputs as they are now come in. Where
- * the plant carries the line as well, so do its bytes. Interrupt (tick). Ends the emulator where
+ * the plant carries the line as well, so do its bytes. late: by how many ticks of the clock this
+ * comes after its time. Interrupt (tick). Ends the emulator where
  * the plant has gone. */
-void plant_exchange(struct rig_device *device, uint32_t ticks);
+void plant_exchange(struct rig_device *device, uint32_t ticks, uint64_t late);
 
 /* Inputs of the last exchange. Interrupt (tick). */
 void plant_inputs(struct rig_inputs *inputs);
@@ -22,6 +23,9 @@ void plant_outputs(const int16_t codes[RIG_OUTPUTS]);
 
 /* A phase begins. Main. */
 void plant_announce(uint8_t phase, float turns);
+
+/* A run begins. Main, interrupts locked. */
+void plant_run(void);
 
 /* Whether the plant carries the line, in place of the USART. Any context. */
 bool plant_carries(void);
