@@ -5,11 +5,14 @@ tried again if, and only if, QEMU was late meanwhile by its own clock (``patienc
 """
 
 import pytest
+import yaml
 
 from daq.config.rig import RigConfig
+from daq.lookup.shipped import find_file
 from daq.serial.backend import SerialDevice, SerialOptions
 from tests.daq.hal_contract import Bench, HalContract
 from tests.daq.serial.support import emulator
+from tests.daq.support import rig, start_rig, until, write_yaml
 from tests.daq.test_hal import _exact_currents
 from tests.firmware import lockstep, patience
 from tests.firmware.build import needs
@@ -51,3 +54,91 @@ class TestFirmware(HalContract):
     @pytest.fixture
     def actuator_currents(self):
         return _exact_currents
+
+
+# Shorter than the shipped one, so that it takes seconds; the same signals.
+SHORT = {"duration": 6, "calibration": {"samples": 400}, "homing": {"turns": 0.5}}
+
+
+def changed(kind, name, path, **changes):
+    content = yaml.safe_load(find_file(kind, name).read_text(encoding="utf-8"))
+    return write_yaml(path, content, **changes)
+
+
+@pytest.mark.soak
+@pytest.mark.patient
+def test_an_identification_on_it_is_that_of_the_simulated_rig(elf, tmp_path):
+    """``rig run prbs.yaml --rig serial.yaml --port ... --identify``, and without the wire."""
+    experiment = changed("protocol", "prbs.yaml", tmp_path / "prbs.yaml", **SHORT)
+    serial = changed("backend", "serial.yaml", tmp_path / "serial.yaml", options={"watchdog": 2})
+    with emulated(elf, tmp_path / "qemu", seed=5) as running:
+        patience.watch(running)
+        words = ["run", experiment, "--rig", serial, "--port", running.port, "--identify"]
+        wired = rig(*words, "--out", tmp_path / "wired", cwd=tmp_path)
+        assert wired.returncode == 0, wired.stderr
+    simulated = changed(
+        "backend", "simulated.yaml", tmp_path / "simulated.yaml", options={"seed": 5}
+    )
+    words = ["run", experiment, "--rig", simulated, "--identify"]
+    direct = rig(*words, "--out", tmp_path / "direct", cwd=tmp_path)
+    assert direct.returncode == 0, direct.stderr
+    there, here = (identified(tmp_path / name) for name in ("wired", "direct"))
+    assert there.keys() == here.keys()
+    apart = {
+        name: (there[name], here[name]) for name in here if not overlap(there[name], here[name])
+    }
+    assert not apart
+
+
+def identified(folder):
+    """Intervals of the parameters that have one, by name."""
+    (file,) = folder.glob("*/parameters.yaml")
+    rows = yaml.safe_load(file.read_text())["parameters"]
+    return {name: row["interval"] for name, row in rows.items() if row.get("interval")}
+
+
+def overlap(a, b):
+    return a[0] <= b[1] and b[0] <= a[1]
+
+
+@pytest.mark.soak
+def test_a_host_that_is_killed_leaves_zero_outputs(elf, tmp_path):
+    with emulated(elf, tmp_path / "qemu", seed=5) as running:
+        serial = changed(
+            "backend", "serial.yaml", tmp_path / "serial.yaml", options={"port": running.port}
+        )
+        experiment = changed("protocol", "prbs.yaml", tmp_path / "prbs.yaml", **SHORT)
+        process = start_rig("run", experiment, "--rig", serial, cwd=tmp_path)
+        try:
+            until(lambda: moving(running.journal), "outputs that are not zero")
+        finally:
+            process.kill()
+            process.communicate()
+        until(lambda: not moving(running.journal), "zero outputs")
+        last = running.journal[-1]
+        assert last["latch"] == "WATCHDOG" and last["outputs"] == [0, 0]
+
+
+def moving(journal):
+    return bool(journal) and any(journal[-1]["outputs"])
+
+
+def test_what_the_emulator_has_and_the_firmware_not_is_refused(tmp_path):
+    missing = tmp_path / "rig.elf"
+    result = rig("emulate", "--firmware", missing, cwd=tmp_path)
+    assert result.returncode == 2 and "there is no such file" in result.stderr
+    assert "make -C firmware BOARD=qemu" in result.stderr
+    result = rig("emulate", "--firmware", missing, "--fault", "mute", cwd=tmp_path)
+    assert result.returncode == 2 and "--fault" in result.stderr
+    missing.write_bytes(b"no program")
+    result = rig("emulate", "--firmware", missing, cwd=tmp_path, env={"PATH": "/nowhere"})
+    assert result.returncode == 2 and "apt install qemu-system-arm" in result.stderr
+
+
+def test_a_file_that_is_no_firmware_ends_in_words(tmp_path):
+    needs("qemu-system-arm")
+    wrong = tmp_path / "rig.elf"
+    wrong.write_bytes(bytes(64))
+    result = rig("emulate", "--firmware", wrong, cwd=tmp_path)
+    assert result.returncode == 1 and "QEMU with the firmware ended" in result.stderr
+    assert "Traceback" not in result.stderr
