@@ -58,14 +58,15 @@ class Limits:
 @dataclass
 class Played:
     """A run. samples: as they came. given: what was answered at every tick. outputs: what the
-    outputs were after every tick. times: ticks of the clock between two of them. statuses: of all
-    SAMPLES, with the exchange in which they came.
+    outputs were after every tick. times: ticks of the clock between two of them. costs:
+    instructions of every tick. statuses: of all SAMPLES.
     """
 
     samples: list = field(default_factory=list)
     given: list = field(default_factory=list)
     outputs: list = field(default_factory=list)
     times: list = field(default_factory=list)
+    costs: list = field(default_factory=list)
     statuses: list = field(default_factory=list)
 
 
@@ -136,6 +137,7 @@ class Host:
         if played.given:
             played.outputs.append(exchange.outputs)
             played.times.append(exchange.ticks)
+            played.costs.append(exchange.cost)
         played.given.append(reading)
         self._at_tick(len(played.given) - 1)
 

@@ -81,6 +81,24 @@ def test_commands_are_applied_in_their_ticks_and_told(host, closed):
     assert set(played.times) == {PERIOD}, "not a tick of the clock early or late"
 
 
+MOST_INSTRUCTIONS = 600  # of rig_on_tick, QEMU's converters among them, which cost nothing
+"""At 168 MHz and two clocks an instruction 7 us, of 250 us at 4 kHz."""
+
+
+def test_a_tick_costs_no_more_than_so_many_instructions(host):
+    commands = [(20_000, -5)] * 300 + [(1, 1)] * 200
+    runs = [host.play(600, commands, Limits(), closed) for closed in (False, True)]
+    trip = {5: QUIET._replace(count=2**31 - 1)}
+
+    def at_tick(tick):
+        host.plant.reading = trip.get(tick, QUIET)
+
+    runs.append(host.play(100, commands, Limits(step=3), at_tick=at_tick))
+    costs = [cost for played in runs for cost in played.costs]
+    print(f"instructions of a tick: {max(costs):.0f} at most")
+    assert 200 < max(costs) < MOST_INSTRUCTIONS
+
+
 def test_without_commands_open_loop_is_zero_and_closed_loop_holds(host):
     commands = wave(300)
     played = host.play(400, commands, Limits(), closed=False)

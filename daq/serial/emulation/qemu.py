@@ -26,8 +26,9 @@ _PROGRAM = "qemu-system-arm"
 _MACHINE = ("-M", "netduinoplus2", "-display", "none", "-monitor", "none")
 _SEMIHOSTING = ("-semihosting-config", "enable=on,target=native")
 _VIRTUAL_TIME = ("-icount", "shift=3,sleep=off")
-_OUT = struct.Struct("<I2hBBBBfIHBxHH")
+_OUT = struct.Struct("<I2hBBBBfIHBxHHH2x")
 _IN = struct.Struct("<3iifBBH")
+_INSTRUCTIONS = 1e9 / 168e6 / 8.0  # in a step of SysTick, at 8 ns each
 _PATIENCE = 20.0  # s for QEMU to begin, and between two exchanges
 _LOOK = 0.01  # s
 
@@ -38,7 +39,8 @@ class Exchange(NamedTuple):
     ticks: of its clock since the exchange before, during which the outputs (codes of motor and
     brake) have been as they are here. announced, runs: how many phases and runs there were, modulo
     256; ``phase`` with ``turns`` is the last phase, ``period`` [ticks] that of the last run. late:
-    by how much this comes after its time [s]. line: bytes to the host, in virtual time.
+    by how much this comes after its time [s]. cost: of the tick's interrupt, in instructions, and
+    line: bytes to the host, both in virtual time.
     """
 
     ticks: int
@@ -52,6 +54,7 @@ class Exchange(NamedTuple):
     session: int
     runs: int
     late: float
+    cost: float
     line: bytes
 
 
@@ -104,8 +107,10 @@ class EmulatedFirmware:
 
     def exchange(self) -> Exchange:
         """Wait for what the firmware tells next; it waits for the answer."""
-        ticks, motor, brake, *others, n, late = _OUT.unpack(self._read(_OUT.size))
-        return Exchange(ticks, (motor, brake), *others, 1e-3 * late, self._read(n))
+        ticks, motor, brake, *others, n, late, steps = _OUT.unpack(self._read(_OUT.size))
+        return Exchange(
+            ticks, (motor, brake), *others, 1e-3 * late, steps * _INSTRUCTIONS, self._read(n)
+        )
 
     def answer(self, reading: Reading, line: bytes = b"") -> None:
         """The inputs as they are now. line: bytes from the host, in virtual time; 512 at most."""

@@ -135,7 +135,9 @@ void systick_handler(void) {
     bool ticked = false;
     for (uint32_t i = 0u; (i < CATCH_UP) && (period != 0u) && (now >= due); i++) {
         exchange_at(due);
+        const uint32_t before = SYST_CVR; /* counts down */
         rig_on_tick(&device);
+        plant_cost(before - SYST_CVR);
         due += period;
         ticked = true;
     }

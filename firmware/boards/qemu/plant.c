@@ -4,8 +4,9 @@
 
 /* To the plant: u32 ticks, 2 x i16 outputs, u8 state, u8 latch, u8 phase, u8 announcements,
  * f32 turns, u32 period, u16 session, u8 runs, u8 0, u16 n,
- * u16 late in milliseconds, n bytes of the line. */
-#define OUT_HEAD 28u
+ * u16 late in milliseconds, u16 cost of the last tick in steps of SysTick, u16 0, n bytes of the
+ * line. */
+#define OUT_HEAD 32u
 #define OUT_BYTES 1024u
 /* From the plant: 3 x i32 analog, i32 count, f32 rate, u8 at the end, u8 carries, u16 n, n bytes
  * of the line. */
@@ -22,6 +23,7 @@ static uint8_t phase;
 static uint8_t announcements;
 static float turns;
 static uint8_t runs;
+static uint16_t cost;
 
 static void read_whole(uint8_t *bytes, uint32_t n) {
     uint32_t left = n;
@@ -62,6 +64,8 @@ void plant_exchange(struct rig_device *device, uint32_t ticks, uint64_t late) {
     out[23] = 0u;
     rig_put16(out + 24, (uint16_t)n);
     rig_put16(out + 26, (uint16_t)((late < 65535000u) ? late / 1000u : 65535u));
+    rig_put16(out + 28, cost);
+    rig_put16(out + 30, 0u);
     if (semihosting_write(out_pipe, out, OUT_HEAD + n) != 0u) {
         semihosting_exit(GONE);
     }
@@ -94,6 +98,10 @@ void plant_announce(uint8_t begun, float asked) {
     phase = begun;
     turns = asked;
     announcements++;
+}
+
+void plant_cost(uint32_t steps) {
+    cost = (uint16_t)((steps < 65535u) ? steps : 65535u);
 }
 
 void plant_run(void) {

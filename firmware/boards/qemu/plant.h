@@ -24,6 +24,9 @@ void plant_outputs(const int16_t codes[RIG_OUTPUTS]);
 /* A phase begins. Main. */
 void plant_announce(uint8_t phase, float turns);
 
+/* What rig_on_tick took, in steps of SysTick. Interrupt (tick). */
+void plant_cost(uint32_t steps);
+
 /* A run begins. Main, interrupts locked. */
 void plant_run(void);
 
