@@ -1,6 +1,7 @@
 """The firmware's core beside the Python device, on as many random sequences as one likes.
 
-    python -m benchmarks.firmware [--sequences 1000000] [--first 0] [--frames 10000000] [--workers 2] [--json]
+    python -m benchmarks.firmware [--sequences 1000000] [--first 0] [--frames 10000000]
+        [--workers 2] [--json]
 
 Sequences of bytes, waits and inputs are played to both (tests/firmware/sequences.py), the firmware
 built for this computer under the address and the undefined-behaviour sanitizer. What is compared

@@ -1,8 +1,9 @@
 /* QEMU's netduinoplus2: an STM32F405 without converters, whose plant is outside.
  *
  * TIM2 is the clock (QEMU lets it count at 1 GHz before the prescaler), SysTick the tick's interrupt,
- * set anew for the next instant that matters. Where the emulator was late, ticks follow each other
- * sooner, and their number stays right. There is no independent watchdog. */
+ * once a period or, of a long one, once a part of it. Where the emulator is late, and QEMU's SysTick
+ * is now and then by a period, also in virtual time, ticks follow each other at once; their number
+ * and their order stay right. There is no independent watchdog. */
 #include "board.h"
 
 #include "device.h"
@@ -33,7 +34,7 @@
 #define WATCH 1000u     /* ticks between two looks, at most */
 #define IDLE_REAL 10000u /* ticks between two exchanges while nothing runs */
 #define CATCH_UP 4u     /* ticks that follow each other at once, at most */
-#define REST 100u       /* ticks for the main loop behind them, at least */
+#define PARTS 128u      /* of a period, at most: SysTick counts 24 bits */
 #define RXNE (1u << 5)
 #define STEP (20.0 / 65536.0) /* V */
 
@@ -97,16 +98,34 @@ void board_zero(void) {
     plant_outputs(zero);
 }
 
+static void set_systick(uint32_t steps) {
+    SYST_RVR = steps - 1u;
+    SYST_CVR = 0u;
+}
+
 uint64_t board_timer_start(uint32_t ticks) {
+    /* A whole part of the period, of a watch at most; where there is none, the tick comes with the
+     * first interrupt after its time. */
+    uint32_t steps = WATCH * CORE_CLOCK;
+    const uint32_t least = (ticks + WATCH - 1u) / WATCH;
+    for (uint32_t n = least; n < least + PARTS; n++) {
+        const uint64_t whole = (uint64_t)ticks * CORE_CLOCK;
+        if (whole % n == 0u) {
+            steps = (uint32_t)(whole / n);
+            break;
+        }
+    }
+    plant_run();
     due = board_clock();
     period = ticks;
-    plant_run();
+    set_systick(steps);
     ICSR = PENDSTSET;
     return due;
 }
 
 void board_timer_stop(void) {
     period = 0u;
+    set_systick(WATCH * CORE_CLOCK);
 }
 
 void board_transmit(void) {
@@ -137,7 +156,8 @@ void systick_handler(void) {
         exchange_at(due);
         const uint32_t before = SYST_CVR; /* counts down */
         rig_on_tick(&device);
-        plant_cost(before - SYST_CVR);
+        const uint32_t after = SYST_CVR;
+        plant_cost(before - after + ((after > before) ? SYST_RVR + 1u : 0u));
         due += period;
         ticked = true;
     }
@@ -148,12 +168,6 @@ void systick_handler(void) {
     if ((period == 0u) && (now - exchanged >= (plant_carries() ? WATCH : IDLE_REAL))) {
         exchange_at(now);
     }
-    uint32_t wait = WATCH;
-    if (period != 0u) {
-        wait = (due <= now) ? REST : ((due - now < WATCH) ? (uint32_t)(due - now) : WATCH);
-    }
-    SYST_RVR = wait * CORE_CLOCK - 1u;
-    SYST_CVR = 0u;
 }
 
 void usart1_handler(void);
@@ -173,8 +187,7 @@ static void set_up(void) {
     USART1_CR1 = (1u << 13) | (1u << 5) | (1u << 3) | (1u << 2); /* UE, RXNEIE, TE, RE */
     NVIC_IPR9 |= 0x80u << 8;  /* the line below the tick */
     NVIC_ISER1 = 1u << (37 - 32);
-    SYST_RVR = WATCH * CORE_CLOCK - 1u;
-    SYST_CVR = 0u;
+    set_systick(WATCH * CORE_CLOCK);
     SYST_CSR = 7u;
 }
 

@@ -4,7 +4,7 @@
 
 /* To the plant: u32 ticks, 2 x i16 outputs, u8 state, u8 latch, u8 phase, u8 announcements,
  * f32 turns, u32 period, u16 session, u8 runs, u8 0, u16 n,
- * u16 late in milliseconds, u16 cost of the last tick in steps of SysTick, u16 0, n bytes of the
+ * u16 late in ticks, u16 cost of the last tick in steps of SysTick, u16 0, n bytes of the
  * line. */
 #define OUT_HEAD 32u
 #define OUT_BYTES 1024u
@@ -63,7 +63,7 @@ void plant_exchange(struct rig_device *device, uint32_t ticks, uint64_t late) {
     out[22] = runs;
     out[23] = 0u;
     rig_put16(out + 24, (uint16_t)n);
-    rig_put16(out + 26, (uint16_t)((late < 65535000u) ? late / 1000u : 65535u));
+    rig_put16(out + 26, (uint16_t)((late < 65535u) ? late : 65535u));
     rig_put16(out + 28, cost);
     rig_put16(out + 30, 0u);
     if (semihosting_write(out_pipe, out, OUT_HEAD + n) != 0u) {
