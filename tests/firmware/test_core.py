@@ -152,8 +152,8 @@ def branches(folder):
         words = ["gcov", "--branch-probabilities", "--json-format", "--stdout", notes]
         done = subprocess.run(words, capture_output=True, text=True, cwd=SOURCE, check=True)
         for file in json.loads(done.stdout)["files"]:
-            if not file["file"].startswith("core/"):
-                continue
+            if not file["file"].startswith("core/") or "encoder" in file["file"]:
+                continue  # the encoder has tests of its own
             for line in file["lines"]:
                 counts = [branch["count"] for branch in line["branches"]]
                 taken += sum(count > 0 for count in counts)
