@@ -207,8 +207,8 @@ class SimulatedDevice:
         """The inputs at the next tick, which no command of that tick changes; nothing moves on."""
         self._require_running()
         before, memory = self._x.copy(), self._encoder.memory.copy()
-        still, flags = np.zeros((1, len(CHANNELS))), np.zeros(1, dtype=np.int64)
-        raw, _ = self._simulate(still, flags, self._unit_noise(1))
+        zeros, flags = np.zeros((1, len(CHANNELS))), np.zeros(1, dtype=np.int64)
+        raw, _ = self._simulate(zeros, flags, self._unit_noise(1))
         self._x, self._encoder.memory = before, memory
         self._noise_used -= 1
         return raw

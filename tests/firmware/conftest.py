@@ -1,4 +1,4 @@
-"""Tests that are marked ``patient`` are tried again where QEMU was late."""
+"""Tests that are marked ``patient`` are tried again on load."""
 
 import pytest
 

@@ -5,7 +5,7 @@ import math
 import struct
 from dataclasses import dataclass, field
 
-from daq.serial.emulation.qemu import EmulatedFirmware, Reading
+from daq.serial.emulation.qemu import EmulatedFirmware, InputCodes
 from tests.faults import line
 from tests.firmware.build import make, needs
 
@@ -73,7 +73,7 @@ class Played:
 class Host:
     """A host that says what it is told to, by frames of ``tests.faults.line``.
 
-    plant: ``read(ticks, outputs) -> Reading``, called at every exchange. mute: whether it says
+    plant: ``read(ticks, outputs) -> InputCodes``, called at every exchange. mute: whether it says
     nothing. damage: a function of bytes sent.
     """
 
@@ -194,4 +194,4 @@ def elf():
     return make(BOARD="qemu") / "qemu" / "rig.elf"
 
 
-__all__ = ["Host", "Limits", "Played", "Reading", "elf", "firmware"]
+__all__ = ["Host", "InputCodes", "Limits", "Played", "elf", "firmware"]

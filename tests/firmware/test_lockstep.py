@@ -13,7 +13,7 @@ from tests.faults.board import Reading as Latched
 from tests.faults.faults import FAULTS, Fault
 from tests.faults.firmware import CLAMPED, HELD, INTERLOCK, UNDERFLOW, Ticker
 from tests.firmware import lockstep
-from tests.firmware.lockstep import CLOCK, IDLE, PERIOD, Host, Limits, Reading
+from tests.firmware.lockstep import CLOCK, IDLE, PERIOD, Host, InputCodes, Limits
 
 NONE, SAFE, UNDERRUN, TRIPPED, WATCHDOG = range(5)
 ZERO = (0, 0)
@@ -23,7 +23,7 @@ ZERO = (0, 0)
 class Bench:
     """Inputs that a test writes."""
 
-    reading: Reading
+    reading: InputCodes
 
     def read(self, ticks, outputs):
         return self.reading
@@ -42,7 +42,7 @@ class Rig:
         volts, count, rate, flags = self.board.latch()
         codes = tuple(round(value / STEP) for value in volts)
         rate = float(np.float32(rate))
-        return Reading(codes, (count + 2**31) % 2**32 - 2**31, rate, bool(flags))
+        return InputCodes(codes, (count + 2**31) % 2**32 - 2**31, rate, bool(flags))
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +88,7 @@ MOST_INSTRUCTIONS = 600  # of rig_on_tick, QEMU's converters among them, which c
 def test_a_tick_costs_no_more_than_so_many_instructions(host):
     commands = [(20_000, -5)] * 300 + [(1, 1)] * 200
     runs = [host.play(600, commands, Limits(), closed) for closed in (False, True)]
-    trip = {5: QUIET._replace(count=2**31 - 1)}
+    trip = {5: QUIET._replace(counts=2**31 - 1)}
 
     def at_tick(tick):
         host.plant.reading = trip.get(tick, QUIET)
@@ -120,7 +120,7 @@ def test_clamps_are_those_of_start(host):
 # --- every limit, in the tick in which it is passed ---------------------------------------------
 
 AT = 60  # tick
-QUIET = Reading((0, 0, 0), 0, 0.0)
+QUIET = InputCodes((0, 0, 0), 0, 0.0)
 
 
 def analog(channel, code):
@@ -140,18 +140,18 @@ LIMITS = {
         for name, at, beyond in (("low", -500, -501), ("high", 700, 701))
     },
     "count low": (
-        Limits(counts_low=-9), QUIET._replace(count=-9), QUIET._replace(count=-10),
+        Limits(counts_low=-9), QUIET._replace(counts=-9), QUIET._replace(counts=-10),
     ),
-    "count high": (Limits(counts_high=9), QUIET._replace(count=9), QUIET._replace(count=10)),
+    "count high": (Limits(counts_high=9), QUIET._replace(counts=9), QUIET._replace(counts=10)),
     "rate": (Limits(rate=1000.5), QUIET._replace(rate=1000.5), QUIET._replace(rate=1000.6)),
     "rate backwards": (
         Limits(rate=1000.5), QUIET._replace(rate=-1000.5), QUIET._replace(rate=-1000.6),
     ),
     "rate that is none": (Limits(), QUIET._replace(rate=math.inf), QUIET._replace(rate=math.nan)),
-    "step": (Limits(step=12), QUIET._replace(count=12), QUIET._replace(count=25)),
-    "step backwards": (Limits(step=12), QUIET._replace(count=-12), QUIET._replace(count=-25)),
+    "step": (Limits(step=12), QUIET._replace(counts=12), QUIET._replace(counts=25)),
+    "step backwards": (Limits(step=12), QUIET._replace(counts=-12), QUIET._replace(counts=-25)),
     "step over the counter's end": (
-        Limits(step=12), QUIET._replace(count=12), QUIET._replace(count=-(2**31)),
+        Limits(step=12), QUIET._replace(counts=12), QUIET._replace(counts=-(2**31)),
     ),
 }  # fmt: skip
 

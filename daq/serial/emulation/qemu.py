@@ -58,11 +58,11 @@ class Exchange(NamedTuple):
     line: bytes
 
 
-class Reading(NamedTuple):
-    """What stands at the inputs: codes (3,), count, its rate [1/s], whether one is at its end."""
+class InputCodes(NamedTuple):
+    """At the inputs: codes (3,), counts, their rate [1/s], whether one is at its end."""
 
     analog: Sequence[int]
-    count: int
+    counts: int
     rate: float
     at_end: bool = False
 
@@ -107,15 +107,19 @@ class EmulatedFirmware:
 
     def exchange(self) -> Exchange:
         """Wait for what the firmware tells next; it waits for the answer."""
-        ticks, motor, brake, *others, n, late, steps = _OUT.unpack(self._read(_OUT.size))
-        return Exchange(
-            ticks, (motor, brake), *others, 1e-6 * late, steps * _INSTRUCTIONS, self._read(n)
+        ticks, motor, brake, state, latch, phase, announced, turns, *rest = _OUT.unpack(
+            self._read(_OUT.size)
         )
+        period, session, runs, n, late, steps = rest
+        return Exchange(
+            ticks, (motor, brake), state, latch, phase, announced, turns, period, session, runs,
+            1e-6 * late, steps * _INSTRUCTIONS, self._read(n),
+        )  # fmt: skip
 
-    def answer(self, reading: Reading, line: bytes = b"") -> None:
+    def answer(self, reading: InputCodes, line: bytes = b"") -> None:
         """The inputs as they are now. line: bytes from the host, in virtual time; 512 at most."""
-        analog, count, rate, at_end = reading
-        head = _IN.pack(*analog, count, rate, at_end, self._virtual, len(line))
+        analog, counts, rate, at_end = reading
+        head = _IN.pack(*analog, counts, rate, at_end, self._virtual, len(line))
         try:
             os.write(self._to, head + line)
         except BrokenPipeError:
@@ -137,10 +141,10 @@ class EmulatedFirmware:
         self._from = self._opened(pipes[0], os.O_RDONLY)
         self._to = self._opened(pipes[1], os.O_WRONLY)
         if not self._virtual and self._tcp is None:
-            found = re.search(r"redirected to (\S+)", self._log.read_text())
-            if found is None:
+            match = re.search(r"redirected to (\S+)", self._log.read_text())
+            if match is None:
                 raise self._failure()
-            self.port = found[1]
+            self.port = match[1]
 
     def _line(self) -> list[str]:
         if self._virtual:
@@ -180,9 +184,10 @@ class EmulatedFirmware:
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(timeout=1.0)
         status = self._process.poll()
-        said = self._log.read_text(errors="replace").strip().splitlines()
+        lines = self._log.read_text(errors="replace").strip().splitlines()
+        word = lines[-1] if lines else "no word"
         return DeviceError(
-            f"QEMU with the firmware ended with status {status}: {said[-1] if said else 'no word'}",
+            f"QEMU with the firmware ended with status {status}: {word}",
             file=str(self._elf),
         )
 

@@ -16,12 +16,12 @@ from daq.hal import ANALOG_INPUTS, CHANNELS, Flag, Phase, Simulation
 from daq.run.realtime import RealTime
 from daq.serial.emulation.emulator import SimulatedBoard, opened_journal, warm_up
 from daq.serial.emulation.endpoints import named
-from daq.serial.emulation.qemu import EmulatedFirmware, Exchange, Reading
+from daq.serial.emulation.qemu import EmulatedFirmware, Exchange, InputCodes
 from daq.serial.messages import CodedGuard, Latch, State
 
 CLOCK = 1_000_000  # Hz, of the firmware's board in QEMU
 _LATE = 0.02  # s that are worth a line of the journal
-_AT_REST = Reading((0,) * len(ANALOG_INPUTS), 0, 0.0)
+_AT_REST = InputCodes((0,) * len(ANALOG_INPUTS), 0, 0.0)
 _LEAST, _MOST = np.iinfo(np.int32).min, np.iinfo(np.int32).max
 _SATURATED = int(Flag.SATURATED)
 # The firmware has limits; the plant has none.
@@ -41,7 +41,7 @@ class SimulatedPlant:
         self._session = self._announced = self._runs = 0
         self._reading = _AT_REST
 
-    def read(self, exchange: Exchange) -> Reading:
+    def read(self, exchange: Exchange) -> InputCodes:
         """What stands at the inputs, after what the firmware tells has happened."""
         board = self._board
         if exchange.session != self._session:
@@ -59,7 +59,7 @@ class SimulatedPlant:
             board.advance(exchange.outputs)
         (record,) = board.latch().tolist()
         analog, count, rate, _, flags = record
-        self._reading = Reading(analog, count, rate, bool(flags & _SATURATED))
+        self._reading = InputCodes(analog, count, rate, bool(flags & _SATURATED))
         return self._reading
 
 
