@@ -13,6 +13,7 @@ import select
 import shutil
 import struct
 import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Sequence
@@ -76,6 +77,10 @@ class EmulatedFirmware:
     """
 
     def __init__(self, elf: Path, virtual: bool = False, tcp: int | None = None) -> None:
+        if not hasattr(os, "mkfifo"):
+            raise ConfigError(
+                f"--firmware {elf}: there are no named pipes for QEMU", cure="use Linux, or WSL"
+            )
         if not elf.is_file():
             raise ConfigError(
                 f"--firmware {elf}: there is no such file",
@@ -129,7 +134,7 @@ class EmulatedFirmware:
         folder = Path(self._files.enter_context(tempfile.TemporaryDirectory(prefix="rig-qemu-")))
         pipes = folder / "plant.out", folder / "plant.in"
         for pipe in pipes:
-            os.mkfifo(pipe)
+            _make(pipe)
         output = self._files.enter_context((folder / "qemu.txt").open("wb"))
         command = [_PROGRAM, *_MACHINE, *_SEMIHOSTING, *self._line(), "-kernel", str(self._elf)]
         self._log = folder / "qemu.txt"
@@ -160,14 +165,14 @@ class EmulatedFirmware:
         while True:
             # A writer finds no reader at first; a reader would not know whether a writer is there.
             try:
-                descriptor = os.open(pipe, mode | os.O_NONBLOCK)
+                descriptor = _end_of(pipe, mode)
                 break
             except OSError:
                 if self._process.poll() is not None or time.monotonic() > deadline:
                     raise self._failure() from None
                 time.sleep(_LOOK)
         self._files.callback(os.close, descriptor)
-        os.set_blocking(descriptor, True)
+        _let_wait(descriptor)
         return descriptor
 
     def _read(self, n: int) -> bytes:
@@ -194,3 +199,22 @@ class EmulatedFirmware:
     def _end(self) -> None:
         self._process.kill()
         self._process.wait()
+
+
+def _make(pipe: Path) -> None:
+    if sys.platform == "win32":
+        raise NotImplementedError
+    os.mkfifo(pipe)
+
+
+def _end_of(pipe: Path, mode: int) -> int:
+    """An end of a pipe; OSError where a writer finds no reader."""
+    if sys.platform == "win32":
+        raise NotImplementedError
+    return os.open(pipe, mode | os.O_NONBLOCK)
+
+
+def _let_wait(descriptor: int) -> None:
+    if sys.platform == "win32":
+        raise NotImplementedError
+    os.set_blocking(descriptor, True)
