@@ -10,6 +10,7 @@ and interlocks around any device, so that those exist once.
 
 import enum
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any, Protocol, runtime_checkable
 
@@ -210,13 +211,15 @@ class Electronics:
     """A computed plant, and the converters that a board would have around it.
 
     device: the plant in virtual time. volts: (low, high), range of inputs and outputs. step_in,
-    step_out: their resolution [V].
+    step_out: their resolution [V]. latch: the inputs at the device's next tick, one row, before its
+    command is known; what ``receive`` then gives has the same.
     """
 
     device: Device
     volts: tuple[float, float]
     step_in: float
     step_out: float
+    latch: Callable[[], RawSamples]
 
 
 @runtime_checkable

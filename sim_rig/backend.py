@@ -203,6 +203,16 @@ class SimulatedDevice:
             if kept.any():
                 return RawSamples(**{name: values[kept] for name, values in vars(raw).items()})
 
+    def latch(self) -> RawSamples:
+        """The inputs at the next tick, which no command of that tick changes; nothing moves on."""
+        self._require_running()
+        before, memory = self._x.copy(), self._encoder.memory.copy()
+        zeros, flags = np.zeros((1, len(CHANNELS))), np.zeros(1, dtype=np.int64)
+        raw, _ = self._simulate(zeros, flags, self._unit_noise(1))
+        self._x, self._encoder.memory = before, memory
+        self._noise_used -= 1
+        return raw
+
     def stop(self) -> None:
         """End sampling."""
         self.safe()
@@ -227,7 +237,8 @@ class SimulatedDevice:
         bits = _IDEAL_BITS if options.ideal else options.imperfections.bits
         volts = (-converters.RANGE, converters.RANGE)
         step_in, step_out = (2.0 * converters.RANGE / 2**n for n in (bits, _OUTPUT_BITS))
-        return hal.Electronics(SimulatedDevice(options), volts, step_in, step_out)
+        device = SimulatedDevice(options)
+        return hal.Electronics(device, volts, step_in, step_out, device.latch)
 
     def _warm_up(self) -> None:
         """Import and compile what the plant is computed with, once."""

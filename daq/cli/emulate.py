@@ -35,6 +35,13 @@ def emulate(
     journal: Annotated[
         Path | None, Option(metavar="FILE", help="Log of what became of the outputs, JSON.")
     ] = None,
+    firmware: Annotated[
+        Path | None,
+        Option(
+            metavar="ELF",
+            help="In place of the emulator run this firmware in QEMU, the simulated rig behind it.",
+        ),
+    ] = None,
     json: options.AsJson = False,
 ) -> None:
     """Put the simulated rig behind the serial protocol.
@@ -45,7 +52,7 @@ def emulate(
     from daq.hal import Simulation
     from daq.lookup.rigs import load_rig
     from daq.run.realtime import RealTime
-    from daq.serial.emulation import faults
+    from daq.serial.emulation import faults, rehearsal
     from daq.serial.emulation.emulator import Emulator
     from daq.serial.emulation.endpoints import port_of
 
@@ -53,6 +60,11 @@ def emulate(
         _list_faults(json)
         return
     chosen = [faults.parse(text) for text in fault or []]
+    if firmware is not None and (chosen or drift):
+        raise ConfigError(
+            "--firmware: it has none of the emulator's --fault and --drift",
+            cure="leave them out, or leave out --firmware",
+        )
     config, device = load_rig(rig, watch=terminal.report_event)
     if not isinstance(device, Simulation):
         cure = (
@@ -74,6 +86,9 @@ def emulate(
             )
         sys.stdout.flush()
 
+    if firmware is not None:
+        rehearsal.serve(device, firmware, link, tcp, journal, ready)
+        return
     port = port_of(link, tcp)
     emulator = Emulator(device, config.name, port, chosen, 1e-6 * drift, seed)
     emulator.serve(journal, ready)

@@ -125,6 +125,8 @@ class CommandRing:
         """
         if self._mode is Mode.OPEN_LOOP and first > self.until:
             return False
+        if first >= self.credit_until:
+            return True  # none is kept
         end = min(first + len(codes), self.credit_until)
         begin = max(first, self.tick)
         if self._mode is Mode.CLOSED_LOOP:
@@ -156,5 +158,4 @@ class CommandRing:
             codes = np.where(rows[:, None] < 0, self._last, codes[np.maximum(rows, 0)])
         self._last = codes[-1].copy()
         self.tick += n
-        self.until = max(self.until, self.tick)
         return codes, flags

@@ -305,7 +305,9 @@ class HostMachine:
         if self._state is State.IDLE or status.run != self._run or old:
             return
         self.status = status
-        self.commands.acknowledge(status.queued_until, status.credit_until, now)
+        # Commands for ticks that are past are not waited for, whether they came or not.
+        taken = max(status.queued_until, status.tick)
+        self.commands.acknowledge(taken, status.credit_until, now)
         self._pump(now)
         if self._state is State.RUNNING and status.latch is Latch.WATCHDOG:
             self._fail(self._why_tripped(now, self._start.watchdog))

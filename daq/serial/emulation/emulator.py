@@ -10,12 +10,12 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 
 from daq.errors import ConfigError
-from daq.hal import ANALOG_INPUTS, CHANNELS, Electronics, Guard, Mode, Phase, Simulation
+from daq.hal import ANALOG_INPUTS, CHANNELS, Electronics, Guard, Mode, Phase, RawSamples, Simulation
 from daq.serial import messages
 from daq.serial.emulation.endpoints import Port
 from daq.serial.emulation.faults import EVENTS, Fault, Line
@@ -41,7 +41,7 @@ class SimulatedBoard:
         self.phase = Phase.OPEN
         self.outputs = [0] * len(CHANNELS)
         self.stuck = False
-        self._device = electronics.device
+        self._device, self._peek = electronics.device, electronics.latch
         self._step_in, self._step_out = electronics.step_in, electronics.step_out
         self._watched = watched
         self._tick = self._count = 0
@@ -85,16 +85,31 @@ class SimulatedBoard:
         self.outputs = [0] * len(CHANNELS)
         self._device.safe()
 
+    def advance(self, outputs: tuple[int, int]) -> None:
+        """One tick with these codes, of which nobody wants the sample."""
+        self._device.send(self._tick, np.array([outputs]) * self._step_out)
+        self._device.receive()
+        self._tick += 1
+
+    def latch(self) -> Records:
+        """The inputs at the next tick, before its command; one record."""
+        records = np.zeros(1, dtype=messages.SAMPLE_DTYPE)
+        self._code(self._peek(), records)
+        return records
+
     def _play(self, commands: Codes, records: Records) -> None:
         self._device.send(self._tick, commands.astype(np.float64) * self._step_out)
         raw = self._device.receive()
+        self._code(raw, records)
+        self._tick += len(raw.tick)
+
+    def _code(self, raw: RawSamples, records: Records) -> None:
         records["analog"] = np.rint(raw.analog / self._step_in)
         # As a counter of 32 bits shows them.
         records["counts"] = (np.rint(raw.counts).astype(np.int64) + 2**31) % 2**32 - 2**31
         records["count_rate"] = raw.count_rate
         records["applied"] = np.rint(raw.applied / self._step_out)
         records["flags"] = raw.flags
-        self._tick += len(raw.tick)
 
 
 def identity(name: str, electronics: Electronics, max_rate: float) -> Welcome:
@@ -129,6 +144,15 @@ def warm_up(simulation: Simulation) -> float:
         device.receive()
     device.close()
     return info.max_rate
+
+
+def opened_journal(path: Path | None) -> TextIO:
+    """The file of a journal, written line by line; ConfigError where there can be none."""
+    path = path or Path(os.devnull)
+    try:
+        return path.open("w", encoding="utf-8", buffering=1)
+    except OSError as error:
+        raise ConfigError(f"--journal {path}: {error.strerror}") from None
 
 
 class Emulator:
@@ -169,12 +193,7 @@ class Emulator:
         stop = threading.Event()
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda number, frame: stop.set())
-        path = journal or Path(os.devnull)
-        try:
-            self._journal = path.open("w", encoding="utf-8", buffering=1)
-        except OSError as error:
-            raise ConfigError(f"--journal {path}: {error.strerror}") from None
-        with self._journal:
+        with opened_journal(journal) as self._journal:
             self._port.connect()
             ready(self._port.name)
             self._awake_by = time.perf_counter()

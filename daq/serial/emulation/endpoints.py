@@ -5,6 +5,7 @@ import os
 import socket
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 from daq.errors import ConfigError
@@ -159,9 +160,31 @@ def port_of(link: Path | None, tcp: int | None) -> Port:
         if link is not None:
             raise ConfigError("--link names a pty; leave it out where a TCP port is served")
         return TcpPort(tcp or 0)
-    if link is not None and link.exists() and not link.is_symlink():
-        raise ConfigError(f"--link {link}: there is a file of that name; choose another")
+    if link is not None:
+        _refuse_file(link)
     return PtyPort(link)
+
+
+@contextlib.contextmanager
+def named(port: str, link: Path | None) -> Iterator[str]:
+    """A name for a port until the end of the block: the link, which points to it, if there is one.
+
+    Raises ConfigError where there is a file of that name.
+    """
+    if link is None:
+        yield port
+        return
+    _refuse_file(link)
+    _point(link, port)
+    try:
+        yield str(link)
+    finally:
+        link.unlink(missing_ok=True)
+
+
+def _refuse_file(link: Path) -> None:
+    if link.exists() and not link.is_symlink():
+        raise ConfigError(f"--link {link}: there is a file of that name; choose another")
 
 
 def _point(link: Path, target: str) -> None:

@@ -113,9 +113,10 @@ class DeviceMachine:
             return None
         ticks = max(1, self._wanted() - self._waiting())
         due = self._origin + (self._ring.tick + ticks - 1) * self._start.period
+        orphaned = self.heard + round(LINGER_SECONDS * self.identity.clock) + 1
         if self.latch is Latch.WATCHDOG:
-            return due
-        return min(due, self.heard + self._watchdog + 1)
+            return min(due, orphaned)
+        return min(due, orphaned, self.heard + self._watchdog + 1)
 
     def take(self) -> bytes | None:
         """The next frame to write, or None."""
@@ -140,15 +141,23 @@ class DeviceMachine:
         if frame.session == 0:
             return
         # A repeated HELLO of the session that is open changes nothing.
-        if version == self.identity.version and frame.session != self._session:
-            self._end()
-            self._session, self._answered, self.heard = frame.session, None, now
-            self._outbox.clear()
-            if self.latch is not Latch.WATCHDOG:
-                self.latch = Latch.NONE
-            self._board.connect()
+        if version == self.identity.version:
+            self.heard = now
+            if frame.session != self._session:
+                self._open(frame.session)
         welcome = replace(self.identity, latch=self.latch)
         self._answer(frame, Type.WELCOME, welcome.pack())
+
+    def _open(self, session: int) -> None:
+        """A new session, which knows of no run."""
+        self._end()
+        self._session, self._answered = session, None
+        self._run = self._overflow = self._first = 0
+        self._ring.restart(Mode.CLOSED_LOOP)
+        self._outbox.clear()
+        if self.latch is not Latch.WATCHDOG:
+            self.latch = Latch.NONE
+        self._board.connect()
 
     def _request(self, frame: Frame, now: int) -> None:
         """Carry out a request once, however often it comes."""
@@ -210,6 +219,7 @@ class DeviceMachine:
             and self.identity.clock / start.period <= self.identity.max_rate
             and start.watchdog <= self.identity.watchdog_longest
             and all(low <= 0 <= high for low, high in clamps)
+            and start.guard.count_rate >= 0.0  # which NaN is not
         )
 
     def _narrowed(self, guard: messages.CodedGuard) -> messages.CodedGuard:
@@ -239,7 +249,7 @@ class DeviceMachine:
             run, first, codes = messages.unpack_commands(frame.payload)
         except messages.MALFORMED:
             return
-        if run != self._run or self.state is State.IDLE:
+        if run != self._run or self.state is State.IDLE or len(codes) == 0:
             return
         in_order = self._ring.put(first, codes)
         if self.latch is not Latch.NONE:
@@ -266,9 +276,14 @@ class DeviceMachine:
         else:
             guard = self._start.guard
             clamped = np.clip(codes, guard.command_low, guard.command_high)
-            flags[(clamped != codes).any(axis=1)] |= np.uint32(Flag.CLAMPED)
+            commanded = (flags & np.uint32(Flag.HELD)) == 0
+            flags[(clamped != codes).any(axis=1) & commanded] |= np.uint32(Flag.CLAMPED)
             codes = clamped.astype(messages.COMMAND_DTYPE)
         records = self._board.play(codes)
+        # One latch at a time: under one, and from a tick without a command on, no limit closes it.
+        closed = (flags & np.uint32(Flag.UNDERFLOW)) != 0
+        closed |= self.latch is not Latch.NONE
+        records["flags"][closed] &= ~np.uint32(Flag.INTERLOCK)
         tripped = (records["flags"] & np.uint32(Flag.INTERLOCK)) != 0
         if tripped.any():
             flags[int(np.argmax(tripped)) :] = 0

@@ -1,0 +1,2 @@
+# QEMU hands over a byte an interrupt, some ten thousand a second: a short queue is filled in time.
+SIZES := -DRIG_QUEUE=512u -DRIG_SAMPLES=512u

@@ -1,0 +1,6 @@
+# Sizes of the rings (core/config.h), for a microcontroller with more or less memory: the queue takes
+# 8 bytes a command, the samples 32 each.
+SIZES := -DRIG_QUEUE=1024u -DRIG_SAMPLES=256u
+
+# Another processor than a Cortex-M4 with floating point:
+# TARGET := -mcpu=cortex-m0plus -mthumb
