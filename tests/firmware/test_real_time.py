@@ -1,8 +1,10 @@
 """The firmware's ELF in QEMU in real time on a pty, by ``rig emulate --firmware``.
 
 A busy machine keeps QEMU waiting, now and then for longer than the protocol allows. What fails is
-tried again on load alone (``patience``).
+tried again on load alone (``patience``). Only where ``RIG_FIRMWARE_REAL_TIME`` asks for it.
 """
+
+import os
 
 import pytest
 import yaml
@@ -16,6 +18,11 @@ from tests.daq.support import rig, start_rig, until, write_yaml
 from tests.daq.test_hal import _exact_currents
 from tests.firmware import lockstep, patience
 from tests.firmware.build import needs
+
+pytestmark = pytest.mark.skipif(
+    not os.environ.get("RIG_FIRMWARE_REAL_TIME"),
+    reason="QEMU keeps time on a machine with nothing else to do only; RIG_FIRMWARE_REAL_TIME=1",
+)
 
 RESOLUTION, NOISE = 1.6e-4, 0.05
 WATCHDOG = 2.0  # s
