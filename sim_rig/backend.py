@@ -127,7 +127,7 @@ class SimulatedDevice:
         self._steppers: dict[float, Stepper] = {}
         # Draws of their own, so that the noise stays what it is without them.
         self._chance = np.random.default_rng([options.seed, 1])
-        self._phase = float(np.random.default_rng([options.seed, 2]).random())
+        self._encoder_phase = float(np.random.default_rng([options.seed, 2]).random())
         self._late: list[tuple[int, FloatArray]] = []
         self._queue = CommandQueue()
         self._clock = 0.0  # device time since it was switched on [s], at the next tick
@@ -140,7 +140,7 @@ class SimulatedDevice:
         self._warm_up()
         self._open = True
         self._x = self._plant.initial_state
-        self._encoder = EncoderCounter(4 * self.options.encoder_cycles, self._phase)
+        self._encoder = EncoderCounter(4 * self.options.encoder_cycles, self._encoder_phase)
         return hal.DeviceInfo(
             name="simulated rig",
             max_rate=20_000.0,
