@@ -14,6 +14,9 @@ from sysid.uncertainty.colour import record_rows
 
 # Central differences in search coordinates: truncation and rounding both near 1e-8.
 _PERTURBATION = 1e-5
+_FILTER_PERTURBATION = 1e-6  # the same where kinks make a filter jump: fewer lie within less
+# Part of the larger slopes by which those of both sides differ where there is a kink between them.
+_KINK = 0.01
 # Realisations of the inputs' noise: they give a variance to within 12 %.
 _DRAWS = 128
 
@@ -63,10 +66,13 @@ def sensitivity(objective: Objective, chromosome: FloatArray) -> Sensitivity:
     All simulations of a record take as many steps as the most demanding of them needs. Where one
     on one side fails the difference is that on the other side; where both do the slope is zero.
     Where noise of inputs divides the free run's errors it is held: at kinks of the equations it
-    jumps, which differences would take for slopes.
+    jumps, which differences would take for slopes. So do a filter's corrections: of a parameter
+    whose slopes differ between the sides that side counts that has no jump.
     """
     share: FloatArray | float = 1.0
-    criterion, distance = objective, _PERTURBATION * spans(objective, chromosome)
+    criterion, corrects = objective, isinstance(objective, Innovations) and objective.corrects
+    perturbation = _FILTER_PERTURBATION if corrects else _PERTURBATION
+    distance = perturbation * spans(objective, chromosome)
     at, shift = objective.space.encode(chromosome), np.diag(distance)
     around = objective.space.decode(np.concatenate([at[None], at + shift, at - shift]))
     steps = [int(needed) for needed in objective.steps_needed(around).max(axis=0)]
@@ -79,12 +85,26 @@ def sensitivity(objective: Objective, chromosome: FloatArray) -> Sensitivity:
     changes = np.where(runs, values[..., 1:] - centre, 0.0)
     sides = runs[:n].astype(int) + runs[n:]
     slopes = (changes[..., :n] - changes[..., n:]) / (np.maximum(sides, 1) * distance)
+    if corrects:
+        ahead, behind = changes[..., :n] / distance, -changes[..., n:] / distance
+        for rows in record_rows(tuple(record.n_samples for record in objective.records)):
+            slopes[rows] = _without_jumps(slopes[rows], ahead[rows], behind[rows])
     seen = np.concatenate([np.isfinite(record.outputs) for record in objective.records])
     factors = np.broadcast_to(share, seen.shape)
     residual, slopes = factors * centre[..., 0], factors[..., None] * slopes
     return Sensitivity(
         objective, chromosome, steps, residual, seen, slopes, factors, sides < 2, criterion
     )
+
+
+def _without_jumps(slopes: FloatArray, ahead: FloatArray, behind: FloatArray) -> FloatArray:
+    """Slopes of one record, those of the smaller side where the sides are a kink apart."""
+    apart = np.linalg.norm(ahead - behind, axis=(0, 1))
+    sizes = [np.linalg.norm(side, axis=(0, 1)) for side in (ahead, behind)]
+    jumps = apart > _KINK * np.maximum(*sizes)
+    smaller = np.where(sizes[0] < sizes[1], ahead, behind)
+    # A side on which the simulation fails has no slope at all.
+    return np.where(jumps & (np.minimum(*sizes) > 0.0), smaller, slopes)
 
 
 def spans(objective: Objective, chromosome: FloatArray) -> FloatArray:
