@@ -225,12 +225,13 @@ def _from_log(
     outputs = log.frame[list(model.output_names)].to_numpy(dtype=np.float64)
     tick, rows = log.frame["tick"].to_numpy(), selection.rows(log.path, log.frame["t"].to_numpy())
     if speeds is not None:
-        outputs[:, model.output_names.index(SPEED)] = speeds.values
+        speed = np.array([name == SPEED for name in model.output_names])
+        outputs = np.where(speed, speeds.values[:, None], outputs)
     dataset = _dataset(log.path, model, inputs[rows], outputs[rows], tick[rows], log.dt, title)
     if speeds is not None:
         windows = np.zeros((*dataset.outputs.shape, 2))
         places = tick[rows] - tick[rows][0]
-        windows[places, model.output_names.index(SPEED)] = speeds.windows[rows]
+        windows[places] = np.where(speed[:, None], speeds.windows[rows][:, None], 0.0)
         dataset = replace(dataset, windows=windows)
     return _without_run_in(dataset, log.path, model, selection)
 

@@ -107,6 +107,7 @@ def test_the_capture_folder_holds_the_run_as_resolved(completed):
         "name": "",
         "rig": "",
         "validation": {},
+        "metadata": {"operator": "", "sample": "", "note": "", "tags": []},
     }
     assert record["rig"]["sensors"]["encoder"] == {"cycles": 2048, "sign": 1}, "defaults too"
     assert record["rig"]["limits"]["command"]["brake"] == [0.0, 0.38]

@@ -34,7 +34,7 @@ SHIPPED = sorted(
     for path in (ROOT / folder).rglob("*.yaml")
 )
 # Numbers in a unit that stands elsewhere: in a model, or beside them.
-OF_A_MODEL = re.compile(r"^(ranges|fixed|constant|value|range|parameters|initial)$")
+OF_A_MODEL = re.compile(r"^(ranges|fixed|constant|value|range|parameters|initial|process_noise)$")
 
 
 def schema_of(path):

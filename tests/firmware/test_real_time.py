@@ -1,7 +1,7 @@
 """The firmware's ELF in QEMU in real time on a pty, by ``rig emulate --firmware``.
 
 A busy machine keeps QEMU waiting, now and then for longer than the protocol allows. What fails is
-tried again on load alone (``patience``). Only where ``RIG_FIRMWARE_REAL_TIME`` asks for it.
+tried again on load alone (``patience``). Only where ``RIG_REAL_TIME_TESTS`` asks for it.
 """
 
 import os
@@ -20,8 +20,8 @@ from tests.firmware import lockstep, patience
 from tests.firmware.build import needs
 
 pytestmark = pytest.mark.skipif(
-    not os.environ.get("RIG_FIRMWARE_REAL_TIME"),
-    reason="QEMU keeps time on a machine with nothing else to do only; RIG_FIRMWARE_REAL_TIME=1",
+    not os.environ.get("RIG_REAL_TIME_TESTS"),
+    reason="QEMU keeps time on a machine with nothing else to do only; RIG_REAL_TIME_TESTS=1",
 )
 
 RESOLUTION, NOISE = 1.6e-4, 0.05

@@ -484,7 +484,10 @@ def test_a_first_evening_begins_with_the_doctor(tmp_path, backend):
     assert "  # phase: 0" in text and "motor: [-0.5, 0.5]" in text
 
 
-@pytest.mark.soak
+@pytest.mark.skipif(
+    not os.environ.get("RIG_REAL_TIME_TESTS"),
+    reason="it keeps the clock's pace on a machine with nothing else to do; RIG_REAL_TIME_TESTS=1",
+)
 @pytest.mark.parametrize("backend", list(CARDS))
 def test_the_shipped_experiment_is_identified_on_a_fake_card(tmp_path, backend):
     env = environment(**REAL, hand=[2, 5], let_down=[4])
