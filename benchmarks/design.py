@@ -132,16 +132,17 @@ def motor_with_friction(seed: int = 0) -> dict[str, Any]:
     }
 
 
+def of_voltage(**further: Setting) -> dict[str, Setting]:
+    """Settings of an excitation of the motor, with those of its own."""
+    level, seed = Setting(0.1, 5.0), Setting(1, 65535, whole=True)
+    return {"amplitude": level, "offset": Setting(-2.0, 2.0), **further, "seed": seed}
+
+
 def voltage_prbs() -> Excitation:
     def inputs(s: Mapping[str, float]) -> FloatArray:
         return (s["offset"] + s["amplitude"] * levels(s["hold"], s["seed"], 500, 500.0))[:, None]
 
-    settings = {
-        "amplitude": Setting(0.1, 5.0),
-        "offset": Setting(-2.0, 2.0),
-        "hold": Setting(0.002, 0.5, log=True),
-        "seed": Setting(1, 65535, whole=True),
-    }
+    settings = of_voltage(hold=Setting(0.002, 0.5, log=True))
     return Excitation("prbs", settings, inputs, 1.0 / 500.0)
 
 
@@ -152,12 +153,7 @@ def voltage_multisine() -> Excitation:
         wave = np.cos(2.0 * np.pi * lines * np.arange(500)[:, None] / 500.0 + phases).sum(axis=1)
         return (s["offset"] + s["amplitude"] * wave / np.abs(wave).max())[:, None]
 
-    settings = {
-        "amplitude": Setting(0.1, 5.0),
-        "offset": Setting(-2.0, 2.0),
-        "highest": Setting(1.0, 200.0, log=True),
-        "seed": Setting(1, 65535, whole=True),
-    }
+    settings = of_voltage(highest=Setting(1.0, 200.0, log=True))
     return Excitation("multisine", settings, inputs, 1.0 / 500.0)
 
 

@@ -24,13 +24,15 @@ from daq.boards.card import (
     Reading,
     require_phase,
 )
-from daq.boards.watch import GuardWatch, RateEstimate, Unwrapping
+from daq.boards.watch import GuardWatch, RateEstimate
+from daq.counter import Counter
 from daq.errors import DeviceError, Mistake
 from daq.hal import CHANNELS, DeviceInfo, Flag, FloatArray, Guard, IntArray, Mode, Phase, RawSamples
 
 _BLOCK = 0.01  # s of samples read at once while the card plays
 _MARGIN = 0.05  # s of commands that are to be with the card; less, and it runs dry
 _DRIFT = 2e-4  # of the card's clock against this computer's, at most
+_SPAN = 2**24  # counts; counters of 24 and of 32 bits agree in these
 _SATURATED = 1e-3  # of the range, from its ends
 _UNTRIED = "this backend has been tested on a simulated card, never on hardware"
 _NO_WATCHDOG = (
@@ -79,7 +81,7 @@ class CardDevice:
         self._plays = not self._is_closed_loop and self._settings.playback == "board"
         require_phase(self._settings, mode)
         self._rate, self._guard, self._watch = sample_rate, guard, GuardWatch(guard)
-        self._unwrapping, self._estimate = Unwrapping(), RateEstimate(sample_rate)
+        self._counter, self._estimate = Counter(_SPAN), RateEstimate(sample_rate)
         self._queue: dict[int, FloatArray] = {}  # commands by tick, not handed on yet
         self._played: dict[int, FloatArray] = {}  # and handed on ahead
         self._end = 0  # tick behind those
@@ -324,7 +326,7 @@ class CardDevice:
         return max(self._tick, math.floor((self._clock() - self._origin) * self._rate))
 
     def _counted(self, reading: Reading) -> tuple[FloatArray, FloatArray]:
-        counts = self._unwrapping.counts(reading.counts)
+        counts = self._counter.unwrapped(reading.counts)
         rates = reading.rates if reading.rates is not None else self._estimate.rates(counts)
         return counts.astype(np.float64), rates
 

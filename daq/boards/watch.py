@@ -1,4 +1,4 @@
-"""What this program watches for a card that cannot: counts without an end, their rate, limits."""
+"""What this program watches for a card that cannot: the rate of its counts, and limits."""
 
 from collections import deque
 
@@ -7,29 +7,7 @@ import numpy.typing as npt
 
 from daq.hal import FloatArray, Guard
 
-# Counters of 24 and of 32 bits agree in these.
-_SPAN = 2**24
 _LONGEST = 16  # samples of which a rate is estimated
-
-
-class Unwrapping:
-    """Counts without an end, of a counter of 24 bits or more that runs over."""
-
-    def __init__(self) -> None:
-        self._last: int | None = None
-
-    def counts(self, shown: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-        """The counts (n,) that follow those before: the nearer way round is the true one.
-
-        >>> Unwrapping().counts(np.array([1, 0, 2**32 - 1])).tolist()
-        [1, 0, -1]
-        """
-        before = shown[0] if self._last is None else self._last
-        half = _SPAN // 2
-        steps = (np.diff(shown, prepend=before) + half) % _SPAN - half
-        result: npt.NDArray[np.int64] = before + np.cumsum(steps)
-        self._last = int(result[-1])
-        return result
 
 
 class RateEstimate:

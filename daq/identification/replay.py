@@ -76,7 +76,7 @@ class Replay:
     @property
     def rmse_absolute(self) -> dict[str, float]:
         """Root mean squared error of each output in its unit."""
-        return self._by_output(self.metrics.rmse * self.metrics.scale)
+        return self._by_output(self.metrics.rmse_absolute)
 
     @property
     def frame(self) -> pd.DataFrame:

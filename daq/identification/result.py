@@ -414,7 +414,7 @@ def errors_document(model: ProcessModel, metrics: Metrics) -> dict[str, dict[str
     return {
         output.name: {
             **{key: float(values[j]) for key, values in figures.items()},
-            "rmse_absolute": float(metrics.rmse[j] * metrics.scale[j]),
+            "rmse_absolute": float(metrics.rmse_absolute[j]),
             "msd_absolute": float(metrics.msd[j] * metrics.scale[j]),
             "unit": output.unit,
         }

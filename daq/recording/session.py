@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -98,12 +98,7 @@ def open_session(
     # Checked even where it will not run: a mistake in the file is best heard of early.
     validation = loaded.validation()
     runs = [run for run in (loaded, validation) if run is not None]
-    plans = together(
-        *[partial(run.plan, config) for run in runs],
-        partial(_require_port, config, name),
-        partial(require_phase, config.options, loaded.experiment.mode, name),
-    )
-    return Session(loaded, validation, config, device, plans[0])
+    return Session(loaded, validation, config, device, _plan(runs, config, name))
 
 
 def record(
@@ -138,11 +133,7 @@ def record(
     loaded = _noting(loaded, list(notes))
     name = str(rig or rig_for(str(experiment), watch))
     config, device = load_rig(name, options, watch)
-    together(
-        partial(loaded.plan, config),
-        partial(_require_port, config, name),
-        partial(require_phase, config.options, loaded.experiment.mode, name),
-    )
+    _plan([loaded], config, name)
     return load(_run(loaded, config, device, Path(out), watch).folder)
 
 
@@ -168,6 +159,17 @@ def _rig_on(rig: str, port: str | None, realtime: bool, watch: Watch) -> tuple[R
     if changes:
         config, device = load_rig(rig, changes, watch)
     return config, device
+
+
+def _plan(runs: Sequence[LoadedExperiment], config: RigConfig, rig: str) -> Plan:
+    """What the first of some runs will do; ConfigError with all that keeps any from being run."""
+    first, *_ = together(
+        *[partial(run.plan, config) for run in runs],
+        partial(_require_port, config, rig),
+        partial(require_phase, config.options, runs[0].experiment.mode, rig),
+    )
+    plan: Plan = first
+    return plan
 
 
 def _require_port(config: RigConfig, rig: str) -> None:

@@ -11,6 +11,7 @@ from pydantic import Field
 
 from daq.config.base import Section
 from daq.config.units import Seconds, Unit
+from daq.counter import Counter
 from daq.errors import DeviceError
 from daq.hal import ANALOG_INPUTS, CHANNELS, DeviceInfo, FloatArray, Guard, Mode, Phase, RawSamples
 from daq.serial import messages
@@ -237,7 +238,10 @@ class Scaling:
         self.input_range = max(c.low for c in inputs), min(c.high for c in inputs)
         self._in_scale, self._in_offset = _columns(inputs)
         self._out_scale, self._out_offset = _columns(outputs)
-        self._counter = Counter(channels[-1])
+        counter = channels[-1]
+        # It has 32 bits, or 16 where its row of the channel table ends there.
+        is_short = counter.high - counter.low == _SHORT - 1
+        self._counter = Counter(_SHORT if is_short else 2**32)
         self.step_out = float(np.abs(self._out_scale).max())
         self._guard: Guard  # of the run
         self._count: int | None = None  # the latest of the run
@@ -295,26 +299,6 @@ class Scaling:
 
     def _out(self, volts: FloatArray) -> FloatArray:
         return np.asarray((volts - self._out_offset) / self._out_scale, dtype=np.float64)
-
-
-class Counter:
-    """Counts without an end, of a counter that runs over.
-
-    It has 32 bits, or 16 where its row of the channel table ends there.
-    """
-
-    def __init__(self, channel: Channel) -> None:
-        self._span = _SHORT if channel.high - channel.low == _SHORT - 1 else 2**32
-        self._last: int | None = None
-
-    def unwrapped(self, counts: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-        """The counts (n,) that follow those before: the nearer way round is taken for the true."""
-        first = counts[0] if self._last is None else self._last
-        half = self._span // 2
-        steps = (np.diff(counts, prepend=first) + half) % self._span - half
-        result: npt.NDArray[np.int64] = first + np.cumsum(steps)
-        self._last = int(result[-1])
-        return result
 
 
 def _columns(channels: Sequence[Channel]) -> tuple[FloatArray, FloatArray]:

@@ -94,7 +94,7 @@ class Outcome:
         """Mean over the training records of each output's RMSE, in its unit."""
         if not self.training:
             return {}
-        rmse = mean_known([metrics.rmse * metrics.scale for metrics in self.training], 0)
+        rmse = mean_known([metrics.rmse_absolute for metrics in self.training], 0)
         return dict(zip(self.run.model.output_names, rmse.tolist(), strict=True))
 
     def row(self) -> dict[str, Any]:

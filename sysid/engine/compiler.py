@@ -297,11 +297,16 @@ def _source_file(name: str, text: str) -> Path | None:
     try:
         if path.exists():
             return path
-        handle, temporary = tempfile.mkstemp(dir=folder, suffix=".tmp")
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(text)
-        # Two processes may race to here; either's file is the right one.
-        Path(temporary).replace(path)
+        write_cached(path, text.encode())
     except OSError:
         return None
     return path
+
+
+def write_cached(path: Path, content: bytes) -> None:
+    """Write a file of the cache whole or not at all. Raises OSError."""
+    handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
+    with os.fdopen(handle, "wb") as file:
+        file.write(content)
+    # Two processes may race to here; either's file is the right one.
+    Path(temporary).replace(path)

@@ -41,7 +41,7 @@ class Excitation:
     """A family of runs: inputs as a function of free settings.
 
     inputs: of settings by name, (n_samples, n_inputs) in the order of the model's inputs (or
-    what else ``respond`` of a design takes). dt: sample time [s].
+    what else the ``Bench`` of a design takes). dt: sample time [s].
 
     >>> steps = Excitation(
     ...     "step", {"height": Setting(-1.0, 1.0)}, lambda s: np.full((50, 1), s["height"]), 0.01

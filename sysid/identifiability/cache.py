@@ -6,13 +6,11 @@ code that analyses them: of a changed model or code nothing is taken from it.
 
 import contextlib
 import hashlib
-import os
 import pickle
-import tempfile
 from importlib.metadata import version
 from pathlib import Path
 
-from sysid.engine.compiler import cache_folder, fingerprint
+from sysid.engine.compiler import cache_folder, fingerprint, write_cached
 from sysid.identifiability.analysis import Identifiability, identifiability
 from sysid.problem.model import ProcessModel
 
@@ -35,7 +33,7 @@ def kept_identifiability(model: ProcessModel) -> Identifiability:
     result = identifiability(model, sensors=False)
     if path is not None:
         with contextlib.suppress(OSError):
-            _write(path, pickle.dumps(result))
+            write_cached(path, pickle.dumps(result))
     return result
 
 
@@ -45,11 +43,3 @@ def _key(model: ProcessModel) -> str:
     for source in sorted(Path(__file__).parent.glob("*.py")):
         key.update(source.read_bytes())
     return key.hexdigest()[:24]
-
-
-def _write(path: Path, content: bytes) -> None:
-    """Whole or not at all."""
-    handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
-    with os.fdopen(handle, "wb") as file:
-        file.write(content)
-    Path(temporary).replace(path)

@@ -258,7 +258,7 @@ def _validation_errors(
         return []
     # Absolute, because each record has its own largest output.
     trained, validated = (
-        np.sqrt(mean_known([(r.metrics.rmse * r.metrics.scale) ** 2 for r in results], 0))
+        np.sqrt(mean_known([r.metrics.rmse_absolute**2 for r in results], 0))
         for results in (training, validation)
     )
     fits = mean_known([r.metrics.fit for r in validation], 0)

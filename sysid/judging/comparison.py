@@ -239,7 +239,7 @@ def compare(
         row = Row(
             structure.name, structure.n_free, structure.n_effective,
             trained[i].mean_rmse(importance), quality.rmse, quality.msd, quality.fit,
-            quality.rmse * quality.scale, trained[i].rmse_absolute,
+            quality.rmse_absolute, trained[i].rmse_absolute,
             daic[i], dbic[i], ratios[i], standing,
         )  # fmt: skip
         rows.append(row)
@@ -292,7 +292,7 @@ class _FreeRuns:
     @property
     def rmse_absolute(self) -> FloatArray:
         """RMSE in the outputs' units, (n_outputs,); NaN of those without a measured sample."""
-        absolute: FloatArray = np.where(self.seen, self.metrics.rmse * self.scale, np.nan)
+        absolute: FloatArray = np.where(self.seen, self.metrics.rmse_absolute, np.nan)
         return absolute
 
     def mean_rmse(self, importance: FloatArray) -> float:

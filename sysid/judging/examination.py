@@ -90,10 +90,10 @@ def suspected(
     """
     if uncertainty is None:
         return None
-    ends = any(p.on_bound and not p.why for p in uncertainty.parameters)
-    runs = [estimator.predict(record) for record in training]
-    if ends and np.all(fits(training, runs) > FITTED):
-        return None  # what an end of a range leaves looks like something missing
+    if any(p.on_bound and not p.why for p in uncertainty.parameters):
+        runs = [estimator.predict(record) for record in training]
+        if np.all(fits(training, runs) > FITTED):
+            return None  # what an end of a range leaves looks like something missing
     try:
         objective = estimator.final_objective(list(training))
         findings = missing_physics(objective, estimator.chromosome_, uncertainty)

@@ -80,6 +80,11 @@ class Metrics:
     fit: FloatArray
     scale: FloatArray
 
+    @property
+    def rmse_absolute(self) -> FloatArray:
+        """RMSE in the outputs' units."""
+        return self.rmse * self.scale
+
 
 def evaluate(measured: FloatArray, simulated: FloatArray) -> Metrics:
     """All metrics of a record; ``scale`` of the result is max|y| of ``measured``.

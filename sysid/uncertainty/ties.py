@@ -54,32 +54,6 @@ class Ties:
         tied: list[bool] = np.any(self.directions != 0.0, axis=0).tolist()
         return tied
 
-    def apart(self, space: SearchSpace, begin: FloatArray, end: FloatArray) -> FloatArray:
-        """How far a chromosome is from another in search coordinates, (n_free,), up to the ties.
-
-        Of what is tied it is the least move that changes the combinations as much: along a valley
-        of the equations, straight or bent, nothing is apart.
-        """
-        moved, tied = space.encode(end) - space.encode(begin), np.array(self.bound, dtype=bool)
-        if len(self.combinations) < np.count_nonzero(tied) - len(self.directions):
-            return moved  # not all of them have a name
-        first, last = named_values(space, begin), named_values(space, end)
-        increments = np.where(space.log, begin, 1.0)
-        rows, changes = [], []
-        for combination in self.combinations:
-            gradient = free_gradient(combination, space, first) * increments
-            before, after = combination.value(first), combination.value(last)
-            ratio = after / before if before else 0.0
-            # The logarithm of a product is straight in logarithms.
-            change = before * np.log(ratio) if ratio > 0.0 else after - before
-            size = float(np.linalg.norm(gradient))
-            if size > 0.0:
-                rows.append(gradient[tied] / size)
-                changes.append(change / size)
-        if rows:
-            moved[tied] = np.linalg.lstsq(np.array(rows), np.array(changes), rcond=1e-9)[0]
-        return moved
-
     def groups(self) -> list[tuple[list[int], FloatArray]]:
         """Places of parameters that hang together, and their directions (k, n_free)."""
         groups: list[tuple[set[int], list[int]]] = []

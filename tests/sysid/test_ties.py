@@ -1,6 +1,5 @@
 """What the equations tie: kept on disk between runs, and no distance between minima."""
 
-import math
 import subprocess
 import sys
 from dataclasses import replace
@@ -8,10 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sysid import Input, Output, Parameter, ProcessModel, SearchSpace, State
+from sysid import Input, Output, Parameter, ProcessModel, State
 from sysid.identifiability import cache
 from sysid.identifiability.cache import kept_identifiability
-from sysid.uncertainty.ties import Ties
 
 
 def shaft_derivative(x, u, p):
@@ -84,30 +82,6 @@ def test_a_file_that_was_cut_short_is_made_anew(analyses, tmp_path):
     assert combinations(kept_identifiability(shaft())) == ["J_m + J_b"]
     kept_identifiability(shaft())
     assert len(analyses) == 2  # the second time it was whole again
-
-
-def valley():
-    """Ties of the shaft at J_m = 8, J_b = 2, B = 1, and its search space."""
-    space, at = SearchSpace.of(shaft()), np.array([8.0, 2.0, 1.0])
-    (group,) = kept_identifiability(shaft()).tied
-    return Ties.of(space, at, group.combinations, group.parameters), space, at
-
-
-def test_along_a_bent_valley_nothing_is_apart():
-    ties, space, at = valley()
-    # On a logarithmic scale the line of equal sums is bent: its tangent leads away from it.
-    end = np.array([5.0, 5.0, 1.0])
-    straight = space.encode(end) - space.encode(at)
-    assert abs(straight @ [0.8, 0.2, 0.0]) > 0.1
-    assert ties.apart(space, at, end) == pytest.approx(np.zeros(3), abs=1e-9)
-
-
-def test_across_a_valley_it_is_apart_by_what_its_combination_changes():
-    ties, space, at = valley()
-    moved = ties.apart(space, at, np.array([15.0, 5.0, 3.0]))
-    # The sum doubles: by its slopes 0.8 and 0.2 the move makes the logarithm of two.
-    assert moved @ [0.8, 0.2, 0.0] == pytest.approx(math.log(2.0))
-    assert moved[2] == pytest.approx(math.log(3.0))
 
 
 def test_a_process_model_is_made_without_what_identifies_it():
