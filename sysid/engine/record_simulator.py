@@ -7,7 +7,7 @@ import numpy as np
 from sysid.arrays import BoolArray, FloatArray, IntArray
 from sysid.engine.compiler import Filter, Kernels, Tangents, explained_errors
 from sysid.engine.scheme import LANES, work_area
-from sysid.engine.windows import average
+from sysid.engine.windows import average, compared
 from sysid.problem.data import Dataset
 from sysid.problem.model import ProcessModel
 from sysid.threads import Workers
@@ -258,11 +258,8 @@ class RecordSimulator:
         _, estimates = self._plain_block(parameters, starts, lanes, n_steps, signals, kept)
         for j in self._averaged:
             kept[:, j] = average(kept[:, j], self._windows[:n_samples, j])
-        with np.errstate(all="ignore"):
-            kept -= self._measured[:n_samples, :, None]
-            kept *= self._weights[:n_samples, :, None]
-            sse = np.einsum("kjl,kjl->lj", kept, kept)
-        return sse[: len(lanes)], estimates
+        sums = compared(kept, self._measured[:n_samples], self._weights[:n_samples])
+        return sums.T[: len(lanes)], estimates
 
     def _plain_block(
         self,

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from sysid.arrays import FloatArray
 from sysid.engine.arithmetic import UFUNCS
 from sysid.engine.substitution import Copier
 from sysid.engine.tape import Tape
@@ -96,6 +97,23 @@ def followed(function: Any) -> Callable[..., tuple[Any, ...]]:
     copier = Copier(types.SimpleNamespace(**library), lambda copy: copy, builtins, unwrap=True)
     copy: Callable[..., tuple[Any, ...]] = copier.copied(function)
     return copy
+
+
+def evaluated(function: Any, *sides: FloatArray) -> FloatArray:
+    """A model's function (x, u, p) at many points at once, (n_points, n_values).
+
+    sides: values of each, (n_points, ...) or (1, ...). Not finite where the function is not.
+    Raises what following it does, ValueError where its conditions part the points.
+    """
+    letters = dict(zip("xup", sides, strict=True))
+    tape = Tape(
+        {f"{k}{i}": side[:, i] for k, side in letters.items() for i in range(side.shape[1])}
+    )
+    arguments = (traces(tape, letter, side.shape[1]) for letter, side in letters.items())
+    with np.errstate(all="ignore"):
+        values = [tape.value(operand(value)) for value in followed(function)(*arguments)]
+    rows = np.zeros(max(map(len, sides)))
+    return np.stack([rows + value for value in values], axis=1)
 
 
 def traces(tape: Tape, letter: str, count: int) -> tuple[Trace, ...]:

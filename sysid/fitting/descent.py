@@ -14,6 +14,7 @@ import numpy as np
 from sysid.arrays import FloatArray
 from sysid.fitting.objective import Objective
 from sysid.fitting.quadratic import FIRST_DAMPING, heavier
+from sysid.problem.space import SearchSpace
 
 # Sizes of the perturbations, in parts of the ranges. The first is for what is smooth. Where
 # something switches (dry friction, an overflow) the instant of switching moves in steps of the
@@ -21,6 +22,7 @@ from sysid.fitting.quadratic import FIRST_DAMPING, heavier
 PERTURBATIONS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
 # Floors below which outputs' errors are smoothed, in parts of the error.
 FLOORS = (1e-1, 1e-2, 1e-3)
+TOLERANCE = 1e-7  # share of the error that ends a descent where nothing else is said
 PATIENCE = 3  # failures in a row, the later ones with more damping
 NOTHING = 1e-3  # share of the error that is not worth a change of perturbations
 _STEADIER, _BRACINGS = 1.5, 3
@@ -47,17 +49,42 @@ class Point:
 
 
 @dataclass(frozen=True)
+class Restriction:
+    """What a descent keeps to beside the ranges.
+
+    held: a search coordinate, and the value that it keeps. tether: of chromosomes (n, n_free) one
+    residual more, (n,), which pulls a quantity to a target.
+    """
+
+    held: tuple[int, float] | None = None
+    tether: Callable[[FloatArray], FloatArray] | None = None
+
+    def bounds(self, space: SearchSpace) -> tuple[FloatArray, FloatArray]:
+        """Ends of the search coordinates, (n_free,) each."""
+        if self.held is None:
+            return space.coded_bounds
+        place, value = self.held
+        lower, upper = (bounds.copy() for bounds in space.coded_bounds)
+        lower[place] = upper[place] = value
+        return lower, upper
+
+
+FREE = Restriction()
+
+
+@dataclass(frozen=True)
 class Descent:
     """A descent at a point; ``refinement.advance`` returns it one iteration further.
 
-    safe: where integration steps were last chosen and a simulation with them succeeded; beyond,
-    the steps may not do. steps: per sample, for each record; steps_at: the coordinates they were
+    tolerance: share of the error; one that is promised or gains no more has arrived. safe:
+    where integration steps were last chosen and a simulation with them succeeded; beyond, the
+    steps may not do. steps: per sample, for each record; steps_at: the coordinates they were
     chosen at, None where they are yet to be; braced: how often they have been raised since for
     the neighbours' sake. gain: share of the error that the last iteration took away. failures:
     iterations in a row that gained nothing, or hardly any of what was promised. level: of
     ``PERTURBATIONS``. error_of_round: the error where the present round of levels began.
-    smoothing: which of ``FLOORS``. backward: coordinates whose neighbours are taken on the other
-    side, because simulations fail on the usual one.
+    smoothing: which of ``FLOORS``. backward: coordinates whose neighbours are taken on the
+    other side, because simulations fail on the usual one.
     """
 
     point: Point
@@ -74,6 +101,8 @@ class Descent:
     iterations: int = 0
     finished: bool = False
     backward: tuple[int, ...] = ()
+    tolerance: float = TOLERANCE
+    restriction: Restriction = FREE
 
     @property
     def floor(self) -> float:
@@ -81,10 +110,10 @@ class Descent:
         return FLOORS[self.smoothing] * self.point.error
 
     def state(self) -> dict[str, Any]:
-        """The state in plain values and arrays."""
+        """The state in plain values and arrays, of one that nothing restricts."""
         at, error = (None, np.inf) if self.safe is None else (self.safe.at, self.safe.error)
         state = vars(self) | vars(self.point) | {"sure": at, "sure_error": error}
-        del state["point"], state["safe"]
+        del state["point"], state["safe"], state["restriction"]
         return state
 
     @classmethod
@@ -93,7 +122,7 @@ class Descent:
         rest = dict(state)
         at, error = rest.pop("sure"), rest.pop("sure_error")
         point = Point(*(rest.pop(field.name) for field in fields(Point)))
-        return cls(point, None if at is None else Point(at, error), **rest)
+        return cls(point, safe=None if at is None else Point(at, error), **rest)
 
 
 def retreat(_: Objective, descent: Descent) -> Descent | None:

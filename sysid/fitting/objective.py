@@ -13,8 +13,8 @@ sqrt(n_samples) times this.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -87,7 +87,6 @@ class Objective:
         if len(unseen):
             name = simulator.model.output_names[unseen[0]]
             raise ModelError(f"no record has a measured sample of output {name!r}")
-        self.tether: Callable[[FloatArray], FloatArray] | None = None
         self._counter = [0]
 
     @property
@@ -118,15 +117,6 @@ class Objective:
         """The objective of the free run's errors: this one."""
         return self
 
-    def tethered(
-        self, quantity: Callable[[FloatArray], FloatArray], target: float, stiffness: float
-    ) -> Objective:
-        """The same objective with one residual more, which pulls a quantity to a target.
-
-        quantity: (n,) of chromosomes (n, n_free). stiffness: the residual per unit of it.
-        """
-        return self._with(tether=lambda rows: stiffness * (quantity(rows) - target))
-
     def finer(self, accuracy: float) -> Objective:
         """The same objective by simulations of another accuracy, stiff ones given the steps."""
         return self._with(simulator=self.simulator.finer(accuracy))
@@ -153,15 +143,18 @@ class Objective:
         steps = np.broadcast_to(n_steps, (len(chromosomes), len(self.records)))
         simulated = self._simulated(chromosomes, steps, keep=keep)
         self._counter[0] += len(chromosomes)
-        sse, values = simulated.sse.sum(axis=1), simulated.values
-        if self.tether is not None:
-            # As one sample more of an output that counts.
-            output, pull = int(np.argmax(self.weights)), self.tether(chromosomes)
-            row = np.zeros((1, *values.shape[1:]))
-            row[0, output] = pull
-            sse[:, output] += pull**2
-            values = np.concatenate([values, row]) if keep else values
-        return Responses(values, self._roots(sse), simulated.excess.max(axis=1))
+        rms = self._roots(simulated.sse.sum(axis=1))
+        return Responses(simulated.values, rms, simulated.excess.max(axis=1))
+
+    def with_sample(self, responses: Responses, residual: FloatArray) -> Responses:
+        """Responses with one residual more, (n,), as if of the output that counts most."""
+        output = int(np.argmax(self.weights))
+        row = np.zeros((1, *responses.values.shape[1:]))
+        row[0, output] = residual
+        rms = responses.rms.copy()
+        rms[:, output] = np.hypot(rms[:, output], residual / np.sqrt(self.counts[output]))
+        values = np.concatenate([responses.values, row]) if responses.values.size else row[:0]
+        return replace(responses, values=values, rms=rms)
 
     def steps_needed(self, chromosomes: FloatArray) -> IntArray:
         """Integration steps per sample that each chromosome needs, (n, n_records)."""

@@ -104,18 +104,23 @@ class Candidates:
 
 
 def candidates(
-    space: SearchSpace, at: FloatArray, damping: FloatArray, quadratics: Sequence[Quadratic]
+    space: SearchSpace,
+    at: FloatArray,
+    bounds: tuple[FloatArray, FloatArray],
+    damping: FloatArray,
+    quadratics: Sequence[Quadratic],
 ) -> list[Candidates]:
-    """Candidates of several points, within the ranges and the constraints.
+    """Candidates of several points, between bounds and within the constraints.
 
-    at: (m, n_free), search coordinates of the points; damping: (m,), the middle lambda of each.
+    at: (m, n_free), search coordinates of the points; bounds: two of (m, n_free); damping: (m,),
+    the middle lambda of each.
     """
     if not quadratics:
         return []
     hessian = np.stack([quadratic.hessian for quadratic in quadratics])
     gradient = np.stack([quadratic.gradient for quadratic in quadratics])[:, :, None]
-    (lower, upper), width = space.coded_bounds, space.width
-    at = at[:, None]
+    lower, upper = (ends[:, None] for ends in bounds)
+    at, width = at[:, None], space.width
     low, high = (lower - at) / width, (upper - at) / width
     # The last one is for the promise.
     lambdas = np.clip(damping[:, None] * np.append(_FACTORS, 0.0), _LEAST_DAMPING, _MOST_DAMPING)

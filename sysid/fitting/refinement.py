@@ -24,11 +24,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sysid.arrays import FloatArray
-from sysid.fitting.descent import FLOORS, NOTHING, PATIENCE, PERTURBATIONS, Descent, Point, resumed
+from sysid.fitting.descent import (
+    FLOORS,
+    FREE,
+    NOTHING,
+    PATIENCE,
+    PERTURBATIONS,
+    TOLERANCE,
+    Descent,
+    Point,
+    Restriction,
+    resumed,
+)
 from sysid.fitting.objective import Objective, Responses
 from sysid.fitting.quadratic import CANDIDATES, Candidates, Quadratic, candidates, heavier
 from sysid.problem.space import SearchSpace
 
+_MOST_ITERATIONS = 50
 ROUNDING = 1e-12  # errors below it are those of the arithmetic
 _KEPT = 0.02  # share of the promise below which a gain counts as a failure
 _FAR = 0.05  # parts of the ranges; after longer moves the integration steps are chosen anew
@@ -53,13 +65,14 @@ def refine(
     objective: Objective,
     chromosome: FloatArray,
     *,
-    max_iterations: int = 50,
-    tolerance: float = 1e-7,
+    max_iterations: int = _MOST_ITERATIONS,
+    tolerance: float = TOLERANCE,
+    restriction: Restriction = FREE,
     on_iteration: Callable[[Point], None] | None = None,
 ) -> Refinement:
     """Minimise the objective from ``chromosome`` (n_free,) within the ranges and constraints.
 
-    tolerance: share of the error; a descent that is promised or gains no more has arrived.
+    tolerance: as of ``Descent``.
     """
 
     def watch(point: Point) -> bool:
@@ -67,26 +80,26 @@ def refine(
             on_iteration(point)
         return False
 
-    return refine_each(objective, [chromosome], max_iterations, tolerance, watch)[0]
+    descent = begin(objective, chromosome, tolerance=tolerance, restriction=restriction)
+    return refine_each(objective, [descent], max_iterations, watch)[0]
 
 
 def refine_each(
     objective: Objective,
-    chromosomes: Sequence[FloatArray],
-    max_iterations: int = 50,
-    tolerance: float = 1e-7,
+    descents: Sequence[Descent],
+    max_iterations: int = _MOST_ITERATIONS,
     enough: Callable[[Point], bool] = lambda point: False,
 ) -> list[Refinement]:
-    """The same from each of several chromosomes (n_free,), side by side in the same batches.
+    """The same by several descents that begin, side by side in the same batches.
 
     enough: whether a descent that has come to a point need not go on.
     """
-    descents = [begin(objective, chromosome) for chromosome in chromosomes]
+    descents = list(descents)
     for _ in range(max_iterations):
         live = [i for i, descent in enumerate(descents) if not descent.finished]
         if not live:
             break
-        descents = advance(objective, descents, tolerance)
+        descents = advance(objective, descents)
         for i in live:
             if enough(descents[i].point):
                 descents[i] = replace(descents[i], finished=True)
@@ -102,10 +115,31 @@ def refine_each(
     ]
 
 
-def begin(objective: Objective, chromosome: FloatArray) -> Descent:
-    """A descent from a chromosome (n_free,), moved to the nearest point within the ranges."""
+def begin(
+    objective: Objective,
+    chromosome: FloatArray,
+    *,
+    tolerance: float = TOLERANCE,
+    restriction: Restriction = FREE,
+) -> Descent:
+    """A descent from a chromosome (n_free,), moved to the nearest point that it may come to."""
     space = objective.space
-    return Descent(Point(np.clip(space.encode(chromosome), *space.coded_bounds)))
+    at = np.clip(space.encode(chromosome), *restriction.bounds(space))
+    return Descent(Point(at), tolerance=tolerance, restriction=restriction)
+
+
+def errors_of(objective: Objective, descents: Sequence[Descent]) -> FloatArray:
+    """Errors (n,) where descents stand, their restrictions' included, infinite where one failed."""
+    chromosomes = objective.space.decode(np.stack([descent.point.at for descent in descents]))
+    rms, none = objective.rms(chromosomes), np.zeros((0, *objective.weights.shape, 1))
+    errors = []
+    for descent, chromosome, each in zip(descents, chromosomes, rms, strict=True):
+        responses = Responses(none, each[None], np.zeros(1))
+        tether = descent.restriction.tether
+        if tether is not None:
+            responses = objective.with_sample(responses, tether(chromosome[None]))
+        errors.append(objective.error_of(responses.rms)[0])
+    return np.array(errors)
 
 
 def simulations_per_iteration(objective: Objective) -> int:
@@ -121,9 +155,7 @@ def curvature(objective: Objective, at: FloatArray) -> FloatArray:
     return Quadratic.at(objective, around, _distance(objective.space, descent), floor).hessian
 
 
-def advance(
-    objective: Objective, descents: Sequence[Descent], tolerance: float = 1e-7
-) -> list[Descent]:
+def advance(objective: Objective, descents: Sequence[Descent]) -> list[Descent]:
     """The descents after one iteration of each that has not finished."""
     onward = list(descents)
     live = [i for i, descent in enumerate(descents) if not descent.finished]
@@ -132,13 +164,13 @@ def advance(
     per_batch = max(1, _BATCH_BYTES // (8 * residuals_each))
     for first in range(0, len(live), per_batch):
         batch = slice(first, first + per_batch)
-        iterated = _iterated(objective, ready[batch], tolerance)
+        iterated = _iterated(objective, ready[batch])
         for i, descent in zip(live[batch], iterated, strict=True):
             onward[i] = descent
     return onward
 
 
-def _iterated(objective: Objective, descents: list[Descent], tolerance: float) -> list[Descent]:
+def _iterated(objective: Objective, descents: list[Descent]) -> list[Descent]:
     """The descents, whose integration steps are chosen, after one iteration."""
     space = objective.space
     neighbourhoods = [_neighbourhood(space, descent) for descent in descents]
@@ -147,19 +179,20 @@ def _iterated(objective: Objective, descents: list[Descent], tolerance: float) -
     onward = [descent for descent, _ in surveys]
     quadratics = {i: quadratic for i, (_, quadratic) in enumerate(surveys) if quadratic}
     at = np.array([onward[i].point.at for i in quadratics])
+    bounds = [onward[i].restriction.bounds(space) for i in quadratics]
+    ends = np.array([lower for lower, _ in bounds]), np.array([upper for _, upper in bounds])
     damping = np.array([onward[i].damping for i in quadratics])
+    offered = candidates(space, at, ends, damping, list(quadratics.values()))
     offers = {}
-    for i, offer in zip(
-        quadratics, candidates(space, at, damping, list(quadratics.values())), strict=True
-    ):
-        if len(offer.coordinates) and not offer.promise <= tolerance:
+    for i, offer in zip(quadratics, offered, strict=True):
+        if len(offer.coordinates) and not offer.promise <= onward[i].tolerance:
             offers[i] = offer
         else:
             onward[i] = resumed(objective, onward[i], "arrived")
     rows = [offer.coordinates for offer in offers.values()]
-    ends = _responses(objective, [onward[i] for i in offers], rows, keep=False)
-    for (i, offer), responses in zip(offers.items(), ends, strict=True):
-        onward[i] = _judged(objective, onward[i], offer, responses, tolerance)
+    tried = _responses(objective, [onward[i] for i in offers], rows, keep=False)
+    for (i, offer), responses in zip(offers.items(), tried, strict=True):
+        onward[i] = _judged(objective, onward[i], offer, responses)
     return onward
 
 
@@ -200,9 +233,7 @@ def _surveyed(
     return descent, quadratic
 
 
-def _judged(
-    objective: Objective, descent: Descent, offer: Candidates, ends: Responses, tolerance: float
-) -> Descent:
+def _judged(objective: Objective, descent: Descent, offer: Candidates, ends: Responses) -> Descent:
     """The descent after its candidates have been simulated, at the best of them if it gains."""
     assert descent.point.rms is not None and descent.steps_at is not None
     rms = np.stack([descent.point.rms, *ends.rms])
@@ -223,7 +254,7 @@ def _judged(
     descent = replace(descent, damping=damping, failures=failures)
     if failures >= PATIENCE and promising:
         return resumed(objective, descent, "misled")
-    if failures >= PATIENCE or 0.0 < gain <= tolerance:
+    if failures >= PATIENCE or 0.0 < gain <= descent.tolerance:
         return resumed(objective, descent, "arrived")
     return descent
 
@@ -246,7 +277,8 @@ def _distance(space: SearchSpace, descent: Descent) -> FloatArray:
     """Distances h of the neighbours, in parts of the ranges, (n_free,)."""
     h = PERTURBATIONS[descent.level]
     # Away from the nearer bound, so that the perturbed chromosome stays in range.
-    distance = np.where(descent.point.at + h * space.width > space.coded_bounds[1], -h, h)
+    _, upper = space.coded_bounds
+    distance = np.where(descent.point.at + h * space.width > upper, -h, h)
     distance[list(descent.backward)] *= -1.0
     return distance
 
@@ -272,5 +304,9 @@ def _responses(
     parts: dict[int, Responses] = {}
     for i, end in zip(order, np.cumsum(counts), strict=True):
         part = slice(end - len(rows[i]), end)
-        parts[i] = Responses(batch.values[..., part], batch.rms[part], batch.excess[part])
+        responses = Responses(batch.values[..., part], batch.rms[part], batch.excess[part])
+        tether = descents[i].restriction.tether
+        if tether is not None:
+            responses = objective.with_sample(responses, tether(chromosomes[part]))
+        parts[i] = responses
     return [parts[i] for i in range(len(descents))]

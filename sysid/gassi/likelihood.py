@@ -11,19 +11,20 @@ its errors leaves; those that it cannot tell apart are rivals.
 
 import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Literal
 
 import numpy as np
 
 from sysid.arrays import FloatArray
-from sysid.fitting.descent import Point
+from sysid.fitting.descent import Point, Restriction
 from sysid.fitting.free_run import FINER, FINEST
 from sysid.fitting.innovations import Innovations
 from sysid.fitting.objective import Objective
-from sysid.fitting.refinement import refine, refine_each
+from sysid.fitting.refinement import begin, refine, refine_each
 from sysid.gassi.lookalikes import lookalikes
+from sysid.gassi.slide import slid
 from sysid.uncertainty.colour import colour, longest_memory
 from sysid.uncertainty.estimate import Z95
 from sysid.uncertainty.sensitivity import Sensitivity, sensitivity
@@ -100,11 +101,11 @@ def fit_likelihood(
         if best is explored:
             break  # nothing better was found around it
         explored = best
+        starts = lookalikes(best.objective, best.chromosome)
         for end in refine_each(
             best.objective,
-            lookalikes(best.objective, best.chromosome),
+            [begin(best.objective, start, tolerance=_ROUGHLY) for start in starts],
             max_iterations=_QUICKLY,
-            tolerance=_ROUGHLY,
             enough=lambda point: not optima.new(objective.space.decode(point.at)),
         ):
             # By the best one's weights, until it turns out to matter.
@@ -127,7 +128,14 @@ def fit_likelihood(
     apart = list(itertools.compress(rivals, np.logical_not(connected)))
     valley = itertools.compress(rivals, connected)
     ridge = [rival for rival in valley if optima.deviance(rival, best) < Z95**2]
-    return Likeliest(best, _chromosomes(apart), _chromosomes(ridge))
+    return Likeliest(_slid(best), _chromosomes(apart), _chromosomes(ridge))
+
+
+def _slid(optimum: Optimum) -> Optimum:
+    objective = optimum.objective
+    error = float(objective.error_of(optimum.rms[None])[0])
+    end = slid(objective, optimum.chromosome, error)
+    return optimum if end is None else _optimum(objective, end.chromosome, end.rms)
 
 
 def _chromosomes(optima: Sequence[Optimum]) -> tuple[FloatArray, ...]:
@@ -155,6 +163,13 @@ class _Optima:
                 return False
         return True
 
+    def refit(self, optimum: Optimum, refitted: Optimum | None) -> None:
+        """Put one fitted by its own noise, if it could be, in the place of a minimum."""
+        if refitted is not None:
+            rms = optimum.objective.rms(refitted.chromosome[None])[0]
+            place = [other is optimum for other in self._optima].index(True)
+            self._optima[place] = _optimum(refitted.objective, refitted.chromosome, rms)
+
     def ranked(self) -> list[Optimum]:
         """The likeliest first, feasible before infeasible."""
         first = self._optima[0]
@@ -172,14 +187,16 @@ class _Optima:
         The coordinate that differs most is moved in steps, all others are fitted to each.
         """
         objective, coded = optimum.objective, self._objective.space.encode
-        begin, end = coded(optimum.chromosome), coded(rival.chromosome)
-        place = int(np.argmax(np.abs(end - begin) / objective.space.width))
-        at = begin
-        for coordinate in begin[place] + _WAY * (end - begin)[place]:
+        at, end = coded(optimum.chromosome), coded(rival.chromosome)
+        place = int(np.argmax(np.abs(end - at) / objective.space.width))
+        for coordinate in at[place] + _WAY * (end - at)[place]:
             at = at + (coordinate - at[place]) / (end - at)[place] * (end - at)
-            held = objective.space.holding(place, float(coordinate))
             fit = refine(
-                objective.over(held), held.decode(at), max_iterations=_QUICKLY, tolerance=_ROUGHLY
+                objective,
+                objective.space.decode(at),
+                max_iterations=_QUICKLY,
+                tolerance=_ROUGHLY,
+                restriction=Restriction(held=(place, float(coordinate))),
             )
             between = _optimum(objective, fit.chromosome, fit.rms)
             if self.deviance(between, optimum) >= _TOLD_APART:
@@ -265,20 +282,21 @@ def _refitted(
 ) -> _Optima | None:
     """The best optimum and those not told from it by the error, refitted for noisy inputs.
 
-    None where without corrections the inputs' noise would explain more than there is.
+    None where without corrections the inputs' noise would explain more than there is. The others
+    are refitted, and compared, at the noise of the first, and the best of them by its own.
     """
+    first = fit(ranked[0], watch)
+    if first is None:
+        return None
     optima = _Optima(objective)
-    first: Optimum | None = None
-    for optimum in ranked:
-        if by_error.deviance(optimum, ranked[0]) < _CONCEIVABLE:
-            refitted = fit(optimum, watch)
-            if refitted is None and first is None:
-                return None
-            if refitted is not None:
-                first = first or refitted
-                # Compared at the same noise, that of the first.
-                rms = first.objective.rms(refitted.chromosome[None])[0]
-                optima.add(_optimum(refitted.objective, refitted.chromosome, rms))
+    optima.add(first)
+    likely = (o for o in ranked[1:] if by_error.deviance(o, ranked[0]) < _CONCEIVABLE)
+    descents = [begin(first.objective, optimum.chromosome) for optimum in likely]
+    for end in refine_each(first.objective, descents):
+        optima.add(_optimum(first.objective, end.chromosome, end.rms))
+    best = optima.ranked()[0]
+    if best is not first:
+        optima.refit(best, fit(replace(best, objective=ranked[0].objective), watch))
     return optima
 
 

@@ -66,7 +66,9 @@ class LocalSearch:
         self.iteration_cost = refinement.simulations_per_iteration(self.objective)
         affordable = max(1, self.left // (_ITERATIONS_EACH * self.iteration_cost))
         starts = starts[: min(AT_ONCE, affordable)]
-        self.descents = [refinement.begin(self.objective, start) for start in starts]
+        self.descents = [
+            refinement.begin(self.objective, start, tolerance=_ARRIVED) for start in starts
+        ]
         self.reserve = min(_POLISHING * self.iteration_cost, self.left // 3)
         self.polishing = self.polished = False
         self.dips: list[Point] = []
@@ -113,7 +115,8 @@ class LocalSearch:
         elif self.descents:
             self._descend()
         elif self.dips and min(self.minima, key=lambda minimum: minimum.error).varied > 0:
-            self.descents = [Descent(Point(dip.at)) for dip in self.dips[:AT_ONCE]]
+            begun = self.dips[:AT_ONCE]
+            self.descents = [Descent(Point(dip.at), tolerance=_ARRIVED) for dip in begun]
             self.dips = self.dips[AT_ONCE:]
         else:
             self._vary()
@@ -148,7 +151,7 @@ class LocalSearch:
 
     def _descend(self) -> None:
         affordable = (self.left - self.reserve) // self.iteration_cost
-        moved = refinement.advance(self.objective, self.descents[:affordable], _ARRIVED)
+        moved = refinement.advance(self.objective, self.descents[:affordable])
         live = []
         for descent in moved:
             self._take(descent)

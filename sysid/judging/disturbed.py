@@ -7,6 +7,7 @@ equation would do: the function's values along the run are that input's samples.
 """
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,6 +15,7 @@ import numpy as np
 
 from sysid.arrays import FloatArray
 from sysid.engine.stepper import Stepper
+from sysid.engine.trace import evaluated
 from sysid.problem.data import Dataset
 from sysid.problem.model import Input, ModelError, ProcessModel
 
@@ -99,7 +101,9 @@ class DisturbedRun:
         self._rate_size = np.sqrt(np.mean(self.rates**2, axis=0))
 
     def rates_of(self, derivative: Callable[..., Any], vector: FloatArray) -> FloatArray:
-        """Another derivative's values along the run, (n_samples, n_states); NaN where it fails."""
+        """Values of another derivative along the run, (n_samples, n_states), NaN where it fails."""
+        with suppress(Exception):  # it may do more than can be followed at many points at once
+            return evaluated(derivative, self.states, self.record.inputs, vector[None])
         p = tuple(vector.tolist())
         values = np.full(self.states.shape, np.nan)
         rows = zip(self.states.tolist(), self.record.inputs.tolist(), strict=True)

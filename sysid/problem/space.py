@@ -33,8 +33,7 @@ class SearchSpace:
     and the physical limit, else lower and upper. log: mask of the parameters searched by
     logarithm. coded_lower, width: low ends and widths in search coordinates. All (n_free,).
     estimated: record and state of each initial state that is estimated, by their places.
-    one_sided: names of the parameters with one end given. held: a search coordinate and the value
-    that it keeps.
+    one_sided: names of the parameters with one end given.
 
     >>> from sysid.examples import lag
     >>> space = SearchSpace.of(lag(), ranges={"gain": (1.0, 4.0)}, fixed={"tau": 0.1})
@@ -49,7 +48,6 @@ class SearchSpace:
     estimated: tuple[tuple[int, int], ...] = ()
     ties: tuple[Tie, ...] = ()
     one_sided: frozenset[str] = frozenset()
-    held: tuple[int, float] | None = None
     lower: FloatArray = field(init=False, repr=False, compare=False)
     upper: FloatArray = field(init=False, repr=False, compare=False)
     minimum: FloatArray = field(init=False, repr=False, compare=False)
@@ -195,16 +193,9 @@ class SearchSpace:
         """``hard_lower`` and ``hard_upper`` in search coordinates, (n_free,) each."""
         with np.errstate(divide="ignore"):  # the logarithm of zero is the bound -inf
             lower, upper = self.encode(self.hard_lower), self.encode(self.hard_upper)
-        if self.held is not None:
-            place, value = self.held
-            lower[place] = upper[place] = value
         lower.setflags(write=False)
         upper.setflags(write=False)
         return lower, upper
-
-    def holding(self, place: int, value: float) -> SearchSpace:
-        """The space with a search coordinate held at a value."""
-        return replace(self, held=(place, value))
 
     def on_bound(self, chromosome: FloatArray) -> BoolArray:
         """Which values of a chromosome (n_free,) stand on a bound of their range."""

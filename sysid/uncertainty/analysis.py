@@ -19,7 +19,7 @@ from sysid.problem.expressions import measuring_effort
 from sysid.problem.given import covariance_factor
 from sysid.uncertainty.covariance import covariance
 from sysid.uncertainty.estimate import Z95, Estimate, Invariant, Why
-from sysid.uncertainty.profile import Tracer
+from sysid.uncertainty.profile import Tracer, traced
 from sysid.uncertainty.quantities import Coordinate, Expression
 from sysid.uncertainty.sensitivity import Sensitivity, sensitivity
 from sysid.uncertainty.ties import Ties, free_gradient, named_values, ties
@@ -121,9 +121,14 @@ def uncertainty(
     def judged(estimate: Estimate) -> Estimate:
         return replace(estimate, why="rival") if disputed(estimate) else estimate
 
-    parameters = [judged(analysis.parameter(j)) for j in range(len(chromosome))]
+    drafts = [analysis.parameter(j) for j in range(len(chromosome))]
+    tied = list(analysis.ambiguities())
+    combined = [analysis.combination(c) for _, combinations in tied for c in combinations]
+    estimates = iter(map(judged, analysis.settled([*drafts, *combined])))
+    parameters = list(itertools.islice(estimates, len(drafts)))
     ambiguities = [
-        replace(a, determined=tuple(map(judged, a.determined))) for a in analysis.ambiguities()
+        replace(ambiguity, determined=tuple(itertools.islice(estimates, len(combinations))))
+        for ambiguity, combinations in tied
     ]
     apart = [e for e in parameters if e.why == "rival"]
     apart.sort(key=lambda e: measuring_effort(e.unit))
@@ -143,6 +148,20 @@ def uncertainty(
     )
     joint, simultaneous = analysis.together([e.name for e in result.determined()])
     return replace(result, joint=joint, simultaneous=simultaneous)
+
+
+@dataclass(frozen=True)
+class _Draft:
+    """An estimate; with a tracer one whose ends its profile tells.
+
+    valley: values, of the rest of a valley, that the interval holds. place: of a parameter, a
+    part of whose range may be one where simulations fail.
+    """
+
+    estimate: Estimate
+    tracer: Tracer | None = None
+    valley: tuple[float, ...] = ()
+    place: int | None = None
 
 
 class _Analysis:
@@ -169,7 +188,7 @@ class _Analysis:
         matrix, increments = self.covariance.matrix, self.local.increments
         return covariance_factor(matrix, self.ties.directions, increments)
 
-    def parameter(self, j: int) -> Estimate:
+    def parameter(self, j: int) -> _Draft:
         """Estimate of a free parameter."""
         parameter, gradient = self.space.parameters[j], np.eye(len(self.coded))[j]
         estimate = Estimate(
@@ -180,22 +199,20 @@ class _Analysis:
             pushed=bool(self.pushed[j]),
         )
         if self.ties.bound[j]:
-            return replace(estimate, why="tied")
+            return _Draft(replace(estimate, why="tied"))
         self.gradients[parameter.name] = gradient
         deviation = self.covariance.deviation(gradient)
         if not self._is_guide(j, deviation):
             spread = self.free if self.pushed[j] else self.covariance
             tracer = Tracer(self.local, spread, gradient, Coordinate(self.space, j))
-            valley = [self._decoded(j, point[j]) for point in self.ridge]
-            estimate = self._profiled(estimate, tracer, valley)
-            failing = tracer.failed or self.local.failing[j]
-            return replace(estimate, failing=self._failing(j)) if failing else estimate
+            valley = tuple(self._decoded(j, point[j]) for point in self.ridge)
+            return _Draft(estimate, tracer, valley, j)
         low, high = (self._decoded(j, self.coded[j] + sign * Z95 * deviation) for sign in _SIDES)
         std = deviation * abs(float(self.local.increments[j]))
-        return replace(estimate, std=std, low=low, high=high)
+        return _Draft(replace(estimate, std=std, low=low, high=high))
 
-    def ambiguities(self) -> Iterator[Ambiguity]:
-        """Parameters that hang together by the equations, and what is known of them."""
+    def ambiguities(self) -> Iterator[tuple[Ambiguity, list[Invariant]]]:
+        """Parameters that hang together by the equations, and the combinations that do not."""
         for places, directions in self.ties.groups():
             units = [parameter.unit for parameter in self.space.parameters]
             by_effort = sorted(places, key=lambda j: measuring_effort(units[j]))
@@ -205,11 +222,11 @@ class _Analysis:
                 if np.linalg.matrix_rank(columns / np.abs(columns).max(axis=0)) > len(measure):
                     measure.append(j)
             names = {self.space.names[j] for j in places}
-            combined = [self._combination(c) for c in self.ties.combinations if names & {*c.names}]
+            combinations = [c for c in self.ties.combinations if names & {*c.names}]
             parameters, measured = (
                 tuple(self.space.names[j] for j in chosen) for chosen in (by_effort, measure)
             )
-            yield Ambiguity("tied", parameters, tuple(combined), measured)
+            yield Ambiguity("tied", parameters, (), measured), combinations
 
     def unlike(self, chromosomes: Sequence[FloatArray]) -> list[FloatArray]:
         """Those that differ in what is not tied, of each kind the first."""
@@ -282,7 +299,7 @@ class _Analysis:
         narrow = deviation < _WEAK if self.space.log[j] else True
         return inside and narrow and not valley and not self.local.failing[j]
 
-    def _combination(self, combination: Invariant) -> Estimate:
+    def combination(self, combination: Invariant) -> _Draft:
         """Estimate of a combination of tied parameters."""
         text, value = combination.text, float(combination.value(self.named))
         estimate = Estimate(text, combination.unit, value, combination=combination)
@@ -293,23 +310,31 @@ class _Analysis:
         if not (np.isfinite(deviation) and (not positive or deviation < _WEAK * value)):
             moved = gradient / value if positive else gradient
             quantity = Expression(self.space, combination, positive)
-            return self._profiled(estimate, Tracer(self.local, self.covariance, moved, quantity))
+            return _Draft(estimate, Tracer(self.local, self.covariance, moved, quantity))
         product = " + " not in text and " - " not in text
         if product and deviation < _WEAK * abs(value):
             low, high = sorted(value * np.exp(sign * Z95 * deviation / value) for sign in _SIDES)
         else:
             low, high = (value + sign * Z95 * deviation for sign in _SIDES)
-        return replace(estimate, std=deviation, low=float(low), high=float(high))
+        return _Draft(replace(estimate, std=deviation, low=float(low), high=float(high)))
 
-    def _profiled(
-        self, estimate: Estimate, tracer: Tracer, valley: Sequence[float] = ()
-    ) -> Estimate:
-        """An estimate by its profile likelihood, and wide enough for the rest of a valley."""
-        low, high = (tracer.bound(sign) for sign in _SIDES)
-        low = None if low is None else min([low, *valley])
-        high = None if high is None else max([high, *valley])
+    def settled(self, drafts: Sequence[_Draft]) -> list[Estimate]:
+        """Estimates with the ends that profiles tell, wide enough for the rest of a valley."""
+        tracers = [draft.tracer for draft in drafts if draft.tracer is not None]
+        ends = iter(traced([(t, t.bound(sign)) for t in tracers for sign in _SIDES]))
+        return [
+            self._profiled(d, next(ends), next(ends)) if d.tracer else d.estimate for d in drafts
+        ]
+
+    def _profiled(self, draft: _Draft, low: float | None, high: float | None) -> Estimate:
+        low = None if low is None else min([low, *draft.valley])
+        high = None if high is None else max([high, *draft.valley])
         why: Why = "vague" if low is None and high is None else ""
-        return replace(estimate, low=low, high=high, why=why)
+        estimate = replace(draft.estimate, low=low, high=high, why=why)
+        if draft.tracer is None or draft.place is None:
+            return estimate
+        failing = draft.tracer.failed or self.local.failing[draft.place]
+        return replace(estimate, failing=self._failing(draft.place)) if failing else estimate
 
     def _failing(self, place: int) -> float:
         """Share of a parameter's range in which the model cannot be simulated."""

@@ -1,13 +1,16 @@
 """Profile likelihood: how much worse the best fit becomes as one parameter is moved."""
 
 import itertools
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from sysid.arrays import FloatArray
+from sysid.fitting.descent import Descent, Point
 from sysid.fitting.objective import Objective
-from sysid.fitting.refinement import refine
+from sysid.fitting.refinement import errors_of, refine_each
 from sysid.problem.model import ModelError
 from sysid.uncertainty.covariance import Covariance, covariance
 from sysid.uncertainty.estimate import Z95
@@ -62,8 +65,8 @@ def profile(objective: Objective, chromosome: FloatArray, name: str) -> Profile:
     tied = ties(local).directions
     tracer = Tracer(local, covariance(local, tied), np.eye(len(chromosome))[place],
                     Coordinate(space, place))  # fmt: skip
-    centre = (tracer.centre, 0.0)
-    below, above = [centre, *tracer.side(-1.0)], [centre, *tracer.side(1.0)]
+    sides = traced([(tracer, tracer.side(sign)) for sign in (-1.0, 1.0)])
+    below, above = ([(tracer.centre, 0.0), *points] for points in sides)
     points = [*reversed(below), *above[1:]]
     values = np.array([tracer.quantity.value(coordinate) for coordinate, _ in points])
     statistic = np.array([statistic for _, statistic in points])
@@ -72,8 +75,74 @@ def profile(objective: Objective, chromosome: FloatArray, name: str) -> Profile:
     return Profile(name, unit, value, values, statistic, low, high)
 
 
+class Fit(NamedTuple):
+    """A fit of all parameters to a place of a quantity: its statistic, search coordinates."""
+
+    place: float
+    statistic: float
+    at: FloatArray
+
+    @property
+    def root(self) -> float:
+        """The root of the statistic, which is nearly straight."""
+        return float(np.sqrt(self.statistic))
+
+
+class Wanted(NamedTuple):
+    """A place that a fit is wanted for, and search coordinates (n_free,) near it."""
+
+    place: float
+    near: tuple[FloatArray, ...]
+
+
+_Result = TypeVar("_Result")
+# A search along a profile, which asks for fits one after the other.
+Search = Generator[Wanted, Fit, _Result]
+
+
+def traced(searches: Sequence[tuple["Tracer", Search[_Result]]]) -> list[_Result]:
+    """Results of searches along profiles of one estimate, side by side in the same batches."""
+    results: dict[int, _Result] = {}
+    answers: dict[int, Fit | None] = dict.fromkeys(range(len(searches)))
+    while answers:
+        wanted: dict[int, Wanted] = {}
+        for i, answer in answers.items():
+            try:
+                wanted[i] = searches[i][1].send(answer)  # type: ignore[arg-type]  # None begins it
+            except StopIteration as end:
+                results[i] = end.value
+        fits = _fitted([(searches[i][0], task) for i, task in wanted.items()])
+        answers = dict(zip(wanted, fits, strict=True))
+    return [results[i] for i in range(len(searches))]
+
+
+def _fitted(tasks: Sequence[tuple["Tracer", Wanted]]) -> list[Fit]:
+    """The best fits to places."""
+    if not tasks:
+        return []
+    objective = tasks[0][0].objective
+    descents = _begun(objective, tasks)
+    ends = np.stack([end.chromosome for end in refine_each(objective, descents, _ITERATIONS)])
+    errors, coded = objective.evaluate(ends)[0].tolist(), objective.space.encode(ends)
+    return [
+        Fit(wanted.place, max(0.0, tracer.factor * (error - tracer.error)), at)
+        for (tracer, wanted), error, at in zip(tasks, errors, coded, strict=True)
+    ]
+
+
+def _begun(objective: Objective, tasks: Sequence[tuple["Tracer", Wanted]]) -> list[Descent]:
+    """A descent to each place, from the best of what is near."""
+    offered = [tracer.begun(wanted.place, at) for tracer, wanted in tasks for at in wanted.near]
+    errors = iter(errors_of(objective, offered))
+    descents = iter(offered)
+    return [
+        min((next(errors), i, next(descents)) for i in range(len(wanted.near)))[2]
+        for _, wanted in tasks
+    ]
+
+
 class Tracer:
-    """Moves a quantity from ``centre``, where it stands, and fits all parameters to each place.
+    """Moves a quantity from ``centre``, where it stands, and has all parameters fitted to it.
 
     gradient: (n_free,), its changes with the search coordinates. failed: whether simulations end
     a side.
@@ -102,56 +171,68 @@ class Tracer:
         # Next to zero a logarithm's deviation is no measure.
         near = min(self.unit, _BLIND_SHARE * quantity.width)
         self.stiffness = float(np.sqrt(2.0 * _TETHER * scale) / near)
+        loss = 1.0 / (self.factor * max(self.error, 1e-300))  # share of the error
+        self.tolerance = float(np.clip(_RESOLUTION * loss, 1e-7, 1e-3))
+        # How the others go with the quantity where the slopes at the estimate are a guide.
+        along = covariance.matrix @ gradient if np.isfinite(deviation) else gradient
+        self.direction = along / float(gradient @ along)
         self.failed = False
 
-    def side(self, sign: float) -> list[tuple[float, float]]:
-        """Coordinates and statistics on one side, outwards until well beyond the 95 % level."""
-        end, at, points = self._end(sign), self.start, []  # each fit starts from the one before
+    def side(self, sign: float) -> Search[list[tuple[float, float]]]:
+        """Places and statistics on one side, outwards until well beyond the 95 % level."""
+        end, last = self._end(sign), self._at_centre
+        points: list[tuple[float, float]] = []
         for step in _STEPS:
-            coordinate = self.centre + sign * step * self.unit
-            beyond = sign * (coordinate - end) >= 0.0
-            coordinate = end if beyond else coordinate
-            if coordinate == self.centre:
+            place = self.centre + sign * step * self.unit
+            beyond = sign * (place - end) >= 0.0
+            place = end if beyond else place
+            if place == self.centre:
                 break
-            statistic, at = self._fit(coordinate, at)
-            points.append((coordinate, statistic))
-            if beyond or statistic > 1.5 * Z95**2:
+            last = yield self._wanted(place, last)
+            points.append((place, last.statistic))
+            if beyond or last.statistic > 1.5 * Z95**2:
                 break
         return points
 
-    def bound(self, sign: float) -> float | None:
+    def bound(self, sign: float) -> Search[float | None]:
         """Value on one side at which the statistic passes the 95 % level, None for nowhere."""
         end = self._end(sign)
         if sign * (end - self.centre) <= 0.0:
             return None
-        inside, at = (self.centre, 0.0), self.start
-        outside: tuple[float, float] | None = None
+        inside, outside = self._at_centre, None
         step = Z95 * self.unit
         for _ in range(_REFITS):
             if outside is None:
-                coordinate = self.centre + sign * min(step, abs(end - self.centre))
+                place = self.centre + sign * min(step, abs(end - self.centre))
             else:
-                share = (Z95 - inside[1]) / (outside[1] - inside[1])
-                share = float(np.clip(share, 0.1, 0.9)) if np.isfinite(outside[1]) else 0.5
-                coordinate = inside[0] + share * (outside[0] - inside[0])
-            statistic, fitted = self._fit(coordinate, at)
-            point = coordinate, float(np.sqrt(statistic))
-            if statistic > Z95**2:
-                outside = point
+                place = inside.place + _share(inside, outside) * (outside.place - inside.place)
+            fit = yield self._wanted(place, inside)
+            if fit.statistic > Z95**2:
+                outside = fit
             else:
-                inside, at = point, fitted
-                if coordinate == end:
+                inside = fit
+                if place == end:
                     return None
                 # The root of the statistic is nearly straight, if it is felt at all.
-                step *= float(np.clip(1.2 * Z95 / max(point[1], 1e-3), 1.5, _LEAP))
-            if outside is not None and abs(point[1] - Z95) < _NEAR:
+                step *= float(np.clip(1.2 * Z95 / max(fit.root, 1e-3), 1.5, _LEAP))
+            if outside is not None and abs(fit.root - Z95) < _NEAR:
                 break
         if outside is None:
             return None
-        if not np.isfinite(outside[1]):
+        if not np.isfinite(outside.statistic):
             self.failed = True
-            return self.quantity.value(inside[0])
-        return self.crossing([(x, root**2) for x, root in (inside, outside)])
+            return self.quantity.value(inside.place)
+        return self.crossing([(fit.place, fit.statistic) for fit in (inside, outside)])
+
+    def begun(self, place: float, at: FloatArray) -> Descent:
+        """A descent to a place from search coordinates (n_free,), or the nearest possible."""
+        space = self.objective.space
+        restriction = self.quantity.kept(place, self.stiffness)
+        # An open end is no reason to begin where nothing can be simulated.
+        far = _BEYOND * space.width
+        near = np.clip(at, space.coded_lower - far, space.coded_lower + space.width + far)
+        point = Point(np.clip(near, *restriction.bounds(space)))
+        return Descent(point, tolerance=self.tolerance, restriction=restriction)
 
     def crossing(self, points: list[tuple[float, float]]) -> float | None:
         """Value at which the root of the statistic, nearly straight, passes the 95 % level."""
@@ -166,20 +247,23 @@ class Tracer:
         farthest = self.centre + sign * _BEYOND * self.quantity.width
         return sign * min(sign * self.quantity.ends[0 if sign < 0.0 else 1], sign * farthest)
 
-    def _fit(self, coordinate: float, at: FloatArray) -> tuple[float, FloatArray]:
-        """Statistic and search coordinates (n_free,) of the best fit at a value, from others."""
-        loss = 1.0 / (self.factor * max(self.error, 1e-300))  # share of the error
-        constrained, start = self.quantity.constrained(
-            self.objective, coordinate, at, self.stiffness
-        )
-        best = refine(
-            constrained,
-            start,
-            max_iterations=_ITERATIONS,
-            tolerance=float(np.clip(_RESOLUTION * loss, 1e-7, 1e-3)),
-        )
-        statistic = max(0.0, self.factor * (self._error(best.chromosome) - self.error))
-        return statistic, self.objective.space.encode(best.chromosome)
+    @property
+    def _at_centre(self) -> Fit:
+        return Fit(self.centre, 0.0, self.start)
+
+    def _wanted(self, place: float, last: Fit) -> Wanted:
+        """A fit to a place, from where the last one and the way to it lead."""
+        way = self.direction
+        if last.place != self.centre:
+            way = (last.at - self.start) / (last.place - self.centre)
+        return Wanted(place, (last.at + (place - last.place) * way, last.at))
 
     def _error(self, chromosome: FloatArray) -> float:
         return float(self.objective.evaluate(chromosome[None])[0][0])
+
+
+def _share(inside: Fit, outside: Fit) -> float:
+    """The part of the way out at which a straight root passes the 95 % level."""
+    if not np.isfinite(outside.statistic):
+        return 0.5
+    return float(np.clip((Z95 - inside.root) / (outside.root - inside.root), 0.1, 0.9))

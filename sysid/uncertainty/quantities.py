@@ -6,7 +6,7 @@ from typing import Protocol
 import numpy as np
 
 from sysid.arrays import FloatArray
-from sysid.fitting.objective import Objective
+from sysid.fitting.descent import Restriction
 from sysid.problem.space import SearchSpace
 from sysid.uncertainty.estimate import Invariant
 from sysid.uncertainty.ties import named_values
@@ -27,10 +27,8 @@ class Profiled(Protocol):
     def value(self, place: float) -> float:
         """Its value at a place."""
 
-    def constrained(
-        self, objective: Objective, place: float, coded: FloatArray, stiffness: float
-    ) -> tuple[Objective, FloatArray]:
-        """The objective with the quantity at a place, and a chromosome (n_free,) to start from.
+    def kept(self, place: float, stiffness: float) -> Restriction:
+        """What keeps it at a place.
 
         stiffness: residual per unit of the scale, of what cannot be held otherwise.
         """
@@ -53,14 +51,9 @@ class Coordinate:
         """The parameter."""
         return float(np.exp(place)) if self._space.log[self._index] else place
 
-    def constrained(
-        self, objective: Objective, place: float, coded: FloatArray, stiffness: float
-    ) -> tuple[Objective, FloatArray]:
+    def kept(self, place: float, stiffness: float) -> Restriction:
         """Between bounds that are one."""
-        held = self._space.holding(self._index, place)
-        start = coded.copy()
-        start[self._index] = place
-        return objective.over(held), held.decode(start)
+        return Restriction(held=(self._index, place))
 
 
 class Expression:
@@ -88,11 +81,9 @@ class Expression:
         """The expression's value."""
         return float(np.exp(place)) if self._log else place
 
-    def constrained(
-        self, objective: Objective, place: float, coded: FloatArray, stiffness: float
-    ) -> tuple[Objective, FloatArray]:
+    def kept(self, place: float, stiffness: float) -> Restriction:
         """By one residual more."""
-        return objective.tethered(self._places, place, stiffness), self._space.decode(coded)
+        return Restriction(tether=lambda rows: stiffness * (self._places(rows) - place))
 
     def _places(self, chromosomes: FloatArray) -> FloatArray:
         """Places of chromosomes, (n,)."""

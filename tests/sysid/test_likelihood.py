@@ -7,9 +7,12 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 from sysid import GASSI, BatchSimulator, Dataset, Input, Output, Parameter, ProcessModel, State
+from sysid.fitting.descent import Restriction
 from sysid.fitting.objective import Objective
+from sysid.fitting.refinement import refine
 from sysid.gassi.likelihood import fit_likelihood
 from sysid.gassi.lookalikes import lookalikes
+from sysid.gassi.slide import slid
 from sysid.problem.space import SearchSpace
 from sysid.response.linearization import jacobian
 from sysid.uncertainty import uncertainty
@@ -204,6 +207,48 @@ def test_what_the_data_tell_apart_is_no_rival():
 
 def twice_derivative(x, u, p):
     return (-x[0],)
+
+
+def product_lag_derivative(x, u, p):
+    a, b, tau = p
+    return ((a * b * u[0] - x[0]) / tau,)
+
+
+PRODUCT_LAG = ProcessModel(
+    name="product lag",
+    states=(State("x", "1"),),
+    inputs=(Input("u", "1"),),
+    outputs=(Output("x", "1"),),
+    parameters=(
+        Parameter("a", "1", 1.0, 0.1, 10.0, "log"),
+        Parameter("b", "1", 2.0, 0.1, 10.0, "log"),
+        Parameter("tau", "s", 0.05, 0.01, 1.0, "log"),
+    ),
+    derivative=product_lag_derivative,
+)
+
+
+def test_a_tied_value_is_moved_from_an_end_on_which_only_the_tie_has_left_it():
+    target = objective_of(PRODUCT_LAG, record_of(PRODUCT_LAG, 0.01, noise=0.02))
+    held = Restriction(held=(0, np.log(10.0)))
+    at_the_end = refine(target, np.array([10.0, 0.2, 0.05]), restriction=held)
+    assert target.space.on_bound(at_the_end.chromosome).tolist() == [True, False, False]
+    optimum = fit_likelihood(target, [at_the_end.chromosome]).optimum
+    a, b, tau = optimum.chromosome
+    assert not target.space.on_bound(optimum.chromosome).any()
+    product = at_the_end.chromosome[0] * at_the_end.chromosome[1]
+    assert (a * b, tau) == pytest.approx((product, at_the_end.chromosome[2]), rel=1e-3)
+
+
+def test_a_tied_value_stays_on_an_end_that_the_data_want_it_beyond():
+    """All of the valley is beyond the corner of the ranges, so that one of them is on an end."""
+    record = record_of(PRODUCT_LAG, 0.01, noise=0.02)
+    ranges = {"a": (0.1, 1.0), "b": (0.1, 1.0)}
+    space = SearchSpace.of(PRODUCT_LAG, ranges)
+    target = Objective(BatchSimulator(PRODUCT_LAG), space, [record])
+    end = refine(target, np.array([0.5, 0.5, 0.05]))
+    assert end.chromosome[:2] == pytest.approx([1.0, 1.0])
+    assert slid(target, end.chromosome, end.error) is None
 
 
 @pytest.mark.soak

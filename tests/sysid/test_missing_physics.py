@@ -72,6 +72,12 @@ def test_a_variant_that_the_data_ask_for_is_fitted_and_ranked():
     assert verdict_of(fitted, [training], [validation]).trust == "good"
 
 
+def of_two_ways(x, u, p):
+    """Points go different ways through it: one at a time is the only way to follow it."""
+    rates = MODEL.derivative(x, u, p)
+    return (rates[0], rates[1] - (x[1] ** 3 if x[1] > 0.0 else 0.0))
+
+
 def test_what_is_added_to_an_equation_moves_outputs_as_a_model_with_it_would():
     """A cubic drag, by the disturbed run and by SciPy's integration of a model that has it."""
     (training,), _ = CASES["motor"].records(0)
@@ -95,6 +101,16 @@ def test_what_is_added_to_an_equation_moves_outputs_as_a_model_with_it_would():
     expected = (dragged - plain) / eps
     error = np.abs(change - expected).max(axis=0) / np.abs(expected).max(axis=0)
     assert np.all(error < 0.05)
+
+
+@pytest.mark.parametrize("derivative", [MODEL.derivative, of_two_ways])
+def test_rates_along_a_run_are_those_at_each_of_its_points(derivative):
+    (training,), _ = CASES["motor"].records(0)
+    vector = np.array([TRUTH[name] for name in MODEL.parameter_names])
+    run = DisturbedRun(MODEL, vector, training, np.zeros(2))
+    points = zip(run.states, training.inputs, strict=True)
+    expected = [derivative(tuple(x), tuple(u), tuple(vector)) for x, u in points]
+    np.testing.assert_allclose(run.rates_of(derivative, vector), expected, rtol=1e-12)
 
 
 HYSTERESIS = ProcessModel(

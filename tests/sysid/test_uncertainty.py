@@ -33,6 +33,7 @@ from sysid import (
     SearchSpace,
     State,
 )
+from sysid.fitting.descent import Restriction
 from sysid.fitting.objective import Objective
 from sysid.fitting.refinement import refine
 from sysid.uncertainty import uncertainty
@@ -606,8 +607,8 @@ def brushed(derivative):
     record = Dataset(inputs, outputs + 0.3 * rng.standard_normal(outputs.shape), 0.01)
     objective = Objective(simulator, SearchSpace.of(model), [record])
     # Along a tie any value fits: here B stays at the end.
-    at_the_end = objective.over(objective.space.holding(2, math.log(BRUSHED["B"])))
-    return uncertainty(objective, refine(at_the_end, model.nominal).chromosome)
+    held = Restriction(held=(2, math.log(BRUSHED["B"])))
+    return uncertainty(objective, refine(objective, model.nominal, restriction=held).chromosome)
 
 
 def test_a_tie_holds_at_the_end_of_a_logarithmic_range():

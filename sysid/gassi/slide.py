@@ -1,0 +1,49 @@
+"""A minimum moved along its ties, from ends of ranges at which only they have left it.
+
+Where the equations tie parameters, every point along the tie is a minimum, and chance decides at
+which a descent ends. On an end of a range it would seem that the range were too narrow.
+"""
+
+import numpy as np
+
+from sysid.arrays import FloatArray
+from sysid.fitting.objective import Objective
+from sysid.fitting.refinement import Refinement, refine
+from sysid.problem.space import SearchSpace
+from sysid.uncertainty.sensitivity import sensitivity
+from sysid.uncertainty.ties import ties
+
+_HALVINGS = 4  # of a slide that a curved tie does not allow
+_ITERATIONS = 15  # back onto a curved tie
+_WORSE = 1e-5  # share of the error
+
+
+def slid(objective: Objective, chromosome: FloatArray, error: float) -> Refinement | None:
+    """The minimum (n_free,) of an error, slid inside; None where no end is left by that."""
+    space = objective.space
+    on_end = space.on_bound(chromosome)
+    if not on_end.any():
+        return None
+    tied = ties(sensitivity(objective, chromosome))
+    on_end &= np.array(tied.bound, dtype=bool)
+    if not on_end.any():
+        return None
+    at = space.encode(chromosome)
+    slide = _to_the_middle(space, at, tied.directions)
+    for halving in range(_HALVINGS):
+        start = np.clip(at + 0.5**halving * slide, *space.coded_bounds)
+        end = refine(objective, space.decode(start), max_iterations=_ITERATIONS)
+        if (
+            end.error <= (1.0 + _WORSE) * error
+            and not (space.on_bound(end.chromosome) & on_end).any()
+        ):
+            return end
+    return None
+
+
+def _to_the_middle(space: SearchSpace, at: FloatArray, directions: FloatArray) -> FloatArray:
+    """The move along directions (n, n_free) that comes nearest to the middle of the ranges."""
+    left = (space.coded_lower - at) / space.width + 0.5
+    lengths = np.linalg.lstsq((directions / space.width).T, left, rcond=None)[0]
+    move: FloatArray = lengths @ directions
+    return move
