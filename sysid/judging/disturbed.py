@@ -135,18 +135,30 @@ class DisturbedRun:
         eps = _SMALL * (float(given[changed].max()) or 1.0) / size
         return self._change(self.record.inputs + eps * inputs, 0.0, eps)
 
+    def started(self, place: int) -> FloatArray:
+        """Change of the outputs per unit of where a state starts, (n_samples, n_outputs)."""
+        start, eps = self.start.copy(), _SMALL * float(np.abs(self.states[:, place]).max() or 1.0)
+        start[place] += eps
+        moved = self._advance(self.record.inputs, 0.0, start)[:, : self.outputs.shape[1]]
+        change: FloatArray = (moved - self.outputs) / eps
+        return change if np.all(np.isfinite(change)) else np.zeros_like(self.outputs)
+
     def _change(self, inputs: FloatArray, rates: FloatArray | float, eps: float) -> FloatArray:
         disturbed = self._advance(inputs, rates)[:, : self.outputs.shape[1]]
         change: FloatArray = (disturbed - self.outputs) / eps
         return change if np.all(np.isfinite(change)) else np.zeros_like(self.outputs)
 
-    def _advance(self, inputs: FloatArray, rates: FloatArray | float) -> FloatArray:
+    def _advance(
+        self, inputs: FloatArray, rates: FloatArray | float, start: FloatArray | None = None
+    ) -> FloatArray:
         """Outputs of the model with added inputs, (n_samples, n_outputs of it)."""
         added = np.broadcast_to(rates, (len(inputs), len(self.model.states)))
         signals = np.hstack([inputs, added])
         # Outputs stand at the start of every interval: the last row begins one that goes nowhere.
         signals = np.vstack([signals, signals[-1:]])
-        return self._stepper.advance(self.start.copy(), np.ascontiguousarray(signals))[1]
+        return self._stepper.advance(
+            (self.start if start is None else start).copy(), np.ascontiguousarray(signals)
+        )[1]
 
 
 def stretched(signal: FloatArray) -> FloatArray:

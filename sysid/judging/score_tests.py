@@ -121,7 +121,9 @@ def missing_physics(
     channels = list(channel_suspects(runs))
     # Noise of an input makes its gain look smaller: that is no fault.
     channels = [s for s in channels if s.kind != "gain" or s.name not in noisy]
-    foreseen = np.concatenate([_foreseen_noise(runs), _simulation_error(runs, local)], axis=2)
+    foreseen = np.concatenate(
+        [_foreseen_noise(runs), _simulation_error(runs, local), _noisy_starts(runs)], axis=2
+    )
     tests = _Tests(local, uncertainty, foreseen)
     alone = [e.name for e in uncertainty.determined() if e.name in model.parameter_names]
     tests.admit([*channels, *variant_suspects(runs), *change_suspects(runs, alone)])
@@ -173,6 +175,22 @@ def _simulation_error(runs: Sequence[DisturbedRun], local: Sensitivity) -> Float
     size = np.sqrt(np.mean(error[..., 0] ** 2, axis=0))
     left = np.sqrt(np.mean(local.residual**2, axis=0)) * np.mean(local.objective.scales, axis=0)
     return error if np.any(size > _INEXACT * left) else error[..., :0]
+
+
+def _noisy_starts(runs: Sequence[DisturbedRun]) -> FloatArray:
+    """What errors of first samples, at which runs start, do to the outputs: as foreseen noise."""
+    ends = np.cumsum([run.record.n_samples for run in runs]).tolist()
+    columns = [np.zeros((ends[-1], runs[0].outputs.shape[1], 0))]
+    for run, end in zip(runs, ends, strict=True):
+        for place, output in enumerate(run.record.starts_at_samples(run.model)):
+            if output is None:
+                continue
+            column = np.zeros((*columns[0].shape[:2], 1))
+            column[end - run.record.n_samples : end, :, 0] = run.started(place)
+            size = float(np.sqrt(np.mean(column**2)))
+            if size > 0.0:
+                columns.append(column / size)
+    return np.concatenate(columns, axis=2)
 
 
 class _Tests:
