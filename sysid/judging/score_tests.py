@@ -42,6 +42,7 @@ from sysid.judging.suspects import (
     likely_noise,
     variant_suspects,
 )
+from sysid.problem.channels import noise
 from sysid.problem.model import ModelError
 from sysid.uncertainty import Estimate, Uncertainty
 from sysid.uncertainty.colour import Autoregression, colour, record_rows
@@ -121,10 +122,8 @@ def missing_physics(
     channels = list(channel_suspects(runs))
     # Noise of an input makes its gain look smaller: that is no fault.
     channels = [s for s in channels if s.kind != "gain" or s.name not in noisy]
-    foreseen = np.concatenate(
-        [_foreseen_noise(runs), _simulation_error(runs, local), _noisy_starts(runs)], axis=2
-    )
-    tests = _Tests(local, uncertainty, foreseen)
+    foreseen = np.concatenate([_foreseen_noise(runs), _simulation_error(runs, local)], axis=2)
+    tests = _Tests(local, uncertainty, foreseen, _noisy_starts(runs))
     alone = [e.name for e in uncertainty.determined() if e.name in model.parameter_names]
     tests.admit([*channels, *variant_suspects(runs), *change_suspects(runs, alone)])
     tests.admit(list(in_single_records(channels, runs)))
@@ -154,9 +153,9 @@ def _foreseen_noise(runs: Sequence[DisturbedRun]) -> FloatArray:
     for i in np.flatnonzero(np.any([record.input_noise for record in records], axis=0)):
         parts = []
         for run in runs:
-            noise = np.zeros(run.record.inputs.shape)
-            noise[:, i] = likely_noise(run.record.inputs[:, i], float(run.record.input_noise[i]))
-            parts.append(run.driven(noise))
+            part = np.zeros(run.record.inputs.shape)
+            part[:, i] = likely_noise(run.record.inputs[:, i], float(run.record.input_noise[i]))
+            parts.append(run.driven(part))
         columns.append(np.concatenate(parts))
     n = sum(record.n_samples for record in records)
     return np.stack(columns, axis=2) if columns else np.zeros((n, runs[0].outputs.shape[1], 0))
@@ -178,18 +177,16 @@ def _simulation_error(runs: Sequence[DisturbedRun], local: Sensitivity) -> Float
 
 
 def _noisy_starts(runs: Sequence[DisturbedRun]) -> FloatArray:
-    """What errors of first samples, at which runs start, do to the outputs: as foreseen noise."""
-    ends = np.cumsum([run.record.n_samples for run in runs]).tolist()
-    columns = [np.zeros((ends[-1], runs[0].outputs.shape[1], 0))]
-    for run, end in zip(runs, ends, strict=True):
-        for place, output in enumerate(run.record.starts_at_samples(run.model)):
-            if output is None:
-                continue
-            column = np.zeros((*columns[0].shape[:2], 1))
-            column[end - run.record.n_samples : end, :, 0] = run.started(place)
-            size = float(np.sqrt(np.mean(column**2)))
-            if size > 0.0:
-                columns.append(column / size)
+    """Changes (n_rows, n_outputs, k) by one noise of each first sample at which a run starts."""
+    lengths = tuple(run.record.n_samples for run in runs)
+    columns = [np.zeros((sum(lengths), runs[0].outputs.shape[1], 0))]
+    for run, rows in zip(runs, record_rows(lengths), strict=True):
+        for place, j in enumerate(run.record.starts_at_samples(run.model)):
+            if j is not None:
+                deviation = run.record.output_noise[j] or noise(run.record.outputs[:, j])
+                column = np.zeros((*columns[0].shape[:2], 1))
+                column[rows, :, 0] = deviation * run.started(place)
+                columns.append(column)
     return np.concatenate(columns, axis=2)
 
 
@@ -199,8 +196,17 @@ class _Tests:
     Columns are (n_residuals, n_outputs, k), in parts of the outputs' scales.
     """
 
-    def __init__(self, local: Sensitivity, uncertainty: Uncertainty, foreseen: FloatArray) -> None:
-        """foreseen: changes (n_residuals, n_outputs, k) that are there whatever is missing."""
+    def __init__(
+        self,
+        local: Sensitivity,
+        uncertainty: Uncertainty,
+        foreseen: FloatArray,
+        chance: FloatArray,
+    ) -> None:
+        """Of changes that are there whatever is missing, (n_residuals, n_outputs, k) each.
+
+        foreseen: of any size. chance: by one standard deviation of what is known to be so large.
+        """
         self.findings: list[Finding] = []
         self._local, self._residual = local, -local.residual
         self._estimates = [e for e in uncertainty.determined() if e.std]
@@ -213,12 +219,12 @@ class _Tests:
             ]
         )
         zeros = [zero[..., None] for zero in zero_errors(local)]
-        foreseen = foreseen / self._scales[..., None]
-        self._columns = np.concatenate([local.slopes, *zeros, foreseen], axis=2)
+        foreseen, chance = (part / self._scales[..., None] for part in (foreseen, chance))
+        self._columns = np.concatenate([local.slopes, *zeros, chance, foreseen], axis=2)
         self._free = np.concatenate(
             [
                 1.0 / (_FREEDOM * spans(local.objective, local.chromosome)),
-                np.ones(len(zeros)),
+                np.ones(len(zeros) + chance.shape[2]),
                 np.zeros(foreseen.shape[2]),
             ]
         )
