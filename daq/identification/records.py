@@ -229,10 +229,11 @@ def _from_log(
         outputs = np.where(speed, speeds.values[:, None], outputs)
     dataset = _dataset(log.path, model, inputs[rows], outputs[rows], tick[rows], log.dt, title)
     if speeds is not None:
-        windows = np.zeros((*dataset.outputs.shape, 2))
+        windows, jitter = np.zeros((*dataset.outputs.shape, 2)), np.zeros(dataset.outputs.shape)
         places = tick[rows] - tick[rows][0]
         windows[places] = np.where(speed[:, None], speeds.windows[rows][:, None], 0.0)
-        dataset = replace(dataset, windows=windows)
+        jitter[places] = np.where(speed, speeds.jitter[rows][:, None], 0.0)
+        dataset = replace(dataset, windows=windows, jitter=jitter)
     return _without_run_in(dataset, log.path, model, selection)
 
 

@@ -19,6 +19,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from daq.hal import FloatArray, IntArray
 
@@ -35,11 +36,13 @@ class MeanSpeeds:
     """Speeds as means over known times.
 
     values: (n,) [rad/s], NaN for samples between edges of which none was timed. windows: (n, 2),
-    begin and end of what each is the mean over [s], from its sample on.
+    begin and end of what each is the mean over [s], from its sample on. jitter: (n,), standard
+    deviations of when they were [s].
     """
 
     values: FloatArray
     windows: FloatArray
+    jitter: FloatArray
 
 
 @dataclass(frozen=True)
@@ -50,6 +53,7 @@ class _Intervals:
     speed: FloatArray
     begin: FloatArray
     end: FloatArray
+    slack: FloatArray  # by which it may lie earlier or later
     agree: bool  # whether lengths and edges do
 
     @classmethod
@@ -67,17 +71,21 @@ class _Intervals:
         with np.errstate(invalid="ignore"):
             growth = np.nan_to_num(1.0 + np.sign(rate) * change * length**2, nan=1.0)
         growth = np.clip(growth, *_CREDIBLE)
-        end = latest - 0.5 * np.minimum(latest - earliest, length / growth)
+        slack = 0.5 * np.minimum(latest - earliest, length / growth)
+        end = latest - slack
         # An interval begins with the edge that ended the one before; the first row is no edge.
         timed = np.flatnonzero(np.isfinite(length) & (length > 1.0 + _OFF_TICK))
         timed = timed[timed > 1]
+        # Unless the shaft has turned round since, over an edge in the same sample.
+        timed = timed[rate[timed] * rate[timed - 1] >= 0.0]
         low = np.maximum(earliest[timed], earliest[timed - 1] + length[timed])
         high = np.minimum(latest[timed], latest[timed - 1] + length[timed])
         agreeing = low <= high + _OFF_TICK
         end[timed[agreeing]] = 0.5 * (low + high)[agreeing]
+        slack[timed[agreeing]] = 0.5 * np.maximum(high - low, 0.0)[agreeing]
         begin = np.where(rate == 0.0, np.append(earliest[0], end[:-1]), end - length)
         agree = bool(agreeing.sum() >= max(_FEWEST, _SHARE * len(timed)))
-        return cls(rows, rate, begin, end, agree)
+        return cls(rows, rate, begin, end, slack, agree)
 
 
 def mean_speeds(
@@ -93,13 +101,13 @@ def mean_speeds(
     intervals = _Intervals.of(tick, counts, omega * (dt / count))
     if not intervals.agree:
         return None
-    rates, begin, end = _at_rows(intervals, tick)
+    rates, begin, end, slack = _at_rows(intervals, tick)
     windows = np.stack([begin - tick, end - tick], axis=1) * dt
-    return MeanSpeeds(rates * (count / dt), windows)
+    return MeanSpeeds(rates * (count / dt), windows, slack * (dt / np.sqrt(3.0)))
 
 
-def _at_rows(intervals: _Intervals, tick: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Mean rate, begin and end of the interval that each row of the log tells of, (n,) each."""
+def _at_rows(intervals: _Intervals, tick: IntArray) -> tuple[FloatArray, ...]:
+    """Mean rate, begin, end and slack of the interval that each row tells of, (n,) each."""
     n = len(tick)
     before = np.searchsorted(intervals.rows, np.arange(n), side="right") - 1
     after = np.minimum(before + 1, len(intervals.rows) - 1)
@@ -114,4 +122,14 @@ def _at_rows(intervals: _Intervals, tick: IntArray) -> tuple[FloatArray, FloatAr
     rate[silent] = np.where(last, 0.0, np.nan)[silent]
     begin[silent] = np.where(last, intervals.end[before], tick)[silent]
     end[silent] = np.where(last, float(tick[-1]), tick)[silent]
-    return rate, begin, end
+    rate[_repeating(interval, np.abs(tick - 0.5 * (begin + end)))] = np.nan
+    return rate, begin, end, intervals.slack[interval]
+
+
+def _repeating(interval: IntArray, distance: FloatArray) -> npt.NDArray[np.bool_]:
+    """Which rows tell of an interval that a row nearer to its middle tells of as well."""
+    order = np.lexsort((distance, interval))
+    first = np.append(True, np.diff(interval[order]) != 0)
+    repeating = np.ones(len(interval), dtype=bool)
+    repeating[order[first]] = False
+    return repeating

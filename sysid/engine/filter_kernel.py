@@ -13,10 +13,11 @@ the variance r of the output
 
     e = y - g      s = C P C' + r      (x, n) += P C' e / s      P -= P C' C P / s
 
-and what is kept of e, the innovation, is e sqrt(r / s): without noise of inputs and process the
-error of the free run. With noise of the process the sum of log(s / r) stands behind the sum of
-their squares. With ``corrects`` zero nothing is taken in: e is that error whatever the noise, and s
-its variance. Chromosomes are lanes, as in the batch kernel.
+and what is kept of e, the innovation, is e sqrt(r0 / s), with r0 a variance like r but the same for
+all samples: without noise of inputs and process, and of one variance, the error of the free run.
+With noise of the process the sum of log(s / r) stands behind the sum of their squares. With
+``corrects`` zero nothing is taken in: e is that error whatever the noise, and s its variance.
+Chromosomes are lanes, as in the batch kernel.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -76,8 +77,8 @@ class FilterKernel(BatchKernel):
             *block(f"for j in range({2 * q}):", block(EACH_LANE, [sums])),
         ]
         head = (
-            "def innovations(X, rows, tables, u, y, w, r, s, intensity, spread, corrects, start, "
-            "p, dt, n_steps, sums, record):"
+            "def innovations(X, rows, tables, u, y, w, r, unit, s, intensity, spread, corrects, "
+            "start, p, dt, n_steps, sums, record):"
         )
         return "\n".join(block(head, body))
 
@@ -108,18 +109,18 @@ class FilterKernel(BatchKernel):
         """Output j taken in; the deviation d is what the sample's outputs have changed so far."""
         gains, size = self._gains(j), range(self._size)
         lines = [f"e = {_sum([f'o{j}', *_products(gains, 'd{}'.format)])} - y[k, {j}, l]"]
-        kept = f"e = e * w{j}"
+        kept = f"e = e * (w{j} * math.sqrt(unit[{j}] / r[k, {j}]))"
         if gains:
             lines += [f"shared{a} = {_sum(_products(gains, _covariance_with(a)))}" for a in size]
             lines += [
-                f"variance = {_sum(_products(gains, 'shared{}'.format))} + r[{j}]",
+                f"variance = {_sum(_products(gains, 'shared{}'.format))} + r[k, {j}]",
                 f"gain = seen{j} * corrects / variance",
             ]
             lines += [f"d{a} -= shared{a} * (gain * e)" for a in size]
             lines += [f"P{a}_{b} -= shared{a} * (gain * shared{b})" for a, b in self._pairs]
-            kept = f"e = e * (w{j} * math.sqrt(r[{j}] / variance))"
+            kept = f"e = e * (w{j} * math.sqrt(unit[{j}] / variance))"
             if self.variation.driven:
-                logarithm = f"seen{j} * math.log(variance / r[{j}])"
+                logarithm = f"seen{j} * math.log(variance / unit[{j}])"
                 lines.append(f"{at(self._sums + self.n_outputs + j)} += {logarithm}")
         return [*lines, kept, f"{at(self._sums + j)} += e * e", f"record[k, {j}, l] = e"]
 

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from sysid.arrays import BoolArray, FloatArray, IntArray
-from sysid.engine.compiler import Filter, Kernels, Tangents, explained_errors
+from sysid.engine.compiler import Filter, Kernels, Tangents, explained_errors, kernels
 from sysid.engine.scheme import LANES, work_area
-from sysid.engine.windows import average, compared
+from sysid.engine.windows import average, compared, slopes, with_integrals
 from sysid.problem.data import Dataset
 from sysid.problem.model import ProcessModel
 from sysid.threads import Workers
@@ -30,6 +30,7 @@ _PILOT_LEAST = 32  # samples
 # each one's result depends on nothing but itself.
 _LADDER = np.unique(np.round(2.0 ** np.arange(0, 20.01, 0.5)).astype(np.int64))
 _ALL_LANES = np.arange(LANES)
+_BEFORE = 1e-6  # samples before its first by which a window may begin for the arithmetic's sake
 
 
 @dataclass(frozen=True)
@@ -76,9 +77,16 @@ class RecordSimulator:
             self._measured, self._weights = np.zeros_like(outputs), np.ones_like(outputs)
         else:
             self._measured, self._weights = outputs, np.where(missing, 0.0, 1.0 / self.scale)
+        windows = record.windows.reshape(-1, outputs.shape[1], 2) / record.dt  # in samples
+        self._averaged = np.flatnonzero(windows.any(axis=(0, 2))).tolist()
+        self._windows = np.ascontiguousarray(np.moveaxis(windows, 1, 0))
+        if self._averaged:
+            if self.scale is not None:
+                # What a window saw before the record is not known.
+                early = np.arange(len(windows))[:, None] + windows[..., 0] < -_BEFORE
+                self._weights = np.where(early, 0.0, self._weights)
+            self._integrating = kernels(with_integrals(model, self._averaged))
         self._weight = self._weights.max(axis=0)
-        self._windows = record.windows.reshape(-1, outputs.shape[1], 2) / record.dt  # in samples
-        self._averaged = np.flatnonzero(self._windows.any(axis=(0, 2)))
         # Where an input is largest is where a model driven through it is fastest.
         peaks = np.argmax(np.abs(record.inputs), axis=0) if record.inputs.shape[1] else []
         self._extremes = record.inputs[np.unique(np.array([0, *peaks], dtype=np.int64))]
@@ -144,6 +152,7 @@ class RecordSimulator:
         self,
         kalman: Filter,
         noise: FloatArray,
+        scatter: FloatArray,
         process: FloatArray,
         corrects: bool,
         parameters: FloatArray,
@@ -154,7 +163,8 @@ class RecordSimulator:
     ) -> tuple[FloatArray, FloatArray]:
         """As ``residuals``, of the innovations of a filter, in parts of the outputs' noise.
 
-        noise: (n_outputs,), standard deviations. process: (n_states,), those of the states' rates
+        noise: (n_outputs,), standard deviations; scatter: (n_samples, n_outputs), variances of
+        single samples beside it. process: (n_states,), standard deviations of the states' rates
         over the root of a second. corrects: whether the filter takes outputs in. A state that
         starts at the first sample of an output has that sample's error. Returns with the sums of
         squares those of the logarithms of the innovations' variances in parts of the outputs',
@@ -166,7 +176,8 @@ class RecordSimulator:
         first = record.starts_at_samples(model)
         weights = self._weights.copy()
         weights[0, [j for j in first if j is not None]] = 0.0
-        spread = [0.0 if (j := first[i]) is None else noise[j] ** 2 for i in kernel.reached]
+        variances = noise**2 + scatter
+        spread = [0.0 if (j := first[i]) is None else variances[0, j] for i in kernel.reached]
         intensity = process[list(kernel.variation.driven)] ** 2 / record.dt
         of_inputs = record.input_noise[list(kernel.variation.noisy)] ** 2
         start = np.zeros((kernel.n_states, LANES))
@@ -178,7 +189,7 @@ class RecordSimulator:
         with explained_errors(model):
             kalman.innovations(
                 work, work.reshape(-1, LANES), kernel.tables, self._inputs, measured, weights,
-                noise**2, of_inputs, intensity, np.array(spread), float(corrects), start,
+                variances, noise**2, of_inputs, intensity, np.array(spread), float(corrects), start,
                 np.ascontiguousarray(parameters[padded].T), record.dt, n_steps, sums, kept,
             )  # fmt: skip
         values[:] = kept[..., : len(lanes)]
@@ -220,10 +231,28 @@ class RecordSimulator:
         n_samples: how much of the record is simulated. residuals: (n_samples, n_outputs, LANES)
         to fill, or of no size to keep none.
         """
-        if len(self._averaged):
+        if self._averaged:
             return self._averaged_block(parameters, starts, lanes, n_steps, n_samples, residuals)
         signals = self._measured[:n_samples], self._weights[:n_samples]
-        return self._plain_block(parameters, starts, lanes, n_steps, signals, residuals)
+        start = self._initial(starts, lanes)
+        return self._run(self.kernels, parameters, start, lanes, n_steps, signals, residuals)
+
+    def window_errors(
+        self, parameters: FloatArray, starts: FloatArray | None, n_steps: int
+    ) -> FloatArray:
+        """Standard deviations (n_samples, n_outputs) that jitter makes of means over windows.
+
+        parameters: (1, n_parameters). As far as an output changes over its window.
+        """
+        errors = np.zeros_like(self._measured)
+        if self._averaged and self.record.jitter.any():
+            outputs, integrals, _ = self._integrated(
+                parameters, starts, np.zeros(1, dtype=np.int64), n_steps, len(errors)
+            )
+            for j, integral in zip(self._averaged, integrals, strict=True):
+                change = slopes(outputs[:, j, 0].copy(), integral[:, 0].copy(), self._windows[j])
+                errors[:, j] = np.abs(change) * self.record.jitter[:, j] / self.record.dt
+        return errors
 
     def _at_instants(
         self, parameters: FloatArray, starts: FloatArray | None, lanes: IntArray, n_steps: int
@@ -233,14 +262,36 @@ class RecordSimulator:
         A mean over a window is moved by what the free run says it differs from the instant.
         """
         measured = np.repeat(self._measured[..., None], LANES, axis=2)
-        if len(self._averaged):
-            instant = np.full(measured.shape, np.nan)
-            signals = np.zeros_like(self._measured), np.ones_like(self._measured)
-            self._plain_block(parameters, starts, lanes, n_steps, signals, instant)
-            for j in self._averaged:
-                mean = average(instant[:, j], self._windows[:, j])
+        if self._averaged:
+            instant, integrals, _ = self._integrated(
+                parameters, starts, lanes, n_steps, len(measured)
+            )
+            for j, integral in zip(self._averaged, integrals, strict=True):
+                mean = average(instant[:, j], integral, self._windows[j])
                 measured[:, j] += instant[:, j] - mean
         return measured
+
+    def _integrated(
+        self,
+        parameters: FloatArray,
+        starts: FloatArray | None,
+        lanes: IntArray,
+        n_steps: int,
+        n_samples: int,
+    ) -> tuple[FloatArray, list[FloatArray], FloatArray]:
+        """Outputs (n_samples, n_outputs, LANES) at their instants, and integrals of the averaged.
+
+        Each (n_samples, LANES), over the sample time. With them the error estimates of the
+        outputs, (n, n_outputs).
+        """
+        q, more = self._measured.shape[1], len(self._averaged)
+        kept = np.full((n_samples, q + more, LANES), np.nan)
+        signals = np.zeros((n_samples, q + more)), np.ones((n_samples, q + more))
+        start = np.vstack([self._initial(starts, lanes), np.zeros((more, len(lanes)))])
+        integrating = self._integrating
+        _, estimates = self._run(integrating, parameters, start, lanes, n_steps, signals, kept)
+        integrals = [kept[:, q + i] / self.record.dt for i in range(more)]
+        return kept[:, :q], integrals, estimates[:, :q]
 
     def _averaged_block(
         self,
@@ -252,34 +303,40 @@ class RecordSimulator:
         residuals: FloatArray,
     ) -> tuple[FloatArray, FloatArray]:
         """As ``block``, of outputs over the record's windows."""
-        shape = n_samples, self._measured.shape[1]
-        kept = residuals if len(residuals) else np.full((*shape, LANES), np.nan)
-        signals = np.zeros(shape), np.ones(shape)
-        _, estimates = self._plain_block(parameters, starts, lanes, n_steps, signals, kept)
-        for j in self._averaged:
-            kept[:, j] = average(kept[:, j], self._windows[:n_samples, j])
-        sums = compared(kept, self._measured[:n_samples], self._weights[:n_samples])
+        outputs, integrals, estimates = self._integrated(
+            parameters, starts, lanes, n_steps, n_samples
+        )
+        for j, integral in zip(self._averaged, integrals, strict=True):
+            outputs[:, j] = average(outputs[:, j], integral, self._windows[j, :n_samples])
+        sums = compared(outputs, self._measured[:n_samples], self._weights[:n_samples])
+        if len(residuals):
+            residuals[:] = outputs
         return sums.T[: len(lanes)], estimates
 
-    def _plain_block(
+    def _run(
         self,
+        kernels: Kernels,
         parameters: FloatArray,
-        starts: FloatArray | None,
+        start: FloatArray,
         lanes: IntArray,
         n_steps: int,
         signals: tuple[FloatArray, FloatArray],
         residuals: FloatArray,
     ) -> tuple[FloatArray, FloatArray]:
-        """As ``block``, of outputs at their instants. signals: measured outputs and weights."""
+        """As ``block``, of outputs at their instants.
+
+        start: (n_states, n) of the kernels' model. signals: its measured outputs and weights.
+        """
         padded = lanes.take(_ALL_LANES, mode="wrap")
-        n_outputs = self._measured.shape[1]
+        start = np.ascontiguousarray(start.take(_ALL_LANES, axis=1, mode="wrap"))
+        n_outputs = signals[0].shape[1]
         sums = np.empty((2 * n_outputs, LANES))
-        work = work_area(self.kernels.batch.work_rows * LANES)
+        work = work_area(kernels.batch.work_rows * LANES)
         record = self._inputs[: len(signals[0])], *signals
-        start, p = self._initial(starts, padded), np.ascontiguousarray(parameters[padded].T)
-        with explained_errors(self.kernels.model):
-            self.kernels.simulate(
-                work, work.reshape(-1, LANES), self.kernels.batch.tables, *record, start, p,
+        p = np.ascontiguousarray(parameters[padded].T)
+        with explained_errors(kernels.model):
+            kernels.simulate(
+                work, work.reshape(-1, LANES), kernels.batch.tables, *record, start, p,
                 self.record.dt, n_steps, sums, residuals,
             )  # fmt: skip
         return sums[:n_outputs].T[: len(lanes)], sums[n_outputs:].T[: len(lanes)]

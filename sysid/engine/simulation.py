@@ -198,6 +198,7 @@ class BatchSimulator:
         starts: Sequence[FloatArray | None],
         noise: FloatArray,
         *,
+        scatter: Sequence[FloatArray] | None = None,
         process: FloatArray | None = None,
         corrects: bool = True,
         balanced: bool = True,
@@ -205,27 +206,31 @@ class BatchSimulator:
         """As ``residuals``, of the innovations of an extended Kalman filter.
 
         Noise of the inputs is the records' own; noise: (n_outputs,), standard deviations of the
-        outputs; process: (n_states,), intensities of the process's noise, standard deviations of
-        the states' rates over the root of a second. An innovation is scaled by the output's noise
-        over its own standard deviation: without noise of inputs and process innovations are the
-        residuals. With noise of the process, where ``balanced``, all of an output are multiplied by
-        the geometric mean of those deviations: their sum of squares is then least where the
-        likelihood of an output of unknown noise is largest. Unless it ``corrects`` itself by the
-        outputs, they are those of the free run, scaled so. See ``filter_kernel``. Raises ModelError
-        for equations that cannot be differentiated.
+        outputs; scatter: per record, (n_samples, n_outputs), variances that single samples have
+        beside that; process: (n_states,), intensities of the process's noise, standard deviations
+        of the states' rates over the root of a second. An innovation is scaled by the output's
+        noise over its own standard deviation: without noise of inputs and process innovations are
+        the residuals. With noise of the process, where ``balanced``, all of an output are
+        multiplied by the geometric mean of those deviations: their sum of squares is then least
+        where the likelihood of an output of unknown noise is largest. Unless it ``corrects`` itself
+        by the outputs, they are those of the free run, scaled so. See ``filter_kernel``. Raises
+        ModelError for equations that cannot be differentiated.
         """
         process = np.zeros(len(self.model.states)) if process is None else process
         driven = tuple(np.flatnonzero(process).tolist())
         kalman = kalman_filter(self.model, noisy_inputs(records), driven)
         logarithms = np.zeros((len(parameters), len(records), len(noise)))
+        if scatter is None:
+            scatter = [np.zeros(record.outputs.shape) for record in records]
 
         def simulate(
             r: int, simulator: RecordSimulator, part: FloatArray, rows: slice, steps: int
         ) -> tuple[FloatArray, FloatArray]:
             values = part[..., rows]
             sse, logarithms[rows, r] = simulator.innovations(
-                kalman, noise, process, corrects, parameters, starts[r], rows, steps, values
-            )
+                kalman, noise, scatter[r], process, corrects, parameters, starts[r], rows, steps,
+                values,
+            )  # fmt: skip
             return sse, np.where(np.isfinite(sse).all(axis=1), 0.0, np.inf)
 
         parameters = self._check(parameters, records)
@@ -239,6 +244,22 @@ class BatchSimulator:
             values=innovations.values * factor.T,
             sse=innovations.sse * factor[:, None] ** 2,
         )
+
+    def scatter(
+        self,
+        vector: FloatArray,
+        records: Sequence[Dataset],
+        n_steps: IntArray,
+        starts: Sequence[FloatArray | None],
+    ) -> list[FloatArray]:
+        """Variances (n_samples, n_outputs) that the jitter of each record's windows makes.
+
+        vector: (n_parameters,), of the run that tells how outputs change; n_steps: (n_records,).
+        """
+        return [
+            self._on(record).window_errors(vector[None], start, int(steps)) ** 2
+            for record, steps, start in zip(records, n_steps, starts, strict=True)
+        ]
 
     def tangents(
         self,

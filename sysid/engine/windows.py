@@ -1,29 +1,65 @@
-"""Outputs as a sensor shows them that averages over a while before it is read."""
+"""Outputs as a sensor shows them that averages over a while before it is read.
+
+Between samples an output is the parabola through both with the mean that it has between them, of
+which the simulation tells the integral: straight lines would cut its corners.
+"""
 
 import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numba import njit
 
 from sysid.arrays import FloatArray
+from sysid.problem.model import Output, ProcessModel, State, picker
 
 _INSTANT = 1e-6  # samples that no window is shorter than, unless it is an instant
+_BESIDE = 0.05  # samples by which a window is widened to see how fast an output changes
+
+
+def with_integrals(model: ProcessModel, places: Sequence[int]) -> ProcessModel:
+    """The model with the integrals of the outputs at these places as further states and outputs.
+
+    >>> from sysid.examples import lag
+    >>> with_integrals(lag(), [0]).derivative((1.0, 0.0), (0.0,), (2.0, 0.5))
+    (-2.0, 1.0)
+    """
+    n, derivative, output = len(model.states), model.derivative, model.output
+    chosen = [model.outputs[j] for j in places]
+    names = [(f"integral of {signal.name}", f"{signal.unit}*s") for signal in chosen]
+    if output is None:
+        pick = picker([model.state_names.index(signal.name) for signal in chosen])
+    else:
+        pick = picker(list(places))
+
+    def rates(x: Any, u: Any, p: Any) -> tuple[Any, ...]:
+        plain = x[:n]
+        values = plain if output is None else output(plain, u, p)
+        return (*derivative(plain, u, p), *pick(values))
+
+    def outputs(x: Any, u: Any, p: Any) -> tuple[Any, ...]:
+        return (*output(x[:n], u, p), *x[n:])  # type: ignore[misc]
+
+    return replace(
+        model,
+        states=model.states + tuple(State(*name, first_sample=False) for name in names),
+        outputs=model.outputs + tuple(Output(*name) for name in names),
+        derivative=rates,
+        output=None if output is None else outputs,
+    )
 
 
 @njit(cache=True, nogil=True)
-def average(outputs: FloatArray, windows: FloatArray) -> FloatArray:
+def average(outputs: FloatArray, integrals: FloatArray, windows: FloatArray) -> FloatArray:
     """An output with each sample its mean over a window, (n_samples, n_lanes).
 
-    outputs: (n_samples, n_lanes), straight between samples. windows: (n_samples, 2), begin and end
-    in samples from the sample on; a window of no length is an instant. What would be outside of
-    the record is cut off.
+    outputs, integrals: (n_samples, n_lanes), these over the sample time. windows: (n_samples, 2),
+    begin and end in samples from the sample on; a window of no length is an instant. What would
+    be outside of the record is cut off.
     """
     n, lanes = outputs.shape
-    area = np.zeros((n, lanes))  # under the output until each sample
-    for k in range(1, n):
-        for lane in range(lanes):
-            step = 0.5 * (outputs[k - 1, lane] + outputs[k, lane])
-            area[k, lane] = area[k - 1, lane] + step
     means = np.empty((n, lanes))
     for k in range(n):
         begin = min(max(k + windows[k, 0], 0.0), n - 1.0)
@@ -31,18 +67,56 @@ def average(outputs: FloatArray, windows: FloatArray) -> FloatArray:
         i, j = min(math.floor(begin), n - 2), min(math.floor(end), n - 2)
         a, b = begin - i, end - j
         if end - begin < _INSTANT:
+            v0, v1, area = _parabola(b)
             for lane in range(lanes):
-                means[k, lane] = (1.0 - b) * outputs[j, lane] + b * outputs[j + 1, lane]
+                change = integrals[j + 1, lane] - integrals[j, lane]
+                means[k, lane] = v0 * outputs[j, lane] + v1 * outputs[j + 1, lane] + area * change
             continue
-        # Weights of the two samples on either side of each end in the area up to it.
-        a0, a1 = a * (1.0 - 0.5 * a), 0.5 * a * a
-        b0, b1 = b * (1.0 - 0.5 * b), 0.5 * b * b
+        a0, a1, area_a = _area(a)
+        b0, b1, area_b = _area(b)
         part = 1.0 / (end - begin)
         for lane in range(lanes):
-            before = area[i, lane] + a0 * outputs[i, lane] + a1 * outputs[i + 1, lane]
-            until = area[j, lane] + b0 * outputs[j, lane] + b1 * outputs[j + 1, lane]
-            means[k, lane] = part * (until - before)
+            change = integrals[i + 1, lane] - integrals[i, lane]
+            before = a0 * outputs[i, lane] + a1 * outputs[i + 1, lane] + area_a * change
+            change = integrals[j + 1, lane] - integrals[j, lane]
+            until = b0 * outputs[j, lane] + b1 * outputs[j + 1, lane] + area_b * change
+            between = integrals[j, lane] - integrals[i, lane]
+            means[k, lane] = part * (between + until - before)
     return means
+
+
+@njit(cache=True, nogil=True)
+def slopes(outputs: FloatArray, integrals: FloatArray, windows: FloatArray) -> FloatArray:
+    """Mean change of an output per sample time over its windows, (n_samples,).
+
+    outputs, integrals: (n_samples,); as of ``average``.
+    """
+    n = len(outputs)
+    means = np.empty(n)
+    for k in range(n):
+        begin = min(max(k + windows[k, 0] - _BESIDE, 0.0), n - 1.0)
+        end = min(max(k + windows[k, 1] + _BESIDE, 0.0), n - 1.0)
+        total = 0.0
+        for place, sign in ((begin, -1.0), (end, 1.0)):
+            i = min(math.floor(place), n - 2)
+            v0, v1, area = _parabola(place - i)
+            change = integrals[i + 1] - integrals[i]
+            total += sign * (v0 * outputs[i] + v1 * outputs[i + 1] + area * change)
+        means[k] = total / max(end - begin, _BESIDE)
+    return means
+
+
+@njit(cache=True, nogil=True)
+def _parabola(s: float) -> tuple[float, float, float]:
+    """Weights in the parabola's value of both samples and of the area between them."""
+    return 1.0 - 4.0 * s + 3.0 * s * s, -2.0 * s + 3.0 * s * s, 6.0 * s - 6.0 * s * s
+
+
+@njit(cache=True, nogil=True)
+def _area(s: float) -> tuple[float, float, float]:
+    """The same in the area under it up to a part of the way."""
+    s2, s3 = s * s, s * s * s
+    return s - 2.0 * s2 + s3, -s2 + s3, 3.0 * s2 - 2.0 * s3
 
 
 @njit(cache=True, nogil=True)

@@ -48,10 +48,12 @@ class Innovations(Objective):
     noise: (n_outputs,), standard deviations of the outputs in their units. error: (n_outputs,),
     the same of the free run's errors at the chromosome that it began with. corrects: whether
     outputs correct the states. process: (n_states,), noise of the states' rates, in their units
-    over the root of a second.
+    over the root of a second. scatter: per record, (n_samples, n_outputs), variances of single
+    samples beside the noise, by the jitter of their windows at the chromosome that was settled.
     """
 
     noise: FloatArray
+    scatter: list[FloatArray]
     error: FloatArray
     corrects: bool
     process: FloatArray
@@ -69,6 +71,7 @@ class Innovations(Objective):
         variant = cls.__new__(cls)
         vars(variant).update(vars(objective))
         variant.noise = variant.error = np.maximum(noise, _TINY)
+        variant.scatter = [np.zeros(record.outputs.shape) for record in objective.records]
         variant.corrects = corrects
         n_states = len(objective.simulator.model.states)
         variant.process = np.zeros(n_states) if process is None else process
@@ -94,13 +97,15 @@ class Innovations(Objective):
         steps = self.steps_needed(chromosome[None])
         # Noise of the process may explain nearly all of a free run's error.
         least = (_LEAST_OF_PROCESS if self.process.any() else _LEAST_NOISE) * self.error
-        settled = self
+        vector, starts = self.space.full(chromosome), self._starts(chromosome[None])
+        scatter = self.simulator.scatter(vector, self.records, steps[0], starts)
+        settled = self._with(scatter=scatter)
         for _ in range(_ROUNDS):
             innovations = settled._simulated(chromosome[None], steps, balanced=False).values[..., 0]
             before, noise = settled.noise, np.maximum(self.in_units(innovations), least)
             if not np.isfinite(noise).all():
                 return self
-            settled = self._with(noise=noise)
+            settled = settled._with(noise=noise)
             if np.allclose(noise, before, rtol=_STEADY):
                 break
         return settled
@@ -115,7 +120,9 @@ class Innovations(Objective):
     @property
     def overwhelmed(self) -> BoolArray:
         """Outputs whose errors the noise of the inputs more than explains, (n_outputs,)."""
-        few: BoolArray = (self.noise < _NEAR * self.error) & (self.weights > 0.0)
+        known = sum(part.sum(axis=0) for part in self.scatter) / np.maximum(self.counts, 1)
+        noise = np.sqrt(self.noise**2 + known)
+        few: BoolArray = (noise < _NEAR * self.error) & (self.weights > 0.0)
         return few
 
     def share(self, chromosome: FloatArray, steps: IntArray) -> FloatArray:
@@ -147,6 +154,7 @@ class Innovations(Objective):
             steps,
             starts,
             self.noise,
+            scatter=self.scatter,
             process=self.process,
             corrects=self.corrects,
             balanced=balanced,

@@ -23,7 +23,8 @@ class Dataset:
     of what is identified. output_noise: (n_outputs,), that of the outputs, below which no model's
     errors can be; 0 where it is not known. windows: (n_samples, n_outputs, 2), the time over which
     a sensor averaged each sample of an output, its begin and end in seconds from the sample on;
-    both 0 where it was sampled at its instant. Simulated outputs are averaged alike. Default none.
+    both 0 where it was sampled at its instant. Simulated outputs are averaged alike. jitter:
+    (n_samples, n_outputs), standard deviation of when each window was [s]. Default none.
 
     Raises ModelError for mismatched shapes, fewer than two rows, complex numbers, inputs that are
     not finite, or infinite outputs.
@@ -42,6 +43,7 @@ class Dataset:
     input_noise: FloatArray = field(default_factory=lambda: np.zeros(0))
     output_noise: FloatArray = field(default_factory=lambda: np.zeros(0))
     windows: FloatArray = field(default_factory=lambda: np.zeros(0))
+    jitter: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         for name in ("inputs", "outputs"):
@@ -72,6 +74,15 @@ class Dataset:
         begin, end = self.windows[..., 0], self.windows[..., 1]
         if not (np.isfinite(self.windows).all() and np.all(begin <= end)):
             raise ModelError(f"{self.name}: a window must begin before it ends, at finite times")
+        if self.jitter.size == 0:
+            object.__setattr__(self, "jitter", np.zeros(self.outputs.shape))
+        if self.jitter.shape != self.outputs.shape or not np.all(
+            np.isfinite(self.jitter) & (self.jitter >= 0.0)
+        ):
+            raise ModelError(
+                f"{self.name}: jitter must hold a finite number, 0 or more, for each sample and "
+                f"output: {self.outputs.shape}; it has shape {self.jitter.shape}"
+            )
 
     def _table(self, name: str) -> FloatArray:
         """Inputs or outputs as real numbers, (n_samples, n); ModelError where they are others."""
@@ -119,8 +130,14 @@ class Dataset:
     def part(self, begin: int, end: int, name: str) -> Dataset:
         """The rows from ``begin`` up to ``end`` as a record."""
         rows = slice(begin, end)
-        inputs, outputs, windows = self.inputs[rows], self.outputs[rows], self.windows[rows]
-        return replace(self, inputs=inputs, outputs=outputs, windows=windows, name=name)
+        return replace(
+            self,
+            inputs=self.inputs[rows],
+            outputs=self.outputs[rows],
+            windows=self.windows[rows],
+            jitter=self.jitter[rows],
+            name=name,
+        )
 
     def check(self, model: ProcessModel) -> None:
         """Raise ModelError unless the columns match the model's inputs and outputs."""

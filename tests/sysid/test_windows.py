@@ -36,11 +36,17 @@ def test_simulated_outputs_are_averaged_over_the_windows():
     record = averaged_step()
     simulator = BatchSimulator(lag(), accuracy=1e-8)
     simulated = simulator.trajectories(np.array([1.0, TAU]), record)[0]
-    np.testing.assert_allclose(simulated, record.outputs, atol=1e-4)
+    np.testing.assert_allclose(simulated, record.outputs, atol=1e-7)
     at_samples = simulator.trajectories(np.array([1.0, TAU]), replace(record, windows=np.zeros(0)))
     assert np.abs(at_samples[0] - record.outputs).max() > 0.1
     result = simulator.errors(np.array([1.0, TAU]), [record])
-    assert result.sse[0, 0, 0] == pytest.approx(np.sum((simulated - record.outputs) ** 2))
+    assert result.sse[0, 0, 0] < 1e-10
+    doubled = replace(record, outputs=2.0 * record.outputs)
+    result = simulator.errors(np.array([1.0, TAU]), [doubled])
+    known = (
+        record.time + record.windows[:, 0, 0] > -1e-9
+    )  # the rest was averaged over what was before
+    assert result.sse[0, 0, 0] == pytest.approx(np.sum(record.outputs[known] ** 2), rel=1e-5)
 
 
 def test_a_sensor_that_averages_does_not_slow_the_model_down():
