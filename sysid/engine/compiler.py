@@ -72,13 +72,17 @@ class Filter:
 
 @functools.lru_cache(maxsize=8)
 def kalman_filter(
-    model: ProcessModel, noisy: tuple[int, ...], driven: tuple[int, ...] = ()
+    model: ProcessModel,
+    noisy: tuple[int, ...],
+    driven: tuple[int, ...] = (),
+    averaged: tuple[int, ...] = (),
 ) -> Filter:
     """Compile a model's filter for noise on some inputs and states; as ``kernels``.
 
-    noisy, driven: their places. Raises ModelError for equations that cannot be differentiated.
+    noisy, driven: their places; averaged: places of outputs, as of ``FilterKernel``, whose model
+    is ``with_integrals`` of them. Raises ModelError for equations that cannot be differentiated.
     """
-    kernel = FilterKernel(model, variation(model, noisy, driven))
+    kernel = FilterKernel(model, variation(model, noisy, driven), averaged)
     text = f"{kernel.structure.program}\n\n{kernel.text()}"
     return Filter(kernel, *_compiled(model, text, {}, ("innovations",)))
 

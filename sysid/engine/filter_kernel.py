@@ -20,7 +20,7 @@ With noise of the process the sum of log(s / r) stands behind the sum of their s
 Chromosomes are lanes, as in the batch kernel.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from sysid.engine.batch_kernel import EACH_LANE, BatchKernel, at
 from sysid.engine.program import block
@@ -30,29 +30,47 @@ from sysid.problem.model import ProcessModel
 
 _Place = tuple[int, int]
 _ROOT_3 = repr(3.0**0.5)
+_OF_MEAN = ("before", "now", "between")
 
 
 class FilterKernel(BatchKernel):
     """Text of the filter; needs what the batch kernel needs, and the program of a variation.
 
+    averaged: outputs that are measured as means over a time that ends with the sample. The model
+    then has the integrals of these, in their order, as its last states and its last outputs: they
+    begin at zero in every sample, and a mean is a sum of the output at the sample before, of that
+    at the sample and of the integral in between, times the ``mean`` weights.
+
     Behind the rows of lanes of the batch kernel the work area holds P's upper triangle, of the
-    reached states and then of the noisy inputs, and the estimate of each noise.
+    reached states, then of the noisy inputs and then of the averaged outputs at the sample before,
+    and the estimates of each noise and of each of those outputs there.
     """
 
-    def __init__(self, model: ProcessModel, variation: Variation) -> None:
+    def __init__(
+        self, model: ProcessModel, variation: Variation, averaged: Sequence[int] = ()
+    ) -> None:
         super().__init__(model, variation.structure)
         self.variation, self.reached = variation, variation.reached
         self.n_noises = len(variation.noisy)
         self.counts["gains"] = len(variation.gains)
         self._size = len(self.reached) + self.n_noises
-        self._pairs = [(a, b) for a in range(self._size) for b in range(a, self._size)]
+        self.n_measured = self.n_outputs - len(averaged)
+        # Of one that no noise reaches the free run tells all.
+        first = variation.n_states - len(averaged)
+        integral = {j: first + m for m, j in enumerate(averaged) if self._gains(j)}
+        self.averaged = list(integral)
+        self._integral = {j: self.reached.index(i) for j, i in integral.items()}
+        self._lag = {j: self._size + m for m, j in enumerate(self.averaged)}
+        self._places = range(self._size + len(self.averaged))
+        self._pairs = [(a, b) for a in self._places for b in self._places if a <= b]
         self._covariance = self.work_rows
         self._noises = self._covariance + len(self._pairs)
-        self.work_rows = self._noises + self.n_noises
+        self._before = self._noises + self.n_noises - self._size
+        self.work_rows = self._noises + self.n_noises + len(self.averaged)
 
     def text(self, *, many_registers: bool = False) -> str:
         """Python text of ``innovations``."""
-        q, outputs = self.n_outputs, range(self.n_outputs)
+        q, outputs = self.n_measured, range(self.n_measured)
         sample = [
             *[f"v{j} = u[k, {j}]" for j in range(self.n_recorded)],
             *[f"v{j} = 0.0" for j in range(self.n_recorded, self.n_inputs)],
@@ -77,8 +95,8 @@ class FilterKernel(BatchKernel):
             *block(f"for j in range({2 * q}):", block(EACH_LANE, [sums])),
         ]
         head = (
-            "def innovations(X, rows, tables, u, y, w, r, unit, s, intensity, spread, corrects, "
-            "start, p, dt, n_steps, sums, record):"
+            "def innovations(X, rows, tables, u, y, w, r, unit, mean, s, intensity, spread, "
+            "corrects, start, p, dt, n_steps, sums, record):"
         )
         return "\n".join(block(head, body))
 
@@ -90,25 +108,56 @@ class FilterKernel(BatchKernel):
         """P before the first sample: ``spread`` of the states, and the noises' variances."""
         n = len(self.reached)
         variances = {(a, a): f"spread[{a}]" if a < n else f"s[{a - n}]" for a in range(self._size)}
-        return self._stored(variances)
+        nothing = [f"{at(self._before + place)} = 0.0" for place in self._lag.values()]
+        return [*self._stored(variances), *nothing]
 
     def _corrected(self) -> list[str]:
         """The outputs of a sample taken in, and their innovations kept."""
-        n, size = len(self.reached), range(self._size)
-        lines = self._outputs()
+        n, lines = len(self.reached), self._outputs()
         if self.output_states is None and self.variation.gains:
             lines += self.call("gains", "g", [at(i) for i in range(self.n_states)], "v")
-        lines += [*self._loaded(), *[f"d{a} = 0.0" for a in size]]
-        for j in range(self.n_outputs):
+        lines += [*self._loaded(), *[f"d{a} = 0.0" for a in self._places]]
+        for j in range(self.n_measured):
             lines += self._taken_in(j)
-        lines += [f"{at(i)} += d{a}" for a, i in enumerate(self.reached)]
+        begun = self._integral.values()
+        lines += [
+            f"{at(i)} = 0.0" if a in begun else f"{at(i)} += d{a}"
+            for a, i in enumerate(self.reached)
+        ]
         lines += [f"{at(self._noises + k)} = d{n + k}" for k in range(self.n_noises)]
-        return lines + self._stored({(a, b): f"P{a}_{b}" for a, b in self._pairs})
+        variances = {(a, b): f"P{a}_{b}" for a, b in self._pairs}
+        for j, place in self._lag.items():
+            gains = self._gains(j)
+            lines.append(
+                f"{at(self._before + place)} = {_sum([f'o{j}', *_products(gains, 'd{}'.format)])}"
+            )
+            for a in range(self._size):
+                lines.append(f"L{place}_{a} = {_sum(_products(gains, _covariance_with(a)))}")
+                variances[a, place] = f"L{place}_{a}"
+            for other, behind in self._lag.items():
+                if behind >= place:
+                    row = _products(self._gains(other), f"L{place}_{{}}".format)
+                    variances[place, behind] = _sum(row)
+        variances = {pair: v for pair, v in variances.items() if not set(pair) & set(begun)}
+        return lines + self._stored(variances)
 
     def _taken_in(self, j: int) -> list[str]:
         """Output j taken in; the deviation d is what the sample's outputs have changed so far."""
-        gains, size = self._gains(j), range(self._size)
-        lines = [f"e = {_sum([f'o{j}', *_products(gains, 'd{}'.format)])} - y[k, {j}, l]"]
+        gains, size, lines = self._gains(j), self._places, []
+        predicted = [f"o{j}"]
+        if j in self._lag:
+            place, integral = self._lag[j], self._integral[j]
+            lines += [f"{name} = mean[k, {j}, {i}]" for i, name in enumerate(_OF_MEAN)]
+            before, now, between = _OF_MEAN
+            gains = {b: f"{now} * {c}" if c else now for b, c in gains.items()}
+            gains |= {place: before, integral: between}
+            area = at(self.reached[integral])
+            predicted = [
+                f"{before} * {at(self._before + place)}",
+                f"{now} * o{j}",
+                f"{between} * {area}",
+            ]
+        lines += [f"e = {_sum([*predicted, *_products(gains, 'd{}'.format)])} - y[k, {j}, l]"]
         kept = f"e = e * (w{j} * math.sqrt(unit[{j}] / r[k, {j}]))"
         if gains:
             lines += [f"shared{a} = {_sum(_products(gains, _covariance_with(a)))}" for a in size]
@@ -121,7 +170,7 @@ class FilterKernel(BatchKernel):
             kept = f"e = e * (w{j} * math.sqrt(unit[{j}] / variance))"
             if self.variation.driven:
                 logarithm = f"seen{j} * math.log(variance / unit[{j}])"
-                lines.append(f"{at(self._sums + self.n_outputs + j)} += {logarithm}")
+                lines.append(f"{at(self._sums + self.n_measured + j)} += {logarithm}")
         return [*lines, kept, f"{at(self._sums + j)} += e * e", f"record[k, {j}, l] = e"]
 
     def _gains(self, j: int) -> dict[int, str]:
@@ -175,7 +224,11 @@ class FilterKernel(BatchKernel):
             for k in range(self.n_noises):
                 if (a, k) in gamma:
                     variances[a, n + k] = f"{gamma[a, k]} * s[{k}]"
+            for place in self._lag.values():
+                terms = [f"{phi[a, c]} * P{c}_{place}" for c in range(self._size) if (a, c) in phi]
+                variances[a, place] = _sum(terms)
         variances |= {(n + k, n + k): f"s[{k}]" for k in range(self.n_noises)}
+        variances |= {(a, b): f"P{a}_{b}" for a, b in self._pairs if a >= self._size}
         return lines + self._stored(variances)
 
     def _process(self) -> list[dict[int, str]]:

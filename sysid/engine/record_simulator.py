@@ -7,7 +7,7 @@ import numpy as np
 from sysid.arrays import BoolArray, FloatArray, IntArray
 from sysid.engine.compiler import Filter, Kernels, Tangents, explained_errors, kernels
 from sysid.engine.scheme import LANES, work_area
-from sysid.engine.windows import average, compared, slopes, with_integrals
+from sysid.engine.windows import average, compared, slopes, weights_of_mean, with_integrals
 from sysid.problem.data import Dataset
 from sysid.problem.model import ProcessModel
 from sysid.threads import Workers
@@ -77,15 +77,17 @@ class RecordSimulator:
             self._measured, self._weights = np.zeros_like(outputs), np.ones_like(outputs)
         else:
             self._measured, self._weights = outputs, np.where(missing, 0.0, 1.0 / self.scale)
-        windows = record.windows.reshape(-1, outputs.shape[1], 2) / record.dt  # in samples
-        self._averaged = np.flatnonzero(windows.any(axis=(0, 2))).tolist()
+        windows = np.zeros((*outputs.shape, 2))
+        if record.windows.size:
+            windows = record.windows / record.dt  # in samples
+        self.averaged = np.flatnonzero(windows.any(axis=(0, 2))).tolist()
         self._windows = np.ascontiguousarray(np.moveaxis(windows, 1, 0))
-        if self._averaged:
+        if self.averaged:
             if self.scale is not None:
                 # What a window saw before the record is not known.
                 early = np.arange(len(windows))[:, None] + windows[..., 0] < -_BEFORE
                 self._weights = np.where(early, 0.0, self._weights)
-            self._integrating = kernels(with_integrals(model, self._averaged))
+            self._integrating = kernels(with_integrals(model, self.averaged))
         self._weight = self._weights.max(axis=0)
         # Where an input is largest is where a model driven through it is fastest.
         peaks = np.argmax(np.abs(record.inputs), axis=0) if record.inputs.shape[1] else []
@@ -173,7 +175,7 @@ class RecordSimulator:
         record, kernel, model = self.record, kalman.kernel, self.kernels.model
         lanes = np.arange(rows.start, rows.stop)
         padded = lanes.take(_ALL_LANES, mode="wrap")
-        first = record.starts_at_samples(model)
+        first = [*record.starts_at_samples(model), *[None] * kernel.n_states]
         weights = self._weights.copy()
         weights[0, [j for j in first if j is not None]] = 0.0
         variances = noise**2 + scatter
@@ -185,12 +187,18 @@ class RecordSimulator:
         kept = np.empty((record.n_samples, len(noise), LANES))
         sums = np.empty((2 * len(noise), LANES))
         work = work_area(kernel.work_rows * LANES)
-        measured = self._at_instants(parameters, starts, lanes, n_steps)
+        mean = np.zeros((*self._measured.shape, 3))
+        mean[..., 1] = 1.0
+        for j in kernel.averaged:
+            mean[:, j] = weights_of_mean(self._windows[j])
+        measured = self._after_the_last(mean, parameters, starts, lanes, n_steps)
+        mean[..., 2] /= record.dt
         with explained_errors(model):
             kalman.innovations(
                 work, work.reshape(-1, LANES), kernel.tables, self._inputs, measured, weights,
-                variances, noise**2, of_inputs, intensity, np.array(spread), float(corrects), start,
-                np.ascontiguousarray(parameters[padded].T), record.dt, n_steps, sums, kept,
+                variances, noise**2, mean, of_inputs, intensity, np.array(spread),
+                float(corrects), start, np.ascontiguousarray(parameters[padded].T), record.dt,
+                n_steps, sums, kept,
             )  # fmt: skip
         values[:] = kept[..., : len(lanes)]
         sse, logarithms = (half.T[: len(lanes)] for half in np.split(sums, 2))
@@ -231,7 +239,7 @@ class RecordSimulator:
         n_samples: how much of the record is simulated. residuals: (n_samples, n_outputs, LANES)
         to fill, or of no size to keep none.
         """
-        if self._averaged:
+        if self.averaged:
             return self._averaged_block(parameters, starts, lanes, n_steps, n_samples, residuals)
         signals = self._measured[:n_samples], self._weights[:n_samples]
         start = self._initial(starts, lanes)
@@ -245,30 +253,38 @@ class RecordSimulator:
         parameters: (1, n_parameters). As far as an output changes over its window.
         """
         errors = np.zeros_like(self._measured)
-        if self._averaged and self.record.jitter.any():
+        if self.averaged and self.record.jitter.any():
             outputs, integrals, _ = self._integrated(
                 parameters, starts, np.zeros(1, dtype=np.int64), n_steps, len(errors)
             )
-            for j, integral in zip(self._averaged, integrals, strict=True):
+            for j, integral in zip(self.averaged, integrals, strict=True):
                 change = slopes(outputs[:, j, 0].copy(), integral[:, 0].copy(), self._windows[j])
                 errors[:, j] = np.abs(change) * self.record.jitter[:, j] / self.record.dt
         return errors
 
-    def _at_instants(
-        self, parameters: FloatArray, starts: FloatArray | None, lanes: IntArray, n_steps: int
+    def _after_the_last(
+        self,
+        mean: FloatArray,
+        parameters: FloatArray,
+        starts: FloatArray | None,
+        lanes: IntArray,
+        n_steps: int,
     ) -> FloatArray:
-        """Measured outputs for each lane, (n_samples, n_outputs, LANES), at their instants.
+        """Measured outputs for each lane, (n_samples, n_outputs, LANES), as a filter takes them in.
 
-        A mean over a window is moved by what the free run says it differs from the instant.
+        That is by what a window saw since the sample before; the free run says what more it saw.
+        mean: (n_samples, n_outputs, 3), weights as of ``weights_of_mean``.
         """
         measured = np.repeat(self._measured[..., None], LANES, axis=2)
-        if self._averaged:
+        if self.averaged:
             instant, integrals, _ = self._integrated(
                 parameters, starts, lanes, n_steps, len(measured)
             )
-            for j, integral in zip(self._averaged, integrals, strict=True):
-                mean = average(instant[:, j], integral, self._windows[j])
-                measured[:, j] += instant[:, j] - mean
+            for j, integral in zip(self.averaged, integrals, strict=True):
+                output, (before, now, between) = instant[:, j], mean[:, j].T[..., None]
+                last = now * output
+                last[1:] += before[1:] * output[:-1] + between[1:] * np.diff(integral, axis=0)
+                measured[:, j] += last - average(output, integral, self._windows[j])
         return measured
 
     def _integrated(
@@ -284,7 +300,7 @@ class RecordSimulator:
         Each (n_samples, LANES), over the sample time. With them the error estimates of the
         outputs, (n, n_outputs).
         """
-        q, more = self._measured.shape[1], len(self._averaged)
+        q, more = self._measured.shape[1], len(self.averaged)
         kept = np.full((n_samples, q + more, LANES), np.nan)
         signals = np.zeros((n_samples, q + more)), np.ones((n_samples, q + more))
         start = np.vstack([self._initial(starts, lanes), np.zeros((more, len(lanes)))])
@@ -306,7 +322,7 @@ class RecordSimulator:
         outputs, integrals, estimates = self._integrated(
             parameters, starts, lanes, n_steps, n_samples
         )
-        for j, integral in zip(self._averaged, integrals, strict=True):
+        for j, integral in zip(self.averaged, integrals, strict=True):
             outputs[:, j] = average(outputs[:, j], integral, self._windows[j, :n_samples])
         sums = compared(outputs, self._measured[:n_samples], self._weights[:n_samples])
         if len(residuals):

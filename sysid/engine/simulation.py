@@ -12,6 +12,7 @@ from sysid.arrays import FloatArray, IntArray
 from sysid.engine.compiler import kalman_filter, kernels, tangents
 from sysid.engine.record_simulator import RecordSimulator
 from sysid.engine.scheme import LANES
+from sysid.engine.windows import with_integrals
 from sysid.problem.data import Dataset
 from sysid.problem.model import ModelError, ProcessModel
 from sysid.threads import Workers, available_cores
@@ -218,7 +219,9 @@ class BatchSimulator:
         """
         process = np.zeros(len(self.model.states)) if process is None else process
         driven = tuple(np.flatnonzero(process).tolist())
-        kalman = kalman_filter(self.model, noisy_inputs(records), driven)
+        averaged = tuple(sorted({j for record in records for j in self._on(record).averaged}))
+        model = with_integrals(self.model, averaged) if averaged else self.model
+        kalman = kalman_filter(model, noisy_inputs(records), driven, averaged)
         logarithms = np.zeros((len(parameters), len(records), len(noise)))
         if scatter is None:
             scatter = [np.zeros(record.outputs.shape) for record in records]

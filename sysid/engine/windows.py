@@ -85,6 +85,20 @@ def average(outputs: FloatArray, integrals: FloatArray, windows: FloatArray) -> 
     return means
 
 
+def weights_of_mean(windows: FloatArray) -> FloatArray:
+    """Weights (n_samples, 3) of what has been since the sample before in each sample's mean.
+
+    Of the output at that sample, of the output at this one and of the area between, over the
+    sample time. windows: (n_samples, 2), as of ``average``; of each the part that lies there, or
+    the end that is nearest to it.
+    """
+    begin, end = np.clip(windows + 1.0, 0.0, 1.0).T
+    length = end - begin
+    instant = length < _INSTANT
+    parts = (np.array(_area(end)) - np.array(_area(begin))) / np.where(instant, 1.0, length)
+    return np.where(instant, np.array(_parabola(end)), parts).T
+
+
 @njit(cache=True, nogil=True)
 def slopes(outputs: FloatArray, integrals: FloatArray, windows: FloatArray) -> FloatArray:
     """Mean change of an output per sample time over its windows, (n_samples,).
