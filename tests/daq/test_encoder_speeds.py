@@ -75,6 +75,19 @@ def test_speeds_are_the_means_over_their_windows(angle, error, at_samples):
     assert np.sqrt(np.mean((omega - exactly) ** 2)) > at_samples
 
 
+@pytest.mark.parametrize("angle", [swinging, creeping])
+def test_its_jitter_says_how_far_a_mean_may_be_off(angle):
+    """Each error in parts of what the jitter makes of the true acceleration is about one."""
+    tick, theta, omega = logged(angle, 1.2)
+    speeds = mean_speeds(tick, theta, omega, DT, COUNT)
+    middle = np.clip(tick * DT + speeds.windows.mean(axis=1), 1e-3, 1.2)
+    slope = (angle(middle + 1e-5) - 2.0 * angle(middle) + angle(middle - 1e-5)) / 1e-10
+    error = speeds.values - mean_over(angle, speeds.windows)
+    expected = np.abs(slope) * speeds.jitter
+    clear = np.isfinite(error) & (expected > 1e-3)
+    assert 0.4 < np.sqrt(np.mean((error[clear] / expected[clear]) ** 2)) < 1.2
+
+
 def test_a_shaft_that_stands_still_has_no_speed():
     tick, theta, omega = logged(stopping, 1.2)
     still = (tick * DT > 0.31) & (tick * DT < 0.79)

@@ -69,9 +69,58 @@ def test_the_filter_sees_them_alike(corrects):
     np.testing.assert_allclose(filtered[1:], plain[1:], atol=1e-6)
 
 
-def test_a_part_keeps_its_windows():
+def test_of_means_over_the_last_sample_innovations_are_those_of_a_kalman_filter():
+    """The lag's output and its input's error at the sample before tell each mean exactly."""
+    rng = np.random.default_rng(0)
+    u, y = rng.choice([-1.0, 1.0], 80), rng.standard_normal(80)
+    y[[30, 31]] = np.nan
+    windows = np.sort(rng.uniform(-DT, 0.0, (80, 1, 2)), axis=2)
+    record = Dataset(u, y, DT, input_noise=np.array([0.3]), windows=windows)
+    scatter = rng.uniform(0.0, 0.1, (80, 1))
+    filtered = BatchSimulator(lag().with_initial({"y": 0.0})).innovations(
+        np.array([[2.0, TAU]]), [record], [np.ones(1)], np.array([[1]]), [None], np.array([0.2]),
+        scatter=[scatter],
+    )  # fmt: skip
+    # States are the output and the input's error at the sample before.
+    x, P, fading = np.zeros(2), np.diag([0.0, 0.3**2]), np.exp(-DT / TAU)
+    expected = np.zeros(80)
+    for k in range(1, 80):
+        begin, end = windows[k, 0] + DT
+        mean = TAU * (np.exp(-begin / TAU) - np.exp(-end / TAU)) / (end - begin)
+        H, F = np.array([mean, 2.0 * (1.0 - mean)]), np.array([fading, 2.0 * (1.0 - fading)])
+        driven = np.array([0.0, u[k - 1]])
+        if np.isfinite(y[k]):
+            s = H @ P @ H + 0.2**2 + scatter[k, 0]
+            e = H @ (x + driven) - y[k]
+            expected[k] = e * 0.2 / np.sqrt(s)
+            x, P = x - P @ H / s * e, P - np.outer(P @ H, P @ H) / s
+        x, P = np.array([F @ (x + driven), 0.0]), np.diag([F @ P @ F, 0.3**2])
+    np.testing.assert_allclose(filtered.values[:, 0, 0], expected, atol=1e-7)
+
+
+def test_jitter_of_windows_counts_by_how_fast_an_output_changes():
     record = averaged_step()
-    np.testing.assert_array_equal(record.part(50, 90, "part").windows, record.windows[50:90])
+    record = replace(record, jitter=np.full((N, 1), 2e-4))
+    (scatter,) = BatchSimulator(lag()).scatter(
+        np.array([1.0, TAU]), [record], np.array([4]), [None]
+    )
+    k = 150 + np.flatnonzero(np.ptp(record.windows[150:, 0], axis=1) > 0.0)
+    middle = record.time[k] + record.windows[k, 0].mean(axis=1)
+    slope = np.exp(-middle / TAU) / TAU
+    np.testing.assert_allclose(np.sqrt(scatter[k, 0]), 2e-4 * slope, rtol=0.01)
+
+
+def test_a_part_keeps_its_windows():
+    record = replace(averaged_step(), jitter=np.linspace(0.0, 1e-3, N)[:, None])
+    part = record.part(50, 90, "part")
+    np.testing.assert_array_equal(part.windows, record.windows[50:90])
+    np.testing.assert_array_equal(part.jitter, record.jitter[50:90])
+
+
+@pytest.mark.parametrize("jitter", [np.zeros(5), np.full((5, 1), -1.0), np.full((5, 1), np.nan)])
+def test_jitter_that_can_be_none_is_refused(jitter):
+    with pytest.raises(ModelError, match=r"jitter must hold a finite number, 0 or more, for each"):
+        Dataset(np.ones(5), np.zeros(5), DT, windows=np.zeros((5, 1, 2)), jitter=jitter)
 
 
 @pytest.mark.parametrize(
