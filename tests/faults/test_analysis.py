@@ -13,6 +13,7 @@ from tests.soak import mostly_soak
 PAGE = Path(__file__).parents[2] / "docs" / "safety-analysis.md"
 OUTCOMES = {"stop": "stop", "note": "warning", "no": "missed"}
 ALWAYS = "encoder dead"
+TRIES = 3
 
 
 @dataclass(frozen=True)
@@ -62,5 +63,8 @@ LINE = [("encoder dead", "closed"), ("clock 10 % fast", "open"), ("SAFE ignored"
 @pytest.mark.parametrize(("fault", "loop"), LINE)
 def test_on_a_line_as_well(fault, loop):
     (end,) = (end for *case, end in cases([fault], "_line") if case == [fault, loop])
-    outcome = perform(trial_of(fault, loop, line=True))
+    for _ in range(TRIES):
+        outcome = perform(trial_of(fault, loop, line=True))
+        if outcome.result != "before":  # a busy computer that ends the run before its fault
+            break
     assert outcome.result == OUTCOMES[end], outcome
