@@ -205,6 +205,7 @@ def run_on_a_line(folder, experiment, setting, watchdog=1.0):
 # --- the faults --------------------------------------------------------------------------
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize("name", VIRTUAL)
 def test_a_fault_changes_nothing_before_its_instant_and_something_after(name):
     load = FAULTS[name].loads[0] if len(FAULTS[name].loads) == 1 else "free"

@@ -149,6 +149,7 @@ def oscillator():
     )
 
 
+@pytest.mark.soak
 def test_noise_of_the_process_is_that_of_a_kalman_filter():
     """Of a linear model, with Van Loan's exact covariance of an interval."""
     rng, model, dt, intensity = np.random.default_rng(2), oscillator(), 0.05, 1.0
