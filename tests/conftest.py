@@ -28,9 +28,11 @@ def pytest_configure(config):
 def pytest_collection_modifyitems(items):
     # The longest begin first, so that no process waits for one alone at the end.
     longest = [
-        "test_tutorial", "test_friction_identification", "test_cli", "test_combinations",
-        "test_campaigns", "faults/test_analysis", "test_compile", "faults/test_device",
-        "test_guesses", "test_docstrings",
+        "test_friction_identification", "test_tutorial", "test_cli", "test_combinations",
+        "faults/test_analysis", "test_missing_physics", "test_uncertainty", "faults/test_device",
+        "boards/test_boards", "test_guesses", "firmware/test_core", "sim_rig/test_device",
+        "test_real_time", "test_compile", "test_hal_boards", "test_campaigns", "test_ends",
+        "test_simulation", "test_docstrings", "test_replay",
     ]  # fmt: skip
 
     def place(item):

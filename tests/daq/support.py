@@ -203,14 +203,14 @@ def forked_rig(**env):
     yield lambda args, cwd, report=False: server.run(_words(args, report), cwd, env=env)
 
 
-def until(condition, what, seconds=60.0):
+def until(condition, what, seconds=60.0, every=0.005):
     """Poll until ``condition`` gives something true, and return it."""
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline:
         result = condition()
         if result:
             return result
-        time.sleep(0.005)
+        time.sleep(every)
     raise AssertionError(f"not within {seconds:g} s: {what}")
 
 

@@ -286,6 +286,7 @@ def test_errors_stand_in_physical_units_everywhere(folder):
     assert " mm " in result.stdout
 
 
+@pytest.mark.soak
 def test_a_report_of_a_part_of_a_log_is_drawn_again(folder):
     configured(folder, use="0.5 s ..", run_in="5 rows")
     words = ("identify", "day1.csv", "--config", "id.yaml", "--out", "results")

@@ -248,7 +248,7 @@ def test_workers_end_with_the_program_that_started_them(data, number):
         times = [Path(f"/proc/{pid}/stat").read_text().split()[13] for pid in workers]
         return len(times) == 2 and min(map(int, times)) > 2 * ticks and workers
 
-    workers = until(busy, "two workers that have been busy for a while")
+    workers = until(busy, "two workers that have been busy for a while", 180)
     process.send_signal(number)
     _, errors = process.communicate(timeout=60)
     until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in workers), "their end", 20)

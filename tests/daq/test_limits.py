@@ -17,6 +17,7 @@ from daq.limits.load import i2t_levels
 from daq.lookup.rigs import load_rig
 from daq.rig import Rig
 from sim_rig.backend import SimulatedDevice, Simulation
+from tests.sim_rig.support import PLANTS
 from tests.soak import mostly_soak
 
 RATE = 800.0
@@ -351,19 +352,18 @@ def test_without_a_homing_nothing_counts_as_unwound():
     assert first_trip(limits, samples(theta=np.linspace(0.0, -30.0, 400))) is None
 
 
+# Plants that the simulated device's tests compile too.
 QUIET = [
-    *(({}, load, "closed") for load in ("pulley", "free", "hand", "locked")),
-    *(({"ideal": True}, load, "closed") for load in ("pulley", "free", "hand", "locked")),
-    *((options, "pulley", "open") for options in ({}, {"ideal": True})),
-    ({"imperfections": {"bits": 8}}, "pulley", "closed"),
+    *(({}, plant) for plant in ({}, *PLANTS.values())),
+    ({"ideal": True}, {}),
+    ({"imperfections": {"bits": 8}}, {}),
 ]
 
 
-@pytest.mark.parametrize(("options", "load", "driver"), mostly_soak(QUIET), ids=str)
-def test_nothing_trips_on_a_simulated_rig_that_rests_works_and_rests(options, load, driver):
-    plant = {"load": load, "driver_motor": driver, "driver_brake": driver}
+@pytest.mark.parametrize(("options", "plant"), mostly_soak(QUIET), ids=str)
+def test_nothing_trips_on_a_simulated_rig_that_rests_works_and_rests(options, plant):
     config = RigConfig(limits=EVERYTHING | {"current": {"motor": 10.0, "brake": 10.0}})
-    if load == "locked":  # which a limit of stalling is there to find
+    if plant.get("load") == "locked":  # which a limit of stalling is there to find
         config = RigConfig(limits=config.limits.model_dump() | {"encoder": {"stall": None}})
     rig = Rig(SimulatedDevice(Simulation(**options, plant=plant)), config)
     limits = Limits(config)

@@ -104,6 +104,7 @@ def spin(run, folder, **settings):
     return run(["run", "e.yaml", "--rig", "rig.yaml"], folder)
 
 
+@pytest.mark.soak
 def test_a_controller_that_never_ends_does_not_hold_the_computer(tmp_path, real_time):
     with forked_rig() as run:
         result = spin(run, tmp_path)

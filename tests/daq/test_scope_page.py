@@ -1,6 +1,7 @@
 """The scope's page in a real browser: headless Chromium, where it and its driver are installed."""
 
 import contextlib
+import functools
 import shutil
 import signal
 
@@ -15,15 +16,21 @@ from daq.hal import Flag
 from daq.logs.capture import Capture
 from daq.logs.recording import load
 from daq.logs.writer import LogWriter
-from tests.daq.support import start_rig, until, write_experiment, write_rig
+from tests.daq import support
+from tests.daq.support import start_rig, write_experiment, write_rig
 from tests.daq.test_scope import RATE, samples, start_scope
 
+# Each look at the page is work for three processes.
+until = functools.partial(support.until, every=0.05)
 _BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
 _DRIVER = shutil.which("chromedriver")
-pytestmark = pytest.mark.skipif(
-    not (_BROWSER and _DRIVER),
-    reason="needs Chromium and its driver (Debian: apt install chromium chromium-driver)",
-)
+pytestmark = [
+    pytest.mark.soak,
+    pytest.mark.skipif(
+        not (_BROWSER and _DRIVER),
+        reason="needs Chromium and its driver (Debian: apt install chromium chromium-driver)",
+    ),
+]
 
 # Finds an element by CSS also inside Bokeh's shadow trees.
 _FIND = """
@@ -136,7 +143,6 @@ def recording(root, name, **facts):
     capture.finish("completed", None)
 
 
-@pytest.mark.soak
 def test_it_follows_a_run_of_the_rig_from_its_beginning_to_its_end(scope, tmp_path):
     tab = scope()
     assert "No run under runs yet" in tab.head()
@@ -165,7 +171,6 @@ def test_it_follows_a_run_of_the_rig_from_its_beginning_to_its_end(scope, tmp_pa
     assert set(loaded) == {"127.0.0.1"} and not tab.errors()
 
 
-@pytest.mark.soak
 def test_a_paused_page_stands_still_until_it_is_let_go_on(scope, tmp_path):
     with recording(tmp_path, "first") as (_, log):
         log.append(samples(400))
@@ -194,7 +199,6 @@ def test_a_paused_page_stands_still_until_it_is_let_go_on(scope, tmp_path):
         assert len(tab.drawn()) == 0 and "waiting for the first sample" in tab.head()
 
 
-@pytest.mark.soak
 def test_a_finished_run_is_shown_whole_and_magnified_to_its_samples(scope, tmp_path):
     n = 100_000  # more than is kept as it is
     torque = np.sin(np.arange(n) / 5000.0)
@@ -241,7 +245,6 @@ def test_a_finished_run_is_shown_whole_and_magnified_to_its_samples(scope, tmp_p
     until(lambda: tab.height("torque")[1] > 9.0, "its height")
 
 
-@pytest.mark.soak
 def test_the_values_are_those_under_the_cursor_and_from_the_mark(scope, tmp_path):
     block = samples(800)
     with recording(tmp_path, "short") as (capture, log):
@@ -279,7 +282,6 @@ def test_a_broken_log_shows_what_is_readable_and_says_what_is_not(scope, tmp_pat
     assert ">interlock<" in tab.head() and "too much &lt;i&gt;" in tab.head()
 
 
-@pytest.mark.soak
 def test_a_log_of_the_original_program_is_shown(scope, tmp_path):
     names = ("t", "cmd_voltage_motor", "cmd_voltage_brake", "current_motor", "current_brake")
     names = (*names, "torque", "theta", "omega")

@@ -12,7 +12,8 @@ from tests.soak import mostly_soak
 
 PAGE = Path(__file__).parents[2] / "docs" / "safety-analysis.md"
 OUTCOMES = {"stop": "stop", "note": "warning", "no": "missed"}
-ALWAYS = ("encoder dead", "SAFE ignored")
+ALWAYS = "encoder dead"
+TRIES = 3
 
 
 @dataclass(frozen=True)
@@ -41,15 +42,13 @@ def cases(names, suffix=""):
     chosen = [row for row in rows() if row.fault in names]
     return [
         (row.fault, loop, end)
-        for row in sorted(chosen, key=lambda row: row.fault not in ALWAYS)
+        for row in sorted(chosen, key=lambda row: row.fault != ALWAYS)
         for loop in ("open", "closed")
         if (end := getattr(row, loop + suffix)) != "-"
     ]
 
 
-@pytest.mark.parametrize(
-    ("fault", "loop", "end"), mostly_soak(cases(VIRTUAL), always=2 * len(ALWAYS))
-)
+@pytest.mark.parametrize(("fault", "loop", "end"), mostly_soak(cases(VIRTUAL), always=2))
 def test_a_fault_ends_as_the_page_says(fault, loop, end):
     outcome = perform(trial_of(fault, loop, line=False))
     assert outcome.result == OUTCOMES[end], outcome
@@ -64,5 +63,8 @@ LINE = [("encoder dead", "closed"), ("clock 10 % fast", "open"), ("SAFE ignored"
 @pytest.mark.parametrize(("fault", "loop"), LINE)
 def test_on_a_line_as_well(fault, loop):
     (end,) = (end for *case, end in cases([fault], "_line") if case == [fault, loop])
-    outcome = perform(trial_of(fault, loop, line=True))
+    for _ in range(TRIES):
+        outcome = perform(trial_of(fault, loop, line=True))
+        if outcome.result != "before":  # a busy computer that ends the run before its fault
+            break
     assert outcome.result == OUTCOMES[end], outcome

@@ -130,16 +130,15 @@ def test_without_a_fault_every_protocol_is_completed(tmp_path, name, seed):
 
 
 STAIRCASES = [
-    ([30, 120], [0, 0.06]),  # fast but for its ends, and the brake comes on with the motor
-    ([120, -120], [0, 0.08]),
-    ([30, 60, 120], [0, 0.04, 0.12]),
-    ([-30, -120], [0.15, 0]),
-    ([5], [0.02]),
+    ([30, 120], [0, 0.06], None),  # fast but for its ends, and the brake comes on with the motor
+    ([120, -120], [0, 0.08], 1),
+    ([30, 60, 120], [0, 0.04, 0.12], None),
+    ([-30, -120], [0.15, 0], 1),
+    ([5], [0.02], None),
 ]
 
 
-@pytest.mark.parametrize("seed", [None, pytest.param(1, marks=pytest.mark.soak)])
-@pytest.mark.parametrize(("velocities", "brake"), mostly_soak(STAIRCASES))
+@pytest.mark.parametrize(("velocities", "brake", "seed"), mostly_soak(STAIRCASES, always=0))
 def test_a_healthy_motor_at_speed_is_not_called_wrong(tmp_path, velocities, brake, seed):
     """On the simulated rig, without a seed, as on drawn plants of this folder's."""
     name = "constant_velocity.yaml"
@@ -206,6 +205,7 @@ def run_on_a_line(folder, experiment, setting, watchdog=1.0):
 # --- the faults --------------------------------------------------------------------------
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize("name", VIRTUAL)
 def test_a_fault_changes_nothing_before_its_instant_and_something_after(name):
     load = FAULTS[name].loads[0] if len(FAULTS[name].loads) == 1 else "free"

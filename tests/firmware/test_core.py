@@ -26,7 +26,7 @@ from tests.firmware.sequences import (
 )
 from tests.soak import mostly_soak
 
-SHARES = [(first, 500) for first in range(0, 10_000, 500)]
+SHARES = [(first, 500) for first in range(0, 2_500, 500)]
 PAGE = SOURCE.parent / "docs" / "serial-protocol.md"
 
 
@@ -63,8 +63,10 @@ def test_the_sequences_reach_every_state_latch_and_answer():
     assert {0, 1, 2, 8, 16, 32, 33, 34, 40, 48} <= flags
 
 
-@pytest.mark.parametrize("frames", [100_000, pytest.param(10_000_000, marks=pytest.mark.soak)])
+@pytest.mark.parametrize("frames", [100_000, pytest.param(1_000_000, marks=pytest.mark.soak)])
 def test_no_damaged_frame_is_accepted(native, frames):
+    """``python -m benchmarks.firmware`` sends ten million."""
+
     def fuzz(seed):
         words = [native / "fuzz", str(frames // 2), str(seed)]
         return subprocess.run(words, capture_output=True, text=True, check=False)

@@ -581,6 +581,7 @@ def expected_failures(model):
 
 
 # nk=0, because scikit-learn's rows have no time: an output depends on its own row.
+@pytest.mark.soak
 @parametrize_with_checks(
     [ARX(1, 1, 0), ARMAX(1, 1, 1, 0), ARMAX(1, 1, 1, 0, stable=True, offset=False)],
     expected_failed_checks=expected_failures,

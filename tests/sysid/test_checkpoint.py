@@ -74,7 +74,7 @@ def assert_same(found, expected):
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no SIGKILL here")
-@pytest.mark.parametrize("share", mostly_soak([0.3, 0.02, 0.6, 0.97]))
+@pytest.mark.parametrize("share", mostly_soak([0.3, 0.97], always=0))
 def test_a_killed_search_goes_on_to_the_bit(tmp_path, whole, share):
     expected, steps = whole
     steps = searching(steps)

@@ -81,6 +81,7 @@ def test_a_start_that_is_unknown_takes_its_part_of_the_information():
     assert information[np.ix_([0, 2], [0, 2])] == pytest.approx(exact, rel=1e-9)
 
 
+@pytest.mark.soak
 def test_noise_of_an_input_counts_as_a_fit_that_compensates_it_scatters():
     slopes, n, sigma = responses_to_step()[:, :2], 60, 0.3
     decay = np.exp(-DT / 0.2)

@@ -47,6 +47,7 @@ def test_independent_changes_add_up_and_those_that_cancel_do_not():
     assert_allclose(twice**2 - alone**2, 2.0 * (once**2 - alone**2), rtol=1e-6)
 
 
+@pytest.mark.soak
 def test_intervals_of_the_second_stage_hold_the_truth_and_merely_fixed_ones_do_not():
     held = np.zeros(2)
     for seed in range(40):

@@ -74,8 +74,8 @@ def test_of_a_nonlinear_system_they_are_those_of_an_extended_kalman_filter():
     rng, model, dt = np.random.default_rng(1), pendulum(), 0.1
     p, noise = np.array([2.0, 9.0, 0.4]), np.array([0.05, 0.3])
     of_inputs = np.array([0.4, 0.2])
-    u = np.column_stack([prbs(rng, 40, -3.0, 3.0), prbs(rng, 40, -1.0, 1.0)])
-    y = np.column_stack([0.6 * np.sin(np.arange(40) / 3.0), prbs(rng, 40, -3.0, 3.0, hold=3)])
+    u = np.column_stack([prbs(rng, 24, -3.0, 3.0), prbs(rng, 24, -1.0, 1.0)])
+    y = np.column_stack([0.6 * np.sin(np.arange(24) / 3.0), prbs(rng, 24, -3.0, 3.0, hold=3)])
     record = Dataset(u, y, dt, input_noise=of_inputs)
     innovations = simulate(model, p, record, noise, steps=60)
     expected = extended_kalman_filter(model, p, record, noise)
@@ -149,6 +149,7 @@ def oscillator():
     )
 
 
+@pytest.mark.soak
 def test_noise_of_the_process_is_that_of_a_kalman_filter():
     """Of a linear model, with Van Loan's exact covariance of an interval."""
     rng, model, dt, intensity = np.random.default_rng(2), oscillator(), 0.05, 1.0
@@ -214,6 +215,7 @@ def gusty_record(b, c, intensity, seed, n=1500, dt=0.05, steps=20):
     return Dataset(force, np.array(speeds) + 0.15 * rng.standard_normal(n), dt, "gusty")
 
 
+@pytest.mark.soak
 def test_gusts_bias_the_error_and_not_the_innovations():
     """Gusts waste speed on a drag that grows with its square: a free run finds more of it."""
     truth, intensity = {"b": 2.0, "c": 1.5}, 1.0
@@ -301,6 +303,7 @@ def test_where_noise_explains_all_of_a_free_run_a_filter_takes_over():
     assert all(e.low < truth < e.high for e, truth in zip(estimates, (GAIN, TAU), strict=True))
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize("criterion", ["compensated", "innovations"])
 def test_intervals_hold_the_truth(criterion):
     held = []

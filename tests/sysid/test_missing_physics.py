@@ -16,6 +16,7 @@ from sysid import BatchSimulator, Dataset, Input, Output, Parameter, ProcessMode
 from sysid.gassi import GASSI
 from sysid.judging.disturbed import DisturbedRun
 from sysid.judging.examination import verdict_of
+from tests.soak import mostly_soak
 from tests.sysid.reference import simulate
 
 CASES = {case.name: case for case in cases()}
@@ -23,16 +24,16 @@ CASES = {case.name: case for case in cases()}
 
 @pytest.mark.parametrize(
     ("name", "words"),
-    [
-        ("load half", "load is 1.9"),
-        ("sign of the current", "current is -"),
-        ("current 0.3 A off", "current is 0.28"),
-        ("speed clipped at 80 %", "omega saturates near its largest values"),
-        ("Coulomb friction", "a term in omega"),
-        ("winding warms up", "R changes by +3"),
-        ("Coulomb friction, load's noise", "a term in omega"),
-        ("load off in later logs", "load of training 2 is -0.0"),
-    ],
+    mostly_soak(
+        [
+            ("load half", "load is 1.9"),
+            ("Coulomb friction", "a term in omega"),
+            ("sign of the current", "current is -"),
+            ("speed clipped at 80 %", "omega saturates near its largest values"),
+            ("Coulomb friction, load's noise", "a term in omega"),
+            ("load off in later logs", "load of training 2 is -0.0"),
+        ],
+    ),
 )
 def test_what_is_wrong_is_named_with_its_size(name, words):
     outcome = tried(CASES[name], 0)
@@ -40,7 +41,7 @@ def test_what_is_wrong_is_named_with_its_size(name, words):
     assert words in said
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", mostly_soak([0, 1]))
 @pytest.mark.parametrize("name", ["motor", "noise not known", "next to no noise, not known"])
 def test_a_right_model_lacks_nothing(name, seed):
     outcome = tried(CASES[name], seed)
@@ -53,6 +54,7 @@ def test_with_a_known_noise_all_that_is_above_it_is_told():
     assert outcome.moved
 
 
+@pytest.mark.soak
 def test_a_variant_that_the_data_ask_for_is_fitted_and_ranked():
     model = replace(MODEL, variants=lambda: {"friction=dry": WITH_FRICTION})
     (training,), validation = CASES["Coulomb friction"].records(1)
@@ -129,7 +131,9 @@ HYSTERESIS = ProcessModel(
 )
 
 
-@pytest.mark.parametrize("noise", [0.003, 0.0], ids=["a fit of 99.7 %", "no noise at all"])
+@pytest.mark.parametrize(
+    "noise", mostly_soak([0.003, 0.0]), ids=["a fit of 99.7 %", "no noise at all"]
+)
 def test_a_perfect_bouc_wen_model_is_good_down_to_rounding(noise):
     """What is left is noise, or the error of two simulations of unequal accuracy."""
     logs = [hysteresis_log(seed, noise) for seed in (1, 2)]
@@ -168,7 +172,7 @@ def test_what_a_search_says_of_ties_and_answers_is_the_same_for_every_seed():
         training, outputs=training.outputs[:, 1:], output_noise=NOISE[1:], output_zero=np.zeros(1)
     )
     says = set()
-    for seed in range(5):
+    for seed in range(3):
         fitted = GASSI(model, population=60, generations=12, random_state=seed).fit(alone)
         uncertainty = fitted.uncertainty([alone])
         says.add(
@@ -181,6 +185,7 @@ def test_what_a_search_says_of_ties_and_answers_is_the_same_for_every_seed():
     assert len(says) == 1, says
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize("name", ["LuGre friction", "cogging", "winding warms up fast"])
 def test_what_fits_no_function_is_not_good(name):
     outcome = tried(CASES[name], 2)

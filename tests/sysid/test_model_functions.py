@@ -61,10 +61,6 @@ def times(a, b):
     return a * b
 
 
-def by_default(x, u, p, product=times):
-    return product(x[1], 0.7), u[0] - p[0] * x[1] - x[0]
-
-
 def closure(factor, inner):
     def derivative(x, u, p, shift=0.25):
         return inner(x[1], factor) + shift, u[0] - p[0] * x[1] * abs(x[1]) ** 0.5 - x[0]
@@ -77,8 +73,8 @@ toolbox.times = times
 toolbox.FACTOR = 0.7
 
 
-def through_a_module(x, u, p):
-    return toolbox.times(x[1], toolbox.FACTOR), u[0] - p[0] * x[1] - x[0]
+def through_a_module(x, u, p, product=times):
+    return toolbox.times(x[1], toolbox.FACTOR), product(u[0], 0.7) - p[0] * x[1] - x[0]
 
 
 def double(x, u, p):
@@ -90,9 +86,8 @@ MODELS = {
     "mathematics and conditions": {"derivative": mathematics},
     "one_state_no_inputs": {"derivative": one_state, "states": 1, "inputs": 0},
     "powers and logarithms": {"derivative": powers},
-    "a helper as a default": {"derivative": by_default},
     "closure, defaults and powers": {"derivative": closure(1.5, times)},
-    "module": {"derivative": through_a_module},
+    "module, a helper as a default": {"derivative": through_a_module},
     "helpers and output": {"derivative": helpers, "output": double, "outputs": 3},
 }
 

@@ -178,7 +178,7 @@ def test_the_actuator_follows_scipy_over_its_shipped_ranges():
     model, dt, n = actuator(), 1.0 / 800.0, 40
     worst = 0.0
     simulator = BatchSimulator(model)
-    for vector in draw(model, rng, 24):
+    for vector in draw(model, rng, 12):
         inputs = np.column_stack(
             [prbs(rng, n, -4, 4), prbs(rng, n, 0, 0.38), prbs(rng, n, -0.1, 0.1, 5)]
         )

@@ -112,7 +112,7 @@ def responses(force, x, p):
 
 
 def test_tangents_are_those_of_an_independent_integrator():
-    simulator, data = BatchSimulator(oscillator()), record()
+    simulator, data = BatchSimulator(oscillator()), record(12)
     vectors = np.array([list(VALUES.values()), [1.2, 60.0, 2.0, 3.0, 20.0]])
     starts = np.array([[0.1, -0.4, 0.02], [0.0, 0.5, 0.0]])
     along = np.concatenate([of_log_parameters(vectors), np.zeros((2, 3, N))], axis=1)

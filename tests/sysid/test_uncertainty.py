@@ -286,6 +286,7 @@ def test_intervals_cover_under_white_noise():
     assert 0.92 < coverage(record)[0] < 0.98
 
 
+@pytest.mark.soak
 def test_intervals_cover_under_coloured_noise_where_white_ones_would_not():
     def record(rng):
         u = slow(rng, 500)
@@ -327,6 +328,7 @@ def test_a_zero_error_of_an_output_has_the_closed_form_and_covers():
     assert naive < 0.85
 
 
+@pytest.mark.soak
 def test_a_zero_error_of_an_input_has_the_closed_form_and_covers():
     zero = np.array([0.1, 0.0, 0.0])
 
@@ -611,6 +613,7 @@ def brushed(derivative):
     return uncertainty(objective, refine(objective, model.nominal, restriction=held).chromosome)
 
 
+@pytest.mark.soak
 def test_a_tie_holds_at_the_end_of_a_logarithmic_range():
     result = brushed(slow_winding)
     assert [e.why for e in result.parameters] == ["tied"] * 4

@@ -66,9 +66,7 @@ def test_a_card_that_is_gone_at_any_call_is_an_error_in_words_and_never_another(
     for method, count in calls.items():
         if method == "close":
             continue
-        for at in sorted({1, max(1, count // 2), count}):
-            if at > count:
-                continue
+        for at in sorted({1, count}):
             with fakes(fault=(method, at)):
                 device = make(playback=playback)
                 try:
@@ -204,7 +202,7 @@ def test_outputs_that_come_behind_inputs_are_shifted_into_their_ticks(make, phas
 
 @pytest.mark.parametrize(
     "phase",
-    [0.2, *(pytest.param(value, marks=pytest.mark.soak) for value in (-1.0, 0.0, 1.0, 2.1))],
+    [0.2, *(pytest.param(value, marks=pytest.mark.soak) for value in (-1.0, 2.1))],
 )
 def test_the_phase_is_measured_by_a_loop_back(phase):
     with fakes(phase=phase, loopback="rc"):
