@@ -114,7 +114,7 @@ def _show(title: str, errors: dict[str, dict[str, Any]]) -> None:
 
     print(title)
     shown = {name: OutputErrors.of(each) for name, each in errors.items()}
-    print_errors(shown, label="replay")
+    print_errors({"replay": shown})
 
 
 def _bounds(texts: list[str]) -> dict[str, float]:

@@ -58,9 +58,45 @@ class QuantityRow:
         return (high - low) / (2.0 * _Z95)
 
     @property
+    def engineering(self) -> tuple[float, str]:
+        """Factor and unit in which its value has one to three digits before the point."""
+        return notation.engineering(self.value, self.unit)
+
+    def text(self, number: float, scale: float = 1.0) -> str:
+        """The value, or an end of an interval, times the scale, as fine as the interval supports.
+
+        All of a quantity's numbers have the same last decimal place, with two digits at least
+        where the interval does not reach through zero.
+        """
+        low, high = self.interval or self.here or (None, None)
+        through_zero = low is not None and high is not None and low < 0.0 < high
+        largest = max(abs(self.value), (self.deviation or 0.0) if through_zero else 0.0)
+        if number == 0.0 or not math.isfinite(number) or not 0.0 < largest < math.inf:
+            return notation.number(scale * number)
+        beyond = math.floor(math.log10(abs(number))) - math.floor(math.log10(largest))
+        digits = min(self.digits + beyond, self.digits + 1)
+        if digits < 1 and through_zero:
+            return "0"
+        return notation.number(scale * number, max(digits, 1 if through_zero else 2))
+
+    @property
     def two_sided(self) -> bool:
         """Whether it has an interval with both ends."""
         return self.interval is not None and None not in self.interval
+
+    @property
+    def narrow(self) -> bool:
+        """Whether the digits of a value do not tell the ends of its interval apart."""
+        low, high = self.interval or (None, None)
+        if low is None or high is None or low == high:
+            return False
+        return self.text(low) == self.text(high)
+
+    @property
+    def half_width(self) -> float:
+        """Half of an interval that has both ends, else NaN."""
+        low, high = self.interval or (None, None)
+        return math.nan if low is None or high is None else 0.5 * (high - low)
 
     @property
     def undetermined_label(self) -> str:
@@ -69,12 +105,17 @@ class QuantityRow:
         return ", ".join(filter(None, (LABELS.get(self.undetermined, ""), fails)))
 
     def interval_text(self, write: Callable[[float], str], between: str, empty: str) -> str:
-        """The interval with its ends written: ``1.0 .. 1.2``, ``< 1.2``, or ``> 1.0``."""
+        """The interval with its ends written: ``1.0 .. 1.2``, ``< 1.2``, or ``> 1.0``.
+
+        ``± 3.0e-12`` where the digits of the ends do not tell them apart.
+        """
         low, high = self.interval or (None, None)
         if low is None and high is None:
             return empty
         if low is None or high is None:
             return f"< {write(high)}" if high is not None else f"> {write(low or 0.0)}"
+        if self.narrow:
+            return f"± {write(self.half_width)}"
         return f"{write(low)}{between}{write(high)}"
 
 
@@ -102,8 +143,14 @@ class ParameterRow(QuantityRow):
 
     @property
     def digits(self) -> int:
-        """Significant digits: of a fixed or tied one four."""
-        return super().digits if self.free else 4
+        """Significant digits: of a tied one, and where no interval was looked for, four."""
+        sought = self.free and (self.interval is not None or bool(self.undetermined))
+        return super().digits if sought else 4
+
+    def text(self, number: float, scale: float = 1.0) -> str:
+        """As of any quantity; what was fixed as it was given."""
+        fixed = not self.free and self.tied is None
+        return notation.shortest(scale * number) if fixed else super().text(number, scale)
 
     @property
     def label(self) -> str:
@@ -310,9 +357,8 @@ class Rows:
         several = len(self.logs["training"]) > 1
         parts = "The logs" if several else "Parts of the log"
         return (
-            f"{parts} want parameters of their own: they differ by {self.disagreement**0.5:.1f} "
-            "times what noise explains, so that model or sensors are not quite what they are taken "
-            "for. The intervals are as wide as that spread."
+            f"{parts}, each by itself, give parameters {self.disagreement**0.5:.1f} times as far "
+            "apart as noise explains; the intervals are as wide as that spread."
         )
 
     @cached_property

@@ -140,21 +140,28 @@ def _excitation(subject: Subject) -> Iterator[Picture]:
 
 
 def _residuals(subject: Subject) -> Iterator[Picture]:
-    log, run = (subject.validation or subject.training)[0]
+    part = "validation" if subject.validation else "training"
+    logs = subject.validation or subject.training
+    (log, run), shown = logs[0], subject.document["metrics"][part][0]["outputs"]
     data = log.dataset
     if not np.isfinite(run).all():
         return
     test = residual_test(data.outputs - run, data.inputs, data.input_noise)
+    which = f"{data.name}, the first of {len(logs)}" if len(logs) > 1 else data.name
     lines = {}
     for j, output in enumerate(subject.model.outputs):
         lines[output.name] = {"with its past": test.auto[:, j] / float(test.auto_band[j])}
+        # Those of the table, which know the parameters' uncertainty; of older reports chance's.
+        bands = shown[output.name].get("residual_independence_bands", {})
         for i in np.flatnonzero(test.tested):
-            correlation = test.cross[:, j, i] / float(test.cross_band[j, i])
-            lines[output.name][f"with {subject.model.input_names[i]}"] = correlation
+            name = subject.model.input_names[i]
+            band = float(bands.get(name, test.cross_band[j, i]))
+            lines[output.name][f"with {name}"] = test.cross[:, j, i] / band
     yield Picture(
         "residuals", "residuals",
-        f"Correlation of the residuals ({data.name}) with their own past and with past inputs, in "
-        "parts of the 95 % band (grey): a model that explains all but white noise stays inside.",
+        f"Correlation of the residuals ({which}) with their own past and with past inputs, in "
+        "parts of the 95 % band (grey), that of inputs as wide as the parameters' uncertainty "
+        "makes it: a model that explains all but white noise stays inside.",
         residual_correlations(np.asarray(test.lags * data.dt), lines),
     )  # fmt: skip
 
