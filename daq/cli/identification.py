@@ -304,7 +304,7 @@ def print_errors(errors: Mapping[str, Mapping[str, OutputErrors]], of: str = "")
             cells += [notation.quantity(error.rmse_absolute, error.unit)]
             cells += [notation.percent(error.fit_percent)]
             rows.append(["" if place else output, *([log] if of else []), *cells])
-    title = "Free-run simulation: RMSE and MSD in parts of max|y|, RMSE in the output's unit, fit"
+    title = "Free run: RMSE and MSD in parts of max|y|, RMSE in the output's unit, fit"
     terminal.print_table(title, head, rows, text=[of])
 
 

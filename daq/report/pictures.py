@@ -1,6 +1,5 @@
 """The figures of an identification's report: which are drawn, from which arrays."""
 
-import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -21,7 +20,7 @@ from daq.files import write_whole
 from daq.findings import Axis
 from daq.identification.baseline import Baseline
 from daq.identification.records import LoggedRecord
-from daq.identification.replay import Replay
+from daq.identification.replay import Replay, short_names
 from daq.identification.rows import ParameterRow, Rows
 from daq.logs.columns import UNITS
 from daq.logs.recording import load
@@ -399,17 +398,15 @@ def draw_replay(replays: Sequence[Replay], path: Path) -> None:
 
     Raises ConfigError for an unknown format, RunError if the file cannot be written.
     """
-    first, labels = replays[0], ["simulated"]
-    if len(replays) > 1:
-        # What they have in common, up to an option, need not stand in the legend.
-        alike = os.path.commonprefix([replay.source for replay in replays])  # noqa: RUF071
-        common = re.split(r"[^:,=]*$", alike)[0]
-        labels = [replay.source.removeprefix(common) or replay.source for replay in replays]
+    first = replays[0]
+    labels = short_names(replays) if len(replays) > 1 else ["simulated"]
     outputs = []
     for j, output in enumerate(first.model.outputs):
         lines = {"measured": first.measured[:, j]}
         lines |= {k: r.simulated[:, j] for k, r in zip(labels, replays, strict=True)}
-        fits = ", ".join(f"{replay.metrics.fit[j]:.1f}" for replay in replays)
-        outputs.append(Panel(output.name, output.unit, lines, note=f"fit {fits} %"))
+        fits = [_percent(replay.metrics.fit[j]) for replay in replays]
+        named = [f"{label} {fit}" for label, fit in zip(labels, fits, strict=True)]
+        note = f"fit: {', '.join(named)}" if len(fits) > 1 else f"fit {fits[0]}"
+        outputs.append(Panel(output.name, output.unit, lines, note=note))
     kind = style.format_of(path)
     write_whole(path, style.render(responses(first.time, outputs), kind))
