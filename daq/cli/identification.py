@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from daq import notation
@@ -237,6 +237,8 @@ def _show_residuals(rows: Rows) -> None:
 
 
 def _show_notes(result: Identification) -> None:
+    from daq.identification.rows import start_sentences
+
     rows, verdict = result.rows, result.verdict
     if result.interrupted:
         terminal.print_text(
@@ -259,35 +261,13 @@ def _show_notes(result: Identification) -> None:
         terminal.print_text(f"{subject}: {statement.trust}. {' '.join(statement.reasons)}")
     for note in verdict.notes:
         terminal.print_text(note)
-    for line in _starts(result):
+    for line in start_sentences(result.document["metrics"]["validation"]):
         terminal.print_text(line)
     if rows.refined:
         terminal.print_text(rows.determined_sentence)
         for sentence in (rows.together_sentence, rows.disagreement_sentence):
             if sentence:
                 terminal.print_text(sentence)
-
-
-def _starts(result: Identification) -> Iterator[str]:
-    """Where validations start that were estimated, and what their first samples would give."""
-    for log in result.validation:
-        starts = log.result.starts
-        if starts is None or starts.first_fit is None:
-            continue
-        number = terminal.number
-        where = [
-            f"{s.state} at {number(s.value, 3)} {s.unit}, {number(s.value - s.first, 2)} from its "
-            f"first sample (searched in {number(s.low, 3)} .. {number(s.high, 3)})"
-            for s in starts.estimates
-            if s.first == s.first
-        ]
-        fits = ", ".join(
-            f"{name} {fit:.1f} -> {first:.1f} %"
-            for name, fit, first in zip(
-                result.model.output_names, log.result.metrics.fit, starts.first_fit, strict=True
-            )
-        )
-        yield f"{log.result.name} starts with {'; '.join(where)}. From the first samples: {fits}."
 
 
 def print_errors(errors: Mapping[str, Mapping[str, OutputErrors]], of: str = "") -> None:

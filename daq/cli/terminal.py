@@ -134,6 +134,20 @@ def print_json_error(error: RigError) -> None:
     print_json({"exit_status": error.exit_status, "errors": errors, "notes": notes})
 
 
+def print_json_usage_error(error: Any) -> None:
+    """The document of a command line that makes no sense; error: of Typer's, with its message."""
+    parameter, context = getattr(error, "param", None), getattr(error, "ctx", None)
+    mistake = {
+        "error": error.format_message(),
+        "file": None,
+        "line": None,
+        "column": None,
+        "key": getattr(error, "option_name", None) or getattr(parameter, "name", None),
+        "cure": None if context is None else f"see {context.command_path} --help",
+    }
+    print_json({"exit_status": error.exit_code, "errors": [mistake], "notes": []})
+
+
 def print_text(text: str) -> None:
     """Sentences: on a terminal wrapped between words, its indent kept, in a pipe one line."""
     if sys.stdout.isatty():

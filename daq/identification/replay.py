@@ -117,10 +117,10 @@ def replay(
 
     log: as for ``identify``. parameters: an identification or its ``parameters.yaml``. model: in
     place of parameters a model by name, at its own values, such as ``actuator:parameters=A``.
-    config: settings of ``identify``, of which the columns of a foreign log and the part of it that is
-    used count, and without parameters its model, fixed and tied values, outputs and starts. Without any of these the
-    parameters are those of the simulated ``rig``. trust: run the Python file of a model that
-    ``parameters.yaml`` names. Raises ConfigError.
+    config: settings of ``identify``, of which the columns of a foreign log and the part of it that
+    is used count, and without parameters its model, fixed and tied values, outputs and starts.
+    Without any of these the parameters are those of the simulated ``rig``. trust: run the Python
+    file of a model that ``parameters.yaml`` names. Raises ConfigError.
 
     >>> from daq import record, replay
     >>> result = replay(record("prbs.yaml"))  # through the simulated rig's own model

@@ -13,6 +13,7 @@ from functools import cached_property
 from typing import Any
 
 from daq import notation
+from daq.notation import percent, quantity
 
 _Z95 = 1.96
 LABELS = {  # of undetermined reasons
@@ -380,6 +381,36 @@ def logs_of(metrics: Mapping[str, Any], part: str) -> tuple[LogErrors, ...]:
         LogErrors(log.get("name", ""), {k: OutputErrors.of(e) for k, e in log["outputs"].items()})
         for log in metrics[part]
     )
+
+
+def start_sentences(logs: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Where logs start that were estimated, and what their first samples would give.
+
+    logs: of a document's ``metrics``.
+    """
+    sentences = []
+    for log in logs:
+        if "fit_percent_from_first_sample" not in log:
+            continue
+        where = [
+            f"{state} at {quantity(start['value'], start['unit'])}, "
+            f"{quantity(start['value'] - start['first_sample'], start['unit'], 2)} from its first "
+            f"sample (searched in {quantity(start['range'][0], start['unit'])} .. "
+            f"{quantity(start['range'][1], start['unit'])})"
+            for state, start in log["starts"].items()
+            if start.get("first_sample") is not None
+        ]
+        fits = [
+            f"{name} {percent(errors['fit_percent'])} -> {percent(_number(first))} %"
+            for (name, errors), first in zip(
+                log["outputs"].items(), log["fit_percent_from_first_sample"].values(), strict=True
+            )
+        ]
+        sentences.append(
+            f"{log['name']} starts with {'; '.join(where)}. From the first sample: "
+            f"{', '.join(fits)}."
+        )
+    return sentences
 
 
 def mean_errors(logs: Sequence[LogErrors]) -> dict[str, OutputErrors]:

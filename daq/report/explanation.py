@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from daq.identification.rows import OutputErrors, Rows, logs_of, mean_errors
+from daq.identification.rows import OutputErrors, Rows, logs_of, mean_errors, start_sentences
 from daq.lookup.models import trust_option
 from sysid import ProcessModel
 
@@ -52,6 +52,7 @@ def view(model: ProcessModel, document: Mapping[str, Any], rows: Rows) -> dict[s
         "rival": next(iter(rows.ambiguities_of("rival")), None),
         # States that a combination holds the start of.
         "starts": {name: f"{name}(0)" for name in model.state_names if f"{name}(0)" in names},
+        "start_sentences": start_sentences(document["metrics"]["validation"]),
         "steps": _steps(document, rows),
         "ended": _ENDED[search["stopped"]],
     }
