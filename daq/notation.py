@@ -103,10 +103,18 @@ def digits(value: float, deviation: float | None) -> int:
     """Significant digits that an uncertainty supports; 2 where it is unknown."""
     if deviation is None:
         return 2
-    if deviation <= 0.0 or value == 0.0:
+    if deviation <= 0.0:
         return 4
     ratio = abs(value) / deviation
     return max(2, min(7, math.floor(math.log10(max(ratio, 1e-3))) + 2))
+
+
+def shortest(value: float) -> str:
+    """A number that somebody chose, in the digits that it has, six at most."""
+    mantissa, sign, power = number(value, 6).partition("e")
+    whole, point, places = mantissa.partition(".")
+    places = places.rstrip("0")
+    return f"{whole}{point if places else ''}{places}{sign}{power}"
 
 
 def engineering(value: float, unit: str) -> tuple[float, str]:
@@ -120,6 +128,18 @@ def engineering(value: float, unit: str) -> tuple[float, str]:
     power = 3 * math.floor(math.log10(size) / 3) if size else 0
     prefix = _PREFIXES.get(power)
     return (1.0, unit) if prefix is None else (10.0**-power, f"{prefix}{unit}")
+
+
+def quantity(value: float, unit: str, digits: int = 3) -> str:
+    """A number with its unit, in the multiple of it that reads best: ``5.06 mA``."""
+    scale, multiple = engineering(value, unit)
+    text = number(scale * value, digits)
+    return text if multiple in ("", "1") else f"{text} {multiple}"
+
+
+def percent(value: float) -> str:
+    """A fit, to a tenth of a per cent."""
+    return f"{value:.1f}" if math.isfinite(value) else "-"
 
 
 def number_html(text: str) -> str:

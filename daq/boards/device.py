@@ -184,11 +184,13 @@ class CardDevice:
             volts = loopback.sequence(seed)
             # A tail keeps the card from running dry before all is read.
             self._card.start(loopback.RATE, np.concatenate([volts, np.zeros_like(volts)]))
+            shown = np.zeros(0)
             try:
-                blocks = [self._next_block(loopback.RATE).analog for _ in range(len(volts) // 10)]
+                while len(shown) < len(volts):
+                    shown = np.append(shown, self._next_block(loopback.RATE).analog[:, 0])
             finally:
                 self._card.stop()
-            delays.append(loopback.delay(volts[:, 0], np.concatenate(blocks)[:, 0]))
+            delays.append(loopback.delay(volts[:, 0], shown[: len(volts)]))
         return delays
 
     def _require_open(self) -> None:

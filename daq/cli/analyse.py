@@ -8,13 +8,11 @@ from typing import TYPE_CHECKING, Annotated
 
 from typer import Argument
 
-from daq import notation
 from daq.cli import options, terminal
+from daq.identification.rows import QuantityRow
 
 if TYPE_CHECKING:
     from daq.findings import Findings, Number
-
-_WIDTH = 2 * 1.96  # standard deviations in a 95 % interval
 
 
 def analyse(
@@ -70,12 +68,15 @@ def show_findings(findings: Findings, folder: Path) -> None:
 
 
 def _number_row(number: Number) -> list[str]:
-    scale, unit = notation.engineering(number.value, number.unit)
-    interval, digits = "-", 4
-    if number.low is not None and number.high is not None:
-        if math.isfinite(number.high - number.low):
-            digits = notation.digits(number.value, (number.high - number.low) / _WIDTH)
-        ends = (terminal.number(scale * end, digits) for end in (number.low, number.high))
-        interval = " .. ".join(ends)
-    value = terminal.number(scale * number.value, digits)
-    return [number.name, value, interval, unit, number.meaning]
+    interval = None
+    low, high = number.low, number.high
+    if low is not None and high is not None and math.isfinite(high - low):
+        interval = low, high
+    row = QuantityRow(number.name, number.value, number.unit, interval)
+    scale, unit = row.engineering
+
+    def write(value: float) -> str:
+        return row.text(value, scale) if interval else terminal.number(scale * value)
+
+    ends = row.interval_text(write, between=" .. ", empty="-")
+    return [number.name, write(number.value), ends, unit, number.meaning]

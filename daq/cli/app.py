@@ -8,7 +8,8 @@ from contextlib import AbstractContextManager, nullcontext, suppress
 from inspect import Parameter, signature
 from typing import Annotated, Any
 
-from typer import BadParameter, Exit, Option, Typer
+from typer import BadParameter, Context, Exit, Option, Typer
+from typer.core import TyperGroup
 
 from daq.cli import terminal
 from daq.cli.analyse import analyse
@@ -108,8 +109,22 @@ def _secure_cache() -> None:
         raise ConfigError(str(error)) from None
 
 
+class _Commands(TyperGroup):
+    """The commands; with ``--json`` a mistake in the command line is a document as well."""
+
+    def invoke(self, ctx: Context) -> Any:
+        json = "--json" in ctx.args
+        try:
+            return super().invoke(ctx)
+        except Exception as error:
+            if json and hasattr(error, "format_message"):  # all that Typer's mistakes share
+                terminal.print_json_usage_error(error)
+            raise
+
+
 app = Typer(
     name="rig",
+    cls=_Commands,
     help=(
         "Excite a hybrid haptic actuator (DC motor and magnetorheological brake), log every "
         "sample, and identify its parameters.\n\n"

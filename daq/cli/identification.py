@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from daq import notation
@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from daq.identification.comparison import ComparisonResult, SeedsResult
     from daq.identification.result import Identification
     from daq.identification.rows import (
-        LogErrors,
         OutputErrors,
         ParameterRow,
         QuantityRow,
@@ -106,10 +105,9 @@ def _show_parameters(result: Identification) -> None:
 
 def _parameter_row(result: Identification, row: ParameterRow) -> list[str]:
     # One unit for the whole row, chosen by its value.
-    scale, unit = notation.engineering(row.value, row.unit)
+    scale, unit = row.engineering
     source = "data" if row.name in result.estimator.guesses_ else row.source
-    digits = row.digits if result.rows.refined else 4
-    value = terminal.number(scale * row.value, digits)
+    value = row.text(row.value, scale)
     if row.range is None:
         how = f"= {row.tied}" if row.tied is not None else "fixed"
         return [row.name, value, "", unit, how, source, ""]
@@ -124,14 +122,13 @@ def _span(
     """A range as text; brackets mark an end where the search starts, but which is no bound."""
     bounds = zip(ends, configured or ends, strict=True)
     return " .. ".join(
-        f"({scale * end:g})" if bound is None else f"{scale * end:g}" for end, bound in bounds
+        f"({notation.shortest(scale * end)})" if bound is None else notation.shortest(scale * end)
+        for end, bound in bounds
     )
 
 
 def _interval(row: QuantityRow, scale: float) -> str:
-    return row.interval_text(
-        lambda end: terminal.number(scale * end, row.digits), between=" .. ", empty="-"
-    )
+    return row.interval_text(lambda end: row.text(end, scale), between=" .. ", empty="-")
 
 
 def _show_open_questions(rows: Rows) -> None:
@@ -161,12 +158,12 @@ def _show_rivals(rows: Rows) -> None:
 
 def _rival_row(row: ParameterRow, rivals: Sequence[RivalRow]) -> list[str]:
     """One parameter in this result and in each rival, all in the unit of the first."""
-    scale, unit = notation.engineering(row.value, row.unit)
+    scale, unit = row.engineering
     answers = [(row.value, row.here or (None, None))]
     answers += [(r.values[row.name], r.intervals.get(row.name, (None, None))) for r in rivals]
-    cells = [terminal.number(scale * value, row.digits) for value, _ in answers]
+    cells = [row.text(value, scale) for value, _ in answers]
     for k, (_, ends) in enumerate(answers):
-        written = ["?" if end is None else terminal.number(scale * end, row.digits) for end in ends]
+        written = ["?" if end is None else row.text(end, scale) for end in ends]
         cells[k] += f" ({written[0]} .. {written[1]})"
     return [row.name, *cells, unit]
 
@@ -178,8 +175,8 @@ def _show_products(rows: Rows) -> None:
             print("What no data of these outputs can tell apart:")
         terminal.print_text(f"  {', '.join(ambiguity.parameters)} act only together.")
         for row in ambiguity.determined:
-            scale, unit = notation.engineering(row.value, row.unit)
-            value = terminal.number(scale * row.value, row.digits)
+            scale, unit = row.engineering
+            value = row.text(row.value, scale)
             quantity = value if unit in {"", "1"} else f"{value} {unit}"
             interval = _interval(row, scale)
             ends = f"95 % interval {interval}" if row.interval else row.undetermined_label
@@ -200,11 +197,15 @@ def _show_products(rows: Rows) -> None:
 
 
 def _show_profiles(profiles: Sequence[Profile]) -> None:
+    from daq.identification.rows import QuantityRow
+
     rows = []
     for profile in profiles:
         # None where the profile never rises enough: the data set no end on that side.
-        ends = ["open" if p is None else terminal.number(p) for p in (profile.low, profile.high)]
-        rows.append([profile.name, terminal.number(profile.value), " .. ".join(ends), profile.unit])
+        ends = profile.low, profile.high
+        row = QuantityRow(profile.name, profile.value, profile.unit, ends)
+        scale, unit = row.engineering
+        rows.append([row.name, row.text(row.value, scale), _interval(row, scale), unit])
     if rows:
         head = ["parameter", "value", "95 % interval", "unit"]
         terminal.print_table("Profile likelihood", head, rows, text=["unit"])
@@ -215,11 +216,13 @@ def _show_errors(rows: Rows) -> None:
 
     training, validation = rows.logs["training"], rows.logs["validation"]
     if len(training) == 1 and len(validation) <= 1:
-        print_errors(training[0].outputs, [log.outputs for log in validation])
+        print_errors({part: logs[0].outputs for part, logs in rows.logs.items() if logs}, "data")
         return
     for part, logs in rows.logs.items():
         if logs:
-            _print_logs(f"{part.capitalize()} logs", logs, mean_errors(logs))
+            errors = {log.name: log.outputs for log in logs}
+            mean = {"mean": mean_errors(logs)} if len(logs) > 1 else {}
+            print_errors({**errors, **mean}, f"{part} log")
 
 
 def _show_residuals(rows: Rows) -> None:
@@ -234,6 +237,8 @@ def _show_residuals(rows: Rows) -> None:
 
 
 def _show_notes(result: Identification) -> None:
+    from daq.identification.rows import start_sentences
+
     rows, verdict = result.rows, result.verdict
     if result.interrupted:
         terminal.print_text(
@@ -256,7 +261,7 @@ def _show_notes(result: Identification) -> None:
         terminal.print_text(f"{subject}: {statement.trust}. {' '.join(statement.reasons)}")
     for note in verdict.notes:
         terminal.print_text(note)
-    for line in _starts(result):
+    for line in start_sentences(result.document["metrics"]["validation"]):
         terminal.print_text(line)
     if rows.refined:
         terminal.print_text(rows.determined_sentence)
@@ -265,65 +270,22 @@ def _show_notes(result: Identification) -> None:
                 terminal.print_text(sentence)
 
 
-def _starts(result: Identification) -> Iterator[str]:
-    """Where validations start that were estimated, and what their first samples would give."""
-    for log in result.validation:
-        starts = log.result.starts
-        if starts is None or starts.first_fit is None:
-            continue
-        number = terminal.number
-        where = [
-            f"{s.state} at {number(s.value, 3)} {s.unit}, {number(s.value - s.first, 2)} from its "
-            f"first sample (searched in {number(s.low, 3)} .. {number(s.high, 3)})"
-            for s in starts.estimates
-            if s.first == s.first
-        ]
-        fits = ", ".join(
-            f"{name} {fit:.1f} -> {first:.1f} %"
-            for name, fit, first in zip(
-                result.model.output_names, log.result.metrics.fit, starts.first_fit, strict=True
-            )
-        )
-        yield f"{log.result.name} starts with {'; '.join(where)}. From the first samples: {fits}."
+def print_errors(errors: Mapping[str, Mapping[str, OutputErrors]], of: str = "") -> None:
+    """Table of RMSE, MSD and fit of each output, a line for each log.
 
-
-def print_errors(
-    training: Mapping[str, OutputErrors],
-    validation: Sequence[Mapping[str, OutputErrors]] = (),
-    label: str = "training",
-) -> None:
-    """Table of RMSE, MSD and fit of each output, on one log or on two."""
-    head = ["output", f"RMSE, {label}", "MSD", "RMSE", "fit [%]"]
-    if validation:
-        head += ["RMSE, validation", "MSD", "RMSE", "fit [%]"]
+    errors: by log, by output. of: what the logs are called, empty of a single one.
+    """
+    head = ["output", *([of] if of else []), "RMSE", "MSD", "in its unit", "fit [%]"]
     rows = []
-    for output in training:
-        row = [output]
-        for errors in (log[output] for log in (training, *validation)):
-            row += [terminal.number(errors.rmse, 3), terminal.number(errors.msd, 2)]
-            row += [_absolute(errors), f"{errors.fit_percent:.1f}"]
-        rows.append(row)
-    title = "Free-run simulation, RMSE and MSD in parts of max|y|, then RMSE in the output's unit"
-    terminal.print_table(title, head, rows)
-
-
-def _absolute(errors: OutputErrors) -> str:
-    """RMSE with its unit."""
-    scale, unit = notation.engineering(errors.rmse_absolute, errors.unit)
-    value = terminal.number(scale * errors.rmse_absolute, 3)
-    return value if unit in {"", "1"} else f"{value} {unit}"
-
-
-def _print_logs(title: str, logs: Sequence[LogErrors], mean: Mapping[str, OutputErrors]) -> None:
-    head = ["log", *(f"fit of {name} [%]" for name in mean), *(f"RMSE of {n}" for n in mean)]
-    head += [f"{name} [{errors.unit or '1'}]" for name, errors in mean.items()]
-    rows = []
-    for name, outputs in [*((log.name, log.outputs) for log in logs), ("mean", mean)]:
-        fits = [f"{errors.fit_percent:.1f}" for errors in outputs.values()]
-        parts = [terminal.number(errors.rmse, 3) for errors in outputs.values()]
-        absolute = [terminal.number(errors.rmse_absolute, 3) for errors in outputs.values()]
-        rows.append([name, *fits, *parts, *absolute])
-    terminal.print_table(f"{title}: RMSE in parts of max|y|, then in units", head, rows)
+    for output in next(iter(errors.values())):
+        for place, (log, outputs) in enumerate(errors.items()):
+            error = outputs[output]
+            cells = [terminal.number(error.rmse, 3), terminal.number(error.msd, 2)]
+            cells += [notation.quantity(error.rmse_absolute, error.unit)]
+            cells += [notation.percent(error.fit_percent)]
+            rows.append(["" if place else output, *([log] if of else []), *cells])
+    title = "Free run: RMSE and MSD in parts of max|y|, RMSE in the output's unit, fit"
+    terminal.print_table(title, head, rows, text=[of])
 
 
 def show_comparison(

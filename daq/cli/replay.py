@@ -62,9 +62,7 @@ def replay(
         shared = {"log": first.path, "figure": drawn, "fail_under": bounds, "passed": passed}
         terminal.print_json({**several, **shared})
     else:
-        for result, document in zip(results, documents, strict=True):
-            through = f"{result.path} through {result.title}"
-            _show(through, document["outputs"])
+        _show(results, documents)
         if drawn is not None:
             print(f"Figure: {drawn}")
         if all(document["passed"] for document in documents):
@@ -108,13 +106,19 @@ def _document(result: Replay, bounds: Mapping[str, float]) -> dict[str, Any]:
     }
 
 
-def _show(title: str, errors: dict[str, dict[str, Any]]) -> None:
+def _show(results: Sequence[Replay], documents: Sequence[Mapping[str, Any]]) -> None:
     from daq.cli.identification import print_errors
+    from daq.identification.replay import short_names
     from daq.identification.rows import OutputErrors
 
-    print(title)
-    shown = {name: OutputErrors.of(each) for name, each in errors.items()}
-    print_errors(shown, label="replay")
+    tables = (document["outputs"].items() for document in documents)
+    errors = {
+        label: {name: OutputErrors.of(each) for name, each in outputs}
+        for label, outputs in zip(short_names(results), tables, strict=True)
+    }
+    titles = " and ".join(result.title for result in results)
+    terminal.print_text(f"{results[0].path} through {titles}")
+    print_errors(errors, "model" if len(results) > 1 else "")
 
 
 def _bounds(texts: list[str]) -> dict[str, float]:

@@ -167,10 +167,7 @@ def _quantity(row: QuantityRow | None, interval: bool = False) -> str:
 
 
 def _cells(row: QuantityRow) -> tuple[str, str]:
-    def write(value: float) -> str:
-        return terminal.number(value, row.digits)
-
-    return write(row.value), row.interval_text(write, " .. ", "")
+    return row.text(row.value), row.interval_text(row.text, " .. ", "")
 
 
 def _text(value: object) -> str:

@@ -34,6 +34,7 @@ _documents: ContextVar[TextIO | None] = ContextVar("documents", default=None)
 _has_document: ContextVar[bool] = ContextVar("has_document", default=False)
 _VOLUMES = {"warning": Volume.QUIET, "note": Volume.NORMAL, "detail": Volume.VERBOSE}
 _VERBOSE_PERIOD = 1.0  # s between lines of progress
+_BESIDE_BAR = 70  # columns of a progress line beside its bar: name, status, time
 
 
 @contextmanager
@@ -131,6 +132,20 @@ def print_json_error(error: RigError) -> None:
     ]
     notes = getattr(error, "__notes__", [])
     print_json({"exit_status": error.exit_status, "errors": errors, "notes": notes})
+
+
+def print_json_usage_error(error: Any) -> None:
+    """The document of a command line that makes no sense; error: of Typer's, with its message."""
+    parameter, context = getattr(error, "param", None), getattr(error, "ctx", None)
+    mistake = {
+        "error": error.format_message(),
+        "file": None,
+        "line": None,
+        "column": None,
+        "key": getattr(error, "option_name", None) or getattr(parameter, "name", None),
+        "cure": None if context is None else f"see {context.command_path} --help",
+    }
+    print_json({"exit_status": error.exit_code, "errors": [mistake], "notes": []})
 
 
 def print_text(text: str) -> None:
@@ -284,15 +299,16 @@ def _bars() -> Iterator[Callable[[Progress], None]]:
     from rich import progress
     from rich.console import Console
 
-    columns = (
-        progress.TextColumn("{task.description:<22}"),
-        progress.BarColumn(bar_width=30),
+    console = Console(file=sys.stderr)
+    columns = [
+        progress.TextColumn("{task.description:<20}"),
+        progress.BarColumn(bar_width=max(2, min(30, console.width - _BESIDE_BAR))),
         progress.TextColumn("{task.fields[note]}"),
         progress.TimeElapsedColumn(),
-        progress.TextColumn("[dim]left"),
-        progress.TimeRemainingColumn(),
-    )
-    with progress.Progress(*columns, console=Console(file=sys.stderr)) as bars:
+    ]
+    if console.width >= _BESIDE_BAR + 22:
+        columns += [progress.TextColumn("[dim]left"), progress.TimeRemainingColumn()]
+    with progress.Progress(*columns, console=console) as bars:
         tasks: dict[str, progress.TaskID] = {}
 
         def update(step: Progress) -> None:

@@ -1,18 +1,20 @@
-"""A linear model beside an identification: what physics adds to knowing none."""
+"""Linear models beside an identification: what physics adds to knowing none."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from daq.identification.records import LoggedRecord
-from sysid import ModelError
+from sysid import Dataset, ModelError
 from sysid.arrays import FloatArray
-from sysid.linear import ARMAX, tuned
+from sysid.linear import OE, tuned
 from sysid.problem.metrics import Metrics, evaluate
 from sysid.problem.model import ProcessModel
+from sysid.problem.regressors import with_regressors
 
-# Orders tried, few enough for a second: each output's own search is small.
-_NA, _NB, _NC = range(1, 5), range(1, 4), (0, 2)
+# Orders tried, few enough for a second; and those of the fit in hindsight.
+_NF, _NB = range(1, 4), range(1, 3)
+_RICHEST = {"nf": 4, "nb": 2}
 # Samples times outputs times signals beyond which even these take long.
 _LARGEST = 80_000
 
@@ -21,7 +23,8 @@ _LARGEST = 80_000
 class Baseline:
     """A fitted linear model: its orders, errors on every log, and free runs over some.
 
-    runs: of each validation log, (n_samples, n_outputs).
+    training: empty of a model that was fitted to the validation data. runs: of each validation
+    log, (n_samples, n_outputs). inputs: what it was given beside the model's inputs.
     """
 
     name: str
@@ -29,36 +32,72 @@ class Baseline:
     training: Sequence[Metrics]
     validation: Sequence[Metrics]
     runs: Sequence[FloatArray]
+    inputs: tuple[str, ...] = ()
 
 
-def baseline_of(
+def baselines_of(
     model: ProcessModel, training: Sequence[LoggedRecord], validation: Sequence[LoggedRecord]
-) -> Baseline | str:
-    """ARMAX with orders chosen on the ends of the training logs, or why there is none.
+) -> list[Baseline] | str:
+    """Output-error models, the best linear free runs there are; or why there are none.
 
-    There is none for logs too short, too long for the time that a report may take, of several
-    sample times, or with free runs that grow without bounds.
+    First one with orders chosen on the ends of the training logs; then one with the model's
+    ``regressors`` as further inputs, if it has any; then one that is fitted to the validation logs
+    themselves: what other orders or training data would not make a linear model exceed by much.
+    There are none for logs too short, too long for the time that a report may take, or of several
+    sample times.
     """
     q, m = len(model.outputs), len(model.inputs)
-    groups = [[log.dataset for log in logs] for logs in (training, validation)]
-    rows = sum(record.n_samples for record in groups[0])
+    records = [[log.dataset for log in logs] for logs in (training, validation)]
+    rows = sum(record.n_samples for record in records[0])
     if not m:
         return "the model has no inputs"
     if rows * q * (q + m) > _LARGEST:
         return (
             f"choosing its orders on {rows} samples takes longer than a report may; "
-            "rig identify --armax does it"
+            "rig identify --oe does it"
         )
-    # An input held from its sample on acts first on the next row; an interpolated one at once.
-    first = [[int(signal.hold == "zoh") for signal in model.inputs]] * q
     try:
-        selection = tuned(ARMAX(stable=True), groups[0], na=_NA, nb=_NB, nc=_NC, nk=[first])
-        runs = [[selection.model.predict(record) for record in records] for records in groups]
+        baselines = [_tuned("OE", *records)]
+        extended, names = _extended(model, records)
+        if names:
+            baselines.append(replace(_tuned("OE, more inputs", *extended), inputs=names))
+        if validation:
+            baselines.append(_in_hindsight(baselines[0], records[1]))
     except ModelError as error:
         return str(error)
+    return baselines
+
+
+def _tuned(name: str, training: Sequence[Dataset], validation: Sequence[Dataset]) -> Baseline:
+    selection = tuned(OE(), training, nf=_NF, nb=_NB)
+    return _judged(name, selection.best.orders, selection.model, training, validation)
+
+
+def _in_hindsight(tuned: Baseline, validation: Sequence[Dataset]) -> Baseline:
+    """Fitted to what it is judged on, to which no more of the other's choices matter."""
+    orders = {**_RICHEST, "nk": tuned.orders["nk"]}
+    fitted = OE(**orders).fit(list(validation))
+    return _judged("OE, in hindsight", orders, fitted, (), validation)
+
+
+def _judged(
+    name: str,
+    orders: dict[str, Any],
+    model: OE,
+    training: Sequence[Dataset],
+    validation: Sequence[Dataset],
+) -> Baseline:
+    runs = [[model.predict(record) for record in records] for records in (training, validation)]
     trained, validated = [
         [evaluate(record.outputs, run) for record, run in zip(records, simulated, strict=True)]
-        for records, simulated in zip(groups, runs, strict=True)
+        for records, simulated in zip((training, validation), runs, strict=True)
     ]
-    orders = {name: order for name, order in selection.best.orders.items() if name != "nk"}
-    return Baseline("ARMAX", orders, trained, validated, runs[1])
+    return Baseline(name, orders, trained, validated, runs[1])
+
+
+def _extended(
+    model: ProcessModel, parts: Sequence[Sequence[Dataset]]
+) -> tuple[list[list[Dataset]], tuple[str, ...]]:
+    """Records with the model's regressors as inputs, and their names."""
+    pairs = [[with_regressors(model, record) for record in records] for records in parts]
+    return [[record for record, _ in part] for part in pairs], pairs[0][0][1]

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import os
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,7 +19,7 @@ from daq.hal import FloatArray, Simulation
 from daq.identification.fit import take
 from daq.identification.request import SettingsRequest
 from daq.identification.result import Identification
-from daq.identification.settings import Problem, columns_of, problem_of, with_signals
+from daq.identification.settings import Problem, columns_of, problem_of, selection_of, with_signals
 from daq.lookup.models import find_model
 from daq.lookup.rigs import DEFAULT_RIG, load_rig
 from sysid import BatchSimulator, Metrics, ModelError, ProcessModel, evaluate, free_run
@@ -34,7 +36,8 @@ class Replay:
     """A log's inputs through a model, beside what was measured.
 
     time: (n,) [s]. measured, simulated: (n, n_outputs) in the outputs' units. source: where the
-    parameters come from. warning: how the logged run ended if it did not complete.
+    parameters come from. warning: how the logged run ended if it did not complete. config: what
+    gave a model by name values that are not its own.
 
     >>> from daq import record, replay
     >>> result = replay(record("prbs.yaml"))
@@ -50,12 +53,14 @@ class Replay:
     simulated: FloatArray
     metrics: Metrics
     warning: str | None
+    config: Path | None = None
 
     @property
     def title(self) -> str:
         """The model, and where its parameters come from."""
         if self.source.partition(":")[0] == self.model.name:
-            return f"{self.source} at its own values"
+            values = "at its own values" if self.config is None else f"with values of {self.config}"
+            return f"{self.source} {values}"
         return f"{self.model.name} with the parameters of {self.source}"
 
     @property
@@ -112,29 +117,31 @@ def replay(
 
     log: as for ``identify``. parameters: an identification or its ``parameters.yaml``. model: in
     place of parameters a model by name, at its own values, such as ``actuator:parameters=A``.
-    config: settings of ``identify``, of which the columns of a foreign log count, and without
-    parameters its model, fixed and tied values, outputs and starts. Without any of these the
-    parameters are those of the simulated ``rig``. trust: run the Python file of a model that
-    ``parameters.yaml`` names. Raises ConfigError.
+    config: settings of ``identify``, of which the columns of a foreign log and the part of it that
+    is used count, and without parameters its model, fixed and tied values, outputs and starts.
+    Without any of these the parameters are those of the simulated ``rig``. trust: run the Python
+    file of a model that ``parameters.yaml`` names. Raises ConfigError.
 
     >>> from daq import record, replay
     >>> result = replay(record("prbs.yaml"))  # through the simulated rig's own model
     >>> result.fit["current_motor"] > 95.0
     True
     """
-    file = Path(config) if config is not None else None
-    if parameters is None and (model is not None or (file is not None and _names_model(file))):
+    file, valued = None if config is None else Path(config), None
+    if parameters is None and (model is not None or (file is not None and _sets_values(file))):
         problem = problem_of(SettingsRequest(None if file is None else str(file), {"model": model}))
         chosen, values, source = problem.model, _declared(problem), problem.model_name
-        mapping = problem.mapping
+        settings = problem.settings
+        valued = file if settings.fixed or settings.tied or problem.given else None
+        mapping, selection = problem.mapping, problem.selection
     elif model is not None:
         raise ConfigError(
             "a result names its own model", cure="give --parameters or --model", key="--model"
         )
     else:
         chosen, values, source = _parameters(parameters, str(rig), trust)
-        mapping = columns_of(file, chosen)
-    logged = take(log, "data", chosen, mapping)
+        mapping, selection = columns_of(file, chosen), selection_of(file, chosen)
+    logged = take(log, "data", chosen, mapping, selection)
     record = logged.dataset
     try:
         simulated = free_run(BatchSimulator(chosen), chosen.vector(values), record)
@@ -142,11 +149,27 @@ def replay(
         raise ConfigError(str(error)) from None
     time = np.arange(record.n_samples, dtype=np.float64) * record.dt
     metrics, measured = evaluate(record.outputs, simulated), record.outputs
-    return Replay(logged.path, chosen, source, time, measured, simulated, metrics, logged.warning)
+    return Replay(
+        logged.path, chosen, source, time, measured, simulated, metrics, logged.warning, valued
+    )
 
 
-def _names_model(config: Path) -> bool:
-    return yaml_file.load(config).content.get("model") is not None
+def _sets_values(config: Path) -> bool:
+    """Whether a configuration says which model it is, or gives it values."""
+    content = yaml_file.load(config).content
+    return any(content.get(key) is not None for key in ("model", "fixed", "tied", "given"))
+
+
+def short_names(replays: Sequence[Replay]) -> list[str]:
+    """Where each has its parameters from, without what all have in common up to an option.
+
+    >>> from types import SimpleNamespace as Named
+    >>> short_names([Named(source="actuator:parameters=A"), Named(source="actuator:parameters=B")])
+    ['A', 'B']
+    """
+    alike = os.path.commonprefix([replay.source for replay in replays])  # noqa: RUF071
+    common = re.split(r"[^:,=]*$", alike)[0]
+    return [replay.source.removeprefix(common) or replay.source for replay in replays]
 
 
 def _declared(problem: Problem) -> dict[str, float]:

@@ -444,14 +444,17 @@ def _averaged(result: Identification) -> dict[str, str]:
 def _log(model: ProcessModel, log: FittedLog) -> dict[str, Any]:
     """Errors and residual tests of each output on one log."""
     residuals, outputs = log.result.residuals, {}
+    tested = np.flatnonzero(residuals.tested)
     for j, (name, errors) in enumerate(errors_document(model, log.result.metrics).items()):
         outputs[name] = {
             **errors,
             **_in_parts_of_noise(log.result, j),
             "residual_autocorrelation_in_band": float(residuals.white[j]),
             "residual_independent_of": {
-                model.input_names[i]: float(residuals.independent[j, i])
-                for i in np.flatnonzero(residuals.tested)
+                model.input_names[i]: float(residuals.independent[j, i]) for i in tested
+            },
+            "residual_independence_bands": {
+                model.input_names[i]: float(residuals.cross_band[j, i]) for i in tested
             },
         }
     entry = {"log": str(log.log.path), "name": log.result.name, "outputs": outputs}

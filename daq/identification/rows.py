@@ -13,6 +13,7 @@ from functools import cached_property
 from typing import Any
 
 from daq import notation
+from daq.notation import percent, quantity
 
 _Z95 = 1.96
 LABELS = {  # of undetermined reasons
@@ -58,9 +59,45 @@ class QuantityRow:
         return (high - low) / (2.0 * _Z95)
 
     @property
+    def engineering(self) -> tuple[float, str]:
+        """Factor and unit in which its value has one to three digits before the point."""
+        return notation.engineering(self.value, self.unit)
+
+    def text(self, number: float, scale: float = 1.0) -> str:
+        """The value, or an end of an interval, times the scale, as fine as the interval supports.
+
+        All of a quantity's numbers have the same last decimal place, with two digits at least
+        where the interval does not reach through zero.
+        """
+        low, high = self.interval or self.here or (None, None)
+        through_zero = low is not None and high is not None and low < 0.0 < high
+        largest = max(abs(self.value), (self.deviation or 0.0) if through_zero else 0.0)
+        if number == 0.0 or not math.isfinite(number) or not 0.0 < largest < math.inf:
+            return notation.number(scale * number)
+        beyond = math.floor(math.log10(abs(number))) - math.floor(math.log10(largest))
+        digits = min(self.digits + beyond, self.digits + 1)
+        if digits < 1 and through_zero:
+            return "0"
+        return notation.number(scale * number, max(digits, 1 if through_zero else 2))
+
+    @property
     def two_sided(self) -> bool:
         """Whether it has an interval with both ends."""
         return self.interval is not None and None not in self.interval
+
+    @property
+    def narrow(self) -> bool:
+        """Whether the digits of a value do not tell the ends of its interval apart."""
+        low, high = self.interval or (None, None)
+        if low is None or high is None or low == high:
+            return False
+        return self.text(low) == self.text(high)
+
+    @property
+    def half_width(self) -> float:
+        """Half of an interval that has both ends, else NaN."""
+        low, high = self.interval or (None, None)
+        return math.nan if low is None or high is None else 0.5 * (high - low)
 
     @property
     def undetermined_label(self) -> str:
@@ -69,12 +106,17 @@ class QuantityRow:
         return ", ".join(filter(None, (LABELS.get(self.undetermined, ""), fails)))
 
     def interval_text(self, write: Callable[[float], str], between: str, empty: str) -> str:
-        """The interval with its ends written: ``1.0 .. 1.2``, ``< 1.2``, or ``> 1.0``."""
+        """The interval with its ends written: ``1.0 .. 1.2``, ``< 1.2``, or ``> 1.0``.
+
+        ``± 3.0e-12`` where the digits of the ends do not tell them apart.
+        """
         low, high = self.interval or (None, None)
         if low is None and high is None:
             return empty
         if low is None or high is None:
             return f"< {write(high)}" if high is not None else f"> {write(low or 0.0)}"
+        if self.narrow:
+            return f"± {write(self.half_width)}"
         return f"{write(low)}{between}{write(high)}"
 
 
@@ -102,8 +144,14 @@ class ParameterRow(QuantityRow):
 
     @property
     def digits(self) -> int:
-        """Significant digits: of a fixed or tied one four."""
-        return super().digits if self.free else 4
+        """Significant digits: of a tied one, and where no interval was looked for, four."""
+        sought = self.free and (self.interval is not None or bool(self.undetermined))
+        return super().digits if sought else 4
+
+    def text(self, number: float, scale: float = 1.0) -> str:
+        """As of any quantity; what was fixed as it was given."""
+        fixed = not self.free and self.tied is None
+        return notation.shortest(scale * number) if fixed else super().text(number, scale)
 
     @property
     def label(self) -> str:
@@ -310,9 +358,8 @@ class Rows:
         several = len(self.logs["training"]) > 1
         parts = "The logs" if several else "Parts of the log"
         return (
-            f"{parts} want parameters of their own: they differ by {self.disagreement**0.5:.1f} "
-            "times what noise explains, so that model or sensors are not quite what they are taken "
-            "for. The intervals are as wide as that spread."
+            f"{parts}, each by itself, give parameters {self.disagreement**0.5:.1f} times as far "
+            "apart as noise explains; the intervals are as wide as that spread."
         )
 
     @cached_property
@@ -334,6 +381,36 @@ def logs_of(metrics: Mapping[str, Any], part: str) -> tuple[LogErrors, ...]:
         LogErrors(log.get("name", ""), {k: OutputErrors.of(e) for k, e in log["outputs"].items()})
         for log in metrics[part]
     )
+
+
+def start_sentences(logs: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Where logs start that were estimated, and what their first samples would give.
+
+    logs: of a document's ``metrics``.
+    """
+    sentences = []
+    for log in logs:
+        if "fit_percent_from_first_sample" not in log:
+            continue
+        where = [
+            f"{state} at {quantity(start['value'], start['unit'])}, "
+            f"{quantity(start['value'] - start['first_sample'], start['unit'], 2)} from its first "
+            f"sample (searched in {quantity(start['range'][0], start['unit'])} .. "
+            f"{quantity(start['range'][1], start['unit'])})"
+            for state, start in log["starts"].items()
+            if start.get("first_sample") is not None
+        ]
+        fits = [
+            f"{name} {percent(errors['fit_percent'])} -> {percent(_number(first))} %"
+            for (name, errors), first in zip(
+                log["outputs"].items(), log["fit_percent_from_first_sample"].values(), strict=True
+            )
+        ]
+        sentences.append(
+            f"{log['name']} starts with {'; '.join(where)}. From the first sample: "
+            f"{', '.join(fits)}."
+        )
+    return sentences
 
 
 def mean_errors(logs: Sequence[LogErrors]) -> dict[str, OutputErrors]:

@@ -153,11 +153,14 @@ def _without_nulls(file: File, models: Sequence[ProcessModel]) -> tuple[File, fr
     content, mistakes = dict(file.content), []
     for group, kind in _KEYED_BY.items():
         entries, names = content.get(group), _all_names(models, kind)
+        if group in content and entries is None:
+            content[group] = {}
         if not isinstance(entries, Mapping):
             continue
         for name in entries:
             if entries[name] is None and name not in names:
-                mistakes.append(file.mistake((group, str(name)), suggestion(str(name), names)))
+                problem = "the model has no such name; " + suggestion(str(name), names)
+                mistakes.append(file.mistake((group, str(name)), problem))
         content[group] = {name: value for name, value in entries.items() if value is not None}
     check.refuse(mistakes)
     fixed = file.content.get("fixed")
@@ -191,16 +194,29 @@ def columns_of(config: Path | None, model: ProcessModel) -> ColumnMapping | None
 
     The file may name another, for which the columns serve as well; ConfigError where they do not.
     """
-    if config is None:
-        return None
-    file, unconverted = in_model_units(yaml_file.load(config), [model])
-    columns = check.validate(file, IdentificationConfig, others=unconverted).columns
-    if columns is None:
+    file, settings = _configuration(config, model)
+    columns = settings.columns
+    if file is None or columns is None:
         return None
     mapping = ColumnMapping(file, columns)
     # The file may be of a comparison, in which other models have other signals.
     records.check_mapping(model, mapping, {"inputs": columns.inputs, "outputs": columns.outputs})
     return mapping
+
+
+def selection_of(config: Path | None, model: ProcessModel) -> Selection:
+    """Which samples of a log count by a configuration, whatever model it names; ConfigError."""
+    file, settings = _configuration(config, model)
+    return Selection(settings.use, settings.run_in, settings.robust, file)
+
+
+def _configuration(
+    config: Path | None, model: ProcessModel
+) -> tuple[YamlFile | None, IdentificationConfig]:
+    if config is None:
+        return None, IdentificationConfig()
+    file, unconverted = in_model_units(yaml_file.load(config), [model])
+    return file, check.validate(file, IdentificationConfig, others=unconverted)
 
 
 def gassi_settings(problem: Problem) -> dict[str, Any]:

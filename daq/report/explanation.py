@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from daq.identification.rows import Rows, logs_of, mean_errors
+from daq.identification.rows import OutputErrors, Rows, logs_of, mean_errors, start_sentences
 from daq.lookup.models import trust_option
 from sysid import ProcessModel
 
@@ -28,7 +28,6 @@ class Step:
 def view(model: ProcessModel, document: Mapping[str, Any], rows: Rows) -> dict[str, Any]:
     """Variables of the page's template, beside the document and its rows."""
     comparison, search = document["comparison"], document["search"]
-    baseline = comparison if "metrics" in comparison else None
     logs = rows.logs["training"]
     quantities = [*rows.determined, *rows.bounded, *rows.combinations]
     names = " ".join(row.name for row in quantities)
@@ -41,17 +40,19 @@ def view(model: ProcessModel, document: Mapping[str, Any], rows: Rows) -> dict[s
         "quantities": quantities,
         "determined": _determined(document, rows),
         "data_sentence": _data_sentence(document["reproduction"]["logs"]),
-        "tables": {part: _errors(rows, baseline, part) for part in ("training", "validation")},
+        "tables": {
+            part: _errors(rows, comparison.get("baselines", ()), part)
+            for part in ("training", "validation")
+        },
         "log_rows": _log_rows(document["reproduction"]["logs"], rows),
-        "log_outputs": list(logs[0].outputs),
-        "baseline": baseline,
-        "baseline_sentence": _baseline_sentence(comparison),
+        "baseline_sentences": _baseline_sentences(comparison, rows),
         "meanings": {p.name: p.description for p in model.parameters},
         "described": any(p.description for p in model.parameters),
         "no_intervals": "the search was interrupted" if interrupted else unrefined,
         "rival": next(iter(rows.ambiguities_of("rival")), None),
         # States that a combination holds the start of.
         "starts": {name: f"{name}(0)" for name in model.state_names if f"{name}(0)" in names},
+        "start_sentences": start_sentences(document["metrics"]["validation"]),
         "steps": _steps(document, rows),
         "ended": _ENDED[search["stopped"]],
     }
@@ -103,12 +104,16 @@ def _data_sentence(logs: Sequence[Mapping[str, Any]]) -> str:
     return f"{', '.join(parts)}, which took no part in the fit."
 
 
-def _errors(rows: Rows, baseline: Mapping[str, Any] | None, part: str) -> list[dict[str, Any]]:
-    """A row for each output: errors of the model, then of the baseline, mean over the logs."""
-    columns = [mean_errors(rows.logs[part])]
-    if baseline is not None:
-        columns.append(mean_errors(logs_of(baseline["metrics"], part)))
-    return [{"name": name, "cells": [column[name] for column in columns]} for name in columns[0]]
+def _errors(
+    rows: Rows, baselines: Sequence[Mapping[str, Any]], part: str
+) -> dict[str, dict[str, OutputErrors]]:
+    """Of each output the errors of the model, then of each baseline, mean over the logs."""
+    models = {"identified": mean_errors(rows.logs[part])}
+    models |= {each["name"]: mean_errors(logs_of(each["metrics"], part)) for each in baselines}
+    return {
+        output: {name: errors[output] for name, errors in models.items() if errors}
+        for output in models["identified"]
+    }
 
 
 def _log_rows(fingerprints: Sequence[Mapping[str, Any]], rows: Rows) -> list[dict[str, Any]]:
@@ -118,20 +123,47 @@ def _log_rows(fingerprints: Sequence[Mapping[str, Any]], rows: Rows) -> list[dic
         {
             **{key: log[key] for key in ("name", "use", "samples")},
             "seconds": log["samples"] / log["sample_rate"],
-            "outputs": list(errors[log["use"], log["name"]].values()),
+            "outputs": errors[log["use"], log["name"]],
         }
         for log in fingerprints
     ]
 
 
-def _baseline_sentence(comparison: Mapping[str, Any]) -> str:
+def _baseline_sentences(comparison: Mapping[str, Any], rows: Rows) -> list[str]:
+    """What the linear models are, and how they were made as good as they can be."""
     if "left_out" in comparison:
-        return f"No linear baseline: {comparison['left_out']}."
-    orders = ", ".join(f"{name} = {order}" for name, order in comparison["orders"].items())
-    return (
-        f"{comparison['name']} is a linear model of the same data that knows no physics "
-        f"(A(q) y = B(q) u + C(q) e with the shift q, white noise e and the orders {orders}): what "
-        "the equations must beat."
+        return [f"No linear baseline: {comparison['left_out']}."]
+    first, *others = comparison["baselines"]
+    outputs = list(rows.logs["training"][0].outputs)
+    sentences = [
+        "OE (output error) is a linear model of the same data that knows no physics, "
+        "y = B(q)/F(q) u + constant + e with the shift q: what the equations must beat. It is "
+        "fitted by the error of its free run, by which all are judged here; of its orders those "
+        f"that serve the end of the training data best ({_orders(first['orders'], outputs)})."
+    ]
+    for baseline in others:
+        if "more_inputs" in baseline:
+            more = " and ".join(baseline["more_inputs"])
+            sentences.append(
+                f"“{baseline['name']}” has {more} as an input as well, of measured outputs, which "
+                "is more than a free run is otherwise given."
+            )
+        if not baseline["metrics"]["training"]:
+            sentences.append(
+                f"“{baseline['name']}” is fitted to the validation data themselves: where even "
+                "that is far below the identified model, no linear model would do."
+            )
+    return sentences
+
+
+def _orders(orders: Mapping[str, Any], outputs: Sequence[str]) -> str:
+    """Poles and coefficients of every output."""
+
+    def of(name: str, j: int) -> Any:
+        return orders[name][j] if isinstance(orders[name], list) else orders[name]
+
+    return "; ".join(
+        f"{output} nf = {of('nf', j)}, nb = {of('nb', j)}" for j, output in enumerate(outputs)
     )
 
 

@@ -10,7 +10,7 @@ _RULES = r"""% With \usepackage{booktabs} its rules are those of booktabs, witho
 \providecommand{\midrule}{\hline}
 \providecommand{\bottomrule}{\hline}
 """
-_SIGNS = str.maketrans({"<": r"\ensuremath{<}", ">": r"\ensuremath{>}"})
+_SIGNS = str.maketrans({"<": r"\ensuremath{<}", ">": r"\ensuremath{>}", "±": r"\ensuremath{\pm}"})
 
 
 def latex(rows: Rows) -> str:
@@ -52,7 +52,7 @@ def _cells(row: QuantityRow) -> list[str]:
     return [
         notation.tex(row.name),
         notation.escape_tex(row.description if isinstance(row, ParameterRow) else ""),
-        notation.number_tex(notation.number(row.value, row.digits)),
+        notation.number_tex(row.text(row.value)),
         _interval(row),
         notation.unit_tex(row.unit),
     ]
@@ -62,7 +62,7 @@ def _interval(row: QuantityRow) -> str:
     if row.interval is not None:
 
         def write(end: float) -> str:
-            return notation.number_tex(notation.number(end, row.digits))
+            return notation.number_tex(row.text(end))
 
         return row.interval_text(write, between=" to ", empty="--").translate(_SIGNS)
     if not isinstance(row, ParameterRow):

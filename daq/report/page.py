@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from markupsafe import Markup, escape
 from matplotlib.figure import Figure
 
 from daq import notation
-from daq.identification.rows import Rows
+from daq.identification.rows import QuantityRow, Rows
 from daq.report.explanation import view
 from sysid import ProcessModel
 
@@ -68,7 +68,10 @@ def rendered(
         "equation": lambda text: Markup(notation.equation(text)),
         "unit": notation.unit_text,
         "number": _number,
-        "plain": lambda value: Markup(notation.number_html(f"{value:g}")),
+        "plain": lambda value: Markup(notation.number_html(notation.shortest(value))),
+        "of": _of,
+        "sized": _sized,
+        "percent": lambda value: _marked(value, notation.percent),
         "marked": lambda text: Markup(_CODE.sub(r"<code>\1</code>", str(escape(text)))),
     }
     figures = [
@@ -79,10 +82,28 @@ def rendered(
 
 
 def _number(value: float | None, digits: int = 3) -> Markup:
-    """A number for people, and the whole of it for machines."""
+    return _marked(value, lambda value: notation.number(value, digits))
+
+
+def _of(value: float | None, row: QuantityRow) -> Markup:
+    """The value of a quantity, or an end of its interval, in the unit that the row is shown in."""
+    return _marked(value, lambda value: row.text(value, row.engineering[0]))
+
+
+def _sized(value: float | None, unit: str) -> Markup:
+    """A number with the multiple of its unit that reads best."""
     if value is None or not math.isfinite(value):
         return Markup("–")
-    shown = notation.number_html(notation.number(value, digits))
+    scale, multiple = notation.engineering(value, unit)
+    number = _marked(value, lambda value: notation.number(scale * value, 3))
+    return Markup(f"{number} {escape(notation.unit_text(multiple))}".rstrip())
+
+
+def _marked(value: float | None, write: Callable[[float], str]) -> Markup:
+    """A number as written for people, and the whole of it for machines."""
+    if value is None or not math.isfinite(value):
+        return Markup("–")
+    shown = notation.number_html(write(value))
     return Markup(f'<span class="n" data-value="{value!r}">{shown}</span>')
 
 

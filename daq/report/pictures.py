@@ -1,6 +1,5 @@
 """The figures of an identification's report: which are drawn, from which arrays."""
 
-import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -21,7 +20,7 @@ from daq.files import write_whole
 from daq.findings import Axis
 from daq.identification.baseline import Baseline
 from daq.identification.records import LoggedRecord
-from daq.identification.replay import Replay
+from daq.identification.replay import Replay, short_names
 from daq.identification.rows import ParameterRow, Rows
 from daq.logs.columns import UNITS
 from daq.logs.recording import load
@@ -140,21 +139,28 @@ def _excitation(subject: Subject) -> Iterator[Picture]:
 
 
 def _residuals(subject: Subject) -> Iterator[Picture]:
-    log, run = (subject.validation or subject.training)[0]
+    part = "validation" if subject.validation else "training"
+    logs = subject.validation or subject.training
+    (log, run), shown = logs[0], subject.document["metrics"][part][0]["outputs"]
     data = log.dataset
     if not np.isfinite(run).all():
         return
     test = residual_test(data.outputs - run, data.inputs, data.input_noise)
+    which = f"{data.name}, the first of {len(logs)}" if len(logs) > 1 else data.name
     lines = {}
     for j, output in enumerate(subject.model.outputs):
         lines[output.name] = {"with its past": test.auto[:, j] / float(test.auto_band[j])}
+        # Those of the table, which know the parameters' uncertainty; of older reports chance's.
+        bands = shown[output.name].get("residual_independence_bands", {})
         for i in np.flatnonzero(test.tested):
-            correlation = test.cross[:, j, i] / float(test.cross_band[j, i])
-            lines[output.name][f"with {subject.model.input_names[i]}"] = correlation
+            name = subject.model.input_names[i]
+            band = float(bands.get(name, test.cross_band[j, i]))
+            lines[output.name][f"with {name}"] = test.cross[:, j, i] / band
     yield Picture(
         "residuals", "residuals",
-        f"Correlation of the residuals ({data.name}) with their own past and with past inputs, in "
-        "parts of the 95 % band (grey): a model that explains all but white noise stays inside.",
+        f"Correlation of the residuals ({which}) with their own past and with past inputs, in "
+        "parts of the 95 % band (grey), that of inputs as wide as the parameters' uncertainty "
+        "makes it: a model that explains all but white noise stays inside.",
         residual_correlations(np.asarray(test.lags * data.dt), lines),
     )  # fmt: skip
 
@@ -392,17 +398,15 @@ def draw_replay(replays: Sequence[Replay], path: Path) -> None:
 
     Raises ConfigError for an unknown format, RunError if the file cannot be written.
     """
-    first, labels = replays[0], ["simulated"]
-    if len(replays) > 1:
-        # What they have in common, up to an option, need not stand in the legend.
-        alike = os.path.commonprefix([replay.source for replay in replays])  # noqa: RUF071
-        common = re.split(r"[^:,=]*$", alike)[0]
-        labels = [replay.source.removeprefix(common) or replay.source for replay in replays]
+    first = replays[0]
+    labels = short_names(replays) if len(replays) > 1 else ["simulated"]
     outputs = []
     for j, output in enumerate(first.model.outputs):
         lines = {"measured": first.measured[:, j]}
         lines |= {k: r.simulated[:, j] for k, r in zip(labels, replays, strict=True)}
-        fits = ", ".join(f"{replay.metrics.fit[j]:.1f}" for replay in replays)
-        outputs.append(Panel(output.name, output.unit, lines, note=f"fit {fits} %"))
+        fits = [_percent(replay.metrics.fit[j]) for replay in replays]
+        named = [f"{label} {fit}" for label, fit in zip(labels, fits, strict=True)]
+        note = f"fit: {', '.join(named)}" if len(fits) > 1 else f"fit {fits[0]}"
+        outputs.append(Panel(output.name, output.unit, lines, note=note))
     kind = style.format_of(path)
     write_whole(path, style.render(responses(first.time, outputs), kind))

@@ -11,7 +11,7 @@ from typing import Any
 from daq.documents import plain
 from daq.figures import style
 from daq.files import make_folder, write_whole
-from daq.identification.baseline import Baseline, baseline_of
+from daq.identification.baseline import Baseline, baselines_of
 from daq.identification.records import LoggedRecord, Split
 from daq.identification.request import SettingsRequest
 from daq.identification.result import Identification, errors_document
@@ -36,11 +36,11 @@ def publish(result: Identification, folder: Path, watch: Watch = ignore) -> dict
     """
     watch(Progress("Report", 0, _STEPS, "linear baseline"))
     logs = [fitted.log for fitted in result.training], [fitted.log for fitted in result.validation]
-    linear = baseline_of(result.model, *logs)
+    linear = baselines_of(result.model, *logs)
     document = plain(_document(result, logs, linear))
     parts = result.training, result.validation
     training, validation = ([(fitted.log, fitted.run) for fitted in part] for part in parts)
-    baseline = linear if isinstance(linear, Baseline) else None
+    baseline = None if isinstance(linear, str) else linear[0]
     subject = Subject(result.model, document, training, validation, baseline)
     drawings: list[Drawing] = []
     for picture, files in draw(pictures(subject), folder / FIGURES, ["svg"]):
@@ -102,7 +102,9 @@ def fingerprints(logs: Split) -> list[dict[str, Any]]:
     ]
 
 
-def _document(result: Identification, logs: Split, linear: Baseline | str) -> dict[str, Any]:
+def _document(
+    result: Identification, logs: Split, linear: Sequence[Baseline] | str
+) -> dict[str, Any]:
     """The identification's document with what only the report says."""
     now = datetime.datetime.now(datetime.UTC)
     meanings = {p.name: p.description for p in result.model.parameters}
@@ -120,14 +122,19 @@ def _document(result: Identification, logs: Split, linear: Baseline | str) -> di
     }
 
 
-def _comparison(result: Identification, linear: Baseline | str) -> dict[str, Any]:
+def _comparison(result: Identification, linear: Sequence[Baseline] | str) -> dict[str, Any]:
     if isinstance(linear, str):
         return {"left_out": linear}
+    return {"baselines": [_baseline(result, each) for each in linear]}
+
+
+def _baseline(result: Identification, baseline: Baseline) -> dict[str, Any]:
     metrics = {
         part: [{"outputs": errors_document(result.model, errors)} for errors in logs]
-        for part, logs in (("training", linear.training), ("validation", linear.validation))
+        for part, logs in (("training", baseline.training), ("validation", baseline.validation))
     }
-    return {"name": linear.name, "orders": linear.orders, "metrics": metrics}
+    more = {"more_inputs": list(baseline.inputs)} if baseline.inputs else {}
+    return {"name": baseline.name, "orders": baseline.orders, **more, "metrics": metrics}
 
 
 def _reproduction(result: Identification, logs: Split) -> dict[str, Any]:

@@ -217,10 +217,20 @@ def _prediction(
     if voided:
         light += voided
     elif not validation:
+        grave += _poor_fits(model, training)
         light.append("No data were held back for validation: the errors are those of the fit.")
     light += _input_traces(model, validation or training)
-    light += _failing_starts(validation)
+    light += _failing_starts((*training, *validation))
     return Statement.of(grave, light, _praise(model, validation))
+
+
+def _poor_fits(model: ProcessModel, training: Sequence[RecordResult]) -> Iterator[str]:
+    """Reasons: outputs that are not explained even where the model was fitted to them."""
+    fits = mean_known([result.metrics.fit for result in training], 0)
+    floor = ~_above_noise(training) & _known(training)
+    for name, fit, at_floor in zip(model.output_names, fits, floor, strict=True):
+        if fit < FITTED and not at_floor:
+            yield f"{name} is explained poorly even on the training data (fit {fit:.0f} %)."
 
 
 def _moved_together(findings: Sequence[Finding]) -> float:
@@ -302,15 +312,18 @@ def _input_traces(model: ProcessModel, results: Sequence[RecordResult]) -> Itera
             )
 
 
-def _failing_starts(validation: Sequence[RecordResult]) -> Iterator[str]:
+def _failing_starts(results: Sequence[RecordResult]) -> Iterator[str]:
     """Reasons: records on which a start, not the model, is what fails."""
-    for result in validation:
+    for result in results:
         for start in result.starts.estimates if result.starts is not None else ():
             if start.on_end:
+                sample = (
+                    f", its first sample is {start.first:.3g}" if np.isfinite(start.first) else ""
+                )
                 yield (
                     f"On {result.name} {start.state} starts at an end of its range, "
-                    f"{start.value:.3g} {start.unit}: the start may be what fails there. Widen its "
-                    "range under 'initial'."
+                    f"{start.value:.3g} {start.unit}{sample}: the start may be what fails there. "
+                    f"Widen its range under 'initial', {start.low:.3g} .. {start.high:.3g}."
                 )
 
 
@@ -409,10 +422,15 @@ def _disagreement(uncertainty: Uncertainty, logs: int) -> Iterator[str]:
 
 def _parameters_on_bounds(uncertainty: Uncertainty) -> Iterator[str]:
     """Reason: parameters that stand on an end of their range."""
-    names = [p.name for p in uncertainty.parameters if p.on_bound]
+    ends = [p.name for p in uncertainty.parameters if p.on_bound]
+    starts = [name for name in ends if "(0)" in name]
+    names = [name for name in ends if name not in starts]
     if names:
         verb = "stands" if len(names) == 1 else "stand"
         yield f"{', '.join(names)} {verb} on an end of the range: widen it, or fix the value."
+    if starts:
+        verb = "stands" if len(starts) == 1 else "stand"
+        yield f"{', '.join(starts)} {verb} on an end of the range: widen it under 'initial'."
 
 
 def _lacking(alternative: Alternative) -> str:
@@ -457,7 +475,9 @@ def _untested(
     """What could not be tested, and for want of what."""
     tested = _known(results)
     names = [n for n, is_tested in zip(model.output_names, tested, strict=True) if not is_tested]
-    if names:
+    if uncertainty is None:
+        yield "Without intervals it is not tested whether more than the noise is left to explain."
+    elif names:
         yield (
             f"The noise of {', '.join(names)} is not known from a calibration: whether more could "
             "be explained is not tested."

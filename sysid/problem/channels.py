@@ -186,9 +186,10 @@ def spikes(values: FloatArray, inputs: FloatArray) -> Spikes | None:
     # A shaft that slips out of its rest for a sample.
     at[1:-1] &= (before != 0.0) | (after != 0.0)
     jolted = _after_jumps(inputs)
-    if jolted[1:-1].any():
+    reactions = np.abs(away)[jolted[1:-1] & np.isfinite(away)]
+    if len(reactions):
         # What follows a jump may be as large as what usually follows one.
-        reaction = np.nanquantile(np.abs(away)[jolted[1:-1]], 0.9)
+        reaction = np.quantile(reactions, 0.9)
         at[1:-1] &= ~jolted[1:-1] | (np.abs(away) > 3.0 * reaction)
     count = int(at.sum())
     if count == 0:

@@ -390,6 +390,26 @@ def test_with_json_a_failure_is_a_document_too(tmp_path):
         assert error["error"] in result.stderr
 
 
+@pytest.mark.parametrize(
+    ("words", "key", "says"),
+    [
+        (("identify", "log.csv", "--jsn"), "--jsn", "--json"),
+        (("identify", "log.csv", "--population", "many"), "population", "'--population'"),
+        (("replay",), "log", "RUN_OR_CSV"),
+        (("identify",), None, "name the logs"),
+        (("identif", "log.csv"), None, "'identify'"),
+    ],
+)
+def test_with_json_a_mistaken_command_line_is_a_document_too(tmp_path, words, key, says):
+    result = rig(*words, "--json", cwd=tmp_path)
+    document = json.loads(result.stdout)
+    assert result.returncode == document["exit_status"] == 2
+    (error,) = document["errors"]
+    assert error["key"] == key and says in error["error"]
+    assert "--help" in error["cure"] and "Usage: " in result.stderr
+    assert rig(*words, cwd=tmp_path).stdout == ""
+
+
 def test_a_document_is_printed_once(tmp_path):
     result = rig("ports", "/dev/no-such-port", "--json", cwd=tmp_path)
     assert result.returncode == 2

@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from daq.config.units import factor
+from daq.identification.rows import ParameterRow, QuantityRow
 from daq.notation import digits, engineering, number
 
 
@@ -60,3 +61,38 @@ def test_the_last_digit_is_the_second_of_the_uncertainty_at_most(value, ratio):
     assert 2 <= shown <= 7
     if 2 < shown < 7:
         assert 0.01 * std <= step <= std
+
+
+@pytest.mark.parametrize(
+    ("value", "ends", "written"),
+    [
+        (1.0, (0.988, 1.012), ("1.000", "0.988 .. 1.012")),
+        (9.99e-4, (9.5e-4, 1.05e-3), ("9.99e-4", "9.50e-4 .. 0.001050")),
+        (0.0061, (0.0014, 0.025), ("0.0061", "0.0014 .. 0.0250")),
+        (122.0, (105.1, 141.7), ("122", "105 .. 142")),
+        (-0.02, (-0.5, 0.46), ("-0.02", "-0.50 .. 0.46")),
+        (22.0, (7.2, 27.0), ("22", "7.2 .. 27")),
+        (1.0, (1.0 - 1e-12, 1.0 + 1e-12), ("1.000000", "± 1.0e-12")),
+        (0.011, (None, 0.0371), ("0.011", "< 0.037")),
+        (0.0, (-1.0, 1.0), ("0", "-1.00 .. 1.00")),
+    ],
+)
+def test_a_value_and_the_ends_of_its_interval_end_at_one_decimal_place(value, ends, written):
+    row = QuantityRow("a", value, "1", ends)
+    assert (row.text(value), row.interval_text(row.text, " .. ", "-")) == written
+
+
+@given(st.floats(1e-9, 1e9), st.floats(1e-5, 5.0))
+def test_no_end_of_an_interval_is_rounded_by_more_than_it_can_bear(value, relative):
+    low, high = value - relative * value, value + relative * value
+    row = QuantityRow("a", value, "1", (low, high))
+    if not row.narrow:
+        assert abs(float(row.text(high)) - high) <= 0.14 * (high - low)
+        assert abs(float(row.text(low)) - low) <= 0.14 * (high - low)
+
+
+def test_what_was_given_is_written_as_it_was_given():
+    def text(value, scale=1.0):
+        return ParameterRow("a", value, "1").text(value, scale)
+
+    assert [text(-1.0), text(0.5), text(1.18e-3, 1e3), text(126.0)] == ["-1", "0.5", "1.18", "126"]
