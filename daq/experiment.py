@@ -117,7 +117,8 @@ class Frame:
 
     def level(self, channel: str) -> FreeSetting:
         """A level of a channel within the range of its commands."""
-        return FreeSetting(*getattr(self, channel), calm=0.0)
+        low, high = getattr(self, channel)
+        return FreeSetting(low, high, calm=0.0)
 
     def whole(self, seconds: float) -> float:
         """The nearest time that is a whole number of samples, one at least [s]."""

@@ -57,9 +57,7 @@ class Steps(OpenLoop):
             return None
         ends = np.round(np.linspace(0, frame.n_samples, _PIECES + 1))
         hold = (np.diff(ends) / frame.sample_rate).tolist()
-        free = {
-            f"{name}_{k}": frame.level(name) for name in CHANNELS for k in range(_PIECES)
-        }
+        free = {f"{name}_{k}": frame.level(name) for name in CHANNELS for k in range(_PIECES)}
 
         def content(values: Mapping[str, float]) -> dict[str, Any]:
             return {

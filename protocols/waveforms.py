@@ -127,7 +127,7 @@ def between_levels(
             file[name] = {**swing, **keys({key: values[f"{name}_{key}"] for key in free})}
         return file
 
-    settings = {}
+    settings: dict[str, FreeSetting] = {}
     for name in CHANNELS:
         settings |= {f"{name}_{level}": frame.level(name) for level in levels}
         settings |= {f"{name}_{key}": setting for key, setting in free.items()}

@@ -108,7 +108,9 @@ def _show(result: DesignResult) -> None:
     terminal.print_table(title, head, rows, text=["unit"])
     for unknown in result.unknown:
         names = ", ".join(unknown.names)
-        terminal.print_text(f"Stays unknown: {names}: {unknown.why}. What would tell: {unknown.cure}.")
+        terminal.print_text(
+            f"Stays unknown: {names}: {unknown.why}. What would tell: {unknown.cure}."
+        )
     print(f"Experiments, {result.figure.name} and design.json: {result.folder}")
     rig = shlex.quote(str(result.runs[0].file))
     terminal.print_next(f"rig check {rig}", f"rig run {rig}, and so each of them")

@@ -5,8 +5,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from daq.config.base import Section
-from daq.config.units import Hertz, Percent, Quantity, Seconds
-from daq.experiment import Homing, OffsetCalibration
+from daq.config.units import Hertz, Percent, Quantity, Seconds, Turns
 
 Targets = dict[str, Annotated[Percent, Field(gt=0.0, le=1000.0)]]
 
@@ -45,12 +44,15 @@ class Question(Section):
     time: Seconds = Field(10.0, gt=0.0, le=3600.0, description="logged time of all runs, at most")
     run: Seconds = Field(1.25, gt=0.0, le=600.0, description="length of a run")
     sample_rate: Hertz = Field(800.0, gt=0.0, le=1e6, description="samples per second")
-    calibration: OffsetCalibration = Field(
-        OffsetCalibration(), description="offset calibration before each run"
+    calibration: int = Field(
+        3200, ge=1, le=1_000_000, description="samples of the offset calibration before each run"
     )
-    homing: Homing | None = Field(
+    turns: Turns | None = Field(
         None,
-        description="winding of the load; default 5 turns where the rig has limits.winding",
+        ge=0.0,
+        le=1000.0,
+        description="of the load's cable to wind before each run; default 5 where the rig has "
+        "limits.winding",
     )
     protocols: list[str] = Field(
         default_factory=list,

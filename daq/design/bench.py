@@ -7,11 +7,11 @@ import numpy as np
 from daq.config.rig import RigConfig
 from daq.errors import ConfigError
 from daq.experiment import Plan
-from daq.hal import CHANNELS, FloatArray, Phase, Samples
+from daq.hal import CHANNELS, FloatArray, IntArray, Phase, Samples
 from daq.limits import Limits
 from daq.limits.base import TURN
 from daq.run.plan import check_commands
-from sysid import BatchSimulator, Dataset, ModelError, ProcessModel
+from sysid import BatchSimulator, Dataset, ProcessModel
 
 COMMANDS = tuple(f"applied_voltage_{name}" for name in CHANNELS)
 MEASURED = ("current_motor", "current_brake", "torque", "theta", "omega")
@@ -54,9 +54,6 @@ class PlantBench:
         self._from = [model.parameter_names.index(name) for name in shared]
         self._to = [plant.parameter_names.index(name) for name in shared]
         self._n_steps: int | None = None
-        # Computed signals have no noise, and so may stand still.
-        watched = rig.limits.model_copy(update={"frozen": None})
-        self._watched = rig.model_copy(update={"limits": watched})
 
     def records(
         self, inputs: FloatArray, dt: float, vectors: FloatArray
@@ -111,7 +108,7 @@ class PlantBench:
         )
 
     def _passes(self, samples: Samples) -> bool:
-        limits, rate = Limits(self._watched), 1.0 / (samples.time[1] - samples.time[0])
+        limits, rate = Limits(self._rig, faults=False), 1.0 / (samples.time[1] - samples.time[0])
         if self._turns:
             limits.begin(Phase.HOMING, rate)
             limits.check(_wound(samples, self._turns))
@@ -128,9 +125,10 @@ class PlantBench:
             for j, name in enumerate(CHANNELS)
             for kind in ("cmd", "applied")
         }
-        ticks = np.arange(n, dtype=np.int64)
+        ticks: IntArray = np.arange(n, dtype=np.int64)
+        time: FloatArray = ticks * dt
         flags = np.zeros(n, dtype=np.int64)
-        return Samples(tick=ticks, time=ticks * dt, flags=flags, **volts, **measured)
+        return Samples(tick=ticks, time=time, flags=flags, **volts, **measured)
 
     def _record(
         self, inputs: FloatArray, dt: float, signals: Mapping[str, FloatArray], run: int

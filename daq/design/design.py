@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import datetime
 import json
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,13 +23,13 @@ from daq.design.pictures import draw_design
 from daq.design.result import DesignResult, PlannedRun
 from daq.documents import plain
 from daq.errors import ConfigError
-from daq.experiment import Frame, Homing
+from daq.experiment import Frame
 from daq.files import make_folder, write_whole
 from daq.hal import Device, Simulation
 from daq.identification.request import SettingsRequest
 from daq.identification.settings import Problem, problem_of
-from daq.logs.recording import log_path
 from daq.logs.recording import load as load_recording
+from daq.logs.recording import log_path
 from daq.lookup.models import find_model
 from daq.lookup.rigs import DEFAULT_RIG, load_rig
 from daq.lookup.schemas import schema_comment
@@ -115,9 +114,11 @@ def set_up(file: TypedSettings, watch: Watch = ignore) -> Setup:
     config = _beside(file, "config", question.config)
     model = _beside(file, "model", question.model)
     problem = problem_of(SettingsRequest(config, {"model": model}), watch)
-    homing = question.homing or Homing(turns=_TURNS if rig.limits.winding is not None else 0.0)
+    turns = question.turns
+    if turns is None:
+        turns = _TURNS if rig.limits.winding is not None else 0.0
     frame = _frame(file, question, rig)
-    families = families_of(file, question, frame, homing)
+    families = families_of(file, question, frame, turns)
     space = _space(file, problem)
     result = _beside(file, "parameters", question.parameters)
     log = _beside(file, "log", question.log)
@@ -128,8 +129,8 @@ def set_up(file: TypedSettings, watch: Watch = ignore) -> Setup:
     if recording is None and not question.noise:
         shown = ", ".join(f"{name} {deviation:.2g}" for name, deviation in noise.items())
         watch(Note("note", f"noise is assumed: {shown}; --log RUN takes a calibration's"))
-    plant = _plant(file, question, rig_name, device, homing.turns)
-    bench = PlantBench(problem.model, plant, rig, homing.turns, question.margin / 100.0)
+    plant = _plant(file, question, rig_name, device, turns)
+    bench = PlantBench(problem.model, plant, rig, turns, question.margin / 100.0)
     prior = prior_of(space, None if result is None else Path(result))
     return Setup(file, question, rig_name, rig, problem, space, bench, families, prior, noise)
 
@@ -177,7 +178,9 @@ def write(setup: Setup, chosen: Design, folder: Path) -> DesignResult:
     Raises RunError where the disk refuses.
     """
     vectors = setup.space.full(
-        setup.prior.draws(setup.space, setup.question.checks, np.random.default_rng(setup.question.seed))
+        setup.prior.draws(
+            setup.space, setup.question.checks, np.random.default_rng(setup.question.seed)
+        )
     )
     runs = []
     for k, run in enumerate(chosen.runs, 1):

@@ -8,7 +8,7 @@ from typing import Any
 from daq.config.question import Question
 from daq.config.yaml_file import YamlFile
 from daq.errors import ConfigError
-from daq.experiment import Family, Frame, Homing, OpenLoop
+from daq.experiment import Family, Frame, OpenLoop
 from daq.hal import FloatArray
 from daq.lookup.classes import find_class
 from daq.plugins import installed
@@ -50,7 +50,7 @@ class ProtocolFamily:
 
 
 def families_of(
-    file: YamlFile, question: Question, frame: Frame, homing: Homing
+    file: YamlFile, question: Question, frame: Frame, turns: float
 ) -> dict[str, ProtocolFamily]:
     """Families of the protocols that a question names, or of all that have one, by name.
 
@@ -69,13 +69,15 @@ def families_of(
             common = {
                 "protocol": name,
                 "sample_rate": frame.sample_rate,
-                "calibration": question.calibration.model_dump(),
-                "homing": homing.model_dump(),
+                "calibration": {"samples": question.calibration},
+                "homing": {"turns": turns},
             }
             families[name] = ProtocolFamily(protocol, family, common)
         elif question.protocols:
             problem = f"protocol {name} has no settings that a design may choose"
-            raise file.error(("protocols", k), problem, f"known are {', '.join(with_family(frame))}")
+            raise file.error(
+                ("protocols", k), problem, f"known are {', '.join(with_family(frame))}"
+            )
     return families
 
 

@@ -20,7 +20,7 @@ def draw_design(result: DesignResult, rig: RigConfig) -> None:
     runs = result.runs
     commands = np.concatenate([run.commands for run in runs])
     ends = np.cumsum([len(run.commands) * run.dt for run in runs])
-    time = np.arange(len(commands)) * runs[0].dt
+    time: FloatArray = np.arange(len(commands)) * runs[0].dt
     predictions = []
     for j, name in enumerate(CHANNELS):
         line = commands[:, j]
@@ -52,11 +52,13 @@ def _limits_of(rig: RigConfig) -> dict[str, _Limits]:
         name: (None if most is None else -most, most) for name, most in both.items()
     }
     low = limits.winding if limits.winding is not None else travel[0]
-    ends["theta"] = (None if low is None else low * TURN, None if travel[1] is None else travel[1] * TURN)
+    ends["theta"] = _in_radians(low), _in_radians(travel[1])
     return ends
 
 
+def _in_radians(turns: float | None) -> float | None:
+    return None if turns is None else turns * TURN
+
+
 def _prediction(name: str, values: FloatArray, limits: _Limits) -> Prediction:
-    return Prediction(
-        name, UNITS[name], values[0], values.min(axis=0), values.max(axis=0), limits
-    )
+    return Prediction(name, UNITS[name], values[0], values.min(axis=0), values.max(axis=0), limits)

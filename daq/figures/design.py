@@ -60,12 +60,12 @@ def design(
 def _predicted(
     panel: Axes, time: FloatArray, breaks: Sequence[float], prediction: Prediction
 ) -> None:
-    style_of_line = "steps-post" if prediction.steps else "default"
+    drawstyle = "steps-post" if prediction.steps else "default"
     if not np.array_equal(prediction.low, prediction.high):
         low, high = prediction.low, prediction.high
         panel.fill_between(time, low, high, color=style.FAINT, lw=0.0, label="plausible")
     panel.plot(*style.thinned(time, prediction.line), color=style.IDENTIFIED, lw=0.7,
-               drawstyle=style_of_line, label="likeliest")  # fmt: skip
+               drawstyle=drawstyle, label="likeliest")  # fmt: skip
     for end in prediction.limits:
         if end is not None:
             panel.axhline(end, color="black", lw=0.6, ls="--", label="limit")
@@ -90,4 +90,4 @@ def _intervals(
     panel.set_ylim(len(labels) - 0.4, -0.6)
     style.logarithmic(panel.xaxis, np.append(widths, [t for t in targets if t is not None]))
     panel.grid(visible=False, axis="y")
-    panel.set_xlabel("95 % interval, half width [% of value]: before (open), after (full)")
+    panel.set_xlabel("half width of 95 % interval, before and after [%]")

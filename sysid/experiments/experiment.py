@@ -126,7 +126,8 @@ def design(
     not count, an input left out is known exactly. runs: the most there
     may be. targets: half width of the 95 % interval that is wanted, in parts of the value, by
     parameter or combination (``{"K_m": 0.01, "J_m + J_b": 0.05}``); runs are added until all are
-    met; precision: the same for all that experiments can tell. Without them the ``criterion`` decides: D of all parameters, A (mean variance) or E
+    met; precision: the same for all that experiments can tell. Without them the ``criterion``
+    decides: D of all parameters, A (mean variance) or E
     (largest variance) of ``quantities``, by default all that experiments can tell.
 
     prior: what is known, by default the model's ranges around its nominal values; before: (n_free,

@@ -8,6 +8,7 @@ their offspring become candidates.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -81,9 +82,7 @@ class Search:
         """
         for k in range(n):
             excitation = self.excitations[k % len(self.excitations)]
-            self._settle(
-                excitation, self.rng.random(len(excitation.settings)), excitation.calmer
-            )
+            self._settle(excitation, self.rng.random(len(excitation.settings)), excitation.calmer)
 
     def generation(self, n: int, progress: float) -> None:
         """Offspring of the chosen; progress: 0 at the first generation, 1 at the last."""
@@ -96,11 +95,8 @@ class Search:
                 genes[from_father] = father.genes[from_father]
             moves = width * self.rng.standard_normal(len(genes))
             moves[self.rng.random(len(genes)) < 0.5] = 0.0
-            self._settle(
-                mother.excitation,
-                np.clip(genes + moves, 0.0, 1.0),
-                lambda child, origin=mother.genes: 0.5 * (child + origin),
-            )
+            back = partial(_midway, mother.genes)
+            self._settle(mother.excitation, np.clip(genes + moves, 0.0, 1.0), back)
 
     def choose(self) -> None:
         """The best set that greed and exchanges lead to."""
@@ -155,3 +151,7 @@ class Search:
         if self.watch is not None:
             self.watch(self.attempts, len(self.pool))
         return candidate is not None
+
+
+def _midway(origin: FloatArray, genes: FloatArray) -> FloatArray:
+    return 0.5 * (genes + origin)
