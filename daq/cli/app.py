@@ -13,6 +13,7 @@ from typer import BadParameter, Exit, Option, Typer
 from daq.cli import terminal
 from daq.cli.analyse import analyse
 from daq.cli.campaign import campaign
+from daq.cli.characterise import characterise
 from daq.cli.check import check
 from daq.cli.design import design
 from daq.cli.doctor import doctor
@@ -36,6 +37,7 @@ _COMMANDS: tuple[tuple[Callable[..., None], str], ...] = (
     (check, "rig check prbs.yaml --plot check.png"),
     (analyse, "rig analyse runs/20260101T120000Z-constant_velocity"),
     (design, "rig design question.yaml --time 10 --precision 5%"),
+    (characterise, "rig characterise simulated.yaml --time 10 --precision 5%"),
     (identify, "rig identify runs/20260101T120000Z-prbs --validate other_log.csv"),
     (campaign, "rig campaign runs/* --model actuator --model actuator:hysteresis=dahl --seeds 0:5"),
     (

@@ -5,8 +5,9 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from daq.config.base import Section
-from daq.config.units import Hertz, Percent, Quantity, Seconds, Turns
+from daq.config.units import Hertz, Part, Percent, Seconds, Turns
 
+_RUN = 1.25  # s, of a run where a question does not say
 Targets = dict[str, Annotated[Percent, Field(gt=0.0, le=1000.0)]]
 
 
@@ -29,7 +30,8 @@ class Question(Section):
     parameters: str | None = Field(
         None, description="result of an earlier identification, from which the design starts"
     )
-    targets: Targets = Field(
+    targets: _RUN = 1.25  # s, of a run where a question does not say
+Targets = Field(
         default_factory=dict,
         description="half width of the 95 % interval that is wanted, of parameters or combinations",
         examples=[{"K_m": "1 %", "J_m + J_b": "5 %"}],
@@ -42,7 +44,9 @@ class Question(Section):
         description="without targets: information of all (D), mean variance (A), worst one (E)",
     )
     time: Seconds = Field(10.0, gt=0.0, le=3600.0, description="logged time of all runs, at most")
-    run: Seconds = Field(1.25, gt=0.0, le=600.0, description="length of a run")
+    run: Seconds | None = Field(
+        None, gt=0.0, le=600.0, description="length of a run; default 1.25 s, or the time if less"
+    )
     sample_rate: Hertz = Field(800.0, gt=0.0, le=1e6, description="samples per second")
     calibration: int = Field(
         3200, ge=1, le=1_000_000, description="samples of the offset calibration before each run"
@@ -59,11 +63,11 @@ class Question(Section):
         description="which to choose from; default all with free settings",
         examples=[["prbs", "steps"]],
     )
-    noise: dict[str, Annotated[Quantity, Field(gt=0.0)]] = Field(
+    noise: dict[str, Annotated[Part, Field(gt=0.0)]] = Field(
         default_factory=dict,
-        description="standard deviations of what is measured; default what log says, or 10 mV at "
+        description="standard deviations of what is measured, in the model's units; default what log says, or 10 mV at "
         "each analog input and a sixth of a count a sample",
-        examples=[{"current_motor": "5 mA"}],
+        examples=[{"current_motor": 0.005}],
     )
     log: str | None = Field(None, description="a run whose calibration tells the noise")
     margin: Percent = Field(
@@ -83,6 +87,11 @@ class Question(Section):
         return self
 
     @property
+    def seconds(self) -> float:
+        """Length of a run [s]."""
+        return min(_RUN, self.time) if self.run is None else self.run
+
+    @property
     def most_runs(self) -> int:
-        """How many runs the time holds, one at least."""
-        return max(1, int(self.time / self.run + 1e-9))
+        """How many runs the time holds."""
+        return int(self.time / self.seconds + 1e-9)

@@ -213,12 +213,12 @@ def _beside(file: TypedSettings, key: str, name: str | None) -> str | None:
 
 
 def _frame(file: YamlFile, question: Question, rig: RigConfig) -> Frame:
-    n_samples = round(question.run * question.sample_rate)
+    n_samples = round(question.seconds * question.sample_rate)
     if n_samples < 2:
-        problem = f"{question.run:g} s at {question.sample_rate:g} Hz makes {n_samples} samples"
+        problem = f"{question.seconds:g} s at {question.sample_rate:g} Hz makes {n_samples} samples"
         raise file.error(("run",), problem, "make it longer")
-    if question.run > question.time:
-        problem = f"a run of {question.run:g} s is longer than the {question.time:g} s of all"
+    if question.seconds > question.time:
+        problem = f"a run of {question.seconds:g} s is longer than the {question.time:g} s of all"
         raise file.error(("run",), problem, "make it shorter, or give more time")
     ranges = rig.limits.command
     return Frame(n_samples, question.sample_rate, ranges.motor, ranges.brake)
