@@ -108,7 +108,8 @@ def _show(result: Characterisation) -> None:
         for interval in result.intervals
     ]
     print()
-    title = f"After {result.seconds:g} s in {len(result.rounds)} rounds; 95 % intervals in % of the value"
+    spent = f"{result.seconds:g} s in {len(result.rounds)} rounds"
+    title = f"After {spent}: 95 % intervals in % of the value"
     head = ["quantity", "value", "unit", "half width", "expected"]
     terminal.print_table(title, head, rows, text=["unit"])
     terminal.print_text(f"It ended because {result.reason}. Trust: {result.verdict['trust']}.")

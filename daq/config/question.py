@@ -30,8 +30,7 @@ class Question(Section):
     parameters: str | None = Field(
         None, description="result of an earlier identification, from which the design starts"
     )
-    targets: _RUN = 1.25  # s, of a run where a question does not say
-Targets = Field(
+    targets: Targets = Field(
         default_factory=dict,
         description="half width of the 95 % interval that is wanted, of parameters or combinations",
         examples=[{"K_m": "1 %", "J_m + J_b": "5 %"}],
@@ -65,8 +64,8 @@ Targets = Field(
     )
     noise: dict[str, Annotated[Part, Field(gt=0.0)]] = Field(
         default_factory=dict,
-        description="standard deviations of what is measured, in the model's units; default what log says, or 10 mV at "
-        "each analog input and a sixth of a count a sample",
+        description="standard deviations of what is measured, in the model's units; default what "
+        "log says, or 10 mV at each analog input and a sixth of a count a sample",
         examples=[{"current_motor": 0.005}],
     )
     log: str | None = Field(None, description="a run whose calibration tells the noise")
