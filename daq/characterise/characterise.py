@@ -81,12 +81,15 @@ def characterise(
     [%], None for as narrow as they get. out: a new folder for all of it. settings: keys of the
     designs, as ``key=value``. Raises ConfigError before anything moves, and what a run raises.
     """
-    there = Path(rig)
     request = Request(
-        str(there.resolve() if there.exists() else rig), time, precision, None if model is None else whole_name(model),
+        _absolute(rig) if Path(rig).exists() else str(rig),
+        time,
+        precision,
+        None if model is None else whole_name(model),
         None if plant is None else whole_name(plant),
-        None if config is None else str(Path(config).resolve()), tuple(settings),
-    )  # fmt: skip
+        None if config is None else _absolute(config),
+        tuple(settings),
+    )
     load_rig(str(rig), watch=watch)
     now = datetime.datetime.now(datetime.UTC)
     folder = Path(out) if out is not None else Path("runs") / f"{now:%Y%m%dT%H%M%SZ}-characterise"
@@ -130,6 +133,10 @@ def _continued(root: Path, request: Request, watch: Watch) -> Characterisation:
         root, tuple(done), tuple(last.intervals()), _spent(done), reason,
         last.result["verdict"], page, root / "report" / "report.html",
     )  # fmt: skip
+
+
+def _absolute(path: str | Path) -> str:
+    return str(Path(path).resolve())
 
 
 def _end(request: Request, done: Sequence[Round]) -> str:
@@ -177,7 +184,6 @@ def _design(current: Round, request: Request, done: Sequence[Round], watch: Watc
         if most - runs < _LEAST:
             runs = most
         setup = set_up(_question(request, done, runs * question.seconds))
-        make_folder(current.folder)
         write(setup, choose(setup, watch), current.folder)
     return any(q["after"] < _GAIN * q["before"] for q in current.design["quantities"])
 

@@ -26,6 +26,8 @@ from daq.errors import ConfigError
 from daq.experiment import Frame
 from daq.files import make_folder, write_whole
 from daq.hal import Device, Simulation
+from daq.identification import stages
+from daq.identification.fit import check_writable
 from daq.identification.request import SettingsRequest
 from daq.identification.settings import Problem, problem_of
 from daq.logs.recording import load as load_recording
@@ -101,7 +103,7 @@ def design_files(
     typed = {key: value for key, value in options.items() if value is not None}
     setup = set_up(TypedSettings.of(typed, settings, written), watch)
     folder = out or Path("designs") / _stamp()
-    make_folder(folder)
+    check_writable(folder)
     return write(setup, choose(setup, watch), folder)
 
 
@@ -112,15 +114,17 @@ def set_up(file: TypedSettings, watch: Watch = ignore) -> Setup:
     rig_name = _beside(file, "rig", question.rig) or DEFAULT_RIG
     rig, device = load_rig(rig_name, watch=watch)
     config = _beside(file, "config", question.config)
-    model = _beside(file, "model", question.model)
-    problem = problem_of(SettingsRequest(config, {"model": model}), watch)
+    result = _earlier(file, question)
+    model, record = _beside(file, "model", question.model), None
+    if model is None and result is not None:
+        model, record = result.content.get("model"), result.path
+    problem = problem_of(SettingsRequest(config, {"model": model}), watch, record)
     turns = question.turns
     if turns is None:
         turns = _TURNS if rig.limits.winding is not None else 0.0
     frame = _frame(file, question, rig)
     families = families_of(file, question, frame, turns)
     space = _space(file, problem)
-    result = _beside(file, "parameters", question.parameters)
     log = _beside(file, "log", question.log)
     recording = None if log is None else load_recording(log_path(Path(log)))
     if recording is not None:
@@ -131,7 +135,7 @@ def set_up(file: TypedSettings, watch: Watch = ignore) -> Setup:
         watch(Note("note", f"noise is assumed: {shown}; --log RUN takes a calibration's"))
     plant = _plant(file, question, rig_name, device, turns)
     bench = PlantBench(problem.model, plant, rig, turns, question.margin / 100.0)
-    prior = prior_of(space, None if result is None else Path(result))
+    prior = prior_of(space, result)
     return Setup(file, question, rig_name, rig, problem, space, bench, families, prior, noise)
 
 
@@ -173,10 +177,11 @@ def choose(setup: Setup, watch: Watch = ignore) -> Design:
 
 
 def write(setup: Setup, chosen: Design, folder: Path) -> DesignResult:
-    """A design's experiments, its figure and its document, in a folder.
+    """A design's experiments, its figure and its document, in a folder that may be new.
 
-    Raises RunError where the disk refuses.
+    The document is the last of them. Raises RunError where the disk refuses.
     """
+    make_folder(folder)
     vectors = setup.space.full(
         setup.prior.draws(
             setup.space, setup.question.checks, np.random.default_rng(setup.question.seed)
@@ -202,6 +207,12 @@ def _experiment_text(content: Mapping[str, Any], rig: str, number: int, count: i
     head = f"{schema_comment('experiment')}\n# Run {number} of {count} of a design by rig design.\n"
     file = {"protocol": content["protocol"], "rig": rig, **content}
     return head + yaml.safe_dump(file, sort_keys=False, default_flow_style=None)
+
+
+def _earlier(file: TypedSettings, question: Question) -> YamlFile | None:
+    """The result of an earlier identification that a question names."""
+    path = _beside(file, "parameters", question.parameters)
+    return None if path is None else stages.load([Path(path)])[0]
 
 
 def _beside(file: TypedSettings, key: str, name: str | None) -> str | None:

@@ -19,15 +19,14 @@ _VOLTS = 0.010  # rms at an analog input, where nothing tells more
 _COUNTS = 1.0 / 6.0  # of the count in a sample, by which a speed errs
 
 
-def prior_of(space: SearchSpace, result: Path | None) -> Prior:
+def prior_of(space: SearchSpace, file: YamlFile | None) -> Prior:
     """What the ranges say, and beside them an earlier identification's result.
 
-    Raises ConfigError for a file that is no such result, or of another model.
+    file: the result. Raises ConfigError for one of another model, or without numbers.
     """
     ranges = Prior.of_ranges(space)
-    if result is None:
+    if file is None:
         return ranges
-    (file,) = stages.load([result])
     model, n_free = space.model, len(space.index)
     names = [name for name in space.names[:n_free] if name in file.content["parameters"]]
     if not names:
