@@ -155,8 +155,10 @@ class Round:
 
 
 def _interval(quantity: Mapping[str, Any], entry: Mapping[str, Any]) -> Interval:
-    value, ends = entry.get("value", quantity["value"]), entry.get("interval")
-    width = None if not ends or not value else 0.5 * abs((ends[1] - ends[0]) / value)
+    value = entry.get("value", quantity["value"])
+    low, high = entry.get("interval") or (None, None)
+    bounded = low is not None and high is not None and value
+    width = 0.5 * abs((high - low) / value) if bounded else None
     return Interval(quantity["name"], quantity["unit"], value, width, quantity["after"])
 
 
