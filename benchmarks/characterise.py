@@ -63,12 +63,9 @@ def hidden_rig(number: int, seconds: float) -> dict[str, Any]:
         designed = characterise.characterise(rig, seconds, None, folder / "c")
         spent = time.perf_counter() - begin
         shipped = _shipped(folder, rig, designed.rounds[-1])
-    values = {
-        quantity.text: quantity.value(
-            {**dict(zip(model.parameter_names, model.nominal, strict=False)), **truth}
-        )
-        for quantity in determined(identifiability(model, sensors=False), SearchSpace.of(model))
-    }
+    nominal = dict(zip(model.parameter_names, model.nominal.tolist(), strict=True))
+    structure, space = identifiability(model, sensors=False), SearchSpace.of(model)
+    values = {q.text: q.value({**nominal, **truth}) for q in determined(structure, space)}
     bounded = [i for i in designed.intervals if i.width is not None]
     pairs = [(i.width, shipped[i.name].width) for i in bounded if shipped[i.name].width]
     ratios = [prbs / width for width, prbs in pairs if width and prbs]

@@ -122,8 +122,8 @@ def between_levels(
     def content(values: Mapping[str, float]) -> dict[str, Any]:
         file = dict(common)
         for name in CHANNELS:
-            one, other = (values[f"{name}_{level}"] for level in levels)
-            swing = {"offset": 0.5 * (one + other), "amplitude": 0.5 * abs(one - other)}
+            first, second = (values[f"{name}_{level}"] for level in levels)
+            swing = {"offset": 0.5 * (first + second), "amplitude": 0.5 * abs(first - second)}
             file[name] = {**swing, **keys({key: values[f"{name}_{key}"] for key in free})}
         return file
 

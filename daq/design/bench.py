@@ -15,6 +15,7 @@ from sysid import BatchSimulator, Dataset, ProcessModel
 
 COMMANDS = tuple(f"applied_voltage_{name}" for name in CHANNELS)
 MEASURED = ("current_motor", "current_brake", "torque", "theta", "omega")
+_ASTRAY = 0.5  # of the noise, by which a model may err where it is right
 _ACCURACY = 1e-2  # of the plant, beside which margins are wide
 
 
@@ -23,7 +24,9 @@ class PlantBench:
 
     plant: of which commands are inputs and the rig's signals outputs; others of its inputs are
     zero. turns: wound up before each run. margin: part of each limit that is kept from it: whatever
-    is commanded or measured must keep them when it is so much larger.
+    is commanded or measured must keep them when it is so much larger. noise: of the model's outputs
+    by name; a run in which the plant does what the model does not, such as an amplifier at the end
+    of its range, would lead its parameters astray, and is refused as well.
     """
 
     def __init__(
@@ -33,6 +36,7 @@ class PlantBench:
         rig: RigConfig,
         turns: float = 0.0,
         margin: float = 0.1,
+        noise: Mapping[str, float] | None = None,
     ) -> None:
         for name in set(model.input_names) - {*COMMANDS, *plant.output_names}:
             raise ConfigError(
@@ -50,6 +54,11 @@ class PlantBench:
         self._model, self._rig, self._turns = model, rig, turns
         self._scale = 1.0 / (1.0 - margin)
         self._simulator = BatchSimulator(plant, accuracy=_ACCURACY)
+        self._model_simulator = BatchSimulator(model, accuracy=_ACCURACY)
+        self._noise = {n: s for n, s in (noise or {}).items() if n in model.output_names}
+        starts = dict(zip(plant.state_names, plant.initial_state.tolist(), strict=True))
+        named = zip(model.state_names, model.initial_state.tolist(), strict=True)
+        self._starts = np.array([[starts.get(name, start) for name, start in named]])
         shared = [name for name in model.parameter_names if name in plant.parameter_names]
         self._from = [model.parameter_names.index(name) for name in shared]
         self._to = [plant.parameter_names.index(name) for name in shared]
@@ -64,6 +73,9 @@ class PlantBench:
         # Most of what passes a limit does so with the likeliest parameters.
         first = self.signals(inputs, dt, vectors[:1])
         if not self._within_limits(inputs, dt, first):
+            return None
+        likeliest = self._record(inputs, dt, first, 0)
+        if not self._follows(likeliest, vectors[:1], first):
             return None
         others = self.signals(inputs, dt, vectors[1:])
         if not self._within_limits(inputs, dt, others):
@@ -94,6 +106,23 @@ class PlantBench:
         except ConfigError:
             return False
         return True
+
+    def _follows(
+        self, record: Dataset, vectors: FloatArray, signals: Mapping[str, FloatArray]
+    ) -> bool:
+        """Whether the model does what the plant does, to within the noise of its outputs."""
+        simulator = self._model_simulator
+        # By as many steps, so that errors of the integration are alike.
+        outputs = simulator.trajectories(vectors, record, self._n_steps, self._starts)[0]
+        errors = {
+            name: outputs[:, j] - signals[name][0]
+            for j, name in enumerate(simulator.model.output_names)
+            if name in self._noise and name in signals
+        }
+        return all(
+            float(np.sqrt(np.mean(error**2))) <= _ASTRAY * self._noise[name]
+            for name, error in errors.items()
+        )
 
     def _within_limits(
         self, inputs: FloatArray, dt: float, signals: Mapping[str, FloatArray]

@@ -100,6 +100,8 @@ def design_files(
     ``key=value``. Raises ConfigError.
     """
     written = None if question is None else yaml_file.load(question)
+    if written is not None:
+        check.refuse_other_kind(written, "a design's question")
     typed = {key: value for key, value in options.items() if value is not None}
     setup = set_up(TypedSettings.of(typed, settings, written), watch)
     folder = out or Path("designs") / _stamp()
@@ -109,7 +111,6 @@ def design_files(
 
 def set_up(file: TypedSettings, watch: Watch = ignore) -> Setup:
     """A question and what it names. Raises ConfigError that names file, line, key and cure."""
-    check.refuse_other_kind(file, "a design's question")
     question = check.validate(file, Question)
     rig_name = _beside(file, "rig", question.rig) or DEFAULT_RIG
     rig, device = load_rig(rig_name, watch=watch)
@@ -134,7 +135,7 @@ def set_up(file: TypedSettings, watch: Watch = ignore) -> Setup:
         shown = ", ".join(f"{name} {deviation:.2g}" for name, deviation in noise.items())
         watch(Note("note", f"noise is assumed: {shown}; --log RUN takes a calibration's"))
     plant = _plant(file, question, rig_name, device, turns)
-    bench = PlantBench(problem.model, plant, rig, turns, question.margin / 100.0)
+    bench = PlantBench(problem.model, plant, rig, turns, question.margin / 100.0, noise)
     prior = prior_of(space, result)
     return Setup(file, question, rig_name, rig, problem, space, bench, families, prior, noise)
 

@@ -50,12 +50,12 @@ def _together(ranges: FloatArray, changes: FloatArray, places: list[int]) -> Flo
 
     changes: (n, n_free), of one standard deviation each; places: the coordinates that it knows.
     """
-    told = np.ix_(places, places)
-    covariance = (changes.T @ changes)[told]
+    block = np.ix_(places, places)
+    covariance = (changes.T @ changes)[block]
     # What no change moves has been told exactly, as far as numbers go.
     least = 1e-9 * np.eye(len(places)) * max(float(np.trace(covariance)), 1e-12)
     information = np.linalg.inv(ranges)
-    information[told] += np.linalg.inv(covariance + least)
+    information[block] += np.linalg.inv(covariance + least)
     together: FloatArray = np.linalg.inv(information)
     return 0.5 * (together + together.T)
 

@@ -85,6 +85,16 @@ def test_a_limit_is_kept_by_the_margin():
         assert (records is not None) == passes, config.name
 
 
+def test_a_run_that_drives_an_amplifier_to_its_end_is_left_to_models_that_have_one():
+    noise = {"current_motor": 0.005, "current_brake": 0.005, "omega": 0.1}
+    config, device = load_rig("simulated.yaml")
+    for limits, motor, passes in ((False, 0.2, True), (False, 1.2, False), (True, 1.2, True)):
+        model = actuator(limits=limits, parameters="rig")
+        judge = PlantBench(model, device.plant_model(5.0), config, 5.0, 0.1, noise)
+        records = judge.records(commands(motor), 1.0 / 800.0, model.nominal[None])
+        assert (records is not None) == passes
+
+
 def test_what_the_model_is_given_of_a_run_is_what_the_rig_would_log(tmp_path):
     loose, vectors = bench()
     (record,) = loose.records(commands(0.3, 0.05), 1.0 / 800.0, vectors)
