@@ -1,9 +1,9 @@
 """Rigs, runs and their logs; what the commands do, as functions for scripts and notebooks.
 
 ``check`` previews an experiment, ``record`` runs it, ``analyse`` concludes from a run, ``load``
-reads a log, ``identify``, ``resume``, ``compare``, ``campaign`` and ``replay`` do what the commands
-of these names do. They never print: ``watch`` is called with what they say meanwhile. Each is
-imported when it is first used.
+reads a log, ``design``, ``identify``, ``resume``, ``compare``, ``campaign`` and ``replay`` do what
+the commands of these names do. They never print: ``watch`` is called with what they say meanwhile.
+Each is imported when it is first used.
 """
 
 from __future__ import annotations
@@ -12,6 +12,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from daq.design.design import design
+    from daq.design.result import DesignResult
     from daq.errors import ConfigError, RigError
     from daq.identification.campaign import CampaignRequest, CampaignResult, campaign
     from daq.identification.comparison import ComparisonRequest, ComparisonResult, compare
@@ -30,6 +32,7 @@ _HOMES = {
     "ComparisonRequest": "daq.identification.comparison",
     "ComparisonResult": "daq.identification.comparison",
     "ConfigError": "daq.errors",
+    "DesignResult": "daq.design.result",
     "Identification": "daq.identification.result",
     "Preview": "daq.recording.preview",
     "Recording": "daq.logs.recording",
@@ -38,6 +41,7 @@ _HOMES = {
     "analyse": "daq.recording.analysis",
     "campaign": "daq.identification.campaign",
     "check": "daq.recording.preview",
+    "design": "daq.design.design",
     "compare": "daq.identification.comparison",
     "identify": "daq.identification.fit",
     "load": "daq.logs.recording",
@@ -53,6 +57,7 @@ __all__ = [
     "ComparisonRequest",
     "ComparisonResult",
     "ConfigError",
+    "DesignResult",
     "Identification",
     "Preview",
     "Recording",
@@ -62,6 +67,7 @@ __all__ = [
     "campaign",
     "check",
     "compare",
+    "design",
     "identify",
     "load",
     "record",

@@ -5,7 +5,7 @@ A protocol is a subclass of one of three: ``Timed``, commands known beforehand f
 """
 
 import abc
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, Protocol
@@ -84,6 +84,57 @@ class Plan:
     def excites(self) -> bool:
         """Whether any command may be other than zero."""
         return bool(np.any(self.lowest) or np.any(self.highest))
+
+
+@dataclass(frozen=True)
+class FreeSetting:
+    """A number that a design may choose between two ends.
+
+    log: whether it counts by its logarithm; whole: whether it is a whole number, such as a seed.
+    calm: the value towards which it excites less, if there is one.
+    """
+
+    low: float
+    high: float
+    log: bool = False
+    whole: bool = False
+    calm: float | None = None
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What runs of a design have in common: their length, rate and ranges of the commands [V]."""
+
+    n_samples: int
+    sample_rate: float
+    motor: tuple[float, float]
+    brake: tuple[float, float]
+
+    @property
+    def seconds(self) -> float:
+        """Length of a run [s]."""
+        return self.n_samples / self.sample_rate
+
+    def level(self, channel: str) -> FreeSetting:
+        """A level of a channel within the range of its commands."""
+        low, high = getattr(self, channel)
+        return FreeSetting(low, high, calm=0.0)
+
+    def whole(self, seconds: float) -> float:
+        """The nearest time that is a whole number of samples, one at least [s]."""
+        return max(1, round(seconds * self.sample_rate)) / self.sample_rate
+
+
+@dataclass(frozen=True)
+class Family:
+    """Runs of a protocol among which a design may choose.
+
+    free: settings by name. content: of a value for each of them the keys of an experiment's file,
+    without those that all protocols have.
+    """
+
+    free: Mapping[str, FreeSetting]
+    content: Callable[[Mapping[str, float]], dict[str, Any]]
 
 
 class Experiment(Section, abc.ABC):
@@ -168,6 +219,11 @@ class OpenLoop(Experiment):
     def remarks(self) -> tuple[str, ...]:
         """What else a user should know beforehand, a line each."""
         return ()
+
+    @classmethod
+    def family(cls, frame: Frame) -> Family | None:
+        """Runs within a frame that ``rig design`` may choose from; None: it chooses no such."""
+        return None
 
     def plan(self) -> Plan:
         """The commands and their peaks."""

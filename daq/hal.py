@@ -232,5 +232,12 @@ class Simulation(Protocol):
         Raises ``sysid.ModelError`` for a plant that no process model can be made of.
         """
 
+    def plant_model(self, turns: float) -> Any:
+        """The whole plant as a ``sysid.ProcessModel`` of which only commands are inputs that count.
+
+        Its outputs are named as the fields of ``Samples``; turns: of its cable, wound up before.
+        Raises ``sysid.ModelError`` where nobody can say beforehand what it does.
+        """
+
     def board(self) -> Electronics:
         """The same plant anew, without faults of its connection, for a board to serve."""

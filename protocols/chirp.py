@@ -7,8 +7,9 @@ import numpy as np
 from pydantic import Field
 
 from daq.config.units import Hertz, Seconds
+from daq.experiment import Family, Frame, FreeSetting
 from daq.hal import FloatArray
-from protocols.waveforms import Excitation, ExcitedChannel
+from protocols.waveforms import Excitation, ExcitedChannel, between_levels
 
 
 class ChirpChannel(ExcitedChannel):
@@ -25,6 +26,13 @@ class Chirp(Excitation[ChirpChannel]):
     sweep: Literal["linear", "logarithmic"] = Field(
         "logarithmic", description="equal time for equal steps in Hz, or for each octave"
     )
+
+    @classmethod
+    def family(cls, frame: Frame) -> Family:
+        """Where the sweep begins and ends."""
+        end = FreeSetting(1.0 / frame.seconds, 0.25 * frame.sample_rate, log=True)
+        free = {"start_frequency": end, "end_frequency": end}
+        return between_levels(frame, free, {"duration": frame.seconds})
 
     def excited_samples(self) -> int:
         """Samples between the ramps."""

@@ -13,8 +13,9 @@ import numpy as np
 from pydantic import Field
 
 from daq.config.units import Hertz, Seconds
+from daq.experiment import Family, Frame, FreeSetting
 from daq.hal import FloatArray, IntArray
-from protocols.waveforms import Excitation, ExcitedChannel, whole_samples
+from protocols.waveforms import Excitation, ExcitedChannel, between_levels, whole_samples
 
 _GROUP = 4  # odd harmonics of which the odd-random grid leaves one out
 
@@ -53,6 +54,20 @@ class Multisine(Excitation[MultisineChannel]):
     draws: int = Field(
         1, ge=1, le=1000, description="sets of phases tried; the lowest crest factor is taken"
     )
+
+    @classmethod
+    def family(cls, frame: Frame) -> Family:
+        """One period: lines up to a frequency, and the seeds."""
+        lowest = 1.0 / frame.seconds
+        free = {
+            "highest": FreeSetting(2.0 * lowest, 0.45 * frame.sample_rate, log=True),
+            "seed": FreeSetting(0, 2**16 - 1, whole=True),
+        }
+
+        def keys(values: dict[str, float]) -> dict[str, Any]:
+            return {"band": [lowest, values["highest"]], "seed": int(values["seed"])}
+
+        return between_levels(frame, free, {"period": frame.seconds}, keys)
 
     def excited_samples(self) -> int:
         """Samples between the ramps."""

@@ -1,15 +1,16 @@
 """Pseudo-random binary sequences on both channels."""
 
 import math
+from typing import Any
 
 import numpy as np
 from pydantic import Field
 
 from daq.config.base import Section
 from daq.config.units import Seconds, Volts
-from daq.experiment import Timed
+from daq.experiment import Family, Frame, FreeSetting, Timed
 from daq.hal import CHANNELS, FloatArray, IntArray
-from protocols.waveforms import whole_samples
+from protocols.waveforms import between_levels, whole_samples
 
 REGISTER_BITS = 16
 SEQUENCE_LENGTH = 2**REGISTER_BITS - 1
@@ -42,6 +43,20 @@ class Prbs(Timed):
             levels = channel.offset + channel.amplitude * (2.0 * bits - 1.0)
             columns.append(np.repeat(levels, hold)[: self.n_samples])
         return np.stack(columns, axis=1)
+
+    @classmethod
+    def family(cls, frame: Frame) -> Family:
+        """How long a bit is held, and the seeds."""
+        free = {
+            "hold": FreeSetting(1.0 / frame.sample_rate, 0.25 * frame.seconds, log=True),
+            "seed": FreeSetting(1, SEQUENCE_LENGTH, whole=True),
+        }
+
+        def keys(values: dict[str, float]) -> dict[str, Any]:
+            hold = frame.whole(values["hold"])
+            return {"minimum_period": hold, "seed": int(values["seed"])}
+
+        return between_levels(frame, free, {"duration": frame.seconds}, keys)
 
     def remarks(self) -> tuple[str, ...]:
         """How evenly each channel is at its two levels."""

@@ -1,11 +1,14 @@
 """A sine on each channel."""
 
+import math
+
 import numpy as np
 from pydantic import Field
 
 from daq.config.units import Hertz, Radians, Seconds
+from daq.experiment import Family, Frame, FreeSetting
 from daq.hal import FloatArray
-from protocols.waveforms import Excitation, ExcitedChannel
+from protocols.waveforms import Excitation, ExcitedChannel, between_levels
 
 
 class SineChannel(ExcitedChannel):
@@ -19,6 +22,15 @@ class Sine(Excitation[SineChannel]):
     """Sines, one on each channel, for as long as the file says."""
 
     duration: Seconds = Field(gt=0.0, le=86400.0, description="of the sines, without the ramps")
+
+    @classmethod
+    def family(cls, frame: Frame) -> Family:
+        """Frequency and phase."""
+        free = {
+            "frequency": FreeSetting(1.0 / frame.seconds, 0.25 * frame.sample_rate, log=True),
+            "phase": FreeSetting(-math.pi, math.pi),
+        }
+        return between_levels(frame, free, {"duration": frame.seconds})
 
     def excited_samples(self) -> int:
         """Samples between the ramps."""

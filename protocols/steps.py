@@ -1,13 +1,18 @@
 """Levels held for some time, or staircases up and down."""
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 from pydantic import Field
 
 from daq.config.base import Section
 from daq.config.units import Seconds, Volts
-from daq.experiment import OpenLoop
+from daq.experiment import Family, Frame, OpenLoop
 from daq.hal import CHANNELS, FloatArray, IntArray
 from protocols.waveforms import HeldChannel, smooth_rise, whole_samples
+
+_PIECES = 8  # levels of a free waveform
 
 
 class StaircaseLevels(Section):
@@ -44,6 +49,23 @@ class Steps(OpenLoop):
     )
     motor: StepsChannel = Field(description="levels of the motor's commands")
     brake: StepsChannel = Field(description="levels of the brake's commands")
+
+    @classmethod
+    def family(cls, frame: Frame) -> Family | None:
+        """Any levels of both channels, one after the other, each held alike long."""
+        if frame.n_samples < _PIECES:
+            return None
+        ends = np.round(np.linspace(0, frame.n_samples, _PIECES + 1))
+        hold = (np.diff(ends) / frame.sample_rate).tolist()
+        free = {f"{name}_{k}": frame.level(name) for name in CHANNELS for k in range(_PIECES)}
+
+        def content(values: Mapping[str, float]) -> dict[str, Any]:
+            return {
+                name: {"levels": [values[f"{name}_{k}"] for k in range(_PIECES)], "hold": hold}
+                for name in CHANNELS
+            }
+
+        return Family(free, content)
 
     def waveform(self) -> FloatArray:
         """Both channels' levels, (n_samples, 2) [V]; with a ramp the last change is to zero."""

@@ -2,15 +2,16 @@
 
 import abc
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from pydantic import Field
 
 from daq.config.base import Section
 from daq.config.units import Seconds, Volts
-from daq.experiment import OpenLoop, Plan
+from daq.experiment import Family, Frame, FreeSetting, OpenLoop, Plan
 from daq.hal import CHANNELS, FloatArray
 
 
@@ -104,6 +105,33 @@ class Excitation(OpenLoop, Generic[Channel]):
                 f"{0.5 * self.sample_rate:g} Hz; lower it or raise sample_rate"
             )
         return frequency
+
+
+def between_levels(
+    frame: Frame,
+    free: Mapping[str, FreeSetting],
+    common: Mapping[str, Any],
+    keys: Callable[[dict[str, float]], dict[str, Any]] = dict,
+) -> Family:
+    """Runs of which each channel moves between two levels, with further free settings.
+
+    common: keys of the file that all have. keys: those of a channel, of its free settings by name.
+    """
+    levels = ("level", "other_level")
+
+    def content(values: Mapping[str, float]) -> dict[str, Any]:
+        file = dict(common)
+        for name in CHANNELS:
+            first, second = (values[f"{name}_{level}"] for level in levels)
+            swing = {"offset": 0.5 * (first + second), "amplitude": 0.5 * abs(first - second)}
+            file[name] = {**swing, **keys({key: values[f"{name}_{key}"] for key in free})}
+        return file
+
+    settings: dict[str, FreeSetting] = {}
+    for name in CHANNELS:
+        settings |= {f"{name}_{level}": frame.level(name) for level in levels}
+        settings |= {f"{name}_{key}": setting for key, setting in free.items()}
+    return Family(settings, content)
 
 
 def smooth_rise(n: int) -> FloatArray:

@@ -15,7 +15,7 @@ from sim_rig.guesses import guesses
 from sim_rig.physics import electrical, options, values
 from sim_rig.physics.friction import FRICTIONS
 from sim_rig.physics.hysteresis import hysteresis as hysteresis_model
-from sim_rig.physics.loads import LOADS
+from sim_rig.physics.loads import LOADS, wound_up
 from sim_rig.physics.options import Design
 from sim_rig.physics.parameters import Layout, constraints, fixed, log_range
 from sim_rig.plots import operating_points, plots
@@ -68,6 +68,7 @@ def actuator(
     limits: options.Limits = False,
     parameters: options.ParameterSet = "nominal",
     outputs: tuple[str, ...] = (),
+    turns: options.Turns = 0.0,
 ) -> ProcessModel:
     """The actuator with the given parts, its parameters at a named set.
 
@@ -94,7 +95,8 @@ def actuator(
     model = replace(_Assembly(design).model(outputs), variants=_variants(design, outputs))
     named = values.named(parameters, design)
     changes = {k: {"nominal": v} for k, v in named.items() if k in model.parameter_names}
-    return model.with_parameters(**changes)
+    model = model.with_parameters(**changes)
+    return model.with_initial(wound_up(model, turns)) if turns else model
 
 
 def regressors(record: Any) -> dict[str, FloatArray]:

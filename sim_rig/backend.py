@@ -231,6 +231,10 @@ class SimulatedDevice:
         """The plant's process model, with its values as nominal ones; may raise ModelError."""
         return self.options.plant.process_model()
 
+    def plant_model(self, turns: float) -> ProcessModel:
+        """The whole plant as commands drive it, so many turns wound up; may raise ModelError."""
+        return self.options.plant.driven(turns if self.options.cable else 0.0)
+
     def board(self) -> hal.Electronics:
         """The same rig anew, in virtual time and without faults of its connection."""
         options = self.options.model_copy(update={"time": "virtual", "faults": Faults()})

@@ -92,9 +92,23 @@ class Plant(Section):
         names = set(model.parameter_names)
         return _with_values(model, {k: v for k, v in self.parameters.items() if k in names})
 
-    def _actuator(self, load: options.Load, limits: bool = False) -> ProcessModel:
+    def driven(self, turns: float) -> ProcessModel:
+        """The whole plant as commands alone drive it, its cable wound up by so many turns.
+
+        Raises ModelError for a hand, whose motion nobody knows beforehand.
+        """
+        if self.load == "hand":
+            raise ModelError("a hand moves as it will: nobody can say what a run would log")
+        model = self._actuator(self.load, limits=True, turns=turns)
+        return _with_values(model, self.parameters)
+
+    def _actuator(
+        self, load: options.Load, limits: bool = False, turns: float = 0.0
+    ) -> ProcessModel:
         parts = self.model_dump(exclude={"load", "parameter_set", "parameters"})
-        return actuator(**parts, load=load, limits=limits, parameters=self.parameter_set)
+        return actuator(
+            **parts, load=load, limits=limits, parameters=self.parameter_set, turns=turns
+        )
 
 
 def state_sizes(plant: ProcessModel) -> FloatArray:

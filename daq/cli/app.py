@@ -14,7 +14,9 @@ from typer.core import TyperGroup
 from daq.cli import terminal
 from daq.cli.analyse import analyse
 from daq.cli.campaign import campaign
+from daq.cli.characterise import characterise
 from daq.cli.check import check
+from daq.cli.design import design
 from daq.cli.doctor import doctor
 from daq.cli.emulate import emulate
 from daq.cli.figures import figures
@@ -35,6 +37,8 @@ _COMMANDS: tuple[tuple[Callable[..., None], str], ...] = (
     (run, "rig run prbs.yaml --identify"),
     (check, "rig check prbs.yaml --plot check.png"),
     (analyse, "rig analyse runs/20260101T120000Z-constant_velocity"),
+    (design, "rig design question.yaml --time 10 --precision 5%"),
+    (characterise, "rig characterise simulated.yaml --time 10 --precision 5%"),
     (identify, "rig identify runs/20260101T120000Z-prbs --validate other_log.csv"),
     (campaign, "rig campaign runs/* --model actuator --model actuator:hysteresis=dahl --seeds 0:5"),
     (
@@ -52,7 +56,7 @@ _COMMANDS: tuple[tuple[Callable[..., None], str], ...] = (
     (ports, "rig ports"),
     (doctor, "rig doctor /dev/ttyACM0"),
 )
-_COMPUTING = {identify, campaign, replay, figures}  # that drive no rig
+_COMPUTING = {design, identify, campaign, replay, figures}  # that drive no rig
 _QUIET = Option("--quiet", "-q", help="Results and warnings only: no progress, no hints.")
 _VERBOSE = Option("--verbose", "-v", help="Also which files and plugins are used.")
 _VOLUME_OPTIONS = [

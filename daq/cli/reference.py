@@ -66,6 +66,11 @@ def pages(
         "What `rig identify --config FILE.yaml` and `--set KEY=VALUE` take.",
         _rows(documents["identification"]),
     )
+    made["question.md"] = _page(
+        "Question of a design: keys of the YAML",
+        "What `rig design QUESTION.yaml` and `--set KEY=VALUE` take.",
+        _rows(documents["question"]),
+    )
     made["datasheet.md"] = _page(
         "Data sheet: keys of the YAML",
         "What `rig identify --datasheet FILE.yaml` takes: for each parameter, by its name:",
@@ -82,7 +87,8 @@ def _index(protocols: Mapping[str, type[Experiment]]) -> str:
     return (
         f"{_HEAD}\n# Reference\n\nExperiments, by protocol:\n\n{experiments}\n"
         "Other files and commands:\n\n- [rig](rig.md)\n- [identification](identification.md)\n"
-        "- [data sheet](datasheet.md)\n- [command line](command-line.md)\n\n"
+        "- [question of a design](question.md)\n- [data sheet](datasheet.md)\n"
+        "- [command line](command-line.md)\n\n"
         "`rig schema` writes the same as JSON Schemas, by which editors complete and check files.\n"
     )
 

@@ -76,10 +76,12 @@ def refuse(mistakes: Sequence[Mistake]) -> None:
 
 # Keys by which each kind of file is known when it is given in another's place, and the cure.
 _SEARCH_KEYS = {"model", "columns", "ranges", "fixed", "population", "preset"}
+_QUESTION_KEYS = {"targets", "precision", "criterion", "time", "plant", "protocols", "noise"}
 _KINDS = {
     "an experiment": ({"protocol"}, "name it behind rig run or rig check"),
     "a rig": ({"backend", "limits", "sensors"}, "give it with --rig"),
     "an identification's settings": (_SEARCH_KEYS, "give it with --config"),
+    "a design's question": (_QUESTION_KEYS, "name it behind rig design"),
 }
 
 

@@ -66,6 +66,24 @@ def history(overlays: Sequence[Overlay], trends: Sequence[Trend]) -> Figure:
     return figure
 
 
+@style.styled
+def narrowing(seconds: FloatArray, names: Sequence[str], widths: FloatArray) -> Figure:
+    """Half widths of intervals [%] after so many logged seconds, (n_rounds, n_names)."""
+    labels = [notation.label(name) for name in names]
+    figure, (panel,) = style.stack([2.4], top=style.legend_room(list(names)))
+    for place, (label, width) in enumerate(zip(labels, widths.T, strict=True)):
+        panel.plot(
+            seconds, width, marker="o", ms=2.8, lw=0.9, label=label,
+            color=style.CYCLE[place % len(style.CYCLE)],
+            ls=style.DASHES[place // len(style.CYCLE) % len(style.DASHES)],
+        )  # fmt: skip
+    style.logarithmic(panel.yaxis, widths)
+    panel.set_xlabel("logged time [s]")
+    style.name_y(panel, "half width of 95 % interval", "[%]")
+    style.legend(figure, panel)
+    return figure
+
+
 def _draw_overlay(axis: Axes, overlay: Overlay) -> None:
     for place, (name, (time, values)) in enumerate(overlay.lines.items()):
         axis.plot(

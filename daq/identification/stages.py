@@ -48,7 +48,7 @@ def under(
     """
     settled = {*settings.ranges, *settings.fixed, *settings.tied, *freed}
     values: dict[str, float] = {}
-    factor: list[list[float]] = []
+    factors: list[list[float]] = []
     sources: dict[str, str] = {}
     for file in files:
         estimates = _found(file, model)
@@ -60,11 +60,11 @@ def under(
             if name in sources:
                 raise file.error(("parameters", name), f"also in {sources[name]}; keep one")
             values[name], sources[name] = estimates[name], _source(file, name)
-        rows = _factor(file, kept, model)
+        rows = factor(file, kept, model)
         before = len(values) - len(kept)
-        factor = [[*row, *[0.0] * len(kept)] for row in factor]
-        factor += [[*[0.0] * before, *row] for row in rows]
-    given = Given(values, factor) if values else None
+        factors = [[*row, *[0.0] * len(kept)] for row in factors]
+        factors += [[*[0.0] * before, *row] for row in rows]
+    given = Given(values, factors) if values else None
     if given is not None:
         try:
             given.check(model)
@@ -86,7 +86,7 @@ def _found(file: YamlFile, model: ProcessModel) -> dict[str, float]:
     except (AttributeError, KeyError, TypeError):
         raise file.error(("ambiguities",), "not as rig identify writes it", _ANEW) from None
     return {
-        str(name): _number(file, name, entry, model)
+        str(name): value(file, name, model)
         for name, entry in file.content["parameters"].items()
         if name in model.parameter_names
         and isinstance(entry, dict)
@@ -102,21 +102,27 @@ def _is_known(estimate: Mapping[str, Any]) -> bool:
     return std <= _WELL * abs(value)
 
 
-def _number(file: YamlFile, name: str, entry: Mapping[str, Any], model: ProcessModel) -> float:
-    value = entry.get("value")
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise file.error(("parameters", name, "value"), f"expected a number, found {value!r}")
-    return value * _unit(file, name, entry, model)
+def value(file: YamlFile, name: str, model: ProcessModel) -> float:
+    """A result's value of a parameter, in the model's unit; ConfigError for none."""
+    entry = file.content["parameters"][name]
+    number = entry.get("value") if isinstance(entry, dict) else entry
+    if isinstance(number, bool) or not isinstance(number, int | float):
+        raise file.error(("parameters", name, "value"), f"expected a number, found {number!r}")
+    return number * _unit(file, name, entry, model)
 
 
-def _unit(file: YamlFile, name: str, entry: Mapping[str, Any], model: ProcessModel) -> float:
+def _unit(file: YamlFile, name: str, entry: Any, model: ProcessModel) -> float:
     """The unit of a result's parameter in the model's."""
     key = ("parameters", name, "unit")
-    return unit_factor(file, key, entry.get("unit"), model.parameter(name).unit)
+    unit = entry.get("unit") if isinstance(entry, dict) else None
+    return unit_factor(file, key, unit, model.parameter(name).unit)
 
 
-def _factor(file: YamlFile, names: Sequence[str], model: ProcessModel) -> list[list[float]]:
-    """Rows of the covariance's factor for some parameters, those without any left out."""
+def factor(file: YamlFile, names: Sequence[str], model: ProcessModel) -> list[list[float]]:
+    """Rows of the covariance's factor for some parameters, those without any left out.
+
+    In the model's units; raises ConfigError for numbers that are none.
+    """
     content = file.content["covariance"]
     columns, rows = content.get("parameters"), content.get("factor")
     try:

@@ -41,11 +41,12 @@ class Doubt:
 
 
 class Limits:
-    """All limits of a rig, asked together."""
+    """All limits of a rig, asked together; faults: also those that tell hardware which fails."""
 
-    def __init__(self, config: RigConfig) -> None:
+    def __init__(self, config: RigConfig, *, faults: bool = True) -> None:
         users = [_UserCode(settings) for settings in config.limits.own]
-        self._limits: list[Limit] = [*_built_in(config), *users]
+        limits = [*_built_in(config), *users]
+        self._limits = [limit for limit in limits if faults or not limit.tells_faults]
         self._phase = Phase.OPEN
         self._doubts: dict[Limit, Doubt] = {}
 
@@ -160,6 +161,7 @@ class _UserCode(Limit):
             raise ConfigError(problem, key="limits.own") from error
         self._name = f"the limit {type(self._limit).__name__}"
         self.stops = bool(self._limit.stops)
+        self.tells_faults = bool(self._limit.tells_faults)
 
     def begin(self, phase: Phase, sample_rate: float) -> None:
         with self._blamed():

@@ -26,6 +26,7 @@ class TorqueAgreement(Limit):
     slow: a slow speed [rad/s].
     """
 
+    tells_faults = True
     stops = False
 
     def __init__(self, constant: float, friction: float, slow: float) -> None:
@@ -86,6 +87,8 @@ class CurrentAgreement(Limit):
     slow: speed [rad/s] up to which the amplifier must give half of what is asked; infinite for the
     brake's, without back EMF.
     """
+
+    tells_faults = True
 
     def __init__(self, channel: str, gain: float, limit: float, slow: float) -> None:
         self._name, self._command = f"current_{channel}", f"applied_voltage_{channel}"

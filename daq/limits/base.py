@@ -26,6 +26,9 @@ class Limit(abc.ABC):
     stops: bool = True
     """Whether it ends the run. Else ``check`` looks at all rows of a block all the same, the first
     beyond is flagged, and the record and the end of the run say why."""
+    tells_faults: bool = False
+    """Whether it tells hardware that fails: what a healthy rig of the file's ratings never shows,
+    however it is driven."""
 
     def begin(self, phase: Phase, sample_rate: float) -> None:  # noqa: B027
         """A phase begins: ticks and time count from zero again. sample_rate in Hz."""

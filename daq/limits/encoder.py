@@ -43,6 +43,8 @@ class Disagreement(Limit):
     and fro shows nothing in that sum: the paths of both are compared as well.
     """
 
+    tells_faults = True
+
     def __init__(self, turns: float) -> None:
         self._most = turns * TURN
 
@@ -174,6 +176,7 @@ class Stalled(Limit):
 class Contrary(Limit):
     """A shaft that gains speed against a motor current which must turn it."""
 
+    tells_faults = True
     stops = False
 
     def __init__(self, drive: Drive, speed: float) -> None:
@@ -214,6 +217,8 @@ class Acceleration(Limit):
     per_ampere: acceleration of the bare shaft [rad/s^2] by an ampere of the motor, at most. count:
     angle of one [rad].
     """
+
+    tells_faults = True
 
     def __init__(self, drive: Drive, per_ampere: float, count: float) -> None:
         self._drive, self._per_ampere, self._count = drive, per_ampere, count

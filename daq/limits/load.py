@@ -37,6 +37,8 @@ class Magnitude(Limit):
 class DeviceFound(Limit):
     """What the device itself found beyond its guard."""
 
+    tells_faults = True
+
     def check(self, samples: Samples) -> Trip | None:
         """Look for the device's flag."""
         flags = samples.flags

@@ -15,6 +15,8 @@ _RARER = 10  # times the longest standstill of the calibration that an input may
 class Jump(Limit):
     """Angle from one sample to the next: no shaft turns faster than this."""
 
+    tells_faults = True
+
     def __init__(self, fastest: float) -> None:
         self._fastest = fastest
 

@@ -12,6 +12,7 @@ from pydantic import BaseModel
 
 from daq.config.base import Section
 from daq.config.identification import DatasheetEntry, IdentificationConfig
+from daq.config.question import Question
 from daq.config.rig import RigConfig, with_options
 from daq.errors import ConfigError
 from daq.experiment import Experiment
@@ -68,13 +69,14 @@ def backend_options(watch: Watch = ignore) -> dict[str, type[Section]]:
 def documents(
     protocols: Mapping[str, type[Experiment]], backends: Mapping[str, type[Section]]
 ) -> dict[str, Schema]:
-    """The schemas by kind of file: experiment, rig, identification, datasheet."""
+    """The schemas by kind of file: experiment, rig, identification, question, datasheet."""
     settings = json_schema(IdentificationConfig)
     by_name = {"type": "object", "additionalProperties": json_schema(DatasheetEntry)}
     schemas = {
         "experiment": ("An experiment", experiment_schema(protocols)),
         "rig": ("A rig", rig_schema(backends)),
         "identification": ("Settings of an identification", settings),
+        "question": ("A design's question", json_schema(Question)),
         "datasheet": ("A data sheet: parameters by name", by_name),
     }
     return {k: {"$schema": DRAFT, "title": title, **s} for k, (title, s) in schemas.items()}

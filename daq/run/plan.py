@@ -23,17 +23,22 @@ def plan(experiment: Experiment, rig: RigConfig) -> Plan:
     if isinstance(experiment, ClosedLoop):
         rehearse(experiment, planned)
     _check_homing(experiment.homing.turns, rig)
-    for channel, name in enumerate(CHANNELS):
-        _check_range(planned, rig, channel, name)
-        if planned.commands is not None:
-            volts = planned.commands[:, channel]
-            _check_slew(volts, experiment.sample_rate, rig, name)
-            _check_current(volts, experiment.sample_rate, rig, name)
+    check_commands(planned, experiment.sample_rate, rig)
     if isinstance(experiment, ClosedLoop) and rig.limits.speed is not None:
         for name, values in planned.references.items():
             if experiment.columns.get(name) == "rad/s":
                 _check_speed(values, rig.limits.speed, name)
     return planned
+
+
+def check_commands(planned: Plan, sample_rate: float, rig: RigConfig) -> None:
+    """Raise ConfigError for commands beyond a rig's ranges, slew, current or i^2 t."""
+    for channel, name in enumerate(CHANNELS):
+        _check_range(planned, rig, channel, name)
+        if planned.commands is not None:
+            volts = planned.commands[:, channel]
+            _check_slew(volts, sample_rate, rig, name)
+            _check_current(volts, sample_rate, rig, name)
 
 
 def _check_homing(turns: float, rig: RigConfig) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 from sim_rig.physics.options import Load
 from sim_rig.physics.parameters import fixed
-from sysid import Input, Parameter, State
+from sysid import Input, ModelError, Parameter, ProcessModel, State
 
 GRAVITY = 9.80665  # m/s^2
 _CROSSOVER = 0.1  # rad in which a cable wound off changes sides, about as it leaves a small drum
@@ -77,6 +77,20 @@ def pulley_torque(theta: Any, omega: Any, x: Any, u: Any, p: Any) -> tuple[Any, 
     pressed = max(height - length, 0.0)
     stop = stiffness * pressed * max(1.0 + loss * speed, 0.0)
     return -tension * lever, speed, (tension - stop) / mass - GRAVITY
+
+
+def wound_up(model: ProcessModel, turns: float) -> dict[str, float]:
+    """Where states of an actuator start whose brake holds a load that was wound up.
+
+    Raises ModelError for a load without a cable.
+    """
+    values = dict(zip(model.parameter_names, model.nominal.tolist(), strict=True))
+    if "k_cable" not in values:
+        raise ModelError(f"turns: {turns:g} are wound up of a load that has no cable; load: pulley")
+    theta = 2.0 * math.pi * turns
+    length = values["radius"] * (math.hypot(theta, _CROSSOVER) - _CROSSOVER)
+    height = length - values["mass"] * GRAVITY / values["k_cable"]
+    return {"theta": theta, "height": height, "z": -1.0}
 
 
 def hand_torque(theta: Any, omega: Any, x: Any, u: Any, p: Any) -> tuple[Any]:

@@ -47,6 +47,9 @@ Sensor = Annotated[
     Field(description="torque sensor at the load, or between motor and brake"),
 ]
 Limits = Annotated[bool, Field(description="ends of the amplifiers' range: 24 V, 2.5 A")]
+Turns = Annotated[
+    float, Field(ge=0.0, le=1000.0, description="turns of a pulley's cable wound up at the start")
+]
 ParameterSet = Annotated[
     Literal["nominal", "rig", "A", "B", "C", "D"],
     Field(

@@ -14,6 +14,8 @@ class Setting:
     """A free setting of an excitation, between two ends.
 
     log: whether it is drawn by its logarithm; whole: whether it is a whole number, such as a seed.
+    calm: the value towards which it excites less, to which it is drawn where a run would pass a
+    limit; None where no value does.
 
     >>> Setting(0.01, 1.0, log=True).value(0.5).__round__(3)
     0.1
@@ -23,9 +25,16 @@ class Setting:
     high: float
     log: bool = False
     whole: bool = False
+    calm: float | None = None
 
     def __post_init__(self) -> None:
         check_range("of a setting", self.low, self.high, "log" if self.log else "linear")
+
+    def towards_calm(self, gene: float) -> float:
+        """A place in its range, halfway to where it excites less."""
+        if self.calm is None or self.log:
+            return gene
+        return 0.5 * (gene + (self.calm - self.low) / (self.high - self.low))
 
     def value(self, gene: float) -> float:
         """The value at a place in its range, 0 at the low end and 1 at the high one."""
@@ -59,6 +68,11 @@ class Excitation:
         """Settings at places (n_settings,) in their ranges."""
         pairs = zip(self.settings.items(), genes.tolist(), strict=True)
         return {name: setting.value(gene) for (name, setting), gene in pairs}
+
+    def calmer(self, genes: FloatArray) -> FloatArray:
+        """Places in the ranges of the settings at which they excite less, (n_settings,)."""
+        pairs = zip(self.settings.values(), genes.tolist(), strict=True)
+        return np.array([setting.towards_calm(gene) for setting, gene in pairs])
 
     def signal(self, genes: FloatArray) -> FloatArray:
         """Inputs at places in the ranges of the settings, (n_samples, n_inputs)."""

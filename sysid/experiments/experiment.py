@@ -99,6 +99,7 @@ def design(
     noise: Mapping[str, float],
     runs: int = 4,
     targets: Mapping[str, float] | None = None,
+    precision: float | None = None,
     quantities: Sequence[str] = (),
     criterion: criteria.Name = "D",
     prior: Prior | None = None,
@@ -116,7 +117,7 @@ def design(
     offspring: int = 16,
     accuracy: float = 1e-3,
     seed: int = 0,
-    watch: Callable[[str], None] | None = None,
+    watch: Callable[[int, int], None] | None = None,
 ) -> Design:
     """Choose the runs that tell most about the parameters of a model.
 
@@ -125,7 +126,8 @@ def design(
     not count, an input left out is known exactly. runs: the most there
     may be. targets: half width of the 95 % interval that is wanted, in parts of the value, by
     parameter or combination (``{"K_m": 0.01, "J_m + J_b": 0.05}``); runs are added until all are
-    met. Without targets the ``criterion`` decides: D of all parameters, A (mean variance) or E
+    met; precision: the same for all that experiments can tell. Without them the ``criterion``
+    decides: D of all parameters, A (mean variance) or E
     (largest variance) of ``quantities``, by default all that experiments can tell.
 
     prior: what is known, by default the model's ranges around its nominal values; before: (n_free,
@@ -135,7 +137,7 @@ def design(
     takes the place of these limits where a plant is not the model alone. draws: parameter vectors
     over which the criterion is averaged (ED-optimality). candidates, generations, offspring: how
     many runs are tried at random, and how often how many new ones are made of the best. watch: is
-    told how far it is.
+    told how many runs have been simulated, and how many of them kept the limits.
 
     Raises ModelError for unknown names, equations that cannot be differentiated, where every
     candidate would pass a limit, and where the simulation's error would pass for information.
@@ -160,6 +162,8 @@ def design(
     measured = [name for name in model.output_names if name in noise]
     structure = identifiability(space.as_model().with_outputs(measured), sensors=False)
     wanted = chosen(tuple(targets or quantities), structure, space)
+    if precision is not None:
+        targets = {quantity.text: precision for quantity in wanted}
     knowledge, rng = prior or Prior.of_ranges(space), np.random.default_rng(seed)
     information = knowledge.information() + (0.0 if before is None else before)
     drawn = knowledge.draws(space, max(draws, checks), rng)
@@ -176,8 +180,8 @@ def design(
     goals = np.array(list((targets or {}).values())) / Z95
     gradients = relative_gradients(wanted, space, robust)
     of_information = criteria.Criterion(criterion, information, gradients, goals)
-    search = Search(excitations, evaluate, of_information, rng, runs)
-    search.run(candidates, generations, offspring, watch)
+    search = Search(excitations, evaluate, of_information, rng, runs, watch)
+    search.run(candidates, generations, offspring)
     total = search.total()
     for expected, chromosome in zip(total, robust, strict=True):
         refuse_phantoms(expected, informant.null_directions(chromosome))

@@ -8,6 +8,7 @@ their offspring become candidates.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from sysid.experiments.excitation import Excitation
 from sysid.problem.model import ModelError
 
 _WIDEST, _FINEST = 0.3, 0.02  # deviation of a moved setting, in parts of its range
-_HALVINGS = 3  # of the way from offspring that pass a limit to one that does not
+_HALVINGS = 3  # of the way from a run that passes a limit to one that does not
 _ROUNDS = 20  # of exchanges
 _GAIN = 1e-9  # by which an exchange must lower the loss
 
@@ -43,7 +44,7 @@ class Search:
     """Candidates so far, and the best set of them.
 
     attempts: runs that were simulated; chosen: the set, as places in ``pool``, the same one perhaps
-    several times.
+    several times. watch: is told the attempts and those within the limits after each.
     """
 
     excitations: Sequence[Excitation]
@@ -51,15 +52,14 @@ class Search:
     criterion: Criterion
     rng: np.random.Generator
     most: int
+    watch: Callable[[int, int], None] | None = None
 
     def __post_init__(self) -> None:
         self.pool: list[RunCandidate] = []
         self.chosen: list[int] = []
         self.attempts = 0
 
-    def run(
-        self, candidates: int, generations: int, offspring: int, watch: Callable[[str], None] | None
-    ) -> None:
+    def run(self, candidates: int, generations: int, offspring: int) -> None:
         """Candidates anywhere, then generations of offspring of the best set.
 
         Raises ModelError where none of the candidates keeps the limits.
@@ -72,16 +72,17 @@ class Search:
             )
         self.choose()
         for k in range(generations):
-            if watch is not None:
-                watch(f"generation {k + 1} of {generations}: {len(self.pool)} runs to choose from")
             self.generation(offspring, k / max(generations - 1, 1))
             self.choose()
 
     def scatter(self, n: int) -> None:
-        """Candidates anywhere in the settings' ranges, of each excitation alike many."""
+        """Candidates anywhere in the settings' ranges, of each excitation alike many.
+
+        One that passes a limit is drawn to where its settings excite less.
+        """
         for k in range(n):
             excitation = self.excitations[k % len(self.excitations)]
-            self._add(excitation, self.rng.random(len(excitation.settings)))
+            self._settle(excitation, self.rng.random(len(excitation.settings)), excitation.calmer)
 
     def generation(self, n: int, progress: float) -> None:
         """Offspring of the chosen; progress: 0 at the first generation, 1 at the last."""
@@ -94,7 +95,8 @@ class Search:
                 genes[from_father] = father.genes[from_father]
             moves = width * self.rng.standard_normal(len(genes))
             moves[self.rng.random(len(genes)) < 0.5] = 0.0
-            self._settle(mother, np.clip(genes + moves, 0.0, 1.0))
+            back = partial(_midway, mother.genes)
+            self._settle(mother.excitation, np.clip(genes + moves, 0.0, 1.0), back)
 
     def choose(self) -> None:
         """The best set that greed and exchanges lead to."""
@@ -128,12 +130,17 @@ class Search:
             self.chosen[place] = best
         return better
 
-    def _settle(self, mother: RunCandidate, genes: FloatArray) -> None:
-        """Add offspring, drawn towards its mother, who keeps the limits, until it does."""
+    def _settle(
+        self,
+        excitation: Excitation,
+        genes: FloatArray,
+        back: Callable[[FloatArray], FloatArray],
+    ) -> None:
+        """Add a candidate, drawn back where it passes a limit until it does not."""
         for _ in range(_HALVINGS + 1):
-            if self._add(mother.excitation, genes):
+            if self._add(excitation, genes):
                 break
-            genes = 0.5 * (genes + mother.genes)
+            genes = back(genes)
 
     def _add(self, excitation: Excitation, genes: FloatArray) -> bool:
         """Add a candidate if it keeps the limits; whether it does."""
@@ -141,4 +148,10 @@ class Search:
         candidate = self.evaluate(excitation, genes)
         if candidate is not None:
             self.pool.append(candidate)
+        if self.watch is not None:
+            self.watch(self.attempts, len(self.pool))
         return candidate is not None
+
+
+def _midway(origin: FloatArray, genes: FloatArray) -> FloatArray:
+    return 0.5 * (genes + origin)

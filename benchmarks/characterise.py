@@ -1,0 +1,136 @@
+"""What `rig characterise` tells of hidden rigs, beside 8 runs of the shipped PRBS.
+
+python -m benchmarks.characterise [--json] [--rigs 3] [--first 0] [--time 10]
+
+Each rig is the simulated one with the model's nominal values, each times a factor of 0.6 to 1.6
+drawn anew. It is characterised from the model's ranges within 10 s of logged time; the same rig
+then makes 8 runs of the shipped PRBS, 10 s, with seeds of their own, which are identified together.
+Figures: geometric mean of the ratio of the intervals' widths (of a quantity that the PRBS does not
+bound the ratio counts none), the widest interval, how many hold the truth, and achieved over
+predicted deviations.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from benchmarks._common import arguments, report
+from daq import record
+from daq.characterise import characterise
+from daq.characterise.rounds import Interval, Round
+from daq.identification.fit import fit
+from daq.identification.request import SettingsRequest
+from daq.identification.settings import problem_of
+from daq.logs.capture import LOG_NAME
+from daq.lookup.shipped import find_file
+from sim_rig.actuator import actuator
+from sysid import identifiability
+from sysid.experiments.quantities import determined
+from sysid.problem.space import SearchSpace
+
+RUNS = 8
+FACTORS = 0.6, 1.6
+SEEDS = 1000  # between those of one run of the PRBS and the next
+
+
+def main() -> None:
+    parser = arguments(__doc__ or "")
+    parser.add_argument("--rigs", type=int, default=3, help="hidden parameters drawn")
+    parser.add_argument("--first", type=int, default=0, help="number of the first rig")
+    parser.add_argument("--time", type=float, default=10.0, help="logged time [s]")
+    options = parser.parse_args()
+    numbers = range(options.first, options.first + options.rigs)
+    rigs = [hidden_rig(number, options.time) for number in numbers]
+    report({"rigs": rigs}, options.json, show)
+
+
+def hidden_rig(number: int, seconds: float) -> dict[str, Any]:
+    """Figures of one rig."""
+    model = actuator()
+    rng = np.random.default_rng(number)
+    free = [p for p in model.parameters if not p.fixed]
+    truth = {p.name: p.nominal * rng.uniform(*FACTORS) for p in free}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        rig = _rig_file(folder, number, truth)
+        begin = time.perf_counter()
+        designed = characterise.characterise(rig, seconds, None, folder / "c")
+        spent = time.perf_counter() - begin
+        shipped = _shipped(folder, rig, designed.rounds[-1])
+    nominal = dict(zip(model.parameter_names, model.nominal.tolist(), strict=True))
+    structure, space = identifiability(model, sensors=False), SearchSpace.of(model)
+    values = {q.text: q.value({**nominal, **truth}) for q in determined(structure, space)}
+    bounded = [i for i in designed.intervals if i.width is not None]
+    pairs = [(i.width, shipped[i.name].width) for i in bounded if shipped[i.name].width]
+    ratios = [prbs / width for width, prbs in pairs if width and prbs]
+    return {
+        "rig": number,
+        "seconds": spent,
+        "logged": designed.seconds,
+        "quantities": {
+            i.name: {
+                "designed": i.width,
+                "expected": i.expected,
+                "prbs": shipped[i.name].width,
+                "value": i.value,
+                "truth": values[i.name],
+            }
+            for i in designed.intervals
+        },
+        "narrower": float(np.exp(np.mean(np.log(ratios)))) if ratios else None,
+        "unbounded_by_prbs": sum(i.width is None for i in shipped.values()),
+        "unbounded": len(designed.intervals) - len(bounded),
+        "covered": sum(_covers(i, values[i.name]) for i in bounded) / max(len(bounded), 1),
+    }
+
+
+def _covers(interval: Interval, truth: float) -> bool:
+    assert interval.width is not None
+    return abs(truth - interval.value) <= interval.width * abs(interval.value)
+
+
+def _rig_file(folder: Path, number: int, truth: dict[str, float]) -> Path:
+    content = yaml.safe_load(find_file("backend", "simulated.yaml").read_text(encoding="utf-8"))
+    content["options"]["seed"] = number
+    content["options"]["plant"]["parameters"] = {name: float(v) for name, v in truth.items()}
+    path = folder / "rig.yaml"
+    path.write_text(yaml.safe_dump(content))
+    return path
+
+
+def _shipped(folder: Path, rig: Path, last: Round) -> dict[str, Interval]:
+    """Intervals of the same quantities from runs of the shipped PRBS."""
+    content = yaml.safe_load(find_file("protocol", "prbs.yaml").read_text(encoding="utf-8"))
+    logs = []
+    for k in range(RUNS):
+        for j, channel in enumerate(("motor", "brake")):
+            content[channel]["seed"] = 1 + SEEDS * (2 * k + j)
+        experiment = folder / f"prbs-{k}.yaml"
+        experiment.write_text(yaml.safe_dump(content))
+        logs.append(record(experiment, rig, folder / "prbs").folder / LOG_NAME)
+    identification = Round(folder / "shipped", 1)
+    identification.folder.mkdir(parents=True)
+    (identification.folder / "design.json").write_bytes((last.folder / "design.json").read_bytes())
+    fit(problem_of(SettingsRequest()), logs, [], identification.identification)
+    return {interval.name: interval for interval in identification.intervals()}
+
+
+def show(figures: dict[str, Any]) -> None:
+    for rig in figures["rigs"]:
+        print(f"\nRig {rig['rig']}: {rig['logged']:g} s logged, {rig['seconds']:.0f} s spent")
+        for name, q in rig["quantities"].items():
+            widths = (q[key] for key in ("designed", "expected", "prbs"))
+            shown = "  ".join(f"{'-':>9}" if w is None else f"{100 * w:7.3g} %" for w in widths)
+            print(f"  {name:20} {shown}   off {100 * (q['value'] / q['truth'] - 1):+.2g} %")
+        print(f"  narrower by {rig['narrower']}, covered {rig['covered']:.2f}")
+        print(f"  unbounded: {rig['unbounded']}, by the PRBS {rig['unbounded_by_prbs']}")
+
+
+if __name__ == "__main__":
+    main()

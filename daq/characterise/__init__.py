@@ -1,0 +1,1 @@
+"""A rig's parameters by itself: run, identify, design, run, until they are known well enough."""

@@ -1,0 +1,212 @@
+"""Run, identify, design, and again, until precision, time or information end."""
+
+from __future__ import annotations
+
+import datetime
+import shlex
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from daq.characterise.page import write_page
+from daq.characterise.rounds import Interval, Request, Round, rounds_of
+from daq.config.yaml_file import TypedSettings
+from daq.design.design import choose, set_up, write
+from daq.errors import RigError, Terminated
+from daq.files import make_folder
+from daq.identification.fit import check_writable, fit
+from daq.identification.request import CHECKPOINT, SettingsRequest
+from daq.identification.settings import problem_of
+from daq.logs.capture import LOG_NAME
+from daq.lookup.models import whole_name
+from daq.lookup.rigs import load_rig
+from daq.progress import Started, Watch, ignore
+from daq.recording.session import record
+from daq.report.publication import publish
+
+_FIRST = 0.25  # of the time, for a first round, from what little is known
+_LATER = 0.5  # of what is left, for each that follows
+_LEAST = 2  # runs of a last round: fewer join the round before
+_GAIN = 0.98  # of the widths, to which a round must be expected to bring them
+
+
+@dataclass(frozen=True)
+class Characterisation:
+    """A rig's parameters after all rounds, and why there are no more.
+
+    intervals: after the last round. seconds: logged in all. verdict: of the last identification.
+    """
+
+    folder: Path
+    rounds: tuple[Round, ...]
+    intervals: tuple[Interval, ...]
+    seconds: float
+    reason: str
+    verdict: dict[str, Any]
+    page: Path
+    report: Path
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """The same for machines."""
+        return {
+            "folder": str(self.folder),
+            "rounds": len(self.rounds),
+            "logged_seconds": self.seconds,
+            "ended": self.reason,
+            "quantities": [asdict(interval) for interval in self.intervals],
+            "verdict": self.verdict,
+            "parameters": str(self.rounds[-1].identification / "parameters.yaml"),
+            "page": str(self.page),
+            "report": str(self.report),
+        }
+
+
+def characterise(
+    rig: str | Path = "simulated.yaml",
+    time: float = 60.0,
+    precision: float | None = 5.0,
+    out: str | Path | None = None,
+    *,
+    model: str | None = None,
+    plant: str | None = None,
+    config: str | Path | None = None,
+    settings: Sequence[str] = (),
+    watch: Watch = ignore,
+) -> Characterisation:
+    """Find a rig's parameters: design runs, run them, identify, and again.
+
+    time: logged time of all runs, at most [s]. precision: half width wanted of all 95 % intervals
+    [%], None for as narrow as they get. out: a new folder for all of it. settings: keys of the
+    designs, as ``key=value``. Raises ConfigError before anything moves, and what a run raises.
+    """
+    request = Request(
+        _absolute(rig) if Path(rig).exists() else str(rig),
+        time,
+        precision,
+        None if model is None else whole_name(model),
+        None if plant is None else whole_name(plant),
+        None if config is None else _absolute(config),
+        tuple(settings),
+    )
+    load_rig(str(rig), watch=watch)
+    now = datetime.datetime.now(datetime.UTC)
+    folder = Path(out) if out is not None else Path("runs") / f"{now:%Y%m%dT%H%M%SZ}-characterise"
+    check_writable(folder)
+    set_up(_question(request, [], request.time), watch)
+    request.save(folder)
+    return resume(folder, watch=watch)
+
+
+def resume(folder: str | Path, *, watch: Watch = ignore) -> Characterisation:
+    """Go on with a characterisation from what is there, however it ended.
+
+    Raises ConfigError where none has begun, and what a run raises.
+    """
+    root = Path(folder)
+    request = Request.load(root)
+    try:
+        return _continued(root, request, watch)
+    except (KeyboardInterrupt, Terminated, RigError) as stop:
+        command = f"rig characterise --resume {shlex.quote(str(root))}"
+        stop.add_note(f"what was done until then is kept; go on with: {command}")
+        raise
+
+
+def _continued(root: Path, request: Request, watch: Watch) -> Characterisation:
+    done = rounds_of(root)
+    reason = _end(request, done)
+    while not reason:
+        current = Round(root, len(done) + 1)
+        if not _design(current, request, done, watch):
+            reason = "no run within the limits would tell more"
+            break
+        _run(current, request, watch)
+        _identify([*done, current], request, watch)
+        done.append(current)
+        write_page(root, done, "still running")
+        reason = _end(request, done)
+    last = done[-1]
+    page = write_page(root, done, reason)
+    return Characterisation(
+        root, tuple(done), tuple(last.intervals()), _spent(done), reason,
+        last.result["verdict"], page, root / "report" / "report.html",
+    )  # fmt: skip
+
+
+def _absolute(path: str | Path) -> str:
+    return str(Path(path).resolve())
+
+
+def _end(request: Request, done: Sequence[Round]) -> str:
+    """Why there is no further round; empty where there is one."""
+    if not done:
+        return ""
+    if request.precision is not None:
+        widths = [interval.width for interval in done[-1].intervals()]
+        if all(w is not None and 100.0 * w <= request.precision for w in widths):
+            return f"all that experiments tell is known to {request.precision:g} %"
+    if _spent(done) + done[-1].seconds / len(done[-1].experiments) > request.time * (1.0 + 1e-9):
+        return f"the {request.time:g} s are used up"
+    return ""
+
+
+def _spent(done: Sequence[Round]) -> float:
+    return sum(each.seconds for each in done)
+
+
+def _question(request: Request, done: Sequence[Round], seconds: float) -> TypedSettings:
+    """What the design of the next round is asked, of so many seconds."""
+    last = done[-1] if done else None
+    options = {
+        "rig": request.rig,
+        "model": request.model,
+        "plant": request.plant,
+        "config": request.config,
+        "parameters": None if last is None else str(last.identification),
+        "log": None if last is None else str(last.captures(last.experiments[0])[0]),
+        "time": seconds,
+        "seed": len(done),
+    }
+    given = {key: value for key, value in options.items() if value is not None}
+    return TypedSettings.of(given, list(request.settings))
+
+
+def _design(current: Round, request: Request, done: Sequence[Round], watch: Watch) -> bool:
+    """Design a round, unless it is there; whether it promises to tell more."""
+    if not current.is_designed:
+        watch(Started(f"round {current.number}"))
+        left = request.time - _spent(done)
+        share = _LATER * left if done else _FIRST * left
+        question = set_up(_question(request, done, left), watch).question
+        runs, most = max(1, round(share / question.seconds)), question.most_runs
+        if most - runs < _LEAST:
+            runs = most
+        setup = set_up(_question(request, done, runs * question.seconds))
+        write(setup, choose(setup, watch), current.folder)
+    return any(q["after"] < _GAIN * q["before"] for q in current.design["quantities"])
+
+
+def _run(current: Round, request: Request, watch: Watch) -> None:
+    """Run what of a round's experiments has not been run to its end."""
+    for experiment in current.experiments:
+        if not current.captures(experiment):
+            record(experiment, request.rig, current.runs, watch=watch)
+
+
+def _identify(rounds: Sequence[Round], request: Request, watch: Watch) -> None:
+    """Identify from all runs until now, and publish the result."""
+    folder = rounds[-1].identification
+    problem = problem_of(SettingsRequest(request.config, {"model": request.model}), watch)
+    logs = [
+        each.captures(experiment)[0] / LOG_NAME
+        for each in rounds
+        for experiment in each.experiments
+    ]
+    going_on = (folder / CHECKPOINT).exists()
+    identification = fit(problem, logs, [], folder, watch, resume=going_on)
+    if identification.interrupted:
+        raise KeyboardInterrupt
+    make_folder(rounds[-1].root / "report")
+    publish(identification, rounds[-1].root / "report", watch)

@@ -1,0 +1,168 @@
+"""Rounds of a characterisation, as they stand on the disk.
+
+One folder holds all of it: the request, and for each round its design, its runs and the
+identification from all runs until then. Each part is written whole, its last file last, so that
+after a kill what is there is done, and the rest is done anew.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from daq.config import json_file, yaml_file
+from daq.design.design import DATA
+from daq.errors import ConfigError
+from daq.files import make_folder, write_whole
+from daq.identification.request import PARAMETERS
+from daq.logs.capture import COMPLETED, RUN_NAME
+
+_REQUEST = "characterise.json"
+_RUNS, _IDENTIFICATION = "runs", "identification"
+
+
+@dataclass(frozen=True)
+class Request:
+    """What was asked for; rig, model, plant and config as they are found from any folder.
+
+    time: logged, of all runs together [s]. precision: half width of the 95 % intervals [%], None
+    for as narrow as the time allows. settings: further keys of the designs, as ``key=value``.
+    """
+
+    rig: str
+    time: float
+    precision: float | None = None
+    model: str | None = None
+    plant: str | None = None
+    config: str | None = None
+    settings: tuple[str, ...] = ()
+
+    def save(self, folder: Path) -> None:
+        """Write it into the folder of the rounds. Raises ConfigError for one with another in it."""
+        make_folder(folder)
+        file = folder / _REQUEST
+        if file.exists():
+            cure = (
+                f"go on with it: rig characterise --resume {folder}, or choose another with --out"
+            )
+            raise ConfigError("a characterisation has begun there", cure=cure, file=folder)
+        write_whole(file, json.dumps(asdict(self), indent=1) + "\n")
+
+    @classmethod
+    def load(cls, folder: Path) -> Request:
+        """The request in a folder. Raises ConfigError where there is none."""
+        file = folder / _REQUEST
+        if not file.exists():
+            cure = "name the folder that rig characterise made"
+            raise ConfigError("no characterisation has begun there", cure=cure, file=folder)
+        try:
+            content = json_file.load(file, "request", "characterise anew")
+            return cls(**{**content, "settings": tuple(content["settings"])})
+        except (KeyError, TypeError) as error:
+            raise ConfigError(
+                f"not a request: {error}", cure="characterise anew", file=file
+            ) from None
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A quantity after a round: its value, and half width of its 95 % interval in parts of it.
+
+    expected: the half width that the design predicted; None where it is not in the design. width
+    is None where the runs determine no interval.
+    """
+
+    name: str
+    unit: str
+    value: float
+    width: float | None
+    expected: float | None
+
+
+@dataclass(frozen=True)
+class Round:
+    """A round, by its number from 1, in the folder of all."""
+
+    root: Path
+    number: int
+
+    @property
+    def folder(self) -> Path:
+        """Where it stands."""
+        return self.root / f"round-{self.number}"
+
+    @property
+    def identification(self) -> Path:
+        """Where its result stands."""
+        return self.folder / _IDENTIFICATION
+
+    @property
+    def runs(self) -> Path:
+        """Where its captures go."""
+        return self.folder / _RUNS
+
+    @property
+    def is_designed(self) -> bool:
+        """Whether its design is there."""
+        return (self.folder / DATA).exists()
+
+    @property
+    def is_identified(self) -> bool:
+        """Whether its result is there."""
+        return (self.identification / PARAMETERS).exists()
+
+    @property
+    def design(self) -> dict[str, Any]:
+        """The design's document."""
+        return json_file.load(self.folder / DATA, "design", "delete its folder and go on")
+
+    @property
+    def experiments(self) -> list[Path]:
+        """Its experiments' files, in order."""
+        return [self.folder / Path(run["file"]).name for run in self.design["runs"]]
+
+    @property
+    def seconds(self) -> float:
+        """Logged time of its runs [s]."""
+        return float(self.design["duration_seconds"])
+
+    def captures(self, experiment: Path) -> list[Path]:
+        """Folders of an experiment's runs that were completed."""
+        return [
+            record.parent
+            for record in sorted(self.runs.glob(f"*-{experiment.stem}*/{RUN_NAME}"))
+            if json_file.load(record, "record", "delete its folder").get("status") == COMPLETED
+        ]
+
+    @property
+    def result(self) -> dict[str, Any]:
+        """The result's document."""
+        return yaml_file.load(self.identification / PARAMETERS).content
+
+    def intervals(self) -> list[Interval]:
+        """All that experiments can tell, after this round."""
+        result = self.result
+        entries: dict[str, Mapping[str, Any]] = dict(result["parameters"])
+        for ambiguity in result.get("ambiguities") or ():
+            entries |= {entry["name"]: entry for entry in ambiguity["determined"]}
+        return [
+            _interval(quantity, entries.get(quantity["name"], {}))
+            for quantity in self.design["quantities"]
+        ]
+
+
+def _interval(quantity: Mapping[str, Any], entry: Mapping[str, Any]) -> Interval:
+    value = entry.get("value", quantity["value"])
+    low, high = entry.get("interval") or (None, None)
+    bounded = low is not None and high is not None and value
+    width = 0.5 * abs((high - low) / value) if bounded else None
+    return Interval(quantity["name"], quantity["unit"], value, width, quantity["after"])
+
+
+def rounds_of(folder: Path) -> list[Round]:
+    """Rounds with a result, in order."""
+    numbers = range(1, 1 + len(list(folder.glob("round-*"))))
+    return [each for n in numbers if (each := Round(folder, n)).is_identified]

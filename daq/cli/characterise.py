@@ -1,0 +1,119 @@
+"""``rig characterise``: a rig's parameters by runs that design themselves."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from typer import Argument, Option
+
+from daq.cli import completion, options, terminal
+from daq.config.units import converted
+from daq.errors import ConfigError
+
+if TYPE_CHECKING:
+    from daq.characterise.characterise import Characterisation
+
+
+def characterise(
+    rig: Annotated[
+        str,
+        Argument(
+            metavar="[RIG.yaml]",
+            help="Rig file; default the simulated rig.",
+            autocompletion=completion.rigs,
+        ),
+    ] = "simulated.yaml",
+    time: Annotated[
+        str, Option(metavar="SECONDS", help="Logged time of all runs, at most.")
+    ] = "60 s",
+    precision: Annotated[
+        str | None,
+        Option(metavar="PERCENT", help="Half width wanted of all intervals, such as 5%."),
+    ] = None,
+    model: options.ModelName = None,
+    plant: Annotated[
+        str | None,
+        Option(metavar="NAME|FILE.py:OBJECT", help="The whole rig as a model, load included."),
+    ] = None,
+    config: options.ConfigFile = None,
+    out: Annotated[
+        Path | None, Option(metavar="DIR", help="New folder for all of it; default under runs/.")
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        Option(
+            "--set",
+            metavar="KEY=VALUE",
+            help="A key of the designs' question, such as protocols=[prbs]; may be repeated.",
+        ),
+    ] = None,
+    resume: Annotated[
+        Path | None, Option(metavar="DIR", help="Go on with what was interrupted there.")
+    ] = None,
+    json: options.AsJson = False,
+) -> None:
+    """Find a rig's parameters: design runs, run them, identify, and again.
+
+    Until the intervals are narrow enough, the time is used up, or no run would tell more. One
+    folder holds designs, logs, results and a page; after an interruption it goes on from there.
+    """
+    from daq.characterise import characterise as use_case
+
+    with terminal.watching(json) as watch:
+        if resume is not None:
+            result = use_case.resume(resume, watch=watch)
+        else:
+            result = use_case.characterise(
+                rig,
+                _number("--time", time, "s"),
+                None if precision is None else _number("--precision", precision, "%"),
+                out,
+                model=model,
+                plant=plant,
+                config=config,
+                settings=settings or [],
+                watch=watch,
+            )
+    if json:
+        terminal.print_json(result.document)
+    else:
+        _show(result)
+
+
+def _number(option: str, text: str, unit: str) -> float:
+    """A number above 0, with its unit or without."""
+    try:
+        number = float(converted(text, unit))
+    except ValueError:
+        number = -1.0
+    if not 0.0 < number <= 1e5:
+        raise ConfigError(
+            f"{text!r} is no number above 0 in {unit}", cure=f"write {option} 10 or "
+            f"{option} '10 {unit}'", key=option,
+        )  # fmt: skip
+    return number
+
+
+def _show(result: Characterisation) -> None:
+    number = terminal.number
+    rows = [
+        [
+            interval.name,
+            number(interval.value),
+            interval.unit,
+            "-" if interval.width is None else number(100.0 * interval.width, 2),
+            "-" if interval.expected is None else number(100.0 * interval.expected, 2),
+        ]
+        for interval in result.intervals
+    ]
+    print()
+    spent = f"{result.seconds:g} s in {len(result.rounds)} rounds"
+    title = f"After {spent}: 95 % intervals in % of the value"
+    head = ["quantity", "value", "unit", "half width", "expected"]
+    terminal.print_table(title, head, rows, text=["unit"])
+    terminal.print_text(f"It ended because {result.reason}. Trust: {result.verdict['trust']}.")
+    print(f"Page: {result.page}")
+    print(f"Report: {result.report}")
+    last = result.rounds[-1]
+    terminal.print_next(f"rig replay LOG --parameters {last.identification / 'parameters.yaml'}")

@@ -1,0 +1,1 @@
+"""Experiments designed for a rig: from a question to files that ``rig run`` runs."""

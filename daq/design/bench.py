@@ -1,0 +1,179 @@
+"""A rig that is only computed: what its runs would log, and whether they would pass a limit."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from daq.config.rig import RigConfig
+from daq.errors import ConfigError
+from daq.experiment import Plan
+from daq.hal import CHANNELS, FloatArray, IntArray, Phase, Samples
+from daq.limits import Limits
+from daq.limits.base import TURN
+from daq.run.plan import check_commands
+from sysid import BatchSimulator, Dataset, ProcessModel
+
+COMMANDS = tuple(f"applied_voltage_{name}" for name in CHANNELS)
+MEASURED = ("current_motor", "current_brake", "torque", "theta", "omega")
+_ASTRAY = 0.5  # of the noise, by which a model may err where it is right
+_ACCURACY = 1e-2  # of the plant, beside which margins are wide
+
+
+class PlantBench:
+    """Runs on a computed plant within the rig's limits: a bench for ``sysid.design``.
+
+    plant: of which commands are inputs and the rig's signals outputs; others of its inputs are
+    zero. turns: wound up before each run. margin: part of each limit that is kept from it: whatever
+    is commanded or measured must keep them when it is so much larger. noise: of the model's outputs
+    by name; a run in which the plant does what the model does not, such as an amplifier at the end
+    of its range, would lead its parameters astray, and is refused as well.
+    """
+
+    def __init__(
+        self,
+        model: ProcessModel,
+        plant: ProcessModel,
+        rig: RigConfig,
+        turns: float = 0.0,
+        margin: float = 0.1,
+        noise: Mapping[str, float] | None = None,
+    ) -> None:
+        for name in set(model.input_names) - {*COMMANDS, *plant.output_names}:
+            raise ConfigError(
+                f"model {model.name} has the input {name}, and nothing tells it: it is no command, "
+                f"and the plant's outputs are {', '.join(plant.output_names)}",
+                cure="name a plant that has it, with --plant",
+            )
+        signals = [name for name in MEASURED if name in plant.output_names]
+        if not set(COMMANDS) <= set(plant.input_names) or "omega" not in signals:
+            raise ConfigError(
+                f"plant {plant.name} does not turn commands into a rig's signals",
+                cure=f"give it the inputs {' and '.join(COMMANDS)}, and outputs among "
+                f"{', '.join(MEASURED)}",
+            )
+        self._model, self._rig, self._turns = model, rig, turns
+        self._scale = 1.0 / (1.0 - margin)
+        self._simulator = BatchSimulator(plant, accuracy=_ACCURACY)
+        self._model_simulator = BatchSimulator(model, accuracy=_ACCURACY)
+        self._noise = {n: s for n, s in (noise or {}).items() if n in model.output_names}
+        starts = dict(zip(plant.state_names, plant.initial_state.tolist(), strict=True))
+        named = zip(model.state_names, model.initial_state.tolist(), strict=True)
+        self._starts = np.array([[starts.get(name, start) for name, start in named]])
+        shared = [name for name in model.parameter_names if name in plant.parameter_names]
+        self._from = [model.parameter_names.index(name) for name in shared]
+        self._to = [plant.parameter_names.index(name) for name in shared]
+        self._n_steps: int | None = None
+
+    def records(
+        self, inputs: FloatArray, dt: float, vectors: FloatArray
+    ) -> Sequence[Dataset] | None:
+        """As of ``sysid.experiments.bench.Bench``; inputs: commands (n_samples, 2) [V]."""
+        if not self._commands_allowed(inputs, dt):
+            return None
+        # Most of what passes a limit does so with the likeliest parameters.
+        first = self.signals(inputs, dt, vectors[:1])
+        if not self._within_limits(inputs, dt, first):
+            return None
+        likeliest = self._record(inputs, dt, first, 0)
+        if not self._follows(likeliest, vectors[:1], first):
+            return None
+        others = self.signals(inputs, dt, vectors[1:])
+        if not self._within_limits(inputs, dt, others):
+            return None
+        signals = {name: np.concatenate([first[name], others[name]]) for name in first}
+        return [self._record(inputs, dt, signals, k) for k in range(len(vectors))]
+
+    def signals(self, inputs: FloatArray, dt: float, vectors: FloatArray) -> dict[str, FloatArray]:
+        """What the rig's sensors would see, by name, each (n, n_samples).
+
+        vectors: (n, n_parameters), of the model's parameters.
+        """
+        plant = self._simulator.model
+        values = np.tile(plant.nominal, (len(vectors), 1))
+        values[:, self._to] = vectors[:, self._from]
+        driven = np.zeros((len(inputs), len(plant.inputs)))
+        driven[:, [plant.input_names.index(name) for name in COMMANDS]] = inputs
+        record = Dataset(driven, np.full((len(inputs), len(plant.outputs)), np.nan), dt)
+        if self._n_steps is None:
+            self._n_steps = int(self._simulator.steps_of_each(values, record).max())
+        outputs = self._simulator.trajectories(values, record, self._n_steps)
+        return {name: outputs[:, :, j] for j, name in enumerate(plant.output_names)}
+
+    def _commands_allowed(self, inputs: FloatArray, dt: float) -> bool:
+        plan = Plan(len(inputs), inputs.min(axis=0), inputs.max(axis=0), inputs)
+        try:
+            check_commands(plan, 1.0 / dt, self._rig)
+        except ConfigError:
+            return False
+        return True
+
+    def _follows(
+        self, record: Dataset, vectors: FloatArray, signals: Mapping[str, FloatArray]
+    ) -> bool:
+        """Whether the model does what the plant does, to within the noise of its outputs."""
+        simulator = self._model_simulator
+        # By as many steps, so that errors of the integration are alike.
+        outputs = simulator.trajectories(vectors, record, self._n_steps, self._starts)[0]
+        errors = {
+            name: outputs[:, j] - signals[name][0]
+            for j, name in enumerate(simulator.model.output_names)
+            if name in self._noise and name in signals
+        }
+        return all(
+            float(np.sqrt(np.mean(error**2))) <= _ASTRAY * self._noise[name]
+            for name, error in errors.items()
+        )
+
+    def _within_limits(
+        self, inputs: FloatArray, dt: float, signals: Mapping[str, FloatArray]
+    ) -> bool:
+        """Whether the rig's limits let all of several runs pass."""
+        n_runs = len(next(iter(signals.values())))
+        if not all(np.isfinite(values).all() for values in signals.values()):
+            return False
+        return all(
+            self._passes(self._samples(inputs, dt, {n: s[k] for n, s in signals.items()}))
+            for k in range(n_runs)
+        )
+
+    def _passes(self, samples: Samples) -> bool:
+        limits, rate = Limits(self._rig, faults=False), 1.0 / (samples.time[1] - samples.time[0])
+        if self._turns:
+            limits.begin(Phase.HOMING, rate)
+            limits.check(_wound(samples, self._turns))
+        limits.begin(Phase.RUN, rate)
+        return limits.check(samples) is None
+
+    def _samples(self, inputs: FloatArray, dt: float, signals: Mapping[str, FloatArray]) -> Samples:
+        """A run as a log would have it, with all that it does larger by the margin."""
+        n, scale = len(inputs), self._scale
+        missing = np.zeros(n)
+        measured = {name: scale * signals.get(name, missing) for name in MEASURED}
+        volts = {
+            f"{kind}_voltage_{name}": scale * inputs[:, j]
+            for j, name in enumerate(CHANNELS)
+            for kind in ("cmd", "applied")
+        }
+        ticks: IntArray = np.arange(n, dtype=np.int64)
+        time: FloatArray = ticks * dt
+        flags = np.zeros(n, dtype=np.int64)
+        return Samples(tick=ticks, time=time, flags=flags, **volts, **measured)
+
+    def _record(
+        self, inputs: FloatArray, dt: float, signals: Mapping[str, FloatArray], run: int
+    ) -> Dataset:
+        """What the model would be given of a run."""
+        commands = dict(zip(COMMANDS, inputs.T, strict=True))
+        columns = [
+            commands[name] if name in commands else signals[name][run]
+            for name in self._model.input_names
+        ]
+        unseen = np.full((len(inputs), len(self._model.outputs)), np.nan)
+        return Dataset(np.column_stack(columns), unseen, dt, "design")
+
+
+def _wound(samples: Samples, turns: float) -> Samples:
+    """Two samples of the winding that a run follows: before it, and after."""
+    ends = {name: values[:2] * 0 for name, values in vars(samples).items()}
+    angle = np.array([0.0, turns * TURN])
+    return Samples(**{**ends, "tick": samples.tick[:2], "time": samples.time[:2], "theta": angle})

@@ -1,0 +1,108 @@
+"""What is known before a design: parameters with their covariance, and noise of the sensors."""
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from daq.config.rig import RigConfig
+from daq.config.yaml_file import YamlFile
+from daq.errors import ConfigError
+from daq.hal import ANALOG_INPUTS, FloatArray
+from daq.identification import stages
+from daq.logs.recording import Recording
+from sysid import ProcessModel, SearchSpace
+from sysid.experiments import Prior
+
+_VOLTS = 0.010  # rms at an analog input, where nothing tells more
+_COUNTS = 1.0 / 6.0  # of the count in a sample, by which a speed errs
+
+
+def prior_of(space: SearchSpace, file: YamlFile | None) -> Prior:
+    """What the ranges say, and beside them an earlier identification's result.
+
+    file: the result. Raises ConfigError for one of another model, or without numbers.
+    """
+    ranges = Prior.of_ranges(space)
+    if file is None:
+        return ranges
+    model, n_free = space.model, len(space.index)
+    names = [name for name in space.names[:n_free] if name in file.content["parameters"]]
+    if not names:
+        problem = f"it has no parameter of model {model.name} that is searched"
+        raise file.error(("parameters",), problem, "name a result of the same model")
+    places = [space.names.index(name) for name in names]
+    values = ranges.values.copy()
+    values[places] = [stages.value(file, name, model) for name in names]
+    values = np.clip(values, space.lower, space.upper)
+    changes = np.zeros((0, n_free))
+    rows = stages.factor(file, names, model)
+    if rows:
+        changes = np.zeros((len(rows), n_free))
+        changes[:, places] = rows
+        changes /= np.where(space.log, values, 1.0)
+    return Prior(values, _together(ranges.covariance, changes, places))
+
+
+def _together(ranges: FloatArray, changes: FloatArray, places: list[int]) -> FloatArray:
+    """Covariance of coordinates known by their ranges and by a result's independent changes.
+
+    changes: (n, n_free), of one standard deviation each; places: the coordinates that it knows.
+    """
+    block = np.ix_(places, places)
+    covariance = (changes.T @ changes)[block]
+    # What no change moves has been told exactly, as far as numbers go.
+    least = 1e-9 * np.eye(len(places)) * max(float(np.trace(covariance)), 1e-12)
+    information = np.linalg.inv(ranges)
+    information[block] += np.linalg.inv(covariance + least)
+    together: FloatArray = np.linalg.inv(information)
+    return 0.5 * (together + together.T)
+
+
+def noise_of(
+    file: YamlFile,
+    given: Mapping[str, float],
+    rig: RigConfig,
+    model: ProcessModel,
+    sample_rate: float,
+    log: Recording | None,
+) -> dict[str, float]:
+    """Standard deviation of each measured output and input of a model.
+
+    given: by name, from ``file``, before what the calibration of a log tells and what is assumed.
+    Raises ConfigError for a name that is not measured, or of which nothing is known.
+    """
+    measured = [
+        *model.output_names,
+        *(name for name in model.input_names if not name.startswith("applied_")),
+    ]
+    for name in given:
+        if name not in measured:
+            problem = f"model {model.name} measures no {name}; it measures {', '.join(measured)}"
+            raise file.error(("noise", name), problem)
+    assumed = _assumed(rig, sample_rate)
+    noise = {}
+    for name in measured:
+        calibrated = log.noise(name)[0] if log is not None else 0.0
+        deviation = given.get(name) or calibrated or assumed.get(name)
+        if deviation is None:
+            cure = f"write its standard deviation, noise: {{{name}: ...}}"
+            raise file.error(("noise",), f"nothing tells the noise of {name}", cure)
+        noise[name] = deviation
+    return noise
+
+
+def _assumed(rig: RigConfig, sample_rate: float) -> dict[str, float]:
+    """Noise of a rig's signals by its sensors' scales and its encoder's counts."""
+    sensors = rig.sensors
+    count = abs(sensors.encoder.count)
+    analog = {name: _VOLTS * getattr(sensors, name).scale for name in ANALOG_INPUTS}
+    return {**analog, "theta": count / math.sqrt(12.0), "omega": _COUNTS * count * sample_rate}
+
+
+def require_calibrated(path: Path, log: Recording) -> None:
+    """Raise ConfigError for a log whose run was not calibrated."""
+    if not (log.record or {}).get("calibration", {}).get("noise"):
+        problem = "it has no calibration, which tells the noise of the sensors"
+        raise ConfigError(problem, cure="name the folder of a run that rig run made", file=path)

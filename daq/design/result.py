@@ -1,0 +1,117 @@
+"""What a design holds for people and machines: runs, predicted intervals, what stays unknown."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from daq.config.question import Question
+from daq.hal import FloatArray
+from sysid import Design, ProcessModel
+
+_WIDE = 0.5  # half width in parts of the value, from which a quantity counts as hardly known
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """What no run of a design tells, why, and what would tell it."""
+
+    names: tuple[str, ...]
+    why: str
+    cure: str
+
+
+@dataclass(frozen=True)
+class PlannedRun:
+    """A run of a design: its file, its protocol and what it is expected to do.
+
+    commands: (n_samples, 2) [V]. signals: of the rig by name, (n_draws, n_samples) each, the first
+    row at the likeliest parameters. dt: sample time [s].
+    """
+
+    file: Path
+    protocol: str
+    settings: Mapping[str, float]
+    commands: FloatArray
+    signals: Mapping[str, FloatArray]
+    dt: float
+
+
+@dataclass(frozen=True)
+class DesignResult:
+    """A design for a rig, and its files.
+
+    model_name, rig_name: as they are typed. noise: standard deviations that it counts on.
+    """
+
+    question: Question
+    model: ProcessModel
+    model_name: str
+    rig_name: str
+    design: Design
+    runs: tuple[PlannedRun, ...]
+    noise: Mapping[str, float]
+    folder: Path
+    figure: Path
+
+    @property
+    def unknown(self) -> list[Unknown]:
+        """What stays unknown behind these runs."""
+        return [*self._of_structure(), *self._of_information()]
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """The same for machines."""
+        return {
+            "model": self.model_name,
+            "rig": self.rig_name,
+            "duration_seconds": self.design.duration,
+            "met": self.design.met,
+            "runs": [
+                {
+                    "file": str(run.file),
+                    "protocol": run.protocol,
+                    "seconds": len(run.commands) * run.dt,
+                    "settings": dict(run.settings),
+                }
+                for run in self.runs
+            ],
+            "quantities": [
+                {**asdict(quantity), "met": quantity.met} for quantity in self.design.quantities
+            ],
+            "unknown": [asdict(unknown) for unknown in self.unknown],
+            "noise": dict(self.noise),
+            "simulated": self.design.attempts,
+            "beyond_limits": self.design.refused,
+            "figure": str(self.figure),
+        }
+
+    def _of_structure(self) -> list[Unknown]:
+        """What the equations let no experiment tell."""
+        listing = f"rig models {self.model_name} --identifiable"
+        unknown = []
+        for group in self.design.tied:
+            together = ", ".join(combination.text for combination in group.combinations)
+            only = f"only {together} of them act" if together else "they act only together"
+            fix = " and ".join(group.fix)
+            cure = f"measure {fix} by other means and fix it, or mount the rig otherwise: with"
+            cure += f" another load or its sensor elsewhere ({listing} compares)"
+            unknown.append(Unknown(group.parameters, f"on what is measured {only}", cure))
+        if self.design.unseen:
+            cure = "fix it by other means, or measure what it acts on"
+            unknown.append(Unknown(self.design.unseen, "it acts on nothing measured", cure))
+        return unknown
+
+    def _of_information(self) -> list[Unknown]:
+        """What these runs do not tell well enough."""
+        missed = [q for q in self.design.quantities if not q.met]
+        wide = [q for q in self.design.quantities if q.target is None and q.after > _WIDE]
+        unknown = []
+        for quantities, why in (
+            (missed, "the time or the limits do not allow what was asked for"),
+            (wide, "these runs hardly feel it"),
+        ):
+            if quantities:
+                cure = "give more time, or wider limits; or fix it by other means"
+                unknown.append(Unknown(tuple(q.name for q in quantities), why, cure))
+        return unknown

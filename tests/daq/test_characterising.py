@@ -1,0 +1,106 @@
+"""``rig characterise``: rounds in one folder, which go on from wherever they were ended."""
+
+import itertools
+import json
+import shutil
+import signal
+import subprocess
+
+import pytest
+
+from daq.characterise.rounds import Round, rounds_of
+from tests.daq.support import few_free, rig, start_rig, write_yaml
+
+QUICK = ["candidates=8", "generations=0", "draws=1", "checks=2", "calibration=16", "run=0.5 s"]
+
+
+def words(*more):
+    settings = [word for setting in QUICK for word in ("--set", setting)]
+    return ["characterise", "--config", "id.yaml", "--out", "c", *settings, *more]
+
+
+@pytest.fixture
+def folder(tmp_path):
+    write_yaml(tmp_path / "id.yaml", few_free())
+    return tmp_path
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A characterisation of three parameters in 1.5 s, to its end."""
+    folder = tmp_path_factory.mktemp("finished")
+    write_yaml(folder / "id.yaml", few_free())
+    done = rig(*words("--time", "1.5", "--json"), cwd=folder, timeout=300)
+    assert done.returncode == 0, done.stderr
+    return folder, json.loads(done.stdout)
+
+
+def test_it_uses_the_time_and_tells_the_parameters(finished):
+    folder, document = finished
+    assert document["logged_seconds"] == 1.5
+    assert document["ended"] == "the 1.5 s are used up"
+    widths = {q["name"]: q["width"] for q in document["quantities"]}
+    assert widths.keys() == {"R_m", "K_m", "B_m"}
+    page = (folder / "c" / "characterise.html").read_text()
+    for quantity in document["quantities"]:
+        assert f'data-value="{quantity["value"]!r}"' in page
+    assert (folder / "c" / "report" / "report.html").exists()
+
+
+def test_each_round_is_narrower_than_the_one_before(finished):
+    rounds = rounds_of(finished[0] / "c")
+    assert len(rounds) > 1
+    for before, after in itertools.pairwise(rounds):
+        pairs = zip(before.intervals(), after.intervals(), strict=True)
+        widths = [(a.width, b.width) for a, b in pairs if a.width is not None]
+        assert sum(b < a for a, b in widths) >= len(widths) - 1
+
+
+def test_what_was_done_is_not_done_again(finished, tmp_path):
+    shutil.copytree(finished[0], tmp_path, dirs_exist_ok=True)
+    last = rounds_of(tmp_path / "c")[-1]
+    shutil.rmtree(last.identification)
+    logs = {path: path.stat().st_mtime_ns for path in (tmp_path / "c").rglob("log.csv")}
+    done = rig("characterise", "--resume", "c", "--json", cwd=tmp_path, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["quantities"] == finished[1]["quantities"]
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "c").rglob("log.csv")} == logs
+
+
+def test_a_folder_that_is_taken_is_not_written_to(finished):
+    folder, _ = finished
+    done = rig(*words("--time", "1.5"), cwd=folder)
+    assert done.returncode == 2
+    assert "go on with it: rig characterise --resume c" in done.stderr
+
+
+def test_mistakes_are_named_before_anything_is_written(folder):
+    for more, named in (
+        (["--precision", "five"], "--precision: 'five' is no number above 0 in %"),
+        (["--set", "protocols=[play]"], "protocol play has no settings"),
+        (["serial.yaml"], "name a model of the whole plant"),
+    ):
+        done = rig(*words(*more), cwd=folder)
+        assert done.returncode == 2
+        assert named in done.stderr
+    assert not (folder / "c").exists()
+    done = rig("characterise", "--resume", "c", cwd=folder)
+    assert done.returncode == 2
+    assert "name the folder that rig characterise made" in done.stderr
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("until", ["design.json", "log.csv", "search.ckpt", "parameters.yaml"])
+def test_a_killed_characterisation_goes_on_to_the_same_end(until, finished, folder):
+    process = start_rig(*words("--time", "1.5", "--json"), cwd=folder)
+    while process.poll() is None and not list((folder / "c").rglob(until)):
+        try:
+            process.wait(0.01)
+        except subprocess.TimeoutExpired:
+            continue
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    assert Round(folder / "c", 1).folder.exists()
+    done = rig("characterise", "--resume", "c", "--json", cwd=folder, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["quantities"] == finished[1]["quantities"]

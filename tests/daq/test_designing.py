@@ -1,0 +1,183 @@
+"""``rig design``: files that ``rig run`` runs, within limits, and what they would tell."""
+
+import json
+
+import numpy as np
+import pytest
+import yaml
+
+from daq.config.yaml_file import TypedSettings
+from daq.design.bench import PlantBench
+from daq.design.design import set_up
+from daq.experiment import Frame
+from daq.lookup.classes import find_class
+from daq.lookup.rigs import load_rig
+from sim_rig.actuator import actuator
+from tests.daq.support import few_free, merged, rig, write_yaml
+
+QUICK = {"candidates": 10, "generations": 0, "draws": 1, "checks": 2, "calibration": 16}
+QUESTION = {**QUICK, "time": "2.5 s", "config": "id.yaml", "targets": {"K_m": "1 %"}}
+FRAME = Frame(1000, 800.0, (-5.0, 5.0), (0.0, 0.38))
+
+
+@pytest.fixture
+def asked(tmp_path):
+    """A question on three parameters in a folder of its own."""
+    write_yaml(tmp_path / "id.yaml", few_free())
+    return write_yaml(tmp_path / "question.yaml", QUESTION)
+
+
+def bench(**changes):
+    config, device = load_rig("simulated.yaml")
+    limits = merged(config.limits.model_dump(), changes)
+    config = config.model_copy(update={"limits": type(config.limits).model_validate(limits)})
+    model = actuator(parameters="rig")
+    return PlantBench(model, device.plant_model(5.0), config, 5.0), model.nominal[None]
+
+
+def commands(motor, brake=0.0):
+    return np.tile([motor, brake], (400, 1))
+
+
+@pytest.mark.parametrize("name", ["chirp", "multisine", "prbs", "sine", "steps"])
+def test_all_of_a_family_are_runs_of_the_frames_length_within_the_ranges(name):
+    protocol = find_class("protocol", name, None)
+    family, rng = protocol.family(FRAME), np.random.default_rng(1)
+    for place in (0.0, 1.0, *rng.random(6)):
+        values = {
+            key: free.low * (free.high / free.low) ** place if free.log
+            else free.low + (free.high - free.low) * place
+            for key, free in family.free.items()
+        }  # fmt: skip
+        content = {"protocol": name, "sample_rate": 800, **family.content(values)}
+        waveform = protocol.model_validate(content).waveform()
+        assert waveform.shape == (1000, 2)
+        assert np.all(waveform >= [-5.0 - 1e-9, -1e-9])
+        assert np.all(waveform <= [5.0 + 1e-9, 0.38 + 1e-9])
+
+
+@pytest.mark.parametrize(
+    ("limits", "motor"),
+    [
+        ({"current": {"motor": 0.5}}, 1.2),  # A of 0.6
+        ({"speed": 20.0}, 1.2),
+        ({"torque": 0.01}, 0.1),
+        ({"winding": 4.99}, -0.3),
+        ({"travel": [-1.0, 5.01]}, 1.2),
+        ({"i2t": {"motor": {"continuous": 0.1, "budget": 0.01}}}, 0.6),
+        ({"command": {"motor": [-0.5, 0.5]}}, 0.6),
+    ],
+)
+def test_a_run_beyond_any_limit_is_refused(limits, motor):
+    within, vectors = bench()
+    assert within.records(commands(motor), 1.0 / 800.0, vectors) is not None
+    tight, _ = bench(**limits)
+    assert tight.records(commands(motor), 1.0 / 800.0, vectors) is None
+
+
+def test_a_limit_is_kept_by_the_margin():
+    config = load_rig("simulated.yaml")[0]
+    loose, vectors = bench()
+    top = np.abs(loose.signals(commands(0.9), 1.0 / 800.0, vectors)["omega"]).max()
+    for share, passes in ((1.12, True), (1.08, False)):
+        tight, _ = bench(speed=share * float(top))
+        records = tight.records(commands(0.9), 1.0 / 800.0, vectors)
+        assert (records is not None) == passes, config.name
+
+
+def test_a_run_that_drives_an_amplifier_to_its_end_is_left_to_models_that_have_one():
+    noise = {"current_motor": 0.005, "current_brake": 0.005, "omega": 0.1}
+    config, device = load_rig("simulated.yaml")
+    for limits, motor, passes in ((False, 0.2, True), (False, 1.2, False), (True, 1.2, True)):
+        model = actuator(limits=limits, parameters="rig")
+        judge = PlantBench(model, device.plant_model(5.0), config, 5.0, 0.1, noise)
+        records = judge.records(commands(motor), 1.0 / 800.0, model.nominal[None])
+        assert (records is not None) == passes
+
+
+def test_what_the_model_is_given_of_a_run_is_what_the_rig_would_log(tmp_path):
+    loose, vectors = bench()
+    (record,) = loose.records(commands(0.3, 0.05), 1.0 / 800.0, vectors)
+    experiment = {
+        "protocol": "steps", "homing": {"turns": 5}, "motor": {"levels": [0.3], "hold": 0.5},
+        "brake": {"levels": [0.05], "hold": 0.5}, "name": "levels",
+    }  # fmt: skip
+    write_yaml(tmp_path / "levels.yaml", experiment)
+    write_yaml(tmp_path / "rig.yaml", {"backend": "simulated", "options": {"ideal": True}})
+    rig("run", "levels.yaml", "--rig", "rig.yaml", cwd=tmp_path)
+    (log,) = tmp_path.glob("runs/*/log.csv")
+    table = np.genfromtxt(log, delimiter=",", names=True)
+    assert record.inputs[40:, 2] == pytest.approx(table["torque"][40:400], abs=1e-3)
+
+
+def test_a_design_writes_runs_a_figure_and_what_they_would_tell(asked, tmp_path):
+    done = rig("design", asked, "--out", "d", "--json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    document = json.loads(done.stdout)
+    assert json.loads((tmp_path / "d" / "design.json").read_text()) == document
+    assert (tmp_path / "d" / "design.png").stat().st_size > 10_000
+    by_name = {quantity["name"]: quantity for quantity in document["quantities"]}
+    assert by_name.keys() == {"R_m", "K_m", "B_m"}
+    assert by_name["K_m"]["target"] == 0.01
+    assert all(q["after"] < q["before"] for q in document["quantities"])
+    for run in document["runs"]:
+        checked = rig("check", run["file"], "--json", cwd=tmp_path)
+        assert json.loads(checked.stdout)["samples"] == 1000
+
+
+def test_a_designed_run_passes_no_limit_and_is_identified(asked, tmp_path):
+    rig("design", asked, "--out", "d", cwd=tmp_path)
+    done = rig("run", "d/designed-1.yaml", "--json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    folder = json.loads(done.stdout)["run"]["folder"]
+    identified = rig("identify", folder, "--config", "id.yaml", cwd=tmp_path)
+    assert identified.returncode == 0, identified.stderr
+    again = rig(
+        "design", asked, "--parameters", folder, "--log", folder, "--out", "e", "--json",
+        cwd=tmp_path,
+    )  # fmt: skip
+    assert "noise is assumed" not in again.stderr
+    before, after = (json.loads((tmp_path / name / "design.json").read_text()) for name in "de")
+    for first, second in zip(before["quantities"], after["quantities"], strict=True):
+        assert second["before"] < first["before"]
+
+
+def test_prior_from_a_result_has_its_deviations(tmp_path):
+    write_yaml(tmp_path / "id.yaml", few_free())
+    value = {"R_m": 1.1, "K_m": 0.15, "B_m": 2e-4}
+    factor = [[0.011, 0.0, 0.0], [0.0, 0.003, 0.0], [0.0, 1e-3, 1e-5]]
+    units = dict(zip(value, ("ohm", "N*m/A", "N*m*s/rad"), strict=True))
+    result = {
+        "parameters": {name: {"value": value[name], "unit": units[name]} for name in value},
+        "covariance": {"parameters": list(value), "factor": factor},
+    }
+    (tmp_path / "result.yaml").write_text(yaml.safe_dump(result))
+    files = {name: str(tmp_path / f"{name}.yaml") for name in ("id", "result")}
+    setup = set_up(TypedSettings.of({"config": files["id"], "parameters": files["result"]}))
+    exact = np.array(factor).T @ np.array(factor) / np.outer([*value.values()], [*value.values()])
+    order = [setup.space.names.index(name) for name in value]
+    assert setup.prior.values[order] == pytest.approx([*value.values()])
+    assert setup.prior.covariance[np.ix_(order, order)] == pytest.approx(exact, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ({"tagrets": {"K_m": 1}}, "question.yaml:1:1: tagrets: unknown key; did you mean"),
+        ({"targets": {"K_m": 1}, "precision": 5}, "give targets or precision, not both"),
+        ({"protocols": ["play"]}, "protocols.0: protocol play has no settings"),
+        ({"run": "3 s", "time": "2 s"}, "run: a run of 3 s is longer than the 2 s of all"),
+        ({"noise": {"x": 1.0}}, "noise.x: model actuator measures no x; it measures"),
+        ({"targets": {"J_m": 5}, **QUICK}, "targets: J_m: no experiment tells it, for J_m, J_b"),
+        ({"rig": "serial.yaml", "time": 5}, "name a model of the whole plant, such as --plant"),
+        ({"time": 5, "plant": "lag"}, "plant: unknown model 'lag'; known are actuator"),
+        ({"protocol": "prbs"}, "this file holds an experiment, and should hold a design's"),
+    ],
+)
+def test_a_mistake_in_a_question_is_named_with_its_cure(content, words, tmp_path):
+    write_yaml(tmp_path / "question.yaml", content)
+    done = rig("design", "question.yaml", cwd=tmp_path)
+    assert done.returncode == 2
+    assert words in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "designs").exists()
