@@ -79,6 +79,7 @@ _SEARCH_KEYS = {"model", "columns", "ranges", "fixed", "population", "preset"}
 _KINDS = {
     "an experiment": ({"protocol"}, "name it behind rig run or rig check"),
     "a rig": ({"backend", "limits", "sensors"}, "give it with --rig"),
+    "a torque controller's settings": ({"controller"}, "give it to rig tune"),
     "an identification's settings": (_SEARCH_KEYS, "give it with --config"),
 }
 

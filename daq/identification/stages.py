@@ -60,7 +60,7 @@ def under(
             if name in sources:
                 raise file.error(("parameters", name), f"also in {sources[name]}; keep one")
             values[name], sources[name] = estimates[name], _source(file, name)
-        rows = _factor(file, kept, model)
+        rows = factor_of(file, kept, model)
         before = len(values) - len(kept)
         factor = [[*row, *[0.0] * len(kept)] for row in factor]
         factor += [[*[0.0] * before, *row] for row in rows]
@@ -115,7 +115,7 @@ def _unit(file: YamlFile, name: str, entry: Mapping[str, Any], model: ProcessMod
     return unit_factor(file, key, entry.get("unit"), model.parameter(name).unit)
 
 
-def _factor(file: YamlFile, names: Sequence[str], model: ProcessModel) -> list[list[float]]:
+def factor_of(file: YamlFile, names: Sequence[str], model: ProcessModel) -> list[list[float]]:
     """Rows of the covariance's factor for some parameters, those without any left out."""
     content = file.content["covariance"]
     columns, rows = content.get("parameters"), content.get("factor")
