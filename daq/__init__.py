@@ -1,9 +1,9 @@
 """Rigs, runs and their logs; what the commands do, as functions for scripts and notebooks.
 
 ``check`` previews an experiment, ``record`` runs it, ``analyse`` concludes from a run, ``load``
-reads a log, ``identify``, ``resume``, ``compare``, ``campaign``, ``replay`` and ``tune`` do what the commands
-of these names do. They never print: ``watch`` is called with what they say meanwhile. Each is
-imported when it is first used.
+reads a log, ``identify``, ``resume``, ``compare``, ``campaign``, ``replay`` and ``tune`` do
+what the commands of these names do. They never print: ``watch`` is called with what they say
+meanwhile. Each is imported when it is first used.
 """
 
 from __future__ import annotations

@@ -7,16 +7,17 @@ commands. Controllers are registered under the entry-point group ``rig.controlle
 
 import abc
 from dataclasses import dataclass
-from typing import Protocol, Self
+from typing import Any, Protocol, Self
 
 import numpy as np
 from pydantic import Field
 
 from daq.config.base import Section
 from daq.config.units import Amperes, Hertz
+from daq.errors import ConfigError
 from daq.experiment import Sample
 from daq.hal import FloatArray
-from sysid import ProcessModel
+from sysid import LinearModel, ProcessModel
 
 _ENDS = (2.5, 97.5)  # %
 
@@ -57,6 +58,47 @@ class Fact:
         return float(f"{low:.5g}"), float(f"{high:.5g}")
 
 
+@dataclass(frozen=True)
+class OperatingPoint:
+    """A linear model of the actuator for small deviations from a state, and its shaft there.
+
+    branch: of the hysteresis. brake_current [A]. stiffness [N*m/rad], damping [N*m*s/rad]: of the
+    shaft. linear: of all states; its inputs are the commands and the hand's torque.
+    """
+
+    branch: str
+    brake_current: float
+    stiffness: float
+    damping: float
+    linear: LinearModel
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+
+    def state_space(self) -> Any:
+        """The same as a ``control.StateSpace`` of python-control, signals named.
+
+        Raises ConfigError where that is not installed.
+
+        >>> from daq import tune
+        >>> point = tune("torque.yaml", model="actuator:parameters=rig").operating_points()[0]
+        >>> point.state_space().output_labels
+        ['current_motor', 'current_brake', 'omega', 'theta']
+        """
+        try:
+            import control
+        except ImportError:
+            cure = "install it with pip install hybrid-rig[control]"
+            raise ConfigError("python-control is not installed", cure=cure) from None
+        return control.ss(
+            *self.linear,
+            states=list(self.states),
+            inputs=list(self.inputs),
+            outputs=list(self.outputs),
+            name=f"{self.branch} at {1e3 * self.brake_current:g} mA",
+        )
+
+
 class TorqueControl(Section, abc.ABC):
     """Settings of a torque controller, and how they become a law."""
 
@@ -78,6 +120,12 @@ class TorqueControl(Section, abc.ABC):
 
         Raises sysid.ModelError for a model that it cannot control.
         """
+
+    def operating_points(
+        self, model: ProcessModel, parameters: FloatArray
+    ) -> tuple[OperatingPoint, ...]:
+        """The family of linear models that the controller has to do with; none by default."""
+        return ()
 
     def tuned(self, facts: tuple[Fact, ...]) -> Self:
         """The settings as the uncertainty of the facts allows them; see each controller."""

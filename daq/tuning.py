@@ -19,7 +19,7 @@ from daq.lookup.controllers import load_settings
 from daq.lookup.models import find_model, name_parts
 from daq.progress import Watch, ignore
 from daq.provenance import software_versions
-from daq.torque import Fact, TorqueControl
+from daq.torque import Fact, OperatingPoint, TorqueControl
 from sysid import ModelError, ProcessModel
 
 _HEAD = """\
@@ -32,8 +32,8 @@ class Tuning:
     """A controller for an actuator, and what it rests on.
 
     parameters: values by name. source: where they come from. facts: quantities of the actuator,
-    with the spread that the identification's uncertainty gives them. n_draws: plausible parameters
-    that were looked at. uncertain: parameters that the identification gives no interval, which are
+    with the spread that the identification's uncertainty gives them. draws: plausible parameters,
+    (n, n_parameters). uncertain: parameters that the identification gives no interval, which are
     taken as they are.
 
     >>> from daq import tune
@@ -48,7 +48,7 @@ class Tuning:
     parameters: Mapping[str, float]
     source: str
     facts: tuple[Fact, ...]
-    n_draws: int
+    draws: FloatArray
     uncertain: tuple[str, ...]
 
     @cached_property
@@ -59,7 +59,7 @@ class Tuning:
             "model": self.model_name,
             "parameters": dict(self.parameters),
             "source": self.source,
-            "draws": self.n_draws,
+            "draws": len(self.draws),
             "facts": {
                 fact.name: {
                     "value": float(f"{fact.value:.6g}"),
@@ -68,9 +68,23 @@ class Tuning:
                 }
                 for fact in self.facts
             },
+            "operating_points": [
+                {
+                    "branch": point.branch,
+                    "brake_current": round(point.brake_current, 6),
+                    "stiffness": float(f"{point.stiffness:.4g}"),
+                    "damping": float(f"{point.damping:.4g}"),
+                }
+                for point in self.operating_points()
+            ],
             **({"without_interval": list(self.uncertain)} if self.uncertain else {}),
             "software": software_versions(),
         }
+
+    def operating_points(self, draw: int | None = None) -> tuple[OperatingPoint, ...]:
+        """The family of linear models, of the parameters or of one of the draws."""
+        vector = self.model.vector(dict(self.parameters)) if draw is None else self.draws[draw]
+        return self.control.operating_points(self.model, vector)
 
     def save(self, path: str | Path) -> None:
         """Write the file that experiments name. Raises ConfigError."""
@@ -127,8 +141,7 @@ def tune(
     except ModelError as error:
         raise ConfigError(str(error), file=source) from None
     named = dict(zip(chosen.parameter_names, vector.tolist(), strict=True))
-    n_draws = len(plausible)
-    return Tuning(control.tuned(facts), name, chosen, named, source, facts, n_draws, uncertain)
+    return Tuning(control.tuned(facts), name, chosen, named, source, facts, plausible, uncertain)
 
 
 def _draws(
@@ -141,7 +154,8 @@ def _draws(
     """
     names = list(model.parameter_names)
     columns = [name for name in file.content["covariance"].get("parameters") or () if name in names]
-    rows = np.array(stages.factor_of(file, columns, model)).reshape(-1, len(columns))
+    factor = stages.factor_of(file, columns, model)
+    rows = np.array(factor).reshape(len(factor), len(columns))
     searched = [p.name for p in model.parameters if not _is_fixed(file, p.name)]
     spread = {name for name, column in zip(columns, rows.T, strict=True) if np.any(column)}
     rng = np.random.default_rng(seed)

@@ -5,9 +5,10 @@ from collections.abc import Callable
 import numpy as np
 from pydantic import Field
 
-from daq.torque import Fact, TorqueControl
+from daq.torque import Fact, OperatingPoint, TorqueControl
 from haptics.allocation import Allocation, Preference
 from haptics.dynamics import ActuatorDynamics
+from haptics.operating_points import operating_points
 from sysid import ProcessModel
 from sysid.arrays import FloatArray
 
@@ -58,6 +59,12 @@ class ActuatorControl(TorqueControl):
             Fact(name, value(nominal), unit, np.array([value(each) for each in plausible]), meaning)
             for name, unit, meaning, value in _FACTS
         )
+
+    def operating_points(
+        self, model: ProcessModel, parameters: FloatArray
+    ) -> tuple[OperatingPoint, ...]:
+        """Within the brake's yield travel and sliding either way, up to its largest current."""
+        return operating_points(model, parameters, np.linspace(0.0, self.brake_current, 4).tolist())
 
     def most_volts(self, model: ProcessModel, parameters: FloatArray) -> tuple[float, float]:
         """Those of the largest currents, at rest."""

@@ -1,9 +1,10 @@
 """Which part of a torque the motor gives and which the brake, in closed form.
 
-The shaft's torque is T = K i_m + b i_b with i_b >= 0. The slope b = dT/di_b follows from the state of
-the brake's hysteresis: it is against the motion where the brake slides, and passes zero with the
-hysteresis variable where the motion turns round. So a brake that only dissipates is asked for exactly
-what it can give, and its current comes and goes with b, continuously: nothing chatters at rest.
+The shaft's torque is T = K i_m + b i_b with i_b >= 0. The slope b = dT/di_b follows from the state
+of the brake's hysteresis: it is against the motion where the brake slides, and passes zero with the
+hysteresis variable where the motion turns round. So a brake that only dissipates is asked for
+exactly what it can give, and its current comes and goes with b, continuously: nothing chatters at
+rest.
 """
 
 from dataclasses import dataclass
@@ -33,12 +34,12 @@ class Allocation:
         if self.preference == "motor" or torque * slope <= 0.0:
             return 0.0
         most = abs(self.constant) * limit_m
-        # What is beyond the motor is the brake's under any preference, as far as it reaches; less
-        # and less where its slope passes zero.
-        excess = max(abs(torque) - most, 0.0)
-        least = excess * abs(slope) / max(slope**2, (excess / limit_b) ** 2)
+        # What is beyond the motor is the brake's under any preference. Where an ampere of it gives
+        # less than one of the motor, it fades out: the current has no jump where b passes zero.
+        reach = limit_b * min(abs(slope / self.constant), 1.0)
+        least = min((abs(torque) - most) / abs(slope), reach) if abs(torque) > most else 0.0
         if self.preference == "stiction":
-            return min(least, limit_b)
+            return least
         R_m, R_b = self.resistances
         shared = torque / (self.constant**2 / R_m + slope**2 / R_b) * slope / R_b
         return min(max(shared, least), limit_b)

@@ -21,7 +21,7 @@ INPUTS = ("applied_voltage_motor", "applied_voltage_brake", "torque")
 SHAFT = ("omega", "z", "theta")
 CURRENTS = ("current_motor", "current_brake")
 
-_SUBSTEP = 0.3  # largest change of z, in parts of its range, by one midpoint step
+_SUBSTEP = 0.5  # largest change of z, in parts of its range, by one Runge-Kutta step
 _MOST_SUBSTEPS = 64
 _TURNS = 1.0  # rad that a shaft turns until its hysteresis surely slides
 
@@ -74,14 +74,15 @@ class ActuatorDynamics:
         self._omega, self._z, self._theta = (model.state_names.index(name) for name in SHAFT)
         self._i_m, self._i_b = (model.state_names.index(name) for name in CURRENTS)
         loaded = self._derivative(tuple(self._zeros), tuple(unit), self._p)[self._omega]
-        self.inertia = 1.0 / (loaded - self._slopes(0.0, 0.0, 0.0, 0.0, 0.0)[self._omega])
+        self.inertia: float = 1.0 / (loaded - self._slopes(0.0, 0.0, 0.0, 0.0, 0.0)[self._omega])
         self.motor_constant = self.torque(1.0, 0.0, 0.0, 0.0, 0.0) - self.torque(
             0.0, 0.0, 0.0, 0.0, 0.0
         )
 
     def torque(self, i_m: float, i_b: float, omega: float, z: float, theta: float) -> float:
         """Torque of motor, brake and friction on the shaft [N*m]."""
-        return self.inertia * self._slopes(i_m, i_b, omega, z, theta)[self._omega]
+        acceleration: float = self._slopes(i_m, i_b, omega, z, theta)[self._omega]
+        return self.inertia * acceleration
 
     def rest(self, i_b: float, omega: float, z: float, theta: float) -> float:
         """The same without the motor's: brake, friction and viscous damping [N*m]."""
@@ -100,8 +101,11 @@ class ActuatorDynamics:
         n = min(int(share) + 1, _MOST_SUBSTEPS)
         step = time / n
         for _ in range(n):
-            middle = z + 0.5 * step * self._slopes(0.0, 0.0, omega, z, 0.0)[self._z]
-            z += step * self._slopes(0.0, 0.0, omega, middle, 0.0)[self._z]
+            first = self._z_rate(omega, z)
+            second = self._z_rate(omega, z + 0.5 * step * first)
+            third = self._z_rate(omega, z + 0.5 * step * second)
+            last = self._z_rate(omega, z + step * third)
+            z += step / 6.0 * (first + 2.0 * (second + third) + last)
         return z
 
     @cached_property
@@ -109,8 +113,8 @@ class ActuatorDynamics:
         """The hysteresis variable at which a shaft that turns forwards slides."""
         z, step = 0.0, 1e-3
         for _ in range(int(_TURNS / step)):
-            change = step * self._slopes(0.0, 0.0, 1.0, z, 0.0)[self._z]
-            z += step * self._slopes(0.0, 0.0, 1.0, z + 0.5 * change, 0.0)[self._z]
+            change = step * self._z_rate(1.0, z + 0.5 * step * self._z_rate(1.0, z))
+            z += change
             if abs(change) < 1e-9 * abs(z):
                 break
         return z
@@ -118,7 +122,7 @@ class ActuatorDynamics:
     @cached_property
     def stiffness(self) -> float:
         """dz/dtheta at z = 0 in parts of the z that slides [1/rad]: inverse of the yield travel."""
-        return abs(self._slopes(0.0, 0.0, 1.0, 0.0, 0.0)[self._z] / self.sliding)
+        return abs(self._z_rate(1.0, 0.0) / self.sliding)
 
     @property
     def resistances(self) -> tuple[float, float]:
@@ -143,6 +147,11 @@ class ActuatorDynamics:
         """dx/dt = A x + B u of all states at a speed, a hysteresis variable, a brake current."""
         x = self._state(0.0, i_b, omega, z, 0.0)
         return linearize(self.model, np.array(x), np.zeros(len(self.model.inputs)), self.parameters)
+
+    def _z_rate(self, omega: float, z: float) -> float:
+        """dz/dt at a speed."""
+        rate: float = self._slopes(0.0, 0.0, omega, z, 0.0)[self._z]
+        return rate
 
     def _channel(self, current: str, command: str) -> Channel:
         A, B, _, _ = self.linear(0.0, 0.0, 0.0)

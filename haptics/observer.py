@@ -7,8 +7,8 @@ the torques of motor, brake and friction as its input and the hand's torque as a
 
     theta' = omega,  omega' = (N + h) / J,  h' = white noise
 
-It measures the angle and, where it is to, the torque sensor, which has h but for the noise. N is that
-of the currents in the sample, so it is right whatever became of the commands.
+It measures the angle and, where it is to, the torque sensor, which has h but for the noise. N is
+that of the currents in the sample, so it is right whatever became of the commands.
 """
 
 import math
@@ -52,7 +52,7 @@ class ShaftObserver:
         self.gain = kalman_gain(dynamics.inertia, time, noise, walk)
         self._rows = self.gain.tolist()
         self.motion = Motion(0.0, 0.0, 0.0, 0.0)
-        self.known = 0.0  # torque of motor, brake and friction over the last sample [N*m]
+        self.known: float = 0.0  # torque of motor, brake and friction over the last sample [N*m]
         self._started = False
 
     @property

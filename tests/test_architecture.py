@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-PACKAGES = ("daq", "sysid", "sim_rig", "protocols")
+PACKAGES = ("daq", "haptics", "sysid", "sim_rig", "protocols")
 MODULES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 
 # Said by grammar, not by what a thing is.

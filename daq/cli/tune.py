@@ -72,7 +72,13 @@ def _show(tuning: Tuning) -> None:
     head = ["quantity", "value", "95 % of draws", "unit", "what it is"]
     title = f"{tuning.control.controller} controller for {tuning.source}"
     terminal.print_table(title, head, rows, text=["unit", "what it is"])
-    if not tuning.n_draws:
+    rows = [
+        [p.branch, number(p.brake_current), number(p.stiffness, 3), number(p.damping, 3)]
+        for p in tuning.operating_points()
+    ]
+    head = ["branch of the hysteresis", "brake [A]", "stiffness [N*m/rad]", "damping [N*m*s/rad]"]
+    terminal.print_table("The shaft by operating point", head, rows, text=head[:1])
+    if not len(tuning.draws):
         print("No uncertainty is known of these parameters.")
     if tuning.uncertain:
         terminal.print_text(

@@ -67,9 +67,9 @@ def load_controller(name: str, folder: Path) -> TunedController:
         raise file.error(("model",), "this key is missing; it names the process model", _AGAIN)
     model = find_model(file.content["model"], path.parent, record=path)
     values = file.content["parameters"]
-    for name, value in values.items():
+    for key, value in values.items():
         if isinstance(value, bool) or not isinstance(value, int | float):
-            raise file.error(("parameters", str(name)), f"expected a number, found {value!r}")
+            raise file.error(("parameters", str(key)), f"expected a number, found {value!r}")
     try:
         controller = TunedController(path, control, model, model.vector(values))
         controller.most_volts  # noqa: B018 - refuses what cannot be controlled

@@ -27,7 +27,8 @@ class SimulatedUser:
         self._holds = holds
         self._path = np.array([(0.0, 0.0), *path]).T
         # At rest at both ends.
-        self._spline = CubicSpline(*self._path, bc_type="clamped") if smooth and path else None
+        times, angles = self._path
+        self._spline = CubicSpline(times, angles, bc_type="clamped") if smooth and path else None
         self._run_start = math.inf
         self._rest_angle = 0.0
         self._turns = 0.0
