@@ -88,7 +88,8 @@ def _index(protocols: Mapping[str, type[Experiment]]) -> str:
     return (
         f"{_HEAD}\n# Reference\n\nExperiments, by protocol:\n\n{experiments}\n"
         "Other files and commands:\n\n- [rig](rig.md)\n- [identification](identification.md)\n"
-        "- [data sheet](datasheet.md)\n- [torque controller](torque.md)\n- [command line](command-line.md)\n\n"
+        "- [data sheet](datasheet.md)\n- [torque controller](torque.md)\n"
+        "- [command line](command-line.md)\n\n"
         "`rig schema` writes the same as JSON Schemas, by which editors complete and check files.\n"
     )
 

@@ -53,7 +53,7 @@ def tune(
     _show(tuning)
     print(f"Controller: {out}")
     terminal.print_next(
-        "rig run torque_tracking.yaml, which names controller.yaml under torque_controller"
+        f"write 'torque_controller: {out}' into an experiment, such as torque_tracking.yaml"
     )
 
 

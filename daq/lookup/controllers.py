@@ -10,7 +10,7 @@ from daq.errors import ConfigError
 from daq.hal import FloatArray
 from daq.lookup.classes import file_and_class, find_class
 from daq.lookup.models import find_model
-from daq.lookup.shipped import find_file
+from daq.lookup.shipped import find_file, shipped_files
 from daq.lookup.user_code import locate
 from daq.progress import Watch, ignore
 from daq.torque import TorqueControl, TorqueLaw
@@ -23,13 +23,14 @@ _AGAIN = "make it anew with rig tune"
 class TunedController:
     """A controller's settings and the actuator that it is tuned to.
 
-    parameters: (n_parameters,). path: of the file that holds all this.
+    parameters: (n_parameters,). source: where they come from. path: of the file with all this.
     """
 
     path: Path
     control: TorqueControl
     model: ProcessModel
     parameters: FloatArray
+    source: str
 
     @cached_property
     def most_volts(self) -> tuple[float, float]:
@@ -51,9 +52,11 @@ def load_settings(name: str, watch: Watch = ignore) -> TorqueControl:
 def load_controller(name: str, folder: Path) -> TunedController:
     """A file that rig tune made; ConfigError names file, line, key and cure.
 
-    It is looked up from the working folder, then from ``folder``.
+    It is looked up from the working folder, then from ``folder``, then among the shipped ones.
     """
-    path = next((path for path in (Path(name), folder / name) if path.is_file()), None)
+    shipped = shipped_files("controller").get(name, Path())
+    candidates = (Path(name), folder / name, shipped)
+    path = next((path for path in candidates if path.is_file()), None)
     if path is None:
         cure = "make it with rig tune torque.yaml --parameters PARAMETERS.yaml"
         raise ConfigError("there is no such file", cure=cure, file=name)
@@ -71,7 +74,8 @@ def load_controller(name: str, folder: Path) -> TunedController:
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise file.error(("parameters", str(key)), f"expected a number, found {value!r}")
     try:
-        controller = TunedController(path, control, model, model.vector(values))
+        source = str(file.content.get("source", "parameters of unknown origin"))
+        controller = TunedController(path, control, model, model.vector(values), source)
         controller.most_volts  # noqa: B018 - refuses what cannot be controlled
     except ModelError as error:
         raise file.error(("parameters",), str(error), _AGAIN) from None

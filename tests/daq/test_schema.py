@@ -33,6 +33,7 @@ SHIPPED = sorted(
     path
     for folder in ("protocols", "sim_rig", "daq", "haptics", "examples")
     for path in (ROOT / folder).rglob("*.yaml")
+    if path.name != "simulated_controller.yaml"  # which rig tune made
 )
 # Numbers in a unit that stands elsewhere: in a model, or beside them.
 OF_A_MODEL = re.compile(r"^(ranges|fixed|constant|value|range|parameters|initial|process_noise)$")

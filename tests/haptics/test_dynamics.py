@@ -1,4 +1,4 @@
-"""The actuator's dynamics as controllers see them, against simulations that know nothing of them."""
+"""The actuator's dynamics as controllers see them, against simulations of their own."""
 
 import math
 

@@ -1,11 +1,13 @@
-"""``rig tune``: from parameters and their covariance to a controller's file, and what it refuses."""
+"""``rig tune``: from parameters and their covariance to a controller's file."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
 
+import haptics
 from daq import tune
 from sim_rig.actuator import actuator
 from tests.daq.support import rig
@@ -106,3 +108,13 @@ def test_a_model_that_is_no_actuator_is_refused(tmp_path):
     write(tmp_path / "t.yaml", SETTINGS)
     done = rig("tune", "t.yaml", "--model", "lag.py:model", cwd=tmp_path)
     assert done.returncode == 2 and "entry point rig.models" in done.stderr
+
+
+def test_the_shipped_controller_is_what_tune_makes_for_the_simulated_rig():
+    made = tune("torque.yaml", model="actuator:parameters=rig").document
+    path = Path(haptics.__file__).parent / "simulated_controller.yaml"
+    shipped = yaml.safe_load(path.read_text())
+    for document in (made, shipped):
+        document.pop("software")
+    again = "run: rig tune torque.yaml --model actuator:parameters=rig --out haptics/simulated_..."
+    assert shipped == yaml.safe_load(yaml.safe_dump(made)), again
