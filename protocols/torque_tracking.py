@@ -74,8 +74,9 @@ class TorqueTracking(TorqueExperiment):
         )
         wave = min(sums, key=crest_factor)
         rise = np.clip(np.minimum(time, time[-1] - time) / max(self.fade, 1e-9), 0.0, 1.0)
-        shape: FloatArray = 0.5 - 0.5 * np.cos(np.pi * rise)
-        return shape * wave * (self.torque / np.max(np.abs(wave)))
+        shape = 0.5 - 0.5 * np.cos(np.pi * rise)
+        reference: FloatArray = shape * wave * (self.torque / np.max(np.abs(wave)))
+        return reference
 
     def controller(self) -> Controller:
         """The reference, sample by sample, through the controller's law."""
