@@ -57,6 +57,12 @@ class Fact:
         low, high = np.percentile(self.draws, _ENDS)
         return float(f"{low:.5g}"), float(f"{high:.5g}")
 
+    @property
+    def ends(self) -> tuple[float, float]:
+        """The same, the value among them; the value alone where no draws are known."""
+        low, high = self.interval or (self.value, self.value)
+        return min(low, self.value), max(high, self.value)
+
 
 @dataclass(frozen=True)
 class OperatingPoint:
@@ -127,8 +133,16 @@ class TorqueControl(Section, abc.ABC):
         """The family of linear models that the controller has to do with; none by default."""
         return ()
 
-    def tuned(self, facts: tuple[Fact, ...]) -> Self:
-        """The settings as the uncertainty of the facts allows them; see each controller."""
+    def tuned(
+        self,
+        model: ProcessModel,
+        parameters: FloatArray,
+        facts: tuple[Fact, ...],
+    ) -> Self:
+        """The settings as the spread of the facts allows them; see each controller.
+
+        Raises sysid.ModelError where none are allowed.
+        """
         return self
 
     @abc.abstractmethod

@@ -138,10 +138,11 @@ def tune(
         )
     try:
         facts = control.facts(chosen, vector, plausible)
+        tuned = control.tuned(chosen, vector, facts)
     except ModelError as error:
         raise ConfigError(str(error), file=source) from None
     named = dict(zip(chosen.parameter_names, vector.tolist(), strict=True))
-    return Tuning(control.tuned(facts), name, chosen, named, source, facts, plausible, uncertain)
+    return Tuning(tuned, name, chosen, named, source, facts, plausible, uncertain)
 
 
 def _draws(

@@ -17,6 +17,7 @@ the acceleration, the loop of a free shaft is 1 - k (J_model / J) F(s) e^(-s d),
 whatever the delay d while k J_model / J < 1. ``tuned`` keeps k so for all plausible J.
 """
 
+import abc
 import math
 from typing import Literal, Self
 
@@ -27,12 +28,11 @@ from daq.experiment import Sample
 from daq.torque import Fact
 from haptics.actuator_control import ActuatorControl
 from haptics.dynamics import ActuatorDynamics
-from haptics.observer import SensorNoise, ShaftObserver
+from haptics.observer import Hand, SensorNoise, ShaftFilter, ShaftObserver
 from sysid import ProcessModel
 from sysid.arrays import FloatArray
 
 _CERTAIN = 0.95  # of the inertia, the most that is ever taken off
-_ROOT_12 = math.sqrt(12.0)  # of a quantised signal: step by standard deviation
 
 
 class Feedforward(ActuatorControl):
@@ -50,12 +50,15 @@ class Feedforward(ActuatorControl):
         0.03, gt=0.0, le=10.0, description="by which the hand's torque changes in a sample, roughly"
     )
 
-    def tuned(self, facts: tuple[Fact, ...]) -> Self:
+    def tuned(
+        self,
+        model: ProcessModel,
+        parameters: FloatArray,
+        facts: tuple[Fact, ...],
+    ) -> Self:
         """No more of the inertia than the least plausible one has."""
         inertia = next(fact for fact in facts if fact.name == "inertia")
-        ends = inertia.interval
-        least = inertia.value if ends is None else min(ends[0], inertia.value)
-        share = min(self.inertia_share, _CERTAIN * least / inertia.value)
+        share = min(self.inertia_share, _CERTAIN * inertia.ends[0] / inertia.value)
         return self.model_copy(update={"inertia_share": float(f"{share:.4g}")})
 
     def law(self, model: ProcessModel, parameters: FloatArray) -> "FeedforwardLaw":
@@ -63,51 +66,79 @@ class Feedforward(ActuatorControl):
         return FeedforwardLaw(self, ActuatorDynamics(model, parameters))
 
 
-class FeedforwardLaw:
-    """The inverse at work."""
+class InverseLaw(abc.ABC):
+    """The inverse of amplifiers, brake and friction; what else the shaft is to do, a subclass says.
 
-    def __init__(self, control: Feedforward, dynamics: ActuatorDynamics) -> None:
+    observer: of the shaft, by its filter.
+    """
+
+    def __init__(
+        self, control: ActuatorControl, dynamics: ActuatorDynamics, shaft: ShaftFilter
+    ) -> None:
         self._dynamics, self._allocation = dynamics, control.shared(dynamics)
         self._time = time = 1.0 / control.sample_rate
-        angle = 2.0 * math.pi / control.encoder_counts / _ROOT_12
-        self._observer = ShaftObserver(
-            dynamics, time, SensorNoise(angle, math.inf), control.hand_walk
-        )
+        self.observer = ShaftObserver(dynamics, time, shaft)
         self._brake = BrakeCurrent(dynamics.brake.delay, time, control.ahead)
         self._horizon = (control.ahead + 0.5) * time + dynamics.motor.delay
-        self._share = control.inertia_share * dynamics.inertia
-        self._smoothing = 1.0 - math.exp(-2.0 * math.pi * control.acceleration_filter * time)
-        self._acceleration, self._torque = 0.0, math.nan
-        self._tick = -1
         self._most = control.motor_current / dynamics.motor.gain
+        self._torque, self._tick = math.nan, -1
 
     def volts(self, sample: Sample, torque: float) -> tuple[float, float]:
         """Commands of motor and brake [V]."""
-        dynamics, observer = self._dynamics, self._observer
-        for _ in range(sample.tick - self._tick - 1 if self._tick >= 0 else 0):
-            self._brake.next()  # samples that did not arrive
-            observer.coast()
-        self._tick = sample.tick
-        current = self._brake.next()
-        observer.update(sample.theta, sample.torque, sample.current_motor, current)
-        self._acceleration += self._smoothing * (observer.acceleration - self._acceleration)
-        motion = observer.ahead(self._horizon)
-        needed = (
-            self._predicted(torque)
-            + self._share * self._acceleration
-            - dynamics.rest(0.0, motion.omega, motion.z, motion.theta)
-        )
-        slope = dynamics.brake_slope(motion.omega, motion.z, motion.theta)
-        i_b = self._allocation.brake(needed, slope)
-        i_m = self._allocation.motor(needed - slope * self._brake.mean(i_b))
+        dynamics = self._dynamics
+        self._observe(sample)
+        motion = self.observer.ahead(self._horizon)
+        slope = 0.0 if math.isnan(self._torque) else (torque - self._torque) / self._time
+        self._torque = torque
+        rest = dynamics.rest(0.0, motion.omega, motion.z, motion.theta)
+        needed = self.shaft_torque(torque, slope) - rest
+        per_ampere = dynamics.brake_slope(motion.omega, motion.z, motion.theta)
+        i_b = self._allocation.brake(needed, per_ampere)
+        from_brake = per_ampere * self._brake.mean(i_b)
+        i_m = self._allocation.motor(needed - from_brake)
+        self.limited(dynamics.motor_constant * i_m + from_brake - needed)
         volts = (i_m - dynamics.motor.emf * motion.omega) / dynamics.motor.gain
         return min(max(volts, -self._most), self._most), i_b / dynamics.brake.gain
 
-    def _predicted(self, torque: float) -> float:
-        """The reference at the time of the answer, along its last slope."""
-        slope = 0.0 if math.isnan(self._torque) else (torque - self._torque) / self._time
-        self._torque = torque
-        return torque + self._horizon * slope
+    @abc.abstractmethod
+    def shaft_torque(self, torque: float, slope: float) -> float:
+        """Torque on the shaft beside what overcomes friction [N*m].
+
+        torque: that the hand is to feel now; slope: by which it changes [N*m/s].
+        """
+
+    def limited(self, missing: float) -> None:  # noqa: B027 - what has no memory need not know
+        """Take note of what the limits of the currents leave of the torque, as it is [N*m]."""
+
+    def _observe(self, sample: Sample) -> None:
+        for _ in range(sample.tick - self._tick - 1 if self._tick >= 0 else 0):
+            self._brake.next()  # samples that did not arrive
+            self.observer.coast()
+        self._tick = sample.tick
+        current = self._brake.next()
+        self.observer.update(sample.theta, sample.torque, sample.current_motor, current)
+
+
+class FeedforwardLaw(InverseLaw):
+    """The reference along its last slope, and the acceleration's share."""
+
+    def __init__(self, control: Feedforward, dynamics: ActuatorDynamics) -> None:
+        time, noise = 1.0 / control.sample_rate, SensorNoise(encoder_noise(control.encoder_counts))
+        shaft = ShaftFilter.of(dynamics.inertia, time, noise, Hand(control.hand_walk))
+        super().__init__(control, dynamics, shaft)
+        self._share = control.inertia_share * dynamics.inertia
+        self._smoothing = 1.0 - math.exp(-2.0 * math.pi * control.acceleration_filter * time)
+        self._acceleration = 0.0
+
+    def shaft_torque(self, torque: float, slope: float) -> float:
+        """tau_r + k J domega/dt."""
+        self._acceleration += self._smoothing * (self.observer.acceleration - self._acceleration)
+        return torque + self._horizon * slope + self._share * self._acceleration
+
+
+def encoder_noise(counts: int) -> float:
+    """Standard deviation of an angle in counts of a revolution [rad]."""
+    return 2.0 * math.pi / counts / math.sqrt(12.0)
 
 
 class BrakeCurrent:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from haptics.dynamics import ActuatorDynamics
-from haptics.observer import SensorNoise, ShaftObserver
+from haptics.observer import Hand, SensorNoise, ShaftFilter, ShaftObserver
 from sim_rig.actuator import actuator
 from sysid import Stepper
 
@@ -28,9 +28,10 @@ def motion():
     return states, hand
 
 
-def observed(states, hand, noise, lost=()):
+def observed(states, hand, noise, hand_model=Hand(0.01), lost=()):  # noqa: B008
     dynamics = ActuatorDynamics(MODEL)
-    observer = ShaftObserver(dynamics, T, noise, walk=0.01)
+    shaft = ShaftFilter.of(dynamics.inertia, T, noise, hand_model)
+    observer = ShaftObserver(dynamics, T, shaft)
     names = MODEL.state_names
     i_m, i_b, theta = (names.index(n) for n in ("current_motor", "current_brake", "theta"))
     rows = []
@@ -40,7 +41,7 @@ def observed(states, hand, noise, lost=()):
         else:
             angle = math.floor(x[theta] / COUNT) * COUNT
             observer.update(angle, torque, x[i_m], x[i_b])
-        rows.append((observer.motion.omega, observer.motion.z, observer.motion.hand))
+        rows.append((observer.motion.omega, observer.motion.z, observer.hand))
     return np.array(rows).T
 
 
@@ -58,7 +59,7 @@ def test_speed_hysteresis_and_hand_are_observed(motion, torque_noise):
 
 def test_samples_that_do_not_arrive_leave_no_jump(motion):
     states, hand = motion
-    noise = SensorNoise(COUNT / math.sqrt(12.0), math.inf)
+    noise = SensorNoise(COUNT / math.sqrt(12.0))
     omega, _, _ = observed(states, hand, noise, lost=range(1000, 1010))
     true_omega = states[:, MODEL.state_names.index("omega")]
     assert np.abs(omega - true_omega)[1000:1060].max() < 2.0
