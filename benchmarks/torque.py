@@ -1,7 +1,7 @@
 """How well torque controllers give a torque to a moving hand, beside the static baseline.
 
 python -m benchmarks.torque [--json] [--rigs 3] [--identify] [--worn]
-                            [--controllers static feedforward]
+                            [--controllers static feedforward lqg]
 
 Rigs are drawn: each of the actuator's parameters 0.8 to 1.25 times the simulated rig's, the hand's
 stiffness and damping 0.25 to 4 times theirs, the hand's motion at random, at up to 10 rad/s. The
@@ -43,7 +43,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--identify", action="store_true")
     parser.add_argument("--worn", action="store_true")
-    parser.add_argument("--controllers", nargs="+", default=["static", "feedforward"])
+    parser.add_argument("--controllers", nargs="+", default=["static", "feedforward", "lqg"])
     options = parser.parse_args()
     rows = [
         measure(options.seed + k, options.controllers, options.identify, options.worn)

@@ -77,9 +77,9 @@ class ShaftFilter:
         gain[:, : len(C)] = P @ C.T @ np.linalg.inv(C @ P @ C.T + R)
         return cls(A, b, gain)
 
-    def predicted(self, x: FloatArray, known: float) -> FloatArray:
+    def predicted(self, x: FloatArray, driving: float) -> FloatArray:
         """The state a sample later."""
-        later: FloatArray = self.A @ x + self.b * known
+        later: FloatArray = self.A @ x + self.b * driving
         return later
 
     def corrected(self, x: FloatArray, theta: float, torque: float) -> FloatArray:
@@ -103,7 +103,7 @@ class ShaftObserver:
     def __init__(self, dynamics: ActuatorDynamics, time: float, shaft: ShaftFilter) -> None:
         self._dynamics, self._time, self._filter = dynamics, time, shaft
         self.state = np.zeros(len(shaft.b))
-        self._z = self._known = 0.0
+        self._z = self._driving = 0.0
         self._started = False
 
     @property
@@ -129,7 +129,7 @@ class ShaftObserver:
     @property
     def acceleration(self) -> float:
         """Of the shaft [rad/s^2]."""
-        return (self._known + self.hand + self.disturbance) / self._dynamics.inertia
+        return (self._driving + self.hand + self.disturbance) / self._dynamics.inertia
 
     def update(self, theta: float, torque: float, i_m: float, i_b: float) -> None:
         """To a sample of angle, torque sensor and currents."""
@@ -139,13 +139,13 @@ class ShaftObserver:
             return
         motion, dynamics = self.motion, self._dynamics
         rest = dynamics.rest(i_b, motion.omega, motion.z, motion.theta)
-        self._known = dynamics.motor_constant * i_m + rest
-        guess = self._filter.predicted(self.state, self._known)
+        self._driving = dynamics.motor_constant * i_m + rest
+        guess = self._filter.predicted(self.state, self._driving)
         self._move(self._filter.corrected(guess, theta, torque))
 
     def coast(self) -> None:
         """Over a sample that did not arrive."""
-        self._move(self._filter.predicted(self.state, self._known))
+        self._move(self._filter.predicted(self.state, self._driving))
 
     def ahead(self, time: float) -> Motion:
         """The motion so much later [s], at the present acceleration."""

@@ -16,7 +16,17 @@ MODULES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob
 # Said by grammar, not by what a thing is.
 GRAMMAR = {"found", "told", "own", "one", "known", "asked", "said", "some", "other", "still"}
 # Gerunds that are nouns of the field.
-NOUNS = {"timing", "scaling", "sampling", "damping", "fitting", "judging", "recording"}
+NOUNS = {
+    "timing",
+    "tuning",
+    "torque_tracking",
+    "scaling",
+    "sampling",
+    "damping",
+    "fitting",
+    "judging",
+    "recording",
+}
 
 
 KEYS_OF_FILES = {("daq/config/rig.py", "own")}  # limits.own
