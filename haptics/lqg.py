@@ -60,16 +60,16 @@ class Lqg(ActuatorControl):
         4.0, ge=1.0, le=100.0, description="factor either way of the hands that must be stable"
     )
     hand_rate: Annotated[float, Unit("N*m/s")] = Field(
-        1.0, gt=0.0, le=1e3, description="by which its motion changes torque's slope in a sample"
+        0.6, gt=0.0, le=1e3, description="by which its motion changes torque's slope in a sample"
     )
     disturbance: NewtonMetres = Field(
         2e-4, gt=0.0, le=1.0, description="by which unknown friction changes in a sample"
     )
     effort: Part = Field(
-        0.1, gt=0.0, le=1e6, description="weight of the motor's changes, the least; tune raises it"
+        0.3, gt=0.0, le=1e6, description="weight of the motor's changes, the least; tune raises it"
     )
     sensitivity: Part = Field(
-        2.0, gt=1.0, le=10.0, description="largest of the loop at the motor, over all these hands"
+        3.0, gt=1.0, le=10.0, description="largest of the loop at the motor, over all these hands"
     )
 
     def tuned(
