@@ -31,6 +31,7 @@ _HEAD = """\
 class Tuning:
     """A controller for an actuator, and what it rests on.
 
+    requested: its settings as they were given; ``control`` has them as the uncertainty allows.
     parameters: values by name. source: where they come from. facts: quantities of the actuator,
     with the spread that the identification's uncertainty gives them. draws: plausible parameters,
     (n, n_parameters). uncertain: parameters that the identification gives no interval, which are
@@ -42,6 +43,7 @@ class Tuning:
     0.1412
     """
 
+    requested: TorqueControl
     control: TorqueControl
     model_name: str
     model: ProcessModel
@@ -50,6 +52,12 @@ class Tuning:
     facts: tuple[Fact, ...]
     draws: FloatArray
     uncertain: tuple[str, ...]
+
+    @property
+    def changes(self) -> dict[str, tuple[Any, Any]]:
+        """Settings that tuning has changed: as requested, and as they are."""
+        before, after = self.requested.model_dump(mode="json"), self.control.model_dump(mode="json")
+        return {key: (before[key], after[key]) for key in after if before[key] != after[key]}
 
     @cached_property
     def document(self) -> dict[str, Any]:
@@ -142,7 +150,7 @@ def tune(
     except ModelError as error:
         raise ConfigError(str(error), file=source) from None
     named = dict(zip(chosen.parameter_names, vector.tolist(), strict=True))
-    return Tuning(tuned, name, chosen, named, source, facts, plausible, uncertain)
+    return Tuning(control, tuned, name, chosen, named, source, facts, plausible, uncertain)
 
 
 def _draws(

@@ -4,6 +4,7 @@ import pytest
 import yaml
 
 from daq import analyse, record
+from daq.logs.recording import load
 from tests.daq.support import rig
 from tests.haptics.test_torque_tracking import controller
 from tests.protocols.closed_loop import SHIPPED
@@ -31,7 +32,7 @@ def test_little_is_left_of_friction_and_inertia(tmp_path, kind, most):
 def test_blocks_without_commands_have_none(tmp_path):
     path = experiment(tmp_path, controller(tmp_path, "feedforward"))
     run = record(path, "moving_hand.yaml", tmp_path, options={"hand": TO_AND_FRO})
-    log = run.frame
+    log = load(run.path, ("controlled",)).frame
     free = log[log.controlled == 0.0]
     assert len(free) > 800 and not free.cmd_voltage_motor.any()
     assert log.controlled.diff().abs().max() < 0.02  # comes and goes without a jump

@@ -54,6 +54,7 @@ def test_no_more_inertia_is_taken_off_than_the_least_plausible_one(tmp_path):
     wide = tune(settings, result(tmp_path, J={"J_m": 0.1, "J_b": 0.1}))
     low, _ = facts(wide)["inertia"].interval
     assert wide.control.inertia_share == pytest.approx(0.95 * low / 1.02e-4, rel=1e-3)
+    assert wide.changes == {"inertia_share": (0.95, wide.control.inertia_share)}
     narrow = tune(settings, result(tmp_path, J={"J_m": 0.001}))
     assert narrow.control.inertia_share > 0.94
 
