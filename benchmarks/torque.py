@@ -26,6 +26,7 @@ import protocols
 from benchmarks._common import arguments, report
 from daq import analyse, identify, record, tune
 from sim_rig.actuator import actuator
+from sim_rig.physics.loads import HAND_DAMPING, HAND_STIFFNESS
 from sim_rig.plant import Plant
 
 DRAWN = (
@@ -108,7 +109,8 @@ def shipped(package: Any, name: str) -> dict[str, Any]:
 
 def _identified(folder: Path, seed: int, plant: Mapping[str, Any]) -> Path:
     """What the shipped experiment tells of such a rig, as parameters.yaml."""
-    pulley = {k: v for k, v in plant["parameters"].items() if k not in {"K_u", "B_u"}}
+    # Whoever winds the load holds on as firmly as its friction asks for.
+    pulley = {**plant["parameters"], "K_u": HAND * HAND_STIFFNESS, "B_u": HAND * HAND_DAMPING}
     options = {"seed": seed, "plant": {**plant, "parameters": pulley}}
     run = record("prbs.yaml", "simulated.yaml", folder / "runs", options=options)
     name = "actuator:friction=stribeck" if "friction" in plant else "actuator"
