@@ -7,7 +7,7 @@ commands. Controllers are registered under the entry-point group ``rig.controlle
 
 import abc
 from dataclasses import dataclass
-from typing import Any, Protocol, Self
+from typing import Any, ClassVar, Protocol, Self
 
 import numpy as np
 from pydantic import Field
@@ -107,6 +107,9 @@ class OperatingPoint:
 
 class TorqueControl(Section, abc.ABC):
     """Settings of a torque controller, and how they become a law."""
+
+    takes_torque: ClassVar[bool] = False
+    """Whether it is fed the torque sensor, which then is no judge of it."""
 
     controller: str = Field(min_length=1, description="name of a controller, or FILE.py:CLASS")
     sample_rate: Hertz = Field(800.0, gt=0.0, le=1e6, description="of the experiments it is for")

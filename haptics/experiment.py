@@ -20,6 +20,18 @@ class TorqueExperiment(ClosedLoop):
         """The controller. Raises ConfigError for a file that holds none."""
         return load_controller(self.torque_controller, self._folder)
 
+    def controller_remarks(self) -> tuple[str, ...]:
+        """Which controller it is, and whether the torque sensor may judge it."""
+        tuned = self.tuned_controller
+        name = tuned.control.controller
+        remarks = [f"Its {name} controller is {tuned.path}, tuned to {tuned.source}."]
+        if tuned.control.takes_torque:
+            remarks.append(
+                "It listens to the torque sensor that judges it here: what noise and offset of that "
+                "sensor do to the hand is not seen as an error."
+            )
+        return tuple(remarks)
+
     def bounds(self) -> tuple[FloatArray, FloatArray]:
         """Lowest and highest commands of motor and brake, (2,) each [V].
 

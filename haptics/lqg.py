@@ -23,7 +23,7 @@ times the design's at both ends of what the identification leaves of inertia and
 import itertools
 import math
 from dataclasses import dataclass
-from typing import Annotated, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
@@ -44,6 +44,8 @@ _FREQUENCIES = 60
 
 class Lqg(ActuatorControl):
     """LQG with a disturbance observer on top of the inverse; takes the torque sensor."""
+
+    takes_torque: ClassVar[bool] = True
 
     controller: Literal["lqg"] = Field(description="lqg")
     encoder_counts: int = Field(8192, ge=4, description="of the encoder in a revolution")

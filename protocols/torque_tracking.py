@@ -54,9 +54,8 @@ class TorqueTracking(TorqueExperiment):
         lowest, highest = self.bounds()
         n_samples = self.samples_in(self.duration)
         reference = {"torque_ref": self.reference(n_samples)}
-        tuned = self.tuned_controller
         remarks = (
-            f"Its {tuned.control.controller} controller is {tuned.path}, tuned to {tuned.source}.",
+            *self.controller_remarks(),
             "Hold the handle, and turn it as you like: the torque is felt against your hand. With "
             "nobody at it the shaft runs away until a limit ends the run.",
         )

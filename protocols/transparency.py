@@ -43,9 +43,8 @@ class Transparency(TorqueExperiment):
             )
         lowest, highest = self.bounds()
         n_samples = self.samples_in(2 * self.pairs * self.block, "block")
-        tuned = self.tuned_controller
         remarks = (
-            f"Its {tuned.control.controller} controller is {tuned.path}, tuned to {tuned.source}.",
+            *self.controller_remarks(),
             "Hold the handle, and turn it to and fro alike in all blocks; every "
             f"{self.block:g} s the controller comes or goes.",
         )
