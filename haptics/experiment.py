@@ -27,7 +27,7 @@ class TorqueExperiment(ClosedLoop):
         remarks = [f"Its {name} controller is {tuned.path}, tuned to {tuned.source}."]
         if tuned.control.takes_torque:
             remarks.append(
-                "It listens to the torque sensor that judges it here: what noise and offset of that "
+                "It listens to the torque sensor that judges it here: what noise and offset of the "
                 "sensor do to the hand is not seen as an error."
             )
         return tuple(remarks)
