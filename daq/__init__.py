@@ -1,9 +1,9 @@
 """Rigs, runs and their logs; what the commands do, as functions for scripts and notebooks.
 
 ``check`` previews an experiment, ``record`` runs it, ``analyse`` concludes from a run, ``load``
-reads a log, ``design``, ``identify``, ``resume``, ``compare``, ``campaign`` and ``replay`` do what
-the commands of these names do. They never print: ``watch`` is called with what they say meanwhile.
-Each is imported when it is first used.
+reads a log, ``design``, ``identify``, ``resume``, ``compare``, ``campaign``, ``replay`` and
+``tune`` do what the commands of these names do. They never print: ``watch`` is called with what
+they say meanwhile. Each is imported when it is first used.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from daq.recording.analysis import Analysis, analyse
     from daq.recording.preview import Preview, check
     from daq.recording.session import record
+    from daq.tuning import Tuning, tune
 
 _HOMES = {
     "Analysis": "daq.recording.analysis",
@@ -38,6 +39,7 @@ _HOMES = {
     "Recording": "daq.logs.recording",
     "Replay": "daq.identification.replay",
     "RigError": "daq.errors",
+    "Tuning": "daq.tuning",
     "analyse": "daq.recording.analysis",
     "campaign": "daq.identification.campaign",
     "check": "daq.recording.preview",
@@ -48,6 +50,7 @@ _HOMES = {
     "record": "daq.recording.session",
     "replay": "daq.identification.replay",
     "resume": "daq.identification.fit",
+    "tune": "daq.tuning",
 }
 
 __all__ = [
@@ -63,6 +66,7 @@ __all__ = [
     "Recording",
     "Replay",
     "RigError",
+    "Tuning",
     "analyse",
     "campaign",
     "check",
@@ -73,6 +77,7 @@ __all__ = [
     "record",
     "replay",
     "resume",
+    "tune",
 ]
 
 

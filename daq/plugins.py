@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from daq.errors import ConfigError, suggestion
 
-Kind = Literal["backend", "limit", "model", "protocol"]
+Kind = Literal["backend", "controller", "limit", "model", "protocol"]
 
 
 def installed(kind: Kind) -> dict[str, EntryPoint]:

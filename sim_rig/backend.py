@@ -65,7 +65,11 @@ class Simulation(Section):
     hand: list[tuple[Seconds, Radians]] = Field(
         default_factory=list,
         description="of load 'hand': [time, angle] from the start of the run and from there on, "
-        "through which its wrist moves in straight lines",
+        "through which its wrist moves",
+    )
+    hand_path: Literal["lines", "smooth"] = Field(
+        "lines",
+        description="straight lines from point to point, or smoothly, at rest at both ends",
     )
     current_sense: Annotated[float, Unit("V/A")] = Field(
         2.0, gt=0.0, description="gain of both channels' current sensors"
@@ -114,7 +118,9 @@ class SimulatedDevice:
         self.options = options
         self._plant = options.plant.build()
         self._motion = [self._plant.state_names.index(name) for name in ("theta", "omega")]
-        self._user = SimulatedUser(options.plant.load == "hand", options.hand)
+        self._user = SimulatedUser(
+            options.plant.load == "hand", options.hand, options.hand_path == "smooth"
+        )
         self._rng = np.random.default_rng(options.seed)
         worst = 0.0 if options.ideal else options.imperfections.offset
         senses = np.array([options.current_sense, options.current_sense, options.torque_sense])

@@ -10,13 +10,23 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-PACKAGES = ("daq", "sysid", "sim_rig", "protocols")
+PACKAGES = ("daq", "haptics", "sysid", "sim_rig", "protocols")
 MODULES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 
 # Said by grammar, not by what a thing is.
 GRAMMAR = {"found", "told", "own", "one", "known", "asked", "said", "some", "other", "still"}
 # Gerunds that are nouns of the field.
-NOUNS = {"timing", "scaling", "sampling", "damping", "fitting", "judging", "recording"}
+NOUNS = {
+    "timing",
+    "tuning",
+    "torque_tracking",
+    "scaling",
+    "sampling",
+    "damping",
+    "fitting",
+    "judging",
+    "recording",
+}
 
 
 KEYS_OF_FILES = {("daq/config/rig.py", "own")}  # limits.own

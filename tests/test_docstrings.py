@@ -9,6 +9,7 @@ import pkgutil
 import pytest
 
 import daq
+import haptics
 import protocols
 import sim_rig
 import sysid
@@ -24,7 +25,7 @@ def modules_of(package):
 def examples():
     """The docstrings that have examples, by the objects' names."""
     finder = doctest.DocTestFinder(exclude_empty=True)
-    for package in (daq, protocols, sim_rig, sysid):
+    for package in (daq, haptics, protocols, sim_rig, sysid):
         for name in modules_of(package):
             for test in finder.find(importlib.import_module(name)):
                 if test.examples:

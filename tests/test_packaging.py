@@ -16,7 +16,7 @@ from tests.daq.support import environment
 pytestmark = pytest.mark.soak
 
 ROOT = Path(__file__).resolve().parents[1]
-PACKAGES = ("daq", "protocols", "sim_rig", "sysid")
+PACKAGES = ("daq", "haptics", "protocols", "sim_rig", "sysid")
 
 
 @pytest.fixture(scope="module")

@@ -31,6 +31,7 @@ from daq.cli.runs import runs
 from daq.cli.schema import schema
 from daq.cli.scope import scope
 from daq.cli.terminal import Volume, output
+from daq.cli.tune import tune
 from daq.errors import ConfigError, RigError
 
 _COMMANDS: tuple[tuple[Callable[..., None], str], ...] = (
@@ -46,6 +47,7 @@ _COMMANDS: tuple[tuple[Callable[..., None], str], ...] = (
         "rig replay runs/20260101T120000Z-prbs "
         "--parameters runs/20260101T120000Z-prbs/identification/parameters.yaml",
     ),
+    (tune, "rig tune torque.yaml --parameters runs/20260101T120000Z-prbs/identification"),
     (runs, "rig runs protocol=prbs --parameters K_m --sort K_m"),
     (figures, "rig figures runs/20260101T120000Z-prbs --format pdf --format png"),
     (init, "rig init my_rig"),

@@ -15,6 +15,7 @@ from daq.files import make_folder, write_whole
 from daq.lookup import schemas
 from daq.lookup.schemas import Schema, branches, unit_in
 from daq.lookup.shipped import shipped_files
+from daq.torque import TorqueControl
 
 _HEAD = "<!-- Made by `rig schema --reference`; what it says stands in the code. Do not edit. -->\n"
 _TABLE = "| key | value | unit | default | allowed | meaning |\n|---|---|---|---|---|---|\n"
@@ -48,17 +49,21 @@ def write_reference(folder: Path, command: Any) -> list[Path]:
     """Write all pages; the paths written. ConfigError when they cannot be."""
     make_folder(folder)
     watch = terminal.report_event
-    texts = pages(schemas.protocols(watch), schemas.backend_options(watch), command)
+    controllers = schemas.controllers(watch)
+    texts = pages(schemas.protocols(watch), schemas.backend_options(watch), controllers, command)
     for name, text in texts.items():
         write_whole(folder / name, text)
     return [folder / name for name in texts]
 
 
 def pages(
-    protocols: Mapping[str, type[Experiment]], backends: Mapping[str, Any], command: Any
+    protocols: Mapping[str, type[Experiment]],
+    backends: Mapping[str, Any],
+    controllers: Mapping[str, type[TorqueControl]],
+    command: Any,
 ) -> dict[str, str]:
     """The text of each page by the name of its file. command: the whole command line."""
-    documents = schemas.documents(protocols, backends)
+    documents = schemas.documents(protocols, backends, controllers)
     made = {f"protocol-{name}.md": _protocol(name, kind) for name, kind in protocols.items()}
     made["rig.md"] = _rig(documents["rig"], backends)
     made["identification.md"] = _page(
@@ -76,6 +81,7 @@ def pages(
         "What `rig identify --datasheet FILE.yaml` takes: for each parameter, by its name:",
         _rows(documents["datasheet"]["additionalProperties"], "PARAMETER."),
     )
+    made["torque.md"] = _torque(controllers)
     made["command-line.md"] = _command_line(command)
     return {"README.md": _index(protocols), **made}
 
@@ -88,6 +94,7 @@ def _index(protocols: Mapping[str, type[Experiment]]) -> str:
         f"{_HEAD}\n# Reference\n\nExperiments, by protocol:\n\n{experiments}\n"
         "Other files and commands:\n\n- [rig](rig.md)\n- [identification](identification.md)\n"
         "- [question of a design](question.md)\n- [data sheet](datasheet.md)\n"
+        "- [torque controller](torque.md)\n"
         "- [command line](command-line.md)\n\n"
         "`rig schema` writes the same as JSON Schemas, by which editors complete and check files.\n"
     )
@@ -115,6 +122,15 @@ def _rig(document: Schema, backends: Mapping[str, Any]) -> str:
     for name, options in backends.items():
         rows = _rows(schemas.rig_options(options), "options.")
         text += f"\n## Options of the backend `{name}`\n\n{_TABLE}{rows}"
+    return text
+
+
+def _torque(controllers: Mapping[str, type[TorqueControl]]) -> str:
+    intro = "What `rig tune FILE.yaml` takes, by `controller`."
+    text = f"{_HEAD}\n# Torque controller: keys of the YAML\n\n{intro}\n\n{_UNITS}"
+    for name, kind in controllers.items():
+        rows = _rows(schemas.json_schema(kind))
+        text += f"\n## `{name}`\n\n{inspect.getdoc(kind)}\n\n{_TABLE}{rows}"
     return text
 
 

@@ -80,6 +80,7 @@ _QUESTION_KEYS = {"targets", "precision", "criterion", "time", "plant", "protoco
 _KINDS = {
     "an experiment": ({"protocol"}, "name it behind rig run or rig check"),
     "a rig": ({"backend", "limits", "sensors"}, "give it with --rig"),
+    "a torque controller's settings": ({"controller"}, "give it to rig tune"),
     "an identification's settings": (_SEARCH_KEYS, "give it with --config"),
     "a design's question": (_QUESTION_KEYS, "name it behind rig design"),
 }

@@ -126,7 +126,7 @@ def factor(file: YamlFile, names: Sequence[str], model: ProcessModel) -> list[li
     content = file.content["covariance"]
     columns, rows = content.get("parameters"), content.get("factor")
     try:
-        table = np.array(rows, dtype=np.float64).reshape(-1, len(columns))
+        table = np.array(rows, dtype=np.float64).reshape(len(rows), len(columns))
         places = [columns.index(name) for name in names]
     except (TypeError, ValueError, AttributeError):
         problem = "it does not hold 'parameters' and as many numbers in each row of 'factor'"

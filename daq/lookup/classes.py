@@ -14,6 +14,7 @@ from daq.hal import Device
 from daq.limits import Limit
 from daq.lookup.user_code import from_file, locate
 from daq.plugins import Kind, load_plugin
+from daq.torque import TorqueControl
 
 
 def find_class(kind: Kind, name: str, folder: Path, record: Path | None = None) -> Any:
@@ -61,6 +62,10 @@ _CLASSES: dict[Kind, tuple[Callable[[Any], bool], str]] = {
         partial(_is_concrete, Experiment),
         "make it a class derived from daq.experiment.Timed, OpenLoop or ClosedLoop, with all of "
         "its methods",
+    ),
+    "controller": (
+        partial(_is_concrete, TorqueControl),
+        "make it a class derived from daq.torque.TorqueControl, with all of its methods",
     ),
     "limit": (
         partial(_is_concrete, Limit),

@@ -19,6 +19,7 @@ from daq.experiment import Experiment
 from daq.files import make_folder, write_whole
 from daq.plugins import Kind, installed, load_plugin
 from daq.progress import Note, Watch, ignore
+from daq.torque import TorqueControl
 
 Schema = dict[str, Any]
 FOLDER = "schemas"
@@ -49,7 +50,8 @@ def write_schemas(folder: Path, watch: Watch = ignore) -> list[Path]:
     """One file for each kind of YAML; the paths written. ConfigError when they cannot be."""
     make_folder(folder)
     paths = []
-    for kind, schema in documents(protocols(watch), backend_options(watch)).items():
+    every = documents(protocols(watch), backend_options(watch), controllers(watch))
+    for kind, schema in every.items():
         path = folder / f"{kind}.json"
         write_whole(path, json.dumps(schema, indent=1, ensure_ascii=False) + "\n")
         paths.append(path)
@@ -66,10 +68,17 @@ def backend_options(watch: Watch = ignore) -> dict[str, type[Section]]:
     return {name: backend.Options for name, backend in _loaded("backend", watch).items()}
 
 
+def controllers(watch: Watch = ignore) -> dict[str, type[TorqueControl]]:
+    """The installed torque controllers that load, by name."""
+    return _loaded("controller", watch)
+
+
 def documents(
-    protocols: Mapping[str, type[Experiment]], backends: Mapping[str, type[Section]]
+    protocols: Mapping[str, type[Experiment]],
+    backends: Mapping[str, type[Section]],
+    controllers: Mapping[str, type[TorqueControl]],
 ) -> dict[str, Schema]:
-    """The schemas by kind of file: experiment, rig, identification, question, datasheet."""
+    """The schemas by kind of file: experiment, rig, identification, question, datasheet, torque."""
     settings = json_schema(IdentificationConfig)
     by_name = {"type": "object", "additionalProperties": json_schema(DatasheetEntry)}
     schemas = {
@@ -78,6 +87,7 @@ def documents(
         "identification": ("Settings of an identification", settings),
         "question": ("A design's question", json_schema(Question)),
         "datasheet": ("A data sheet: parameters by name", by_name),
+        "torque": ("Settings of a torque controller", torque_schema(controllers)),
     }
     return {k: {"$schema": DRAFT, "title": title, **s} for k, (title, s) in schemas.items()}
 
@@ -95,6 +105,18 @@ def experiment_schema(protocols: Mapping[str, type[Experiment]]) -> Schema:
     common["protocol"] = {**common["protocol"], "oneOf": [*named, _FILE_AND_CLASS]}
     cases = [_when("protocol", name, protocol_schema(kind)) for name, kind in protocols.items()]
     return {"type": "object", "properties": common, "required": ["protocol"], "allOf": cases}
+
+
+def torque_schema(controllers: Mapping[str, type[TorqueControl]]) -> Schema:
+    """The union of the controllers' settings, told apart by ``controller``."""
+    common = json_schema(TorqueControl)["properties"]
+    named = [
+        {"const": name, "description": inspect.getdoc(kind) or ""}
+        for name, kind in controllers.items()
+    ]
+    common["controller"] = {**common["controller"], "oneOf": [*named, _FILE_AND_CLASS]}
+    cases = [_when("controller", name, json_schema(kind)) for name, kind in controllers.items()]
+    return {"type": "object", "properties": common, "required": ["controller"], "allOf": cases}
 
 
 def protocol_schema(kind: type[Experiment]) -> Schema:

@@ -68,7 +68,7 @@ def write_starter(folder: Path, protocol: str | None, rig: str, watch: Watch = i
 
 def settings_text() -> str:
     """A file of an identification's settings in which all but two stand as comments."""
-    schema = schemas.documents({}, {})["identification"]
+    schema = schemas.documents({}, {}, {})["identification"]
     items = sorted(schema["properties"].items(), key=lambda item: item[0] not in _ACTIVE)
     settings = "\n".join(_setting(name, item) for name, item in items)
     return f"{schemas.schema_comment('identification')}\n{_HEAD}\n{settings}"

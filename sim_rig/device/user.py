@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from daq.hal import FloatArray
 
@@ -17,12 +18,17 @@ class SimulatedUser:
 
     holds: whether the hand is the load itself, and never lets go. path: (time [s], angle [rad])
     from the start of the run, relative to where winding ended; the wrist moves through these
-    points in straight lines and stays at the last.
+    points in straight lines, or smoothly, and stays at the last.
     """
 
-    def __init__(self, holds: bool, path: Sequence[tuple[float, float]] = ()) -> None:
+    def __init__(
+        self, holds: bool, path: Sequence[tuple[float, float]] = (), smooth: bool = False
+    ) -> None:
         self._holds = holds
         self._path = np.array([(0.0, 0.0), *path]).T
+        # At rest at both ends.
+        times, angles = self._path
+        self._spline = CubicSpline(times, angles, bc_type="clamped") if smooth and path else None
         self._run_start = math.inf
         self._rest_angle = 0.0
         self._turns = 0.0
@@ -71,6 +77,11 @@ class SimulatedUser:
         """Add angle and speed along the path to a hand at rest; elapsed: since the run began."""
         times, angles = self._path
         if elapsed[-1] < 0.0:
+            return
+        if self._spline is not None:
+            within = np.clip(elapsed, 0.0, times[-1])
+            motion[:, 1] += self._spline(within)
+            motion[:, 2] = self._spline(within, 1)
             return
         motion[:, 1] += np.interp(elapsed, times, angles)
         speeds = np.append(np.diff(angles) / np.diff(times), 0.0)

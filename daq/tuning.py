@@ -1,0 +1,186 @@
+"""From an identification to a torque controller: what ``rig tune`` does."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from daq.config import yaml_file
+from daq.errors import ConfigError
+from daq.files import write_whole
+from daq.hal import FloatArray
+from daq.identification import stages
+from daq.identification.replay import read_parameters
+from daq.lookup.controllers import load_settings
+from daq.lookup.models import find_model, name_parts
+from daq.progress import Watch, ignore
+from daq.provenance import software_versions
+from daq.torque import Fact, OperatingPoint, TorqueControl
+from sysid import ModelError, ProcessModel
+
+_HEAD = """\
+# A torque controller, made by rig tune; experiments name this file under 'torque_controller'.
+"""
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """A controller for an actuator, and what it rests on.
+
+    requested: its settings as they were given; ``control`` has them as the uncertainty allows.
+    parameters: values by name. source: where they come from. facts: quantities of the actuator,
+    with the spread that the identification's uncertainty gives them. draws: plausible parameters,
+    (n, n_parameters). uncertain: parameters that the identification gives no interval, which are
+    taken as they are.
+
+    >>> from daq import tune
+    >>> tuning = tune("torque.yaml", model="actuator:parameters=rig")
+    >>> {fact.name: round(fact.value, 4) for fact in tuning.facts}["motor_constant"]
+    0.1412
+    """
+
+    requested: TorqueControl
+    control: TorqueControl
+    model_name: str
+    model: ProcessModel
+    parameters: Mapping[str, float]
+    source: str
+    facts: tuple[Fact, ...]
+    draws: FloatArray
+    uncertain: tuple[str, ...]
+
+    @property
+    def changes(self) -> dict[str, tuple[Any, Any]]:
+        """Settings that tuning has changed: as requested, and as they are."""
+        before, after = self.requested.model_dump(mode="json"), self.control.model_dump(mode="json")
+        return {key: (before[key], after[key]) for key in after if before[key] != after[key]}
+
+    @cached_property
+    def document(self) -> dict[str, Any]:
+        """What the controller's file holds."""
+        return {
+            "settings": self.control.model_dump(mode="json"),
+            "model": self.model_name,
+            "parameters": dict(self.parameters),
+            "source": self.source,
+            "draws": len(self.draws),
+            "facts": {
+                fact.name: {
+                    "value": float(f"{fact.value:.6g}"),
+                    "unit": fact.unit,
+                    **({"interval": list(fact.interval)} if fact.interval else {}),
+                }
+                for fact in self.facts
+            },
+            "operating_points": [
+                {
+                    "branch": point.branch,
+                    "brake_current": round(point.brake_current, 6),
+                    "stiffness": float(f"{point.stiffness:.4g}"),
+                    "damping": float(f"{point.damping:.4g}"),
+                }
+                for point in self.operating_points()
+            ],
+            **({"without_interval": list(self.uncertain)} if self.uncertain else {}),
+            "software": software_versions(),
+        }
+
+    def operating_points(self, draw: int | None = None) -> tuple[OperatingPoint, ...]:
+        """The family of linear models, of the parameters or of one of the draws."""
+        vector = self.model.vector(dict(self.parameters)) if draw is None else self.draws[draw]
+        return self.control.operating_points(self.model, vector)
+
+    def save(self, path: str | Path) -> None:
+        """Write the file that experiments name. Raises ConfigError."""
+        text = yaml.safe_dump(self.document, sort_keys=False, allow_unicode=True)
+        write_whole(Path(path), _HEAD + text)
+
+
+def tune(
+    settings: str | Path,
+    parameters: str | Path | None = None,
+    *,
+    model: str | None = None,
+    draws: int = 200,
+    seed: int = 0,
+    watch: Watch = ignore,
+) -> Tuning:
+    """Make a torque controller for identified parameters.
+
+    settings: file as for ``rig tune``. parameters: what an identification wrote. model: in place
+    of it a model by name, at its own values, such as ``actuator:parameters=A``. draws: plausible
+    parameters, drawn from the identification's covariance, that tell how well the controller knows
+    its actuator. Raises ConfigError.
+
+    >>> from daq import tune
+    >>> tune("torque.yaml", model="actuator:parameters=rig").control.controller
+    'feedforward'
+    """
+    control = load_settings(str(settings), watch)
+    if (parameters is None) == (model is None):
+        raise ConfigError(
+            "which actuator the controller is for is not said" if model is None else
+            "a result names its own model",
+            cure="give --parameters PARAMETERS.yaml, or --model NAME for a model's own values",
+        )  # fmt: skip
+    if parameters is None:
+        assert model is not None
+        chosen, name, source = find_model(model), model, model
+        vector, plausible = chosen.nominal, np.empty((0, len(chosen.parameters)))
+        uncertain: tuple[str, ...] = ()
+    else:
+        path = Path(parameters)
+        file = stages.load([path])[0]
+        name, source = file.content.get("model", ""), str(file.path)
+        chosen, values = read_parameters(file.path, trust=False)
+        vector = chosen.vector(values)
+        plausible, uncertain = _draws(file, chosen, vector, draws, seed)
+    if name_parts(name)[1] is not None:
+        raise ConfigError(
+            f"model {name} lies in a file, which each experiment would run with the controller",
+            cure="install it under the entry point rig.models, and name it so",
+        )
+    try:
+        facts = control.facts(chosen, vector, plausible)
+        tuned = control.tuned(chosen, vector, facts)
+    except ModelError as error:
+        raise ConfigError(str(error), file=source) from None
+    named = dict(zip(chosen.parameter_names, vector.tolist(), strict=True))
+    return Tuning(control, tuned, name, chosen, named, source, facts, plausible, uncertain)
+
+
+def _draws(
+    file: yaml_file.YamlFile, model: ProcessModel, vector: FloatArray, n: int, seed: int
+) -> tuple[FloatArray, tuple[str, ...]]:
+    """Plausible parameters, (at most n, n_parameters), and those that have no spread.
+
+    From the covariance with all its ties: what acts only together moves together. Positive
+    parameters move by factors. Draws that break the model's constraints are left out.
+    """
+    names = list(model.parameter_names)
+    columns = [name for name in file.content["covariance"].get("parameters") or () if name in names]
+    factor = stages.factor(file, columns, model)
+    rows = np.array(factor).reshape(len(factor), len(columns))
+    searched = [p.name for p in model.parameters if not _is_fixed(file, p.name)]
+    spread = {name for name, column in zip(columns, rows.T, strict=True) if np.any(column)}
+    rng = np.random.default_rng(seed)
+    steps = np.zeros((n, len(vector)))
+    steps[:, [names.index(name) for name in columns]] = rng.standard_normal((n, len(rows))) @ rows
+    positive = np.array([p.scale == "log" for p in model.parameters])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        factors = np.exp(np.where(positive, steps / vector, 0.0))
+    moved = np.where(positive, vector * factors, vector + steps)
+    kept = [
+        draw for draw in moved if all(c.function(tuple(draw)) <= 0.0 for c in model.constraints)
+    ]
+    uncertain = tuple(name for name in searched if name not in spread)
+    return np.array(kept).reshape(-1, len(vector)), uncertain
+
+
+def _is_fixed(file: yaml_file.YamlFile, name: str) -> bool:
+    entry = file.content["parameters"].get(name)
+    return not isinstance(entry, dict) or bool(entry.get("fixed")) or "tied" in entry

@@ -1,0 +1,50 @@
+"""Experiments that a torque controller runs."""
+
+from functools import cached_property
+
+import numpy as np
+from pydantic import Field
+
+from daq.experiment import ClosedLoop, SettingError
+from daq.hal import FloatArray
+from daq.lookup.controllers import TunedController, load_controller
+
+
+class TorqueExperiment(ClosedLoop):
+    """A closed loop whose commands are those of a controller that rig tune made."""
+
+    torque_controller: str = Field(min_length=1, description="file that rig tune made")
+
+    @cached_property
+    def tuned_controller(self) -> TunedController:
+        """The controller. Raises ConfigError for a file that holds none."""
+        return load_controller(self.torque_controller, self._folder)
+
+    def controller_remarks(self) -> tuple[str, ...]:
+        """Which controller it is, and whether the torque sensor may judge it."""
+        tuned = self.tuned_controller
+        name = tuned.control.controller
+        remarks = [f"Its {name} controller is {tuned.path}, tuned to {tuned.source}."]
+        if tuned.control.takes_torque:
+            remarks.append(
+                "It listens to the torque sensor that judges it here: what noise and offset of the "
+                "sensor do to the hand is not seen as an error."
+            )
+        return tuple(remarks)
+
+    def bounds(self) -> tuple[FloatArray, FloatArray]:
+        """Lowest and highest commands of motor and brake, (2,) each [V].
+
+        Raises SettingError where the controller is for another sample rate or delay.
+        """
+        control = self.tuned_controller.control
+        for key, value in (("sample_rate", self.sample_rate), ("ahead", self.ahead)):
+            tuned = getattr(control, key)
+            if value != tuned:
+                raise SettingError(
+                    key,
+                    f"{value:g}, but {self.torque_controller} was tuned for {tuned:g}; write "
+                    f"{key}: {tuned:g}, or change it in the controller's settings and tune again",
+                )
+        motor, brake = self.tuned_controller.most_volts
+        return np.array([-motor, 0.0]), np.array([motor, brake])
