@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager, nullcontext, suppress
 from inspect import Parameter, signature
 from typing import Annotated, Any
 
-from typer import BadParameter, Context, Exit, Option, Typer
+from typer import BadParameter, Exit, Option, Typer
 from typer.core import TyperGroup
 
 from daq.cli import terminal
@@ -118,7 +118,7 @@ def _secure_cache() -> None:
 class _Commands(TyperGroup):
     """The commands; with ``--json`` a mistake in the command line is a document as well."""
 
-    def invoke(self, ctx: Context) -> Any:
+    def invoke(self, ctx: Any) -> Any:
         json = "--json" in ctx.args
         try:
             return super().invoke(ctx)
