@@ -92,14 +92,19 @@ class Innovations(Objective):
         variant = cls.of(objective, error, corrects=corrects, process=process)
         return variant.settled(chromosome)
 
+    def scattered(self, chromosome: FloatArray) -> Self:
+        """With the scatter of single samples at a chromosome, (n_free,)."""
+        steps = self.steps_needed(chromosome[None])[0]
+        vector, starts = self.space.full(chromosome), self._starts(chromosome[None])
+        scatter = self.simulator.scatter(vector, self.records, steps, starts)
+        return self._with(scatter=scatter)
+
     def settled(self, chromosome: FloatArray) -> Self:
-        """With the noise that the innovations show at a chromosome, (n_free,)."""
+        """With scatter, and the noise that the innovations show at a chromosome, (n_free,)."""
         steps = self.steps_needed(chromosome[None])
         # Noise of the process may explain nearly all of a free run's error.
         least = (_LEAST_OF_PROCESS if self.process.any() else _LEAST_NOISE) * self.error
-        vector, starts = self.space.full(chromosome), self._starts(chromosome[None])
-        scatter = self.simulator.scatter(vector, self.records, steps[0], starts)
-        settled = self._with(scatter=scatter)
+        settled = self.scattered(chromosome)
         for _ in range(_ROUNDS):
             innovations = settled._simulated(chromosome[None], steps, balanced=False).values[..., 0]
             before, noise = settled.noise, np.maximum(self.in_units(innovations), least)

@@ -81,16 +81,17 @@ def spread(
     noise, axes = np.linalg.eigh(back.T @ score @ back)
     back = back @ axes
     moves, leverages = np.empty((len(lengths), rank)), np.empty((len(lengths), rank, rank))
+    parts = np.empty_like(moves)
     for k, rows in enumerate(record_rows(lengths)):
         part = weighted[rows]
         push = np.einsum("tip,ti->p", part, sensitivity.residual[rows])
         leverages[k] = back.T @ np.einsum("tip,tir->pr", part, sensitivity.slopes[rows],
                                           optimize=True) @ back  # fmt: skip
-        moves[k] = _without(leverages[k], back.T @ push)
+        moves[k] = _without(leverages[k], back.T @ push, 1.0)
+        parts[k] = _without(leverages[k], back.T @ push, 0.5)
     freedom = np.array([_freedom(shares) for shares in np.diagonal(leverages, axis1=1, axis2=2).T])
-    n = len(lengths)
-    variance = (n - 1) / n * np.sum((moves - moves.mean(axis=0)) ** 2, axis=0)
-    ratios = variance / np.maximum(noise, 1e-12 * noise[-1])
+    # The jackknife's own variance is too large on average where some logs tell most.
+    ratios = np.sum(parts**2, axis=0) / np.maximum(noise, 1e-12 * noise[-1])
     chance = _CHANCE if logs else _CHANCE_OF_PARTS
     if stats.chi2.sf(freedom @ ratios, freedom.sum()) > chance:
         return None
@@ -98,10 +99,14 @@ def spread(
     return LogSpread(moves @ back.T, information, float(freedom @ ratios / freedom.sum()))
 
 
-def _without(leverage: FloatArray, push: FloatArray) -> FloatArray:
-    """Move of the estimate without a log, by its leverage (rank, rank) and its score (rank,)."""
+def _without(leverage: FloatArray, push: FloatArray, power: float) -> FloatArray:
+    """Move of the estimate without a log, by its leverage (rank, rank) and its score (rank,).
+
+    power: 1 for the move itself; 1/2 for one whose squares, summed over the logs, have the
+    estimate's variance as their mean (Bell & McCaffrey's second correction).
+    """
     share, axes = linalg.eigh(leverage)
-    left = np.where(share < _ALONE, 1.0 - share, np.inf)
+    left = np.where(share < _ALONE, np.abs(1.0 - share) ** power, np.inf)
     moved: FloatArray = axes @ ((axes.T @ push) / left)
     return moved
 
