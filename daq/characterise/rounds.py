@@ -157,8 +157,9 @@ class Round:
 def _interval(quantity: Mapping[str, Any], entry: Mapping[str, Any]) -> Interval:
     value = entry.get("value", quantity["value"])
     low, high = entry.get("interval") or (None, None)
-    bounded = low is not None and high is not None and value
-    width = 0.5 * abs((high - low) / value) if bounded else None
+    width = None
+    if low is not None and high is not None and value:
+        width = 0.5 * abs((high - low) / value)
     return Interval(quantity["name"], quantity["unit"], value, width, quantity["after"])
 
 

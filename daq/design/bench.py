@@ -155,7 +155,7 @@ class PlantBench:
             for kind in ("cmd", "applied")
         }
         ticks: IntArray = np.arange(n, dtype=np.int64)
-        time: FloatArray = ticks * dt
+        time = np.asarray(ticks * dt, dtype=np.float64)
         flags = np.zeros(n, dtype=np.int64)
         return Samples(tick=ticks, time=time, flags=flags, **volts, **measured)
 

@@ -8,7 +8,7 @@ from typing import Any
 from daq.config.question import Question
 from daq.config.yaml_file import YamlFile
 from daq.errors import ConfigError
-from daq.experiment import Family, Frame, OpenLoop
+from daq.experiment import Family, RunFrame, OpenLoop
 from daq.hal import FloatArray
 from daq.lookup.classes import find_class
 from daq.plugins import installed
@@ -50,7 +50,7 @@ class ProtocolFamily:
 
 
 def families_of(
-    file: YamlFile, question: Question, frame: Frame, turns: float
+    file: YamlFile, question: Question, frame: RunFrame, turns: float
 ) -> dict[str, ProtocolFamily]:
     """Families of the protocols that a question names, or of all that have one, by name.
 
@@ -81,7 +81,7 @@ def families_of(
     return families
 
 
-def with_family(frame: Frame) -> Sequence[str]:
+def with_family(frame: RunFrame) -> Sequence[str]:
     """Names of the installed protocols with settings that a design may choose."""
     folder = Path()
     classes = {name: find_class("protocol", name, folder) for name in installed("protocol")}

@@ -20,7 +20,7 @@ def draw_design(result: DesignResult, rig: RigConfig) -> None:
     runs = result.runs
     commands = np.concatenate([run.commands for run in runs])
     ends = np.cumsum([len(run.commands) * run.dt for run in runs])
-    time: FloatArray = np.arange(len(commands)) * runs[0].dt
+    time = np.asarray(np.arange(len(commands)) * runs[0].dt, dtype=np.float64)
     predictions = []
     for j, name in enumerate(CHANNELS):
         line = commands[:, j]
