@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Field
 
 from daq.config.units import Hertz, Seconds
-from daq.experiment import Family, RunFrame, FreeSetting
+from daq.experiment import Family, FreeSetting, RunFrame
 from daq.hal import FloatArray, IntArray
 from protocols.waveforms import Excitation, ExcitedChannel, between_levels, whole_samples
 

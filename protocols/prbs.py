@@ -8,7 +8,7 @@ from pydantic import Field
 
 from daq.config.base import Section
 from daq.config.units import Seconds, Volts
-from daq.experiment import Family, RunFrame, FreeSetting, Timed
+from daq.experiment import Family, FreeSetting, RunFrame, Timed
 from daq.hal import CHANNELS, FloatArray, IntArray
 from protocols.waveforms import between_levels, whole_samples
 

@@ -6,7 +6,7 @@ import numpy as np
 from pydantic import Field
 
 from daq.config.units import Hertz, Radians, Seconds
-from daq.experiment import Family, RunFrame, FreeSetting
+from daq.experiment import Family, FreeSetting, RunFrame
 from daq.hal import FloatArray
 from protocols.waveforms import Excitation, ExcitedChannel, between_levels
 

@@ -8,7 +8,7 @@ from pydantic import Field
 
 from daq.config.base import Section
 from daq.config.units import Seconds, Volts
-from daq.experiment import Family, RunFrame, OpenLoop
+from daq.experiment import Family, OpenLoop, RunFrame
 from daq.hal import CHANNELS, FloatArray, IntArray
 from protocols.waveforms import HeldChannel, smooth_rise, whole_samples
 

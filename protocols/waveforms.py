@@ -11,7 +11,7 @@ from pydantic import Field
 
 from daq.config.base import Section
 from daq.config.units import Seconds, Volts
-from daq.experiment import Family, RunFrame, FreeSetting, OpenLoop, Plan
+from daq.experiment import Family, FreeSetting, OpenLoop, Plan, RunFrame
 from daq.hal import CHANNELS, FloatArray
 
 

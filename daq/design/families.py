@@ -8,7 +8,7 @@ from typing import Any
 from daq.config.question import Question
 from daq.config.yaml_file import YamlFile
 from daq.errors import ConfigError
-from daq.experiment import Family, RunFrame, OpenLoop
+from daq.experiment import Family, OpenLoop, RunFrame
 from daq.hal import FloatArray
 from daq.lookup.classes import find_class
 from daq.plugins import installed
