@@ -1,5 +1,6 @@
 """Families of runs from the protocols' own settings, and the experiments that their files hold."""
 
+import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -83,13 +84,13 @@ def families_of(
 
 def with_family(frame: RunFrame) -> Sequence[str]:
     """Names of the installed protocols with settings that a design may choose."""
-    folder = Path()
-    classes = {name: find_class("protocol", name, folder) for name in installed("protocol")}
-    return [
-        name
-        for name, protocol in classes.items()
-        if issubclass(protocol, OpenLoop) and protocol.family(frame) is not None
-    ]
+    names = []
+    for name in installed("protocol"):
+        with contextlib.suppress(ConfigError):  # one that does not load
+            protocol = find_class("protocol", name, Path())
+            if issubclass(protocol, OpenLoop) and protocol.family(frame) is not None:
+                names.append(name)
+    return names
 
 
 def _rounded(content: Any) -> Any:
