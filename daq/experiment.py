@@ -102,7 +102,7 @@ class FreeSetting:
 
 
 @dataclass(frozen=True)
-class Frame:
+class RunFrame:
     """What runs of a design have in common: their length, rate and ranges of the commands [V]."""
 
     n_samples: int
@@ -221,7 +221,7 @@ class OpenLoop(Experiment):
         return ()
 
     @classmethod
-    def family(cls, frame: Frame) -> Family | None:
+    def family(cls, frame: RunFrame) -> Family | None:
         """Runs within a frame that ``rig design`` may choose from; None: it chooses no such."""
         return None
 

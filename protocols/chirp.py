@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import Field
 
 from daq.config.units import Hertz, Seconds
-from daq.experiment import Family, Frame, FreeSetting
+from daq.experiment import Family, FreeSetting, RunFrame
 from daq.hal import FloatArray
 from protocols.waveforms import Excitation, ExcitedChannel, between_levels
 
@@ -28,7 +28,7 @@ class Chirp(Excitation[ChirpChannel]):
     )
 
     @classmethod
-    def family(cls, frame: Frame) -> Family:
+    def family(cls, frame: RunFrame) -> Family:
         """Where the sweep begins and ends."""
         end = FreeSetting(1.0 / frame.seconds, 0.25 * frame.sample_rate, log=True)
         free = {"start_frequency": end, "end_frequency": end}

@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Field
 
 from daq.config.units import Hertz, Seconds
-from daq.experiment import Family, Frame, FreeSetting
+from daq.experiment import Family, FreeSetting, RunFrame
 from daq.hal import FloatArray, IntArray
 from protocols.waveforms import Excitation, ExcitedChannel, between_levels, whole_samples
 
@@ -56,7 +56,7 @@ class Multisine(Excitation[MultisineChannel]):
     )
 
     @classmethod
-    def family(cls, frame: Frame) -> Family:
+    def family(cls, frame: RunFrame) -> Family:
         """One period: lines up to a frequency, and the seeds."""
         lowest = 1.0 / frame.seconds
         free = {

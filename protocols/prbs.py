@@ -8,7 +8,7 @@ from pydantic import Field
 
 from daq.config.base import Section
 from daq.config.units import Seconds, Volts
-from daq.experiment import Family, Frame, FreeSetting, Timed
+from daq.experiment import Family, FreeSetting, RunFrame, Timed
 from daq.hal import CHANNELS, FloatArray, IntArray
 from protocols.waveforms import between_levels, whole_samples
 
@@ -45,7 +45,7 @@ class Prbs(Timed):
         return np.stack(columns, axis=1)
 
     @classmethod
-    def family(cls, frame: Frame) -> Family:
+    def family(cls, frame: RunFrame) -> Family:
         """How long a bit is held, and the seeds."""
         free = {
             "hold": FreeSetting(1.0 / frame.sample_rate, 0.25 * frame.seconds, log=True),

@@ -6,7 +6,7 @@ import numpy as np
 from pydantic import Field
 
 from daq.config.units import Hertz, Radians, Seconds
-from daq.experiment import Family, Frame, FreeSetting
+from daq.experiment import Family, FreeSetting, RunFrame
 from daq.hal import FloatArray
 from protocols.waveforms import Excitation, ExcitedChannel, between_levels
 
@@ -24,7 +24,7 @@ class Sine(Excitation[SineChannel]):
     duration: Seconds = Field(gt=0.0, le=86400.0, description="of the sines, without the ramps")
 
     @classmethod
-    def family(cls, frame: Frame) -> Family:
+    def family(cls, frame: RunFrame) -> Family:
         """Frequency and phase."""
         free = {
             "frequency": FreeSetting(1.0 / frame.seconds, 0.25 * frame.sample_rate, log=True),

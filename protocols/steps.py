@@ -8,7 +8,7 @@ from pydantic import Field
 
 from daq.config.base import Section
 from daq.config.units import Seconds, Volts
-from daq.experiment import Family, Frame, OpenLoop
+from daq.experiment import Family, OpenLoop, RunFrame
 from daq.hal import CHANNELS, FloatArray, IntArray
 from protocols.waveforms import HeldChannel, smooth_rise, whole_samples
 
@@ -51,7 +51,7 @@ class Steps(OpenLoop):
     brake: StepsChannel = Field(description="levels of the brake's commands")
 
     @classmethod
-    def family(cls, frame: Frame) -> Family | None:
+    def family(cls, frame: RunFrame) -> Family | None:
         """Any levels of both channels, one after the other, each held alike long."""
         if frame.n_samples < _PIECES:
             return None

@@ -11,7 +11,7 @@ from pydantic import Field
 
 from daq.config.base import Section
 from daq.config.units import Seconds, Volts
-from daq.experiment import Family, Frame, FreeSetting, OpenLoop, Plan
+from daq.experiment import Family, FreeSetting, OpenLoop, Plan, RunFrame
 from daq.hal import CHANNELS, FloatArray
 
 
@@ -108,7 +108,7 @@ class Excitation(OpenLoop, Generic[Channel]):
 
 
 def between_levels(
-    frame: Frame,
+    frame: RunFrame,
     free: Mapping[str, FreeSetting],
     common: Mapping[str, Any],
     keys: Callable[[dict[str, float]], dict[str, Any]] = dict,

@@ -23,7 +23,7 @@ from daq.design.pictures import draw_design
 from daq.design.result import DesignResult, PlannedRun
 from daq.documents import plain
 from daq.errors import ConfigError
-from daq.experiment import Frame
+from daq.experiment import RunFrame
 from daq.files import make_folder, write_whole
 from daq.hal import Device, Simulation
 from daq.identification import stages
@@ -224,7 +224,7 @@ def _beside(file: TypedSettings, key: str, name: str | None) -> str | None:
     return str(beside) if beside.exists() else name
 
 
-def _frame(file: YamlFile, question: Question, rig: RigConfig) -> Frame:
+def _frame(file: YamlFile, question: Question, rig: RigConfig) -> RunFrame:
     n_samples = round(question.seconds * question.sample_rate)
     if n_samples < 2:
         problem = f"{question.seconds:g} s at {question.sample_rate:g} Hz makes {n_samples} samples"
@@ -233,7 +233,7 @@ def _frame(file: YamlFile, question: Question, rig: RigConfig) -> Frame:
         problem = f"a run of {question.seconds:g} s is longer than the {question.time:g} s of all"
         raise file.error(("run",), problem, "make it shorter, or give more time")
     ranges = rig.limits.command
-    return Frame(n_samples, question.sample_rate, ranges.motor, ranges.brake)
+    return RunFrame(n_samples, question.sample_rate, ranges.motor, ranges.brake)
 
 
 def _space(file: YamlFile, problem: Problem) -> SearchSpace:

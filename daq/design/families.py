@@ -1,5 +1,6 @@
 """Families of runs from the protocols' own settings, and the experiments that their files hold."""
 
+import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -8,7 +9,7 @@ from typing import Any
 from daq.config.question import Question
 from daq.config.yaml_file import YamlFile
 from daq.errors import ConfigError
-from daq.experiment import Family, Frame, OpenLoop
+from daq.experiment import Family, OpenLoop, RunFrame
 from daq.hal import FloatArray
 from daq.lookup.classes import find_class
 from daq.plugins import installed
@@ -50,7 +51,7 @@ class ProtocolFamily:
 
 
 def families_of(
-    file: YamlFile, question: Question, frame: Frame, turns: float
+    file: YamlFile, question: Question, frame: RunFrame, turns: float
 ) -> dict[str, ProtocolFamily]:
     """Families of the protocols that a question names, or of all that have one, by name.
 
@@ -81,15 +82,15 @@ def families_of(
     return families
 
 
-def with_family(frame: Frame) -> Sequence[str]:
+def with_family(frame: RunFrame) -> Sequence[str]:
     """Names of the installed protocols with settings that a design may choose."""
-    folder = Path()
-    classes = {name: find_class("protocol", name, folder) for name in installed("protocol")}
-    return [
-        name
-        for name, protocol in classes.items()
-        if issubclass(protocol, OpenLoop) and protocol.family(frame) is not None
-    ]
+    names = []
+    for name in installed("protocol"):
+        with contextlib.suppress(ConfigError):  # one that does not load
+            protocol = find_class("protocol", name, Path())
+            if issubclass(protocol, OpenLoop) and protocol.family(frame) is not None:
+                names.append(name)
+    return names
 
 
 def _rounded(content: Any) -> Any:

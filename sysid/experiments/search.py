@@ -71,6 +71,10 @@ class Search:
                 "reach down to less, or know the parameters better"
             )
         self.choose()
+        if not self.chosen:
+            raise ModelError(
+                "what is asked for is known as well as that already; ask for narrower intervals"
+            )
         for k in range(generations):
             self.generation(offspring, k / max(generations - 1, 1))
             self.choose()

@@ -9,7 +9,7 @@ import yaml
 from daq.config.yaml_file import TypedSettings
 from daq.design.bench import PlantBench
 from daq.design.design import set_up
-from daq.experiment import Frame
+from daq.experiment import RunFrame
 from daq.lookup.classes import find_class
 from daq.lookup.rigs import load_rig
 from sim_rig.actuator import actuator
@@ -17,7 +17,7 @@ from tests.daq.support import few_free, merged, rig, write_yaml
 
 QUICK = {"candidates": 10, "generations": 0, "draws": 1, "checks": 2, "calibration": 16}
 QUESTION = {**QUICK, "time": "2.5 s", "config": "id.yaml", "targets": {"K_m": "1 %"}}
-FRAME = Frame(1000, 800.0, (-5.0, 5.0), (0.0, 0.38))
+FRAME = RunFrame(1000, 800.0, (-5.0, 5.0), (0.0, 0.38))
 
 
 @pytest.fixture
@@ -85,16 +85,6 @@ def test_a_limit_is_kept_by_the_margin():
         assert (records is not None) == passes, config.name
 
 
-def test_a_run_that_drives_an_amplifier_to_its_end_is_left_to_models_that_have_one():
-    noise = {"current_motor": 0.005, "current_brake": 0.005, "omega": 0.1}
-    config, device = load_rig("simulated.yaml")
-    for limits, motor, passes in ((False, 0.2, True), (False, 1.2, False), (True, 1.2, True)):
-        model = actuator(limits=limits, parameters="rig")
-        judge = PlantBench(model, device.plant_model(5.0), config, 5.0, 0.1, noise)
-        records = judge.records(commands(motor), 1.0 / 800.0, model.nominal[None])
-        assert (records is not None) == passes
-
-
 def test_what_the_model_is_given_of_a_run_is_what_the_rig_would_log(tmp_path):
     loose, vectors = bench()
     (record,) = loose.records(commands(0.3, 0.05), 1.0 / 800.0, vectors)
@@ -110,6 +100,7 @@ def test_what_the_model_is_given_of_a_run_is_what_the_rig_would_log(tmp_path):
     assert record.inputs[40:, 2] == pytest.approx(table["torque"][40:400], abs=1e-3)
 
 
+@pytest.mark.soak
 def test_a_design_writes_runs_a_figure_and_what_they_would_tell(asked, tmp_path):
     done = rig("design", asked, "--out", "d", "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -125,6 +116,7 @@ def test_a_design_writes_runs_a_figure_and_what_they_would_tell(asked, tmp_path)
         assert json.loads(checked.stdout)["samples"] == 1000
 
 
+@pytest.mark.soak
 def test_a_designed_run_passes_no_limit_and_is_identified(asked, tmp_path):
     rig("design", asked, "--out", "d", cwd=tmp_path)
     done = rig("run", "d/designed-1.yaml", "--json", cwd=tmp_path)
@@ -132,10 +124,12 @@ def test_a_designed_run_passes_no_limit_and_is_identified(asked, tmp_path):
     folder = json.loads(done.stdout)["run"]["folder"]
     identified = rig("identify", folder, "--config", "id.yaml", cwd=tmp_path)
     assert identified.returncode == 0, identified.stderr
-    again = rig(
-        "design", asked, "--parameters", folder, "--log", folder, "--out", "e", "--json",
-        cwd=tmp_path,
-    )  # fmt: skip
+    known = ["--parameters", folder, "--log", folder]
+    met = rig("design", asked, *known, "--set", "targets.K_m=50", cwd=tmp_path)
+    assert met.returncode == 2
+    assert "known as well as that already" in met.stderr
+    finer = ["--set", "targets.K_m=0.001", "--out", "e", "--json"]
+    again = rig("design", asked, *known, *finer, cwd=tmp_path)
     assert "noise is assumed" not in again.stderr
     before, after = (json.loads((tmp_path / name / "design.json").read_text()) for name in "de")
     for first, second in zip(before["quantities"], after["quantities"], strict=True):
