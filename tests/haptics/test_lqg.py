@@ -56,6 +56,12 @@ def test_the_sensitivity_tells_how_much_stronger_the_motor_may_be():
     assert swing(CONTROL, 2.0, strength=0.95 * peak / (peak - 1.0)) < 1.0
 
 
+@pytest.mark.parametrize("strength", [1.2, 4.0])
+def test_a_stronger_motor_is_reckoned_with(strength):
+    peak = TorqueLoop(CONTROL, DYNAMICS).peak_sensitivity(DYNAMICS.inertia, strength, 4.0)
+    assert (swing(CONTROL, 4.0, strength=strength) > 1.0) == math.isinf(peak)
+
+
 def test_tuning_leaves_the_margin_to_every_hand():
     facts = CONTROL.facts(MODEL, MODEL.nominal, NO_DRAWS)
     tuned = CONTROL.tuned(MODEL, MODEL.nominal, facts)
