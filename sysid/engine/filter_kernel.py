@@ -134,9 +134,9 @@ class FilterKernel(BatchKernel):
             for a in range(self._size):
                 lines.append(f"L{place}_{a} = {_sum(_products(gains, _covariance_with(a)))}")
                 variances[a, place] = f"L{place}_{a}"
-            for other, behind in self._lag.items():
+            for i, behind in self._lag.items():
                 if behind >= place:
-                    row = _products(self._gains(other), f"L{place}_{{}}".format)
+                    row = _products(self._gains(i), f"L{place}_{{}}".format)
                     variances[place, behind] = _sum(row)
         variances = {pair: v for pair, v in variances.items() if not set(pair) & set(begun)}
         return lines + self._stored(variances)

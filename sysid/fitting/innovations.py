@@ -125,8 +125,8 @@ class Innovations(Objective):
     @property
     def overwhelmed(self) -> BoolArray:
         """Outputs whose errors the noise of the inputs more than explains, (n_outputs,)."""
-        known = sum(part.sum(axis=0) for part in self.scatter) / np.maximum(self.counts, 1)
-        noise = np.sqrt(self.noise**2 + known)
+        scatter = sum(part.sum(axis=0) for part in self.scatter) / np.maximum(self.counts, 1)
+        noise = np.sqrt(self.noise**2 + scatter)
         few: BoolArray = (noise < _NEAR * self.error) & (self.weights > 0.0)
         return few
 

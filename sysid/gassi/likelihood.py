@@ -167,7 +167,7 @@ class _Optima:
         """Put one fitted by its own noise, if it could be, in the place of a minimum."""
         if refitted is not None:
             rms = optimum.objective.rms(refitted.chromosome[None])[0]
-            place = [other is optimum for other in self._optima].index(True)
+            place = [kept is optimum for kept in self._optima].index(True)
             self._optima[place] = _optimum(refitted.objective, refitted.chromosome, rms)
 
     def ranked(self) -> list[Optimum]:
