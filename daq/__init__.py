@@ -12,8 +12,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from daq.design.design import design
-    from daq.design.result import DesignResult
+    from daq.designs.design import design
+    from daq.designs.result import DesignResult
     from daq.errors import ConfigError, RigError
     from daq.identification.campaign import CampaignRequest, CampaignResult, campaign
     from daq.identification.comparison import ComparisonRequest, ComparisonResult, compare
@@ -33,7 +33,7 @@ _HOMES = {
     "ComparisonRequest": "daq.identification.comparison",
     "ComparisonResult": "daq.identification.comparison",
     "ConfigError": "daq.errors",
-    "DesignResult": "daq.design.result",
+    "DesignResult": "daq.designs.result",
     "Identification": "daq.identification.result",
     "Preview": "daq.recording.preview",
     "Recording": "daq.logs.recording",
@@ -43,7 +43,7 @@ _HOMES = {
     "analyse": "daq.recording.analysis",
     "campaign": "daq.identification.campaign",
     "check": "daq.recording.preview",
-    "design": "daq.design.design",
+    "design": "daq.designs.design",
     "compare": "daq.identification.comparison",
     "identify": "daq.identification.fit",
     "load": "daq.logs.recording",

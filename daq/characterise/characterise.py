@@ -12,7 +12,7 @@ from typing import Any
 from daq.characterise.page import write_page
 from daq.characterise.rounds import Interval, Request, Round, rounds_of
 from daq.config.yaml_file import TypedSettings
-from daq.design.design import choose, set_up, write
+from daq.designs.design import choose, set_up, write
 from daq.errors import RigError, Terminated
 from daq.files import make_folder
 from daq.identification.fit import check_writable, fit

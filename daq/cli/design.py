@@ -11,7 +11,7 @@ from typer import Argument, Option
 from daq.cli import options, terminal
 
 if TYPE_CHECKING:
-    from daq.design.result import DesignResult
+    from daq.designs.result import DesignResult
 
 
 def design(
@@ -58,7 +58,7 @@ def design(
     Writes them as experiments for rig run, and says beforehand how narrow the intervals will be,
     what stays unknown, and what would tell it. Nothing is energised.
     """
-    from daq.design import design as use_case
+    from daq.designs import design as use_case
 
     typed = {
         "rig": rig,

@@ -122,7 +122,10 @@ MISTAKES = {
         {"run_in": "9 s"},
         "run_in: nothing is left to compare of the 200 samples of",
     ),
-    "a freed name of none": ({"fixed": {"gian": None}}, "fixed.gian: did you mean 'gain'?"),
+    "a freed name of none": (
+        {"fixed": {"gian": None}},
+        "fixed.gian: the model has no such name; did you mean 'gain'?",
+    ),
 }
 
 

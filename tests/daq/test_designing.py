@@ -7,8 +7,8 @@ import pytest
 import yaml
 
 from daq.config.yaml_file import TypedSettings
-from daq.design.bench import PlantBench
-from daq.design.design import set_up
+from daq.designs.bench import PlantBench
+from daq.designs.design import set_up
 from daq.experiment import RunFrame
 from daq.lookup.classes import find_class
 from daq.lookup.rigs import load_rig

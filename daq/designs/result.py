@@ -42,6 +42,12 @@ class DesignResult:
     """A design for a rig, and its files.
 
     model_name, rig_name: as they are typed. noise: standard deviations that it counts on.
+
+    >>> from daq import design
+    >>> few = {"candidates": 4, "generations": 0, "draws": 1, "checks": 1}
+    >>> result = design(precision="50 %", time="1 s", **few)
+    >>> [quantity.name for quantity in result.design.quantities][:2]
+    ['K_dm', 'omega_dm']
     """
 
     question: Question

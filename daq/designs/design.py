@@ -16,11 +16,11 @@ from daq.config import check, yaml_file
 from daq.config.question import Question
 from daq.config.rig import RigConfig
 from daq.config.yaml_file import TypedSettings, YamlFile
-from daq.design.bench import PlantBench
-from daq.design.families import ProtocolFamily, families_of
-from daq.design.knowledge import noise_of, prior_of, require_calibrated
-from daq.design.pictures import draw_design
-from daq.design.result import DesignResult, PlannedRun
+from daq.designs.bench import PlantBench
+from daq.designs.families import ProtocolFamily, families_of
+from daq.designs.knowledge import noise_of, prior_of, require_calibrated
+from daq.designs.pictures import draw_design
+from daq.designs.result import DesignResult, PlannedRun
 from daq.documents import plain
 from daq.errors import ConfigError
 from daq.experiment import RunFrame

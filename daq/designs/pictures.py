@@ -3,7 +3,7 @@
 import numpy as np
 
 from daq.config.rig import RigConfig
-from daq.design.result import DesignResult
+from daq.designs.result import DesignResult
 from daq.figures import design as figures
 from daq.figures import style
 from daq.figures.design import Prediction
