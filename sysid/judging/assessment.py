@@ -128,6 +128,8 @@ def examine(
     shared = by_speed = None
     if systematic is not None and finite:
         by_speed = errors_by_speed(residual, simulated, systematic)
+        if record.jitter.size:
+            by_speed[record.jitter.any(axis=0)] = 0.0  # that is why they do
         if not record.input_noise.any():  # which comes through the plant to all outputs
             shared = shared_errors(residual, systematic)
     return RecordResult(

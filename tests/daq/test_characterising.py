@@ -1,6 +1,5 @@
 """``rig characterise``: rounds in one folder, which go on from wherever they were ended."""
 
-import itertools
 import json
 import shutil
 import signal
@@ -9,7 +8,10 @@ import subprocess
 import pytest
 
 from daq.characterise.rounds import Round, rounds_of
+from sim_rig.actuator import actuator
 from tests.daq.support import few_free, rig, start_rig, write_yaml
+
+pytestmark = pytest.mark.soak
 
 QUICK = ["candidates=8", "generations=0", "draws=1", "checks=2", "calibration=16", "run=0.5 s"]
 
@@ -47,13 +49,15 @@ def test_it_uses_the_time_and_tells_the_parameters(finished):
     assert (folder / "c" / "report" / "report.html").exists()
 
 
-def test_each_round_is_narrower_than_the_one_before(finished):
-    rounds = rounds_of(finished[0] / "c")
-    assert len(rounds) > 1
-    for before, after in itertools.pairwise(rounds):
-        pairs = zip(before.intervals(), after.intervals(), strict=True)
-        widths = [(a.width, b.width) for a, b in pairs if a.width is not None]
-        assert sum(b < a for a, b in widths) >= len(widths) - 1
+def test_the_intervals_hold_what_the_simulated_rig_is_made_of(finished):
+    folder, document = finished
+    assert len(rounds_of(folder / "c")) > 1
+    model = actuator(parameters="rig")
+    truth = dict(zip(model.parameter_names, model.nominal.tolist(), strict=True))
+    determined = [q for q in document["quantities"] if q["width"] is not None]
+    assert {q["name"] for q in determined} >= {"R_m", "K_m"}
+    for quantity in determined:
+        assert abs(quantity["value"] / truth[quantity["name"]] - 1.0) <= quantity["width"] < 0.1
 
 
 def test_what_was_done_is_not_done_again(finished, tmp_path):
