@@ -1,7 +1,6 @@
 """What happens, and what does not, while a run is scheduled in real time."""
 
 import json
-import os
 import subprocess
 import sys
 
@@ -122,4 +121,3 @@ def test_a_library_that_never_returns_is_ended_by_the_system(tmp_path, real_time
         result = spin(run, tmp_path, deep=True)
     assert result.returncode == -9
     assert record_of(only_capture(tmp_path))["status"] == "running"
-    assert os.sched_getscheduler(0) == os.SCHED_OTHER
