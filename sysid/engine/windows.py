@@ -4,6 +4,7 @@ Between samples an output is the parabola through both with the mean that it has
 which the simulation tells the integral: straight lines would cut its corners.
 """
 
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -26,13 +27,18 @@ def with_integrals(model: ProcessModel, places: Sequence[int]) -> ProcessModel:
     >>> with_integrals(lag(), [0]).derivative((1.0, 0.0), (0.0,), (2.0, 0.5))
     (-2.0, 1.0)
     """
+    return _with_integrals(model, tuple(places))
+
+
+@functools.lru_cache(maxsize=8)  # one model for the same question: its kernels are kept by it
+def _with_integrals(model: ProcessModel, places: tuple[int, ...]) -> ProcessModel:
     n, derivative, output = len(model.states), model.derivative, model.output
     chosen = [model.outputs[j] for j in places]
     names = [(f"integral of {signal.name}", f"{signal.unit}*s") for signal in chosen]
     if output is None:
         pick = picker([model.state_names.index(signal.name) for signal in chosen])
     else:
-        pick = picker(list(places))
+        pick = picker(places)
 
     def rates(x: Any, u: Any, p: Any) -> tuple[Any, ...]:
         plain = x[:n]

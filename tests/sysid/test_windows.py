@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from sysid import GASSI, BatchSimulator, Dataset, ModelError
+from sysid.engine.filter_kernel import FilterKernel
 from sysid.examples import lag
 
 DT, TAU = 1e-3, 0.05
@@ -67,6 +68,24 @@ def test_the_filter_sees_them_alike(corrects):
     plain = simulator.residuals(*common).values
     filtered = simulator.innovations(*common, np.array([0.1]), corrects=corrects).values
     np.testing.assert_allclose(filtered[1:], plain[1:], atol=1e-6)
+
+
+def test_the_filter_of_means_is_made_once(monkeypatch):
+    made = []
+
+    class Counted(FilterKernel):
+        def text(self, **options):
+            made.append(self)
+            return super().text(**options)
+
+    monkeypatch.setattr("sysid.engine.compiler.FilterKernel", Counted)
+    record = replace(averaged_step(), input_noise=np.array([1e-9]))
+    model = lag().with_initial({"y": 0.5})
+    for tau in (TAU, 2.0 * TAU):
+        BatchSimulator(model).innovations(
+            np.array([[1.0, tau]]), [record], [np.ones(1)], np.array([[1]]), [None], np.ones(1)
+        )
+    assert len(made) == 1
 
 
 def test_of_means_over_the_last_sample_innovations_are_those_of_a_kalman_filter():
