@@ -1,7 +1,8 @@
 """How large the errors of a right model are, and of what they consist: the floor of its residuals.
 
 Noise of the outputs, as a calibration found it; noise of measured inputs, simulated through the
-plant; what the parameters' own uncertainty makes of a free run, and the error of its simulation.
+plant; what the parameters' own uncertainty makes of a free run, the noise of the samples that it
+starts at, and the error of its simulation.
 """
 
 from dataclasses import dataclass, replace
@@ -34,7 +35,8 @@ class ExpectedErrors:
 
     noise: (n_outputs,), variance by the sensors' noise, of inputs and outputs; NaN where that of
     the output is not known. systematic: (n_samples, n_outputs, k), errors that go with the inputs,
-    each by one standard deviation of what makes it: directions of the parameters, the simulation.
+    each by one standard deviation of what makes it: directions of the parameters, the sample that
+    a state starts at, the simulation.
     """
 
     noise: FloatArray
@@ -92,10 +94,25 @@ def expected_errors(
     exact = fine.trajectories(vector[None], record, None, start[None])[0]
     error = np.where(np.isfinite(exact), exact - undisturbed, 0.0)
     systematic.append(error[..., None])
-    noise = np.where(record.output_noise > 0.0, record.output_noise**2, np.nan)
+    for i, deviation in _noisy_starts(simulator, record).items():
+        moved = start.copy()
+        moved[i] += deviation
+        run = simulator.trajectories(vector[None], record, n_steps, moved[None])[0]
+        change = np.where(np.isfinite(run), run - undisturbed, 0.0)
+        systematic.append(change[..., None])
+    variance = np.where(record.output_noise > 0.0, record.output_noise**2, np.nan)
     if np.any(record.input_noise):
-        noise = noise + _by_input_noise(runs, vector, record, undisturbed)
-    return ExpectedErrors(noise, np.concatenate(systematic, axis=2))
+        variance = variance + _by_input_noise(runs, vector, record, undisturbed)
+    return ExpectedErrors(variance, np.concatenate(systematic, axis=2))
+
+
+def _noisy_starts(simulator: BatchSimulator, record: Dataset) -> dict[int, float]:
+    """Standard deviation of the first sample at which a state starts, by the state's place."""
+    return {
+        i: record.sample_noise(j)
+        for i, j in enumerate(record.starts_at_samples(simulator.model))
+        if j is not None
+    }
 
 
 def _by_parameters(

@@ -42,7 +42,6 @@ from sysid.judging.suspects import (
     likely_noise,
     variant_suspects,
 )
-from sysid.problem.channels import noise
 from sysid.problem.model import ModelError
 from sysid.uncertainty import Estimate, Uncertainty
 from sysid.uncertainty.colour import Autoregression, colour, record_rows
@@ -183,9 +182,8 @@ def _noisy_starts(runs: Sequence[DisturbedRun]) -> FloatArray:
     for run, rows in zip(runs, record_rows(lengths), strict=True):
         for place, j in enumerate(run.record.starts_at_samples(run.model)):
             if j is not None:
-                deviation = run.record.output_noise[j] or noise(run.record.outputs[:, j])
                 column = np.zeros((*columns[0].shape[:2], 1))
-                column[rows, :, 0] = deviation * run.started(place)
+                column[rows, :, 0] = run.record.sample_noise(j) * run.started(place)
                 columns.append(column)
     return np.concatenate(columns, axis=2)
 

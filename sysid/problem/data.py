@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from sysid.arrays import BoolArray, FloatArray
+from sysid.problem.channels import noise
 from sysid.problem.model import AROUND_FIRST_SAMPLE, ModelError, ProcessModel
 
 
@@ -160,6 +161,10 @@ class Dataset:
             if state.first_sample and np.isfinite(first.get(state.name, np.nan)):
                 x0[i] = first[state.name]
         return x0
+
+    def sample_noise(self, output: int) -> float:
+        """Standard deviation of an output's noise: as calibrated, else as its samples show it."""
+        return float(self.output_noise[output]) or noise(self.outputs[:, output])
 
     def starts_at_samples(self, model: ProcessModel) -> list[int | None]:
         """For each state the output whose first sample it starts at, None where it does not."""

@@ -2,8 +2,8 @@
 
 The estimate minimises the mean of the outputs' RMSEs, where each output weighs by the inverse of
 its error; its covariance is the sandwich of the curvature and the covariance of the score, in
-which the residuals' colour, the noise of the inputs and the sensors' zero errors enter (Ljung,
-"System Identification", sections 9.2 and 9.4).
+which the residuals' colour, the noise of the inputs, the sensors' zero errors and the noise of the
+samples that runs start at enter (Ljung, "System Identification", sections 9.2 and 9.4).
 """
 
 from collections.abc import Iterable
@@ -14,7 +14,13 @@ from scipy.linalg import null_space
 
 from sysid.arrays import BoolArray, FloatArray
 from sysid.uncertainty.colour import colour, score_covariance
-from sysid.uncertainty.sensitivity import Sensitivity, input_noises, spans, zero_errors
+from sysid.uncertainty.sensitivity import (
+    Sensitivity,
+    input_noises,
+    spans,
+    start_errors,
+    zero_errors,
+)
 from sysid.uncertainty.spread import LogSpread, spread
 
 # Singular values below this share of the largest are rounding: the direction does nothing.
@@ -93,7 +99,8 @@ def covariance(
     score = score_covariance(weighted, sensitivity.lengths, noise)
     # Not all that the inputs' noise does is seen in residuals: parameters take up slow changes.
     score = _larger(score, _score_covariance_by(weighted, input_noises(sensitivity)))
-    score += _score_covariance_by(weighted, zero_errors(sensitivity))
+    for errors in (zero_errors(sensitivity), start_errors(sensitivity)):
+        score += _score_covariance_by(weighted, errors)
     rows = (slopes * np.sqrt(weight)[:, None]).reshape(-1, slopes.shape[2])
     sizes = np.linalg.norm(rows, axis=0)
     moving = sizes > _ROUNDING**2 * np.max(

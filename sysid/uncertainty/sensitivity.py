@@ -126,7 +126,7 @@ def zero_errors(sensitivity: Sensitivity) -> Iterator[FloatArray]:
             if isinstance(objective, Innovations):
                 outputs = record.outputs.copy()
                 outputs[:, j] += record.output_zero[j]
-                yield _innovation_change(sensitivity, k, replace(record, outputs=outputs))
+                yield _change_by_record(sensitivity, k, replace(record, outputs=outputs))
                 continue
             change = np.zeros_like(sensitivity.residual)
             change[rows, j] = record.output_zero[j] / objective.scales[k][j]
@@ -159,6 +159,25 @@ def given_errors(sensitivity: Sensitivity) -> Iterator[FloatArray]:
         yield np.where(np.isfinite(slope), slope, 0.0)
 
 
+def start_errors(sensitivity: Sensitivity) -> Iterator[FloatArray]:
+    """Changes (n_residuals, n_outputs) by a deviation of each first sample that a run starts at.
+
+    Such a run keeps the noise of one sample for as long as the plant remembers its start. Where no
+    calibration knows the noise it is that of the samples, and not above what the model leaves.
+    """
+    objective = sensitivity.objective
+    places = zip(objective.records, record_rows(sensitivity.lengths), objective.scales, strict=True)
+    for k, (record, rows, scale) in enumerate(places):
+        left = np.sqrt(np.mean(sensitivity.residual[rows] ** 2, axis=0)) * scale
+        for j in record.starts_at_samples(objective.simulator.model):
+            if j is None:
+                continue
+            outputs = record.outputs.copy()
+            outputs[0, j] += record.output_noise[j] or min(record.sample_noise(j), left[j])
+            change = _change_by_record(sensitivity, k, replace(record, outputs=outputs))
+            yield change * sensitivity.share
+
+
 def input_noises(sensitivity: Sensitivity) -> Iterator[FloatArray]:
     """Changes of all residuals whose outer products sum to the covariance by input noise.
 
@@ -184,7 +203,7 @@ def _input_changes(
     if isinstance(objective, Innovations):
         for error in errors:
             disturbed_record = replace(record, inputs=record.inputs + error)
-            yield _innovation_change(sensitivity, k, disturbed_record)
+            yield _change_by_record(sensitivity, k, disturbed_record)
         return
     rows = record_rows(sensitivity.lengths)[k]
     chromosomes = sensitivity.chromosome[None]
@@ -207,8 +226,8 @@ def _input_changes(
         yield change * sensitivity.share
 
 
-def _innovation_change(sensitivity: Sensitivity, k: int, record: Dataset) -> FloatArray:
-    """Change of all innovations with another record k."""
+def _change_by_record(sensitivity: Sensitivity, k: int, record: Dataset) -> FloatArray:
+    """Change of all residuals with another record k."""
     objective = sensitivity.objective
     records = list(objective.records)
     records[k] = record
