@@ -6,10 +6,11 @@ import _thread
 import contextlib
 import os
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from types import FrameType
+from types import CodeType, FrameType
 from typing import Any, NoReturn
 
 from daq.errors import Terminated
@@ -18,6 +19,7 @@ from daq.errors import Terminated
 # a program that is suspended watches no limits. Where there is such a signal.
 _NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK", "SIGQUIT", "SIGTSTP")
 _PATIENCE = 2.0  # s after the first signal in which the outputs must have been zeroed
+_LATER = 0.02  # s until an error that Python swallowed is raised again
 
 
 class SignalHandling:
@@ -30,18 +32,23 @@ class SignalHandling:
     ``last_act``, whose words are shown, and the device's watchdog zeroes the outputs. What came
     behind the shield without an effect is raised at the end. Signals that the process ignores, as
     under nohup, stay ignored. ``interrupt`` raises an error of another thread's as if a signal had
-    brought it.
+    brought it. What is raised in a destructor or in a callback of the garbage collector's is
+    swallowed by Python; it is raised again once that has returned.
     """
 
     def __init__(self) -> None:
         self.last_act: Callable[[str, str], str] = lambda status, reason: ""
         self._before: list[tuple[int, Any]] = []
+        self._sending = threading.Lock()
         self._first = 0.0  # when the first signal came
         self._pending: BaseException | None = None
         self._interruption: BaseException | None = None
         self._shielded, self._breakable = True, False
+        self._raised: tuple[BaseException, bool, bool] | None = None  # by what, and behind what
+        self._hook_before: Callable[[sys.UnraisableHookArgs], Any] = sys.unraisablehook
 
     def __enter__(self) -> SignalHandling:
+        self._hook_before, sys.unraisablehook = sys.unraisablehook, self._swallowed
         if threading.current_thread() is threading.main_thread():
             numbers = [getattr(signal, name) for name in _NAMES if hasattr(signal, name)]
             heard = [n for n in numbers if signal.getsignal(n) is not signal.SIG_IGN]
@@ -49,8 +56,11 @@ class SignalHandling:
         return self
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        for number, handler in reversed(self._before):  # Ctrl-C last: with its own it raises again
+        with self._sending:
+            before, self._before = self._before, []
+        for number, handler in reversed(before):  # Ctrl-C last: with its own it raises again
             signal.signal(number, handler)
+        sys.unraisablehook = self._hook_before
         if error is None and self._pending is not None:
             raise self._pending
 
@@ -75,16 +85,36 @@ class SignalHandling:
 
     def interrupt(self, error: BaseException) -> None:
         """From another thread: raise an error in the main one, out of the call it waits in."""
-        if signal.SIGTERM not in dict(self._before):
-            return  # not in the main thread, or told to ignore it: it would end nothing, or all
-        self._interruption = error
-        if hasattr(signal, "pthread_kill"):
-            signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGTERM)
-        else:  # Windows: heard once the call is back in Python
-            _thread.interrupt_main(signal.SIGTERM)
+        with self._sending:
+            if not self._before:
+                return  # over, not in the main thread, or all are ignored: it would end all
+            number = signal.Signals(self._before[0][0])
+            self._interruption = error
+            if hasattr(signal, "pthread_kill"):
+                signal.pthread_kill(threading.main_thread().ident or 0, number)
+            else:  # Windows: heard once the call is back in Python
+                _thread.interrupt_main(number)
+
+    def _swallowed(self, unraisable: sys.UnraisableHookArgs) -> None:
+        """Python's hook for errors that it cannot raise: ours are raised later."""
+        if self._raised is None or unraisable.exc_value is not self._raised[0]:
+            self._hook_before(unraisable)
+            return
+        error, self._shielded, self._breakable = self._raised
+        self._pending = error  # should the run end before
+        self._interrupt_later(error)
+
+    def _interrupt_later(self, error: BaseException) -> None:
+        timer = threading.Timer(_LATER, self.interrupt, [error])
+        timer.daemon = True
+        timer.start()
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         interruption, self._interruption = self._interruption, None
+        if _within(frame, SignalHandling._swallowed.__code__):
+            if interruption is not None:  # another: its own error follows
+                self._interrupt_later(interruption)
+            return
         if interruption is not None:
             self.end_by(interruption)
             return
@@ -96,6 +126,7 @@ class SignalHandling:
         now = time.monotonic()
         if not self._shielded or self._breakable:
             self._first = self._first or now
+            self._raised, self._pending = (error, self._shielded, self._breakable), None
             self._shielded, self._breakable = True, False
             raise error
         if self._first and now - self._first > _PATIENCE:
@@ -110,3 +141,10 @@ class SignalHandling:
             words = f"{reason}\nrig: {self.last_act(status, reason)}"
         os.write(2, f"rig: {words}\n".encode())
         os._exit(1)
+
+
+def _within(frame: FrameType | None, code: CodeType) -> bool:
+    """Whether a function is being called at a frame of the stack."""
+    while frame is not None and frame.f_code is not code:
+        frame = frame.f_back
+    return frame is not None

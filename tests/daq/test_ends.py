@@ -97,6 +97,40 @@ def test_a_hail_at_any_instant_does_not_leave_a_run_that_goes_on(tmp_path, seed)
     assert_stopped(process, folder)
 
 
+_DESTROYING = '''
+"""The simulated rig, stopped while Python destroys something."""
+import signal
+
+from daq.hal import Phase
+from sim_rig.backend import SimulatedDevice
+
+
+class Buffer:
+    def __del__(self):
+        signal.raise_signal(signal.SIGINT)  # Python swallows what that raises here
+
+
+class Destroying(SimulatedDevice):
+    def announce(self, phase, turns=0.0):
+        super().announce(phase, turns)
+        self.buffer = Buffer() if phase is Phase.RUN else None
+
+    def receive(self):
+        self.buffer = None
+        return super().receive()
+'''
+
+
+def test_one_ctrl_c_ends_a_run_wherever_it_is(tmp_path):
+    (tmp_path / "destroying.py").write_text(_DESTROYING)
+    write_experiment(tmp_path / "e.yaml", duration=5)
+    write_rig(tmp_path / "rig.yaml", backend="destroying.py:Destroying", options={"time": "real"})
+    result = rig("run", "e.yaml", "--rig", "rig.yaml", cwd=tmp_path)
+    assert result.returncode == 1 and "Exception ignored" not in result.stderr
+    record = record_of(only_capture(tmp_path))
+    assert record["status"] == "stopped" and record["outputs"]["confirmed"] is True
+
+
 _HANGING = '''
 """The simulated rig whose outputs cannot be zeroed: it hangs, and signals come."""
 import os
