@@ -34,6 +34,27 @@ class TorqueLaw(Protocol):
 
 
 @dataclass(frozen=True)
+class LawProgram:
+    """A law as a program of fixed memory, which Python, Numba and C99 run alike.
+
+    text: plain scalar Python, constants and functions; of it ``entry`` answers a sample and
+    ``slopes(x, u, p, dx)`` is the model. n_states: numbers of its memory, zero at first.
+    constants, parameters: its numbers, and the model's.
+
+    ``entry(theta, omega, sensed, i_m, reference, lost, s, c, p, volts)``: angle [rad], speed
+    [rad/s], torque sensor [N*m] and motor current [A] of a sample, the torque that the hand is to
+    feel [N*m], samples lost before this one, memory, constants and parameters; writes the
+    commands of motor and brake [V].
+    """
+
+    entry: str
+    text: str
+    n_states: int
+    constants: tuple[float, ...]
+    parameters: tuple[float, ...]
+
+
+@dataclass(frozen=True)
 class Fact:
     """A quantity of the actuator that a controller rests on.
 
@@ -151,6 +172,11 @@ class TorqueControl(Section, abc.ABC):
     @abc.abstractmethod
     def most_volts(self, model: ProcessModel, parameters: FloatArray) -> tuple[float, float]:
         """Largest commands of motor, either way, and brake [V]."""
+
+    def program(self, model: ProcessModel, parameters: FloatArray) -> LawProgram:
+        """The law as a program. Raises ConfigError for a controller that has none."""
+        cure = "give it a method 'program', or take feedforward, lqg or static"
+        raise ConfigError(f"controller {self.controller} is Python alone", cure=cure)
 
     @abc.abstractmethod
     def law(self, model: ProcessModel, parameters: FloatArray) -> TorqueLaw:

@@ -1,14 +1,17 @@
 """What all controllers of the actuator's torque have in common."""
 
+import math
 from collections.abc import Callable
 
 import numpy as np
 from pydantic import Field
 
 from daq.torque import Fact, OperatingPoint, TorqueControl
+from haptics import laws
 from haptics.allocation import Allocation, Preference
 from haptics.dynamics import ActuatorDynamics
 from haptics.operating_points import operating_points
+from haptics.program import ProgramLaw
 from sysid import ProcessModel
 from sysid.arrays import FloatArray
 
@@ -75,3 +78,28 @@ class ActuatorControl(TorqueControl):
         """How a torque is shared."""
         limits = self.motor_current, self.brake_current
         return Allocation(self.allocation, dynamics.motor_constant, dynamics.resistances, limits)
+
+    def law(self, model: ProcessModel, parameters: FloatArray) -> ProgramLaw:
+        """The program, from rest."""
+        return ProgramLaw(self.program(model, parameters), model)
+
+    def constants(self, dynamics: ActuatorDynamics) -> list[float]:
+        """What all laws know of the actuator, (``laws.CONSTANTS``,)."""
+        time, delay = 1.0 / self.sample_rate, dynamics.brake.delay
+        decay = math.exp(-time / delay)
+        values = {
+            laws.TIME: time,
+            laws.HORIZON: (self.ahead + 0.5) * time + dynamics.motor.delay,
+            laws.AHEAD: float(self.ahead),
+            laws.INERTIA: dynamics.inertia,
+            laws.STIFFNESS: dynamics.stiffness,
+            laws.MOTOR_GAIN: dynamics.motor.gain,
+            laws.MOTOR_EMF: dynamics.motor.emf,
+            laws.MOST_VOLTS: self.motor_current / dynamics.motor.gain,
+            laws.BRAKE_GAIN: dynamics.brake.gain,
+            laws.BRAKE_DECAY: decay,
+            laws.BRAKE_MEAN: delay / time * (1.0 - decay),
+            laws.BRAKE_SLOPE: dynamics.brake_slope(0.0, dynamics.sliding, 0.0),
+        }
+        shared = dict(enumerate(self.shared(dynamics).constants))
+        return [float({**values, **shared}.get(k, 0.0)) for k in range(laws.CONSTANTS)]

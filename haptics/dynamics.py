@@ -21,8 +21,6 @@ INPUTS = ("applied_voltage_motor", "applied_voltage_brake", "torque")
 SHAFT = ("omega", "z", "theta")
 CURRENTS = ("current_motor", "current_brake")
 
-_SUBSTEP = 0.5  # largest change of z, in parts of its range, by one Runge-Kutta step
-_MOST_SUBSTEPS = 64
 _TURNS = 1.0  # rad that a shaft turns until its hysteresis surely slides
 
 
@@ -91,22 +89,6 @@ class ActuatorDynamics:
     def brake_slope(self, omega: float, z: float, theta: float) -> float:
         """Torque on the shaft that an ampere of the brake's adds as its hysteresis is [N*m/A]."""
         return self.rest(1.0, omega, z, theta) - self.rest(0.0, omega, z, theta)
-
-    def turned(self, z: float, angle: float, time: float) -> float:
-        """The hysteresis variable after the shaft has turned by ``angle`` [rad] in ``time`` [s]."""
-        if angle == 0.0:
-            return z
-        omega = angle / time
-        share = abs(angle) * self.stiffness / _SUBSTEP
-        n = min(int(share) + 1, _MOST_SUBSTEPS)
-        step = time / n
-        for _ in range(n):
-            first = self._z_rate(omega, z)
-            second = self._z_rate(omega, z + 0.5 * step * first)
-            third = self._z_rate(omega, z + 0.5 * step * second)
-            last = self._z_rate(omega, z + step * third)
-            z += step / 6.0 * (first + 2.0 * (second + third) + last)
-        return z
 
     @cached_property
     def sliding(self) -> float:

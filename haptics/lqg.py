@@ -30,11 +30,13 @@ from pydantic import Field
 from scipy.linalg import expm, solve_discrete_are
 
 from daq.config.units import NewtonMetres, Part, Unit
-from daq.torque import Fact
+from daq.torque import Fact, LawProgram
+from haptics import laws
 from haptics.actuator_control import ActuatorControl
 from haptics.dynamics import ActuatorDynamics
-from haptics.feedforward import InverseLaw, encoder_noise
+from haptics.feedforward import encoder_noise
 from haptics.observer import Hand, SensorNoise, ShaftFilter
+from haptics.program import law_program
 from sysid import ModelError, ProcessModel
 from sysid.arrays import FloatArray
 
@@ -100,9 +102,12 @@ class Lqg(ActuatorControl):
             "sensitivity, or lower hand_range or hand_rate"
         )
 
-    def law(self, model: ProcessModel, parameters: FloatArray) -> "LqgLaw":
-        """The regulator, its observer at rest."""
-        return LqgLaw(self, ActuatorDynamics(model, parameters))
+    def program(self, model: ProcessModel, parameters: FloatArray) -> LawProgram:
+        """The regulator on top of the inverse."""
+        dynamics = ActuatorDynamics(model, parameters)
+        constants = self.shaft_filter(dynamics.inertia).placed(self.constants(dynamics))
+        constants = Regulator.of(self, dynamics.inertia).placed(constants)
+        return law_program("lqg", model, parameters, constants)
 
     def shaft_filter(self, inertia: float) -> ShaftFilter:
         """The observer's filter."""
@@ -111,7 +116,7 @@ class Lqg(ActuatorControl):
         return ShaftFilter.of(inertia, 1.0 / self.sample_rate, noise, hand)
 
 
-@dataclass
+@dataclass(frozen=True)
 class Regulator:
     """The regulator about delta*.
 
@@ -120,7 +125,6 @@ class Regulator:
 
     gain: FloatArray
     lead: float
-    deltas: list[float]
 
     @classmethod
     def of(cls, control: Lqg, inertia: float) -> "Regulator":
@@ -135,38 +139,14 @@ class Regulator:
         Q[0, 0] = 1.0
         P = solve_discrete_are(A, B, Q, R)
         gain = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)[0]
-        return cls(gain, inertia / control.hand_damping, [0.0] * control.ahead)
+        return cls(gain, inertia / control.hand_damping)
 
-    def answer(self, missing: float, rate: float) -> float:
-        """The next delta [N*m]: by e [N*m] and w + tau_r' [N*m/s]."""
-        target = self.lead * rate
-        x = np.array([missing, *(delta - target for delta in self.deltas)])
-        delta = self.deltas[-1] - float(self.gain @ x)
-        self.deltas = [*self.deltas[1:], delta]
-        return delta
-
-    def limited(self, missing: float) -> None:
-        """The last delta as the limits of the currents left it."""
-        self.deltas[-1] += missing
-
-
-class LqgLaw(InverseLaw):
-    """The regulator at work."""
-
-    def __init__(self, control: Lqg, dynamics: ActuatorDynamics) -> None:
-        super().__init__(control, dynamics, control.shaft_filter(dynamics.inertia))
-        self._regulator = Regulator.of(control, dynamics.inertia)
-
-    def shaft_torque(self, torque: float, slope: float) -> float:
-        """tau_r + delta - d."""
-        observer = self.observer
-        missing = torque + observer.hand
-        delta = self._regulator.answer(missing, observer.hand_rate + slope)
-        return torque + self._horizon * slope + delta - observer.disturbance
-
-    def limited(self, missing: float) -> None:
-        """What was given is what the next answer changes."""
-        self._regulator.limited(missing)
+    def placed(self, constants: list[float]) -> list[float]:
+        """Constants of a law with these in their places."""
+        placed = list(constants)
+        placed[laws.AHEAD], placed[laws.LEAD] = float(len(self.gain) - 1), self.lead
+        placed[laws.REGULATOR : laws.REGULATOR + len(self.gain)] = self.gain.tolist()
+        return placed
 
 
 class TorqueLoop:
@@ -175,7 +155,7 @@ class TorqueLoop:
     def __init__(self, control: Lqg, dynamics: ActuatorDynamics) -> None:
         self._control, self._inertia = control, dynamics.inertia
         self._filter = control.shaft_filter(dynamics.inertia)
-        self._regulator = Regulator.of(control, dynamics.inertia)
+        self._constants = Regulator.of(control, dynamics.inertia).placed([0.0] * laws.CONSTANTS)
 
     def peak_sensitivity(self, inertia: float, strength: float, hand: float) -> float:
         """Largest sensitivity at the motor up to half the sample rate; infinite if unstable.
@@ -202,19 +182,22 @@ class TorqueLoop:
         rates[1] = np.array([-K, -B, 1.0]) / inertia
         plant = expm(rates / control.sample_rate)
         n = 2 + len(shaft.b) + 2 * control.ahead
+        constants, memory = self._constants, [0.0] * laws.STATES
 
         def step(s: FloatArray, added: float) -> tuple[FloatArray, float]:
             """A sample: angle and speed, filter, commands under way, deltas; and the command."""
             motion, x = s[:2], s[2 : 2 + len(shaft.b)]
             commands, deltas = np.split(s[2 + len(shaft.b) :], 2)
-            regulator = Regulator(self._regulator.gain, self._regulator.lead, deltas.tolist())
-            command = regulator.answer(float(x[2]), float(x[3])) - float(x[4])
+            memory[laws.DELTAS : laws.DELTAS + control.ahead] = deltas.tolist()
+            answer = laws.regulate(float(x[2]), float(x[3]), memory, constants)
+            command = answer - float(x[4])
             applied = float(commands[0]) + added
             motion = plant[:2, :2] @ motion + plant[:2, 2] * strength * applied
             guess = shaft.predicted(x, applied)
             x = shaft.corrected(guess, float(motion[0]), float(-K * motion[0] - B * motion[1]))
             queue = [*commands[1:], command]
-            return np.concatenate([motion, x, queue, regulator.deltas]), float(commands[0])
+            deltas = memory[laws.DELTAS : laws.DELTAS + control.ahead]
+            return np.concatenate([motion, x, queue, deltas]), float(commands[0])
 
         columns = [step(unit, 0.0) for unit in np.eye(n)]
         A = np.stack([later for later, _ in columns], axis=1)

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import expm, solve_discrete_are
 
-from haptics.dynamics import ActuatorDynamics
+from haptics import laws
 from sysid.arrays import FloatArray
 
 _HAND_WALK = 2e-3  # N*m in a sample, of a hand whose damping is modelled: what is not smooth in it
@@ -87,74 +87,11 @@ class ShaftFilter:
         better: FloatArray = x + self.gain @ (theta - x[0], torque - x[2])
         return better
 
-
-@dataclass
-class Motion:
-    """Angle [rad] and speed [rad/s] of the shaft, and its hysteresis."""
-
-    theta: float
-    omega: float
-    z: float
-
-
-class ShaftObserver:
-    """A shaft's filter, and the hysteresis along its angle."""
-
-    def __init__(self, dynamics: ActuatorDynamics, time: float, shaft: ShaftFilter) -> None:
-        self._dynamics, self._time, self._filter = dynamics, time, shaft
-        self.state = np.zeros(len(shaft.b))
-        self._z = self._driving = 0.0
-        self._started = False
-
-    @property
-    def motion(self) -> Motion:
-        """Now."""
-        return Motion(float(self.state[0]), float(self.state[1]), self._z)
-
-    @property
-    def hand(self) -> float:
-        """The hand's torque on the shaft [N*m]."""
-        return float(self.state[2])
-
-    @property
-    def hand_rate(self) -> float:
-        """By which it changes but for its damping [N*m/s]."""
-        return float(self.state[3])
-
-    @property
-    def disturbance(self) -> float:
-        """What the model of the shaft lacks [N*m]."""
-        return float(self.state[4]) if len(self.state) > 3 else 0.0
-
-    @property
-    def acceleration(self) -> float:
-        """Of the shaft [rad/s^2]."""
-        return (self._driving + self.hand + self.disturbance) / self._dynamics.inertia
-
-    def update(self, theta: float, torque: float, i_m: float, i_b: float) -> None:
-        """To a sample of angle, torque sensor and currents."""
-        if not self._started:
-            self._started = True
-            self.state[0] = theta
-            return
-        motion, dynamics = self.motion, self._dynamics
-        rest = dynamics.rest(i_b, motion.omega, motion.z, motion.theta)
-        self._driving = dynamics.motor_constant * i_m + rest
-        guess = self._filter.predicted(self.state, self._driving)
-        self._move(self._filter.corrected(guess, theta, torque))
-
-    def coast(self) -> None:
-        """Over a sample that did not arrive."""
-        self._move(self._filter.predicted(self.state, self._driving))
-
-    def ahead(self, time: float) -> Motion:
-        """The motion so much later [s], at the present acceleration."""
-        motion, rate = self.motion, self.acceleration
-        angle = time * (motion.omega + 0.5 * time * rate)
-        z = self._dynamics.turned(motion.z, angle, time)
-        return Motion(motion.theta + angle, motion.omega + time * rate, z)
-
-    def _move(self, state: FloatArray) -> None:
-        angle = float(state[0] - self.state[0])
-        self._z = self._dynamics.turned(self._z, angle, self._time)
-        self.state = state
+    def placed(self, constants: list[float]) -> list[float]:
+        """Constants of a law with these in their places; a smaller filter's others are zero."""
+        n, size, placed = len(self.b), laws.FILTER_ORDER, list(constants)
+        A, b, gain = np.zeros((size, size)), np.zeros(size), np.zeros((size, 2))
+        A[:n, :n], b[:n], gain[:n] = self.A, self.b, self.gain
+        for place, values in ((laws.FILTER_A, A), (laws.FILTER_B, b), (laws.FILTER_L, gain)):
+            placed[place : place + values.size] = values.ravel().tolist()
+        return placed

@@ -10,9 +10,11 @@ from typing import Literal
 from pydantic import Field
 
 from daq.config.units import RadiansPerSecond
-from daq.experiment import Sample
+from daq.torque import LawProgram
+from haptics import laws
 from haptics.actuator_control import ActuatorControl
 from haptics.dynamics import ActuatorDynamics
+from haptics.program import law_program
 from sysid import ProcessModel
 from sysid.arrays import FloatArray
 
@@ -25,25 +27,8 @@ class Static(ActuatorControl):
         0.5, ge=0.0, le=100.0, description="speed below which the brake stays off"
     )
 
-    def law(self, model: ProcessModel, parameters: FloatArray) -> "StaticLaw":
-        """The maps as they are."""
-        return StaticLaw(self, ActuatorDynamics(model, parameters))
-
-
-class StaticLaw:
-    """u_b = i_b / G_b, u_m = (tau + k_b sign(omega) i_b) / (K G_m), i_b by the allocation."""
-
-    def __init__(self, control: Static, dynamics: ActuatorDynamics) -> None:
-        self._allocation = control.shared(dynamics)
-        self._standstill = control.standstill
-        self._sliding = -dynamics.brake_slope(0.0, dynamics.sliding, 0.0)
-        self._gains = dynamics.motor.gain, dynamics.brake.gain
-
-    def volts(self, sample: Sample, torque: float) -> tuple[float, float]:
-        """Commands of motor and brake [V]."""
-        speed, slope = sample.omega, 0.0
-        if abs(speed) > self._standstill:
-            slope = -self._sliding if speed > 0.0 else self._sliding
-        i_b = self._allocation.brake(torque, slope)
-        i_m = self._allocation.motor(torque - slope * i_b)
-        return i_m / self._gains[0], i_b / self._gains[1]
+    def program(self, model: ProcessModel, parameters: FloatArray) -> LawProgram:
+        """u_b = i_b / G_b, u_m = (tau - b sign(omega) i_b) / (K G_m), i_b by the allocation."""
+        constants = self.constants(ActuatorDynamics(model, parameters))
+        constants[laws.STANDSTILL] = self.standstill
+        return law_program("static", model, parameters, constants)

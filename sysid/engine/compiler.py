@@ -8,6 +8,7 @@ changed model file therefore gets a new name, and an old kernel is never used fo
 import contextlib
 import functools
 import hashlib
+import math
 import os
 import sys
 import tempfile
@@ -133,6 +134,24 @@ def _compiled(
         if name in scope:
             scope[name] = _njit(scope[name])
     return [_njit(scope[name], nogil=True, cache=path is not None) for name in functions]
+
+
+def compiled_text(name: str, text: str, functions: Sequence[str]) -> list[Any]:
+    """Functions of a text of plain scalar Python, compiled; all that they call stands in it.
+
+    name: by which it lies in the cache folder.
+
+    >>> (double,) = compiled_text("example", "def double(x):\n    return 2.0 * x\n", ["double"])
+    >>> double(1.5)
+    3.0
+    """
+    path = _source_file(f"{name}_{_key(text, {})}.py", text)
+    scope: dict[str, Any] = {"math": math, "__name__": __name__}
+    exec(compile(text, str(path or "<text>"), "exec"), scope)
+    for key, item in scope.items():
+        if isinstance(item, types.FunctionType) and key not in functions:
+            scope[key] = _njit(item)
+    return [_njit(scope[key], nogil=True, cache=path is not None) for key in functions]
 
 
 @contextlib.contextmanager

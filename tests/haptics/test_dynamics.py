@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from haptics import laws
 from haptics.dynamics import ActuatorDynamics
 from haptics.operating_points import operating_points
+from haptics.program import law_functions
 from sim_rig.actuator import actuator
 from sysid import ModelError
 
@@ -52,7 +54,8 @@ def test_gain_and_mean_delay_of_a_channel_are_those_of_its_step(channel):
 @pytest.mark.parametrize("hysteresis", ["bouc-wen", "dahl", "lugre"])
 def test_hysteresis_along_an_angle_is_that_of_the_integrated_equation(hysteresis):
     model = actuator(parameters="rig", hysteresis=hysteresis)
-    dynamics = ActuatorDynamics(model)
+    dynamics, functions = ActuatorDynamics(model), law_functions(model)
+    constants = {laws.STIFFNESS: dynamics.stiffness}
     omega, z = model.state_names.index("omega"), model.state_names.index("z")
 
     def rate(_t, y, speed):
@@ -62,7 +65,7 @@ def test_hysteresis_along_an_angle_is_that_of_the_integrated_equation(hysteresis
 
     mine = exact = 0.0
     for angle in (0.004, 0.012, -0.003, -0.02, 0.001, 0.05):
-        mine = dynamics.turned(mine, angle, 1.25e-3)
+        mine = functions.turned(mine, angle, 1.25e-3, constants, tuple(model.nominal))
         span = (0.0, 1.25e-3)
         run = solve_ivp(rate, span, [exact], args=(angle / 1.25e-3,), rtol=1e-10, atol=1e-12)
         exact = run.y[0, -1]

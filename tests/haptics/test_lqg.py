@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from haptics import laws
 from haptics.dynamics import ActuatorDynamics
 from haptics.lqg import Lqg, Regulator, TorqueLoop
 from sim_rig.actuator import actuator
@@ -16,20 +17,23 @@ NO_DRAWS = np.empty((0, len(MODEL.nominal)))
 CONTROL = Lqg(controller="lqg")
 
 
+def regulator_of(control):
+    """Its state, and its constants."""
+    c = Regulator.of(control, DYNAMICS.inertia).placed([0.0] * laws.CONSTANTS)
+    return [0.0] * laws.STATES, c
+
+
 def swing(control, hand, inertia=1.0, strength=1.0, n=4000):
     """Last speeds of a shaft in a hand under the regulator, by Euler steps of its equations."""
     J, T = DYNAMICS.inertia * inertia, 1.0 / control.sample_rate
     B, K = hand * control.hand_damping, hand * control.hand_stiffness
-    shaft, regulator = (
-        control.shaft_filter(DYNAMICS.inertia),
-        Regulator.of(control, DYNAMICS.inertia),
-    )
+    shaft, (s, c) = control.shaft_filter(DYNAMICS.inertia), regulator_of(control)
     x, theta, omega, steps = np.zeros(len(shaft.b)), 1e-3, 0.0, 40
     queue, applied, speeds = [0.0] * control.ahead, 0.0, []
     for _ in range(n):
         h = -K * theta - B * omega
         x = shaft.corrected(shaft.predicted(x, applied), theta, h)
-        delta = regulator.answer(float(x[2]), float(x[3]))
+        delta = laws.regulate(float(x[2]), float(x[3]), s, c)
         queue.append(delta - float(x[4]))
         applied = queue.pop(0)
         for _ in range(steps):
@@ -79,9 +83,9 @@ def test_what_no_effort_can_make_stable_is_refused():
 
 def test_currents_at_their_limits_wind_nothing_up():
     """A torque beyond the motor's for a second: the error after it is that of another start."""
-    regulator = Regulator.of(CONTROL, DYNAMICS.inertia)
+    s, c = regulator_of(CONTROL)
     for _ in range(800):
-        delta = regulator.answer(0.5, 0.0)
-        regulator.limited(min(delta, 0.1) - delta)
-    assert regulator.deltas[-1] == pytest.approx(0.1)
-    assert regulator.answer(-0.5, 0.0) < 0.0
+        delta = laws.regulate(0.5, 0.0, s, c)
+        s[laws.DELTAS] += min(delta, 0.1) - delta
+    assert s[laws.DELTAS] == pytest.approx(0.1)
+    assert laws.regulate(-0.5, 0.0, s, c) < 0.0

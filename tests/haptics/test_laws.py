@@ -1,0 +1,45 @@
+"""The one text of the laws: by Python and by Numba, over samples that get lost."""
+
+import numpy as np
+import pytest
+
+from daq.experiment import Sample
+from haptics.feedforward import Feedforward
+from haptics.laws import STATES
+from haptics.lqg import Lqg
+from haptics.program import compiled_laws
+from haptics.static import Static
+from sim_rig.actuator import actuator
+
+MODEL = actuator(parameters="rig")
+CONTROLS = [
+    Static(controller="static"),
+    Feedforward(controller="feedforward"),
+    Lqg(controller="lqg"),
+]
+
+
+def samples(n=600):
+    """A shaft that is turned to and fro; every 50th sample is lost."""
+    for k in range(n):
+        t = k / 800.0
+        if k % 50 != 20:
+            theta, omega = 2.0 * np.sin(5.0 * t), 10.0 * np.cos(5.0 * t)
+            yield Sample(k, t, 0.3 * np.sin(9.0 * t), 0.0, 0.05 * np.sin(12.0 * t), theta, omega, 0)
+
+
+@pytest.mark.parametrize("control", CONTROLS, ids=lambda control: control.controller)
+def test_machine_code_answers_as_python_does(control):
+    program = control.program(MODEL, MODEL.nominal)
+    law, compiled = control.law(MODEL, MODEL.nominal), compiled_laws(MODEL)[program.entry]
+    s, c, p = np.zeros(STATES), np.array(program.constants), np.array(program.parameters)
+    volts, tick = np.zeros(2), -1
+    for sample in samples():
+        reference = 0.2 * np.sin(20.0 * sample.time)
+        lost = sample.tick - tick - 1 if tick >= 0 else 0
+        tick = sample.tick
+        compiled(
+            sample.theta, sample.omega, sample.torque, sample.current_motor,
+            reference, lost, s, c, p, volts,
+        )  # fmt: skip
+        assert law.volts(sample, reference) == pytest.approx(tuple(volts), abs=1e-9)
