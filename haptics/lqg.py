@@ -196,8 +196,8 @@ class TorqueLoop:
             guess = shaft.predicted(x, applied)
             x = shaft.corrected(guess, float(motion[0]), float(-K * motion[0] - B * motion[1]))
             queue = [*commands[1:], command]
-            deltas = memory[laws.DELTAS : laws.DELTAS + control.ahead]
-            return np.concatenate([motion, x, queue, deltas]), float(commands[0])
+            later = memory[laws.DELTAS : laws.DELTAS + control.ahead]
+            return np.concatenate([motion, x, queue, later]), float(commands[0])
 
         columns = [step(unit, 0.0) for unit in np.eye(n)]
         A = np.stack([later for later, _ in columns], axis=1)
