@@ -28,6 +28,7 @@ from daq.report.publication import publish
 _FIRST = 0.25  # of the time, for a first round, from what little is known
 _LATER = 0.5  # of what is left, for each that follows
 _LEAST = 2  # runs of a last round: fewer join the round before
+_SEEDS = 2**32  # that a simulated rig takes
 _GAIN = 0.98  # of the widths, to which a round must be expected to bring them
 
 
@@ -122,7 +123,7 @@ def _continued(root: Path, request: Request, watch: Watch) -> Characterisation:
         if not _design(current, request, done, watch):
             reason = "no run within the limits would tell more"
             break
-        _run(current, request, watch)
+        _run(current, request, done, watch)
         _identify([*done, current], request, watch)
         done.append(current)
         write_page(root, done, "still running")
@@ -188,11 +189,18 @@ def _design(current: Round, request: Request, done: Sequence[Round], watch: Watc
     return any(q["after"] < _GAIN * q["before"] for q in current.design["quantities"])
 
 
-def _run(current: Round, request: Request, watch: Watch) -> None:
-    """Run what of a round's experiments has not been run to its end."""
-    for experiment in current.experiments:
+def _run(current: Round, request: Request, done: Sequence[Round], watch: Watch) -> None:
+    """Run what of a round's experiments has not been run to its end.
+
+    A simulated rig makes the same noise from the same seed: each run has a seed of its own.
+    """
+    config, _ = load_rig(request.rig, watch=watch)
+    seed: int | None = getattr(config.options, "seed", None)
+    first = sum(len(each.experiments) for each in done)
+    for place, experiment in enumerate(current.experiments, first):
         if not current.captures(experiment):
-            record(experiment, request.rig, current.runs, watch=watch)
+            options = None if seed is None else {"seed": (seed + place) % _SEEDS}
+            record(experiment, request.rig, current.runs, options=options, watch=watch)
 
 
 def _identify(rounds: Sequence[Round], request: Request, watch: Watch) -> None:

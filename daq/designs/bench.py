@@ -1,6 +1,7 @@
 """A rig that is only computed: what its runs would log, and whether they would pass a limit."""
 
 from collections.abc import Mapping, Sequence
+from threading import Lock
 
 import numpy as np
 
@@ -15,6 +16,9 @@ from sysid import BatchSimulator, Dataset, ProcessModel
 
 COMMANDS = tuple(f"applied_voltage_{name}" for name in CHANNELS)
 MEASURED = ("current_motor", "current_brake", "torque", "theta", "omega")
+_STEP, _HOLD, _STEPS = 0.2, 0.05, 4  # of the commands: in parts of their ranges, s, number
+_WELL = 0.8  # of the draws, whose integration is to be as exact as that
+_FOLLOWED, _MINORITY = 5, 0.5  # draws that are compared, and their share that may go astray
 _ASTRAY = 0.5  # of the noise, by which a model may err where it is right
 _ACCURACY = 1e-2  # of the plant, beside which margins are wide
 
@@ -53,8 +57,8 @@ class PlantBench:
             )
         self._model, self._rig, self._turns = model, rig, turns
         self._scale = 1.0 / (1.0 - margin)
-        self._simulator = BatchSimulator(plant, accuracy=_ACCURACY)
-        self._model_simulator = BatchSimulator(model, accuracy=_ACCURACY)
+        self._simulator = BatchSimulator(plant, accuracy=_ACCURACY, threads=1)
+        self._model_simulator = BatchSimulator(model, accuracy=_ACCURACY, threads=1)
         self._noise = {n: s for n, s in (noise or {}).items() if n in model.output_names}
         starts = dict(zip(plant.state_names, plant.initial_state.tolist(), strict=True))
         named = zip(model.state_names, model.initial_state.tolist(), strict=True)
@@ -62,25 +66,24 @@ class PlantBench:
         shared = [name for name in model.parameter_names if name in plant.parameter_names]
         self._from = [model.parameter_names.index(name) for name in shared]
         self._to = [plant.parameter_names.index(name) for name in shared]
+        self._choosing = Lock()
         self._n_steps: int | None = None
 
     def records(
         self, inputs: FloatArray, dt: float, vectors: FloatArray
     ) -> Sequence[Dataset] | None:
-        """As of ``sysid.experiments.bench.Bench``; inputs: commands (n_samples, 2) [V]."""
+        """As of ``sysid.experiments.bench.Bench``; inputs: commands (n_samples, 2) [V].
+
+        Refused is what passes a limit with any vector, and what leads the model astray with the
+        likeliest or with more than half of those that are compared.
+        """
         if not self._commands_allowed(inputs, dt):
             return None
-        # Most of what passes a limit does so with the likeliest parameters.
-        first = self.signals(inputs, dt, vectors[:1])
-        if not self._within_limits(inputs, dt, first):
+        signals = self.signals(inputs, dt, vectors)
+        if not self._within_limits(inputs, dt, signals):
             return None
-        likeliest = self._record(inputs, dt, first, 0)
-        if not self._follows(likeliest, vectors[:1], first):
+        if self._leads_astray(inputs, dt, vectors[:_FOLLOWED]):
             return None
-        others = self.signals(inputs, dt, vectors[1:])
-        if not self._within_limits(inputs, dt, others):
-            return None
-        signals = {name: np.concatenate([first[name], others[name]]) for name in first}
         return [self._record(inputs, dt, signals, k) for k in range(len(vectors))]
 
     def signals(self, inputs: FloatArray, dt: float, vectors: FloatArray) -> dict[str, FloatArray]:
@@ -91,13 +94,33 @@ class PlantBench:
         plant = self._simulator.model
         values = np.tile(plant.nominal, (len(vectors), 1))
         values[:, self._to] = vectors[:, self._from]
+        record = self._driven(inputs, dt)
+        outputs = self._simulator.trajectories(values, record, self._steps(dt, values))
+        return {name: outputs[:, :, j] for j, name in enumerate(plant.output_names)}
+
+    def _driven(self, inputs: FloatArray, dt: float) -> Dataset:
+        """A run of the plant, of which nothing was measured."""
+        plant = self._simulator.model
         driven = np.zeros((len(inputs), len(plant.inputs)))
         driven[:, [plant.input_names.index(name) for name in COMMANDS]] = inputs
-        record = Dataset(driven, np.full((len(inputs), len(plant.outputs)), np.nan), dt)
-        if self._n_steps is None:
-            self._n_steps = int(self._simulator.steps_of_each(values, record).max())
-        outputs = self._simulator.trajectories(values, record, self._n_steps)
-        return {name: outputs[:, :, j] for j, name in enumerate(plant.output_names)}
+        return Dataset(driven, np.full((len(inputs), len(plant.outputs)), np.nan), dt)
+
+    def _steps(self, dt: float, values: FloatArray) -> int:
+        """Integration steps per sample of all runs.
+
+        As many as most of the first parameters (n, n_parameters) need for steps of the commands;
+        with those that need more, runs are coarse, or blow up and count as beyond limits.
+        """
+        with self._choosing:
+            if self._n_steps is None:
+                ranges = self._rig.limits.command
+                ends = np.array([ranges.motor, ranges.brake]).T
+                inputs = np.repeat(
+                    np.tile(_STEP * ends, (_STEPS, 1)), round(_HOLD / dt) + 1, axis=0
+                )
+                steps = self._simulator.steps_of_each(values, self._driven(inputs, dt))
+                self._n_steps = int(np.quantile(steps, _WELL, method="higher"))
+            return self._n_steps
 
     def _commands_allowed(self, inputs: FloatArray, dt: float) -> bool:
         plan = Plan(len(inputs), inputs.min(axis=0), inputs.max(axis=0), inputs)
@@ -107,15 +130,31 @@ class PlantBench:
             return False
         return True
 
+    def _leads_astray(self, inputs: FloatArray, dt: float, vectors: FloatArray) -> bool:
+        """Whether the plant does what the model does not, beyond half the noise.
+
+        With the likeliest vector, or more than half of them; at commands that are larger by the
+        margin, for an amplifier ends at once.
+        """
+        larger = self._scale * inputs
+        signals = self.signals(larger, dt, vectors)
+        astray = 0
+        for k in range(len(vectors)):
+            record = self._record(larger, dt, signals, k)
+            astray += not self._follows(record, vectors[k], {n: s[k] for n, s in signals.items()})
+            if astray and (k == 0 or astray > _MINORITY * len(vectors)):
+                return True
+        return False
+
     def _follows(
-        self, record: Dataset, vectors: FloatArray, signals: Mapping[str, FloatArray]
+        self, record: Dataset, vector: FloatArray, signals: Mapping[str, FloatArray]
     ) -> bool:
         """Whether the model does what the plant does, to within the noise of its outputs."""
         simulator = self._model_simulator
         # By as many steps, so that errors of the integration are alike.
-        outputs = simulator.trajectories(vectors, record, self._n_steps, self._starts)[0]
+        outputs = simulator.trajectories(vector[None], record, self._n_steps, self._starts)[0]
         errors = {
-            name: outputs[:, j] - signals[name][0]
+            name: outputs[:, j] - signals[name]
             for j, name in enumerate(simulator.model.output_names)
             if name in self._noise and name in signals
         }

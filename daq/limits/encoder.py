@@ -6,8 +6,10 @@ Each bound is so wide that no healthy rig of the file's ratings reaches it.
 import math
 from typing import NamedTuple
 
+import numpy as np
+
 from daq.config.rig import Stall
-from daq.hal import Phase, Samples
+from daq.hal import FloatArray, Phase, Samples
 from daq.limits.base import TURN, Limit, Trip
 
 _IDLE, _SEEN = 0.02, 0.25  # of silent: motions that do not count; of the other's path, at least
@@ -16,6 +18,7 @@ _AT_REST = 1.5  # counts by which a shaft at rest may flicker
 _AGAINST = 0.1  # of the largest speed, gained against the motor's current
 _GRAIN = 2.0  # counts in a sample by which an estimate of the speed may be off
 _LASTING = 0.02  # s in which the currents' torque fades behind them
+_BLOCK = 16  # samples, from which arrays are faster than single values
 _BEYOND = 3  # samples in a row that contradict the currents
 
 
@@ -135,6 +138,16 @@ class Drive:
             self._samples, self._pushes = samples, [self._push(*row) for row in rows]
         return self._pushes
 
+    def ratios(self, samples: Samples) -> FloatArray:
+        """Currents at work in parts of those that turn the shaft, (n,), of a block of samples."""
+        commanded = self._motor_gain * samples.applied_voltage_motor
+        motor = samples.current_motor
+        at_work = np.where(np.abs(commanded) > np.abs(motor), commanded, motor)
+        of_command = self._brake_gain * np.abs(samples.applied_voltage_brake)
+        against = np.maximum(np.abs(samples.current_brake), of_command)
+        ratios: FloatArray = at_work / (self._motor * (1.0 + against / self._brake))
+        return ratios
+
     def _push(self, motor: float, brake: float, volts_motor: float, volts_brake: float) -> Push:
         commanded = self._motor_gain * volts_motor
         at_work = commanded if abs(commanded) > abs(motor) else motor
@@ -156,13 +169,36 @@ class Stalled(Limit):
 
     def check(self, samples: Samples) -> Trip | None:
         """Sum up the drive at a shaft that stands still: seconds times what it is of the least."""
-        rows = zip(samples.theta.tolist(), self._drive.of(samples), strict=True)
-        for row, (theta, push) in enumerate(rows):
+        if len(samples.theta) < _BLOCK:
+            pushes = self._drive.of(samples)
+            ratios = [push.at_work / push.needed for push in pushes]
+            return self._standing(samples.theta.tolist(), ratios, 0)
+        # A step of twice the flicker leaves any place of rest: what is before it is forgotten.
+        left = np.flatnonzero(~(np.abs(np.diff(samples.theta)) <= 2.0 * self._flicker)) + 1
+        ratios = self._drive.ratios(samples)
+        strong = np.where(np.abs(ratios) >= 1.0, np.abs(ratios) * self._dt, 0.0)
+        begins = np.concatenate([[0], left])
+        most = np.add.reduceat(strong, begins)
+        most[0] += abs(self._driven)
+        watched = ~(most <= self._time)
+        watched[-1] = True  # where it stands at the end counts in the next block
+        ends = np.append(left, len(strong))
+        for begin, end in zip(begins[watched].tolist(), ends[watched].tolist(), strict=True):
+            part = samples.theta[begin:end].tolist(), ratios[begin:end].tolist()
+            if begin:
+                self._rest = math.nan
+            trip = self._standing(*part, begin)
+            if trip is not None:
+                return trip
+        return None
+
+    def _standing(self, angles: list[float], ratios: list[float], first: int) -> Trip | None:
+        """Sum up over neighbouring samples, the first of them of that row."""
+        for row, (theta, ratio) in enumerate(zip(angles, ratios, strict=True), first):
             if not abs(theta - self._rest) <= self._flicker:
                 self._rest, self._driven = theta, 0.0
                 continue
             # With its sign: what shakes the shaft to and fro need not be seen.
-            ratio = push.at_work / push.needed
             self._driven += ratio * self._dt if abs(ratio) >= 1.0 else 0.0
             if abs(self._driven) > self._time:
                 return row, (

@@ -356,14 +356,16 @@ class BatchSimulator:
     def _on(self, record: Dataset, scale: FloatArray | None = None) -> RecordSimulator:
         """What simulates a record; without a scale residuals are the outputs themselves."""
         key = id(record), b"" if scale is None else scale.tobytes()
-        if key not in self._records:
+        simulator = self._records.get(key)
+        if simulator is None:
             if len(self._records) >= _MOST_RECORDS:
                 self._records.clear()
-            # It holds the record, whose address stays its own as long.
-            self._records[key] = RecordSimulator(
+            simulator = RecordSimulator(
                 self._kernels, record, scale, self.accuracy, self.max_steps, self._workers
             )
-        return self._records[key]
+            # It holds the record, whose address stays its own as long.
+            self._records[key] = simulator
+        return simulator
 
     def _check(self, parameters: FloatArray, records: Sequence[Dataset]) -> FloatArray:
         if not records:

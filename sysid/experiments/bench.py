@@ -21,6 +21,7 @@ class Bench(Protocol):
 
         inputs: (n_samples, n), as an excitation gives them; dt: sample time [s]. None where a run
         with any of the vectors would pass a limit. Of a record inputs and first samples count.
+        Several threads ask at once.
         """
 
 

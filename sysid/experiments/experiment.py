@@ -14,11 +14,13 @@ from sysid.experiments.information import Informant, refuse_phantoms
 from sysid.experiments.prior import Prior
 from sysid.experiments.quantities import chosen, determined, relative_gradients
 from sysid.experiments.search import RunCandidate, Search
-from sysid.identifiability import Combination, TiedGroup, identifiability
+from sysid.identifiability import Combination, TiedGroup
+from sysid.identifiability.cache import kept_identifiability
 from sysid.problem.data import Dataset
 from sysid.problem.model import ModelError, ProcessModel
 from sysid.problem.ranges import Range
 from sysid.problem.space import SearchSpace
+from sysid.threads import Workers, available_cores, one_thread
 from sysid.uncertainty.estimate import Z95
 from sysid.uncertainty.ties import named_values
 
@@ -92,6 +94,7 @@ class Design:
         return all(quantity.met for quantity in self.quantities)
 
 
+@one_thread()
 def design(
     model: ProcessModel,
     excitations: Sequence[Excitation],
@@ -157,10 +160,11 @@ def design(
     (2.0, True)
     """
     space = SearchSpace.of(model, ranges, fixed, tied=tied)
-    simulator = BatchSimulator(model, accuracy=accuracy)
+    # Candidates are evaluated side by side, each by one thread.
+    simulator = BatchSimulator(model, accuracy=accuracy, threads=1)
     informant = Informant(simulator, space, *_deviations(model, noise))
     measured = [name for name in model.output_names if name in noise]
-    structure = identifiability(space.as_model().with_outputs(measured), sensors=False)
+    structure = kept_identifiability(space.as_model().with_outputs(measured))
     wanted = chosen(tuple(targets or quantities), structure, space)
     if precision is not None:
         targets = {quantity.text: precision for quantity in wanted}
@@ -180,7 +184,8 @@ def design(
     goals = np.array(list((targets or {}).values())) / Z95
     gradients = relative_gradients(wanted, space, robust)
     of_information = criteria.Criterion(criterion, information, gradients, goals)
-    search = Search(excitations, evaluate, of_information, rng, runs, watch)
+    workers = Workers(available_cores())
+    search = Search(excitations, evaluate, of_information, rng, runs, workers, watch)
     search.run(candidates, generations, offspring)
     total = search.total()
     for expected, chromosome in zip(total, robust, strict=True):

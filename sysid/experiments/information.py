@@ -105,11 +105,12 @@ class Informant:
         n_draws = changes.shape[-1]
         variances = of_outputs + np.sum(changes**2, axis=-1) / max(n_draws, 1)
         weighted = slopes / variances[..., None]
-        curvature: FloatArray = np.einsum("tip,tir->pr", weighted, slopes, optimize=True)
+        quiet = (weighted * np.sqrt(of_outputs)[:, None]).reshape(-1, n)
+        weighted, slopes = weighted.reshape(-1, n), slopes.reshape(-1, n)
+        curvature: FloatArray = weighted.T @ slopes
         if not n_draws or not np.isfinite(curvature).all():
             return curvature
-        pushes = np.einsum("tip,tik->pk", weighted, changes, optimize=True)
-        score = np.einsum("tip,i,tir->pr", weighted, of_outputs, weighted, optimize=True)
+        pushes, score = weighted.T @ changes.reshape(-1, n_draws), quiet.T @ quiet
         effective: FloatArray = curvature @ pinvh(score + pushes @ pushes.T / n_draws) @ curvature
         return effective
 

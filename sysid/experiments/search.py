@@ -9,6 +9,7 @@ their offspring become candidates.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from threading import Lock
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from sysid.arrays import FloatArray
 from sysid.experiments.criteria import Criterion
 from sysid.experiments.excitation import Excitation
 from sysid.problem.model import ModelError
+from sysid.threads import Workers
 
 _WIDEST, _FINEST = 0.3, 0.02  # deviation of a moved setting, in parts of its range
 _HALVINGS = 3  # of the way from a run that passes a limit to one that does not
@@ -35,6 +37,15 @@ class RunCandidate:
     information: FloatArray
 
 
+@dataclass(frozen=True)
+class _Trial:
+    """A run to try: its excitation and genes, and from where to where ``back`` leads."""
+
+    excitation: Excitation
+    genes: FloatArray
+    back: Callable[[FloatArray], FloatArray]
+
+
 # Makes a candidate of an excitation and its genes; None where a run would pass a limit.
 Evaluate = Callable[[Excitation, FloatArray], RunCandidate | None]
 
@@ -44,7 +55,8 @@ class Search:
     """Candidates so far, and the best set of them.
 
     attempts: runs that were simulated; chosen: the set, as places in ``pool``, the same one perhaps
-    several times. watch: is told the attempts and those within the limits after each.
+    several times. workers: who evaluate. watch: is told the attempts and those within the limits
+    after each.
     """
 
     excitations: Sequence[Excitation]
@@ -52,12 +64,13 @@ class Search:
     criterion: Criterion
     rng: np.random.Generator
     most: int
+    workers: Workers
     watch: Callable[[int, int], None] | None = None
 
     def __post_init__(self) -> None:
         self.pool: list[RunCandidate] = []
         self.chosen: list[int] = []
-        self.attempts = 0
+        self.attempts = self.kept = 0
 
     def run(self, candidates: int, generations: int, offspring: int) -> None:
         """Candidates anywhere, then generations of offspring of the best set.
@@ -84,13 +97,17 @@ class Search:
 
         One that passes a limit is drawn to where its settings excite less.
         """
+        trials = []
         for k in range(n):
             excitation = self.excitations[k % len(self.excitations)]
-            self._settle(excitation, self.rng.random(len(excitation.settings)), excitation.calmer)
+            genes = self.rng.random(len(excitation.settings))
+            trials.append(_Trial(excitation, genes, excitation.calmer))
+        self._settle(trials)
 
     def generation(self, n: int, progress: float) -> None:
         """Offspring of the chosen; progress: 0 at the first generation, 1 at the last."""
         width = _WIDEST * (_FINEST / _WIDEST) ** progress
+        trials = []
         for _ in range(n):
             mother, father = (self.pool[i] for i in self.rng.choice(self.chosen, 2))
             genes = mother.genes.copy()
@@ -100,7 +117,8 @@ class Search:
             moves = width * self.rng.standard_normal(len(genes))
             moves[self.rng.random(len(genes)) < 0.5] = 0.0
             back = partial(_midway, mother.genes)
-            self._settle(mother.excitation, np.clip(genes + moves, 0.0, 1.0), back)
+            trials.append(_Trial(mother.excitation, np.clip(genes + moves, 0.0, 1.0), back))
+        self._settle(trials)
 
     def choose(self) -> None:
         """The best set that greed and exchanges lead to."""
@@ -134,27 +152,26 @@ class Search:
             self.chosen[place] = best
         return better
 
-    def _settle(
-        self,
-        excitation: Excitation,
-        genes: FloatArray,
-        back: Callable[[FloatArray], FloatArray],
-    ) -> None:
-        """Add a candidate, drawn back where it passes a limit until it does not."""
-        for _ in range(_HALVINGS + 1):
-            if self._add(excitation, genes):
-                break
-            genes = back(genes)
+    def _settle(self, trials: Sequence[_Trial]) -> None:
+        """Add the candidates that trials lead to, in their order whatever the threads."""
+        candidates: list[RunCandidate | None] = [None] * len(trials)
+        told = Lock()
 
-    def _add(self, excitation: Excitation, genes: FloatArray) -> bool:
-        """Add a candidate if it keeps the limits; whether it does."""
-        self.attempts += 1
-        candidate = self.evaluate(excitation, genes)
-        if candidate is not None:
-            self.pool.append(candidate)
-        if self.watch is not None:
-            self.watch(self.attempts, len(self.pool))
-        return candidate is not None
+        def settle(place: int) -> None:
+            trial, genes = trials[place], trials[place].genes
+            for _ in range(_HALVINGS + 1):
+                candidates[place] = candidate = self.evaluate(trial.excitation, genes)
+                with told:
+                    self.attempts += 1
+                    self.kept += candidate is not None
+                    if self.watch is not None:
+                        self.watch(self.attempts, self.kept)
+                if candidate is not None:
+                    return
+                genes = trial.back(genes)
+
+        self.workers.each(settle, range(len(trials)))
+        self.pool += [candidate for candidate in candidates if candidate is not None]
 
 
 def _midway(origin: FloatArray, genes: FloatArray) -> FloatArray:
