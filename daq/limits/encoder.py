@@ -171,8 +171,8 @@ class Stalled(Limit):
         """Sum up the drive at a shaft that stands still: seconds times what it is of the least."""
         if len(samples.theta) < _BLOCK:
             pushes = self._drive.of(samples)
-            ratios = [push.at_work / push.needed for push in pushes]
-            return self._standing(samples.theta.tolist(), ratios, 0)
+            each = [push.at_work / push.needed for push in pushes]
+            return self._standing(samples.theta.tolist(), each, 0)
         # A step of twice the flicker leaves any place of rest: what is before it is forgotten.
         left = np.flatnonzero(~(np.abs(np.diff(samples.theta)) <= 2.0 * self._flicker)) + 1
         ratios = self._drive.ratios(samples)

@@ -433,11 +433,11 @@ def test_a_limit_of_ones_own_that_cannot_be_made_is_told_before_the_run(tmp_path
 def test_a_shaft_that_now_and_then_stands_still_stalls_at_the_same_sample_in_any_blocks(seed):
     rng = np.random.default_rng(seed)
     count = TURN / 8192
-    moves = np.repeat(rng.choice([0.0, 0.6, 4.0], 50), 8) * count
-    current = np.repeat(rng.choice([0.0, 0.9, 1.6], 50), 8)
-    whole = samples(theta=np.cumsum(moves), current_motor=current + RAMP, current_brake=RAMP)
+    stands = np.repeat(rng.choice([0.0, 10.0, 20.0], 50), 8) * count
+    current = np.repeat(rng.choice([0.0, 0.9, 1.2], 50), 8)
+    whole = samples(theta=stands, current_motor=current + RAMP, current_brake=RAMP)
     stall = {"encoder": {"stall": {"motor": 0.5, "time": 0.03}}}
     one_by_one = first_trip(limits_of(**stall), whole, range(1, 400))
     assert one_by_one is not None
-    for size in (400, 150, 37):
+    for size in (400, 37, 29, 23, 19):
         assert first_trip(limits_of(**stall), whole, range(size, 400, size)) == one_by_one
