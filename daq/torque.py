@@ -34,12 +34,28 @@ class TorqueLaw(Protocol):
 
 
 @dataclass(frozen=True)
+class ModelStep:
+    """The actuator's model over a sample, for ``advance`` of a law's text.
+
+    initial: its states. steps: of equal length in ``time`` [s]. places: of omega and theta among
+    the states, of the hand's torque among the inputs. matrices: 5 n^2 numbers.
+    """
+
+    initial: tuple[float, ...]
+    n_inputs: int
+    steps: int
+    time: float
+    places: tuple[int, int, int]
+    matrices: tuple[float, ...]
+
+
+@dataclass(frozen=True)
 class LawProgram:
     """A law as a program of fixed memory, which Python, Numba and C99 run alike.
 
     text: plain scalar Python, constants and functions; of it ``entry`` answers a sample and
     ``slopes(x, u, p, dx)`` is the model. n_states: numbers of its memory, zero at first.
-    constants, parameters: its numbers, and the model's.
+    constants, parameters: its numbers, and the model's. step: the model's.
 
     ``entry(theta, omega, sensed, i_m, reference, lost, s, c, p, volts)``: angle [rad], speed
     [rad/s], torque sensor [N*m] and motor current [A] of a sample, the torque that the hand is to
@@ -52,6 +68,7 @@ class LawProgram:
     n_states: int
     constants: tuple[float, ...]
     parameters: tuple[float, ...]
+    step: ModelStep
 
 
 @dataclass(frozen=True)

@@ -2,19 +2,24 @@
 
 import functools
 import inspect
+import math
 import types
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+from scipy.linalg import expm
+
 from daq.experiment import Sample
-from daq.torque import LawProgram
-from haptics import laws
+from daq.torque import LawProgram, ModelStep
+from haptics import laws, model_step
 from haptics.dynamics import SHAFT
-from sysid import ProcessModel
+from sysid import ProcessModel, linearize
 from sysid.arrays import FloatArray
 from sysid.engine.compiler import compiled_text
 from sysid.engine.scalar_text import ScalarEquations
 
+LONGEST_STEP = 4e-4  # s, of the model
 LAWS = ("static", "feedforward", "lqg")
 
 
@@ -36,7 +41,8 @@ def law_text(model: ProcessModel) -> str:
         equations.row("z_rate", ("omega", "z"), places[1], {omega: "omega", z: "z"}),
         equations.slopes(),
     ]
-    return "\n\n".join([source_of(laws), *functions])
+    head = "from __future__ import annotations"
+    return "\n\n".join([head, source_of(laws), source_of(model_step), *functions])
 
 
 def source_of(module: types.ModuleType) -> str:
@@ -47,15 +53,12 @@ def source_of(module: types.ModuleType) -> str:
         for item in vars(module).values()
         if isinstance(item, types.FunctionType) and item.__module__ == module.__name__
     ]
-    head = "from __future__ import annotations"
-    return "\n\n".join([head, "\n".join(numbers), *functions])
+    return "\n\n".join(["\n".join(numbers), *functions])
 
 
 @functools.lru_cache(maxsize=8)
 def law_functions(model: ProcessModel) -> types.SimpleNamespace:
     """The same as functions of Python."""
-    import math
-
     scope: dict[str, Any] = {"math": math}
     exec(compile(law_text(model), "<laws>", "exec"), scope)
     return types.SimpleNamespace(**scope)
@@ -71,9 +74,55 @@ def law_program(
     law: str, model: ProcessModel, parameters: FloatArray, constants: list[float]
 ) -> LawProgram:
     """A law with its constants."""
+    step = model_step_of(model, parameters, constants[laws.TIME])
     return LawProgram(
-        law, law_text(model), laws.STATES, tuple(constants), tuple(parameters.tolist())
+        law, law_text(model), laws.STATES, tuple(constants), tuple(parameters.tolist()), step
     )
+
+
+def step_matrices(A: FloatArray, h: FloatArray) -> FloatArray:
+    """A, Q, F, G, H of ``haptics.model_step`` in steps h, flat: (n_draws, 5 n^2).
+
+    A: (n_draws, n, n). h: (n_draws,) [s].
+    """
+    n = A.shape[-1]
+
+    def phis(step: FloatArray) -> list[FloatArray]:
+        """phi_1, phi_2 and phi_3 of step A: blocks of one exponential."""
+        block = np.zeros((len(A), 4 * n, 4 * n))
+        block[:, :n, :n] = step[:, None, None] * A
+        for k in range(3):
+            block[:, k * n : (k + 1) * n, (k + 1) * n : (k + 2) * n] = np.eye(n)
+        row = expm(block)[:, :n]
+        return [row[:, :, k * n : (k + 1) * n] for k in (1, 2, 3)]
+
+    size = h[:, None, None]
+    half, _, _ = phis(0.5 * h)
+    first, second, third = phis(h)
+    Q, F = 0.5 * size * half, size * first
+    G, H = size * (2.0 * second - 4.0 * third), size * (4.0 * third - second)
+    matrices: FloatArray = np.stack([A, Q, F, G, H], axis=1).reshape(len(A), -1)
+    return matrices
+
+
+def stiff_part(model: ProcessModel, parameters: FloatArray) -> FloatArray:
+    """The rows of amplifiers and coils of dx/dt = A x + ..., (n, n), the others zero."""
+    x, u = np.zeros(len(model.states)), np.zeros(len(model.inputs))
+    A: FloatArray = np.array(linearize(model, x, u, parameters).A)
+    A[[model.state_names.index(name) for name in SHAFT]] = 0.0
+    A[:, [model.state_names.index(name) for name in SHAFT]] = 0.0
+    return A
+
+
+def model_step_of(model: ProcessModel, parameters: FloatArray, time: float) -> ModelStep:
+    """The model's step over samples ``time`` apart [s]."""
+    names = model.state_names
+    places = names.index("omega"), names.index("theta"), model.input_names.index("torque")
+    steps = max(1, math.ceil(time / LONGEST_STEP))
+    A = stiff_part(model, parameters)
+    matrices = step_matrices(A[None], np.array([time / steps]))[0]
+    initial = tuple(model.initial_state.tolist())
+    return ModelStep(initial, len(model.inputs), steps, time, places, tuple(matrices.tolist()))
 
 
 class ProgramLaw:

@@ -19,6 +19,7 @@ from daq.cli.check import check
 from daq.cli.design import design
 from daq.cli.doctor import doctor
 from daq.cli.emulate import emulate
+from daq.cli.export import export_c
 from daq.cli.figures import figures
 from daq.cli.identify import identify
 from daq.cli.init import init
@@ -57,6 +58,9 @@ _COMMANDS: tuple[tuple[Callable[..., None], str], ...] = (
     (scope, "rig scope"),
     (ports, "rig ports"),
     (doctor, "rig doctor /dev/ttyACM0"),
+)
+_EXPORTS: tuple[tuple[str, Callable[..., None], str], ...] = (
+    ("c", export_c, "rig export c controller.yaml --precision single --out firmware/src"),
 )
 _COMPUTING = {design, identify, campaign, replay, figures}  # that drive no rig
 _QUIET = Option("--quiet", "-q", help="Results and warnings only: no progress, no hints.")
@@ -143,6 +147,10 @@ app = Typer(
 )
 for _command, _example in _COMMANDS:
     app.command(epilog=f"Example:  {_example}")(_with_volume(_command))
+_export = Typer(help="Write what other programs read.", no_args_is_help=True)
+for _name, _command, _example in _EXPORTS:
+    _export.command(_name, epilog=f"Example:  {_example}")(_with_volume(_command))
+app.add_typer(_export, name="export")
 
 
 @app.callback(invoke_without_command=True)
