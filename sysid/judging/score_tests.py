@@ -44,7 +44,7 @@ from sysid.judging.suspects import (
 )
 from sysid.problem.model import ModelError
 from sysid.uncertainty import Estimate, Uncertainty
-from sysid.uncertainty.colour import Autoregression, colour, record_rows
+from sysid.uncertainty.colour import Autoregression, colour, longest_memory, record_rows
 from sysid.uncertainty.sensitivity import (
     Sensitivity,
     input_noises,
@@ -64,6 +64,7 @@ _MOST = 5  # findings
 _MOST_SAMPLES = 10_000  # that are tested: beyond, what matters has long been significant
 _LIKELY = 6  # suspects that are tested again by the colour of what they leave
 _LAGS = 20  # of what colour whitening may leave
+_FORGETS = 20  # samples of a record that count as independent, from where its mean is no colour
 _NEW = 1e-2  # share of a suspect that no change of the parameters makes, below which it is theirs
 _INEXACT = 1e-2  # of the residuals' deviation, from where a simulation's error shows in them
 _FREEDOM = 1.0  # standard deviation of a coordinate before the data: a factor of e
@@ -438,8 +439,9 @@ class _Whitening:
     def of(cls, local: Sensitivity, residual: FloatArray) -> "_Whitening":
         """By residuals (n_residuals, n_outputs); of outputs that do not count none are left."""
         counted = local.objective.weights > 0.0
-        residual = np.where(counted & local.seen, residual, 0.0)
-        model = colour(residual, local.seen, local.lengths)
+        measured = counted & local.seen
+        residual = np.where(measured, residual, 0.0)
+        model = colour_about_means(residual, local.seen, measured, local.lengths)
         values, vectors = np.linalg.eigh(model.noise)
         floor = 1e-12 * max(float(values[-1]), 1e-300)
         roots = np.where(values > floor, 1.0 / np.sqrt(np.maximum(values, floor)), 0.0)
@@ -466,6 +468,24 @@ class _Whitening:
         white = np.einsum("ij,tjm->tim", self.decorrelate, white[self.kept])
         whitened: FloatArray = white.reshape(-1, columns.shape[2])
         return whitened
+
+
+def colour_about_means(
+    residual: FloatArray, seen: BoolArray, measured: BoolArray, lengths: tuple[int, ...]
+) -> Autoregression:
+    """Colour of residuals (n, q) about each record's mean, of outputs that forget soon enough.
+
+    An offset is no colour: an autoregression would take it for a memory without end, and
+    whitening would erase it. Of noise that is nearly as slow as a record its mean is part.
+    """
+    means = np.zeros_like(residual)
+    for rows in record_rows(lengths):
+        count = np.maximum(measured[rows].sum(axis=0), 1)
+        means[rows] = np.where(measured[rows], residual[rows].sum(axis=0) / count, 0.0)
+    centred = residual - means
+    model = colour(centred, seen, lengths)
+    soon = _FORGETS * longest_memory(model, np.mean(centred**2, axis=0)) <= min(lengths)
+    return model if soon.all() else colour(residual - np.where(soon, means, 0.0), seen, lengths)
 
 
 def _gradient(local: Sensitivity, estimate: Estimate) -> FloatArray:

@@ -16,6 +16,7 @@ from sysid import BatchSimulator, Dataset, Input, Output, Parameter, ProcessMode
 from sysid.gassi import GASSI
 from sysid.judging.disturbed import DisturbedRun
 from sysid.judging.examination import verdict_of
+from sysid.judging.score_tests import colour_about_means
 from tests.soak import mostly_soak
 from tests.sysid.reference import simulate
 
@@ -39,6 +40,24 @@ def test_what_is_wrong_is_named_with_its_size(name, words):
     outcome = tried(CASES[name], 0)
     said = " ".join((*outcome.verdict.parameters.reasons, *outcome.verdict.notes))
     assert words in said
+
+
+def test_an_offset_is_no_colour_of_the_residuals():
+    """Its mean is eight times what the noise scatters: whitened as noise it would be gone."""
+    outcome = tried(CASES["current 0.3 A off"], 4)
+    assert outcome.moved
+    assert outcome.verdict.parameters.reasons[0].startswith("current is 0.3 A off")
+
+
+def test_the_mean_of_noise_that_is_as_slow_as_the_record_is_its_colour():
+    noise = np.cumsum(np.random.default_rng(0).standard_normal((750, 1)), axis=0)
+    measured = np.ones_like(noise, dtype=bool)
+    slow, offset = (
+        colour_about_means(e, measured, measured, (750,))
+        for e in (noise + 100.0, np.diff(noise, axis=0, prepend=0.0) + 100.0)
+    )
+    assert abs(1.0 - slow.coefficients.sum()) < 0.01
+    assert abs(1.0 - offset.coefficients.sum()) > 0.5
 
 
 @pytest.mark.parametrize("seed", mostly_soak([0, 1]))
