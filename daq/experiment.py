@@ -16,7 +16,7 @@ from pydantic import Field, PrivateAttr
 from daq.config.base import Section
 from daq.config.metadata import Metadata
 from daq.config.units import Amperes, Hertz, Seconds, Turns
-from daq.findings import Chart, Findings, Heatmap
+from daq.findings import Chart, Findings, Heatmap, Number
 from daq.hal import CHANNELS, FloatArray, Mode, Samples
 
 MOST_SAMPLES = 20_000_000
@@ -295,6 +295,36 @@ class Controller(Protocol):
         """
 
 
+@dataclass(frozen=True)
+class TripLimits:
+    """What stops a run on a rig, and clamps its commands; infinite where nothing does.
+
+    Currents [A], speed [rad/s], torque [N*m] either way; commands from the lowest to the highest
+    [V]. count: angle of one of the encoder [rad].
+    """
+
+    current_motor: float
+    current_brake: float
+    speed: float
+    torque: float
+    motor: tuple[float, float]
+    brake: tuple[float, float]
+    count: float
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What trials of an experiment with plausible actuators say before it runs.
+
+    numbers: what they came to. remarks: what else, a line each. refusal: why the experiment must
+    not run; empty where nothing speaks against it.
+    """
+
+    numbers: tuple[Number, ...]
+    remarks: tuple[str, ...] = ()
+    refusal: str = ""
+
+
 class ClosedLoop(Experiment):
     """A protocol whose controller answers every sample with a command."""
 
@@ -308,6 +338,13 @@ class ClosedLoop(Experiment):
 
     def preview(self) -> Chart | Heatmap | None:
         """What ``rig check --plot`` draws where the plan has no references; None for nothing."""
+        return None
+
+    def evidence(self, limits: TripLimits, draws: int) -> Evidence | None:
+        """What ``draws`` simulated trials say of the run; None where none can be made.
+
+        Raises ConfigError, and ValueError as ``plan`` does.
+        """
         return None
 
     @abc.abstractmethod

@@ -19,7 +19,7 @@ from daq.lookup.controllers import load_settings
 from daq.lookup.models import find_model, name_parts
 from daq.progress import Watch, ignore
 from daq.provenance import software_versions
-from daq.torque import Fact, OperatingPoint, TorqueControl
+from daq.torque import Fact, OperatingPoint, TorqueControl, plausible_parameters
 from sysid import ModelError, ProcessModel
 
 _HEAD = """\
@@ -35,7 +35,7 @@ class Tuning:
     parameters: values by name. source: where they come from. facts: quantities of the actuator,
     with the spread that the identification's uncertainty gives them. draws: plausible parameters,
     (n, n_parameters). uncertain: parameters that the identification gives no interval, which are
-    taken as they are.
+    taken as they are. covariance: of the parameters, as the result's file has it; or empty.
 
     >>> from daq import tune
     >>> tuning = tune("torque.yaml", model="actuator:parameters=rig")
@@ -52,6 +52,7 @@ class Tuning:
     facts: tuple[Fact, ...]
     draws: FloatArray
     uncertain: tuple[str, ...]
+    covariance: Mapping[str, Any]
 
     @property
     def changes(self) -> dict[str, tuple[Any, Any]]:
@@ -86,6 +87,7 @@ class Tuning:
                 for point in self.operating_points()
             ],
             **({"without_interval": list(self.uncertain)} if self.uncertain else {}),
+            **({"covariance": dict(self.covariance)} if self.covariance else {}),
             "software": software_versions(),
         }
 
@@ -130,15 +132,20 @@ def tune(
     if parameters is None:
         assert model is not None
         chosen, name, source = find_model(model), model, model
-        vector, plausible = chosen.nominal, np.empty((0, len(chosen.parameters)))
+        vector = chosen.nominal
         uncertain: tuple[str, ...] = ()
+        covariance: dict[str, Any] = {}
+        plausible = np.empty((0, len(vector)))
     else:
         path = Path(parameters)
         file = stages.load([path])[0]
         name, source = file.content.get("model", ""), str(file.path)
         chosen, values = read_parameters(file.path, trust=False)
         vector = chosen.vector(values)
-        plausible, uncertain = _draws(file, chosen, vector, draws, seed)
+        covariance, uncertain = _spread(file, chosen)
+        columns, factor = covariance["parameters"], np.array(covariance["factor"])
+        rows = factor.reshape(-1, len(columns))
+        plausible = plausible_parameters(chosen, vector, columns, rows, draws, seed)
     if name_parts(name)[1] is not None:
         raise ConfigError(
             f"model {name} lies in a file, which each experiment would run with the controller",
@@ -150,35 +157,23 @@ def tune(
     except ModelError as error:
         raise ConfigError(str(error), file=source) from None
     named = dict(zip(chosen.parameter_names, vector.tolist(), strict=True))
-    return Tuning(control, tuned, name, chosen, named, source, facts, plausible, uncertain)
+    return Tuning(
+        control, tuned, name, chosen, named, source, facts, plausible, uncertain, covariance
+    )
 
 
-def _draws(
-    file: yaml_file.YamlFile, model: ProcessModel, vector: FloatArray, n: int, seed: int
-) -> tuple[FloatArray, tuple[str, ...]]:
-    """Plausible parameters, (at most n, n_parameters), and those that have no spread.
-
-    From the covariance with all its ties: what acts only together moves together. Positive
-    parameters move by factors. Draws that break the model's constraints are left out.
-    """
-    names = list(model.parameter_names)
+def _spread(
+    file: yaml_file.YamlFile, model: ProcessModel
+) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """The covariance by parameters' names and rows, and the parameters that have no spread."""
+    names = model.parameter_names
     columns = [name for name in file.content["covariance"].get("parameters") or () if name in names]
     factor = stages.factor(file, columns, model)
     rows = np.array(factor).reshape(len(factor), len(columns))
     searched = [p.name for p in model.parameters if not _is_fixed(file, p.name)]
     spread = {name for name, column in zip(columns, rows.T, strict=True) if np.any(column)}
-    rng = np.random.default_rng(seed)
-    steps = np.zeros((n, len(vector)))
-    steps[:, [names.index(name) for name in columns]] = rng.standard_normal((n, len(rows))) @ rows
-    positive = np.array([p.scale == "log" for p in model.parameters])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        factors = np.exp(np.where(positive, steps / vector, 0.0))
-    moved = np.where(positive, vector * factors, vector + steps)
-    kept = [
-        draw for draw in moved if all(c.function(tuple(draw)) <= 0.0 for c in model.constraints)
-    ]
     uncertain = tuple(name for name in searched if name not in spread)
-    return np.array(kept).reshape(-1, len(vector)), uncertain
+    return {"parameters": columns, "factor": rows.tolist()}, uncertain
 
 
 def _is_fixed(file: yaml_file.YamlFile, name: str) -> bool:

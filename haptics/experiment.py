@@ -5,9 +5,10 @@ from functools import cached_property
 import numpy as np
 from pydantic import Field
 
-from daq.experiment import ClosedLoop, SettingError
+from daq.experiment import ClosedLoop, Evidence, SettingError, TripLimits
 from daq.hal import FloatArray
 from daq.lookup.controllers import TunedController, load_controller
+from haptics.evidence import Scene, family_margins, run_trials, weigh
 
 
 class TorqueExperiment(ClosedLoop):
@@ -19,6 +20,11 @@ class TorqueExperiment(ClosedLoop):
     def tuned_controller(self) -> TunedController:
         """The controller. Raises ConfigError for a file that holds none."""
         return load_controller(self.torque_controller, self._folder)
+
+    @property
+    def is_controlled(self) -> bool:
+        """Whether it names a controller; some can do without."""
+        return bool(self.torque_controller)
 
     def controller_remarks(self) -> tuple[str, ...]:
         """Which controller it is, and whether the torque sensor may judge it."""
@@ -48,3 +54,18 @@ class TorqueExperiment(ClosedLoop):
                 )
         motor, brake = self.tuned_controller.most_volts
         return np.array([-motor, 0.0]), np.array([motor, brake])
+
+    def scenes(self) -> list[Scene]:
+        """What its trials ask of the controller; none by default, and then no trials."""
+        return []
+
+    def evidence(self, limits: TripLimits, draws: int) -> Evidence | None:
+        """Trials of its scenes, each with a plausible actuator and hand, and margins."""
+        scenes = self.scenes() if self.is_controlled else []
+        if not scenes:
+            return None
+        tuned = self.tuned_controller
+        program = tuned.control.program(tuned.model, tuned.parameters)
+        outcomes = run_trials(tuned, program, scenes, limits, draws)
+        walls = any(scene.wall is not None for scene in scenes)
+        return weigh(outcomes, family_margins(tuned), bool(tuned.spread[0]), walls=walls)

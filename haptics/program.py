@@ -12,7 +12,7 @@ from scipy.linalg import expm
 
 from daq.experiment import Sample
 from daq.torque import LawProgram, ModelStep
-from haptics import laws, model_step
+from haptics import laws, model_step, trial
 from haptics.dynamics import SHAFT
 from sysid import ProcessModel, linearize
 from sysid.arrays import FloatArray
@@ -68,6 +68,15 @@ def law_functions(model: ProcessModel) -> types.SimpleNamespace:
 def compiled_laws(model: ProcessModel) -> dict[str, Callable[..., None]]:
     """The same as machine code, by name."""
     return dict(zip(LAWS, compiled_text("laws", law_text(model), LAWS), strict=True))
+
+
+@functools.lru_cache(maxsize=4)
+def compiled_trial(model: ProcessModel, law: str) -> Callable[..., None]:
+    """``haptics.trial`` with a law, as machine code."""
+    text = source_of(trial).replace("answer(", f"{law}(")
+    function: Callable[..., None]
+    (function,) = compiled_text(f"trial_{law}", f"{law_text(model)}\n\n{text}", ["trial"])
+    return function
 
 
 def law_program(

@@ -13,11 +13,15 @@ from daq.experiment import Answer, Controller, Plan, Sample, SettingError
 from daq.findings import Chart, Findings, Number, Series
 from daq.hal import FloatArray, Samples
 from daq.torque import TorqueLaw
+from haptics.evidence import Scene, fading, hand_path
 from haptics.experiment import TorqueExperiment
 from protocols.analysis.results import TIME, TORQUE
 from protocols.multisine import crest_factor
 
 _DRAWS = 64  # sets of phases, of which the one with the lowest crest factor is taken
+_STRETCH = 2.0  # s of a trial beforehand
+_SCENES = 50
+_FASTEST_HAND = 10.0  # rad/s
 _SHOWN = 2.0  # s of the figure
 
 
@@ -76,6 +80,21 @@ class TorqueTracking(TorqueExperiment):
         shape = 0.5 - 0.5 * np.cos(np.pi * rise)
         reference: FloatArray = shape * wave * (self.torque / np.max(np.abs(wave)))
         return reference
+
+    def scenes(self) -> list[Scene]:
+        """Stretches of the reference, while hands move at up to 10 rad/s."""
+        whole, time = self.reference(self.samples_in(self.duration)), 1.0 / self.sample_rate
+        n = min(len(whole), round(_STRETCH * self.sample_rate))
+        rng = np.random.default_rng(self.seed)
+        starts = rng.integers(0, len(whole) - n + 1, _SCENES).tolist()
+        return [
+            Scene(
+                fading(whole[start : start + n], time),
+                np.ones(n),
+                hand_path(n, time, rng.uniform(1.0, _FASTEST_HAND), rng),
+            )
+            for start in starts
+        ]
 
     def controller(self) -> Controller:
         """The reference, sample by sample, through the controller's law."""

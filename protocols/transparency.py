@@ -13,11 +13,15 @@ from daq.experiment import Answer, Controller, Plan, Sample, SettingError
 from daq.findings import Chart, Findings, Number, Series
 from daq.hal import FloatArray, Samples
 from daq.torque import TorqueLaw
+from haptics.evidence import Scene, hand_path
 from haptics.experiment import TorqueExperiment
 from protocols.analysis.results import TIME, TORQUE
 
 _RAMP = 0.1  # s, in which the controller comes and goes
 _SETTLED = 0.3  # s behind the end of a ramp, that do not count
+_TRIAL = 2.0  # s
+_SCENES = 50
+_FASTEST_HAND = 10.0  # rad/s
 _MOVING = 0.1  # rad/s rms: below, nothing was moved
 
 
@@ -58,6 +62,17 @@ class Transparency(TorqueExperiment):
         rise = np.minimum(within / _RAMP, 1.0)
         shares: FloatArray = np.where(block % 2 == 1, rise, np.where(block > 0, 1.0 - rise, 0.0))
         return shares
+
+    def scenes(self) -> list[Scene]:
+        """The controller comes while hands move at up to 10 rad/s."""
+        time = 1.0 / self.sample_rate
+        n = round(_TRIAL * self.sample_rate)
+        share = np.clip((np.arange(n) * time - _TRIAL / 8.0) / _RAMP, 0.0, 1.0)
+        rng = np.random.default_rng(0)
+        return [
+            Scene(np.zeros(n), share, hand_path(n, time, rng.uniform(1.0, _FASTEST_HAND), rng))
+            for _ in range(_SCENES)
+        ]
 
     def controller(self) -> Controller:
         """The controller's law for no torque, in every second block."""

@@ -7,10 +7,13 @@ import numpy as np
 from daq.experiment import Controller, Plan
 from daq.findings import Chart, Findings, Series
 from daq.hal import FloatArray, Samples
+from haptics.evidence import Scene
 from protocols.analysis.results import DAMPING, STIFFNESS
 from protocols.analysis.walls import WallFindings, WallTheory, visited
-from protocols.control.loop import command_bounds
+from protocols.control.loop import command_bounds, tracker_gains
 from protocols.control.wall import WallRenderer, WallSettings
+
+_LEAN = 0.5  # rad, by which a hand leans beyond the wall
 
 
 class VirtualWall(WallSettings):
@@ -31,6 +34,10 @@ class VirtualWall(WallSettings):
         n_samples = self.samples_in(seconds, "stiffnesses")
         bounds = command_bounds(self.motor_limit, self.brake_commands)
         remarks = tuple(self._passivity(brake) for brake in self.brake_commands)
+        if self.is_controlled:
+            lowest, highest = self.bounds()
+            highest[1] = max(highest[1], *self.brake_commands)
+            bounds, remarks = (lowest, highest), (*self.controller_remarks(), *remarks)
         return Plan(n_samples, *bounds, remarks=remarks)
 
     def preview(self) -> Chart:
@@ -41,6 +48,27 @@ class VirtualWall(WallSettings):
         title = f"Walls to be tried, and theory with the brake at {brake:g} V"
         series = (walls, *self.theory.bounds(brake))
         return Chart("walls", title, DAMPING, STIFFNESS, series)
+
+    def scenes(self) -> list[Scene]:
+        """A hand that leans against each of the walls, and its tap."""
+        time = 1.0 / self.sample_rate
+        contact, ramp = round(0.6 / time), round(0.4 / time)
+        tapped = contact + ramp
+        n = tapped + round((self.tap.time + self.ringing.watch) / time)
+        lean = np.clip(np.arange(n + 1) * time / 0.4, 0.0, 1.0) * (self.position + _LEAN)
+        alpha, beta = tracker_gains(self.speed_filter, time)
+        rest, tap = self.rest, self.tap
+        taps = tap.torque, tapped, tapped + round(tap.time / time)
+        return [
+            Scene(
+                np.zeros(n), np.ones(n), lean,
+                np.array([
+                    cell.stiffness, cell.damping, self.position, cell.brake, alpha, beta / time,
+                    *taps, rest.stiffness, rest.damping, self.ringing.speed,
+                ]),
+            )
+            for cell in self.cells
+        ]  # fmt: skip
 
     def controller(self) -> Controller:
         """The renderer of the walls."""

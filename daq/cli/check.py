@@ -11,6 +11,7 @@ from typer import Option
 from daq.cli import options, terminal
 
 if TYPE_CHECKING:
+    from daq.experiment import Evidence
     from daq.hal import FloatArray
     from daq.recording.preview import ChannelFacts, Preview
 
@@ -25,16 +26,26 @@ def check(
     plot: Annotated[
         Path | None, Option(metavar="FILE.png|pdf|svg", help="Draw waveforms and spectra there.")
     ] = None,
+    draws: Annotated[
+        int,
+        Option(
+            min=0,
+            max=100_000,
+            help="Simulated trials where a torque controller acts, each with a plausible actuator "
+            "and a hand of its own; what trips or does not come to rest is refused. 0: none.",
+        ),
+    ] = 1000,
     json: options.AsJson = False,
 ) -> None:
     """Say what an experiment will do, and energise nothing.
 
-    It is checked against the rig's limits as before a run: duration, peaks, spectrum.
+    It is checked against the rig's limits as before a run: duration, peaks, spectrum; and with a
+    torque controller by trials.
     """
     from daq.recording import preview
 
     with terminal.watching(json) as watch:
-        checked = preview.check(experiment, rig, port, watch=watch)
+        checked = preview.check(experiment, rig, port, draws=draws, watch=watch)
     if plot is not None:
         preview.draw_preview(checked, plot)
     if json:
@@ -69,6 +80,8 @@ def _show(checked: Preview) -> None:
             f"{experiment.homing.turns:g} turns to wind within {experiment.homing.timeout:g} s"
         )
     print(f"Before it: {', '.join(before)}.")
+    if checked.evidence is not None:
+        _show_evidence(checked.evidence)
     for caveat in checked.caveats:
         print(f"Caveat: {caveat.text}.")
     if not plan.excites:
@@ -81,6 +94,15 @@ def _show(checked: Preview) -> None:
         print(
             "It has no 'validation' section: rig run --identify will identify without validation."
         )
+
+
+def _show_evidence(evidence: Evidence) -> None:
+    """What the trials came to."""
+    rows = [[n.name, terminal.number(n.value), n.unit, n.meaning] for n in evidence.numbers]
+    head = ["quantity", "value", "unit", "what it is"]
+    terminal.print_table("Simulated trials", head, rows, text=["unit", "what it is"])
+    for remark in evidence.remarks:
+        terminal.print_text(remark)
 
 
 def _show_channels(title: str, channels: dict[str, ChannelFacts]) -> None:

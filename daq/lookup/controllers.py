@@ -4,6 +4,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+import numpy as np
+
 from daq.config import check, yaml_file
 from daq.config.yaml_file import YamlFile
 from daq.errors import ConfigError
@@ -13,9 +15,10 @@ from daq.lookup.models import find_model
 from daq.lookup.shipped import find_file, shipped_files
 from daq.lookup.user_code import locate
 from daq.progress import Watch, ignore
-from daq.torque import TorqueControl, TorqueLaw
+from daq.torque import TorqueControl, TorqueLaw, plausible_parameters
 from sysid import ModelError, ProcessModel
 
+_MOST_ROUNDS = 20  # of draws, where the model's constraints refuse most
 _AGAIN = "make it anew with rig tune"
 
 
@@ -24,6 +27,7 @@ class TunedController:
     """A controller's settings and the actuator that it is tuned to.
 
     parameters: (n_parameters,). source: where they come from. path: of the file with all this.
+    spread: names of parameters that have one, and the factor of their covariance.
     """
 
     path: Path
@@ -31,6 +35,22 @@ class TunedController:
     model: ProcessModel
     parameters: FloatArray
     source: str
+    spread: tuple[tuple[str, ...], FloatArray]
+
+    def plausible(self, n: int, seed: int = 0) -> FloatArray:
+        """Plausible parameters, (n, n_parameters); none where no spread is known."""
+        names, factor = self.spread
+        if not names:
+            return np.empty((0, len(self.parameters)))
+        rows = np.empty((0, len(self.parameters)))
+        for again in range(_MOST_ROUNDS):
+            drawn = plausible_parameters(
+                self.model, self.parameters, names, factor, n, seed + again
+            )
+            rows = np.concatenate([rows, drawn])[:n]
+            if len(rows) == n:
+                break
+        return rows
 
     @cached_property
     def most_volts(self) -> tuple[float, float]:
@@ -75,11 +95,26 @@ def load_controller(name: str, folder: Path) -> TunedController:
             raise file.error(("parameters", str(key)), f"expected a number, found {value!r}")
     try:
         source = str(file.content.get("source", "parameters of unknown origin"))
-        controller = TunedController(path, control, model, model.vector(values), source)
+        spread = _spread(file, model)
+        controller = TunedController(path, control, model, model.vector(values), source, spread)
         controller.most_volts  # noqa: B018 - refuses what cannot be controlled
     except ModelError as error:
         raise file.error(("parameters",), str(error), _AGAIN) from None
     return controller
+
+
+def _spread(file: YamlFile, model: ProcessModel) -> tuple[tuple[str, ...], FloatArray]:
+    """What the file says of the covariance. Raises ConfigError."""
+    if "covariance" not in file.content:
+        return (), np.empty((0, 0))
+    try:
+        names = tuple(map(str, file.content["covariance"]["parameters"]))
+        factor = np.array(file.content["covariance"]["factor"], dtype=float).reshape(-1, len(names))
+    except (KeyError, TypeError, ValueError):
+        names, factor = (), np.full((1, 1), np.nan)
+    if not np.isfinite(factor).all() or not set(names) <= set(model.parameter_names):
+        raise file.error(("covariance",), "no covariance of the model's parameters", _AGAIN)
+    return names, factor
 
 
 def _control(file: YamlFile, at: tuple[str, ...]) -> TorqueControl:

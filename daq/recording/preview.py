@@ -1,5 +1,6 @@
 """What an experiment would do, without energising anything."""
 
+import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -8,13 +9,13 @@ import numpy as np
 
 from daq.config.rig import RigConfig
 from daq.errors import ConfigError, Mistake, RunError
-from daq.experiment import ClosedLoop, Experiment, Plan
+from daq.experiment import ClosedLoop, Evidence, Experiment, Plan, TripLimits
 from daq.files import write_whole
 from daq.hal import CHANNELS, Disclosing, FloatArray
 from daq.logs.columns import UNITS
 from daq.progress import Watch, ignore
 from daq.recording.session import Session, open_session
-from daq.run.protocol import preview_of
+from daq.run.protocol import evidence_of, preview_of
 
 _PART = 0.9  # of the power, that the stated band holds
 
@@ -43,6 +44,8 @@ class ChannelFacts:
 class Preview:
     """A session that has been checked, and what its plan does to each channel.
 
+    evidence: what simulated trials say, where they were asked for and can be made.
+
     >>> from daq import check
     >>> preview = check("prbs.yaml")
     >>> preview.channels["motor"].limits_volts, preview.concludes
@@ -51,6 +54,7 @@ class Preview:
 
     session: Session
     channels: dict[str, ChannelFacts]
+    evidence: Evidence | None = None
 
     @property
     def experiment(self) -> Experiment:
@@ -110,6 +114,7 @@ class Preview:
             "experiment": str(self.session.loaded.file.path),
             "validation_run": self.session.validation is not None,
             "rig": self.session.rig.name,
+            **({} if self.evidence is None else {"trials": _trials(self.evidence)}),
             "cannot_promise": [caveat.text for caveat in self.caveats],
         }
 
@@ -119,11 +124,14 @@ def check(
     rig: str | Path | None = None,
     port: str | None = None,
     *,
+    draws: int = 0,
     watch: Watch = ignore,
 ) -> Preview:
     """Check an experiment against a rig, as before a run, and say what it would do.
 
-    Files as for ``rig check``. Raises ConfigError with all mistakes.
+    Files as for ``rig check``. draws: simulated trials of a torque controller's experiment, each
+    with an actuator and a hand of its own. Raises ConfigError with all mistakes, and where the
+    trials speak against the run.
 
     >>> from daq import check
     >>> check("prbs.yaml").seconds
@@ -132,7 +140,36 @@ def check(
     session = open_session(str(experiment), None if rig is None else str(rig), port, watch=watch)
     settings = session.loaded.experiment
     channels = {name: _facts(session.plan, session.rig, settings, name) for name in CHANNELS}
-    return Preview(session, channels)
+    return Preview(session, channels, _evidence(session, draws, watch) if draws else None)
+
+
+def _evidence(session: Session, draws: int, watch: Watch) -> Evidence | None:
+    """What trials say of a closed loop. Raises ConfigError where they speak against it."""
+    experiment, rig = session.loaded.experiment, session.rig
+    if not isinstance(experiment, ClosedLoop):
+        return None
+    evidence = evidence_of(experiment, trip_limits(rig), draws)
+    if evidence is not None and evidence.refusal:
+        raise ConfigError(
+            evidence.refusal,
+            cure="ask for less, or tune the controller with lower limits or more effort",
+            file=str(session.loaded.file.path),
+        )
+    return evidence
+
+
+def trip_limits(rig: RigConfig) -> TripLimits:
+    """What stops a run on a rig."""
+    limits = rig.limits
+    return TripLimits(
+        limits.current.motor,
+        limits.current.brake,
+        math.inf if limits.speed is None else limits.speed,
+        math.inf if limits.torque is None else limits.torque,
+        limits.command.motor,
+        limits.command.brake,
+        abs(rig.sensors.encoder.count),
+    )
 
 
 def spectral_lines(column: FloatArray, sample_rate: float) -> tuple[FloatArray, FloatArray]:
@@ -165,6 +202,11 @@ def _facts(planned: Plan, rig: RigConfig, settings: Experiment, name: str) -> Ch
     low, high = frequency[ends].tolist()
     peak = float(np.max(np.abs(column - mean)))
     return ChannelFacts(lowest, highest, limits, mean, rms, peak / rms, (low, high), changes)
+
+
+def _trials(evidence: Evidence) -> dict[str, Any]:
+    numbers = {number.name: number.value for number in evidence.numbers}
+    return {**numbers, "remarks": list(evidence.remarks)}
 
 
 def draw_preview(preview: Preview, path: Path) -> None:

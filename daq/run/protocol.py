@@ -10,7 +10,17 @@ from typing import Any
 import numpy as np
 
 from daq.errors import USER_CODE_ERRORS, ConfigError, RigError, RunError, raised_in
-from daq.experiment import MOST_SAMPLES, Answer, ClosedLoop, Experiment, Plan, Sample, SettingError
+from daq.experiment import (
+    MOST_SAMPLES,
+    Answer,
+    ClosedLoop,
+    Evidence,
+    Experiment,
+    Plan,
+    Sample,
+    SettingError,
+    TripLimits,
+)
 from daq.findings import Chart, Heatmap
 from daq.hal import CHANNELS, FloatArray, Samples
 
@@ -145,6 +155,12 @@ def preview_of(experiment: Experiment) -> Chart | Heatmap | None:
     """What a protocol draws beforehand, if it has a closed loop. Raises ConfigError."""
     with _before_the_run(experiment, "in preview()"):
         return experiment.preview() if isinstance(experiment, ClosedLoop) else None
+
+
+def evidence_of(experiment: ClosedLoop, limits: TripLimits, draws: int) -> Evidence | None:
+    """What a protocol's trials say beforehand. Raises ConfigError."""
+    with _before_the_run(experiment, "in evidence()"):
+        return experiment.evidence(limits, draws)
 
 
 @contextlib.contextmanager

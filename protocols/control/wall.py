@@ -11,8 +11,10 @@ from pydantic import Field
 from daq.config.base import Section
 from daq.config.units import NewtonMetres, Radians, RadiansPerSecond, Seconds, Unit, Volts
 from daq.errors import RunError
-from daq.experiment import Answer, ClosedLoop, Sample
+from daq.experiment import Answer, Sample
 from daq.hal import FloatArray
+from daq.torque import TorqueLaw
+from haptics.experiment import TorqueExperiment
 from protocols.control import loop
 
 Stiffness = Annotated[float, Unit("N*m/rad")]
@@ -76,7 +78,7 @@ class Cell(NamedTuple):
     brake: float
 
 
-class WallSettings(ClosedLoop):
+class WallSettings(TorqueExperiment):
     """A grid of walls, how each is tried, and what is physical."""
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -87,6 +89,9 @@ class WallSettings(ClosedLoop):
         "penetration": "rad",
     }
 
+    torque_controller: str = Field(
+        "", description="file that rig tune made; without one a torque is volts by motor_gain"
+    )
     position: Radians = Field(
         0.2, ge=0.0, le=100.0, description="of the wall, from where the shaft is at first"
     )
@@ -125,6 +130,9 @@ class WallRenderer:
     def __init__(self, settings: WallSettings) -> None:
         self._settings, self._cells = settings, settings.cells
         self._tracker = loop.SpeedTracker(settings.speed_filter)
+        self._law: TorqueLaw | None = None
+        if settings.is_controlled:
+            self._law = settings.tuned_controller.law()
         self._wall: float | None = None
         self._touched = math.nan
         self._index, self._began = -1, 0.0
@@ -155,9 +163,13 @@ class WallRenderer:
             torque += settings.tap.torque
         if state == WATCHED:
             self._watch(now, depth)
-        volts, limit = torque / settings.motor_gain, settings.motor_limit
+        contact = brake if depth > 0.0 else 0.0
         logged = (float(index), float(state), stiffness, damping, depth)
-        return Answer(min(max(volts, -limit), limit), brake if depth > 0.0 else 0.0, logged)
+        if self._law is not None:
+            motor, shared = self._law.volts(sample, torque)
+            return Answer(motor, max(shared, contact), logged)
+        volts, limit = torque / settings.motor_gain, settings.motor_limit
+        return Answer(min(max(volts, -limit), limit), contact, logged)
 
     def _wait(self, now: float, depth: float) -> None:
         """For a hand that leans against the wall."""

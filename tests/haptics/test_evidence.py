@@ -1,0 +1,152 @@
+"""Trials before a run: against theory, against the simulated rig, and what they refuse."""
+
+import json
+
+import numpy as np
+import pytest
+import yaml
+
+from daq import record
+from daq.config.rig import RigConfig
+from daq.errors import InterlockError
+from daq.experiment import TripLimits
+from daq.lookup.controllers import load_controller
+from daq.lookup.experiments import load_experiment
+from daq.recording.preview import trip_limits
+from haptics.dynamics import ActuatorDynamics
+from haptics.evidence import HAND, run_trials
+from haptics.linear_loop import LinearLaw, loop_margins
+from protocols.analysis.walls import SampledWall
+from tests.daq.support import rig
+from tests.haptics.test_torque_tracking import controller, experiment
+from tests.protocols.closed_loop import SHIPPED
+
+LIMITS = TripLimits(2.4, 0.21, 100.0, 3.5, (-5.0, 5.0), (0.0, 0.38), 2.0 * np.pi / 8192.0)
+# Stiff and hard to stand: brake on in contact, as an experiment with walls may have it.
+WALLS = {"stiffnesses": [2, 60], "dampings": [0.005], "brake_commands": [0.36]}
+
+
+def walls(folder, path, **changes):
+    content = yaml.safe_load((SHIPPED / "virtual_wall.yaml").read_text())
+    file = folder / "walls.yaml"
+    file.write_text(yaml.safe_dump({**content, "torque_controller": str(path), **changes}))
+    return file
+
+
+@pytest.fixture(scope="module")
+def static(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("evidence")
+    path = controller(folder, "static")
+    return folder, path, load_controller(str(path), folder)
+
+
+def trials(tuned, file, draws, limits=LIMITS):
+    settings = load_experiment(str(file)).experiment
+    program = tuned.control.program(tuned.model, tuned.parameters)
+    return run_trials(tuned, program, settings.scenes(), limits, draws)
+
+
+def test_soft_walls_rest_and_those_above_the_critical_stiffness_do_not(static):
+    """Between the two a light hand bounces off, in and out, where a linear loop would settle."""
+    folder, path, tuned = static
+    for scale, decided in ((0.1, False), (1.6, True)):
+        stiffness = scale * critical_stiffness(0.005)
+        file = walls(folder, path, stiffnesses=[stiffness], dampings=[0.005], brake_commands=[0.0])
+        outcomes = trials(tuned, file, 40)
+        lightest = outcomes.hands[:, 0] < 0.3 * HAND[0]
+        assert lightest.sum() > 2
+        restless = (outcomes.restless | outcomes.left)[lightest]
+        assert restless.all() if decided else not restless.any()
+
+
+def critical_stiffness(damping):
+    """By eigenvalues, in the lightest of hands."""
+    body = 1.02e-4, 2e-4 + HAND[1] / 4.0, HAND[0] / 4.0
+    return SampledWall(*body, 1.0 / 800.0, 1, 150.0).critical_stiffness(damping)
+
+
+def test_a_limit_ends_the_trials_that_reach_it(static):
+    folder, path, tuned = static
+    file = experiment(folder, path, duration=4.0)
+    free = trials(tuned, file, 12)
+    assert free.tripped.sum() == 0 and not free.restless.any()
+    fastest = free.results[:, 4]
+    low = TripLimits(2.4, 0.21, float(np.median(fastest)), 3.5, (-5, 5), (0, 0.38), LIMITS.count)
+    assert trials(tuned, file, 12, low).tripped.tolist() == [0, 0, 6, 0]
+
+
+def test_a_law_that_feeds_nothing_back_has_all_margins(static):
+    _, _, tuned = static
+    law = LinearLaw.of(tuned)
+    margins = loop_margins(law, ActuatorDynamics(tuned.model), "within yield", HAND, 1.0 / 800.0, 1)
+    assert margins.stable and margins.sensitivity == pytest.approx(1.0)
+    assert margins.disk == pytest.approx(2.0)
+
+
+def test_rig_check_tells_trials_and_refuses_what_trips(static):
+    folder, path, _ = static
+    file = experiment(folder, path, duration=4.0)
+    options = ["--draws", "50", "--rig", "moving_hand.yaml", "--json"]
+    done = rig("check", file.name, *options, cwd=folder)
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout)["trials"]
+    assert told["trials"] == 50 and told["tripped"] == 0 and told["disk_margin"] == pytest.approx(2)
+    assert "No uncertainty" in told["remarks"][0]
+    content = yaml.safe_load((folder / file.name).read_text())
+    (folder / "fast.yaml").write_text(yaml.safe_dump({**content, "torque": 5.0}))
+    done = rig("check", "fast.yaml", *options, cwd=folder)
+    assert done.returncode == 2 and "of 50 simulated trials trip" in done.stderr
+    assert rig("check", "fast.yaml", "--draws", "0", cwd=folder).returncode == 0
+
+
+def test_a_spread_of_the_parameters_is_in_the_trials(static):
+    folder, path, _ = static
+    content = yaml.safe_load((folder / path).read_text())
+    content["covariance"] = {"parameters": ["K_m", "J_m"], "factor": [[0.01, 0.0], [0.0, 1e-5]]}
+    (folder / "spread.yaml").write_text(yaml.safe_dump(content))
+    tuned = load_controller("spread.yaml", folder)
+    drawn = tuned.plausible(400)
+    place = tuned.model.parameter_names.index("K_m")
+    assert drawn.shape == (400, len(tuned.parameters))
+    assert np.std(drawn[:, place]) == pytest.approx(0.01, rel=0.15)
+    content["covariance"]["parameters"] = ["K_m", "nonsense"]
+    (folder / "spread.yaml").write_text(yaml.safe_dump(content))
+    with pytest.raises(Exception, match="no covariance of the model's parameters"):
+        load_controller("spread.yaml", folder)
+
+
+@pytest.mark.soak
+def test_a_wall_that_is_refused_trips_on_the_simulated_rig(tmp_path):
+    path = controller(tmp_path, "feedforward")
+    file = walls(tmp_path, path, **WALLS)
+    done = rig("check", file.name, "--rig", "hand.yaml", "--draws", "200", cwd=tmp_path)
+    assert done.returncode == 2 and "trip current_brake" in done.stderr
+    ended = 0
+    for seed in range(3):
+        try:
+            record(file, "hand.yaml", tmp_path / "runs", options={"seed": seed})
+        except InterlockError:
+            ended += 1
+    assert ended >= 2
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("kind", ["feedforward", "lqg"])
+def test_what_is_let_through_trips_on_no_fresh_rig(tmp_path, kind):
+    path = controller(tmp_path, kind)
+    file = experiment(tmp_path, path, duration=3.0)
+    done = rig("check", file.name, "--rig", "moving_hand.yaml", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    rng = np.random.default_rng(3)
+    for seed in range(8):
+        grip = float(4.0 ** rng.uniform(-1.0, 1.0))
+        plant = {"load": "hand", "parameters": {"K_u": 0.16 * grip, "B_u": 0.0179 * grip}}
+        options = {"seed": seed, "plant": plant}
+        run = record(file, "moving_hand.yaml", tmp_path / "runs", options=options)
+        assert run.record["status"] == "completed"
+
+
+def test_limits_are_those_of_the_rig():
+    limits = trip_limits(RigConfig(backend="simulated"))
+    assert (limits.current_brake, limits.speed) == (0.21, float("inf"))
+    assert limits.count == pytest.approx(2.0 * np.pi / 8192.0)
