@@ -93,6 +93,7 @@ class ActuatorControl(TorqueControl):
             laws.AHEAD: float(self.ahead),
             laws.INERTIA: dynamics.inertia,
             laws.STIFFNESS: dynamics.stiffness,
+            laws.FRICTION: 1.0,
             laws.MOTOR_GAIN: dynamics.motor.gain,
             laws.MOTOR_EMF: dynamics.motor.emf,
             laws.MOST_VOLTS: self.motor_current / dynamics.motor.gain,

@@ -1,7 +1,8 @@
 """What speaks for an experiment with a torque controller before it runs: trials, and margins.
 
 Each trial has an actuator from the identification's uncertainty, and a hand from 1/4 to 4 times
-that of (A.2); see ``haptics.trial`` for what lies between them and the controller.
+that of (A.2); see ``haptics.trial`` for what lies between them and the controller. Amplifiers end
+where a variant of the model with limits has it.
 """
 
 import math
@@ -19,7 +20,7 @@ from haptics import trial
 from haptics.dynamics import SHAFT, ActuatorDynamics
 from haptics.linear_loop import LinearLaw, LoopMargins, loop_margins
 from haptics.operating_points import Branch
-from haptics.program import LONGEST_STEP, compiled_trial, step_matrices, stiff_part
+from haptics.program import compiled_trial, step_matrices, stiff_part
 
 BoolArray = NDArray[np.bool_]
 
@@ -27,6 +28,7 @@ HAND = (0.16, 0.0179)  # N*m/rad, N*m*s/rad, by (A.2)
 HAND_RANGE = 4.0  # factor either way
 NOISE = (5e-3, 5e-3, 7e-3)  # A, A, N*m: rms of the sensors
 
+_LONGEST_STEP = 1.6e-4  # s; an amplifier at its end is faster than its linear part
 _STILL = 0.25  # s at the end over which the shaft is to be at rest
 _CALM = 1.0  # rad/s rms that an encoder's counts and the sensors' noise leave at most
 _FAMILY = 24  # members whose margins are computed
@@ -85,7 +87,7 @@ def run_trials(
     if not len(actuators):
         actuators = controller.parameters[None]
     time = program.step.time
-    steps = max(1, math.ceil(time / LONGEST_STEP))
+    steps = max(1, math.ceil(time / _LONGEST_STEP))
     A = np.stack([stiff_part(model, p) for p in actuators])
     matrices = step_matrices(A, np.full(len(A), time / steps))
     hands = np.array(HAND) * HAND_RANGE ** rng.uniform(-1.0, 1.0, (draws, 1))

@@ -3,7 +3,9 @@
 With tau_r the torque that the hand is to feel, the motor has to give, beside it, what the shaft's
 acceleration and its friction take:
 
-    K_t i_m = tau_r + J domega/dt - rest(omega, z, theta, 0) - b(z) i_b
+    K_t i_m = tau_r + k J domega/dt - f rest(omega, z, theta, 0) - b(z) i_b
+
+with shares k of the inertia and f of the friction.
 
 Speed, acceleration and the hysteresis variable z are observed from the encoder and the currents;
 b(z), what an ampere of the brake gives in this state, is signed, so the brake is asked for a torque
@@ -42,6 +44,12 @@ class Feedforward(ActuatorControl):
     inertia_share: Part = Field(
         0.95, ge=0.0, lt=1.0, description="of the inertia that the motor takes off the hand"
     )
+    friction_share: Part = Field(
+        1.0,
+        ge=0.0,
+        le=1.0,
+        description="of the friction that the motor takes off; no wall is passive with any",
+    )
     acceleration_filter: Hertz = Field(
         50.0, gt=0.0, le=1e4, description="bandwidth of the acceleration that is compensated"
     )
@@ -67,6 +75,7 @@ class Feedforward(ActuatorControl):
         noise = SensorNoise(encoder_noise(self.encoder_counts))
         shaft = ShaftFilter.of(dynamics.inertia, time, noise, Hand(self.hand_walk))
         constants = shaft.placed(self.constants(dynamics))
+        constants[laws.FRICTION] = self.friction_share
         constants[laws.SHARE] = self.inertia_share * dynamics.inertia
         smoothing = 1.0 - math.exp(-2.0 * math.pi * self.acceleration_filter * time)
         constants[laws.SMOOTHING] = smoothing

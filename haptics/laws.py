@@ -37,9 +37,10 @@ TIME, HORIZON, AHEAD, INERTIA, STIFFNESS = 6, 7, 8, 9, 10
 MOTOR_GAIN, MOTOR_EMF, MOST_VOLTS, BRAKE_GAIN, BRAKE_DECAY, BRAKE_MEAN = 11, 12, 13, 14, 15, 16
 # of the static law, of feedforward, of the regulator,
 STANDSTILL, BRAKE_SLOPE, SHARE, SMOOTHING, LEAD = 17, 18, 19, 20, 21
-# and of the shaft's filter x+ = A x + b N, x + L (y - C x), and the regulator's gains.
+# and of the shaft's filter x+ = A x + b N, x + L (y - C x), the regulator's gains, and the share of
+# friction that is compensated.
 FILTER_ORDER = 5
-FILTER_A, FILTER_B, FILTER_L, REGULATOR, CONSTANTS = 22, 47, 52, 62, 83
+FILTER_A, FILTER_B, FILTER_L, REGULATOR, FRICTION, CONSTANTS = 22, 47, 52, 62, 83, 84
 
 # States: of the filter,
 ANGLE, SPEED, HAND, HAND_RATE, DISTURBANCE = 0, 1, 2, 3, 4
@@ -201,7 +202,7 @@ def give(wanted: float, s: Array, c: Array, p: Array, volts: Array) -> float:
     omega, z, theta = s[NEXT_SPEED], s[NEXT_Z], s[NEXT_ANGLE]
     without = rest(0.0, omega, z, theta, c, p)
     per_ampere = rest(1.0, omega, z, theta, c, p) - without
-    needed = wanted - without
+    needed = wanted - c[FRICTION] * without
     i_b = brake_current(needed, per_ampere, c)
     from_brake = per_ampere * mean_brake_current(i_b, s, c)
     i_m = motor_current(needed - from_brake, c)

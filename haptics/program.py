@@ -20,6 +20,7 @@ from sysid.engine.compiler import compiled_text
 from sysid.engine.scalar_text import ScalarEquations
 
 LONGEST_STEP = 4e-4  # s, of the model
+_LIMITED = "limits=true"
 LAWS = ("static", "feedforward", "lqg")
 
 
@@ -70,12 +71,22 @@ def compiled_laws(model: ProcessModel) -> dict[str, Callable[..., None]]:
     return dict(zip(LAWS, compiled_text("laws", law_text(model), LAWS), strict=True))
 
 
+def with_limits(model: ProcessModel) -> ProcessModel:
+    """The model with the ends of its amplifiers, where it has such a variant; else itself."""
+    variant = model.variants().get(_LIMITED) if model.variants is not None else None
+    fits = variant is not None and variant.parameter_names == model.parameter_names
+    return variant if variant is not None and fits else model
+
+
 @functools.lru_cache(maxsize=4)
 def compiled_trial(model: ProcessModel, law: str) -> Callable[..., None]:
-    """``haptics.trial`` with a law, as machine code."""
+    """``haptics.trial`` with a law, as machine code; the actuator's amplifiers have ends."""
     text = source_of(trial).replace("answer(", f"{law}(")
+    # Of two functions of a name the last is taken.
+    plant = ScalarEquations(with_limits(model)).slopes()
     function: Callable[..., None]
-    (function,) = compiled_text(f"trial_{law}", f"{law_text(model)}\n\n{text}", ["trial"])
+    whole = "\n\n".join([law_text(model), plant, text])
+    (function,) = compiled_text(f"trial_{law}", whole, ["trial"])
     return function
 
 

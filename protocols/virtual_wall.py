@@ -1,18 +1,21 @@
 """A virtual wall, spring and damper, at each point of a grid: which of them are stable."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
-from daq.experiment import Controller, Plan
-from daq.findings import Chart, Findings, Series
+from daq.experiment import Controller, Evidence, Plan, TripLimits
+from daq.findings import Chart, Findings, Number, Series
 from daq.hal import FloatArray, Samples
 from haptics.evidence import Scene
+from haptics.passivity import Passivity, Tracker, UnknownPassivityError
 from protocols.analysis.results import DAMPING, STIFFNESS
 from protocols.analysis.walls import WallFindings, WallTheory, visited
 from protocols.control.loop import command_bounds, tracker_gains
 from protocols.control.wall import WallRenderer, WallSettings
 
+_ACTUATORS = 100  # whose passivity is computed
 _LEAN = 0.5  # rad, by which a hand leans beyond the wall
 
 
@@ -69,6 +72,32 @@ class VirtualWall(WallSettings):
             )
             for cell in self.cells
         ]  # fmt: skip
+
+    def evidence(self, limits: TripLimits, draws: int) -> Evidence | None:
+        """The same as of any controller's experiment, and which walls are passive."""
+        evidence = super().evidence(limits, draws)
+        if evidence is None:
+            return None
+        tuned = self.tuned_controller
+        tracker = Tracker(*tracker_gains(self.speed_filter, 1.0 / self.sample_rate))
+        drawn = tuned.plausible(_ACTUATORS)
+        actuators = np.concatenate([tuned.parameters[None], drawn])
+        try:
+            promise = Passivity(tuned, tracker, actuators).promise(limits.count)
+        except UnknownPassivityError as error:
+            return replace(evidence, remarks=(*evidence.remarks, f"{error}."))
+        sure = "with 95 %" if len(drawn) else "if the parameters are right"
+        remark = (
+            f"Walls up to {promise.stiffness:.3g} N*m/rad with a damping of "
+            f"{promise.damping:.2g} N*m*s/rad are passive {sure}, in any passive hand, with the "
+            f"brake or without. Colgate and Schenkel without delay: {promise.colgate:.3g}; Abbott "
+            f"and Okamura: {promise.abbott:.3g} N*m/rad."
+        )
+        passive = Number(
+            "passive_stiffness", promise.stiffness, "N*m/rad", meaning="of walls in any hand"
+        )
+        numbers = (*evidence.numbers, passive)
+        return replace(evidence, numbers=numbers, remarks=(*evidence.remarks, remark))
 
     def controller(self) -> Controller:
         """The renderer of the walls."""

@@ -1,11 +1,13 @@
 """Trials before a run: against theory, against the simulated rig, and what they refuse."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
 
+import sim_rig
 from daq import record
 from daq.config.rig import RigConfig
 from daq.errors import InterlockError
@@ -16,14 +18,15 @@ from daq.recording.preview import trip_limits
 from haptics.dynamics import ActuatorDynamics
 from haptics.evidence import HAND, run_trials
 from haptics.linear_loop import LinearLaw, loop_margins
+from haptics.passivity import Passivity, Tracker
 from protocols.analysis.walls import SampledWall
+from protocols.control.loop import tracker_gains
 from tests.daq.support import rig
 from tests.haptics.test_torque_tracking import controller, experiment
 from tests.protocols.closed_loop import SHIPPED
 
 LIMITS = TripLimits(2.4, 0.21, 100.0, 3.5, (-5.0, 5.0), (0.0, 0.38), 2.0 * np.pi / 8192.0)
-# Stiff and hard to stand: brake on in contact, as an experiment with walls may have it.
-WALLS = {"stiffnesses": [2, 60], "dampings": [0.005], "brake_commands": [0.36]}
+LIGHT = {"K_u": 0.08, "B_u": 0.009}  # half a hand
 
 
 def walls(folder, path, **changes):
@@ -92,11 +95,13 @@ def test_rig_check_tells_trials_and_refuses_what_trips(static):
     told = json.loads(done.stdout)["trials"]
     assert told["trials"] == 50 and told["tripped"] == 0 and told["disk_margin"] == pytest.approx(2)
     assert "No uncertainty" in told["remarks"][0]
-    content = yaml.safe_load((folder / file.name).read_text())
-    (folder / "fast.yaml").write_text(yaml.safe_dump({**content, "torque": 5.0}))
-    done = rig("check", "fast.yaml", *options, cwd=folder)
-    assert done.returncode == 2 and "of 50 simulated trials trip" in done.stderr
-    assert rig("check", "fast.yaml", "--draws", "0", cwd=folder).returncode == 0
+    slow = yaml.safe_load((Path(sim_rig.__file__).parent / "moving_hand.yaml").read_text())
+    slow["limits"]["speed"] = 5.0
+    (folder / "slow.yaml").write_text(yaml.safe_dump(slow))
+    refused = rig("check", file.name, "--draws", "50", "--rig", "slow.yaml", cwd=folder)
+    assert refused.returncode == 2 and "of 50 simulated trials trip speed" in refused.stderr
+    done = rig("check", file.name, "--draws", "0", "--rig", "slow.yaml", cwd=folder)
+    assert done.returncode == 0, done.stderr
 
 
 def test_a_spread_of_the_parameters_is_in_the_trials(static):
@@ -116,15 +121,16 @@ def test_a_spread_of_the_parameters_is_in_the_trials(static):
 
 
 @pytest.mark.soak
-def test_a_wall_that_is_refused_trips_on_the_simulated_rig(tmp_path):
-    path = controller(tmp_path, "feedforward")
-    file = walls(tmp_path, path, **WALLS)
+def test_what_is_refused_trips_on_the_simulated_rig(tmp_path):
+    """Walls by the inverse, which takes inertia off: some ring against the current's limit."""
+    file = walls(tmp_path, controller(tmp_path, "feedforward"))
     done = rig("check", file.name, "--rig", "hand.yaml", "--draws", "200", cwd=tmp_path)
-    assert done.returncode == 2 and "trip current_brake" in done.stderr
+    assert done.returncode == 2 and "simulated trials trip current_motor" in done.stderr
     ended = 0
-    for seed in range(3):
+    for seed in range(4):
+        plant = {"load": "hand", "parameters": LIGHT}
         try:
-            record(file, "hand.yaml", tmp_path / "runs", options={"seed": seed})
+            record(file, "hand.yaml", tmp_path, options={"seed": seed, "plant": plant})
         except InterlockError:
             ended += 1
     assert ended >= 2
@@ -150,3 +156,23 @@ def test_limits_are_those_of_the_rig():
     limits = trip_limits(RigConfig(backend="simulated"))
     assert (limits.current_brake, limits.speed) == (0.21, float("inf"))
     assert limits.count == pytest.approx(2.0 * np.pi / 8192.0)
+
+
+@pytest.mark.soak
+def test_no_promised_wall_rings_on_a_thousand_plausible_actuators(static):
+    """A wall just below the promise, in hands from 1/4 to 4 times that of (A.2)."""
+    folder, path, _ = static
+    content = yaml.safe_load((folder / path).read_text())
+    names = ["K_m", "J_m", "B_m", "alpha0", "c0", "R_m"]
+    spread = np.diag([0.05 * content["parameters"][name] for name in names])
+    content["covariance"] = {"parameters": names, "factor": spread.tolist()}
+    (folder / "wide.yaml").write_text(yaml.safe_dump(content))
+    tuned = load_controller("wide.yaml", folder)
+    tracker = Tracker(*tracker_gains(150.0, 1.0 / 800.0))
+    actuators = np.concatenate([tuned.parameters[None], tuned.plausible(100)])
+    promise = Passivity(tuned, tracker, actuators).promise(LIMITS.count)
+    wall = {"stiffnesses": [promise.stiffness], "dampings": [promise.damping]}
+    rest = {"stiffness": promise.stiffness, "damping": 0.0, "time": 0.4}
+    file = walls(folder, folder / "wide.yaml", **wall, rest=rest, brake_commands=[0.0])
+    outcomes = trials(tuned, file, 1000)
+    assert not outcomes.restless.any() and not outcomes.left.any()

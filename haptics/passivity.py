@@ -1,0 +1,260 @@
+"""Passivity of a rendered wall in sampled data, at all frequencies up to half the sample rate.
+
+A shaft whose impedance is Z(s) = J s + b + Z', with Z' of hand and brake anything passive, has an
+admittance Y = 1 / Z within the disc over [0, 1/b]. The torque of a wall goes to it by way of a
+hold, a delay of ``ahead`` samples and the amplifier; its angle comes back sampled. With the law's
+H(z) from angle to volts, P(s) from volts to torque over s, and the sum over all aliases
+s_k = j (omega + 2 pi k / T),
+
+    L = H (1 / T) sum_k P(s_k) Y_k,   Y_k anywhere in its disc,
+
+so the sum lies in a disc with the centre C = sum P_k / (2 b_k T) and the radius
+R = sum |P_k| / (2 b_k T). No passive hand and no passive brake makes the loop unstable if, at every
+frequency,
+
+    |1 + H C| > |H| R.
+
+For an ideal amplifier this is Colgate and Schenkel's theorem ("Passivity of a class of
+sampled-data systems", Journal of Robotic Systems 14, 1997),
+b > T / 2 / (1 - cos omega T) Re((1 - e^(-j omega T)) H). The motor's back EMF is in b_k.
+
+The brake is passive, but it gives no b: within its yield travel it is a spring without loss.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import expm
+
+from daq.hal import FloatArray
+from daq.lookup.controllers import TunedController
+from haptics.dynamics import SHAFT, ActuatorDynamics
+from haptics.linear_loop import LinearLaw
+
+ComplexArray = NDArray[np.complex128]
+
+_ALIASES = 40  # either side
+_FREQUENCIES = 160
+_STIFFEST = 1e4  # N*m/rad
+_BISECTIONS = 40
+_DAMPINGS = 25
+_SURE = 5.0  # %, of the draws may be below what is promised
+
+
+class UnknownPassivityError(ValueError):
+    """A controller of whose passivity nothing is known; it says why."""
+
+
+@dataclass(frozen=True)
+class Tracker:
+    """A speed by an alpha-beta tracker of the angle; of alpha and beta as a run has them."""
+
+    alpha: float
+    beta: float
+
+    def response(self, z: ComplexArray, time: float) -> ComplexArray:
+        """Speed by angle at points z, (n,) [1/s]."""
+        alpha, beta = self.alpha, self.beta
+        speed: ComplexArray = (
+            beta / time * z * (z - 1.0) / (z * z - (2.0 - alpha - beta) * z + 1.0 - alpha)
+        )
+        return speed
+
+
+@dataclass(frozen=True)
+class WallLaw:
+    """Responses of a law at z = exp(j omega T): volts of the motor by angle, and by reference.
+
+    The motor's current, which a law may listen to, follows the volts as the model has it.
+    """
+
+    z: ComplexArray
+    by_angle: ComplexArray
+    by_reference: ComplexArray
+    time: float
+
+    @classmethod
+    def of(cls, controller: TunedController, time: float) -> "WallLaw":
+        """That of a controller at rest.
+
+        Raises UnknownPassivityError for one that takes the torque sensor.
+        """
+        control = controller.control
+        if control.takes_torque:
+            raise UnknownPassivityError(
+                f"{control.controller} feeds the hand's torque back: its passivity is that of no "
+                "impedance by angle alone, and nothing is promised of it"
+            )
+        law, dynamics = LinearLaw.of(controller), ActuatorDynamics(controller.model)
+        z = np.exp(1j * np.pi * np.geomspace(1e-3, 1.0, _FREQUENCIES))
+        current = _sampled_current(dynamics, z, time) / z**control.ahead
+        rows = [law.F.shape[0]]
+        inner = z[:, None, None] * np.eye(rows[0]) - law.F
+        responses = np.linalg.solve(inner, np.broadcast_to(law.G, (len(z), *law.G.shape)))
+        from_y = (law.H @ responses + law.D)[:, 0]  # of the motor's volts
+        # The speed that a device measures acts on signs alone.
+        fed_back = 1.0 - from_y[:, 3] * current
+        return cls(z, from_y[:, 0] / fed_back, from_y[:, 4] / fed_back, time)
+
+
+@dataclass(frozen=True)
+class Port:
+    """The shaft at which a wall is rendered: centre and radius of its disc, by frequency.
+
+    damping [N*m*s/rad], friction [N*m]: of the sliding shaft without a current.
+    """
+
+    centre: ComplexArray
+    radius: FloatArray
+    damping: float
+    friction: float
+
+    @classmethod
+    def of(cls, dynamics: ActuatorDynamics, z: ComplexArray, time: float, ahead: int) -> "Port":
+        """That of an actuator, at frequencies z."""
+        omega = np.angle(z) / time
+        s = 1j * (omega[:, None] + 2.0 * np.pi / time * np.arange(-_ALIASES, _ALIASES + 1))
+        by_volts, by_speed = _currents(dynamics, s)
+        constant = dynamics.motor_constant
+        at_rest = dynamics.rest(0.0, 1.0, 0.0, 0.0), dynamics.rest(0.0, 0.0, 0.0, 0.0)
+        damping = at_rest[1] - at_rest[0]
+        b = np.maximum(damping - constant * by_speed.real, 1e-12)
+        centre, radius = disc(constant * by_volts, b, s, time, ahead)
+        friction = abs(dynamics.rest(0.0, 0.0, dynamics.sliding, 0.0))
+        return cls(centre, radius, damping, friction)
+
+    def passive(self, H: ComplexArray) -> bool:
+        """Whether volts by -H times the angle leave the port passive."""
+        margin = np.abs(1.0 + H * self.centre) - np.abs(H) * self.radius
+        return bool(np.all(margin > 0.0))
+
+
+def disc(
+    torque: ComplexArray, b: FloatArray, s: ComplexArray, time: float, ahead: int
+) -> tuple[ComplexArray, FloatArray]:
+    """Centre and radius of the disc, (n,), by torque per volt and damping at all aliases s, (n, m).
+
+    time: of a sample [s].
+    """
+    P = torque * (1.0 - np.exp(-s * time)) / s * np.exp(-s * (ahead * time)) / s / time
+    return (P / (2.0 * b)).sum(axis=1), (np.abs(P) / (2.0 * b)).sum(axis=1)
+
+
+@dataclass(frozen=True)
+class WallPromise:
+    """Stiffest passive walls, over plausible actuators.
+
+    stiffness: passive with 95 % [N*m/rad], with a rendered damping [N*m*s/rad]; draws: the
+    stiffest by actuator. colgate: 2 b / T; abbott: min(2 b / T, 2 f / count) of Abbott and Okamura
+    ("Effects of position quantization and sampling rate on virtual-wall passivity", IEEE
+    Transactions on Robotics 21, 2005), both without the delay of an answer and a damping.
+    """
+
+    stiffness: float
+    damping: float
+    draws: FloatArray
+    colgate: float
+    abbott: float
+
+
+@dataclass(frozen=True)
+class Passivity:
+    """Passivity of walls that a controller renders.
+
+    tracker: of the speed that a wall's damping sees. actuators: (n, n_parameters), the identified
+    one first.
+    """
+
+    controller: TunedController
+    tracker: Tracker
+    actuators: FloatArray
+
+    @cached_property
+    def law(self) -> WallLaw:
+        """The controller's. Raises UnknownPassivityError as ``WallLaw.of`` does."""
+        return WallLaw.of(self.controller, self._time)
+
+    @cached_property
+    def ports(self) -> list[Port]:
+        """Of the actuators."""
+        model, law = self.controller.model, self.law
+        ahead = self.controller.control.ahead
+        return [
+            Port.of(ActuatorDynamics(model, p), law.z, self._time, ahead) for p in self.actuators
+        ]
+
+    def stiffest(self, port: Port, damping: float) -> float:
+        """Stiffest passive wall of a damping [N*m*s/rad] at a port; 0 where none is."""
+        law = self.law
+        speed = self.tracker.response(law.z, self._time)
+
+        def passive(K: float) -> bool:
+            """Whether a wall is. The wall's torque on the hand is -(K theta + B omega)."""
+            return port.passive(law.by_reference * (K + damping * speed) - law.by_angle)
+
+        low, high = 0.0, _STIFFEST
+        if not passive(1e-6):
+            return 0.0
+        for _ in range(_BISECTIONS):
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if passive(middle) else (low, middle)
+            if high - low < 1e-4 * high:
+                break
+        return low
+
+    def promise(self, count: float) -> WallPromise:
+        """The stiffest walls; count: angle of one of the encoder [rad]."""
+        nominal = self.ports[0]
+        dampings = np.linspace(0.0, 4.0 * nominal.damping, _DAMPINGS)
+        by_damping = [self.stiffest(nominal, damping) for damping in dampings.tolist()]
+        best = float(dampings[int(np.argmax(by_damping))])
+        draws = np.array([self.stiffest(port, best) for port in self.ports])
+        sure = float(np.percentile(draws, _SURE))
+        colgate = np.array([2.0 * port.damping / self._time for port in self.ports])
+        friction = np.array([2.0 * port.friction / count for port in self.ports])
+        return WallPromise(
+            sure,
+            best,
+            draws,
+            float(np.percentile(colgate, _SURE)),
+            float(np.percentile(np.minimum(colgate, friction), _SURE)),
+        )
+
+    @property
+    def _time(self) -> float:
+        return 1.0 / self.controller.control.sample_rate
+
+
+def _electrical(dynamics: ActuatorDynamics) -> tuple[FloatArray, FloatArray, FloatArray, int]:
+    """A, columns of the motor's command and of the speed, place of its current."""
+    names, inputs = dynamics.model.state_names, dynamics.model.input_names
+    A, B, _, _ = dynamics.linear(0.0, 0.0, 0.0)
+    inner = [i for i, name in enumerate(names) if name not in SHAFT]
+    command, omega = inputs.index("applied_voltage_motor"), names.index("omega")
+    place = inner.index(names.index("current_motor"))
+    return A[np.ix_(inner, inner)], B[inner, command], A[inner, omega], place
+
+
+def _currents(dynamics: ActuatorDynamics, s: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
+    """Motor current by its command [A/V] and by the shaft's speed [A*s/rad], at points s."""
+    A, command, omega, place = _electrical(dynamics)
+    inner = s[..., None, None] * np.eye(len(A)) - A
+    columns = np.stack([command, omega], axis=1)
+    both = np.linalg.solve(inner, np.broadcast_to(columns, (*s.shape, *columns.shape)))
+    by_volts, by_speed = (both[..., place, k].astype(np.complex128) for k in (0, 1))
+    return by_volts, by_speed
+
+
+def _sampled_current(dynamics: ActuatorDynamics, z: ComplexArray, time: float) -> ComplexArray:
+    """The same by a held command, at points z of a sampled system."""
+    A, command, _, place = _electrical(dynamics)
+    n = len(A)
+    block = np.zeros((n + 1, n + 1))
+    block[:n, :n], block[:n, n] = A, command
+    step = expm(block * time)
+    inner = z[:, None, None] * np.eye(n) - step[:n, :n]
+    held = np.broadcast_to(step[:n, n:], (len(z), n, 1))
+    response: ComplexArray = np.linalg.solve(inner, held)[:, place, 0].astype(np.complex128)
+    return response

@@ -1,0 +1,99 @@
+"""Which walls are passive: against the closed form, against hands that would make them unstable."""
+
+import numpy as np
+import pytest
+
+from daq.lookup.controllers import load_controller
+from haptics.dynamics import ActuatorDynamics
+from haptics.linear_loop import sampled_actuator
+from haptics.passivity import Passivity, Port, Tracker, UnknownPassivityError, disc
+from protocols.control.loop import tracker_gains
+from tests.haptics.test_torque_tracking import controller
+
+COUNT = 2.0 * np.pi / 8192.0
+T = 1.0 / 800.0
+TRACKER = Tracker(*tracker_gains(150.0, T))
+
+
+@pytest.mark.parametrize("delay", [0, 1])
+@pytest.mark.parametrize("damping", [0.0, 1e-4])
+def test_of_an_ideal_amplifier_the_disc_is_the_theorem(delay, damping):
+    """b > T / 2 / (1 - cos) Re((1 - e^-j) H), Colgate and Schenkel, within a thousandth."""
+    b, angle = 2e-4, np.pi * np.geomspace(1e-3, 1.0, 200)
+    z = np.exp(1j * angle)
+    s = 1j * (angle[:, None] / T + 2.0 * np.pi / T * np.arange(-400, 401))
+    centre, radius = disc(np.ones_like(s), np.full(s.shape, b), s, T, delay)
+    port = Port(centre, radius, b, 0.0)
+
+    def needed(K):
+        H = (K + damping * (z - 1.0) / z / T) / z**delay
+        return (0.5 * T / (1.0 - np.cos(angle)) * ((1.0 - 1.0 / z) * H).real).max()
+
+    stiffest = max(K for K in np.linspace(1e-3, 0.6, 600) if needed(K) < b)
+    for scale, passive in ((0.99, True), (1.01, False)):
+        assert port.passive(scale * stiffest + damping * (z - 1.0) / z / T) == passive
+
+
+def passivity(folder, kind, draws=0, **settings):
+    path = controller(folder, kind, **settings)
+    tuned = load_controller(str(path), folder)
+    factors = np.random.default_rng(0).normal(1.0, 0.05, (draws, len(tuned.parameters)))
+    actuators = np.concatenate([tuned.parameters[None], tuned.parameters * factors])
+    return Passivity(tuned, TRACKER, actuators)
+
+
+def spectral_radius(dynamics, K, B, spring):
+    """Of the loop of a static law's wall, the sliding shaft and a spring at the handle."""
+    Phi, Gamma, C = sampled_actuator(dynamics, "sliding forwards", (spring, 0.0), T)
+    n, gain = len(Phi), 1.0 / (dynamics.motor_constant * dynamics.motor.gain)
+    alpha, beta = TRACKER.alpha, TRACKER.beta
+    A = np.zeros((n + 3, n + 3))
+    A[:n, :n], A[:n, n + 2] = Phi, Gamma[:, 0]
+    predicted = np.array([1.0, T])
+    A[n, n : n + 2], A[n, :n] = (1.0 - alpha) * predicted, alpha * C[0]
+    A[n + 1, n : n + 2] = np.array([0.0, 1.0]) - beta / T * predicted
+    A[n + 1, :n] = beta / T * C[0]
+    A[n + 2] = -gain * B * A[n + 1]
+    A[n + 2, :n] -= gain * K * C[0]
+    return np.abs(np.linalg.eigvals(A)).max()
+
+
+def test_no_spring_at_the_handle_makes_a_promised_wall_unstable(tmp_path):
+    check = passivity(tmp_path, "static")
+    promise, dynamics = check.promise(COUNT), ActuatorDynamics(check.controller.model)
+    springs = np.geomspace(1e-4, 100.0, 120)
+
+    def worst(K):
+        return max(spectral_radius(dynamics, K, promise.damping, spring) for spring in springs)
+
+    assert worst(promise.stiffness) < 1.0
+    assert worst(1.2 * promise.stiffness) > 1.0
+
+
+def test_a_promise_holds_for_most_of_the_actuators(tmp_path):
+    check = passivity(tmp_path, "static", draws=30)
+    promise = check.promise(COUNT)
+    nominal = promise.draws[0]
+    assert promise.stiffness < nominal
+    assert np.mean(promise.draws >= promise.stiffness) > 0.9
+    assert promise.abbott <= promise.colgate
+
+
+def test_what_is_taken_off_cannot_be_promised(tmp_path):
+    assert passivity(tmp_path, "feedforward").promise(COUNT).stiffness == 0.0
+    plain = {"friction_share": 0.0, "inertia_share": 0.0}
+    inverse = passivity(tmp_path, "feedforward", **plain).promise(COUNT)
+    assert 0.1 < inverse.stiffness < 0.2
+
+
+def test_of_a_law_that_takes_the_torque_sensor_nothing_is_promised(tmp_path):
+    with pytest.raises(UnknownPassivityError, match="feeds the hand's torque back"):
+        passivity(tmp_path, "lqg").promise(COUNT)
+
+
+def test_a_port_has_the_friction_of_its_actuator(tmp_path):
+    check = passivity(tmp_path, "static")
+    dynamics = ActuatorDynamics(check.controller.model)
+    port = check.ports[0]
+    assert port.damping == pytest.approx(2e-4)
+    assert port.friction == pytest.approx(abs(dynamics.rest(0.0, 0.0, dynamics.sliding, 0.0)))
