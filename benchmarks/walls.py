@@ -1,0 +1,189 @@
+"""Which virtual walls are passive for certain, and which rest in simulation: the Z-width.
+
+python -m benchmarks.walls [--json] [--rates 800 4000] [--hands 24] [--plot z_width.png]
+
+Walls rendered by the static law and by the inverse without what it takes off (friction, inertia),
+by the motor alone and with the brake: switched on in contact, or shared by its hysteresis state.
+Guaranteed: passive by ``haptics.passivity`` with 95 % over actuators whose parameters are uncertain
+by 3 %, in any passive hand. Simulated: the stiffest wall that rests in all of so many hands from
+1/4 to 4 times that of (A.2), each with an actuator of its own, after a tap. The best rendered
+damping of each.
+"""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from benchmarks._common import arguments, report
+from daq import tune
+from daq.experiment import TripLimits
+from daq.lookup.controllers import TunedController, load_controller
+from haptics import trial
+from haptics.evidence import Scene, run_trials
+from haptics.passivity import Passivity, Tracker
+from protocols.control.loop import tracker_gains
+
+MODEL = "actuator:parameters=rig"
+UNCERTAIN = ("K_m", "J_m", "B_m", "c0", "alpha0", "alpha1", "R_m", "L_m")
+SPREAD = 0.03
+PLAIN = {"friction_share": 0.0, "inertia_share": 0.0}
+VARIANTS: dict[str, dict[str, Any]] = {
+    "static, motor": {"controller": "static", "allocation": "motor"},
+    "static, brake on in contact": {"controller": "static", "allocation": "motor", "contact": 0.1},
+    "inverse, motor": {"controller": "feedforward", "allocation": "motor", **PLAIN},
+    "inverse, shared": {"controller": "feedforward", "allocation": "heating", **PLAIN},
+    "inverse, friction taken off": {"controller": "feedforward", "inertia_share": 0.0},
+}
+DAMPINGS = (0.0, 2e-4, 3e-3)  # N*m*s/rad
+STIFFEST = 400.0  # N*m/rad
+COUNT = 2.0 * math.pi / 8192.0
+LIMITS = TripLimits(math.inf, math.inf, math.inf, math.inf, (-5.0, 5.0), (0.0, 0.38), COUNT)
+BANDWIDTH = 150.0  # Hz
+POSITION, LEAN = 0.2, 0.5  # rad
+
+
+def main() -> None:
+    parser = arguments(__doc__ or "")
+    parser.add_argument("--rates", type=float, nargs="+", default=[800.0, 4000.0])
+    parser.add_argument("--hands", type=int, default=12)
+    parser.add_argument("--plot", type=Path)
+    options = parser.parse_args()
+    rows = [
+        {"rate": rate, "variant": name, **measure(rate, dict(settings), options.hands)}
+        for rate in options.rates
+        for name, settings in VARIANTS.items()
+    ]
+    if options.plot is not None:
+        draw(rows, options.plot)
+    report({"walls": rows}, options.json, show)
+
+
+def measure(rate: float, settings: dict[str, Any], hands: int) -> dict[str, Any]:
+    """Stiffest walls of one variant, guaranteed and simulated, by rendered damping."""
+    contact = settings.pop("contact", 0.0)
+    tuned = controller(rate, settings)
+    tracker = Tracker(*tracker_gains(BANDWIDTH, 1.0 / rate))
+    actuators = np.concatenate([tuned.parameters[None], tuned.plausible(40)])
+    passivity = Passivity(tuned, tracker, actuators)
+    promise = passivity.promise(COUNT)
+    simulated = [stiffest(tuned, damping, contact, hands) for damping in DAMPINGS]
+    guaranteed = [
+        float(np.percentile([passivity.stiffest(port, B) for port in passivity.ports], 5.0))
+        for B in DAMPINGS
+    ]
+    return {
+        "guaranteed": promise.stiffness,
+        "guaranteed_damping": promise.damping,
+        "colgate": promise.colgate,
+        "abbott": promise.abbott,
+        "simulated": max(simulated),
+        "by_damping": {"guaranteed": guaranteed, "simulated": simulated},
+    }
+
+
+def controller(rate: float, settings: dict[str, Any]) -> TunedController:
+    """A controller for the rig's own parameters, known to 3 %."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        file = folder / "settings.yaml"
+        file.write_text(yaml.safe_dump({"sample_rate": rate, **settings}))
+        path = folder / "controller.yaml"
+        tune(file, model=MODEL).save(path)
+        content = yaml.safe_load(path.read_text())
+        factor = np.diag([SPREAD * content["parameters"][name] for name in UNCERTAIN])
+        content["covariance"] = {"parameters": list(UNCERTAIN), "factor": factor.tolist()}
+        path.write_text(yaml.safe_dump(content))
+        return load_controller(str(path), folder)
+
+
+def stiffest(tuned: TunedController, damping: float, contact: float, hands: int) -> float:
+    """The stiffest wall below the softest that did not rest [N*m/rad]."""
+    low, high = 0.0, math.inf
+    stiffness = 0.05
+    while stiffness < STIFFEST and high == math.inf:
+        if rests(tuned, stiffness, damping, contact, hands):
+            low, stiffness = stiffness, 2.0 * stiffness
+        else:
+            high = stiffness
+    while high < math.inf and high > 1.1 * max(low, 0.02):
+        middle = math.sqrt(max(low, 0.02) * high)
+        if rests(tuned, middle, damping, contact, hands):
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+def rests(
+    tuned: TunedController, stiffness: float, damping: float, contact: float, hands: int
+) -> bool:
+    """Whether a wall comes to rest in all hands."""
+    program = tuned.control.program(tuned.model, tuned.parameters)
+    outcomes = run_trials(
+        tuned, program, [scene(tuned, stiffness, damping, contact)], LIMITS, hands
+    )
+    return not (outcomes.restless | outcomes.left).any()
+
+
+def scene(tuned: TunedController, stiffness: float, damping: float, contact: float) -> Scene:
+    """A hand that leans against a wall, and a tap of 5 ms."""
+    time = 1.0 / tuned.control.sample_rate
+    tapped, n = round(0.5 / time), round(1.4 / time)
+    path = np.clip(np.arange(n + 1) * time / 0.3, 0.0, 1.0) * (POSITION + LEAN)
+    alpha, beta = tracker_gains(BANDWIDTH, time)
+    wall = np.zeros(trial.WALL)
+    wall[: trial.TAP] = stiffness, damping, POSITION, contact, alpha, beta / time
+    wall[trial.TAP : trial.SOFT] = 0.06, tapped, tapped + round(5e-3 / time)
+    # No softer wall before: it would ring by itself where the delay is long.
+    wall[trial.SOFT :] = min(stiffness, 0.1), damping, 8.0
+    return Scene(np.zeros(n), np.ones(n), path, wall)
+
+
+def draw(rows: list[dict[str, Any]], path: Path) -> None:
+    """The Z-width at each rate: guaranteed and simulated, motor alone and with the brake."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    rates = sorted({row["rate"] for row in rows})
+    figure, axes = plt.subplots(1, len(rates), figsize=(5.2 * len(rates), 4.2), squeeze=False)
+    names = list(VARIANTS)
+    for rate, axis in zip(rates, axes[0], strict=True):
+        chosen = {row["variant"]: row for row in rows if row["rate"] == rate}
+        place = np.arange(len(names))
+        for shift, key, color in ((-0.2, "guaranteed", "#1f77b4"), (0.2, "simulated", "#ff7f0e")):
+            heights = [max(chosen[name][key], 1e-2) for name in names]
+            bars = axis.bar(place + shift, heights, 0.38, label=key, color=color)
+            labels = [f"{chosen[name][key]:.2g}" for name in names]
+            axis.bar_label(bars, labels, fontsize=7)
+        first = chosen[names[0]]
+        axis.axhline(first["colgate"], color="0.4", lw=0.8, ls="--", label="Colgate, no delay")
+        axis.set_yscale("log")
+        axis.set_xticks(place, [name.replace(", ", ",\n") for name in names], fontsize=7)
+        axis.set_title(f"{rate:g} Hz", fontsize=9)
+        axis.set_ylabel("stiffest wall [N·m/rad]", fontsize=8)
+        axis.tick_params(labelsize=7)
+    axes[0][0].legend(fontsize=7)
+    figure.tight_layout()
+    figure.savefig(path, dpi=110)
+
+
+def show(figures: dict[str, Any]) -> None:
+    print("stiffest walls [N*m/rad]")
+    print(f"{'rate':>6} {'variant':<30} {'guaranteed':>10} {'simulated':>10} {'Colgate':>8} Abbott")
+    for row in figures["walls"]:
+        print(
+            f"{row['rate']:>6g} {row['variant']:<30} {row['guaranteed']:>10.3g} "
+            f"{row['simulated']:>10.3g} {row['colgate']:>8.3g} {row['abbott']:.3g}"
+        )
+
+
+if __name__ == "__main__":
+    main()
