@@ -87,7 +87,7 @@ class Tuning:
                 for point in self.operating_points()
             ],
             **({"without_interval": list(self.uncertain)} if self.uncertain else {}),
-            **({"covariance": dict(self.covariance)} if self.covariance else {}),
+            **({"covariance": dict(self.covariance)} if self.covariance.get("parameters") else {}),
             "software": software_versions(),
         }
 
@@ -143,8 +143,8 @@ def tune(
         chosen, values = read_parameters(file.path, trust=False)
         vector = chosen.vector(values)
         covariance, uncertain = _spread(file, chosen)
-        columns, factor = covariance["parameters"], np.array(covariance["factor"])
-        rows = factor.reshape(-1, len(columns))
+        columns = covariance["parameters"]
+        rows = np.array(covariance["factor"]).reshape(len(covariance["factor"]), len(columns))
         plausible = plausible_parameters(chosen, vector, columns, rows, draws, seed)
     if name_parts(name)[1] is not None:
         raise ConfigError(

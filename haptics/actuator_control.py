@@ -94,6 +94,8 @@ class ActuatorControl(TorqueControl):
             laws.INERTIA: dynamics.inertia,
             laws.STIFFNESS: dynamics.stiffness,
             laws.FRICTION: 1.0,
+            laws.YIELD_SHARE: 1.0,
+            laws.SLIDING: abs(dynamics.sliding),
             laws.MOTOR_GAIN: dynamics.motor.gain,
             laws.MOTOR_EMF: dynamics.motor.emf,
             laws.MOST_VOLTS: self.motor_current / dynamics.motor.gain,

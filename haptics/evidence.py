@@ -122,7 +122,8 @@ def family_margins(controller: TunedController, seed: int = 0) -> list[LoopMargi
     actuators = np.concatenate(
         [controller.parameters[None], controller.plausible(_FAMILY // 6 - 1, seed)]
     )
-    laws_of = {branch: LinearLaw.of(controller, branch) for branch in _BRANCHES}
+    program = control.program(controller.model, controller.parameters)
+    laws_of = {branch: LinearLaw.of(program, controller.model, branch) for branch in _BRANCHES}
     return [
         loop_margins(
             laws_of[branch],

@@ -38,9 +38,10 @@ MOTOR_GAIN, MOTOR_EMF, MOST_VOLTS, BRAKE_GAIN, BRAKE_DECAY, BRAKE_MEAN = 11, 12,
 # of the static law, of feedforward, of the regulator,
 STANDSTILL, BRAKE_SLOPE, SHARE, SMOOTHING, LEAD = 17, 18, 19, 20, 21
 # and of the shaft's filter x+ = A x + b N, x + L (y - C x), the regulator's gains, and the share of
-# friction that is compensated.
+# friction that is compensated: sliding, of that within the yield travel, and the z that slides.
 FILTER_ORDER = 5
-FILTER_A, FILTER_B, FILTER_L, REGULATOR, FRICTION, CONSTANTS = 22, 47, 52, 62, 83, 84
+FILTER_A, FILTER_B, FILTER_L, REGULATOR = 22, 47, 52, 62
+FRICTION, YIELD_SHARE, SLIDING, CONSTANTS = 83, 84, 85, 86
 
 # States: of the filter,
 ANGLE, SPEED, HAND, HAND_RATE, DISTURBANCE = 0, 1, 2, 3, 4
@@ -202,7 +203,7 @@ def give(wanted: float, s: Array, c: Array, p: Array, volts: Array) -> float:
     omega, z, theta = s[NEXT_SPEED], s[NEXT_Z], s[NEXT_ANGLE]
     without = rest(0.0, omega, z, theta, c, p)
     per_ampere = rest(1.0, omega, z, theta, c, p) - without
-    needed = wanted - c[FRICTION] * without
+    needed = wanted - friction_share(z, c) * without
     i_b = brake_current(needed, per_ampere, c)
     from_brake = per_ampere * mean_brake_current(i_b, s, c)
     i_m = motor_current(needed - from_brake, c)
@@ -210,6 +211,12 @@ def give(wanted: float, s: Array, c: Array, p: Array, volts: Array) -> float:
     volts[0] = min(max(motor, -c[MOST_VOLTS]), c[MOST_VOLTS])
     volts[1] = i_b / c[BRAKE_GAIN]
     return c[MOTOR_CONSTANT] * i_m + from_brake - needed
+
+
+def friction_share(z: float, c: Array) -> float:
+    """Of the friction that is taken off, scheduled by how far the hysteresis has yielded."""
+    yielded = min(abs(z) / c[SLIDING], 1.0)
+    return c[FRICTION] * (c[YIELD_SHARE] + (1.0 - c[YIELD_SHARE]) * yielded)
 
 
 def next_brake_current(s: Array, c: Array) -> None:

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import expm
 
-from daq.lookup.controllers import TunedController
+from daq.torque import LawProgram
 from haptics import laws
 from haptics.dynamics import ActuatorDynamics
 from haptics.operating_points import Branch, operating_point
-from haptics.program import compiled_laws
+from haptics.program import law_functions
 from sysid import ProcessModel
 from sysid.arrays import FloatArray
 
@@ -42,17 +42,18 @@ class LinearLaw:
     D: FloatArray
 
     @classmethod
-    def of(cls, controller: TunedController, branch: Branch = "within yield") -> "LinearLaw":
-        """That of a controller on a branch of the hysteresis."""
-        program = controller.control.program(controller.model, controller.parameters)
-        run = compiled_laws(controller.model)[program.entry]
-        c, p = np.array(program.constants), np.array(program.parameters)
+    def of(
+        cls, program: LawProgram, model: ProcessModel, branch: Branch = "within yield"
+    ) -> "LinearLaw":
+        """That of a program on a branch of the hysteresis."""
+        run = getattr(law_functions(model), program.entry)
+        c, p = list(program.constants), list(program.parameters)
         speed = _DIRECTIONS[branch] * _SPEED
 
         def step(s: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-            later, volts = s.copy(), np.zeros(2)
+            later, volts = s.tolist(), [0.0, 0.0]
             run(*y.tolist(), 0, later, c, p, volts)
-            return later, volts
+            return np.array(later), np.array(volts)
 
         s, y = np.zeros(program.n_states), np.zeros(5)
         for k in range(_SETTLED):

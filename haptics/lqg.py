@@ -18,6 +18,11 @@ wind nothing up.
 The hand is not known. ``tuned`` raises the effort until the loop is stable, with a largest
 sensitivity of ``sensitivity`` at the motor, for hands from 1 / ``hand_range`` to ``hand_range``
 times the design's at both ends of what the identification leaves of inertia and motor constant.
+
+That loop has friction taken off exactly. Within the yield travel friction is a spring, and taking
+it off a sample late leaves a light hand little margin. So the share that is taken off is scheduled
+by the hysteresis: ``yield_share`` of it at z = 0, all of it where the brake slides. ``tuned``
+lowers it until the program's own loop, linearised there, has the same margin.
 """
 
 import itertools
@@ -35,6 +40,7 @@ from haptics import laws
 from haptics.actuator_control import ActuatorControl
 from haptics.dynamics import ActuatorDynamics
 from haptics.feedforward import encoder_noise
+from haptics.linear_loop import LinearLaw, loop_margins
 from haptics.observer import Hand, SensorNoise, ShaftFilter
 from haptics.program import law_program
 from sysid import ModelError, ProcessModel
@@ -42,6 +48,7 @@ from sysid.arrays import FloatArray
 
 _EFFORTS = np.geomspace(1.0, 1e6, 25)  # in parts of the least
 _FREQUENCIES = 60
+_SHARES = np.linspace(1.0, 0.3, 8)
 
 
 class Lqg(ActuatorControl):
@@ -72,6 +79,12 @@ class Lqg(ActuatorControl):
     effort: Part = Field(
         0.3, gt=0.0, le=1e6, description="weight of the motor's changes, the least; tune raises it"
     )
+    yield_share: Part = Field(
+        1.0,
+        gt=0.0,
+        le=1.0,
+        description="of the friction taken off, that within the yield travel; tune lowers it",
+    )
     sensitivity: Part = Field(
         3.0, gt=1.0, le=10.0, description="largest of the loop at the motor, over all these hands"
     )
@@ -82,7 +95,10 @@ class Lqg(ActuatorControl):
         parameters: FloatArray,
         facts: tuple[Fact, ...],
     ) -> Self:
-        """The least effort at which every plausible loop is stable with a margin."""
+        """The least effort at which every plausible loop is stable with a margin.
+
+        Then the largest share of the friction within the yield travel that leaves it, if any does.
+        """
         dynamics = ActuatorDynamics(model, parameters)
         by_name = {fact.name: fact for fact in facts}
         inertias, constants = (by_name[name].ends for name in ("inertia", "motor_constant"))
@@ -95,18 +111,43 @@ class Lqg(ActuatorControl):
             cases = itertools.product({*inertias}, {*strengths}, hands)
             peak = max(loop.peak_sensitivity(*case) for case in cases)
             if peak <= self.sensitivity:
-                return control
+                return control.scheduled(model, parameters)
         raise ModelError(
             f"no effort keeps the loop's sensitivity within {self.sensitivity:g} for all hands up "
             f"to {self.hand_range:g} times either way (at most {peak:.3g} is left); raise "
             "sensitivity, or lower hand_range or hand_rate"
         )
 
+    def scheduled(self, model: ProcessModel, parameters: FloatArray) -> Self:
+        """With the share of the friction within the yield travel that its margin asks for."""
+        dynamics, time = ActuatorDynamics(model, parameters), 1.0 / self.sample_rate
+        hands = np.geomspace(1.0 / self.hand_range, self.hand_range, 3).tolist()
+        peaks = {}
+        for share in (self.yield_share * _SHARES).tolist():
+            control = self.model_copy(update={"yield_share": float(f"{share:.4g}")})
+            law = LinearLaw.of(control.program(model, parameters), model)
+            peaks[control.yield_share] = max(
+                loop_margins(
+                    law,
+                    dynamics,
+                    "within yield",
+                    (hand * self.hand_stiffness, hand * self.hand_damping),
+                    time,
+                    self.ahead,
+                ).sensitivity
+                for hand in hands
+            )
+            if peaks[control.yield_share] <= self.sensitivity:
+                return control
+        best = min(peaks, key=lambda share: peaks[share])
+        return self.model_copy(update={"yield_share": best})
+
     def program(self, model: ProcessModel, parameters: FloatArray) -> LawProgram:
         """The regulator on top of the inverse."""
         dynamics = ActuatorDynamics(model, parameters)
         constants = self.shaft_filter(dynamics.inertia).placed(self.constants(dynamics))
         constants = Regulator.of(self, dynamics.inertia).placed(constants)
+        constants[laws.YIELD_SHARE] = self.yield_share
         return law_program("lqg", model, parameters, constants)
 
     def shaft_filter(self, inertia: float) -> ShaftFilter:

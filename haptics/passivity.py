@@ -87,7 +87,9 @@ class WallLaw:
                 f"{control.controller} feeds the hand's torque back: its passivity is that of no "
                 "impedance by angle alone, and nothing is promised of it"
             )
-        law, dynamics = LinearLaw.of(controller), ActuatorDynamics(controller.model)
+        program = control.program(controller.model, controller.parameters)
+        law = LinearLaw.of(program, controller.model)
+        dynamics = ActuatorDynamics(controller.model, controller.parameters)
         z = np.exp(1j * np.pi * np.geomspace(1e-3, 1.0, _FREQUENCIES))
         current = _sampled_current(dynamics, z, time) / z**control.ahead
         rows = [law.F.shape[0]]

@@ -80,7 +80,7 @@ def test_a_limit_ends_the_trials_that_reach_it(static):
 
 def test_a_law_that_feeds_nothing_back_has_all_margins(static):
     _, _, tuned = static
-    law = LinearLaw.of(tuned)
+    law = LinearLaw.of(tuned.control.program(tuned.model, tuned.parameters), tuned.model)
     margins = loop_margins(law, ActuatorDynamics(tuned.model), "within yield", HAND, 1.0 / 800.0, 1)
     assert margins.stable and margins.sensitivity == pytest.approx(1.0)
     assert margins.disk == pytest.approx(2.0)

@@ -7,6 +7,7 @@ import pytest
 
 from haptics import laws
 from haptics.dynamics import ActuatorDynamics
+from haptics.linear_loop import LinearLaw, loop_margins
 from haptics.lqg import Lqg, Regulator, TorqueLoop
 from sim_rig.actuator import actuator
 from sysid import ModelError
@@ -89,3 +90,17 @@ def test_currents_at_their_limits_wind_nothing_up():
         s[laws.DELTAS] += min(delta, 0.1) - delta
     assert s[laws.DELTAS] == pytest.approx(0.1)
     assert laws.regulate(-0.5, 0.0, s, c) < 0.0
+
+
+def test_tuning_leaves_the_same_margin_within_the_yield_travel():
+    """There friction is a spring, which is taken off late: less of it in a light hand."""
+    facts = CONTROL.facts(MODEL, MODEL.nominal, NO_DRAWS)
+    tuned = CONTROL.tuned(MODEL, MODEL.nominal, facts)
+    assert 0.3 < tuned.yield_share < 1.0
+
+    def peak(control):
+        law = LinearLaw.of(control.program(MODEL, MODEL.nominal), MODEL)
+        hand = CONTROL.hand_stiffness / 4.0, CONTROL.hand_damping / 4.0
+        return loop_margins(law, DYNAMICS, "within yield", hand, 1.0 / 800.0, 1).sensitivity
+
+    assert peak(tuned) <= CONTROL.sensitivity < 0.5 * peak(CONTROL)

@@ -9,6 +9,7 @@ import yaml
 
 import haptics
 from daq import tune
+from daq.lookup.controllers import load_controller
 from sim_rig.actuator import actuator
 from tests.daq.support import rig
 
@@ -66,6 +67,20 @@ def test_draws_keep_the_models_constraints(tmp_path):
     gamma, beta = (RIG.parameter_names.index(name) for name in ("gamma", "beta"))
     assert 50 < len(tuning.draws) < 195
     assert np.all(tuning.draws[:, gamma] >= tuning.draws[:, beta])
+
+
+def test_a_result_without_a_covariance_is_tuned_to_as_it_is(tmp_path):
+    tuning = tune(write(tmp_path / "t.yaml", SETTINGS), result(tmp_path))
+    tuning.save(tmp_path / "c.yaml")
+    assert "covariance" not in tuning.document
+    assert load_controller("c.yaml", tmp_path).plausible(3).shape == (0, len(RIG.nominal))
+
+
+def test_a_controller_has_the_covariance_of_its_result(tmp_path):
+    tuning = tune(write(tmp_path / "t.yaml", SETTINGS), result(tmp_path, K={"K_m": 0.02}))
+    tuning.save(tmp_path / "c.yaml")
+    drawn = load_controller("c.yaml", tmp_path).plausible(200)[:, RIG.parameter_names.index("K_m")]
+    assert np.std(drawn) == pytest.approx(0.02 * 0.1412, rel=0.15)
 
 
 def test_the_command_writes_what_it_shows(tmp_path):
