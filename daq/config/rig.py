@@ -59,6 +59,11 @@ class Encoder(Section):
 
     cycles: int = Field(2048, ge=1, le=1_000_000, description="cycles per revolution")
     sign: Sign = Field(1, description="-1 turns the direction round")
+    speed: Literal["edges", "auto"] = Field(
+        "auto",
+        description="what makes omega: edges is the time between the last two counts, as in the "
+        "reference firmware; auto looks whether a log's slow motion shows that; fast logs do not",
+    )
 
     @property
     def count(self) -> float:

@@ -28,13 +28,15 @@ _OFF_COUNT = 0.05  # counts that a printed angle may be off a whole one
 _OFF_TICK = 0.02  # samples that printed speeds may put an edge off
 _CREDIBLE = 0.85, 1.2  # change of the speed within an interval that its neighbour can tell
 _FEWEST, _SHARE = 3, 0.8  # of the intervals that can be checked, those that must agree
+_MANY = 20  # intervals that contradict what somebody says
 
 
 @dataclass(frozen=True)
 class MeanSpeeds:
     """Speeds as means over known times.
 
-    values: (n,) [rad/s], NaN for samples between edges of which none was timed. windows: (n, 2),
+    values: (n,) [rad/s], NaN for samples between edges of which none was timed, and where the
+    shaft turned round amid several edges of a sample. windows: (n, 2),
     begin and end of what each is the mean over [s], from its sample on. jitter: (n,), standard
     deviations of when they were [s].
     """
@@ -53,7 +55,8 @@ class _Intervals:
     begin: FloatArray
     end: FloatArray
     slack: FloatArray  # by which it may lie earlier or later
-    agree: bool  # whether lengths and edges do
+    checked: int  # those whose length and edges can be compared
+    agreeing: int  # of them
 
     @classmethod
     def of(cls, tick: IntArray, counts: FloatArray, rates: FloatArray) -> _Intervals:
@@ -83,22 +86,43 @@ class _Intervals:
         end[timed[agreeing]] = 0.5 * (low + high)[agreeing]
         slack[timed[agreeing]] = 0.5 * np.maximum(high - low, 0.0)[agreeing]
         begin = np.where(rate == 0.0, np.append(earliest[0], end[:-1]), end - length)
-        agree = bool(agreeing.sum() >= max(_FEWEST, _SHARE * len(timed)))
-        return cls(rows, rate, begin, end, slack, agree)
+        # A turn shows as a speed of zero. Amid several edges nothing tells when the one before was.
+        lone = (np.abs(np.diff(counts[rows], prepend=np.nan)) == 1.0) & (_faster(rate) < 1.0)
+        rate = np.where((rate == 0.0) & ~lone, np.nan, rate)
+        return cls(rows, rate, begin, end, slack, len(timed), int(agreeing.sum()))
+
+    def show_edges(self, known: bool) -> bool:
+        """Whether edges made the speeds; known: somebody says so, and is believed if need be."""
+        if known and self.checked < _MANY:
+            return True
+        return self.agreeing >= max(_FEWEST, _SHARE * self.checked)
+
+
+def _faster(rate: FloatArray) -> FloatArray:
+    """The faster of the speeds before and after each, (n,), without its sign."""
+    size: FloatArray = np.pad(np.abs(rate), 1)
+    faster: FloatArray = np.maximum(size[:-2], size[2:])
+    return faster
 
 
 def mean_speeds(
-    tick: IntArray, theta: FloatArray, omega: FloatArray, dt: float, count: float
+    tick: IntArray,
+    theta: FloatArray,
+    omega: FloatArray,
+    dt: float,
+    count: float,
+    by_edges: bool = False,
 ) -> MeanSpeeds | None:
     """What an encoder's speeds are the means of; None where its edges did not make them.
 
     tick, theta [rad], omega [rad/s]: (n,), of a log's rows. count: angle of a count [rad].
+    by_edges: edges are known to have made them; else slow motion must show it.
     """
     counts = np.rint(theta / count)
     if np.abs(theta / count - counts).max() > _OFF_COUNT:
         return None
     intervals = _Intervals.of(tick, counts, omega * (dt / count))
-    if not intervals.agree:
+    if not intervals.show_edges(by_edges):
         return None
     rates, begin, end, slack = _at_rows(intervals, tick)
     windows = np.stack([begin - tick, end - tick], axis=1) * dt

@@ -88,11 +88,12 @@ class Recording:
             return None
         try:
             sensors = settings_of(self.record)[1]["sensors"]
-            count = Encoder.model_validate(sensors["encoder"]).count
+            encoder = Encoder.model_validate(sensors["encoder"])
         except (KeyError, TypeError, ValueError):
             return None
         tick, theta, omega = (self.frame[name].to_numpy() for name in ("tick", "theta", SPEED))
-        return mean_speeds(tick, theta, omega, self.dt, count)
+        by_edges = encoder.speed == "edges"
+        return mean_speeds(tick, theta, omega, self.dt, encoder.count, by_edges)
 
 
 def load(path: str | Path, extra: Sequence[str] = ()) -> Recording:

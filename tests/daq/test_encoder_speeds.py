@@ -88,6 +88,28 @@ def test_its_jitter_says_how_far_a_mean_may_be_off(angle):
     assert 0.4 < np.sqrt(np.mean((error[clear] / expected[clear]) ** 2)) < 1.2
 
 
+def shaking(t):
+    return 0.21 + 0.06 * np.sin(2.0 * math.pi * 52.0 * t)  # up to 20 rad/s: 32 edges in a sample
+
+
+def test_fast_motion_that_cannot_show_what_made_its_speeds_has_to_be_told():
+    tick, theta, omega = logged(shaking, 0.6)
+    assert mean_speeds(tick, theta, omega, DT, COUNT) is None
+    speeds = mean_speeds(tick, theta, omega, DT, COUNT, by_edges=True)
+    error = speeds.values - mean_over(shaking, speeds.windows)
+    # Where the shaft turns round amid several edges the counter shows 0, which it never was.
+    turns = (omega == 0.0) & (tick > 1)
+    assert turns.sum() > 5 and np.isnan(speeds.values[turns]).all()
+    assert np.isnan(speeds.values).mean() < 0.2
+    assert np.sqrt(np.nanmean(error**2)) < 0.5
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_who_says_that_edges_made_the_speeds_is_not_believed_against_the_log(told):
+    tick, theta, _ = logged(swinging, 1.2)
+    assert mean_speeds(tick, *smoothed(tick, theta), DT, COUNT, by_edges=told) is None
+
+
 def test_a_shaft_that_stands_still_has_no_speed():
     tick, theta, omega = logged(stopping, 1.2)
     still = (tick * DT > 0.31) & (tick * DT < 0.79)

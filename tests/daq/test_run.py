@@ -109,7 +109,9 @@ def test_the_capture_folder_holds_the_run_as_resolved(completed):
         "validation": {},
         "metadata": {"operator": "", "sample": "", "note": "", "tags": []},
     }
-    assert record["rig"]["sensors"]["encoder"] == {"cycles": 2048, "sign": 1}, "defaults too"
+    assert record["rig"]["sensors"]["encoder"] == {"cycles": 2048, "sign": 1, "speed": "auto"}, (
+        "defaults too"
+    )
     assert record["rig"]["limits"]["command"]["brake"] == [0.0, 0.38]
     assert record["rig"]["options"]["journal"] == "journal.jsonl"
     assert record["software"]["hybrid-rig"] and record["software"]["numpy"] == np.__version__
