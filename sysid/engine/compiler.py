@@ -114,7 +114,7 @@ def _compiled(
 ) -> list[Any]:
     """Functions of kernels' text, compiled; called: the model's functions that it calls."""
     # Numba is slow to import.
-    from sysid.engine import intrinsics, vector_math
+    from sysid.engine import float_types, intrinsics, vector_math  # noqa: F401
     from sysid.engine.phi import scheme_matrices
 
     name = "".join(c if c.isalnum() else "_" for c in model.name)[:40]
