@@ -141,7 +141,8 @@ def compiled_text(name: str, text: str, functions: Sequence[str]) -> list[Any]:
 
     name: by which it lies in the cache folder.
 
-    >>> (double,) = compiled_text("example", "def double(x):\n    return 2.0 * x\n", ["double"])
+    >>> text = "def double(x): return 2.0 * x"
+    >>> (double,) = compiled_text("example", text, ["double"])
     >>> double(1.5)
     3.0
     """

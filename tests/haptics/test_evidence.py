@@ -176,3 +176,27 @@ def test_no_promised_wall_rings_on_a_thousand_plausible_actuators(static):
     file = walls(folder, folder / "wide.yaml", **wall, rest=rest, brake_commands=[0.0])
     outcomes = trials(tuned, file, 1000)
     assert not outcomes.restless.any() and not outcomes.left.any()
+
+
+def test_a_wall_by_the_static_controller_is_that_of_volts_by_a_constant(tmp_path):
+    """Both give torque by constants alone: the same walls, but for the amplifier's gain."""
+    folder, path = tmp_path, controller(tmp_path, "static", allocation="motor")
+    few = {"stiffnesses": [2.0], "dampings": [0.01], "brake_commands": [0.0]}
+    depths = []
+    for chosen in (path, ""):
+        file = walls(folder, chosen, **few, calibration={"samples": 400})
+        run = record(file, "hand.yaml", folder / "runs", options={"ideal": True})
+        depths.append(run.frame.theta.to_numpy())
+    n = min(map(len, depths))
+    assert n > 1000 and np.abs(depths[0][:n] - depths[1][:n]).max() < 0.02
+
+
+def test_rig_check_tells_which_walls_are_passive(static):
+    folder, path, _ = static
+    file = walls(folder, path, stiffnesses=[0.2], dampings=[6e-5], brake_commands=[0.0])
+    options = ["--draws", "20", "--rig", "hand.yaml", "--json"]
+    done = rig("check", file.name, *options, cwd=folder)
+    assert done.returncode == 0, done.stderr
+    trials_of_check = json.loads(done.stdout)["trials"]
+    assert 0.2 < trials_of_check["passive_stiffness"] < 0.24
+    assert "in any passive hand" in trials_of_check["remarks"][-1]
