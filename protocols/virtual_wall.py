@@ -97,6 +97,9 @@ class VirtualWall(WallSettings):
             "passive_stiffness", promise.stiffness, "N*m/rad", meaning="of walls in any hand"
         )
         numbers = (*evidence.numbers, passive)
+        if evidence.refusal:
+            promised = f"walls up to {promise.stiffness:.3g} N*m/rad are passive {sure}"
+            return replace(evidence, refusal=f"{evidence.refusal}; {promised}")
         return replace(evidence, numbers=numbers, remarks=(*evidence.remarks, remark))
 
     def controller(self) -> Controller:
