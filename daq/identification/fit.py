@@ -26,6 +26,7 @@ from sysid import ModelError, ProcessModel, SearchSpace
 from sysid.gassi import GASSI, PRESETS
 from sysid.gassi import Progress as SearchProgress
 from sysid.judging.examination import examined, suspected
+from sysid.judging.lags import lag_faults
 from sysid.judging.plausibility import implausible
 from sysid.problem.copies import shared_samples
 from sysid.problem.data import require_information
@@ -228,7 +229,8 @@ def faults_of(problem: Problem, logs: Split) -> tuple[DataFault, ...]:
             units += implausible(model, _space(problem), datasets, part)
         except ModelError as error:
             raise ConfigError(str(error)) from None
-    return (*units, *faults)
+    late = lag_faults(model, [log.dataset for log in logs[0]])
+    return (*units, *late, *faults)
 
 
 def _space(problem: Problem) -> SearchSpace:

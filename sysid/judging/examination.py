@@ -11,6 +11,7 @@ from sysid.gassi import GASSI, PRESETS
 from sysid.judging.alternatives import Alternative, best_alternative, fits
 from sysid.judging.assessment import FITTED, RecordResult, Verdict, examine, judge
 from sysid.judging.expected_errors import expected_errors
+from sysid.judging.lags import lag_faults
 from sysid.judging.score_tests import Finding, missing_physics
 from sysid.judging.starts import estimated_starts
 from sysid.problem.data import Dataset
@@ -52,7 +53,10 @@ def verdict_of(
         validated,
         uncertainty,
         estimator.feasible_,
-        faults=data_faults(estimator.simulator().model, training, validation),
+        faults=(
+            *lag_faults(estimator.simulator().model, training),
+            *data_faults(estimator.simulator().model, training, validation),
+        ),
         findings=None if suspicion is None else suspicion.findings,
         alternative=None if suspicion is None else suspicion.alternative,
     )

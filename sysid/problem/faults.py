@@ -15,7 +15,7 @@ from sysid.problem.model import Input, Output, ProcessModel
 Part = Literal["training", "validation"]
 Severity = Literal["doubt", "note"]
 FaultKind = Literal[
-    "clipped", "frozen", "outliers", "coarse", "copy", "still", "constant", "gap", "unit"
+    "clipped", "frozen", "outliers", "coarse", "copy", "still", "constant", "gap", "unit", "lag"
 ]
 
 Role = Literal["command", "input", "sensor"]

@@ -1,0 +1,67 @@
+"""Channels that lag are told before a fit; what is not clear, and what does not lag, is not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks._stress_cases import CORRECT, MODEL, MORE_CORRECT, cases
+from benchmarks.stress import fitted
+from sysid import Dataset
+from sysid.judging.examination import verdict_of
+from sysid.judging.lags import Lag, lag_faults, lags
+
+CASES = {case.name: case for case in cases()}
+
+
+@pytest.mark.parametrize(
+    ("name", "lag"),
+    [
+        ("current a sample late", Lag(0, 0, 1)),
+        ("speed ten samples late", Lag(1, 0, 10)),
+        ("voltage two samples late", Lag(0, 0, -2)),
+        ("voltage ten samples late", Lag(0, 0, -10)),
+    ],
+)
+def test_a_lag_is_told_with_its_size(name, lag):
+    training, _ = CASES[name].records(0)
+    assert lag in lags(training)
+
+
+@pytest.mark.parametrize("case", [*CORRECT, *MORE_CORRECT], ids=lambda case: case.name)
+def test_channels_that_do_not_lag_are_let_alone(case):
+    training, _ = case.records(0)
+    assert lags(training) == ()
+
+
+@pytest.mark.filterwarnings("error")
+def test_of_inputs_that_move_together_nothing_is_clear():
+    training, _ = CASES["voltage ten samples late"].records(0)
+    together = [replace(r, inputs=r.inputs[:, :1] * [1.0, 0.5]) for r in training]
+    assert lags(together) == ()
+    still = [replace(r, inputs=0.0 * r.inputs) for r in training]
+    assert lags(still) == ()
+    assert lags([Dataset(np.zeros((5, 1)), np.zeros((5, 1)), 0.01)]) == ()
+
+
+def test_what_a_controller_makes_of_an_output_is_no_late_input():
+    """u follows y by a sample: y seems to move before u."""
+    rng, n = np.random.default_rng(0), 1500
+    target, u, y = np.repeat(rng.normal(size=n // 50), 50), np.zeros(n), np.zeros(n)
+    for k in range(n - 1):
+        u[k] = 0.5 * (target[k] - y[k - 1])
+        y[k + 1] = 0.9 * y[k] + u[k] + 0.5 * rng.normal()
+    assert lags([Dataset(u, y, 0.01)]) == ()
+
+
+def test_it_is_a_fault_of_the_data_that_the_verdict_names():
+    case = CASES["current a sample late"]
+    training, validation = case.records(0)
+    (fault,) = lag_faults(MODEL, training)
+    assert fault.channel == "current" and fault.severity == "doubt"
+    assert "current follows voltage 1 sample (0.002 s) later" in fault.statement
+    verdict = verdict_of(fitted(case, training, 0), training, [validation])
+    assert verdict.parameters.trust == "limited"
+    assert verdict.parameters.reasons[0] == fault.sentence
