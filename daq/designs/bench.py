@@ -6,11 +6,13 @@ from threading import Lock
 import numpy as np
 
 from daq.config.rig import RigConfig
+from daq.designs.knowledge import expected_jitter, speed_noise
 from daq.errors import ConfigError
 from daq.experiment import Plan
 from daq.hal import CHANNELS, FloatArray, IntArray, Phase, Samples
 from daq.limits import Limits
 from daq.limits.base import TURN
+from daq.logs.encoder import SPEED
 from daq.run.plan import check_commands
 from sysid import BatchSimulator, Dataset, ProcessModel
 
@@ -30,7 +32,8 @@ class PlantBench:
     zero. turns: wound up before each run. margin: part of each limit that is kept from it: whatever
     is commanded or measured must keep them when it is so much larger. noise: of the model's outputs
     by name; a run in which the plant does what the model does not, such as an amplifier at the end
-    of its range, would lead its parameters astray, and is refused as well.
+    of its range, would lead its parameters astray, and is refused as well. timed: whether the
+    rig's speed is one count over the time between edges, whose instants err.
     """
 
     def __init__(
@@ -41,6 +44,7 @@ class PlantBench:
         turns: float = 0.0,
         margin: float = 0.1,
         noise: Mapping[str, float] | None = None,
+        timed: bool = False,
     ) -> None:
         for name in set(model.input_names) - {*COMMANDS, *plant.output_names}:
             raise ConfigError(
@@ -56,6 +60,7 @@ class PlantBench:
                 f"{', '.join(MEASURED)}",
             )
         self._model, self._rig, self._turns = model, rig, turns
+        self._timed = timed and SPEED in model.output_names
         self._scale = 1.0 / (1.0 - margin)
         self._simulator = BatchSimulator(plant, accuracy=_ACCURACY, threads=1)
         self._model_simulator = BatchSimulator(model, accuracy=_ACCURACY, threads=1)
@@ -158,8 +163,11 @@ class PlantBench:
             for j, name in enumerate(simulator.model.output_names)
             if name in self._noise and name in signals
         }
+        # Noise of a speed that is timed is less than what its edges' instants make.
+        coarse = speed_noise(self._rig, 1.0 / record.dt) if self._timed else 0.0
+        most = {**self._noise, SPEED: max(self._noise.get(SPEED, 0.0), coarse)}
         return all(
-            float(np.sqrt(np.mean(error**2))) <= _ASTRAY * self._noise[name]
+            float(np.sqrt(np.mean(error**2))) <= _ASTRAY * most[name]
             for name, error in errors.items()
         )
 
@@ -208,7 +216,12 @@ class PlantBench:
             for name in self._model.input_names
         ]
         unseen = np.full((len(inputs), len(self._model.outputs)), np.nan)
-        return Dataset(np.column_stack(columns), unseen, dt, "design")
+        jitter = np.zeros_like(unseen)
+        if self._timed:
+            count = abs(self._rig.sensors.encoder.count)
+            speeds = self._model.output_names.index(SPEED)
+            jitter[:, speeds] = expected_jitter(signals[SPEED][run], dt, count)
+        return Dataset(np.column_stack(columns), unseen, dt, "design", jitter=jitter)
 
 
 def _wound(samples: Samples, turns: float) -> Samples:

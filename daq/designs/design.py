@@ -30,6 +30,7 @@ from daq.identification import stages
 from daq.identification.fit import check_writable
 from daq.identification.request import SettingsRequest
 from daq.identification.settings import Problem, problem_of
+from daq.logs.encoder import SPEED
 from daq.logs.recording import load as load_recording
 from daq.logs.recording import log_path
 from daq.lookup.models import find_model
@@ -135,7 +136,8 @@ def set_up(file: TypedSettings, watch: Watch = ignore) -> Setup:
         shown = ", ".join(f"{name} {deviation:.2g}" for name, deviation in noise.items())
         watch(Note("note", f"noise is assumed: {shown}; --log RUN takes a calibration's"))
     plant = _plant(file, question, rig_name, device, turns)
-    bench = PlantBench(problem.model, plant, rig, turns, question.margin / 100.0, noise)
+    timed = SPEED not in question.noise
+    bench = PlantBench(problem.model, plant, rig, turns, question.margin / 100.0, noise, timed)
     prior = prior_of(space, result)
     return Setup(file, question, rig_name, rig, problem, space, bench, families, prior, noise)
 

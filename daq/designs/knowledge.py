@@ -11,12 +11,15 @@ from daq.config.yaml_file import YamlFile
 from daq.errors import ConfigError
 from daq.hal import ANALOG_INPUTS, FloatArray
 from daq.identification import stages
+from daq.logs.encoder import SPEED
 from daq.logs.recording import Recording
 from sysid import ProcessModel, SearchSpace
 from sysid.experiments import Prior
 
 _VOLTS = 0.010  # rms at an analog input, where nothing tells more
 _COUNTS = 1.0 / 6.0  # of the count in a sample, by which a speed errs
+_TIMED = 0.1  # of that, beside what the instants of its edges do
+_REPEATED = 3.0  # samples at most that tell of the same edges while the speed changes
 
 
 def prior_of(space: SearchSpace, file: YamlFile | None) -> Prior:
@@ -98,7 +101,28 @@ def _assumed(rig: RigConfig, sample_rate: float) -> dict[str, float]:
     sensors = rig.sensors
     count = abs(sensors.encoder.count)
     analog = {name: _VOLTS * getattr(sensors, name).scale for name in ANALOG_INPUTS}
-    return {**analog, "theta": count / math.sqrt(12.0), "omega": _COUNTS * count * sample_rate}
+    omega = _TIMED * speed_noise(rig, sample_rate)
+    return {**analog, "theta": count / math.sqrt(12.0), SPEED: omega}
+
+
+def speed_noise(rig: RigConfig, sample_rate: float) -> float:
+    """Standard deviation of a speed by its encoder's counts in a sample [rad/s]."""
+    return _COUNTS * abs(rig.sensors.encoder.count) * sample_rate
+
+
+def expected_jitter(omega: FloatArray, dt: float, count: float) -> FloatArray:
+    """Standard deviations of when speeds were measured that are timed from edge to edge [s].
+
+    As ``daq.logs.encoder.mean_speeds`` finds them in a log on average. omega: (n,) [rad/s]; count:
+    angle of one [rad].
+
+    >>> (1e3 * expected_jitter(np.array([0.1, 1.0, 10.0]), 1e-3, 1e-3)).round(4).tolist()
+    [0.5, 0.2887, 0.0289]
+    """
+    length = count / np.maximum(np.abs(omega) * dt, 1e-3 * count)  # samples between edges
+    slack = np.minimum(length, 1.0) / math.sqrt(12.0)
+    jitter: FloatArray = dt * slack * np.sqrt(np.clip(length, 1.0, _REPEATED))
+    return jitter
 
 
 def require_calibrated(path: Path, log: Recording) -> None:

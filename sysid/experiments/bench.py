@@ -20,8 +20,8 @@ class Bench(Protocol):
         """What a run would log if the parameters were each of ``vectors`` (n, n_parameters).
 
         inputs: (n_samples, n), as an excitation gives them; dt: sample time [s]. None where a run
-        with any of the vectors would pass a limit. Of a record inputs and first samples count.
-        Several threads ask at once.
+        with any of the vectors would pass a limit. Of a record inputs, first samples and jitter
+        count. Several threads ask at once.
         """
 
 

@@ -1,8 +1,9 @@
 """Fisher information of an experiment before it is run.
 
 With the tangents S of the outputs by the search coordinates and white noise of variance r on each
-output it is F = S' S / r. Starts that a record does not tell take their part of it away; the Schur
-complement is left.
+output it is F = S' S / r. Where a sample's instant is known to a deviation j only (``jitter`` of a
+record), its error has the variance r + (j dy/dt)^2. Starts that a record does not tell take their
+part of it away; the Schur complement is left.
 
 Noise of a measured input moves the outputs by G n, which is not white. A fit divides each error by
 the variance s = r + var(G n) of its sample (``criterion: compensated`` of an identification). With
@@ -54,12 +55,17 @@ class Informant:
     def information(self, record: Dataset, chromosomes: FloatArray) -> FloatArray:
         """Of the search coordinates at chromosomes (n, n_free), (n, n_free, n_free).
 
-        Of the record only inputs and first samples count. Not finite where a simulation failed.
+        Of the record only inputs, first samples and jitter count. Not finite where a simulation
+        failed.
         """
         model, n_free = self._simulator.model, len(self._space.index)
         unknown = [i for i in range(len(model.states)) if record.initial_range(model, i)]
         slopes = self._slopes(record, chromosomes, unknown)
-        joint = [self._joint(each, n_free + len(unknown)) for each in slopes]
+        errors = self._errors(record, chromosomes)
+        joint = [
+            self._joint(each, scatter, n_free + len(unknown))
+            for each, scatter in zip(slopes, errors, strict=True)
+        ]
         return np.array([_without_starts(each, n_free) for each in joint])
 
     def _slopes(
@@ -94,18 +100,28 @@ class Informant:
         )
         return slopes
 
-    def _joint(self, slopes: FloatArray, n: int) -> FloatArray:
+    def _errors(self, record: Dataset, chromosomes: FloatArray) -> FloatArray:
+        """Variances of the samples' errors, inputs without noise, (n, n_samples, n_outputs)."""
+        white = np.broadcast_to(self._noise**2, (len(chromosomes), *record.outputs.shape))
+        if not record.jitter.any():
+            return white
+        outputs = self._simulator.trajectories(self._space.full(chromosomes), record)
+        rates = np.gradient(outputs, record.dt, axis=1)
+        return white + (rates * record.jitter) ** 2
+
+    def _joint(self, slopes: FloatArray, errors: FloatArray, n: int) -> FloatArray:
         """Information of n coordinates and unknown starts together.
 
         slopes: (n_samples, n_outputs, n + n_draws), those by draws of the inputs' noise behind.
+        errors: (n_samples, n_outputs), variances.
         """
         counted = np.isfinite(self._noise)
-        of_outputs = self._noise[counted] ** 2
+        of_outputs = errors[:, counted]
         slopes, changes = slopes[:, counted, :n], slopes[:, counted, n:]
         n_draws = changes.shape[-1]
         variances = of_outputs + np.sum(changes**2, axis=-1) / max(n_draws, 1)
         weighted = slopes / variances[..., None]
-        quiet = (weighted * np.sqrt(of_outputs)[:, None]).reshape(-1, n)
+        quiet = (weighted * np.sqrt(of_outputs)[..., None]).reshape(-1, n)
         weighted, slopes = weighted.reshape(-1, n), slopes.reshape(-1, n)
         curvature: FloatArray = weighted.T @ slopes
         if not n_draws or not np.isfinite(curvature).all():

@@ -71,6 +71,14 @@ def test_what_was_done_is_not_done_again(finished, tmp_path):
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "c").rglob("log.csv")} == logs
 
 
+def test_each_run_has_noise_of_its_own(finished):
+    logs = sorted((finished[0] / "c").rglob("log.csv"))
+    noise = {json.dumps(json.loads(run.read_text())["calibration"]["noise"]) for run in (
+        log.parent / "run.json" for log in logs
+    )}  # fmt: skip
+    assert len(noise) == len(logs) > 1
+
+
 def test_a_folder_that_is_taken_is_not_written_to(finished):
     folder, _ = finished
     done = rig(*words("--time", "1.5"), cwd=folder)

@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 import yaml
 
+from daq import record
 from daq.config.yaml_file import TypedSettings
 from daq.designs.bench import PlantBench
 from daq.designs.design import set_up
+from daq.designs.knowledge import expected_jitter
 from daq.experiment import RunFrame
+from daq.logs.encoder import mean_speeds
 from daq.lookup.classes import find_class
 from daq.lookup.rigs import load_rig
 from sim_rig.actuator import actuator
@@ -85,9 +88,39 @@ def test_a_limit_is_kept_by_the_margin():
         assert (records is not None) == passes, config.name
 
 
+@pytest.mark.parametrize(("margin", "passes"), [(0.0, True), (0.1, False)])
+def test_an_amplifier_is_kept_from_the_end_of_its_supply_by_the_margin(margin, passes):
+    config, device = load_rig("simulated.yaml")
+    model, noise = actuator(parameters="rig"), {"current_brake": 0.005, "omega": 0.1}
+    careful = PlantBench(model, device.plant_model(5.0), config, 5.0, margin, noise)
+    step = commands(0.0, 0.255)
+    step[:50] = 0.0
+    vectors = np.tile(model.nominal, (5, 1))
+    assert (careful.records(step, 1.0 / 800.0, vectors) is not None) == passes
+    stiff = np.array(model.nominal)
+    stiff[model.parameter_names.index("R_b")] *= 1.6
+    of_some, of_most = (np.vstack([vectors[: 5 - n], np.tile(stiff, (n, 1))]) for n in (2, 3))
+    if passes:
+        assert careful.records(step, 1.0 / 800.0, of_some) is not None
+        assert careful.records(step, 1.0 / 800.0, of_most) is None
+
+
+def test_the_instants_of_edges_err_as_a_log_shows(tmp_path):
+    log = record("prbs.yaml", options={"seed": 1}, out=tmp_path).frame
+    tick, theta, omega = (log[name].to_numpy() for name in ("tick", "theta", "omega"))
+    dt, count = 1.0 / 800.0, 2.0 * np.pi / 8192
+    told = mean_speeds(tick, theta, omega, dt, count)
+    expected = expected_jitter(omega, dt, count)
+    for low, high in ((1.0, 2.0), (2.0, 5.0), (5.0, 20.0)):
+        band = (np.abs(omega) >= low) & (np.abs(omega) < high) & np.isfinite(told.values)
+        assert band.sum() > 100
+        sizes = [np.sqrt(np.mean(each[band] ** 2)) for each in (expected, told.jitter)]
+        assert sizes[0] == pytest.approx(sizes[1], rel=0.25)
+
+
 def test_what_the_model_is_given_of_a_run_is_what_the_rig_would_log(tmp_path):
     loose, vectors = bench()
-    (record,) = loose.records(commands(0.3, 0.05), 1.0 / 800.0, vectors)
+    (simulated,) = loose.records(commands(0.3, 0.05), 1.0 / 800.0, vectors)
     experiment = {
         "protocol": "steps", "homing": {"turns": 5}, "motor": {"levels": [0.3], "hold": 0.5},
         "brake": {"levels": [0.05], "hold": 0.5}, "name": "levels",
@@ -97,7 +130,7 @@ def test_what_the_model_is_given_of_a_run_is_what_the_rig_would_log(tmp_path):
     rig("run", "levels.yaml", "--rig", "rig.yaml", cwd=tmp_path)
     (log,) = tmp_path.glob("runs/*/log.csv")
     table = np.genfromtxt(log, delimiter=",", names=True)
-    assert record.inputs[40:, 2] == pytest.approx(table["torque"][40:400], abs=1e-3)
+    assert simulated.inputs[40:, 2] == pytest.approx(table["torque"][40:400], abs=1e-3)
 
 
 @pytest.mark.soak

@@ -1,5 +1,7 @@
 """Experiments designed for a lag, whose information is known in closed form."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -59,10 +61,10 @@ def responses_to_step(n=60, gain=3.0, tau=0.2):
     return np.column_stack([gain * (1.0 - decay), -gain * t / tau * decay, decay])
 
 
-def information_of_step(model, input_noise=0.0):
+def information_of_step(model, input_noise=0.0, jitter=0.0):
     noise = np.array([NOISE["y"]]), np.array([input_noise])
     informant = Informant(BatchSimulator(model), SearchSpace.of(model), *noise)
-    record = blank(model, np.ones((60, 1)), DT)
+    record = replace(blank(model, np.ones((60, 1)), DT), jitter=np.full((60, 1), jitter))
     return informant.information(record, model.nominal[None])[0]
 
 
@@ -72,6 +74,25 @@ def test_information_is_that_of_the_closed_form():
     information = information_of_step(lag())
     assert information[np.ix_([0, 2], [0, 2])] == pytest.approx(exact, rel=1e-9)
     assert information[1] == pytest.approx(information[0], rel=1e-12)  # the other gain
+
+
+def test_a_sample_of_which_the_instant_is_not_known_tells_less_the_faster_its_output():
+    jitter, slopes = 0.01, responses_to_step()[:, :2]
+    rates = np.gradient(slopes[:, 0], DT)
+    errors = NOISE["y"] ** 2 + (rates * jitter) ** 2
+    exact = slopes.T @ (slopes / errors[:, None])
+    information = information_of_step(lag(), jitter=jitter)
+    assert information[np.ix_([0, 2], [0, 2])] == pytest.approx(exact, rel=1e-3)
+    assert exact[1, 1] < 0.8 * information_of_step(lag())[2, 2]
+
+
+def test_the_number_of_threads_does_not_change_a_design(monkeypatch):
+    shared = {"noise": NOISE, "limits": {"u": (-1.0, 1.0)}, "runs": 2, **QUICK}
+    several = design(lag(), [SQUARE], **shared)
+    monkeypatch.setattr("sysid.experiments.experiment.available_cores", lambda: 1)
+    alone = design(lag(), [SQUARE], **shared)
+    assert [run.settings for run in several.runs] == [run.settings for run in alone.runs]
+    assert several.attempts == alone.attempts
 
 
 def test_a_start_that_is_unknown_takes_its_part_of_the_information():
