@@ -22,7 +22,7 @@ from sysid.fitting.descent import Point, Restriction
 from sysid.fitting.free_run import FINER, FINEST
 from sysid.fitting.innovations import Innovations
 from sysid.fitting.objective import Objective
-from sysid.fitting.refinement import begin, refine, refine_each
+from sysid.fitting.refinement import Refinement, begin, refine, refine_each
 from sysid.gassi.lookalikes import lookalikes
 from sysid.gassi.slide import slid
 from sysid.uncertainty.colour import colour, longest_memory
@@ -47,6 +47,9 @@ _CONCEIVABLE = 40.0  # the same before a minimum has been refined to its end
 _QUICKLY, _ROUGHLY = 15, 1e-4  # iterations and tolerance until then
 _WAY = np.array([0.25, 0.5, 0.75])  # parts of the way between two minima that are tried
 _EXPLORED = 2  # minima whose lookalikes are descended from
+# Descents by innovations around the first minimum, in parts of the ranges to either side, and error
+# in parts of the first's beyond which one is given up.
+_AROUND, _SPREAD, _FAR_BEHIND = 8, 0.25, 1.5
 # Minima are one when the way between them, were all linear, changed twice the log-likelihood by
 # less than this.
 _ONE = 16.0
@@ -288,6 +291,8 @@ def _refitted(
     first = fit(ranked[0], watch)
     if first is None:
         return None
+    if isinstance(first.objective, Innovations) and first.objective.corrects:
+        first = better_around(fit, first, ranked[0], watch)
     optima = _Optima(objective)
     optima.add(first)
     likely = (o for o in ranked[1:] if by_error.deviance(o, ranked[0]) < _CONCEIVABLE)
@@ -298,6 +303,37 @@ def _refitted(
     if best is not first:
         optima.refit(best, fit(replace(best, objective=ranked[0].objective), watch))
     return optima
+
+
+def better_around(
+    fit: Callable[[Optimum, Watch | None], Optimum | None],
+    first: Optimum,
+    by_error: Optimum,
+    watch: Watch | None,
+) -> Optimum:
+    """The best of a filter's minimum and of descents from points spread around it.
+
+    Minima of free runs say little of a filter's, so that one of them is no place to end at.
+    Descents that are far behind after a few iterations are given up.
+    """
+    objective, space = first.objective, first.objective.space
+    spread = _SPREAD * np.random.default_rng(0).uniform(-1.0, 1.0, (_AROUND, len(space.names)))
+    starts = space.decode(space.encode(first.chromosome) + spread * space.width)
+    least = float(objective.evaluate(first.chromosome[None])[0][0])
+    ends: Sequence[Refinement] = ()
+    for iterations, behind in ((_QUICKLY // 3, _FAR_BEHIND), (_QUICKLY, 1.0)):
+        descents = [begin(objective, start, tolerance=_ROUGHLY) for start in starts]
+        ends = refine_each(objective, descents, max_iterations=iterations)
+        ends = [end for end in ends if end.error < behind * least]
+        starts = np.array([end.chromosome for end in ends]).reshape(-1, len(space.names))
+    if not ends:
+        return first
+    best = min(ends, key=lambda end: end.error)
+    found = fit(replace(by_error, chromosome=best.chromosome), watch)
+    if found is None or not found.feasible >= first.feasible:
+        return first
+    better = float(objective.evaluate(found.chromosome[None])[0][0]) < least
+    return found if better else first
 
 
 def noisy_fit(

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -17,8 +18,12 @@ from sysid import (
     Output,
     Parameter,
     ProcessModel,
+    SearchSpace,
     State,
 )
+from sysid.fitting.innovations import Innovations
+from sysid.fitting.objective import Objective
+from sysid.gassi.likelihood import Optimum, better_around, noisy_fit
 from tests.sysid.support import lag, linear_response, prbs
 
 DT, TAU, GAIN = 0.02, 0.05, 2.0
@@ -301,6 +306,21 @@ def test_where_noise_explains_all_of_a_free_run_a_filter_takes_over():
     assert fit.parameters_["gain"] == pytest.approx(GAIN, rel=0.01)
     estimates = fit.uncertainty(record).parameters
     assert all(e.low < truth < e.high for e, truth in zip(estimates, (GAIN, TAU), strict=True))
+
+
+def test_a_filters_minimum_is_sought_around_that_of_free_runs():
+    (record, _) = noisy_records(1)
+    space = SearchSpace.of(lag())
+    objective = Objective(BatchSimulator(lag(), accuracy=1e-4), space, [record])
+    wrong = np.array([1.5 * GAIN, 1.5 * TAU])
+    by_error = Optimum(objective, wrong, objective.rms(wrong[None])[0], feasible=True)
+    criterion = Innovations.starting(objective, wrong, corrects=True)
+    stuck = replace(by_error, objective=criterion, rms=criterion.rms(wrong[None])[0])
+    fit = partial(noisy_fit, True, None, objective)
+    better = better_around(fit, stuck, by_error, None)
+    from_truth = fit(replace(by_error, chromosome=np.array([GAIN, TAU])))
+    np.testing.assert_allclose(better.chromosome, from_truth.chromosome, rtol=0.02)
+    assert better_around(lambda optimum, watch: None, stuck, by_error, None) is stuck
 
 
 @pytest.mark.soak
