@@ -241,3 +241,29 @@ def test_a_disk_that_fills_up_later_does_not_lose_the_search(tmp_path, whole, mo
             noisy(), checkpoint=folder / "search.ckpt", on_progress=vanish
         )
     assert_same(found, whole[0])
+
+
+def test_states_that_follow_at_once_are_not_written_one_by_one(tmp_path, monkeypatch):
+    """Writing waits for the disk; the last state is kept until then."""
+    clock = [100.0]
+    monkeypatch.setattr("sysid.gassi.checkpoint.time.monotonic", lambda: clock[0])
+    path = tmp_path / "search"
+    keeper = checkpoint.Checkpoint(path, ORIGIN)
+    written = []
+    for step, later in enumerate(
+        [0.0, 0.4 * checkpoint.INTERVAL, 0.4 * checkpoint.INTERVAL, 0.4 * checkpoint.INTERVAL]
+    ):
+        clock[0] += later
+        keeper.save({"step": step})
+        written.append(checkpoint.load(path, ORIGIN)["step"])
+    assert written == [0, 0, 0, 3]
+    keeper.save({"step": 4})
+    keeper.flush()
+    assert checkpoint.load(path, ORIGIN)["step"] == 4
+
+
+ORIGIN = {
+    "model": {"name": "lag", "signals and parameters": "", "equations": ""},
+    "records": [],
+    "settings": {},
+}
