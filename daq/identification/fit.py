@@ -23,9 +23,6 @@ from daq.logs.recording import Recording, log_path
 from daq.lookup.models import trust_option
 from daq.progress import Note, Progress, Watch, ignore, warn
 from sysid import ModelError, ProcessModel, SearchSpace
-from sysid.gassi import GASSI, PRESETS
-from sysid.gassi import Progress as SearchProgress
-from sysid.judging.examination import examined, suspected
 from sysid.judging.lags import lag_faults
 from sysid.judging.plausibility import implausible
 from sysid.problem.copies import shared_samples
@@ -35,6 +32,9 @@ from sysid.uncertainty import Uncertainty
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from sysid.gassi import GASSI
+    from sysid.gassi import Progress as SearchProgress
 
     Source = str | Path | Recording | pd.DataFrame
 
@@ -256,6 +256,10 @@ def assemble(
     faults: of the logs, where they have been looked for. test_missing: whether what the model may
     lack is tested, and the surest variant fitted.
     """
+    # It loads scikit-learn, which takes a second and those that fit nothing do without.
+    from sysid.gassi import PRESETS
+    from sysid.judging.examination import suspected
+
     datasets = [log.dataset for log in logs[0]]
     refined = PRESETS[estimator.preset].refine and estimator.stopped_ != "interrupted"
     uncertainty = estimator.uncertainty(datasets) if refined else None
@@ -303,12 +307,16 @@ def take(
 
 
 def _fitted(log: LoggedRecord, estimator: GASSI, uncertainty: Uncertainty | None) -> FittedLog:
+    from sysid.judging.examination import examined
+
     return FittedLog(log, *examined(estimator, log.dataset, uncertainty))
 
 
 def _searched(
     problem: Problem, train: Sequence[LoggedRecord], folder: Path | None, watch: Watch, resume: bool
 ) -> GASSI:
+    from sysid.gassi import GASSI
+
     def report(step: SearchProgress) -> None:
         activity, unit = _STAGES[step.stage]
         status = f"{unit} {step.done}/{step.total}, best error {step.error:.3g}"

@@ -23,17 +23,17 @@ from daq.lookup.models import trust_option
 from daq.provenance import software_versions
 from sysid import Metrics, ProcessModel
 from sysid.arrays import FloatArray
-from sysid.gassi import GASSI, PRESETS
-from sysid.judging.assessment import RecordResult, Verdict, judge
-from sysid.judging.examination import Suspicion
-from sysid.judging.score_tests import description
-from sysid.judging.starts import Starts
 from sysid.problem.faults import DataFault
 from sysid.problem.model import Parameter
 from sysid.uncertainty import Estimate, Profile, Uncertainty
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from sysid.gassi import GASSI
+    from sysid.judging.assessment import RecordResult, Verdict
+    from sysid.judging.examination import Suspicion
+    from sysid.judging.starts import Starts
 
 
 _RMSE = "mean over outputs of the RMSE on outputs normalised by max|y|"
@@ -92,6 +92,8 @@ class Identification:
     @cached_property
     def verdict(self) -> Verdict:
         """How well outputs are predicted, whether parameters may be used, and why."""
+        from sysid.judging.assessment import judge
+
         parts, suspicion = (self.training, self.validation), self.suspicion
         training, validation = ([log.result for log in part] for part in parts)
         return judge(
@@ -159,6 +161,8 @@ class Identification:
     @cached_property
     def document(self) -> dict[str, Any]:
         """What ``parameters.yaml`` holds, and ``rig identify --json`` prints beside the files."""
+        from sysid.gassi import PRESETS
+
         estimator, settings, verdict = self.estimator, self.problem.settings, self.verdict
         signals = settings.model_dump(mode="json", include=set(Signals.model_fields))
         starts = estimator.initial_states_
@@ -260,6 +264,8 @@ def _verdict(verdict: Verdict) -> dict[str, Any]:
 
 def _missing(identification: Identification) -> dict[str, Any]:
     """What score tests found, and the variant that was fitted for it."""
+    from sysid.judging.score_tests import description
+
     suspicion, command = identification.suspicion, identification.alternative_command
     assert suspicion is not None
     alternative = suspicion.alternative

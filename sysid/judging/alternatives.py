@@ -1,12 +1,14 @@
 """A variant of the model, fitted because the residuals ask for it, and whether it is better."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sysid.arrays import FloatArray
-from sysid.gassi import GASSI
 from sysid.judging.comparison import Candidate, Comparison, compare
 from sysid.judging.score_tests import Finding
 from sysid.judging.suspects import variants_of
@@ -14,6 +16,9 @@ from sysid.problem.data import Dataset
 from sysid.problem.metrics import fit_percent, mean_known
 from sysid.problem.model import ModelError
 from sysid.uncertainty import Uncertainty
+
+if TYPE_CHECKING:
+    from sysid.gassi import GASSI
 
 # A difference of BIC above this is very strong evidence (Kass & Raftery, "Bayes factors",
 # J. American Statistical Association 90, 1995).
@@ -48,6 +53,8 @@ def best_alternative(
 
     None where no variant is among them, or none of its simulations succeeds.
     """
+    from sysid.gassi import GASSI
+
     named = [finding.name for finding in findings if finding.kind == "variant"]
     if not named or estimator.model is None:
         return None
