@@ -19,7 +19,7 @@ from daq.cli.check import check
 from daq.cli.design import design
 from daq.cli.doctor import doctor
 from daq.cli.emulate import emulate
-from daq.cli.export import export_c
+from daq.cli.export import export_c, export_mat, export_mcap, export_parquet
 from daq.cli.figures import figures
 from daq.cli.identify import identify
 from daq.cli.init import init
@@ -60,6 +60,9 @@ _COMMANDS: tuple[tuple[Callable[..., None], str], ...] = (
     (doctor, "rig doctor /dev/ttyACM0"),
 )
 _EXPORTS: tuple[tuple[str, Callable[..., None], str], ...] = (
+    ("mat", export_mat, "rig export mat runs/20260101T120000Z-prbs"),
+    ("mcap", export_mcap, "rig export mcap runs/20260101T120000Z-prbs --out prbs.mcap"),
+    ("parquet", export_parquet, "rig export parquet runs/20260101T120000Z-prbs"),
     ("c", export_c, "rig export c controller.yaml --precision single --out firmware/src"),
 )
 _COMPUTING = {design, identify, campaign, replay, figures}  # that drive no rig

@@ -18,6 +18,51 @@ class Digits(StrEnum):
     SINGLE = "single"
 
 
+Log = Annotated[Path, Argument(metavar="LOG", help="A capture folder, or a CSV of one.")]
+Target = Annotated[
+    Path | None, Option(metavar="FILE", help="Default: beside the log, under its name.")
+]
+
+
+def export_mat(log: Log, out: Target = None, json: options.AsJson = False) -> None:
+    """Write a log as a MAT file (level 5), for MATLAB, Octave and scipy.
+
+    A vector for each column, their units, and the record of the run. rig identify reads it too.
+    """
+    _export_log(log, out, "mat", json)
+
+
+def export_mcap(log: Log, out: Target = None, json: options.AsJson = False) -> None:
+    """Write a log as MCAP, for Foxglove and PlotJuggler; needs hybrid-rig[formats].
+
+    A message a sample on /samples at its time of day, the record of the run attached.
+    """
+    _export_log(log, out, "mcap", json)
+
+
+def export_parquet(log: Log, out: Target = None, json: options.AsJson = False) -> None:
+    """Write a log as a Parquet table, for pandas, Polars and DuckDB; needs hybrid-rig[formats].
+
+    Units are metadata of the columns, the record of the run that of the table.
+    """
+    _export_log(log, out, "parquet", json)
+
+
+def _export_log(log: Path, out: Path | None, kind: str, json: bool) -> None:
+    from daq.logs.formats import WRITERS
+    from daq.logs.recording import load_whole
+
+    recording = load_whole(log)
+    file = out or recording.path.with_suffix(f".{kind}")
+    WRITERS[kind](recording, file)
+    if recording.warning:
+        terminal.report("warning", recording.warning)
+    if json:
+        terminal.print_json({"file": file, "format": kind, "samples": len(recording.frame)})
+        return
+    print(f"Written: {file} ({len(recording.frame)} samples)")
+
+
 def export_c(
     controller: Annotated[
         Path, Argument(metavar="CONTROLLER.yaml", help="A file that rig tune made.")

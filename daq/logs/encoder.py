@@ -91,9 +91,9 @@ class _Intervals:
         rate = np.where((rate == 0.0) & ~lone, np.nan, rate)
         return cls(rows, rate, begin, end, slack, len(timed), int(agreeing.sum()))
 
-    def show_edges(self, known: bool) -> bool:
-        """Whether edges made the speeds; known: somebody says so, and is believed if need be."""
-        if known and self.checked < _MANY:
+    def show_edges(self, stated: bool) -> bool:
+        """Whether edges made the speeds; stated: somebody says so, and is believed if need be."""
+        if stated and self.checked < _MANY:
             return True
         return self.agreeing >= max(_FEWEST, _SHARE * self.checked)
 

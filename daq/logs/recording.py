@@ -134,6 +134,13 @@ def load(path: str | Path, extra: Sequence[str] = ()) -> Recording:
     return Recording(csv, frame, dt, torn, record, end_of_run(csv, record, torn))
 
 
+def load_whole(path: str | Path) -> Recording:
+    """A log as ``load`` reads it, with every column that it has."""
+    csv = log_path(Path(path))
+    present = column_names(csv) if csv.exists() else ()
+    return load(path, [name for name in present if name not in COLUMNS])
+
+
 def log_path(path: Path) -> Path:
     """The CSV that a folder or file name given by a user means."""
     return path / LOG_NAME if path.is_dir() else path

@@ -155,13 +155,13 @@ class Search:
     def _settle(self, trials: Sequence[_Trial]) -> None:
         """Add the candidates that trials lead to, in their order whatever the threads."""
         candidates: list[RunCandidate | None] = [None] * len(trials)
-        told = Lock()
+        counting = Lock()
 
         def settle(place: int) -> None:
             trial, genes = trials[place], trials[place].genes
             for _ in range(_HALVINGS + 1):
                 candidates[place] = candidate = self.evaluate(trial.excitation, genes)
-                with told:
+                with counting:
                     self.attempts += 1
                     self.kept += candidate is not None
                     if self.watch is not None:

@@ -329,11 +329,11 @@ def better_around(
     if not ends:
         return first
     best = min(ends, key=lambda end: end.error)
-    found = fit(replace(by_error, chromosome=best.chromosome), watch)
-    if found is None or not found.feasible >= first.feasible:
+    nearby = fit(replace(by_error, chromosome=best.chromosome), watch)
+    if nearby is None or not nearby.feasible >= first.feasible:
         return first
-    better = float(objective.evaluate(found.chromosome[None])[0][0]) < least
-    return found if better else first
+    better = float(objective.evaluate(nearby.chromosome[None])[0][0]) < least
+    return nearby if better else first
 
 
 def noisy_fit(

@@ -58,12 +58,12 @@ def lags(records: Sequence[Dataset]) -> tuple[Lag, ...]:
         return ()
     pasts, around, now = (np.concatenate(parts)[:_MOST_ROWS] for parts in zip(*pieces, strict=True))
     held = [all(_held(record.inputs[:, i]) for record in records) for i in range(around.shape[2])]
-    found = []
+    late = []
     for j in range(now.shape[1]):
         for i, onset in _onsets(pasts[:, :, j], around, now[:, j]).items():
             if onset > 1 or (onset < 0 and held[i]):
-                found.append(Lag(j, i, onset - 1))
-    return tuple(found)
+                late.append(Lag(j, i, onset - 1))
+    return tuple(late)
 
 
 def _onsets(past: FloatArray, around: FloatArray, now: FloatArray) -> dict[int, int]:
@@ -110,11 +110,11 @@ def lag_faults(
 
 
 def _faults(
-    model: ProcessModel, records: Sequence[Dataset], found: Sequence[Lag], part: Part
+    model: ProcessModel, records: Sequence[Dataset], clear: Sequence[Lag], part: Part
 ) -> Iterator[DataFault]:
     """The largest lag of each output that is late, and of each input that is."""
     worst: dict[str, Lag] = {}
-    for lag in sorted(found, key=lambda lag: abs(lag.samples)):
+    for lag in sorted(clear, key=lambda lag: abs(lag.samples)):
         late = lag.samples > 0
         worst[model.output_names[lag.output] if late else model.input_names[lag.input]] = lag
     for channel, lag in worst.items():
