@@ -20,6 +20,7 @@ from daq.lookup.models import find_model, name_parts
 from daq.progress import Watch, ignore
 from daq.provenance import software_versions
 from daq.torque import Fact, OperatingPoint, TorqueControl, plausible_parameters
+from daq.views import Lines, Shown
 from sysid import ModelError, ProcessModel
 
 _HEAD = """\
@@ -27,8 +28,8 @@ _HEAD = """\
 """
 
 
-@dataclass(frozen=True)
-class Tuning:
+@dataclass(frozen=True, repr=False)
+class Tuning(Shown):
     """A controller for an actuator, and what it rests on.
 
     requested: its settings as they were given; ``control`` has them as the uncertainty allows.
@@ -53,6 +54,19 @@ class Tuning:
     draws: FloatArray
     uncertain: tuple[str, ...]
     covariance: Mapping[str, Any]
+
+    @property
+    def headline(self) -> str:
+        """The controller, and where the parameters come from."""
+        return f"{type(self.control).__name__.lower()} for {self.model_name}, {self.source}"
+
+    def lines(self) -> Lines:
+        """Quantities of the actuator, with what the identification leaves open."""
+        rows = [["quantity", "value", "95 % interval", "unit"]]
+        for fact in self.facts:
+            span = " .. ".join(f"{end:.4g}" for end in fact.interval) if fact.interval else "-"
+            rows.append([fact.name, f"{fact.value:.4g}", span, fact.unit])
+        return rows
 
     @property
     def changes(self) -> dict[str, tuple[Any, Any]]:

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from daq.identification.rows import (
         OutputErrors,
         ParameterRow,
-        QuantityRow,
         RivalRow,
         Rows,
     )
@@ -112,7 +111,7 @@ def _parameter_row(result: Identification, row: ParameterRow) -> list[str]:
         how = f"= {row.tied}" if row.tied is not None else "fixed"
         return [row.name, value, "", unit, how, source, ""]
     span = _span(row.range, result.problem.settings.ranges.get(row.name), scale)
-    interval = _interval(row, scale) if result.rows.refined else ""
+    interval = row.span(scale) if result.rows.refined else ""
     return [row.name, value, interval, unit, span, source, row.label]
 
 
@@ -125,10 +124,6 @@ def _span(
         f"({notation.shortest(scale * end)})" if bound is None else notation.shortest(scale * end)
         for end, bound in bounds
     )
-
-
-def _interval(row: QuantityRow, scale: float) -> str:
-    return row.interval_text(lambda end: row.text(end, scale), between=" .. ", empty="-")
 
 
 def _show_open_questions(rows: Rows) -> None:
@@ -178,7 +173,7 @@ def _show_products(rows: Rows) -> None:
             scale, unit = row.engineering
             value = row.text(row.value, scale)
             quantity = value if unit in {"", "1"} else f"{value} {unit}"
-            interval = _interval(row, scale)
+            interval = row.span(scale)
             ends = f"95 % interval {interval}" if row.interval else row.undetermined_label
             terminal.print_text(f"    {row.name} = {quantity}, {ends}")
         starts = [name for name in ambiguity.measure if "(0)" in name]
@@ -205,7 +200,7 @@ def _show_profiles(profiles: Sequence[Profile]) -> None:
         ends = profile.low, profile.high
         row = QuantityRow(profile.name, profile.value, profile.unit, ends)
         scale, unit = row.engineering
-        rows.append([row.name, row.text(row.value, scale), _interval(row, scale), unit])
+        rows.append([row.name, row.text(row.value, scale), row.span(scale), unit])
     if rows:
         head = ["parameter", "value", "95 % interval", "unit"]
         terminal.print_table("Profile likelihood", head, rows, text=["unit"])

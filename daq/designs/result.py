@@ -7,6 +7,7 @@ from typing import Any
 
 from daq.config.question import Question
 from daq.hal import FloatArray
+from daq.views import Shown
 from sysid import Design, ProcessModel
 
 _WIDE = 0.5  # half width in parts of the value, from which a quantity counts as hardly known
@@ -37,8 +38,8 @@ class PlannedRun:
     dt: float
 
 
-@dataclass(frozen=True)
-class DesignResult:
+@dataclass(frozen=True, repr=False)
+class DesignResult(Shown):
     """A design for a rig, and its files.
 
     model_name, rig_name: as they are typed. noise: standard deviations that it counts on.
@@ -59,6 +60,12 @@ class DesignResult:
     noise: Mapping[str, float]
     folder: Path
     figure: Path
+
+    @property
+    def headline(self) -> str:
+        """What is run, for which model, and where its files are."""
+        count = f"{len(self.runs)} run{'s' * (len(self.runs) != 1)}"
+        return f"{count} for {self.model_name} on {self.rig_name}, {self.folder}"
 
     @property
     def unknown(self) -> list[Unknown]:

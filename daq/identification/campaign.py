@@ -21,6 +21,7 @@ from daq.identification.settings import Problem, gassi_settings, problems_of
 from daq.logs.capture import LOG_NAME
 from daq.progress import Progress, Watch, ignore, warn
 from daq.provenance import software_versions
+from daq.views import Shown
 from sysid import Campaign, Dataset, ModelError, Outcome, Run
 from sysid import campaign as run_campaign
 
@@ -101,8 +102,8 @@ class CampaignRequest:
     out: Path | None = None
 
 
-@dataclass(frozen=True)
-class CampaignResult:
+@dataclass(frozen=True, repr=False)
+class CampaignResult(Shown):
     """All runs of a campaign, and where they were written.
 
     table: the CSV of all runs. files: parameters of the best run, by model and logs.
@@ -115,6 +116,13 @@ class CampaignResult:
     campaign: Campaign
     table: Path
     files: Mapping[tuple[str, str], Path]
+
+    @property
+    def headline(self) -> str:
+        """How many runs, of how many structures, and where they are written."""
+        outcomes = self.campaign.outcomes
+        failed = f", {len(self.campaign.failed)} failed" if self.campaign.failed else ""
+        return f"{len(outcomes)} runs{failed}, {self.table}"
 
     @property
     def document(self) -> dict[str, Any]:

@@ -26,6 +26,7 @@ from daq.identification.result import Identification
 from daq.identification.settings import problems_of
 from daq.progress import Watch, ignore, warn
 from daq.provenance import software_versions
+from daq.views import Shown
 from sysid import (
     Campaign,
     Candidate,
@@ -77,8 +78,8 @@ class SeedsResult:
     campaign: Campaign
 
 
-@dataclass(frozen=True)
-class ComparisonResult:
+@dataclass(frozen=True, repr=False)
+class ComparisonResult(Shown):
     """Structures ranked by validation.
 
     group: the logs, as the first model used them. candidates: with their free runs. files:
@@ -99,6 +100,11 @@ class ComparisonResult:
     files: Mapping[str, Path]
     folder: Path
     request_words: Sequence[str]
+
+    @property
+    def headline(self) -> str:
+        """What it comes to."""
+        return self.comparison.verdict
 
     @property
     def outputs(self) -> Sequence[str]:

@@ -22,6 +22,8 @@ from daq.identification.result import Identification
 from daq.identification.settings import Problem, columns_of, problem_of, selection_of, with_signals
 from daq.lookup.models import find_model
 from daq.lookup.rigs import DEFAULT_RIG, load_rig
+from daq.notation import percent, quantity
+from daq.views import Lines, Shown
 from sysid import BatchSimulator, Metrics, ModelError, ProcessModel, evaluate, free_run
 from sysid.problem.ranges import ties
 
@@ -31,8 +33,8 @@ if TYPE_CHECKING:
     from daq.identification.fit import Source
 
 
-@dataclass(frozen=True)
-class Replay:
+@dataclass(frozen=True, repr=False)
+class Replay(Shown):
     """A log's inputs through a model, beside what was measured.
 
     time: (n,) [s]. measured, simulated: (n, n_outputs) in the outputs' units. source: where the
@@ -62,6 +64,18 @@ class Replay:
             values = "at its own values" if self.config is None else f"with values of {self.config}"
             return f"{self.source} {values}"
         return f"{self.model.name} with the parameters of {self.source}"
+
+    @property
+    def headline(self) -> str:
+        """The log, the model, and where its parameters come from."""
+        return f"{self.path} through {self.title}"
+
+    def lines(self) -> Lines:
+        """Fit and errors of each output."""
+        errors, units = self.rmse_absolute, {o.name: o.unit for o in self.model.outputs}
+        rows = [["output", "fit [%]", "RMSE"]]
+        rows += [[k, percent(fit), quantity(errors[k], units[k])] for k, fit in self.fit.items()]
+        return rows
 
     @property
     def fit(self) -> dict[str, float]:

@@ -21,6 +21,7 @@ from daq.identification.rows import Rows
 from daq.identification.settings import Problem
 from daq.lookup.models import trust_option
 from daq.provenance import software_versions
+from daq.views import Lines, Shown
 from sysid import Metrics, ProcessModel
 from sysid.arrays import FloatArray
 from sysid.problem.faults import DataFault
@@ -58,8 +59,8 @@ class FittedLog:
     result: RecordResult
 
 
-@dataclass(frozen=True)
-class Identification:
+@dataclass(frozen=True, repr=False)
+class Identification(Shown):
     """Parameters identified from logs, and how far to trust them.
 
     uncertainty: None where the search was not refined to a minimum. profiles: those asked for.
@@ -83,6 +84,23 @@ class Identification:
     seeds: Mapping[str, Any] | None = None
     faults: tuple[DataFault, ...] = ()
     suspicion: Suspicion | None = None
+
+    @property
+    def headline(self) -> str:
+        """The model, its logs, and what may be used."""
+        names = ", ".join(log.name for logs in self.rows.logs.values() for log in logs)
+        statements = self.verdict.predicted.trust, self.verdict.parameters.trust
+        verdict = f"predictions {statements[0]}, parameters {statements[1]}"
+        return f"{self.problem.model_name} from {names}: {verdict}"
+
+    def lines(self) -> Lines:
+        """Parameters with their 95 % intervals."""
+        rows = [["parameter", "value", "95 % interval", "unit", ""]]
+        for row in self.rows.parameters:
+            scale, unit = row.engineering
+            note = row.undetermined_label if row.free else "fixed"
+            rows.append([row.name, row.text(row.value, scale), row.span(scale), unit, note])
+        return rows
 
     @property
     def model(self) -> ProcessModel:

@@ -105,6 +105,10 @@ class QuantityRow:
         fails = f"simulations fail in {100.0 * self.fails:.0f} % of the range" if self.fails else ""
         return ", ".join(filter(None, (LABELS.get(self.undetermined, ""), fails)))
 
+    def span(self, scale: float = 1.0) -> str:
+        """The interval as a terminal shows it, times the scale; a dash for none."""
+        return self.interval_text(lambda end: self.text(end, scale), between=" .. ", empty="-")
+
     def interval_text(self, write: Callable[[float], str], between: str, empty: str) -> str:
         """The interval with its ends written: ``1.0 .. 1.2``, ``< 1.2``, or ``> 1.0``.
 

@@ -15,17 +15,18 @@ from daq.config.rig import Encoder
 from daq.errors import ConfigError
 from daq.hal import Samples
 from daq.logs.capture import COMPLETED, LOG_NAME, RUN_NAME, RUNNING, further_parts, is_log
-from daq.logs.columns import ATTRIBUTES, COLUMNS, ORIGINAL_COLUMNS
+from daq.logs.columns import ATTRIBUTES, COLUMNS, ORIGINAL_COLUMNS, UNITS
 from daq.logs.encoder import SPEED, MeanSpeeds, mean_speeds
 from daq.logs.table import column_names, read_table
 from daq.logs.time_base import refuse_rows, require_rows, time_base
+from daq.views import Lines, Shown
 
 if TYPE_CHECKING:
     import pandas as pd
 
 
-@dataclass(frozen=True)
-class Recording:
+@dataclass(frozen=True, repr=False)
+class Recording(Shown):
     """A log in SI units, with what is known of its run.
 
     frame: one row per sample with at least the columns of the original program and ``tick``,
@@ -51,6 +52,23 @@ class Recording:
     def name(self) -> str:
         """Folder name of a capture, or file name of a lone log."""
         return self.path.parent.name if self.path.name == LOG_NAME else self.path.stem
+
+    @property
+    def headline(self) -> str:
+        """Its name, length and rate, and how the run ended if not as it should."""
+        n = len(self.frame)
+        size = f"{self.name}, {n} samples, {n * self.dt:.4g} s at {1.0 / self.dt:.4g} Hz"
+        return size if self.warning is None else f"{size}; {self.warning}"
+
+    def lines(self) -> Lines:
+        """Smallest, mean and largest of each channel."""
+        rows = [["channel", "unit", "smallest", "mean", "largest"]]
+        for name, unit in UNITS.items():
+            if name in self.frame and name != "t":
+                column = self.frame[name]
+                figures = column.min(), column.mean(), column.max()
+                rows.append([name, unit, *(f"{figure:.4g}" for figure in figures)])
+        return rows
 
     @property
     def folder(self) -> Path:

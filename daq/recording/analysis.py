@@ -17,12 +17,13 @@ from daq.logs.recording import end_of_run, load, log_path, read_record
 from daq.lookup.classes import find_class
 from daq.progress import Watch, ignore, warn
 from daq.run.protocol import failure
+from daq.views import Lines, Shown
 
 RESULTS = "results"
 
 
-@dataclass(frozen=True)
-class Analysis:
+@dataclass(frozen=True, repr=False)
+class Analysis(Shown):
     """Findings from a capture folder; they stand in its ``results``, too.
 
     >>> Analysis(Path("runs/today"), Findings(remarks=("all quiet",))).findings.remarks
@@ -31,6 +32,20 @@ class Analysis:
 
     folder: Path
     findings: Findings
+
+    @property
+    def headline(self) -> str:
+        """The folder, and what was remarked."""
+        return "; ".join((str(self.folder), *self.findings.remarks))
+
+    def lines(self) -> Lines:
+        """Its numbers, with their 95 % intervals."""
+        rows = [["result", "value", "95 % interval", "unit"]]
+        for result in self.findings.numbers:
+            ends = ["-" if end is None else f"{end:.4g}" for end in (result.low, result.high)]
+            span = "-" if ends == ["-", "-"] else " .. ".join(ends)
+            rows.append([result.name, f"{result.value:.4g}", span, result.unit])
+        return rows if self.findings.numbers else ()
 
     @property
     def document(self) -> dict[str, Any]:

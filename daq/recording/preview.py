@@ -16,6 +16,7 @@ from daq.logs.columns import UNITS
 from daq.progress import Watch, ignore
 from daq.recording.session import Session, open_session
 from daq.run.protocol import evidence_of, preview_of
+from daq.views import Shown
 
 _PART = 0.9  # of the power, that the stated band holds
 
@@ -40,8 +41,8 @@ class ChannelFacts:
     changes: int | None = None
 
 
-@dataclass(frozen=True)
-class Preview:
+@dataclass(frozen=True, repr=False)
+class Preview(Shown):
     """A session that has been checked, and what its plan does to each channel.
 
     evidence: what simulated trials say, where they were asked for and can be made.
@@ -55,6 +56,12 @@ class Preview:
     session: Session
     channels: dict[str, ChannelFacts]
     evidence: Evidence | None = None
+
+    @property
+    def headline(self) -> str:
+        """The experiment and how long it takes."""
+        length = f"{self.seconds:.4g} s at {self.experiment.sample_rate:.4g} Hz"
+        return f"{self.session.loaded.name}: {length}, within the limits"
 
     @property
     def experiment(self) -> Experiment:

@@ -12,7 +12,7 @@ from sysid.problem.channels import noise
 from sysid.problem.model import AROUND_FIRST_SAMPLE, ModelError, ProcessModel
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Dataset:
     """A record: row k holds the outputs latched at time k*dt and the inputs from then on.
 
@@ -45,6 +45,11 @@ class Dataset:
     output_noise: FloatArray = field(default_factory=lambda: np.zeros(0))
     windows: FloatArray = field(default_factory=lambda: np.zeros(0))
     jitter: FloatArray = field(default_factory=lambda: np.zeros(0))
+
+    def __repr__(self) -> str:
+        size = f"{self.n_samples} samples, dt={self.dt:g} s"
+        signals = f"{self.inputs.shape[1]} in, {self.outputs.shape[1]} out"
+        return f"<Dataset: {self.name}, {size}, {signals}>"
 
     def __post_init__(self) -> None:
         for name in ("inputs", "outputs"):

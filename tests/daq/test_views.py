@@ -1,0 +1,65 @@
+"""What results show of themselves at a prompt and in a notebook."""
+
+import xml.etree.ElementTree as ET
+
+import numpy as np
+import pytest
+
+from daq import check, identify, load, record, replay, tune
+from daq.views import Shown
+from sysid import Dataset
+from tests.daq.support import few_free
+
+
+class Named(Shown):
+    headline = "<b> & co"
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    return load(record("prbs.yaml", out=tmp_path_factory.mktemp("runs")).folder)
+
+
+def table_of(result):
+    """Rows of texts of the table that a notebook shows."""
+    page = ET.fromstring(f"<div>{result._repr_html_()}</div>")
+    return [[cell.text or "" for cell in row] for row in page.iter("tr")]
+
+
+def test_a_recording_says_its_length_and_shows_its_channels(log):
+    assert repr(log) == f"<Recording: {log.name}, 1000 samples, 1.25 s at 800 Hz>"
+    rows = {row[0]: row for row in table_of(log)}
+    assert float(rows["omega"][4]) == pytest.approx(log.frame["omega"].max(), rel=1e-3)
+    assert rows["torque"][1] == "N*m" and "t" not in rows
+
+
+def test_a_replay_shows_fit_and_errors(log):
+    result = replay(log)
+    assert repr(result).startswith("<Replay: ") and "actuator" in repr(result)
+    shown = {row[0]: float(row[1]) for row in table_of(result)[1:]}
+    assert shown == pytest.approx(result.fit, abs=0.06)
+
+
+def test_an_identification_says_what_may_be_used_and_shows_intervals(log):
+    result = identify(log, **few_free())
+    words = f"predictions {result.verdict.predicted.trust}"
+    assert words in repr(result) and log.name in repr(result) and "\n" not in repr(result)
+    shown = {row[0]: row for row in table_of(result)}
+    low, high = (float(end) for end in shown["K_m"][2].split(" .. "))
+    assert low < float(shown["K_m"][1]) < high and shown["K_m"][3] == "N*m/A"
+
+
+def test_a_preview_and_a_controller_say_what_they_are():
+    assert repr(check("prbs.yaml")) == "<Preview: prbs: 1.25 s at 800 Hz, within the limits>"
+    tuning = tune("torque.yaml", model="actuator:parameters=rig")
+    assert repr(tuning).startswith("<Tuning: ") and "\n" not in repr(tuning)
+    assert ["motor_constant", "0.1412"] in [row[:2] for row in table_of(tuning)]
+
+
+def test_a_dataset_is_one_line():
+    data = Dataset(np.zeros((1000, 2)), np.zeros((1000, 3)), dt=0.001, name="bench")
+    assert repr([data]) == "[<Dataset: bench, 1000 samples, dt=0.001 s, 2 in, 3 out>]"
+
+
+def test_names_are_no_markup():
+    assert ET.fromstring(Named()._repr_html_()).text == Named.headline
