@@ -441,7 +441,7 @@ class _Whitening:
         counted = local.objective.weights > 0.0
         measured = counted & local.seen
         residual = np.where(measured, residual, 0.0)
-        model = colour_about_means(residual, local.seen, measured, local.lengths)
+        model = colour_about_mean(residual, local.seen, measured, local.lengths)
         values, vectors = np.linalg.eigh(model.noise)
         floor = 1e-12 * max(float(values[-1]), 1e-300)
         roots = np.where(values > floor, 1.0 / np.sqrt(np.maximum(values, floor)), 0.0)
@@ -470,22 +470,20 @@ class _Whitening:
         return whitened
 
 
-def colour_about_means(
+def colour_about_mean(
     residual: FloatArray, seen: BoolArray, measured: BoolArray, lengths: tuple[int, ...]
 ) -> Autoregression:
-    """Colour of residuals (n, q) about each record's mean, of outputs that forget soon enough.
+    """Colour of residuals (n, q) about their mean, of outputs that forget soon enough.
 
     An offset is no colour: an autoregression would take it for a memory without end, and
-    whitening would erase it. Of noise that is nearly as slow as a record its mean is part.
+    whitening would erase it. Of noise that is nearly as slow as a record its mean is part. The
+    mean is that of all records: what is wrong in some of them looks like an offset of each.
     """
-    means = np.zeros_like(residual)
-    for rows in record_rows(lengths):
-        count = np.maximum(measured[rows].sum(axis=0), 1)
-        means[rows] = np.where(measured[rows], residual[rows].sum(axis=0) / count, 0.0)
-    centred = residual - means
+    mean = np.where(measured, residual.sum(axis=0) / np.maximum(measured.sum(axis=0), 1), 0.0)
+    centred = residual - mean
     model = colour(centred, seen, lengths)
     soon = _FORGETS * longest_memory(model, np.mean(centred**2, axis=0)) <= min(lengths)
-    return model if soon.all() else colour(residual - np.where(soon, means, 0.0), seen, lengths)
+    return model if soon.all() else colour(residual - np.where(soon, mean, 0.0), seen, lengths)
 
 
 def _gradient(local: Sensitivity, estimate: Estimate) -> FloatArray:

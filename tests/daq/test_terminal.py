@@ -13,7 +13,16 @@ import typer
 from daq.cli.app import app
 from tests.daq.support import environment, forked_rig, rig, write_experiment, write_rig
 
-COMMANDS = typer.main.get_command(app).commands
+GROUPS = typer.main.get_command(app).commands
+COMMANDS = {
+    " ".join((name, *more)): command
+    for name, group in GROUPS.items()
+    for more, command in (
+        [((key,), each) for key, each in group.commands.items()]
+        if hasattr(group, "commands")
+        else [((), group)]
+    )
+}
 
 
 @pytest.mark.parametrize("name", COMMANDS)

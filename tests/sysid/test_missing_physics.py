@@ -16,7 +16,7 @@ from sysid import BatchSimulator, Dataset, Input, Output, Parameter, ProcessMode
 from sysid.gassi import GASSI
 from sysid.judging.disturbed import DisturbedRun
 from sysid.judging.examination import verdict_of
-from sysid.judging.score_tests import colour_about_means
+from sysid.judging.score_tests import colour_about_mean
 from tests.soak import mostly_soak
 from tests.sysid.reference import simulate
 
@@ -53,7 +53,7 @@ def test_the_mean_of_noise_that_is_as_slow_as_the_record_is_its_colour():
     noise = np.cumsum(np.random.default_rng(0).standard_normal((750, 1)), axis=0)
     measured = np.ones_like(noise, dtype=bool)
     slow, offset = (
-        colour_about_means(e, measured, measured, (750,))
+        colour_about_mean(e, measured, measured, (750,))
         for e in (noise + 100.0, np.diff(noise, axis=0, prepend=0.0) + 100.0)
     )
     assert abs(1.0 - slow.coefficients.sum()) < 0.01
