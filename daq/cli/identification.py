@@ -108,8 +108,7 @@ def _parameter_row(result: Identification, row: ParameterRow) -> list[str]:
     source = "data" if row.name in result.estimator.guesses_ else row.source
     value = row.text(row.value, scale)
     if row.range is None:
-        how = f"= {row.tied}" if row.tied is not None else "fixed"
-        return [row.name, value, "", unit, how, source, ""]
+        return [row.name, value, "", unit, row.held, source, ""]
     span = _span(row.range, result.problem.settings.ranges.get(row.name), scale)
     interval = row.span(scale) if result.rows.refined else ""
     return [row.name, value, interval, unit, span, source, row.label]

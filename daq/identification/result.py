@@ -98,7 +98,7 @@ class Identification(Shown):
         rows = [["parameter", "value", "95 % interval", "unit", ""]]
         for row in self.rows.parameters:
             scale, unit = row.engineering
-            note = row.undetermined_label if row.free else "fixed"
+            note = row.held or row.undetermined_label
             rows.append([row.name, row.text(row.value, scale), row.span(scale), unit, note])
         return rows
 

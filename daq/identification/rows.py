@@ -142,6 +142,13 @@ class ParameterRow(QuantityRow):
     description: str = ""
 
     @property
+    def held(self) -> str:
+        """What holds it, ``= 2*K_m`` or ``fixed``; empty where it is searched."""
+        if self.free:
+            return ""
+        return f"= {self.tied}" if self.tied is not None else "fixed"
+
+    @property
     def free(self) -> bool:
         """Whether it was searched."""
         return self.range is not None

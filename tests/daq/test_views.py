@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from daq import check, identify, load, record, replay, tune
+from daq.identification.rows import ParameterRow
 from daq.views import Shown
 from sysid import Dataset
 from tests.daq.support import few_free
@@ -47,6 +48,12 @@ def test_an_identification_says_what_may_be_used_and_shows_intervals(log):
     shown = {row[0]: row for row in table_of(result)}
     low, high = (float(end) for end in shown["K_m"][2].split(" .. "))
     assert low < float(shown["K_m"][1]) < high and shown["K_m"][3] == "N*m/A"
+    assert shown["L_m"][2:] == ["-", "mH", "fixed"]
+
+
+def test_a_tied_parameter_is_not_called_fixed():
+    assert ParameterRow("K_e", 0.2, "V*s", tied="K_m").held == "= K_m"
+    assert ParameterRow("K_e", 0.2, "V*s", range=(0.1, 1.0)).held == ""
 
 
 def test_a_preview_and_a_controller_say_what_they_are():
