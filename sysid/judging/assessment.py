@@ -15,7 +15,7 @@ import numpy as np
 from sysid.arrays import BoolArray, FloatArray
 from sysid.judging.alternatives import Alternative
 from sysid.judging.expected_errors import ExpectedErrors, FloorTest, floor_test
-from sysid.judging.residual_patterns import errors_by_speed, shared_errors
+from sysid.judging.residual_patterns import errors_alone, errors_by_speed, shared_errors
 from sysid.judging.residual_tests import ResidualTest, residual_test
 from sysid.judging.score_tests import Finding, description
 from sysid.judging.starts import Starts
@@ -61,6 +61,7 @@ class RecordResult:
     floor: residuals in parts of what a right model leaves; None where nothing is known of that.
     starts: initial states that were estimated from the record. shared, by_speed: (n_outputs,),
     correlations as of ``shared_errors`` and ``errors_by_speed``; None where they were not tested.
+    alone: (n_outputs,), shares as of ``errors_alone``; None of a run that did not come to the end.
     """
 
     name: str
@@ -71,6 +72,7 @@ class RecordResult:
     starts: Starts | None = None
     shared: FloatArray | None = None
     by_speed: FloatArray | None = None
+    alone: FloatArray | None = None
 
 
 @dataclass(frozen=True)
@@ -126,6 +128,9 @@ def examine(
     residual, finite = record.outputs - simulated, bool(np.all(np.isfinite(simulated)))
     systematic = None if expected is None else expected.systematic
     shared = by_speed = None
+    alone = errors_alone(residual) if finite else None
+    if alone is not None and record.jitter.size:
+        alone[record.jitter.any(axis=0)] = 0.0  # each has a variance of its own
     if systematic is not None and finite:
         by_speed = errors_by_speed(residual, simulated, systematic)
         if record.jitter.size:
@@ -141,6 +146,7 @@ def examine(
         starts,
         shared,
         by_speed,
+        alone,
     )
 
 
@@ -398,6 +404,14 @@ def _patterns(model: ProcessModel, results: Sequence[RecordResult]) -> Iterator[
                 f"{name} errs more the faster it changes (rank correlation {size:.2f}): instants "
                 "of sampling that are not those of the log, or a time constant that varies. "
                 "Parameters may be off by more than their intervals."
+            )
+    alone = _largest(results, [result.alone for result in results])
+    for name, share in zip(model.output_names, alone, strict=True):
+        if share:
+            yield (
+                f"{100.0 * share:.2g} % of what is left of {name} stands alone, far from what is "
+                "left beside it: outliers too small to be seen in the samples. Squared, they count "
+                "more than their number; leave them out."
             )
 
 

@@ -1,12 +1,13 @@
-"""What residuals are like where no floor is known: shared by outputs, or larger in fast motion.
+"""What residuals are like where no floor is known: shared, larger in fast motion, standing alone.
 
 Sensors err each by themselves. An error that two outputs share came through the plant: a force, a
 voltage, a friction that the model lacks. And sensors err as much in slow as in fast motion; more in
 fast motion is what instants do that are not those of the clock, or a time constant that is wrong.
+Single errors far from those beside them are outliers too small to be seen in the samples.
 """
 
 import numpy as np
-from scipy.stats import spearmanr
+from scipy.stats import binom, spearmanr
 
 from sysid.arrays import BoolArray, FloatArray
 from sysid.judging.residual_tests import residual_test
@@ -16,6 +17,10 @@ _LAGS = 20  # at which two outputs' residuals are compared
 # Deviations of chance beyond which the largest of so many correlations is none of it.
 _SURE = 4.5
 _EXPECTED = 0.5  # of a residual's deviation, from where what a right model leaves may explain it
+# Robust deviations from its neighbours at which an error stands alone, the share of such that does
+# little harm (Student's noise of four degrees of freedom has 0.3 %), and the chance of more.
+_ALONE, _HEAVY, _BY_CHANCE = 6.0, 1e-2, 1e-4
+_ROBUST = 0.6745  # median of |x| of a normal x of unit deviation
 
 
 def shared_errors(residual: FloatArray, systematic: FloatArray) -> FloatArray:
@@ -58,6 +63,32 @@ def errors_by_speed(
         correlation = float(spearmanr(errors, speeds).statistic)
         trend[j] = correlation if correlation > _SURE / np.sqrt(seen.sum()) else 0.0
     return trend
+
+
+def errors_alone(residual: FloatArray) -> FloatArray:
+    """Share of each output's errors that stand alone, (n_outputs,), 0 where chance explains it.
+
+    residual: (n, n_outputs), NaN where a sample was lost. One stands alone where it is six robust
+    deviations from the mean of its neighbours, and the farthest of the three.
+
+    >>> rng = np.random.default_rng(0)
+    >>> noise = rng.standard_normal((500, 2))
+    >>> noise[10::25, 1] += 12.0
+    >>> errors_alone(noise).tolist()
+    [0.0, 0.04]
+    """
+    n, share = len(residual), np.zeros(residual.shape[1])
+    apart = np.zeros_like(residual)
+    apart[1:-1] = residual[1:-1] - 0.5 * (residual[:-2] + residual[2:])
+    sizes = np.abs(np.where(np.isfinite(apart), apart, 0.0))
+    for j in np.flatnonzero(sizes.any(axis=0)):
+        size = sizes[:, j]
+        limit = _ALONE / _ROBUST * float(np.median(size[size > 0.0]))
+        beside = np.maximum(np.roll(size, 1), np.roll(size, -1))
+        count = int(np.sum((size > limit) & (size > beside)))
+        if binom.sf(count - 1, n, _HEAVY) < _BY_CHANCE:
+            share[j] = count / n
+    return share
 
 
 def _explained(residual: FloatArray, systematic: FloatArray) -> BoolArray:

@@ -410,6 +410,23 @@ def test_errors_that_grow_with_the_rate_of_change_are_no_sensors():
     assert verdict([jittered(1, 0.0)], [jittered(2, 0.0)]).trust == "good"
 
 
+@pytest.mark.parametrize("outliers", [0.05, 0.0])
+def test_errors_far_from_their_neighbours_are_outliers(outliers):
+    """Student's noise of four degrees of freedom has none."""
+
+    def spiked(seed):
+        data, rng = record(seed), np.random.default_rng([seed, 6])
+        wrong = rng.standard_t(4.0, (N, 2))
+        wrong[rng.uniform(size=N) < outliers, 0] += 15.0
+        return examine(data, data.outputs - NOISE * wrong)
+
+    judged = verdict([spiked(1)], [spiked(2)])
+    assert judged.parameters.trust == ("limited" if outliers else "good")
+    if outliers:
+        (reason,) = judged.parameters.reasons
+        assert " % of what is left of speed stands alone, far from what is left" in reason
+
+
 def test_parts_of_a_log_that_want_their_own_parameters_make_them_doubtful():
     apart = replace(told(""), disagreement=9.0)
     (reason,) = verdict(uncertainty=apart).parameters.reasons
