@@ -24,19 +24,31 @@ class _Mark(NamedTuple):
     digest: bytes
 
 
+class _Written(NamedTuple):
+    """What was appended so far: bytes, rows without the header, the bytes' hash."""
+
+    size: int
+    n_rows: int
+    content: hashlib._Hash
+
+    def and_then(self, rows: bytes) -> _Written:
+        """With further rows."""
+        content = self.content.copy()
+        content.update(rows)
+        return _Written(self.size + len(rows), self.n_rows + rows.count(b"\n"), content)
+
+
 class Part:
     """A new file that begins with a header; every ``write`` is with the operating system at once.
 
-    first: number of its first row in the run. n_rows: rows written. Raises OSError. The open file
+    first: number of its first row in the run. Raises OSError. The open file
     outlives its name: what was written can be read back where the file was deleted.
     """
 
     def __init__(self, path: Path, header: bytes, first: int = 0) -> None:
         self.path = path
         self.first = first
-        self.n_rows = -1  # the header is none
-        self._size = 0
-        self._hash = hashlib.sha256()
+        self._written = _Written(0, -1, hashlib.sha256())  # the header is no row
         self._marks: list[_Mark] = []
         # Appending, so that no hole of zeros comes about where the file has been truncated.
         kind = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_APPEND | getattr(os, "O_BINARY", 0)
@@ -48,26 +60,32 @@ class Part:
             self.close()
             raise
 
+    @property
+    def n_rows(self) -> int:
+        """Rows written."""
+        return self._written.n_rows
+
     def write(self, rows: bytes) -> None:
         """Append whole rows; of those that the disk refuses, what was written counts."""
-        done = 0
         try:
+            done = 0
             while done < len(rows):
                 done += self._file.write(rows[done:]) or 0
-        finally:
-            written = rows[:done]
-            self._size += done
-            self.n_rows += written.count(b"\n")
-            self._hash.update(written)
-        if self._size - (self._marks[-1].size if self._marks else 0) >= _MARK_EVERY:
+            self._written = self._written.and_then(rows)
+        except BaseException:
+            # A signal may raise between the system's writing and our counting: the file knows.
+            more = os.fstat(self._file.fileno()).st_size - self._written.size
+            self._written = self._written.and_then(rows[: max(more, 0)])
+            raise
+        if self._written.size - (self._marks[-1].size if self._marks else 0) >= _MARK_EVERY:
             self._mark()
 
     def resized(self) -> str | None:
         """Whether somebody truncated the file or wrote into it, in a word; takes a microsecond."""
         size = os.fstat(self._file.fileno()).st_size
-        if size == self._size:
+        if size == self._written.size:
             return None
-        return "truncated" if size < self._size else "written into"
+        return "truncated" if size < self._written.size else "written into"
 
     def disturbed(self) -> str | None:
         """What became of the file by somebody else's doing, in a word."""
@@ -104,11 +122,12 @@ class Part:
         self._file.close()
 
     def _mark(self) -> None:
-        self._marks.append(_Mark(self._size, self.n_rows, self._hash.digest()))
+        size, n_rows, content = self._written
+        self._marks.append(_Mark(size, n_rows, content.digest()))
 
     def _intact(self) -> int:
         """How many rows are certainly as they were written."""
-        if not self._marks or self._marks[-1].size < self._size:
+        if not self._marks or self._marks[-1].size < self._written.size:
             self._mark()
         self._file.seek(0)
         content, position, intact = hashlib.sha256(), 0, 0

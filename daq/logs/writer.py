@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
 import time
@@ -128,8 +129,13 @@ class LogWriter:
         self.path.parent.mkdir(parents=True, exist_ok=True)
         names = (f"{self.path.stem}-{n}{self.path.suffix}" for n in itertools.count(2))
         path = next(p for p in map(self.path.with_name, names) if not p.exists())
-        part = Part(path, self._header, first)
-        part.write(b"".join(rows for _, rows in self._recent))
+        try:
+            part = Part(path, self._header, first)
+            part.write(b"".join(rows for _, rows in self._recent))
+        except BaseException:  # a signal's; the next look begins another part
+            with contextlib.suppress(OSError):
+                path.unlink(missing_ok=True)
+            raise
         self._parts.append(part)
         self._warn(f"{was}, at sample {self.n_samples}; the run goes on in {path}")
 

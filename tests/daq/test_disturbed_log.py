@@ -3,21 +3,27 @@
 The truth is the log of the same run that was left alone: the simulated rig repeats itself.
 """
 
+import contextlib
+import dataclasses
+import itertools
 import os
 import signal
 import sys
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
+import daq.logs
+from daq.hal import Samples
 from daq.logs.recording import load
+from daq.logs.writer import LogWriter
 from tests.daq.support import (
     forked_rig,
     only_capture,
     record_of,
-    running_capture,
-    start_rig,
+    run_in_progress,
     until,
     write_experiment,
     write_rig,
@@ -151,8 +157,7 @@ def test_rows_that_nobody_has_are_named_and_all_others_kept(run, tmp_path, truth
 def test_a_log_deleted_in_a_long_run_is_noticed_at_once(tmp_path):
     write_experiment(tmp_path / "e.yaml", duration=60)
     write_rig(tmp_path / "rig.yaml", options={"time": "real"})
-    process = start_rig("run", "e.yaml", "--rig", "rig.yaml", cwd=tmp_path)
-    folder = running_capture(tmp_path, rows=50)
+    process, folder = run_in_progress(tmp_path)
     before = (folder / "log.csv").read_text().splitlines()
     (folder / "log.csv").unlink()
     until((folder / "log-2.csv").exists, "the run to go on elsewhere")
@@ -170,8 +175,7 @@ def test_a_log_deleted_in_a_long_run_is_noticed_at_once(tmp_path):
 def test_what_is_left_by_kill_behind_a_deleted_log_is_no_whole_log(tmp_path):
     write_experiment(tmp_path / "e.yaml", duration=60)
     write_rig(tmp_path / "rig.yaml", options={"time": "real"})
-    process = start_rig("run", "e.yaml", "--rig", "rig.yaml", cwd=tmp_path)
-    folder = running_capture(tmp_path, rows=50)
+    process, folder = run_in_progress(tmp_path)
     os.truncate(folder / "log.csv", 4000)
     part = folder / "log-2.csv"
     until(lambda: part.exists() and part.read_bytes().count(b"\n") > 100, "rows in a part")
@@ -185,3 +189,72 @@ def test_what_is_left_by_kill_behind_a_deleted_log_is_no_whole_log(tmp_path):
     (folder / "log.csv").unlink()
     with pytest.raises(Exception, match=r"deleted while it was written; .* log-2\.csv"):
         load(folder)
+
+
+class Interrupted(BaseException):
+    """What a signal raises."""
+
+
+class Signal:
+    """Raises once, before the n-th instruction of the log's writing; used as a context manager."""
+
+    def __init__(self, n):
+        self.n = n
+
+    def __enter__(self):
+        self.before = sys.gettrace()
+        sys.settrace(self._trace)
+
+    def __exit__(self, *exception):
+        sys.settrace(self.before)
+
+    def _trace(self, frame, event, argument):
+        if Path(frame.f_code.co_filename).parent != Path(daq.logs.__file__).parent:
+            return None
+        frame.f_trace_opcodes = True
+        if event == "opcode":
+            self.n -= 1
+            if self.n == 0:
+                raise Interrupted
+        return self._trace
+
+
+def _samples(first):
+    ticks = np.arange(first, first + 2)
+    values = {field.name: ticks.astype(float) for field in dataclasses.fields(Samples)}
+    return Samples(**{**values, "tick": ticks, "flags": ticks * 0})
+
+
+@pytest.mark.filterwarnings("ignore:.*unclosed file")  # one that was only just opened
+@pytest.mark.filterwarnings("ignore:.*FileIO")
+@pytest.mark.parametrize("deleted", [False, True])
+def test_a_signal_at_any_instant_of_writing_disturbs_no_log(tmp_path, deleted, monkeypatch):
+    """One that comes between the system's writing and our counting, too."""
+    monkeypatch.setattr(os, "fsync", lambda file: None)  # a thousand of them take their time
+    signals = 0
+    for n in itertools.count(1):
+        path = tmp_path / str(n) / "log.csv"
+        path.parent.mkdir()
+        with LogWriter(path) as log:
+            log.append(_samples(0))
+            if deleted:
+                path.unlink()
+                log._next_look = 0.0
+            signal_at = Signal(n)
+            with contextlib.suppress(Interrupted), signal_at:
+                log.append(_samples(2))
+        whole = path.read_text()
+        header, *rows = whole.splitlines()
+        column = header.split(",").index("tick")
+        ticks = [int(row.split(",")[column]) for row in rows]
+        assert ticks in ([0, 1], [0, 1, 2, 3]), n
+        assert whole.endswith("\n") and log.n_samples == len(rows), n
+        if deleted:
+            assert log.disturbance.startswith("it was deleted"), n
+            assert "nothing of it is lost" in log.disturbance, n
+        else:
+            assert log.disturbance is None, n
+        signals += 1
+        if signal_at.n > 0:
+            break
+    assert signals > 300, "it was interrupted at every instruction"

@@ -18,7 +18,7 @@ from tests.daq.support import (
     only_capture,
     record_of,
     rig,
-    running_capture,
+    run_in_progress,
     start_rig,
     until,
     write_experiment,
@@ -78,8 +78,7 @@ def assert_stopped(process, folder):
 def test_a_hail_of_signals_ends_a_run_that_says_so(tmp_path):
     write_experiment(tmp_path / "e.yaml", duration=60)
     write_rig(tmp_path / "rig.yaml", options={"time": "real"})
-    process = start_rig("run", "e.yaml", "--rig", "rig.yaml", cwd=tmp_path)
-    folder = running_capture(tmp_path)
+    process, folder = run_in_progress(tmp_path, rows=1)
     hail(process, random.Random(2))
     assert_stopped(process, folder)
 

@@ -25,7 +25,7 @@ from tests.daq.support import (
     only_capture,
     record_of,
     rig,
-    running_capture,
+    run_in_progress,
     write_experiment,
     write_rig,
 )
@@ -334,14 +334,21 @@ def test_a_closed_terminal_ends_the_run_and_not_its_record(tmp_path):
 
     write_experiment(tmp_path / "e.yaml", duration=60)
     write_rig(tmp_path / "rig.yaml", options={"time": "real"})
-    here, there = pty.openpty()
-    process = subprocess.Popen(
-        [sys.executable, "-c", _OWN_TERMINAL, *RIG, "run", "e.yaml", "--rig", "rig.yaml"],
-        cwd=tmp_path, env=environment(), stdin=there, stdout=there, stderr=there,
-    )  # fmt: skip
-    os.close(there)
-    folder = running_capture(tmp_path, rows=50)
-    os.close(here)
+    terminals = []
+
+    def start():
+        here, there = pty.openpty()
+        terminals.append(here)
+        process = subprocess.Popen(
+            [sys.executable, "-c", _OWN_TERMINAL, *RIG, "run", "e.yaml", "--rig", "rig.yaml"],
+            cwd=tmp_path, env=environment(), stdin=there, stdout=there, stderr=there,
+        )  # fmt: skip
+        os.close(there)
+        return process
+
+    process, folder = run_in_progress(tmp_path, start=start)
+    for terminal in terminals:
+        os.close(terminal)
     process.wait(timeout=60)
     assert_consistent(folder, "stopped", "stopped by SIGHUP during run")
     assert np.all(np.diff(load(folder).frame["tick"]) == 1)

@@ -21,7 +21,7 @@ from tests.daq.support import (
     record_of,
     rig,
     rows_in,
-    running_capture,
+    run_in_progress,
     start_rig,
     until,
     write_experiment,
@@ -360,8 +360,7 @@ def test_losing_the_last_samples_of_a_run_is_no_complete_run(tmp_path, plugin):
 def test_a_signal_stops_a_run_in_real_time_with_its_log_whole(tmp_path, plugin, number, by):
     write_experiment(tmp_path / "e.yaml", duration=30)
     write_rig(tmp_path / "rig.yaml", **merged(FAULTY, {"options": {"time": "real"}}))
-    process = start_rig("run", "e.yaml", "--rig", "rig.yaml", cwd=tmp_path, env=plugin)
-    folder = running_capture(tmp_path, rows=50)
+    process, folder = run_in_progress(tmp_path, env=plugin)
     process.send_signal(number)
     _, errors = process.communicate(timeout=30)
     assert process.returncode == 1, errors
@@ -378,8 +377,7 @@ def test_a_signal_stops_a_run_in_real_time_with_its_log_whole(tmp_path, plugin, 
 def test_a_closed_terminal_stops_a_run_too(tmp_path, plugin):
     write_experiment(tmp_path / "e.yaml", duration=30)
     write_rig(tmp_path / "rig.yaml", **merged(FAULTY, {"options": {"time": "real"}}))
-    process = start_rig("run", "e.yaml", "--rig", "rig.yaml", cwd=tmp_path, env=plugin)
-    folder = running_capture(tmp_path, rows=50)
+    process, folder = run_in_progress(tmp_path, env=plugin)
     process.send_signal(signal.SIGHUP)
     process.communicate(timeout=30)
     assert process.returncode == 1
@@ -405,9 +403,8 @@ def test_a_signal_while_the_load_is_wound_is_recorded_with_its_phase(tmp_path):
 def test_rows_reach_the_file_while_the_run_is_going_on(tmp_path):
     write_experiment(tmp_path / "e.yaml", duration=30)
     write_rig(tmp_path / "rig.yaml", options={"time": "real"})
-    process = start_rig("run", "e.yaml", "--rig", "rig.yaml", cwd=tmp_path)
+    process, folder = run_in_progress(tmp_path, rows=20)
     try:
-        folder = running_capture(tmp_path, rows=20)
         for more in (100, 200, 300):
             until(lambda least=more: rows_in(folder) >= least, f"{more} rows")
             assert process.poll() is None

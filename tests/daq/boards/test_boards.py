@@ -2,9 +2,7 @@
 
 import json
 import os
-import shutil
 import signal
-from functools import partial
 
 import numpy as np
 import pytest
@@ -19,9 +17,7 @@ from tests.daq.support import (
     only_capture,
     record_of,
     rig,
-    rows_in,
-    start_rig,
-    until,
+    run_in_progress,
     write_experiment,
     write_rig,
     write_yaml,
@@ -413,23 +409,6 @@ def test_an_open_loop_without_a_measured_phase_is_refused_before_anything(tmp_pa
     assert not (tmp_path / "runs").exists()
 
 
-def started(folder, env):
-    """A run in progress; begun again where a busy computer came too late for the card."""
-    for _ in range(3):
-        process = start_rig("run", "e.yaml", "--rig", "rig.yaml", cwd=folder, env=env)
-        until(partial(_goes_on_or_ended, process, folder), "a log, or an end")
-        if process.poll() is None:
-            return process
-        _, errors = process.communicate()
-        shutil.rmtree(folder / "runs", ignore_errors=True)
-    raise AssertionError(errors)
-
-
-def _goes_on_or_ended(process, folder):
-    captures = (folder / "runs").glob("*")
-    return process.poll() is not None or any(rows_in(capture) >= 100 for capture in captures)
-
-
 @pytest.mark.parametrize(
     "ending", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.soak)]
 )
@@ -437,7 +416,7 @@ def test_a_signal_zeroes_the_outputs_of_a_card(tmp_path, ending):
     write_experiment(tmp_path / "e.yaml", duration=60)
     without_seed(rig_file(tmp_path))
     env = environment(**REAL, journal=str(tmp_path / "journal"))
-    process = started(tmp_path, _whole(env))
+    process, _ = run_in_progress(tmp_path, rows=100, env=_whole(env))
     process.send_signal(ending)
     _, said = process.communicate(timeout=60)
     assert process.returncode not in (0, 2)
@@ -451,7 +430,7 @@ def test_a_killed_host_leaves_an_armed_watchdog_behind(tmp_path, backend):
     write_experiment(tmp_path / "e.yaml", duration=60)
     without_seed(rig_file(tmp_path, backend))
     env = environment(**REAL, journal=str(tmp_path / "journal"))
-    process = started(tmp_path, _whole(env))
+    process, _ = run_in_progress(tmp_path, rows=100, env=_whole(env))
     process.kill()
     process.communicate(timeout=60)
     entries = journal_of(tmp_path / "journal")

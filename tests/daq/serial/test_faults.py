@@ -22,8 +22,7 @@ from tests.daq.support import (
     forked_rig,
     only_capture,
     record_of,
-    running_capture,
-    start_rig,
+    run_in_progress,
     until,
     write_experiment,
 )
@@ -241,8 +240,7 @@ def test_a_port_that_is_not_there_is_named_with_the_cure(tmp_path):
 def test_a_killed_host_means_zero_outputs_within_the_watchdogs_time(tmp_path, emulate, rig, mode):
     with emulate(tmp_path) as running:
         write_run(tmp_path, running.port, mode, seconds=60, watchdog=0.2)
-        process = start_rig("run", "e.yaml", "--rig", "rig.yaml", cwd=tmp_path)
-        running_capture(tmp_path, rows=80)
+        process, _ = run_in_progress(tmp_path, rows=80)
         until(lambda: any(running.journal[-1]["outputs"]), "outputs that are not zero")
         os.kill(process.pid, signal.SIGKILL)
         process.communicate()
