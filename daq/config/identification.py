@@ -345,6 +345,28 @@ class IdentificationConfig(Signals):
         description="the part of each log that is used, or of logs by name",
         examples=["0 s .. 20 s", {"day1.csv": "rows 1 .. 4000"}],
     )
+    merge: Annotated[list[str], BeforeValidator(_several), WithJsonSchema(_NAMES_SCHEMA)] = Field(
+        default_factory=list,
+        description="files with columns that a log lacks, beside it; * stands for its name",
+        examples=["*_force.csv"],
+    )
+    delay: dict[str, Seconds] = Field(
+        default_factory=dict,
+        description="by how much channels of the logs come late",
+        examples=[{"torque": "3 ms"}],
+    )
+    detrend: dict[str, Literal["constant", "linear"]] = Field(
+        default_factory=dict,
+        description="what is taken off channels: their mean (constant) or a straight line (linear)",
+        examples=[{"torque": "linear"}],
+    )
+    decimate: int = Field(
+        1,
+        ge=1,
+        le=10_000,
+        description="samples of which one is left, behind a low-pass that all channels share",
+        examples=[10],
+    )
     run_in: RunInSetting = Field(
         None,
         description="beginning of each log that is simulated and not compared, a time or rows",

@@ -59,6 +59,26 @@ def signals(time: FloatArray, panels: Sequence[Panel]) -> Figure:
 
 
 @style.styled
+def overlaid(times: tuple[FloatArray, FloatArray], panels: Sequence[Panel]) -> Figure:
+    """Two lines a panel, each over its own time [s]: what it was, and drawn over it what it is."""
+    names = list(panels[0].lines)
+    figure, axes = style.stack([0.62] * len(panels), 0.13, top=0.2)
+    looks: tuple[dict[str, Any], ...] = (
+        {"color": style.ASKED, "lw": 1.6},
+        {"color": style.IDENTIFIED, "lw": 0.8},
+    )
+    for axis, panel in zip(axes, panels, strict=True):
+        drawn = "steps-post" if panel.steps else "default"
+        for name, time, look in zip(names, times, looks, strict=True):
+            axis.plot(*style.thinned(time, panel.lines[name]), label=name, drawstyle=drawn, **look)
+        style.name_y(axis, notation.words(panel.name), notation.bracketed(panel.unit))
+        axis.margins(x=0.01)
+    axes[-1].set_xlabel("time [s]")
+    style.legend(figure, axes[0])
+    return figure
+
+
+@style.styled
 def responses(time: FloatArray, outputs: Sequence[Panel]) -> Figure:
     """Each output's response and, at its own scale below, measured minus simulated.
 

@@ -7,7 +7,7 @@ from daq.config import check, yaml_file
 from daq.config.identification import DatasheetEntry, IdentificationConfig
 from daq.config.yaml_file import YamlFile
 from daq.errors import suggestion
-from daq.identification.records import unit_factor
+from daq.identification.foreign import unit_factor
 from sysid import ModelError, ProcessModel, SearchSpace
 
 Entries = dict[str, tuple[YamlFile, DatasheetEntry]]  # by parameter, with the file they stand in

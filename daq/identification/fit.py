@@ -13,7 +13,8 @@ import numpy as np
 
 from daq.errors import ConfigError, Terminated
 from daq.identification import records, request
-from daq.identification.records import ColumnMapping, LoggedRecord, Split
+from daq.identification.foreign import ColumnMapping
+from daq.identification.records import LoggedRecord, Split
 from daq.identification.request import SettingsRequest
 from daq.identification.result import FittedLog, Identification
 from daq.identification.selection import EVERYTHING, Selection
@@ -123,6 +124,9 @@ def fit(
     """
     train, check = load_logs(problem, training, validation)
     warn(watch, *(log.warning for log in (*train, *check)))
+    for log in (*train, *check):
+        if log.preparation is not None:
+            watch(Note("note", f"{log.path}: {'; '.join(log.preparation.steps)}"))
     train, ends = records.hold_back(train, problem.settings.hold_back)
     _require_information(problem, train)
     logs = train, [*ends, *check]

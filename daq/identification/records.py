@@ -2,44 +2,41 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.config.check import refuse
-from daq.config.identification import Column, Columns
-from daq.config.units import factor
-from daq.config.yaml_file import Key, YamlFile
 from daq.errors import ConfigError, suggestion
 from daq.hal import FloatArray, IntArray
+from daq.identification.foreign import ColumnMapping, read_foreign
 from daq.identification.selection import EVERYTHING, Selection
 from daq.logs import matlab
 from daq.logs.capture import LOG_NAME
 from daq.logs.encoder import SPEED, MeanSpeeds
 from daq.logs.recording import Recording, end_of_run, log_path, read_record
 from daq.logs.recording import load as load_recording
-from daq.logs.table import column_names, read_table
 from daq.logs.time_base import refuse_rows, require_rows, time_base
 from sysid.problem.data import Dataset
 from sysid.problem.faults import mended
-from sysid.problem.model import Input, ModelError, Output, ProcessModel
+from sysid.problem.model import ModelError, ProcessModel
 
 if TYPE_CHECKING:
     import pandas as pd
 
-Signal = Input | Output
-SignalGroup = tuple[str, dict[str, Column], Sequence[Signal]]
-
 
 @dataclass(frozen=True)
-class ColumnMapping:
-    """The 'columns' section of a configuration file, checked against a model."""
+class Preparation:
+    """What was done to a log before it was used: its steps, and the record before and after them.
 
-    file: YamlFile
-    columns: Columns
+    start: where in the record before them the other begins [s].
+    """
+
+    steps: tuple[str, ...]
+    before: Dataset
+    after: Dataset
+    start: float
 
 
 @dataclass(frozen=True)
@@ -47,13 +44,16 @@ class LoggedRecord:
     """A log as a record for a model; warning: how a run that did not complete ended.
 
     measured: its record with the faulty samples that ``robust`` leaves out of ``dataset``; None
-    where that leaves none out.
+    where that leaves none out. preparation: what was done to it before, None for nothing. merged:
+    files with columns of it.
     """
 
     dataset: Dataset
     path: Path
     warning: str | None
     measured: Dataset | None = None
+    preparation: Preparation | None = None
+    merged: tuple[Path, ...] = ()
 
 
 Split = tuple[list[LoggedRecord], list[LoggedRecord]]  # for training, for validation
@@ -83,7 +83,7 @@ def load(
     """One log as a record; ConfigError names the file, line and column of what is wrong."""
     try:
         if mapping is not None:
-            return _load_foreign(log_path(path), model, mapping, selection)
+            return _foreign(log_path(path), model, mapping, selection)
         return from_recording(load_recording(path), model, selection)
     except ModelError as error:
         raise ConfigError(str(error), file=path) from None
@@ -100,7 +100,8 @@ def from_recording(
     outputs = np.array([recording.noise(n) for n in model.output_names]).reshape(-1, 2).T
     calibrated = {"output_noise": outputs[0], "output_zero": outputs[1]}
     dataset = replace(dataset, input_noise=noise, input_zero=zero, **calibrated)
-    return _mended(LoggedRecord(dataset, recording.path, recording.warning), model, selection)
+    log = LoggedRecord(dataset, recording.path, recording.warning)
+    return _prepared(log, model, selection)
 
 
 def from_frame(
@@ -129,7 +130,24 @@ def from_frame(
     tick, dt = time_base(path, numbers["t"].to_numpy(), first_line=0)
     log = Recording(path, numbers.assign(tick=tick), dt)
     record = LoggedRecord(_from_log(log, model, name, selection), path, None)
-    return _mended(record, model, selection)
+    return _prepared(record, model, selection)
+
+
+def _prepared(log: LoggedRecord, model: ProcessModel, selection: Selection) -> LoggedRecord:
+    """A log as ``delay``, ``detrend``, ``decimate``, ``run_in`` and ``robust`` want it."""
+    if selection.preparation.needed:
+        made, before = selection.prepared(log.dataset, log.path, model), log.dataset
+        steps = (*_merging(log), *made.steps)
+        preparation = Preparation(steps, before, made.dataset, made.start)
+        log = replace(log, dataset=made.dataset, preparation=preparation)
+    elif log.merged:
+        log = replace(log, preparation=Preparation(_merging(log), log.dataset, log.dataset, 0.0))
+    log = replace(log, dataset=_without_run_in(log.dataset, log.path, model, selection))
+    return _mended(log, model, selection)
+
+
+def _merging(log: LoggedRecord) -> tuple[str, ...]:
+    return (f"merged with {', '.join(map(str, log.merged))}",) if log.merged else ()
 
 
 def _mended(log: LoggedRecord, model: ProcessModel, selection: Selection) -> LoggedRecord:
@@ -137,6 +155,24 @@ def _mended(log: LoggedRecord, model: ProcessModel, selection: Selection) -> Log
     if not selection.robust:
         return log
     return replace(log, dataset=mended(model, log.dataset), measured=log.dataset)
+
+
+def _foreign(
+    path: Path, model: ProcessModel, mapping: ColumnMapping, selection: Selection
+) -> LoggedRecord:
+    """A log of another program as a record."""
+    others = selection.merged(path)
+    table = read_foreign(path, model, mapping, others)
+    rows = selection.rows(path, table.time)
+    inputs, outputs, tick = table.inputs[rows], table.outputs[rows], table.tick[rows]
+    if selection.run_in is None:
+        # The first sample tells where the model starts.
+        first = int(np.argmax(np.isfinite(outputs).all(axis=1)))
+        inputs, outputs, tick = inputs[first:], outputs[first:], tick[first:]
+    dataset = _dataset(path, model, inputs, outputs, tick, table.dt, path.stem)
+    warning = end_of_run(path, read_record(path), table.torn)
+    log = LoggedRecord(dataset, path, warning, merged=tuple(others))
+    return _prepared(log, model, selection)
 
 
 def hold_back(logs: list[LoggedRecord], part: float) -> Split:
@@ -173,39 +209,6 @@ def _halves(log: LoggedRecord, part: float) -> tuple[LoggedRecord, LoggedRecord]
     return halves[0], halves[1]
 
 
-def check_mapping(
-    model: ProcessModel, mapping: ColumnMapping, spare: Mapping[str, Collection[str]]
-) -> None:
-    """Raise ConfigError unless every signal of the model, and no other, has its column.
-
-    spare: ``inputs`` and ``outputs`` that may have one as well though this model is used without
-    them.
-    """
-    file, groups = mapping.file, _groups(model, mapping.columns)
-    for group, given, signals in groups:
-        needed = [signal.name for signal in signals]
-        for name in given:
-            if name not in needed and name not in spare[group]:
-                problem = f"model {model.name} has no such signal; {suggestion(name, needed)}"
-                raise file.error(("columns", group, name), problem)
-        for name in needed:
-            if name not in given:
-                problem = f"{name!r} of model {model.name} is missing; add it"
-                raise file.error(("columns", group), problem)
-    for name, column in mapping.columns.outputs.items():
-        if column.constant is not None:
-            key = ("columns", "outputs", name)
-            raise file.error(key, "an output must be measured, not constant")
-    for group, given, signals in groups:
-        for signal in signals:
-            unit_key = ("columns", group, signal.name, "unit")
-            unit_factor(file, unit_key, given[signal.name].unit, signal.unit)
-
-
-def _groups(model: ProcessModel, columns: Columns) -> list[SignalGroup]:
-    return [("inputs", columns.inputs, model.inputs), ("outputs", columns.outputs, model.outputs)]
-
-
 def _from_log(
     log: Recording,
     model: ProcessModel,
@@ -234,7 +237,7 @@ def _from_log(
         windows[places] = np.where(speed[:, None], speeds.windows[rows][:, None], 0.0)
         jitter[places] = np.where(speed, speeds.jitter[rows][:, None], 0.0)
         dataset = replace(dataset, windows=windows, jitter=jitter)
-    return _without_run_in(dataset, log.path, model, selection)
+    return dataset
 
 
 def _without_run_in(
@@ -251,85 +254,6 @@ def _without_run_in(
     no_starts = [name not in model.state_names for name in model.output_names]
     outputs[0, no_starts] = np.nan
     return replace(dataset, outputs=outputs)
-
-
-def _load_foreign(
-    path: Path, model: ProcessModel, mapping: ColumnMapping, selection: Selection
-) -> LoggedRecord:
-    columns = mapping.columns
-    _check_columns(path, model, mapping)
-    gapless = {columns.time.column, *(columns.inputs[name].column for name in model.input_names)}
-    outputs_from = {columns.outputs[name].column for name in model.output_names}
-    used = sorted(name for name in gapless | outputs_from if name is not None)
-    gaps = [name for name in used if name not in gapless]
-    cure = "mend these cells or remove their lines (removed lines count as lost samples)"
-    frame, first_line, torn = read_table(path, used, cure, gaps)
-    require_rows(path, len(frame))
-    time, tick, dt = _foreign_time(path, frame, first_line, mapping)
-
-    def values(group: str, given: dict[str, Column], signals: Sequence[Signal]) -> FloatArray:
-        table = np.zeros((len(frame), len(signals)))
-        for j, signal in enumerate(signals):
-            source, key = given[signal.name], ("columns", group, signal.name, "unit")
-            factor = source.sign * unit_factor(mapping.file, key, source.unit, signal.unit)
-            if source.column is not None:
-                table[:, j] = frame[source.column].to_numpy() * factor
-            elif source.constant is not None:
-                table[:, j] = source.constant * factor
-        return table
-
-    rows = selection.rows(path, time)
-    inputs, outputs = (values(*group)[rows] for group in _groups(model, columns))
-    tick = tick[rows]
-    if selection.run_in is None:
-        # The first sample tells where the model starts.
-        first = int(np.argmax(np.isfinite(outputs).all(axis=1)))
-        inputs, outputs, tick = inputs[first:], outputs[first:], tick[first:]
-    dataset = _dataset(path, model, inputs, outputs, tick, dt, path.stem)
-    dataset = _without_run_in(dataset, path, model, selection)
-    log = LoggedRecord(dataset, path, end_of_run(path, read_record(path), torn))
-    return _mended(log, model, selection)
-
-
-def _check_columns(path: Path, model: ProcessModel, mapping: ColumnMapping) -> None:
-    """Raise ConfigError at each key that names a column which a file does not have."""
-    present, columns = column_names(path), mapping.columns
-    wanted: list[tuple[Key, str | None]] = [(("columns", "time", "column"), columns.time.column)]
-    for group, given, signals in _groups(model, columns):
-        wanted += [(("columns", group, s.name, "column"), given[s.name].column) for s in signals]
-    mistakes = []
-    for key, name in wanted:
-        if name is not None and name not in present:
-            hint = suggestion(name, list(filter(None, present)))
-            mistakes.append(mapping.file.mistake(key, f"{path} has no column {name!r}; {hint}"))
-    refuse(mistakes)
-
-
-def _foreign_time(
-    path: Path, frame: pd.DataFrame, first_line: int, mapping: ColumnMapping
-) -> tuple[FloatArray, IntArray, float]:
-    """Times [s] and sequence numbers of a foreign table's rows, and their sample time [s]."""
-    time = mapping.columns.time
-    if time.column is None:
-        assert time.sample_rate is not None
-        tick: IntArray = np.arange(len(frame), dtype=np.int64)
-        return tick / time.sample_rate, tick, 1.0 / time.sample_rate
-    seconds = unit_factor(mapping.file, ("columns", "time", "unit"), time.unit, "s")
-    values = frame[time.column].to_numpy() * seconds
-    cure = (
-        "say 'grid: 0.001' (s) in 'columns: time:' to round uneven times to multiples of it, or "
-        "resample the log to a constant rate"
-    )
-    places = None
-    if time.grid is not None:
-        places = np.round((values - values[0]) / time.grid)
-        if np.any(np.diff(places) == 0.0) and np.all(np.diff(values) > 0.0):
-            apart = f"rows of {path} are {np.diff(values).min():g} s apart; take a tenth of that"
-            problem = f"{time.grid:g} s is too coarse: {apart}"
-            raise mapping.file.error(("columns", "time", "grid"), problem)
-        values = values[0] + places * time.grid
-    tick, dt = time_base(path, values, places, first_line=first_line, column=time.column, cure=cure)
-    return values, tick, dt
 
 
 def _dataset(
@@ -357,11 +281,3 @@ def _dataset(
         if signal.hold != "zoh":
             filled[:, column] = np.interp(np.arange(length), rows, inputs[:, column])
     return Dataset(filled, whole, dt, name)
-
-
-def unit_factor(file: YamlFile, key: tuple[str, ...], unit: str | None, wanted: str) -> float:
-    """Factor from a unit in the file to the model's unit."""
-    try:
-        return 1.0 if unit is None else factor(unit, wanted)
-    except ValueError as error:
-        raise file.error(key, str(error)) from None

@@ -24,6 +24,7 @@ from daq.provenance import software_versions
 from daq.views import Lines, Shown
 from sysid import Metrics, ProcessModel
 from sysid.arrays import FloatArray
+from sysid.problem.data import Dataset
 from sysid.problem.faults import DataFault
 from sysid.problem.model import Parameter
 from sysid.uncertainty import Estimate, Profile, Uncertainty
@@ -191,6 +192,7 @@ class Identification(Shown):
             **{key: value for key, value in signals.items() if value},
             "criterion": {"name": estimator.criterion_, "reason": estimator.criterion_reason_},
             **({"averaged": averaged} if (averaged := _averaged(self)) else {}),
+            **({"preparation": prepared} if (prepared := _preparation(self)) else {}),
             "verdict": _verdict(verdict),
             **({"missing": _missing(self)} if self.suspicion is not None else {}),
             "data_faults": [_fault(fault) for fault in self.faults],
@@ -463,6 +465,26 @@ def _averaged(result: Identification) -> dict[str, str]:
         for j, name in enumerate(result.model.output_names)
         if any(record.windows.size and record.windows[:, j].any() for record in records)
     }
+
+
+def _preparation(result: Identification) -> list[dict[str, Any]]:
+    """What was done to each log before it was used; a log of which a part was held back once."""
+    logs = {str(log.log.path): log.log for log in (*result.training, *result.validation)}
+    return [
+        {
+            "log": path,
+            "steps": list(log.preparation.steps),
+            "before": _size(log.preparation.before),
+            "after": _size(log.preparation.after),
+            "start": log.preparation.start,
+        }
+        for path, log in logs.items()
+        if log.preparation is not None
+    ]
+
+
+def _size(record: Dataset) -> dict[str, Any]:
+    return {"samples": record.n_samples, "sample_time": record.dt}
 
 
 def _log(model: ProcessModel, log: FittedLog) -> dict[str, Any]:

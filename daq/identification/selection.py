@@ -1,4 +1,4 @@
-"""Which samples of a log are used, which of them are compared, and which count as not measured."""
+"""What of a log is used, how it is prepared, and what of it is compared."""
 
 from __future__ import annotations
 
@@ -14,33 +14,72 @@ from daq.config.yaml_file import YamlFile
 from daq.errors import ConfigError, Mistake, suggestion
 from daq.hal import FloatArray
 from daq.logs.capture import LOG_NAME
+from sysid.problem.data import Dataset
+from sysid.problem.model import ProcessModel
+from sysid.problem.preparation import AS_IT_IS, Preparation, PreparationError, Prepared, prepare
 
 
 @dataclass(frozen=True)
 class Selection:
-    """What ``use``, ``run_in`` and ``robust`` of a configuration say of its logs.
+    """What a configuration says of its logs before they are fitted; ``KEYS`` name it.
 
     use: for all logs, or by the name of a capture folder or file, with or without its ending.
-    file: where they stand.
+    merge: files beside a log with columns that it lacks, ``*`` for its name. file: where all this
+    stands.
     """
 
     use: Stretch | dict[str, Stretch] | None = None
     run_in: RunIn | None = None
     robust: bool = False
+    merge: tuple[str, ...] = ()
+    preparation: Preparation = AS_IT_IS
     file: YamlFile | None = None
 
     @classmethod
     def of(cls, document: Mapping[str, Any]) -> Selection:
         """From a ``document``."""
-        settings = IdentificationConfig.model_validate(document)
-        return cls(settings.use, settings.run_in, settings.robust)
+        return cls.under(IdentificationConfig.model_validate(document))
+
+    @classmethod
+    def under(cls, settings: IdentificationConfig, file: YamlFile | None = None) -> Selection:
+        """From settings, and the file that they stand in."""
+        preparation = Preparation(settings.delay, settings.detrend, settings.decimate)
+        merge = tuple(settings.merge)
+        return cls(settings.use, settings.run_in, settings.robust, merge, preparation, file)
 
     @property
     def document(self) -> dict[str, Any]:
         """The settings as they were written, those that were."""
         content = {} if self.file is None else self.file.content
-        keys = ("use", "run_in", "robust")
-        return {key: content[key] for key in keys if content.get(key) is not None}
+        return {key: content[key] for key in KEYS if content.get(key)}
+
+    def check_channels(self, channels: Sequence[str]) -> None:
+        """Raise ConfigError for a channel to be prepared that no model has."""
+        for key in ("delay", "detrend"):
+            for name in getattr(self.preparation, key):
+                if name not in channels:
+                    cure = suggestion(name, list(channels))
+                    raise self._mistaken((key, name), "the model has no such channel", cure)
+
+    def merged(self, path: Path) -> list[Path]:
+        """The files with more columns of a log; ConfigError for one that is not there."""
+        name = path.parent.name if path.name == LOG_NAME else path.stem
+        files = [path.parent / pattern.replace("*", name) for pattern in self.merge]
+        for file in files:
+            if not file.is_file():
+                cure = "write its name as seen from the log, with * for the log's name"
+                raise self._mistaken(("merge",), f"there is no {file}", cure)
+        return files
+
+    def prepared(self, record: Dataset, path: Path, model: ProcessModel) -> Prepared:
+        """A record as ``delay``, ``detrend`` and ``decimate`` have it; ConfigError."""
+        try:
+            return prepare(model, record, self.preparation)
+        except PreparationError as error:
+            problem = error.problem.replace(record.name, str(path), 1)
+            raise self._mistaken(
+                error.key, problem, "use more of the log, or change this"
+            ) from None
 
     def rows(self, path: Path, time: FloatArray) -> slice:
         """The rows of a log that are used; time: of its rows, (n,) [s], as the log counts it.
@@ -107,6 +146,8 @@ def _names(path: Path) -> Sequence[str]:
         return [path.parent.name, str(path)]
     return [path.name, path.stem, str(path)]
 
+
+KEYS = ("use", "merge", "delay", "detrend", "decimate", "run_in", "robust")
 
 EVERYTHING = Selection()
 """All rows of every log, as they were measured."""

@@ -11,8 +11,8 @@ from daq.config.identification import IdentificationConfig, Signals
 from daq.config.units import converted
 from daq.config.yaml_file import TypedSettings, YamlFile
 from daq.errors import ConfigError, Mistake, suggestion
-from daq.identification import datasheets, records, stages
-from daq.identification.records import ColumnMapping
+from daq.identification import datasheets, stages
+from daq.identification.foreign import ColumnMapping, check_mapping
 from daq.identification.request import SettingsRequest
 from daq.identification.selection import EVERYTHING, Selection
 from daq.lookup.models import DEFAULT_MODEL, find_model, whole_name
@@ -81,7 +81,7 @@ def problems_of(
     file, freed = _without_nulls(file, [model for model, _ in declared])
     file, unconverted = in_model_units(file, [model for model, _ in declared])
     settings = check.validate(file, IdentificationConfig, others=unconverted)
-    selection = Selection(settings.use, settings.run_in, settings.robust, file)
+    selection = Selection.under(settings, file)
     for model, name in declared:
         watch(Note("detail", f"model {name}: {model.description}"))
     models = [_with_outputs(file, settings, model) for model, _ in declared]
@@ -89,6 +89,7 @@ def problems_of(
     mapping = ColumnMapping(file, settings.columns) if settings.columns else None
     signals = [name for m, _ in declared for name in (*m.output_names, *m.state_names)]
     spare = {"inputs": _all_names(models, "input_names"), "outputs": signals}
+    selection.check_channels(list(dict.fromkeys([*spare["inputs"], *signals])))
     # Typed names are relative to where they are typed, those in a file to that file.
     beside = config.parent if config is not None and "datasheet" not in file.typed else Path()
     entries = datasheets.load([beside / name for name in settings.datasheet], models)
@@ -105,7 +106,7 @@ def problems_of(
         completed = _with_freed(file, completed, model, freed)
         _check_space(file, completed, model, earlier)
         if mapping is not None:
-            records.check_mapping(model, mapping, spare)
+            check_mapping(model, mapping, spare)
         started = _with_starts(file, completed, model)
         if completed.guess and model.guesses is None:
             missing = "no 'guesses' function that reads ranges from logs; leave this out"
@@ -200,14 +201,14 @@ def columns_of(config: Path | None, model: ProcessModel) -> ColumnMapping | None
         return None
     mapping = ColumnMapping(file, columns)
     # The file may be of a comparison, in which other models have other signals.
-    records.check_mapping(model, mapping, {"inputs": columns.inputs, "outputs": columns.outputs})
+    check_mapping(model, mapping, {"inputs": columns.inputs, "outputs": columns.outputs})
     return mapping
 
 
 def selection_of(config: Path | None, model: ProcessModel) -> Selection:
     """Which samples of a log count by a configuration, whatever model it names; ConfigError."""
     file, settings = _configuration(config, model)
-    return Selection(settings.use, settings.run_in, settings.robust, file)
+    return Selection.under(settings, file)
 
 
 def _configuration(

@@ -11,7 +11,7 @@ from daq.config import yaml_file
 from daq.config.identification import IdentificationConfig
 from daq.config.yaml_file import YamlFile
 from daq.errors import ConfigError
-from daq.identification.records import unit_factor
+from daq.identification.foreign import unit_factor
 from daq.identification.request import PARAMETERS
 from sysid import Given, ModelError, ProcessModel
 

@@ -17,7 +17,9 @@ from daq.report.explanation import view
 from sysid import ProcessModel
 
 # In the order of the page.
-TOPICS = ("parameters", "responses", "residuals", "frequency", "torque", "excitation", "search")
+TOPICS = (
+    "data", "parameters", "responses", "residuals", "frequency", "torque", "excitation", "search",
+)  # fmt: skip
 _CODE = re.compile("`([^`]+)`")  # what is typed, in sentences
 _TEMPLATES = Path(__file__).parent / "templates"
 

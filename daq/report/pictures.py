@@ -15,7 +15,7 @@ from daq.figures import style
 from daq.figures.bode import ComplexArray, bode
 from daq.figures.findings import plot
 from daq.figures.parameters import convergence, correlation, intervals, ranges
-from daq.figures.signals import Panel, residual_correlations, responses, signals, spectra
+from daq.figures.signals import Panel, overlaid, residual_correlations, responses, signals, spectra
 from daq.files import write_whole
 from daq.findings import Axis
 from daq.identification.baseline import Baseline
@@ -83,6 +83,7 @@ def pictures(subject: Subject) -> Iterator[Picture]:
     """The figures, each yielded as soon as it is drawn."""
     yield from _responses(subject, "validation", subject.validation, subject.baseline)
     yield from _responses(subject, "training", subject.training, None)
+    yield from _preparation(subject)
     yield from _excitation(subject)
     yield from _residuals(subject)
     yield from _search(subject.document)
@@ -127,6 +128,29 @@ def _response(output: Output, log: Dataset, simulated: Mapping[str, FloatArray],
 
 def _percent(fit: float) -> str:
     return (f"{fit:.1f}".replace("-", "−") if np.isfinite(fit) else "–") + " %"
+
+
+def _preparation(subject: Subject) -> Iterator[Picture]:
+    """The first prepared log before and after."""
+    logs = [log for log, _ in (*subject.training, *subject.validation)]
+    shown = next((log for log in logs if log.preparation is not None), None)
+    if shown is None or shown.preparation is None:
+        return
+    before, after = shown.preparation.before, shown.preparation.after
+    times = before.time, after.time + shown.preparation.start
+    sides = (
+        (subject.model.inputs, before.inputs, after.inputs),
+        (subject.model.outputs, before.outputs, after.outputs),
+    )
+    panels = [
+        Panel(s.name, s.unit, {"as logged": raw, "as used": used}, getattr(s, "hold", "") == "zoh")
+        for signals_of_side, *values in sides
+        for s, raw, used in zip(signals_of_side, *(table.T for table in values), strict=True)
+    ]
+    yield Picture(
+        "preparation", "data",
+        f"The log {shown.dataset.name} before and after its preparation.", overlaid(times, panels),
+    )  # fmt: skip
 
 
 def _excitation(subject: Subject) -> Iterator[Picture]:

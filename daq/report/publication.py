@@ -95,11 +95,16 @@ def fingerprints(logs: Split) -> list[dict[str, Any]]:
             "use": use,
             "samples": log.dataset.n_samples,
             "sample_rate": 1.0 / log.dataset.dt,
-            "sha256": hashlib.sha256(log.path.read_bytes()).hexdigest(),
+            "sha256": _hash(log.path),
+            **({"merged": {str(f): _hash(f) for f in log.merged}} if log.merged else {}),
         }
         for use, part in zip(("training", "validation"), logs, strict=True)
         for log in part
     ]
+
+
+def _hash(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def _document(

@@ -93,10 +93,12 @@ def _logs(reproduction: Mapping[str, Any], model: ProcessModel) -> Split:
     logs: dict[str, dict[Path, LoggedRecord]] = {"training": {}, "validation": {}}
     for entry in reproduction["logs"]:
         path = root / entry["log"]
-        if not path.exists():
-            raise ConfigError("this log of the report is gone", cure=_AGAIN, file=path)
-        if hashlib.sha256(path.read_bytes()).hexdigest() != entry["sha256"]:
-            raise ConfigError("this log is another than the report's", cure=_AGAIN, file=path)
+        for name, digest in {entry["log"]: entry["sha256"], **entry.get("merged", {})}.items():
+            file = root / name
+            if not file.exists():
+                raise ConfigError("this log of the report is gone", cure=_AGAIN, file=file)
+            if hashlib.sha256(file.read_bytes()).hexdigest() != digest:
+                raise ConfigError("this log is another than the report's", cure=_AGAIN, file=file)
         logs[entry["use"]][path] = records.load(path, model, columns, selection)
     training, ends = records.hold_back(list(logs["training"].values()), reproduction["hold_back"])
     # Of a log that is in both, the end was held back.

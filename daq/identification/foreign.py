@@ -1,0 +1,240 @@
+"""Logs of other programs: which column is which signal, and columns of several files together."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daq.config.check import refuse
+from daq.config.identification import Column, Columns
+from daq.config.units import factor
+from daq.config.yaml_file import Key, YamlFile
+from daq.errors import ConfigError, suggestion
+from daq.hal import FloatArray, IntArray
+from daq.logs.table import column_names, read_table
+from daq.logs.time_base import require_rows, time_base
+from sysid.problem.model import Input, Output, ProcessModel
+from sysid.problem.preparation import filtered, low_pass
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Signal = Input | Output
+SignalGroup = tuple[str, dict[str, Column], Sequence[Signal]]
+
+_CURE = "mend these cells or remove their lines (removed lines count as lost samples)"
+_FASTER = 1.5  # times the log's rate above which a merged file is filtered first
+
+
+@dataclass(frozen=True)
+class ColumnMapping:
+    """The 'columns' section of a configuration file, checked against a model."""
+
+    file: YamlFile
+    columns: Columns
+
+
+@dataclass(frozen=True)
+class ForeignTable:
+    """A model's signals from a foreign log, in its units, a row for each sample.
+
+    inputs: (n, n_inputs); outputs: (n, n_outputs), NaN where not measured. time: (n,) [s] as the
+    log counts it; tick: (n,) sequence numbers. torn: whether a cut last line is left out.
+    """
+
+    inputs: FloatArray
+    outputs: FloatArray
+    time: FloatArray
+    tick: IntArray
+    dt: float
+    torn: bool
+
+
+def check_mapping(
+    model: ProcessModel, mapping: ColumnMapping, spare: Mapping[str, Collection[str]]
+) -> None:
+    """Raise ConfigError unless every signal of the model, and no other, has its column.
+
+    spare: ``inputs`` and ``outputs`` that may have one as well though this model is used without
+    them.
+    """
+    file, groups = mapping.file, _groups(model, mapping.columns)
+    for group, given, signals in groups:
+        needed = [signal.name for signal in signals]
+        for name in given:
+            if name not in needed and name not in spare[group]:
+                problem = f"model {model.name} has no such signal; {suggestion(name, needed)}"
+                raise file.error(("columns", group, name), problem)
+        for name in needed:
+            if name not in given:
+                problem = f"{name!r} of model {model.name} is missing; add it"
+                raise file.error(("columns", group), problem)
+    for name, column in mapping.columns.outputs.items():
+        if column.constant is not None:
+            key = ("columns", "outputs", name)
+            raise file.error(key, "an output must be measured, not constant")
+    for group, given, signals in groups:
+        for signal in signals:
+            unit_key = ("columns", group, signal.name, "unit")
+            unit_factor(file, unit_key, given[signal.name].unit, signal.unit)
+
+
+def _groups(model: ProcessModel, columns: Columns) -> list[SignalGroup]:
+    return [("inputs", columns.inputs, model.inputs), ("outputs", columns.outputs, model.outputs)]
+
+
+def read_foreign(
+    path: Path, model: ProcessModel, mapping: ColumnMapping, others: Sequence[Path] = ()
+) -> ForeignTable:
+    """The model's signals of a log; others: files with columns that it lacks.
+
+    Raises ConfigError, naming file, line and column.
+    """
+    places = _places(path, model, mapping, others)
+    sources = {mapping.columns.inputs[signal.name].column: signal for signal in model.inputs}
+    measured = {mapping.columns.outputs[name].column for name in model.output_names}
+    gaps = [name for name in measured if name is not None and name not in sources]
+    parts = {file: _read(file, columns, gaps, mapping) for file, columns in places.items()}
+    log = parts[path]
+    columns = {name: log.frame[name].to_numpy() for name in places[path]}
+    held = {name for name, signal in sources.items() if name is not None and signal.hold == "zoh"}
+    kept = np.ones(len(log.time), dtype=bool)
+    for file, part in parts.items():
+        if file == path:
+            continue
+        kept &= (log.time >= part.time[0] - 0.5 * log.dt) & (log.time <= part.time[-1] + part.dt)
+        for name in places[file]:
+            columns[name] = _moved(part, name, log, name in held)
+    if kept.sum() < 2:
+        spans = ", ".join(
+            f"{file.name} {part.time[0]:g} s .. {part.time[-1]:g} s" for file, part in parts.items()
+        )
+        cure = "merge files whose times count from the same instant"
+        raise ConfigError(f"no time is in all of {spans}", cure=cure, file=path)
+
+    def values(group: str, given: dict[str, Column], signals: Sequence[Signal]) -> FloatArray:
+        table = np.zeros((len(log.time), len(signals)))
+        for j, signal in enumerate(signals):
+            source, key = given[signal.name], ("columns", group, signal.name, "unit")
+            factor = source.sign * unit_factor(mapping.file, key, source.unit, signal.unit)
+            if source.column is not None:
+                table[:, j] = columns[source.column] * factor
+            elif source.constant is not None:
+                table[:, j] = source.constant * factor
+        return table[kept]
+
+    inputs, outputs = (values(*group) for group in _groups(model, mapping.columns))
+    return ForeignTable(inputs, outputs, log.time[kept], log.tick[kept], log.dt, log.torn)
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A file's columns, its times [s] and sequence numbers, and whether its last line was cut."""
+
+    frame: pd.DataFrame
+    time: FloatArray
+    tick: IntArray
+    dt: float
+    torn: bool
+
+
+def _read(
+    path: Path, columns: Sequence[str], gaps: Collection[str], mapping: ColumnMapping
+) -> _Part:
+    time = mapping.columns.time.column
+    names = sorted({*columns, *([] if time is None else [time])})
+    frame, first_line, torn = read_table(path, names, _CURE, [n for n in gaps if n in names])
+    require_rows(path, len(frame))
+    return _Part(frame, *_foreign_time(path, frame, first_line, mapping), torn)
+
+
+def _moved(part: _Part, name: str, log: _Part, held: bool) -> FloatArray:
+    """A column of another file at the times of a log.
+
+    A held input's is the latest before, others run straight between two samples and are NaN beside
+    one that was not measured; those of a faster file pass a low-pass first.
+    """
+    values: FloatArray = part.frame[name].to_numpy(dtype=np.float64)
+    time = part.time
+    if held:
+        latest = np.searchsorted(time, log.time + 1e-3 * part.dt, side="right") - 1
+        before: FloatArray = values[np.maximum(latest, 0)]
+        return before
+    even = len(time) == int(part.tick[-1] - part.tick[0]) + 1
+    if even and log.dt > _FASTER * part.dt:
+        taps = low_pass(log.dt / part.dt)
+        half = len(taps) // 2
+        # Beyond its ends it is taken to stay as it is.
+        values = filtered(np.pad(values, half, mode="edge")[:, None], taps)[:, 0]
+    return np.interp(log.time, time, values)
+
+
+def _places(
+    path: Path, model: ProcessModel, mapping: ColumnMapping, others: Sequence[Path]
+) -> dict[Path, list[str]]:
+    """The columns that are wanted of each file; ConfigError at each key that no file has."""
+    time = mapping.columns.time.column
+    present = {file: column_names(file) for file in (path, *others)}
+    wanted: list[tuple[Key, str | None]] = []
+    for group, given, signals in _groups(model, mapping.columns):
+        wanted += [(("columns", group, s.name, "column"), given[s.name].column) for s in signals]
+    mistakes, places = [], dict[Path, list[str]]({path: []})
+    if time is not None:
+        mistakes = [
+            mapping.file.mistake(("columns", "time", "column"), _lacking(file, time, names))
+            for file, names in present.items()
+            if time not in names
+        ]
+    for key, name in wanted:
+        file = next((file for file in present if name in present[file]), None)
+        if name is None or file is not None:
+            if name is not None and file is not None and name not in places.get(file, ()):
+                places.setdefault(file, []).append(name)
+            continue
+        every = [column for names in present.values() for column in names]
+        mistakes.append(mapping.file.mistake(key, _lacking(path, name, every)))
+    refuse(mistakes)
+    return places
+
+
+def _lacking(path: Path, name: str, present: Sequence[str]) -> str:
+    return f"{path} has no column {name!r}; {suggestion(name, list(filter(None, present)))}"
+
+
+def _foreign_time(
+    path: Path, frame: pd.DataFrame, first_line: int, mapping: ColumnMapping
+) -> tuple[FloatArray, IntArray, float]:
+    """Times [s] and sequence numbers of a foreign table's rows, and their sample time [s]."""
+    time = mapping.columns.time
+    if time.column is None:
+        assert time.sample_rate is not None
+        tick: IntArray = np.arange(len(frame), dtype=np.int64)
+        return tick / time.sample_rate, tick, 1.0 / time.sample_rate
+    seconds = unit_factor(mapping.file, ("columns", "time", "unit"), time.unit, "s")
+    values = frame[time.column].to_numpy() * seconds
+    cure = (
+        "say 'grid: 0.001' (s) in 'columns: time:' to round uneven times to multiples of it, or "
+        "resample the log to a constant rate"
+    )
+    places = None
+    if time.grid is not None:
+        places = np.round((values - values[0]) / time.grid)
+        if np.any(np.diff(places) == 0.0) and np.all(np.diff(values) > 0.0):
+            apart = f"rows of {path} are {np.diff(values).min():g} s apart; take a tenth of that"
+            problem = f"{time.grid:g} s is too coarse: {apart}"
+            raise mapping.file.error(("columns", "time", "grid"), problem)
+        values = values[0] + places * time.grid
+    tick, dt = time_base(path, values, places, first_line=first_line, column=time.column, cure=cure)
+    return values, tick, dt
+
+
+def unit_factor(file: YamlFile, key: tuple[str, ...], unit: str | None, wanted: str) -> float:
+    """Factor from a unit in the file to the model's unit."""
+    try:
+        return 1.0 if unit is None else factor(unit, wanted)
+    except ValueError as error:
+        raise file.error(key, str(error)) from None

@@ -1,0 +1,178 @@
+"""Foreign logs that are cut, merged, moved, detrended and decimated before they are used."""
+
+import dataclasses
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+
+from daq import ConfigError
+from daq.identification import records
+from daq.identification.fit import identify_files
+from daq.identification.request import SettingsRequest
+from daq.identification.settings import problem_of
+from daq.report.publication import publish
+from daq.report.reprint import redraw
+from sysid import GASSI, Dataset
+from sysid.examples import lag
+from sysid.problem.preparation import Preparation, low_pass, prepare
+
+GAIN, TAU, DT, N = 3.0, 0.04, 1e-3, 3000
+CONFIG = {
+    "model": "lag.py:model",
+    "population": 16,
+    "generations": 2,
+    "columns": {
+        "time": {"column": "t"},
+        "inputs": {"u": {"column": "u"}},
+        "outputs": {"y": {"column": "y"}},
+    },
+}
+
+
+def clean():
+    """A lag at 1 kHz under levels that hold for 23 samples, without noise."""
+    u = np.repeat(np.random.default_rng(0).uniform(-1.0, 1.0, N // 23 + 1), 23)[:N]
+    y = np.zeros(N)
+    for k in range(N - 1):
+        y[k + 1] = GAIN * u[k] + (y[k] - GAIN * u[k]) * np.exp(-DT / TAU)
+    return Dataset(u, y, DT, "lag")
+
+
+def fitted(record):
+    return GASSI(lag(), population=20, generations=3).fit([record]).parameters_
+
+
+def test_a_decimated_record_gives_the_parameters_of_the_whole():
+    record = clean()
+    made = prepare(lag(), record, Preparation(decimate=10))
+    assert made.dataset.dt == pytest.approx(10 * DT)
+    found = fitted(made.dataset)
+    assert found["gain"] == pytest.approx(GAIN, rel=0.01)
+    assert found["tau"] == pytest.approx(TAU, rel=0.02)
+    # Every tenth sample as it stands folds what is faster than the new rate into the signals.
+    thinned = fitted(Dataset(record.inputs[::10], record.outputs[::10], 10 * DT))
+    assert abs(thinned["gain"] / GAIN - 1.0) > 0.05
+
+
+def test_the_low_pass_stops_what_would_fold_into_its_passband():
+    for factor in (2, 7, 10):
+        taps = low_pass(factor)
+        frequency = np.linspace(0.0, 1.0, 2000)  # in parts of the Nyquist frequency
+        phases = np.exp(-1j * np.pi * np.outer(frequency, np.arange(len(taps))))
+        gain = np.abs(phases @ taps)
+        assert np.allclose(gain[frequency < 0.75 / factor], 1.0, atol=2e-3)
+        assert gain[frequency > 1.25 / factor].max() < 2e-3
+        assert np.allclose(taps, taps[::-1])
+
+
+@pytest.mark.parametrize("late", [3e-3, 3.4e-3, -2.5e-3])
+def test_an_output_that_comes_late_is_moved_back(late):
+    record = clean()
+    times = record.time - late
+    smooth = np.sin(20.0 * record.time)
+    moved = dataclasses.replace(record, outputs=np.sin(20.0 * times))
+    made = prepare(lag(), moved, Preparation(delay={"y": late}))
+    first = round(made.start / DT)
+    then = slice(first, first + made.dataset.n_samples)
+    inner = slice(20, -20)
+    assert np.allclose(made.dataset.outputs[inner, 0], smooth[then][inner], atol=1e-6)
+    assert np.array_equal(made.dataset.inputs, record.inputs[then])
+
+
+def test_samples_that_were_not_measured_take_no_part():
+    record = clean()
+    outputs = record.outputs + 2.0 + 3.0 * record.time[:, None]
+    outputs[1000:1100] = np.nan
+    record = dataclasses.replace(record, outputs=outputs)
+    flat = prepare(lag(), record, Preparation(detrend={"y": "linear"})).dataset.outputs[:, 0]
+    known = np.isfinite(flat)
+    assert known.sum() == N - 100
+    assert np.allclose(np.polyfit(record.time[known], flat[known], 1), 0.0, atol=1e-9)
+    made = prepare(lag(), record, Preparation(decimate=10))
+    lost = np.flatnonzero(np.isnan(made.dataset.outputs[:, 0])) * made.dataset.dt + made.start
+    assert 0.95 <= lost.min() <= 1.01 and 1.09 <= lost.max() <= 1.15
+
+
+def test_white_noise_is_known_behind_the_filter():
+    rng, n = np.random.default_rng(1), 40_000
+    record = Dataset(
+        rng.standard_normal(n), rng.standard_normal(n), DT, input_noise=[1.0], output_noise=[1.0]
+    )
+    made = prepare(lag(), record, Preparation(decimate=8)).dataset
+    assert made.input_noise[0] == pytest.approx(np.std(made.inputs), rel=0.05)
+    assert made.output_noise[0] == pytest.approx(np.std(made.outputs), rel=0.05)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A log whose force stands in a file of its own, faster, later, and with an offset."""
+    record = clean()
+    (tmp_path / "lag.py").write_text("from sysid.examples import lag\nmodel = lag()\n")
+    pd.DataFrame({"t": record.time, "u": record.inputs[:, 0]}).to_csv(
+        tmp_path / "day1.csv", index=False
+    )
+    fast = np.arange(-200, 2 * N - 400) * DT / 2.0
+    force = np.interp(fast - 4e-3, record.time, record.outputs[:, 0])
+    pd.DataFrame({"t": fast, "y": force}).to_csv(tmp_path / "day1_force.csv", index=False)
+    return tmp_path
+
+
+def problem(folder, **changes):
+    path = folder / "id.yaml"
+    path.write_text(yaml.safe_dump({**CONFIG, **changes}))
+    return problem_of(SettingsRequest(str(path)))
+
+
+def loaded(folder, **changes):
+    asked = problem(folder, **changes)
+    return records.load(folder / "day1.csv", asked.model, asked.mapping, asked.selection)
+
+
+def test_a_log_is_merged_moved_cut_and_decimated_and_the_report_shows_it(folder):
+    steps = {"merge": "*_force.csv", "use": "0.1 s .. 2.7 s", "delay": {"y": "4 ms"}, "decimate": 5}
+    problem(folder, **steps)
+    notes = []
+    request = SettingsRequest(str(folder / "id.yaml"))
+    result = identify_files([folder / "day1.csv"], [], request, folder / "out", notes.append)
+    found = result.parameters["value"]
+    assert found["gain"] == pytest.approx(GAIN, rel=0.02)
+    assert found["tau"] == pytest.approx(TAU, rel=0.05)
+    document = yaml.safe_load((folder / "out" / "parameters.yaml").read_text())
+    entry = document["preparation"][0]
+    assert entry["before"]["sample_time"] == pytest.approx(DT)
+    assert entry["after"]["sample_time"] == pytest.approx(5 * DT)
+    told = "; ".join(entry["steps"])
+    assert "day1_force.csv" in told and "y 4 ms earlier" in told and "become" in told
+    assert any(told in getattr(note, "text", "") for note in notes)
+    publish(result, folder / "out")
+    page = (folder / "out" / "report.html").read_text()
+    assert 'id="preparation"' in page and "y 4 ms earlier" in page
+    drawn = redraw(folder / "out", ["png"], folder / "again", trust=True)
+    assert folder / "again" / "preparation.png" in drawn
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"delay": {"z": 0.1}}, "delay.z: the model has no such channel"),
+        ({"detrend": {"y": "quadratic"}}, "detrend.y"),
+        ({"decimate": 0}, "decimate"),
+        ({"merge": "*_force.csv", "decimate": 900}, "needs at least"),
+        ({"merge": "*_force.csv", "delay": {"y": "9 s"}}, "the delay must be far shorter"),
+        ({"merge": "missing.csv"}, "merge: there is no"),
+        ({}, "has no column 'y'"),
+    ],
+)
+def test_what_a_log_does_not_have_is_told_at_its_key(folder, changes, told):
+    with pytest.raises(ConfigError, match=r"id\.yaml") as caught:
+        loaded(folder, **changes)
+    assert told in str(caught.value)
+
+
+def test_files_whose_times_do_not_meet_are_refused(folder):
+    late = pd.read_csv(folder / "day1_force.csv").assign(t=lambda table: table.t + 100.0)
+    late.to_csv(folder / "day1_force.csv", index=False)
+    with pytest.raises(ConfigError, match="no time is in all of"):
+        loaded(folder, merge="*_force.csv")
