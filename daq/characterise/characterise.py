@@ -21,9 +21,11 @@ from daq.identification.settings import problem_of
 from daq.logs.capture import LOG_NAME
 from daq.lookup.models import whole_name
 from daq.lookup.rigs import load_rig
+from daq.notation import quantity
 from daq.progress import Started, Watch, ignore
 from daq.recording.session import record
 from daq.report.publication import publish
+from daq.views import Lines, Shown
 
 _FIRST = 0.25  # of the time, for a first round, from what little is known
 _LATER = 0.5  # of what is left, for each that follows
@@ -32,8 +34,8 @@ _SEEDS = 2**32  # that a simulated rig takes
 _GAIN = 0.98  # of the widths, to which a round must be expected to bring them
 
 
-@dataclass(frozen=True)
-class Characterisation:
+@dataclass(frozen=True, repr=False)
+class Characterisation(Shown):
     """A rig's parameters after all rounds, and why there are no more.
 
     intervals: after the last round. seconds: logged in all. verdict: of the last identification.
@@ -47,6 +49,21 @@ class Characterisation:
     verdict: dict[str, Any]
     page: Path
     report: Path
+
+    @property
+    def headline(self) -> str:
+        """Rounds, logged time, and why it ended."""
+        rounds = f"{len(self.rounds)} round{'s' * (len(self.rounds) != 1)}"
+        return f"{rounds}, {self.seconds:.3g} s logged in {self.folder}: {self.reason}"
+
+    def lines(self) -> Lines:
+        """Quantities with the half widths of their 95 % intervals."""
+        rows = [["quantity", "value", "half width [%]", "expected [%]"]]
+        for interval in self.intervals:
+            widths = (interval.width, interval.expected)
+            texts = ["-" if width is None else f"{100.0 * width:.2g}" for width in widths]
+            rows.append([interval.name, quantity(interval.value, interval.unit), *texts])
+        return rows
 
     @property
     def document(self) -> dict[str, Any]:

@@ -26,7 +26,7 @@ from daq.identification.result import Identification
 from daq.identification.settings import problems_of
 from daq.progress import Watch, ignore, warn
 from daq.provenance import software_versions
-from daq.views import Shown
+from daq.views import Lines, Shown
 from sysid import (
     Campaign,
     Candidate,
@@ -70,12 +70,21 @@ class ComparisonRequest:
     out: Path | None = None
 
 
-@dataclass(frozen=True)
-class SeedsResult:
+@dataclass(frozen=True, repr=False)
+class SeedsResult(Shown):
     """One structure identified with several seeds: the best run, and all of them."""
 
     best: Identification
     campaign: Campaign
+
+    @property
+    def headline(self) -> str:
+        """How many seeds, and the best of them."""
+        return f"best of {len(self.campaign.outcomes)} seeds: {self.best.headline}"
+
+    def lines(self) -> Lines:
+        """The best one's parameters with their 95 % intervals."""
+        return self.best.lines()
 
 
 @dataclass(frozen=True, repr=False)

@@ -28,6 +28,7 @@ from daq.run.protocol import Dialogue, description_of
 from daq.run.realtime import RealTime
 from daq.run.sampling import Sampling, Watcher, nobody
 from daq.run.signals import SignalHandling
+from daq.views import Lines, Shown
 
 _STATUS: dict[type[BaseException], str] = {
     InterlockError: "interlock",
@@ -35,8 +36,8 @@ _STATUS: dict[type[BaseException], str] = {
 }  # others: failed
 
 
-@dataclass(frozen=True)
-class RunResult:
+@dataclass(frozen=True, repr=False)
+class RunResult(Shown):
     """A completed run: its folder, what was logged, and how punctual it was, as in run.json.
 
     doubts: what the limits that do not stop a run have said, with the cures. warnings: the same of
@@ -49,6 +50,17 @@ class RunResult:
     realtime: dict[str, Any]
     doubts: list[str]
     warnings: list[str]
+
+    @property
+    def headline(self) -> str:
+        """Its samples, where they are, and how much is in doubt."""
+        said = f", {n} doubts" if (n := len(self.doubts) + len(self.warnings)) else ""
+        return f"{self.n_samples} samples in {self.folder}{said}"
+
+    def lines(self) -> Lines:
+        """What was in doubt."""
+        doubts = [*self.doubts, *self.warnings]
+        return [["doubts"], *([text] for text in doubts)] if doubts else []
 
     @property
     def document(self) -> dict[str, Any]:

@@ -1,12 +1,18 @@
 """What results show of themselves at a prompt and in a notebook."""
 
 import xml.etree.ElementTree as ET
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from daq import check, identify, load, record, replay, tune
+from daq.characterise.characterise import Characterisation
+from daq.characterise.rounds import Interval, Round
+from daq.identification.comparison import SeedsResult
 from daq.identification.rows import ParameterRow
+from daq.run.runner import RunResult
 from daq.views import Shown
 from sysid import Dataset
 from tests.daq.support import few_free
@@ -66,6 +72,29 @@ def test_a_preview_and_a_controller_say_what_they_are():
 def test_a_dataset_is_one_line():
     data = Dataset(np.zeros((1000, 2)), np.zeros((1000, 3)), dt=0.001, name="bench")
     assert repr([data]) == "[<Dataset: bench, 1000 samples, dt=0.001 s, 2 in, 3 out>]"
+
+
+def test_a_run_says_where_it_is_and_what_is_in_doubt():
+    folder = Path("runs/a")
+    run = RunResult(folder, 1000, {}, {}, ["it is warm"], [])
+    assert repr(run) == f"<RunResult: 1000 samples in {folder}, 1 doubts>"
+    assert table_of(run) == [["doubts"], ["it is warm"]]
+    assert "<table" not in RunResult(folder, 1000, {}, {}, [], [])._repr_html_()
+
+
+def test_a_characterisation_says_why_it_ended_and_shows_half_widths():
+    intervals = (Interval("R_m", "ohm", 1.2, 0.031, 0.03), Interval("L_m", "H", 5e-4, None, None))
+    end = Path("c"), (Round(Path("c"), 1),), intervals, 12.5, "precise", {}, Path("p"), Path("r")
+    result = Characterisation(*end)
+    assert repr(result) == "<Characterisation: 1 round, 12.5 s logged in c: precise>"
+    assert table_of(result)[1:] == [["R_m", "1.20 ohm", "3.1", "3"], ["L_m", "500 µH", "-", "-"]]
+
+
+def test_the_best_of_several_seeds_is_shown():
+    best = SimpleNamespace(headline="actuator from a", lines=lambda: [["parameter"], ["R_m"]])
+    result = SeedsResult(best, SimpleNamespace(outcomes=(1, 2)))
+    assert repr(result) == "<SeedsResult: best of 2 seeds: actuator from a>"
+    assert table_of(result) == [["parameter"], ["R_m"]]
 
 
 def test_names_are_no_markup():
