@@ -19,7 +19,7 @@ from daq.cli.check import check
 from daq.cli.design import design
 from daq.cli.doctor import doctor
 from daq.cli.emulate import emulate
-from daq.cli.export import export_c, export_mat, export_mcap, export_parquet
+from daq.cli.export import export_c, export_fmu, export_mat, export_mcap, export_parquet
 from daq.cli.figures import figures
 from daq.cli.identify import identify
 from daq.cli.init import init
@@ -63,6 +63,7 @@ _EXPORTS: tuple[tuple[str, Callable[..., None], str], ...] = (
     ("mat", export_mat, "rig export mat runs/20260101T120000Z-prbs"),
     ("mcap", export_mcap, "rig export mcap runs/20260101T120000Z-prbs --out prbs.mcap"),
     ("parquet", export_parquet, "rig export parquet runs/20260101T120000Z-prbs"),
+    ("fmu", export_fmu, "rig export fmu runs/20260101T120000Z-prbs"),
     ("c", export_c, "rig export c controller.yaml --precision single --out firmware/src"),
 )
 _COMPUTING = {design, identify, campaign, replay, figures}  # that drive no rig

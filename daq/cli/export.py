@@ -63,6 +63,36 @@ def _export_log(log: Path, out: Path | None, kind: str, json: bool) -> None:
     print(f"Written: {file} ({len(recording.frame)} samples)")
 
 
+def export_fmu(
+    result: Annotated[
+        Path, Argument(metavar="RESULT", help="A parameters.yaml, its folder, or its run's.")
+    ],
+    out: Annotated[
+        Path | None, Option(metavar="FILE", help="Default: MODEL.fmu beside the result.")
+    ] = None,
+    trust: options.Trust = False,
+    json: options.AsJson = False,
+) -> None:
+    """Write an identified model as a functional mock-up unit (FMI 3.0, co-simulation).
+
+    Its C source is inside, and on Linux with a compiler (cc) what that compiles to; whoever
+    simulates it needs no Python. Parameters and starts can be set, inputs are held over a step.
+    """
+    from daq.fmu.export import export, result_file
+
+    file = result_file(result)
+    unit = export(file, trust=trust)
+    path = unit.save(out or file.with_name(f"{unit.identifier}.fmu"))
+    binaries = [] if unit.binary is None else [unit.platform]
+    if not binaries:
+        cure = f"its simulator compiles it, or you: sources/{unit.identifier}.c says how"
+        terminal.report("note", f"there is no binary in it; {cure}")
+    if json:
+        terminal.print_json({"file": path, "model": unit.identifier, "binaries": binaries})
+        return
+    print(f"Written: {path}{f' (with a binary for {binaries[0]})' if binaries else ''}")
+
+
 def export_c(
     controller: Annotated[
         Path, Argument(metavar="CONTROLLER.yaml", help="A file that rig tune made.")

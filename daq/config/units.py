@@ -118,6 +118,27 @@ def factor(given: str, wanted: str) -> float:
     return result
 
 
+_SI = {"kilogram": "kg", "meter": "m", "second": "s", "ampere": "A", "kelvin": "K", "mole": "mol",
+       "candela": "cd", "radian": "rad"}  # fmt: skip
+
+
+def base_units(unit: str) -> tuple[float, dict[str, int]] | None:
+    """A unit as a factor and whole powers of kg, m, s, A, K, mol, cd and rad; None for others.
+
+    >>> base_units("mN*m")
+    (0.001, {'kg': 1, 'm': 2, 's': -2})
+    """
+    try:
+        quantity = _registry().Quantity(1.0, _spelt(unit)).to_base_units()
+    except Exception:
+        return None
+    powers = {_SI.get(name): power for name, power in quantity.unit_items()}
+    if None in powers or any(power != int(power) for power in powers.values()):
+        return None
+    named = [name for name in _SI.values() if name in powers]
+    return float(f"{quantity.magnitude:.12g}"), {name: int(powers[name]) for name in named}
+
+
 @functools.cache
 def _registry() -> Any:
     import pint

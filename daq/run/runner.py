@@ -54,8 +54,8 @@ class RunResult(Shown):
     @property
     def headline(self) -> str:
         """Its samples, where they are, and how much is in doubt."""
-        said = f", {n} doubts" if (n := len(self.doubts) + len(self.warnings)) else ""
-        return f"{self.n_samples} samples in {self.folder}{said}"
+        doubts = f", {n} doubts" if (n := len(self.doubts) + len(self.warnings)) else ""
+        return f"{self.n_samples} samples in {self.folder}{doubts}"
 
     def lines(self) -> Lines:
         """What was in doubt."""

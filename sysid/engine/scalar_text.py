@@ -1,6 +1,7 @@
 """A model's equations as plain scalar Python, without its tuples, closures and helpers.
 
-``slopes(x, u, p, dx)`` writes dx/dt of all states into dx. The text is straight-line code over
+``slopes(x, u, p, dx)`` writes dx/dt of all states into dx, ``observe(x, u, p, y)`` the outputs into
+y. The text is straight-line code over
 flat arrays, in which conditions are choices: what Numba compiles and ``c_text`` makes C99 of.
 """
 
@@ -30,6 +31,10 @@ class ScalarEquations:
         self._tape = Tape()
         try:
             self._rows = branching(self._tape, model, model.derivative)
+            if model.output is None:
+                self._outputs = [f"x{model.state_names.index(k)}" for k in model.output_names]
+            else:
+                self._outputs = branching(self._tape, model, model.output)
         except Exception as error:
             raise ModelError(
                 f"model {model.name}: its equations cannot be followed ({error}); they may use "
@@ -41,6 +46,12 @@ class ScalarEquations:
         stores = [f"dx[{i}] = {row}" for i, row in enumerate(self._rows)]
         head = "slopes(x: Array, u: Array, p: Array, dx: Array) -> None"
         return self._text(head, "dx/dt of all states.", self._rows, {}, stores)
+
+    def observe(self) -> str:
+        """``observe(x, u, p, y)``: all outputs."""
+        stores = [f"y[{j}] = {value}" for j, value in enumerate(self._outputs)]
+        head = "observe(x: Array, u: Array, p: Array, y: Array) -> None"
+        return self._text(head, "All outputs.", self._outputs, {}, stores)
 
     def row(self, name: str, arguments: Sequence[str], place: int, at: Mapping[str, str]) -> str:
         """A function of one row of dx/dt by its place.

@@ -1,0 +1,1 @@
+"""Models for other simulators: functional mock-up units (FMI 3.0, co-simulation)."""
