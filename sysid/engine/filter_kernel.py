@@ -30,7 +30,8 @@ from sysid.problem.model import ProcessModel
 
 _Place = tuple[int, int]
 _ROOT_3 = repr(3.0**0.5)
-_OF_MEAN = ("before", "now", "between")
+_WEIGHTS = ("before", "now", "between", "so_far")
+_OF_MEAN, _OF_SUM = 0, 1
 
 
 class FilterKernel(BatchKernel):
@@ -38,12 +39,13 @@ class FilterKernel(BatchKernel):
 
     averaged: outputs that are measured as means over a time that ends with the sample. The model
     then has the integrals of these, in their order, as its last states and its last outputs: they
-    begin at zero in every sample, and a mean is a sum of the output at the sample before, of that
-    at the sample and of the integral in between, times the ``mean`` weights.
+    begin at zero in every sample. A mean is the output at the sample before, that at the sample,
+    the integral in between and the sum so far, times the ``mean`` weights; so is, by weights of its
+    own, the sum that is kept for the next sample.
 
     Behind the rows of lanes of the batch kernel the work area holds P's upper triangle, of the
-    reached states, then of the noisy inputs and then of the averaged outputs at the sample before,
-    and the estimates of each noise and of each of those outputs there.
+    reached states, then of the noisy inputs, then of the averaged outputs at the sample before and
+    then of their sums so far, and the estimates of each noise and of those outputs and sums.
     """
 
     def __init__(
@@ -61,12 +63,14 @@ class FilterKernel(BatchKernel):
         self.averaged = list(integral)
         self._integral = {j: self.reached.index(i) for j, i in integral.items()}
         self._lag = {j: self._size + m for m, j in enumerate(self.averaged)}
-        self._places = range(self._size + len(self.averaged))
+        count = len(self.averaged)
+        self._summed = {j: place + count for j, place in self._lag.items()}
+        self._places = range(self._size + 2 * count)
         self._pairs = [(a, b) for a in self._places for b in self._places if a <= b]
         self._covariance = self.work_rows
         self._noises = self._covariance + len(self._pairs)
         self._before = self._noises + self.n_noises - self._size
-        self.work_rows = self._noises + self.n_noises + len(self.averaged)
+        self.work_rows = self._noises + self.n_noises + 2 * count
 
     def text(self, *, many_registers: bool = False) -> str:
         """Python text of ``innovations``."""
@@ -108,7 +112,8 @@ class FilterKernel(BatchKernel):
         """P before the first sample: ``spread`` of the states, and the noises' variances."""
         n = len(self.reached)
         variances = {(a, a): f"spread[{a}]" if a < n else f"s[{a - n}]" for a in range(self._size)}
-        nothing = [f"{at(self._before + place)} = 0.0" for place in self._lag.values()]
+        behind = self._places[self._size :]
+        nothing = [f"{at(self._before + place)} = 0.0" for place in behind]
         return [*self._stored(variances), *nothing]
 
     def _corrected(self) -> list[str]:
@@ -119,44 +124,58 @@ class FilterKernel(BatchKernel):
         lines += [*self._loaded(), *[f"d{a} = 0.0" for a in self._places]]
         for j in range(self.n_measured):
             lines += self._taken_in(j)
-        begun = self._integral.values()
+        begun, kept = self._integral.values(), self._kept_of_outputs()
+        for place, (terms, row) in kept.items():
+            lines.append(f"next{place} = {_sum([*terms, *_products(row, 'd{}'.format)])}")
+            for a in self._places:
+                lines.append(f"L{place}_{a} = {_sum(_products(row, _covariance_with(a)))}")
+        lines += [f"{at(self._before + place)} = next{place}" for place in kept]
         lines += [
             f"{at(i)} = 0.0" if a in begun else f"{at(i)} += d{a}"
             for a, i in enumerate(self.reached)
         ]
         lines += [f"{at(self._noises + k)} = d{n + k}" for k in range(self.n_noises)]
         variances = {(a, b): f"P{a}_{b}" for a, b in self._pairs}
-        for j, place in self._lag.items():
-            gains = self._gains(j)
-            lines.append(
-                f"{at(self._before + place)} = {_sum([f'o{j}', *_products(gains, 'd{}'.format)])}"
-            )
-            for a in range(self._size):
-                lines.append(f"L{place}_{a} = {_sum(_products(gains, _covariance_with(a)))}")
-                variances[a, place] = f"L{place}_{a}"
-            for i, behind in self._lag.items():
+        for place in kept:
+            variances |= {(a, place): f"L{place}_{a}" for a in range(self._size)}
+            for behind, (_, row) in kept.items():
                 if behind >= place:
-                    row = _products(self._gains(i), f"L{place}_{{}}".format)
-                    variances[place, behind] = _sum(row)
+                    variances[place, behind] = _sum(_products(row, f"L{place}_{{}}".format))
         variances = {pair: v for pair, v in variances.items() if not set(pair) & set(begun)}
         return lines + self._stored(variances)
+
+    def _kept_of_outputs(self) -> dict[int, tuple[list[str], dict[int, str]]]:
+        """What the next sample needs of averaged outputs: terms and the row by places in P."""
+        kept = {place: ([f"o{j}"], self._gains(j)) for j, place in self._lag.items()}
+        for j, place in self._summed.items():
+            kept[place] = self._summed_up(j, _OF_SUM)
+        return kept
+
+    def _summed_up(self, j: int, of: int) -> tuple[list[str], dict[int, str]]:
+        """Terms of averaged output j's mean or sum, and the row by places in P."""
+        lag, integral, summed = self._lag[j], self._integral[j], self._summed[j]
+        before, now, between, so_far = (f"{name}{of}_{j}" for name in _WEIGHTS)
+        row = {b: f"{now} * {c}" if c else now for b, c in self._gains(j).items()}
+        row |= {lag: before, integral: between, summed: so_far}
+        terms = [
+            f"{before} * {at(self._before + lag)}",
+            f"{now} * o{j}",
+            f"{between} * {at(self.reached[integral])}",
+            f"{so_far} * {at(self._before + summed)}",
+        ]
+        return terms, row
 
     def _taken_in(self, j: int) -> list[str]:
         """Output j taken in; the deviation d is what the sample's outputs have changed so far."""
         gains, size, lines = self._gains(j), self._places, []
         predicted = [f"o{j}"]
         if j in self._lag:
-            place, integral = self._lag[j], self._integral[j]
-            lines += [f"{name} = mean[k, {j}, {i}]" for i, name in enumerate(_OF_MEAN)]
-            before, now, between = _OF_MEAN
-            gains = {b: f"{now} * {c}" if c else now for b, c in gains.items()}
-            gains |= {place: before, integral: between}
-            area = at(self.reached[integral])
-            predicted = [
-                f"{before} * {at(self._before + place)}",
-                f"{now} * o{j}",
-                f"{between} * {area}",
+            lines += [
+                f"{name}{of}_{j} = mean[k, {j}, {of}, {i}]"
+                for of in (_OF_MEAN, _OF_SUM)
+                for i, name in enumerate(_WEIGHTS)
             ]
+            predicted, gains = self._summed_up(j, _OF_MEAN)
         lines += [f"e = {_sum([*predicted, *_products(gains, 'd{}'.format)])} - y[k, {j}, l]"]
         kept = f"e = e * (w{j} * math.sqrt(unit[{j}] / r[k, {j}]))"
         if gains:
@@ -224,7 +243,7 @@ class FilterKernel(BatchKernel):
             for k in range(self.n_noises):
                 if (a, k) in gamma:
                     variances[a, n + k] = f"{gamma[a, k]} * s[{k}]"
-            for place in self._lag.values():
+            for place in self._places[self._size :]:
                 terms = [f"{phi[a, c]} * P{c}_{place}" for c in range(self._size) if (a, c) in phi]
                 variances[a, place] = _sum(terms)
         variances |= {(n + k, n + k): f"s[{k}]" for k in range(self.n_noises)}

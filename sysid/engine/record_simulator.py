@@ -1,5 +1,6 @@
 """Simulations of one record: the steps that each parameter vector needs, and blocks of lanes."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,7 +8,14 @@ import numpy as np
 from sysid.arrays import BoolArray, FloatArray, IntArray
 from sysid.engine.compiler import Filter, Kernels, Tangents, explained_errors, kernels
 from sysid.engine.scheme import LANES, work_area
-from sysid.engine.windows import average, compared, slopes, weights_of_mean, with_integrals
+from sysid.engine.windows import (
+    average,
+    compared,
+    slopes,
+    weights_of_mean,
+    weights_of_sums,
+    with_integrals,
+)
 from sysid.problem.data import Dataset
 from sysid.problem.model import ProcessModel
 from sysid.threads import Workers
@@ -187,12 +195,9 @@ class RecordSimulator:
         kept = np.empty((record.n_samples, len(noise), LANES))
         sums = np.empty((2 * len(noise), LANES))
         work = work_area(kernel.work_rows * LANES)
-        mean = np.zeros((*self._measured.shape, 3))
-        mean[..., 1] = 1.0
-        for j in kernel.averaged:
-            mean[:, j] = weights_of_mean(self._windows[j])
-        measured = self._after_the_last(mean, parameters, starts, lanes, n_steps)
-        mean[..., 2] /= record.dt
+        mean, cut = self._means(kernel.averaged, corrects)
+        weights[0, [j for j in self.averaged if j not in cut]] = 0.0  # its mean is not over yet
+        measured = self._after_the_last(cut, parameters, starts, lanes, n_steps)
         with explained_errors(model):
             kalman.innovations(
                 work, work.reshape(-1, LANES), kernel.tables, self._inputs, measured, weights,
@@ -262,9 +267,32 @@ class RecordSimulator:
                 errors[:, j] = np.abs(change) * self.record.jitter[:, j] / self.record.dt
         return errors
 
+    def _means(
+        self, averaged: Sequence[int], corrects: bool
+    ) -> tuple[FloatArray, dict[int, FloatArray]]:
+        """Weights (n_samples, n_outputs, 2, 4) as of ``weights_of_sums`` for a filter.
+
+        And those (n_samples, 3) of outputs whose means are cut off at the sample before.
+        """
+        mean = np.zeros((*self._measured.shape, 2, 4))
+        mean[..., 0, 1] = 1.0
+        cut: dict[int, FloatArray] = {}
+        for j in self.averaged:
+            seen = self._weights[:, j] > 0.0
+            seen[0] = False
+            sums = weights_of_sums(self._windows[j], seen) if corrects else None
+            if j in averaged and sums is not None:
+                mean[:, j] = sums
+            elif j in averaged:
+                mean[:, j, 0, :3] = cut[j] = weights_of_mean(self._windows[j])
+            else:
+                cut[j] = mean[:, j, 0, :3].copy()
+        mean[..., 2] /= self.record.dt
+        return mean, cut
+
     def _after_the_last(
         self,
-        mean: FloatArray,
+        cut: Mapping[int, FloatArray],
         parameters: FloatArray,
         starts: FloatArray | None,
         lanes: IntArray,
@@ -272,16 +300,18 @@ class RecordSimulator:
     ) -> FloatArray:
         """Measured outputs for each lane, (n_samples, n_outputs, LANES), as a filter takes them in.
 
-        That is by what a window saw since the sample before; the free run says what more it saw.
-        mean: (n_samples, n_outputs, 3), weights as of ``weights_of_mean``.
+        Those that are cut are by what a window saw since the sample before; the free run says what
+        more it saw. cut: weights as of ``weights_of_mean``.
         """
         measured = np.repeat(self._measured[..., None], LANES, axis=2)
-        if self.averaged:
+        if cut:
             instant, integrals, _ = self._integrated(
                 parameters, starts, lanes, n_steps, len(measured)
             )
             for j, integral in zip(self.averaged, integrals, strict=True):
-                output, (before, now, between) = instant[:, j], mean[:, j].T[..., None]
+                if j not in cut:
+                    continue
+                output, (before, now, between) = instant[:, j], cut[j].T[..., None]
                 last = now * output
                 last[1:] += before[1:] * output[:-1] + between[1:] * np.diff(integral, axis=0)
                 measured[:, j] += last - average(output, integral, self._windows[j])

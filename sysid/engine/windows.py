@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from sysid.arrays import FloatArray
+from sysid.arrays import BoolArray, FloatArray
 from sysid.problem.model import Output, ProcessModel, State, picker
 
 _INSTANT = 1e-6  # samples that no window is shorter than, unless it is an instant
@@ -103,6 +103,33 @@ def weights_of_mean(windows: FloatArray) -> FloatArray:
     instant = length < _INSTANT
     parts = (np.array(_area(end)) - np.array(_area(begin))) / np.where(instant, 1.0, length)
     return np.where(instant, np.array(_parabola(end)), parts).T
+
+
+def weights_of_sums(windows: FloatArray, seen: BoolArray) -> FloatArray | None:
+    """Weights (n_samples, 2, 4) by which a mean is summed up from sample to sample.
+
+    Of the output at the sample before, of that at this one, of the area between, over the sample
+    time, and of the sum so far: first in each sample's mean, then in the sum that is kept for
+    the next. windows: (n_samples, 2), as of ``average``; seen: (n_samples,), those that matter.
+    None unless each ends since the sample before, and begins no earlier than the one before ends.
+    """
+    weights = np.zeros((len(windows), 2, 4))
+    weights[:, 0, :3] = weights_of_mean(windows)
+    rows = np.flatnonzero(seen)
+    if np.any(windows[rows, 1] > _INSTANT) or np.any(windows[rows, 1] <= -1.0):
+        return None
+    rows = rows[windows[rows, 0] < -1.0 - _INSTANT]
+    begins, length = rows + windows[rows, 0], np.diff(windows[rows], axis=1)
+    first = np.ceil(begins - _INSTANT).astype(np.int64)
+    if np.any(first < np.append(0, rows[:-1])):
+        return None
+    weights[rows, 0, :3] = np.array(_area(windows[rows, 1] + 1.0)).T / length
+    weights[rows, 0, 3] = 1.0 / length[:, 0]
+    before = np.array(_area(begins - (first - 1.0))).T
+    for i, k, part in zip(first, rows, before, strict=True):
+        weights[i, 1, :3] = [0.0, 0.0, 1.0] - part
+        weights[i + 1 : k, 1, 2:] = 1.0
+    return weights
 
 
 @njit(cache=True, nogil=True)

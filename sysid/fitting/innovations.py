@@ -32,6 +32,7 @@ import numpy as np
 
 from sysid.arrays import BoolArray, FloatArray, IntArray
 from sysid.engine.simulation import BatchResult, Residuals, Status
+from sysid.fitting.means import each_mean_once
 from sysid.fitting.objective import Objective
 
 _ROUNDS, _STEADY = 30, 1e-4  # of the outputs' noise, and its relative change at the end
@@ -50,6 +51,7 @@ class Innovations(Objective):
     outputs correct the states. process: (n_states,), noise of the states' rates, in their units
     over the root of a second. scatter: per record, (n_samples, n_outputs), variances of single
     samples beside the noise, by the jitter of their windows at the chromosome that was settled.
+    Where it corrects, the records have each mean over a window once.
     """
 
     noise: FloatArray
@@ -70,6 +72,10 @@ class Innovations(Objective):
         """An objective's counterpart."""
         variant = cls.__new__(cls)
         vars(variant).update(vars(objective))
+        if corrects:
+            variant.records = [each_mean_once(record) for record in objective.records]
+            seen = [np.isfinite(record.outputs).sum(axis=0) for record in variant.records]
+            variant.counts = np.sum(seen, axis=0)
         variant.noise = variant.error = np.maximum(noise, _TINY)
         variant.scatter = [np.zeros(record.outputs.shape) for record in objective.records]
         variant.corrects = corrects
@@ -103,7 +109,7 @@ class Innovations(Objective):
         """With scatter, and the noise that the innovations show at a chromosome, (n_free,)."""
         steps = self.steps_needed(chromosome[None])
         # Noise of the process may explain nearly all of a free run's error.
-        least = (_LEAST_OF_PROCESS if self.process.any() else _LEAST_NOISE) * self.error
+        least = (_LEAST_OF_PROCESS if self.process.any() or self.corrects else _LEAST_NOISE) * self.error
         settled = self.scattered(chromosome)
         for _ in range(_ROUNDS):
             innovations = settled._simulated(chromosome[None], steps, balanced=False).values[..., 0]

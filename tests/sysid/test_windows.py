@@ -10,6 +10,7 @@ import pytest
 from sysid import GASSI, BatchSimulator, Dataset, ModelError
 from sysid.engine.filter_kernel import FilterKernel
 from sysid.examples import lag
+from sysid.fitting.means import each_mean_once
 
 DT, TAU = 1e-3, 0.05
 N = 300
@@ -115,6 +116,36 @@ def test_of_means_over_the_last_sample_innovations_are_those_of_a_kalman_filter(
             x, P = x - P @ H / s * e, P - np.outer(P @ H, P @ H) / s
         x, P = np.array([F @ (x + driven), 0.0]), np.diag([F @ P @ F, 0.3**2])
     np.testing.assert_allclose(filtered.values[:, 0, 0], expected, atol=1e-7)
+
+
+def test_of_means_over_many_samples_innovations_are_those_of_their_joint_normal():
+    """Each mean is a sum of the inputs' errors, and an innovation what none before tells of it."""
+    rng = np.random.default_rng(1)
+    u, ends = rng.choice([-1.0, 1.0], 80), np.sort(rng.uniform(1.0, 79.0, 30))
+    begins = np.append(0.0, ends[:-1])
+    # Each row tells of the mean that is being taken, as an encoder's log does.
+    interval = np.minimum(np.searchsorted(ends, np.arange(80.0), side="right"), 29)
+    means = rng.standard_normal(30)
+    windows = np.stack([begins[interval], ends[interval]], axis=1) - np.arange(80)[:, None]
+    record = Dataset(
+        u, means[interval], DT, input_noise=np.array([0.3]), windows=windows[:, None] * DT
+    )
+    once = each_mean_once(record)
+    rows = np.flatnonzero(np.isfinite(once.outputs[1:, 0])) + 1
+    told = interval[rows - 1]
+    np.testing.assert_allclose(once.outputs[rows, 0], means[told])
+    assert 20 < len(rows) < 30  # of two that end within a sample one
+    filtered = BatchSimulator(lag().with_initial({"y": 0.0})).innovations(
+        np.array([[2.0, TAU]]), [once], [np.ones(1)], np.array([[1]]), [None], np.array([0.2])
+    )
+    # Area under the response to each sample's input, up to a time.
+    since = np.maximum(np.stack([ends, begins])[:, told, None] - np.arange(80.0), 0.0) * DT
+    area = 2.0 * (rising(since)[1] - rising(np.maximum(since - DT, 0.0))[1])
+    H = (area[0] - area[1]) / ((ends - begins)[told, None] * DT)
+    root = np.linalg.cholesky(0.3**2 * H @ H.T + 0.2**2 * np.eye(len(rows)))
+    expected = 0.2 * np.linalg.solve(root, H @ u - means[told])
+    np.testing.assert_allclose(filtered.values[rows, 0, 0], expected, atol=1e-6)
+    assert not filtered.values[np.setdiff1d(np.arange(80), rows), 0, 0].any()
 
 
 def test_jitter_of_windows_counts_by_how_fast_an_output_changes():

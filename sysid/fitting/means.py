@@ -1,0 +1,68 @@
+"""Means over windows as a filter takes them in: each once, in the sample in which it ends."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from sysid.arrays import FloatArray, IntArray
+from sysid.problem.data import Dataset
+
+_SAME = 1e-6  # samples by which windows of one mean differ for the arithmetic's sake
+_INSIDE = 1e-3  # samples behind the end of a sample where a window that is cut begins
+# Overlap [samples] that comes of ends which are known so well only, and the share of long windows
+# that may overlap more.
+_OVERLAP, _FEW = 1.0, 0.05
+
+
+def each_mean_once(record: Dataset) -> Dataset:
+    """The record with every mean once, where its window ends, and NaN in the rows between.
+
+    Rows that tell of the same window, perhaps before it has ended, repeat its mean. Their jitter
+    is such that all of them count as one; that of the one is less by the root of their number.
+    An output whose windows overlap stays as it is, and so does the first row, where states start.
+
+    >>> ends = np.array([0, 3, 3, 3, 4])
+    >>> windows = np.stack([[0, 0, 0, 0, 3], ends], axis=1) - np.arange(5)[:, None]
+    >>> record = Dataset(np.ones(5), [0, 2, 2, 2, 7], 1.0, windows=windows[:, None])
+    >>> once = each_mean_once(record)
+    >>> once.outputs[:, 0], once.windows[3, 0]
+    (array([ 0., nan, nan,  2.,  7.]), array([-3.,  0.]))
+    """
+    if not record.windows.size:
+        return record
+    outputs, windows, jitter = record.outputs.copy(), record.windows.copy(), record.jitter.copy()
+    for j in np.flatnonzero(record.windows.any(axis=(0, 2))):
+        rows = np.flatnonzero(np.isfinite(outputs[:, j]))
+        spans = windows[rows, j] / record.dt + rows[:, None]
+        moved = np.abs(np.diff(spans, axis=0)).max(axis=1) > _SAME
+        firsts = np.flatnonzero(np.append(True, moved))
+        counts = np.diff(np.append(firsts, len(rows)))
+        ends = np.ceil(spans[firsts, 1] - _SAME).astype(np.int64)
+        within = (spans[firsts, 0] > -_SAME) & (ends > 0) & (ends < record.n_samples)
+        # Of two that end in a sample the later one.
+        within &= np.append(np.diff(ends) > 0, True)
+        firsts, counts, ends = firsts[within], counts[within], ends[within]
+        begins = _apart(spans[firsts, 0], ends)
+        if begins is None:
+            continue
+        told = np.stack([begins, spans[firsts, 1]], axis=1) - ends[:, None]
+        values, jitters = outputs[rows[firsts], j], jitter[rows[firsts], j] / np.sqrt(counts)
+        outputs[1:, j], windows[1:, j], jitter[1:, j] = np.nan, 0.0, 0.0
+        outputs[ends, j], windows[ends, j], jitter[ends, j] = values, told * record.dt, jitters
+    return replace(record, outputs=outputs, windows=windows, jitter=jitter)
+
+
+def _apart(begins: FloatArray, ends: IntArray) -> FloatArray | None:
+    """Begins of windows none of which begins in a sample before one in which another ends.
+
+    begins: (n,) in samples; ends: (n,), samples in which they end. Those within a sample are let
+    alone. None where too many overlap too far.
+    """
+    begins = begins.copy()
+    long = np.flatnonzero(begins < ends - 1.0 - _SAME)
+    earliest = np.append(-np.inf, ends[long[:-1]] - 1.0 + _INSIDE)
+    overlap = earliest - begins[long]
+    if len(long) and np.mean(overlap > _OVERLAP) > _FEW:
+        return None
+    begins[long] = np.maximum(begins[long], earliest)
+    return begins
