@@ -24,6 +24,7 @@ from sysid import (
 from sysid.fitting.innovations import Innovations
 from sysid.fitting.objective import Objective
 from sysid.gassi.likelihood import Optimum, better_around, noisy_fit
+from sysid.uncertainty.sensitivity import sensitivity
 from tests.sysid.support import lag, linear_response, prbs
 
 DT, TAU, GAIN = 0.02, 0.05, 2.0
@@ -321,6 +322,30 @@ def test_a_filters_minimum_is_sought_around_that_of_free_runs():
     from_truth = fit(replace(by_error, chromosome=np.array([GAIN, TAU])))
     np.testing.assert_allclose(better.chromosome, from_truth.chromosome, rtol=0.02)
     assert better_around(lambda optimum, watch: None, stuck, by_error, None) is stuck
+
+
+def test_where_a_filter_jumps_slopes_are_those_of_the_side_without():
+    """At rest on a kink: below it the state is damped, above it is not."""
+    model = ProcessModel(
+        name="kinked",
+        states=(State("y", "1", initial=1.0, first_sample=False),),
+        inputs=(Input("u", "1"),),
+        outputs=(Output("y", "1"),),
+        parameters=(
+            Parameter("rate", "1/s", 5.0, 0.5, 50.0, "log"),
+            Parameter("kink", "1", 1.0, 0.1, 10.0, "log"),
+        ),
+        derivative=lambda x, u, p: (u[0] - p[0] * max(x[0] - p[1], 0.0),),
+    )
+    y = 1.0 + 0.1 * np.random.default_rng(0).standard_normal(60)
+    record = Dataset(np.zeros(60), y, DT, input_noise=np.array([1.0]))
+    at = np.array([5.0, 1.0])
+    objective = Objective(BatchSimulator(model), SearchSpace.of(model), [record])
+    corrected = Innovations.of(objective, np.array([0.1]), corrects=True)
+    slopes = sensitivity(corrected, at).slopes[:, 0]
+    size = corrected.residuals(at[None], [8]).values.max()
+    # A thousandth of the jump, over a change of a millionth, would be a slope of a thousand.
+    assert np.abs(slopes[:, 1]).max() < 10.0 * size
 
 
 @pytest.mark.soak
