@@ -39,7 +39,7 @@ _ROUNDS, _STEADY = 30, 1e-4  # of the outputs' noise, and its relative change at
 # Noise of an output is not below this share of its free run's error; where it comes near, noise
 # of the inputs explains more than there is to explain.
 _LEAST_NOISE, _NEAR = 1e-2, 0.1
-_LEAST_OF_PROCESS = 1e-4
+_LEAST_OF_FILTER = 1e-4
 _TINY = 1e-300
 
 
@@ -108,8 +108,8 @@ class Innovations(Objective):
     def settled(self, chromosome: FloatArray) -> Self:
         """With scatter, and the noise that the innovations show at a chromosome, (n_free,)."""
         steps = self.steps_needed(chromosome[None])
-        # Noise of the process may explain nearly all of a free run's error.
-        least = (_LEAST_OF_PROCESS if self.process.any() or self.corrects else _LEAST_NOISE) * self.error
+        # Noise of the inputs and of the process may explain nearly all of a free run's error.
+        least = (_LEAST_OF_FILTER if self.corrects else _LEAST_NOISE) * self.error
         settled = self.scattered(chromosome)
         for _ in range(_ROUNDS):
             innovations = settled._simulated(chromosome[None], steps, balanced=False).values[..., 0]
