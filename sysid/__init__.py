@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from sysid.experiments import Design, Excitation, Prior, Setting, design
     from sysid.fitting.free_run import free_run
     from sysid.gassi import GASSI
-    from sysid.identifiability.analysis import Identifiability, TiedGroup
     from sysid.identifiability.combination import Combination
+    from sysid.identifiability.findings import Identifiability, TiedGroup
     from sysid.judging.comparison import Candidate, Comparison, compare
     from sysid.linear import ARMAX, ARX, OE, select_orders
     from sysid.problem.data import Dataset, output_scale
@@ -98,7 +98,7 @@ _NAMES = {
     "sysid.experiments": "Design Excitation Prior Setting design",
     "sysid.fitting.free_run": "free_run",
     "sysid.gassi": "GASSI",
-    "sysid.identifiability.analysis": "Identifiability TiedGroup",
+    "sysid.identifiability.findings": "Identifiability TiedGroup",
     "sysid.identifiability.combination": "Combination",
     "sysid.judging.comparison": "Candidate Comparison compare",
     "sysid.linear": "ARMAX ARX OE select_orders",

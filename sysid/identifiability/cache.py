@@ -11,7 +11,8 @@ from importlib.metadata import version
 from pathlib import Path
 
 from sysid.engine.compiler import cache_folder, fingerprint, write_cached
-from sysid.identifiability.analysis import Identifiability, identifiability
+from sysid.identifiability.analysis import identifiability
+from sysid.identifiability.findings import Identifiability
 from sysid.problem.model import ProcessModel
 
 

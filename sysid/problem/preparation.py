@@ -8,8 +8,6 @@ from math import ceil
 from typing import Literal
 
 import numpy as np
-from scipy.interpolate import CubicSpline
-from scipy.signal import firwin, kaiserord, oaconvolve
 
 from sysid.arrays import FloatArray, IntArray
 from sysid.problem.data import Dataset
@@ -131,6 +129,8 @@ def _at(values: FloatArray, places: FloatArray, held: bool) -> FloatArray:
     finite = np.flatnonzero(np.isfinite(values))
     if len(finite) < 2:
         return linear
+    from scipy.interpolate import CubicSpline  # half a second
+
     spline: FloatArray = CubicSpline(finite, values[finite])(places)
     return np.where(np.isfinite(linear), spline, np.nan)
 
@@ -177,6 +177,8 @@ def low_pass(factor: float) -> FloatArray:
     >>> len(taps) % 2, round(float(taps.sum()), 12)
     (1, 1.0)
     """
+    from scipy.signal import firwin, kaiserord  # half a second
+
     width = 2.0 * (1.0 - _PASSED) / factor
     length, beta = kaiserord(_STOPPED, width)
     taps: FloatArray = firwin(length | 1, 1.0 / factor, window=("kaiser", beta))
@@ -188,6 +190,8 @@ def filtered(values: FloatArray, taps: FloatArray) -> FloatArray:
 
     NaN where too little of what the filter sees was measured.
     """
+    from scipy.signal import oaconvolve
+
     is_known = np.isfinite(values)
     shape = taps[:, None]
     sums: FloatArray = oaconvolve(np.where(is_known, values, 0.0), shape, mode="valid", axes=0)
@@ -217,7 +221,7 @@ def _decimated(model: ProcessModel, before: Prepared, preparation: Preparation) 
     mean = np.ones(factor) / factor
     held = np.array([signal.hold == "zoh" for signal in model.inputs], dtype=bool)
     ahead = np.concatenate((inputs, np.repeat(inputs[-1:], factor - 1, axis=0)))
-    averaged = oaconvolve(ahead, mean[:, None], mode="valid", axes=0)
+    averaged = filtered(ahead, mean)
     inputs = np.where(held, averaged, inputs)
     kept = slice(half, record.n_samples - half, factor)
     # White noise by what the filters leave of it.
