@@ -30,12 +30,13 @@ def each_mean_once(record: Dataset) -> Dataset:
     """
     if not record.windows.size:
         return record
-    outputs, windows, jitter = record.outputs.copy(), record.windows.copy(), record.jitter.copy()
+    outputs, windows = record.outputs.copy(), record.windows.astype(np.float64)
+    jitter = record.jitter.astype(np.float64)
     for j in np.flatnonzero(record.windows.any(axis=(0, 2))):
         rows = np.flatnonzero(np.isfinite(outputs[:, j]))
         spans = windows[rows, j] / record.dt + rows[:, None]
-        moved = np.abs(np.diff(spans, axis=0)).max(axis=1) > _SAME
-        firsts = np.flatnonzero(np.append(True, moved))
+        changes = np.abs(np.diff(spans, axis=0)).max(axis=1) > _SAME
+        firsts = np.flatnonzero(np.append(True, changes))
         counts = np.diff(np.append(firsts, len(rows)))
         ends = np.ceil(spans[firsts, 1] - _SAME).astype(np.int64)
         within = (spans[firsts, 0] > -_SAME) & (ends > 0) & (ends < record.n_samples)
@@ -45,10 +46,10 @@ def each_mean_once(record: Dataset) -> Dataset:
         begins = _apart(spans[firsts, 0], ends)
         if begins is None:
             continue
-        told = np.stack([begins, spans[firsts, 1]], axis=1) - ends[:, None]
+        moved = np.stack([begins, spans[firsts, 1]], axis=1) - ends[:, None]
         values, jitters = outputs[rows[firsts], j], jitter[rows[firsts], j] / np.sqrt(counts)
         outputs[1:, j], windows[1:, j], jitter[1:, j] = np.nan, 0.0, 0.0
-        outputs[ends, j], windows[ends, j], jitter[ends, j] = values, told * record.dt, jitters
+        outputs[ends, j], windows[ends, j], jitter[ends, j] = values, moved * record.dt, jitters
     return replace(record, outputs=outputs, windows=windows, jitter=jitter)
 
 
