@@ -185,6 +185,15 @@ def _steps(document: Mapping[str, Any], rows: Rows) -> list[Step]:
     if fitted.get("better"):
         lacking = f"Identify with {fitted['name']}, which explains these data better:"
         steps.insert(0, Step(lacking, command=fitted.get("command", "")))
+    unsure = verdict["predictions"]["trust"] != "good"
+    if rows.logs["validation"] and unsure and rows.weak:
+        steps.append(
+            Step(
+                "Fit the logs of the validation as well, and judge on others: they may feel ",
+                [row.name for row in rows.weak],
+                ", which those of the training hardly do.",
+            )
+        )
     if not rows.logs["validation"]:
         judge = "Judge it on data that it has not seen, with another log:"
         steps.insert(0, Step(judge, command="--validate LOG"))

@@ -34,6 +34,8 @@ def each_mean_once(record: Dataset) -> Dataset:
     jitter = record.jitter.astype(np.float64)
     for j in np.flatnonzero(record.windows.any(axis=(0, 2))):
         rows = np.flatnonzero(np.isfinite(outputs[:, j]))
+        if not len(rows):
+            continue
         spans = windows[rows, j] / record.dt + rows[:, None]
         changes = np.abs(np.diff(spans, axis=0)).max(axis=1) > _SAME
         firsts = np.flatnonzero(np.append(True, changes))

@@ -1,5 +1,6 @@
 """The report of an identification: one page that needs nothing else and says what the data say."""
 
+import copy
 import json
 import math
 import re
@@ -7,12 +8,15 @@ import shlex
 import shutil
 import subprocess
 from html.parser import HTMLParser
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.signal import lfilter
 
 from daq import notation
+from daq.identification.rows import Rows
+from daq.report import explanation
 from tests.daq.support import forked_rig
 
 NASTY = "k_<b>&%$"
@@ -233,6 +237,23 @@ def test_verdict_in_two_sentences_and_how_to_do_it_again(page, document, work, r
     again = json.loads(done.stdout)["parameters"]
     for name, one in document["parameters"].items():
         assert again[name]["value"] == one["value"]
+
+
+def test_a_doubtful_validation_may_feel_what_the_training_hardly_does(document):
+    changed = copy.deepcopy(document)
+    name = next(n for n, p in changed["parameters"].items() if p.get("interval"))
+
+    def asked():
+        plain = SimpleNamespace(parameters=(), state_names=())
+        steps = explanation.view(plain, changed, Rows.of(changed))["steps"]
+        return [list(s.names) for s in steps if s.before.startswith("Fit the logs of the valid")]
+
+    changed["verdict"]["predictions"]["trust"] = "limited"
+    assert asked() == []
+    changed["parameters"][name]["interval"][1] = None
+    assert asked() == [[name]]
+    changed["verdict"]["predictions"]["trust"] = "good"
+    assert asked() == []
 
 
 def test_latex_holds_every_parameter_and_compiles(result, document, work, tmp_path):
