@@ -71,6 +71,14 @@ def test_the_filter_sees_them_alike(corrects):
     np.testing.assert_allclose(filtered[1:], plain[1:], atol=1e-6)
 
 
+def test_a_free_run_that_diverges_has_no_means_and_warns_of_none():
+    record = replace(averaged_step(), input_noise=np.array([1e-9]))
+    filtered = BatchSimulator(lag().with_initial({"y": 0.0})).innovations(
+        np.array([[1.0, -1e-6]]), [record], [np.ones(1)], np.array([[1]]), [None], np.ones(1)
+    )
+    assert not np.isfinite(filtered.values).all()
+
+
 def test_the_filter_of_means_is_made_once(monkeypatch):
     made = []
 
