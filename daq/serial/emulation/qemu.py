@@ -24,6 +24,8 @@ from typing import NamedTuple, Self
 from daq.errors import ConfigError, DeviceError
 
 _PROGRAM = "qemu-system-arm"
+# In real time, where it may. Real-time scheduling would give a core to a firmware that loops.
+_AHEAD_OF_OTHERS = ("nice", "-n", "-10")
 _MACHINE = ("-M", "netduinoplus2", "-display", "none", "-monitor", "none")
 _SEMIHOSTING = ("-semihosting-config", "enable=on,target=native")
 _VIRTUAL_TIME = ("-icount", "shift=3,sleep=off")
@@ -137,6 +139,7 @@ class EmulatedFirmware:
             _make(pipe)
         output = self._files.enter_context((folder / "qemu.txt").open("wb"))
         command = [_PROGRAM, *_MACHINE, *_SEMIHOSTING, *self._line(), "-kernel", str(self._elf)]
+        command = command if self._virtual else [*_AHEAD_OF_OTHERS, *command]
         self._log = folder / "qemu.txt"
         self._process = subprocess.Popen(
             command, cwd=folder, stdin=subprocess.DEVNULL, stdout=output, stderr=output

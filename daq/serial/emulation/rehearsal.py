@@ -87,8 +87,8 @@ def serve(
     plant = SimulatedPlant(rig)
     with contextlib.ExitStack() as stack:
         notes = Journal(stack.enter_context(opened_journal(journal)))
-        RealTime().begin("prefer")  # which QEMU inherits, as it does the core
-        _stay_on_this_core()
+        RealTime().begin("prefer")
+        _share_core()
         firmware = stack.enter_context(EmulatedFirmware(elf, tcp=tcp))
         ready(stack.enter_context(named(firmware.port, link)))
         while not stop.is_set():
@@ -97,11 +97,11 @@ def serve(
             firmware.answer(plant.read(exchange))
 
 
-def _stay_on_this_core() -> None:
-    """Keep this process and those it starts on one core, where the system can.
+def _share_core() -> None:
+    """Keep this process, and QEMU that it starts, on one core.
 
-    Plant and QEMU wait for each other at every tick and never compute at the same time. A core that
-    has to be woken for each makes a tick twice as long, and QEMU hands over half the line's bytes.
+    They wait for each other at every tick and never compute at the same time. Were a core woken for
+    each, a tick would take twice as long, and QEMU hand over half the line's bytes.
     """
     if sys.platform == "linux":
         behind_name = Path("/proc/self/stat").read_text(encoding="ascii").rpartition(")")[2]
