@@ -46,7 +46,8 @@ class RealTime:
         self.refused: dict[str, str] = {}
         self._overrun = overrun
         self._undo = contextlib.ExitStack()
-        self._returned = self._busy = 0.0
+        self._returned: float | None = None  # before the first look
+        self._busy = 0.0
 
     def begin(self, wanted: Realtime) -> None:
         """Obtain what there is. Raises ConfigError, with the cure, when it is required."""

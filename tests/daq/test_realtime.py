@@ -3,9 +3,11 @@
 import json
 import subprocess
 import sys
+import time
 
 import pytest
 
+from daq.run.realtime import RealTime
 from tests.daq.support import (
     forked_rig,
     only_capture,
@@ -121,3 +123,17 @@ def test_a_library_that_never_returns_is_ended_by_the_system(tmp_path, real_time
         result = spin(run, tmp_path, deep=True)
     assert result.returncode == -9
     assert record_of(only_capture(tmp_path))["status"] == "running"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the time of a thread is Linux's")
+def test_what_a_program_computed_before_a_run_is_no_pause_of_it(monkeypatch):
+    monkeypatch.setattr("daq.run.realtime._LONGEST", 0.02)  # s
+    realtime = RealTime()
+    realtime.granted["scheduler"] = "SCHED_FIFO"
+    begun = time.thread_time()
+    assert begun > 0.02
+    # The device is still being opened: no call of it has ended yet.
+    assert realtime.overrun_since(0.0) is None
+    while time.thread_time() < begun + 0.03:
+        pass
+    assert "without a pause" in str(realtime.overrun_since(0.0))

@@ -1,8 +1,8 @@
 """The firmware's ELF in QEMU in real time on a pty, by ``rig emulate --firmware``.
 
 A busy machine keeps QEMU waiting, now and then for longer than the protocol allows. What fails is
-tried again on load alone (``patience``). In the ordinary run of the tests others are that load: these
-run where ``RIG_REAL_TIME_TESTS`` asks for them, alone.
+tried again on load alone (``patience``). Among all other tests those are the load: these run where
+``RIG_REAL_TIME_TESTS`` asks for them, alone.
 """
 
 import os
