@@ -1,5 +1,6 @@
 """What holds for every test."""
 
+import gc
 import os
 import signal
 import sys
@@ -25,14 +26,21 @@ def pytest_configure(config):
         os.environ["RIG_CACHE_DIR"] = str(folder)
 
 
+def pytest_collection_finish():
+    # What was collected stays: the garbage collector need not look through it again and again.
+    gc.collect()
+    gc.freeze()
+
+
 def pytest_collection_modifyitems(items):
     # The longest begin first, so that no process waits for one alone at the end.
     longest = [
-        "test_friction_identification", "test_tutorial", "test_cli", "test_combinations",
-        "faults/test_analysis", "test_missing_physics", "test_uncertainty", "faults/test_device",
-        "boards/test_boards", "test_guesses", "firmware/test_core", "sim_rig/test_device",
-        "test_real_time", "test_compile", "test_hal_boards", "test_campaigns", "test_ends",
-        "test_simulation", "test_docstrings", "test_replay",
+        "test_tutorial", "test_characterising", "test_ends", "faults/test_analysis",
+        "test_evidence", "test_cli", "faults/test_device", "test_combinations", "test_docstrings",
+        "serial/test_faults", "test_scope_page", "test_uncertainty", "test_missing_physics",
+        "boards/test_boards", "sim_rig/test_device", "test_simulation", "test_replay",
+        "test_compile", "test_hal_boards", "test_guesses", "firmware/test_core",
+        "test_friction_identification", "test_real_time", "test_campaigns",
     ]  # fmt: skip
 
     def place(item):

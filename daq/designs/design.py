@@ -80,7 +80,8 @@ def design(
     of the files, by default a new one under ``designs``. Raises ConfigError.
 
     >>> from daq import design
-    >>> result = design(precision="5 %", time="2.5 s", candidates=8, generations=0)
+    >>> quick = {"candidates": 8, "generations": 0, "draws": 1, "checks": 2}
+    >>> result = design(precision="5 %", time="2.5 s", **quick)
     >>> [run.file.name for run in result.runs]
     ['designed-1.yaml', 'designed-2.yaml']
     """

@@ -1,5 +1,6 @@
 """``rig characterise``: rounds in one folder, which go on from wherever they were ended."""
 
+import contextlib
 import json
 import shutil
 import signal
@@ -101,18 +102,20 @@ def test_mistakes_are_named_before_anything_is_written(folder):
     assert "name the folder that rig characterise made" in done.stderr
 
 
-@pytest.mark.soak
-@pytest.mark.parametrize("until", ["design.json", "log.csv", "search.ckpt", "parameters.yaml"])
-def test_a_killed_characterisation_goes_on_to_the_same_end(until, finished, folder):
-    process = start_rig(*words("--time", "1.5", "--json"), cwd=folder)
-    while process.poll() is None and not list((folder / "c").rglob(until)):
-        try:
-            process.wait(0.01)
-        except subprocess.TimeoutExpired:
-            continue
-    process.send_signal(signal.SIGKILL)
-    process.communicate()
-    assert Round(folder / "c", 1).folder.exists()
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no SIGKILL")
+def test_a_killed_characterisation_goes_on_to_the_same_end(finished, folder):
+    """Killed again at every further file that it goes on to write."""
+    begin = words("--time", "1.5", "--json")
+    for until in ("design.json", "log.csv", "search.ckpt", "parameters.yaml"):
+        process = start_rig(*begin, cwd=folder)
+        while process.poll() is None and not list((folder / "c").rglob(until)):
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(0.01)
+        process.send_signal(signal.SIGKILL)
+        _, said = process.communicate()
+        assert process.returncode == -signal.SIGKILL, said
+        assert Round(folder / "c", 1).folder.exists()
+        begin = ["characterise", "--resume", "c", "--json"]
     done = rig("characterise", "--resume", "c", "--json", cwd=folder, timeout=300)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["quantities"] == finished[1]["quantities"]

@@ -124,7 +124,7 @@ def test_a_spread_of_the_parameters_is_in_the_trials(static):
 def test_what_is_refused_trips_on_the_simulated_rig(tmp_path):
     """Walls by the inverse, which takes inertia off: some ring against the current's limit."""
     file = walls(tmp_path, controller(tmp_path, "feedforward"))
-    done = rig("check", file.name, "--rig", "hand.yaml", "--draws", "200", cwd=tmp_path)
+    done = rig("check", file.name, "--rig", "hand.yaml", "--draws", "100", cwd=tmp_path)
     assert done.returncode == 2 and "simulated trials trip current_motor" in done.stderr
     ended = 0
     for seed in range(4):
@@ -140,11 +140,12 @@ def test_what_is_refused_trips_on_the_simulated_rig(tmp_path):
 @pytest.mark.parametrize("kind", ["feedforward", "lqg"])
 def test_what_is_let_through_trips_on_no_fresh_rig(tmp_path, kind):
     path = controller(tmp_path, kind)
-    file = experiment(tmp_path, path, duration=3.0)
-    done = rig("check", file.name, "--rig", "moving_hand.yaml", cwd=tmp_path)
+    file = experiment(tmp_path, path, duration=2.0)
+    words = ["check", file.name, "--rig", "moving_hand.yaml", "--draws", "300"]
+    done = rig(*words, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     rng = np.random.default_rng(3)
-    for seed in range(8):
+    for seed in range(4):
         grip = float(4.0 ** rng.uniform(-1.0, 1.0))
         plant = {"load": "hand", "parameters": {"K_u": 0.16 * grip, "B_u": 0.0179 * grip}}
         options = {"seed": seed, "plant": plant}

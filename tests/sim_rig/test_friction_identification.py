@@ -7,7 +7,7 @@ from benchmarks.friction import LINEAR, WITH, WITHOUT, demands, measure
 
 pytestmark = pytest.mark.soak
 
-ORDERS = {"na": (2, 3, 5), "nb": (2, 3), "nc": (2, 3), "nk": (0, 1)}
+ORDERS = {"na": (2, 3), "nb": (2, 3), "nc": (2, 3), "nk": (0, 1)}
 
 
 @pytest.fixture(scope="module")
