@@ -1,0 +1,56 @@
+"""What is tried again, and what is not."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.daq.support import environment
+
+ROOT = Path(__file__).parents[2]
+_CONFTEST = """
+import sys
+sys.path.insert(0, {root!r})
+from tests.firmware import patience
+from tests.firmware.conftest import pytest_runtest_protocol
+
+class Load:
+    def __str__(self):
+        return {load!r}
+
+patience.Load = Load
+"""
+_TEST = """
+import pytest
+from pathlib import Path
+
+@pytest.mark.patient
+def test_something():
+    tries = Path("tries")
+    n = len(tries.read_text()) if tries.exists() else 0
+    tries.write_text("x" * (n + 1))
+    assert n + 1 >= {good}
+"""
+
+
+@pytest.mark.parametrize(
+    ("load", "good", "tries", "outcome"),
+    [
+        ("", 1, 1, "1 passed"),
+        ("", 2, 1, "1 failed"),
+        ("a busy core", 3, 3, "1 passed"),
+        ("a busy core", 9, 5, "1 skipped"),
+    ],
+)
+def test_only_what_fails_on_load_is_tried_again(tmp_path, load, good, tries, outcome):
+    (tmp_path / "conftest.py").write_text(_CONFTEST.format(root=str(ROOT), load=load))
+    (tmp_path / "test_it.py").write_text(_TEST.format(good=good))
+    (tmp_path / "pytest.ini").write_text("[pytest]\nmarkers = patient")
+    words = [sys.executable, "-m", "pytest", "-rs", "-p", "no:cacheprovider", "-p", "no:hybrid-rig"]
+    done = subprocess.run(
+        words, cwd=tmp_path, env=environment(), capture_output=True, text=True, check=False
+    )
+    assert outcome in done.stdout, done.stdout + done.stderr
+    assert len((tmp_path / "tries").read_text()) == tries
+    assert ("too busy a machine for real time: a busy core" in done.stdout) == (tries == 5)
