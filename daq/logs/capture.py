@@ -16,6 +16,7 @@ from daq.config.metadata import Metadata
 from daq.errors import ConfigError, RunError
 from daq.files import make_folder, write_whole
 from daq.logs.metadata import write_metadata
+from daq.process import RunProcess
 from daq.provenance import software_versions
 
 LOG_NAME = "log.csv"
@@ -45,7 +46,7 @@ class Capture:
 
         metadata: what a person says of it.
         """
-        now = datetime.datetime.now(datetime.UTC)
+        now, process = datetime.datetime.now(datetime.UTC), RunProcess.this()
         facts = {
             "status": RUNNING,
             "reason": None,
@@ -53,6 +54,7 @@ class Capture:
             **record,
             "software": software_versions(),
             "host": {"system": platform.platform(), "node": platform.node()},
+            "process": None if process is None else process.document,
         }
         kept = "".join(c if c.isalnum() or c in "-_." else "-" for c in name).strip("-.")
         folder = _new_folder(root, f"{now:%Y%m%dT%H%M%SZ}-{kept or 'run'}")

@@ -2,13 +2,14 @@
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from bokeh.layouts import gridplot
 from bokeh.models import BasicTicker, ColumnDataSource, CrosshairTool, FactorRange, Range1d
 from bokeh.models.annotations import Span
+from bokeh.models.widgets import Div
 from bokeh.plotting import figure
 
 from daq.hal import Flag, FloatArray
@@ -24,6 +25,8 @@ _FLAG_COLORS = {
 }  # fmt: skip
 _CALM = 0.03  # of a column's span that a stretch may cover and still be drawn as broad: 3 pixels
 _MARGIN, _FILLED = 0.06, 0.7  # parts of a figure's height: free at each end, filled at least
+_NEAR = 0.7  # of a limit from which its line is shown
+FLAGS = "flags"
 _UNDRAWN = ("t", "tick", "flags")  # columns without a curve
 _GRAVE = ("lost", "interlock", "underflow")  # marked across all figures
 
@@ -42,7 +45,7 @@ def groups_of(columns: Sequence[str]) -> list[list[str]]:
     groups: dict[str, list[str]] = {}
     for name in columns:
         if name not in _UNDRAWN:
-            group = groups.setdefault(_quantity(name), [])
+            group = groups.setdefault(quantity_of(name), [])
             group.insert(0 if is_wanted(name) else len(group), name)
     return list(groups.values())
 
@@ -60,13 +63,31 @@ def color_of(column: str) -> str:
 
 
 def make_figures(
-    columns: Sequence[str], sources: Sources, time: Range1d
+    columns: Sequence[str],
+    sources: Sources,
+    time: Range1d,
+    chosen: Collection[str],
+    limits: Mapping[str, Sequence[float]],
 ) -> tuple[Any, list[figure]]:
-    """The figures in a grid with one toolbar, and each by itself."""
+    """The figures of the chosen quantities in a grid with one toolbar, and each by itself.
+
+    limits: drawn as lines, by quantity.
+    """
     cursor = Span(dimension="height", line_color=GREY, line_dash="dotted")
-    plots = [_curve_figure(group, sources, time, cursor) for group in groups_of(columns)]
-    if "flags" in columns:
+    plots = []
+    for group in groups_of(columns):
+        quantity = quantity_of(group[-1])
+        if quantity in chosen:
+            plot = _curve_figure(group, sources, time, cursor)
+            if quantity in limits:
+                ends = list(limits[quantity])
+                lines = plot.hspan(y=ends, line_color=RED, line_dash="dotted")
+                lines.name = f"limits of {quantity}"
+            plots.append(plot)
+    if "flags" in columns and (FLAGS in chosen or not plots):
         plots.append(_flag_strip(sources, time, cursor))
+    if not plots:
+        return Div(text="No channel is chosen."), []
     last = plots[-1]
     last.xaxis.axis_label = "t [s]"
     last.height = (last.height or 0) + 45
@@ -83,12 +104,17 @@ def make_figures(
     return grid, plots
 
 
-def fit(plot: figure, sources: Sources) -> None:
-    """Have a figure's curves fill its height, without moving its axis at every little change."""
+def fit(plot: figure, sources: Sources, limits: Sequence[float] = ()) -> None:
+    """Have a figure's curves fill its height, without moving its axis at every little change.
+
+    limits: there is room for those that the curves come near to.
+    """
     drawn = [np.asarray(sources.samples.data[name]) for name in plot.tags]
     if not drawn or not len(drawn[0]):
         return
     low, high = float(np.fmin.reduce(drawn, None)), float(np.fmax.reduce(drawn, None))
+    high = max([high, *(end for end in limits if end > 0.0 and high > _NEAR * end)])
+    low = min([low, *(end for end in limits if end < 0.0 and low < _NEAR * end)])
     if not high - low > 0.0:
         low, high = low - 1.0, high + 1.0
     shown: Any = plot.y_range
@@ -175,14 +201,15 @@ def lines_at(flags: Mapping[str, Any], mark: float | None) -> dict[str, list[Any
     }
 
 
-def _quantity(name: str) -> str:
+def quantity_of(name: str) -> str:
+    """What a column is of: the same for what was asked, what was applied and what followed."""
     return name.removeprefix("cmd_").removeprefix("applied_").removesuffix("_ref")
 
 
 def _curve_figure(group: Sequence[str], sources: Sources, time: Range1d, cursor: Span) -> figure:
     plot = _empty(time, cursor, 108, Range1d(start=0.0, end=0.0))
     unit = UNITS.get(group[-1])
-    label = _quantity(group[-1]).replace("_", " ")
+    label = quantity_of(group[-1]).replace("_", " ")
     plot.yaxis.axis_label = label + (f"\n[{unit}]" if unit else "")
     plot.yaxis.ticker = BasicTicker(desired_num_ticks=4)  # with three there may be but one
     for column in group:

@@ -127,6 +127,16 @@ class History:
             buckets = np.concatenate([buckets, rest])
         return self._drawn(buckets, step, first * self.bucket, to_the_end, self.bucket)
 
+    def rows(self, start: float, end: float, most: int) -> FloatArray:
+        """Neighbouring rows between two times [s], the newest ``most`` of them, (n, n_columns)."""
+        rows, start = self._recent_rows(), max(start, end - most * self.dt)
+        if len(rows) and end < rows[0, self._time]:
+            rows = self._from_file(*self._bucket_range(start, end))
+        times = rows[:, self._time]
+        first, last = np.searchsorted(times, [start, end], side="left")
+        shown: FloatArray = rows[max(first, last + 1 - most) : last + 1]
+        return shown
+
     def since(self, row: int, step: int) -> View:
         """The full stretches of ``step`` rows from ``row`` on, or from the oldest row kept."""
         recent = self._recent_rows()

@@ -9,13 +9,14 @@ from bokeh.document import Document
 from bokeh.events import DoubleTap, MouseLeave, MouseMove, RangesUpdate, Reset, Tap
 from bokeh.layouts import column, row
 from bokeh.models import ColumnDataSource, Range1d
-from bokeh.models.widgets import Button, Div, RadioButtonGroup
+from bokeh.models.widgets import Button, CheckboxGroup, Div, RadioButtonGroup
 from bokeh.plotting import figure
 
 from daq.hal import FloatArray
 from daq.scope import figures
 from daq.scope.figures import Sources
 from daq.scope.history import History, View, nothing, step_for
+from daq.scope.planes import TIME, VIEWS, Planes
 from daq.scope.texts import FAILED, HELP, VALUE_FIELDS, heading, readout
 from daq.scope.watch import FollowedLog, Watch
 
@@ -24,9 +25,14 @@ _POINTS = 500  # stretches drawn at least over the width of the page
 _WINDOWS: dict[str, float | None] = {"2 s": 2.0, "10 s": 10.0, "60 s": 60.0, "whole run": None}
 _USUAL, _WHOLE = 1, len(_WINDOWS) - 1
 _VALUES_EVERY = 3  # updates between two of the table: ten a second can be read
+_PLANE_EVERY = 6  # and of what is not drawn over time
 _HEAD_EVERY = 15  # and of the heading, after which a browser lays the whole page out anew
 _AHEAD = 2  # updates that may be on their way
 _LOST = 1.0  # s after which an update that the browser has not echoed counts as never received
+_STOP, _STOPPING = "Stop run", "Stopping …"
+_WRAPPED = {"flex-wrap": "wrap"}  # of what has no room side by side
+_WRAPPED_CHOICE = ".bk-input-group { flex-wrap: wrap; }"
+_WIDE = "1 1 420px"  # a figure's share of the width, and what it does not go below
 _MARGIN = 0.5  # of a held view's width that is drawn beyond its edges, to be there when it moves
 
 
@@ -57,11 +63,25 @@ class Page:
         self._window = RadioButtonGroup(labels=list(_WINDOWS), active=_USUAL, name="window")
         self._button.on_click(lambda: self._hold() if self._live else self._follow())
         self._window.on_change("active", lambda attr, old, new: self._follow())
-        self._figures = column(sizing_mode="stretch_width", name="figures")
-        controls = row(self._button, self._window)
+        self._view = RadioButtonGroup(labels=list(VIEWS), active=0, name="view")
+        self._view.on_change("active", lambda attr, old, new: self._lay_out())
+        self._channels = CheckboxGroup(
+            inline=True, name="channels", stylesheets=[_WRAPPED_CHOICE], sizing_mode="stretch_width"
+        )
+        self._channels.on_change("active", lambda attr, old, new: self._lay_out())
+        self._stop = Button(
+            label=_STOP, width=110, name="stop", button_type="danger", visible=False
+        )
+        self._stop.on_click(self._stop_run)
+        self._planes = Planes()
+        self._figures = column(
+            sizing_mode="stretch_width", name="figures", styles={"flex": _WIDE, "min-width": "0"}
+        )
+        controls = row(self._button, self._window, self._view, self._stop, styles=_WRAPPED)
         self._side = column(name="side")
-        body = row(self._figures, self._side, sizing_mode="stretch_width")
-        page = column(self._head, controls, body, sizing_mode="stretch_width")
+        body = row(self._figures, self._side, sizing_mode="stretch_width", styles=_WRAPPED)
+        parts = (self._head, controls, self._channels, body)
+        page = column(*parts, sizing_mode="stretch_width")
         page.tags = [self._sent, self._seen]
         document.add_root(page)
         document.title = "rig scope"
@@ -89,6 +109,8 @@ class Page:
             return
         if log is not None:
             self._draw(log)
+            if self._tick % _PLANE_EVERY == 0:
+                self._draw_plane(log)
         if self._tick % _VALUES_EVERY == 0:
             self._show_values()
         if self._tick % _HEAD_EVERY == 0:
@@ -172,8 +194,10 @@ class Page:
         self._sources.lines.data = {**figures.lines_at(flags, self._mark)}
 
     def _fit(self) -> None:
+        limits = self._log.state.limits if self._log is not None else {}
         for plot in self._plots:
-            figures.fit(plot, self._sources)
+            ends = limits.get(figures.quantity_of(str(plot.tags[-1])), ()) if plot.tags else ()
+            figures.fit(plot, self._sources, ends)
 
     def _clear(self) -> None:
         self._drawn_step = 0
@@ -182,8 +206,34 @@ class Page:
 
     def _make_figures(self, columns: tuple[str, ...]) -> None:
         self._columns, self._plots = columns, []
+        names = [figures.quantity_of(group[-1]) for group in figures.groups_of(columns)]
+        names += [figures.FLAGS] * (figures.FLAGS in columns)
         self._clear()
-        grid, self._plots = figures.make_figures(columns, self._sources, self._time)
+        words = Div(text=HELP, width=380, styles={"color": figures.GREY})
+        self._side.children = [figures.make_value_table(self._values, len(columns) + 1), words]
+        self._channels.labels, everything = names, list(range(len(names)))
+        if self._channels.active == everything:
+            self._lay_out()
+        self._channels.active = everything  # lays out where it changes
+
+    @property
+    def _chosen(self) -> list[str]:
+        """Quantities that are to be seen."""
+        return [self._channels.labels[k] for k in self._channels.active]
+
+    def _lay_out(self) -> None:
+        """The figures of the view and of the channels that are chosen."""
+        view, self._plots = VIEWS[self._view.active or 0], []
+        if not self._columns:
+            return
+        if view != TIME:
+            self._figures.children = [self._planes.layout(view, self._columns, self._chosen)]
+            if self._log is not None:
+                self._draw_plane(self._log)
+            return
+        limits = self._log.state.limits if self._log is not None else {}
+        parts = self._columns, self._sources, self._time, self._chosen, limits
+        grid, self._plots = figures.make_figures(*parts)
         for plot in self._plots:
             plot.on_event(RangesUpdate, self._zoom)
             plot.on_event(Reset, lambda event: self._follow())
@@ -192,10 +242,33 @@ class Page:
             plot.on_event(Tap, lambda event: self._set_mark(event.x))
             plot.on_event(DoubleTap, lambda event: self._set_mark(None))
         self._figures.children = [grid]
-        words = Div(text=HELP, width=380, styles={"color": figures.GREY})
-        self._side.children = [figures.make_value_table(self._values, len(columns) + 1), words]
+        self._fit()
+
+    def _draw_plane(self, log: FollowedLog) -> None:
+        """Draw what is not over time, of the stretch of time that is shown."""
+        view, history = VIEWS[self._view.active or 0], log.history
+        if view == TIME or history is None or not history.n_rows:
+            return
+        start, end = cast("float", self._time.start), cast("float", self._time.end)
+        rows = history.rows(start, end, self._planes.most)
+        self._planes.draw(view, self._columns, self._chosen, rows, history.dt)
+
+    def _stop_run(self) -> None:
+        """End the run as Ctrl-C does."""
+        process = self._log.state.process if self._log is not None else None
+        if process is not None and process.interrupt():
+            self._stop.label = _STOPPING
+
+    def _show_stop(self) -> None:
+        """Offer to stop a run that goes on in a process of this computer."""
+        state = self._log.state if self._log is not None else None
+        process = state.process if state is not None and state.running else None
+        can_stop = process is not None and process.is_alive()
+        if self._stop.visible != can_stop:
+            self._stop.update(visible=can_stop, label=_STOP)
 
     def _show_head(self) -> None:
+        self._show_stop()
         newer = self._log is not self._watch.followed
         head = heading(self._log, self._watch.root, newer)
         if head != self._head.text:

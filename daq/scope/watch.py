@@ -1,13 +1,15 @@
 """The run that is shown: the newest under a folder, or a named one, as it grows."""
 
+import math
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 from daq.errors import ConfigError
 from daq.logs.capture import LOG_NAME, RUN_NAME, RUNNING
 from daq.logs.recording import log_path, read_record, settings_of
+from daq.process import RunProcess
 from daq.scope.history import History
 from daq.scope.tail import LogTail
 
@@ -22,7 +24,8 @@ class RunState:
     """State of a run by its run.json.
 
     status: as in the record; "log" for a lone CSV. details: what to show beside it, by name.
-    problem: what is wrong with the record.
+    problem: what is wrong with the record. limits: values of the rig's limits, by quantity.
+    process: that the run is in, where it can be told from others.
     """
 
     status: str = "log"
@@ -30,6 +33,8 @@ class RunState:
     details: dict[str, str] = field(default_factory=dict)
     expected_rows: int | None = None
     problem: str | None = None
+    limits: dict[str, list[float]] = field(default_factory=dict)
+    process: RunProcess | None = None
 
     @property
     def running(self) -> bool:
@@ -61,6 +66,8 @@ class RunState:
             reason=str(record["reason"]) if record.get("reason") else None,
             details={name: str(value) for name, value in details.items() if value},
             expected_rows=expected_rows,
+            limits=_limits(rig.get("limits")),
+            process=RunProcess.of(record.get("process")),
         )
 
 
@@ -181,6 +188,31 @@ class Watch:
                 self._started[name] = began
         runs = [(began, name) for name, began in self._started.items() if name in folders]
         return folders[max(runs)[1]] / LOG_NAME if runs else None
+
+
+def _limits(limits: Any) -> dict[str, list[float]]:
+    """Where a rig's limits are, by the quantity that they are of; of a record that may lack any."""
+    if not isinstance(limits, dict):
+        return {}
+    ends: dict[str, Any] = {"omega": limits.get("speed"), "torque": limits.get("torque")}
+    for channel in ("motor", "brake"):
+        for kind, quantity in (("current", "current"), ("command", "voltage")):
+            section = limits.get(kind)
+            if isinstance(section, dict):
+                ends[f"{quantity}_{channel}"] = section.get(channel)
+    ends["theta"] = limits.get("travel")
+    lines = {}
+    for quantity, end in ends.items():
+        values = end if isinstance(end, list) else [] if end is None else [end, _negative(end)]
+        numbers = [float(v) for v in values if isinstance(v, int | float) and math.isfinite(v)]
+        numbers = [v for v in numbers if v != 0.0]  # an end at rest is none to come near to
+        if numbers:
+            lines[quantity] = numbers
+    return lines
+
+
+def _negative(value: Any) -> Any:
+    return -value if isinstance(value, int | float) else None
 
 
 def _log_of(named: Path) -> Path:

@@ -98,7 +98,7 @@ def test_the_capture_folder_holds_the_run_as_resolved(completed):
     assert {
         "status", "reason", "started", "experiment", "rig", "software", "host", "device",
         "calibration", "offsets", "homing", "phase", "timing", "log", "realtime", "outputs",
-        "saturated_samples", "doubts",
+        "saturated_samples", "doubts", "process",
     } == set(record)  # fmt: skip
     assert (record["status"], record["reason"], record["phase"]) == ("completed", None, "close")
     assert record["experiment"] == {

@@ -20,10 +20,21 @@ from daq.hal import Samples
 from daq.logs.columns import COLUMNS
 from daq.logs.recording import load
 from daq.logs.writer import LogWriter
+from daq.process import RunProcess
 from daq.scope.history import History
+from daq.scope.planes import spectra
 from daq.scope.tail import LogTail
-from daq.scope.watch import FollowedLog, Watch
-from tests.daq.support import environment, rig, start_rig, until
+from daq.scope.watch import FollowedLog, RunState, Watch
+from tests.daq.support import (
+    environment,
+    record_of,
+    rig,
+    rows_in,
+    start_rig,
+    until,
+    write_experiment,
+    write_rig,
+)
 
 RATE = 800.0
 
@@ -492,3 +503,62 @@ def test_without_bokeh_it_says_how_to_install_it(tmp_path):
         cwd=tmp_path, env=environment(), capture_output=True, text=True, timeout=60, check=False,
     )  # fmt: skip
     assert result.returncode == 2 and "pip install 'hybrid-rig[scope]'" in result.stderr
+
+
+def test_a_run_is_stopped_as_by_ctrl_c_and_no_other_process_is(tmp_path):
+    write_experiment(tmp_path / "e.yaml", duration=300.0)
+    write_rig(tmp_path / "rig.yaml", options={"time": "real"})
+    with start_rig("run", "e.yaml", "--rig", "rig.yaml", cwd=tmp_path) as process:
+        folder = until(lambda: next(iter(tmp_path.glob("runs/*/log.csv")), None), "a log").parent
+        record = record_of(folder)["process"]
+        if sys.platform != "linux":
+            return
+        another = RunProcess.of({**record, "started": record["started"] + 1})
+        assert not another.is_alive() and not another.interrupt()
+        until(lambda: rows_in(folder) > 100, "the run itself")
+        assert process.poll() is None
+        of_run = RunState.of(folder / "log.csv").process
+        assert of_run.is_alive() and of_run.interrupt()
+        process.communicate(timeout=60)
+    document = record_of(folder)
+    assert document["status"] == "stopped" and "Ctrl-C" in document["reason"]
+    assert not of_run.is_alive() and not of_run.interrupt()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"pid": 1}, {"pid": "12"}, {"pid": True}, {"stop": 9}, {"stop": None}, {"more": 1}],
+)
+def test_a_record_that_names_no_process_of_a_run_stops_nothing(change):
+    record = {"pid": 1234, "started": 1, "boot": "b", "stop": int(signal.SIGINT)}
+    assert RunProcess.of(record) is not None
+    assert RunProcess.of({**record, **change}) is None and RunProcess.of(None) is None
+
+
+def test_limits_of_a_record_are_those_of_the_quantities(tmp_path):
+    commands = {"motor": [-5, 5], "brake": [0, 1]}
+    limits = {"current": {"motor": 2.4, "brake": "x"}, "command": commands}
+    record = {"status": "running", "rig": {"limits": {**limits, "speed": 150.0, "travel": None}}}
+    (tmp_path / "run.json").write_text(json.dumps(record))
+    shown = RunState.of(tmp_path / "log.csv").limits
+    assert shown["current_motor"] == [2.4, -2.4] and shown["omega"] == [150.0, -150.0]
+    assert shown["voltage_motor"] == [-5.0, 5.0] and shown["voltage_brake"] == [1.0]
+    assert "theta" not in shown and "current_brake" not in shown
+
+
+def test_neighbouring_rows_are_given_from_memory_and_from_the_file(long):
+    history, rows, _ = long
+    time = rows[:, 0]
+    for first, last in ((1000, 1500), (len(rows) - 400, len(rows) - 1)):
+        shown = history.rows(time[first], time[last], 300)
+        assert np.array_equal(shown[:, 0], time[last - 299 : last + 1])
+
+
+def test_a_sine_has_its_amplitude_in_the_spectrum_and_gaps_count_as_the_mean():
+    t = np.arange(10_000) / 800.0
+    values = np.stack([2.0 * np.sin(2 * np.pi * 50.0 * t) + 7.0, np.full(len(t), np.nan)], axis=1)
+    values[100:110, 0] = np.nan
+    frequency, amplitude = spectra(values, 1.0 / 800.0)
+    assert frequency[amplitude[:, 0].argmax()] == pytest.approx(50.0, abs=0.2)
+    assert amplitude[:, 0].max() == pytest.approx(2.0, rel=0.02)
+    assert not amplitude[:, 1].any() and not len(spectra(values[:10], 0.1)[0])

@@ -171,6 +171,36 @@ def test_it_follows_a_run_of_the_rig_from_its_beginning_to_its_end(scope, tmp_pa
     assert set(loaded) == {"127.0.0.1"} and not tab.errors()
 
 
+def test_channels_views_and_the_stop_button_in_a_narrow_window(scope, tmp_path):
+    write_experiment(tmp_path / "e.yaml", duration=300.0)
+    write_rig(tmp_path / "rig.yaml", options={"time": "real"})
+    tab = scope()
+    with contextlib.ExitStack() as ending:
+        run = start_rig("run", "e.yaml", "--rig", "rig.yaml", cwd=tmp_path)
+        process = ending.enter_context(run)
+        ending.callback(process.terminate)
+        until(lambda: len(tab.drawn()) > 50, "the first samples")
+        tab.driver.set_window_size(600, 1000)
+        limits = tab.model("limits of current_motor", "Array.from(m.data_source.data.y)")
+        assert limits[0] == -limits[1] > 0.0
+        tab.model("channels", "(m.active = [4])")
+        names = "m.children[0].children.map((child) => child[0].name)"
+        torque = ["figure of torque"]
+        until(lambda: tab.model("figures", names) == torque, "the torque alone")
+        tab.model("view", "(m.active = 1)")
+        until(lambda: tab.model("xy", "m.data.x.length > 100"), "torque over speed")
+        tab.model("view", "(m.active = 3)")
+        until(lambda: tab.model("spectra", "m.data.torque?.length > 10"), "the spectrum of torque")
+        wide = tab.driver.execute_script("return document.documentElement.scrollWidth")
+        assert wide <= 600 and not tab.errors()
+        until(lambda: tab.model("stop", "m.visible"), "the stop button")
+        tab.find(".bk-btn-danger").click()
+        process.communicate(timeout=60)
+    until(lambda: "stopped by Ctrl-C" in tab.head(), "the run's end")
+    until(lambda: not tab.model("stop", "m.visible"), "no button for what has ended")
+    tab.driver.set_window_size(1300, 1200)
+
+
 def test_a_paused_page_stands_still_until_it_is_let_go_on(scope, tmp_path):
     with recording(tmp_path, "first") as (_, log):
         log.append(samples(400))
