@@ -6,6 +6,8 @@ tried again on load alone (``patience``). Among all other tests those are the lo
 """
 
 import os
+import tempfile
+from pathlib import Path
 
 import pytest
 import yaml
@@ -82,25 +84,27 @@ def changed(kind, name, path, **changes):
 
 
 @pytest.mark.soak
-@pytest.mark.patient
 def test_an_identification_on_it_is_that_of_the_simulated_rig(elf, tmp_path):
-    """``rig run prbs.yaml --rig serial.yaml --port ... --identify``, and without the wire."""
+    """``rig run prbs.yaml --rig serial.yaml --port ...``, and without the wire, identified."""
     experiment = changed("protocol", "prbs.yaml", tmp_path / "prbs.yaml", **SHORT)
     serial = changed(
         "backend", "serial.yaml", tmp_path / "serial.yaml", options={"watchdog": 2}, limits=NO_CABLE
     )
-    with emulated(elf, tmp_path / "qemu", **FREE) as running:
-        patience.watch(running)
-        words = ["run", experiment, "--rig", serial, "--port", running.port, "--identify"]
-        wired = rig(*words, "--out", tmp_path / "wired", cwd=tmp_path)
-        assert wired.returncode == 0, wired.stderr
     simulated = changed(
         "backend", "simulated.yaml", tmp_path / "simulated.yaml", options=FREE, limits=NO_CABLE
     )
-    words = ["run", experiment, "--rig", simulated, "--identify"]
-    direct = rig(*words, "--out", tmp_path / "direct", cwd=tmp_path)
-    assert direct.returncode == 0, direct.stderr
-    there, here = (identified(tmp_path / name) for name in ("wired", "direct"))
+
+    def wired():
+        folder = Path(tempfile.mkdtemp(dir=tmp_path))
+        with emulated(elf, folder / "qemu", **FREE) as running:
+            patience.watch(running)
+            recorded(experiment, "--rig", serial, "--port", running.port, folder=folder)
+        return folder
+
+    there = identified(patience.on_load(wired))
+    (tmp_path / "direct").mkdir()
+    recorded(experiment, "--rig", simulated, folder=tmp_path / "direct")
+    here = identified(tmp_path / "direct")
     both = there.keys() & here.keys()
     assert len(both) > 5
     apart = {
@@ -109,9 +113,18 @@ def test_an_identification_on_it_is_that_of_the_simulated_rig(elf, tmp_path):
     assert not apart
 
 
+def recorded(*words, folder):
+    """``rig run`` with its runs in a folder."""
+    done = rig("run", *words, "--out", folder / "runs", cwd=folder)
+    assert done.returncode == 0, done.stderr
+
+
 def identified(folder):
-    """Intervals of the parameters that have one, by name."""
-    (file,) = folder.glob("*/identification/parameters.yaml")
+    """Intervals of the parameters that have one, by name, of the one log in a folder."""
+    (log,) = folder.glob("runs/*/log.csv")
+    done = rig("identify", log, "--out", folder, cwd=folder)
+    assert done.returncode == 0, done.stderr
+    (file,) = folder.glob("**/parameters.yaml")
     rows = yaml.safe_load(file.read_text())["parameters"]
     return {
         name: row["interval"]
