@@ -266,6 +266,7 @@ columns:
 """
 
 
+@pytest.mark.soak
 def test_a_model_and_a_csv_of_ones_own_work_like_the_built_in(tmp_path):
     work = tmp_path / "work"
     work.mkdir()
@@ -465,6 +466,7 @@ def test_one_seed_gives_one_result(captured, tmp_path):
 # --- Ctrl-C -------------------------------------------------------------------------------
 
 
+@pytest.mark.soak
 def test_ctrl_c_during_a_search_prints_the_parameters_found_so_far(captured, tmp_path):
     root, folder = captured
     asked = []

@@ -241,6 +241,7 @@ def data(tmp_path):
     return tmp_path
 
 
+@pytest.mark.soak
 def test_sigterm_while_identifying_says_what_is_kept_and_how_to_go_on(data):
     words = ("identify", "log.csv", "--model", "model.py:lag", "--config", "id.yaml")
     process = start_rig(*words, "--out", "found", cwd=data)

@@ -328,6 +328,7 @@ def test_a_disk_that_the_log_fills_still_takes_the_reason(tmp_path):
     assert "cannot be written: No space left on device; the first" in result.stdout
 
 
+@pytest.mark.soak
 def test_a_closed_terminal_ends_the_run_and_not_its_record(tmp_path):
     """A real terminal that goes away, with the progress bar still writing to it."""
     import pty

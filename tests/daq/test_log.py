@@ -197,6 +197,7 @@ def test_harmless_variants_of_a_table_load_alike(tmp_path, change):
 # --- truncation ---------------------------------------------------------------------------
 
 
+@pytest.mark.soak
 def test_a_log_cut_anywhere_loads_without_a_wrong_number_or_says_why(real_log, tmp_path):
     data = real_log.read_bytes()
     whole = load(real_log).frame

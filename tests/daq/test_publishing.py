@@ -141,6 +141,7 @@ def page(result, work):
     return Page((work / "found/report.html").read_text(encoding="utf-8"))
 
 
+@pytest.mark.soak
 def test_files_are_there_and_named_after_the_printed_result(result, work):
     printed = result.stdout.index("Predictions: ")
     assert result.stdout.index("Report: found/report.html") > printed

@@ -117,6 +117,7 @@ def test_rows_of_a_table_side_by_side(rig, capture, tmp_path):
     assert f"({sets[0]})" in failed.stderr
 
 
+@pytest.mark.soak
 def test_the_model_and_fixed_values_of_a_configuration_count(rig, capture, tmp_path):
     model = actuator(parameters="rig")
     values = dict(zip(model.parameter_names, model.nominal.tolist(), strict=True))

@@ -47,6 +47,7 @@ def test_a_replay_shows_fit_and_errors(log):
     assert shown == pytest.approx(result.fit, abs=0.06)
 
 
+@pytest.mark.soak
 def test_an_identification_says_what_may_be_used_and_shows_intervals(log):
     result = identify(log, **few_free())
     words = f"predictions {result.verdict.predicted.trust}"

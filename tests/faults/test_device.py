@@ -155,6 +155,7 @@ def test_a_healthy_motor_at_speed_is_not_called_wrong(tmp_path, velocities, brak
 SLOW = pytest.param("constant_velocity.yaml", marks=pytest.mark.soak)
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize("name", ["prbs.yaml", SLOW])
 def test_on_a_line_it_completes_them_at_the_pace_of_the_clock(tmp_path, name):
     load = "free" if name == "constant_velocity.yaml" else "pulley"

@@ -49,6 +49,7 @@ def trials(tuned, file, draws, limits=LIMITS):
     return run_trials(tuned, program, settings.scenes(), limits, draws)
 
 
+@pytest.mark.soak
 def test_soft_walls_rest_and_those_above_the_critical_stiffness_do_not(static):
     """Between the two a light hand bounces off, in and out, where a linear loop would settle."""
     folder, path, tuned = static
@@ -86,6 +87,7 @@ def test_a_law_that_feeds_nothing_back_has_all_margins(static):
     assert margins.disk == pytest.approx(2.0)
 
 
+@pytest.mark.soak
 def test_rig_check_tells_trials_and_refuses_what_trips(static):
     folder, path, _ = static
     file = experiment(folder, path, duration=4.0)
@@ -179,6 +181,7 @@ def test_no_promised_wall_rings_on_a_thousand_plausible_actuators(static):
     assert not outcomes.restless.any() and not outcomes.left.any()
 
 
+@pytest.mark.soak
 def test_a_wall_by_the_static_controller_is_that_of_volts_by_a_constant(tmp_path):
     """Both give torque by constants alone: the same walls, but for the amplifier's gain."""
     folder, path = tmp_path, controller(tmp_path, "static", allocation="motor")

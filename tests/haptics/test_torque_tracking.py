@@ -41,6 +41,7 @@ def static_error(tmp_path_factory):
     return results(folder, controller(folder, "static"))["error_rms"]
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize("allocation", ["heating", "stiction", "motor"])
 def test_the_inverse_errs_less_than_half_of_the_static_one(tmp_path, static_error, allocation):
     path = controller(tmp_path, "feedforward", allocation=allocation)
@@ -49,6 +50,7 @@ def test_the_inverse_errs_less_than_half_of_the_static_one(tmp_path, static_erro
     assert inverse["error_rms"] < 0.5 * static_error
 
 
+@pytest.mark.soak
 def test_a_brake_saves_the_motor_current_and_gives_the_same_torque(tmp_path):
     logs = {}
     for name in ("heating", "motor"):

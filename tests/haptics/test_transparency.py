@@ -20,6 +20,7 @@ def experiment(folder, path, **changes):
     return file
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize(("kind", "most"), [("feedforward", 35.0), ("lqg", 35.0)])
 def test_little_is_left_of_friction_and_inertia(tmp_path, kind, most):
     path = experiment(tmp_path, controller(tmp_path, kind))

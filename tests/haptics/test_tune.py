@@ -50,6 +50,7 @@ def test_what_acts_only_together_moves_together(tmp_path):
     assert (high - low) / tuned["motor_constant"].value == pytest.approx(4 * 0.02, rel=0.15)
 
 
+@pytest.mark.soak
 def test_no_more_inertia_is_taken_off_than_the_least_plausible_one(tmp_path):
     settings = write(tmp_path / "t.yaml", SETTINGS)
     wide = tune(settings, result(tmp_path, J={"J_m": 0.1, "J_b": 0.1}))

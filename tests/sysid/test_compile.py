@@ -106,6 +106,7 @@ def settled(drive, rate=1.0, steps=19, dt=0.1):
 BEFORE = 2.0 * 0.25 + 0.125 + 0.5
 
 
+@pytest.mark.soak
 def test_a_second_process_loads_what_the_first_compiled(workshop):
     first = workshop.run()
     assert first == pytest.approx(settled(BEFORE), rel=1e-3)

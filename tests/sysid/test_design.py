@@ -68,6 +68,7 @@ def information_of_step(model, input_noise=0.0, jitter=0.0):
     return informant.information(record, model.nominal[None])[0]
 
 
+@pytest.mark.soak
 def test_information_is_that_of_the_closed_form():
     slopes = responses_to_step()[:, :2] / NOISE["y"]
     exact = slopes.T @ slopes

@@ -343,6 +343,7 @@ DESIGNS = [dict(zip(PARTS, parts, strict=True)) for parts in itertools.product(*
 CHECKED = DESIGNS[::965]
 
 
+@pytest.mark.soak
 def test_the_actuator():
     """All that is said of it, in the words of a report."""
     result = identifiability(actuator())

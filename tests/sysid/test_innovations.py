@@ -76,6 +76,7 @@ def pendulum():
     )
 
 
+@pytest.mark.soak
 def test_of_a_nonlinear_system_they_are_those_of_an_extended_kalman_filter():
     rng, model, dt = np.random.default_rng(1), pendulum(), 0.1
     p, noise = np.array([2.0, 9.0, 0.4]), np.array([0.05, 0.3])

@@ -228,6 +228,7 @@ PRODUCT_LAG = ProcessModel(
 )
 
 
+@pytest.mark.soak
 def test_a_tied_value_is_moved_from_an_end_on_which_only_the_tie_has_left_it():
     target = objective_of(PRODUCT_LAG, record_of(PRODUCT_LAG, 0.01, noise=0.02))
     held = Restriction(held=(0, np.log(10.0)))

@@ -190,6 +190,7 @@ def test_the_actuator_follows_scipy_over_its_shipped_ranges():
     assert worst < 1e-3
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize("accuracy", [1e-2, 1e-3, 1e-5])
 def test_accuracy_is_held_on_the_dc_motor(accuracy):
     rng = np.random.default_rng(21)

@@ -111,6 +111,7 @@ def responses(force, x, p):
     raise AssertionError
 
 
+@pytest.mark.soak
 def test_tangents_are_those_of_an_independent_integrator():
     simulator, data = BatchSimulator(oscillator()), record(12)
     vectors = np.array([list(VALUES.values()), [1.2, 60.0, 2.0, 3.0, 20.0]])
@@ -126,6 +127,7 @@ def test_tangents_are_those_of_an_independent_integrator():
         assert np.all(np.abs(tangent - exact).max(axis=(0, 1)) < 1e-5 * sizes)
 
 
+@pytest.mark.soak
 def test_tangents_are_derivatives_of_what_is_simulated_however_coarse_the_steps():
     simulator = BatchSimulator(oscillator())
     records = [record(seed=1), record(20, seed=2)]

@@ -278,6 +278,7 @@ def test_white_noise_gives_the_closed_form():
     assert found.determined() == found.parameters
 
 
+@pytest.mark.soak
 def test_intervals_cover_under_white_noise():
     def record(rng):
         u = 1.0 + rng.standard_normal((150, 3))
@@ -298,6 +299,7 @@ def test_intervals_cover_under_coloured_noise_where_white_ones_would_not():
     assert naive < 0.7
 
 
+@pytest.mark.soak
 def test_a_zero_error_of_an_output_has_the_closed_form_and_covers():
     zero, sigma = 0.2, 0.05
 

@@ -450,6 +450,7 @@ def test_a_card_that_is_unplugged_ends_a_run_that_says_what_is_not_known(tmp_pat
     assert "switch off the amplifier: zero outputs are not confirmed" in result.stderr
 
 
+@pytest.mark.soak
 def test_doctor_measures_the_phase_and_says_what_to_write(tmp_path):
     without_seed(rig_file(tmp_path, phase=None, watchdog=None))
     env = environment(phase=1, loopback="rc")

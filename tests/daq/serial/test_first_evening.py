@@ -72,6 +72,7 @@ def applied(folder):
     return log[["applied_voltage_motor", "applied_voltage_brake"]].to_numpy()
 
 
+@pytest.mark.soak
 def test_the_numbered_commands_work_as_they_stand_on_the_emulator(tmp_path, run):
     shorter = {"still": ("hold: 10 ", "hold: 0.5 "), "tenth": ("samples: 3200", "samples: 400")}
     lab = tmp_path / "lab"

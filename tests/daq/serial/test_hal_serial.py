@@ -56,6 +56,7 @@ def test_a_tcp_port_carries_the_same(tmp_path):
     assert not played.flags.any()
 
 
+@pytest.mark.soak
 def test_the_wire_adds_nothing_to_the_samples(tmp_path):
     # Without noise, and with commands that the converters have, the same rig gives the same.
     codes = np.random.default_rng(8).integers([-3000, 0], [3000, 1000], (60, 2))
