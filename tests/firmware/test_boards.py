@@ -56,6 +56,21 @@ def test_the_template_compiles():
     assert done.returncode == 0, done.stderr
 
 
+def test_a_copy_of_the_template_becomes_a_firmware():
+    needs("make", "arm-none-eabi-gcc")
+    image = (make(BOARD="template") / "template" / "rig.bin").read_bytes()
+    stack, reset = struct.unpack_from("<II", image)
+    assert stack == 0x20000000 + 64 * 1024 and 0x08000000 < reset < 0x08000000 + len(image)
+
+
+def test_a_board_that_is_not_there_is_named_with_those_that_are():
+    needs("make")
+    words = ["make", "-C", SOURCE, "BOARD=nosuch"]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert done.returncode != 0 and "there is no boards/nosuch/board.ld" in done.stderr
+    assert "stm32f405" in done.stderr and "a copy of boards/template" in done.stderr
+
+
 # --- the encoder ------------------------------------------------------------------------------
 
 

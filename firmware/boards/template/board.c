@@ -105,7 +105,8 @@ void board_announce(uint8_t phase, float turns) {
 }
 
 /* Interrupts: the timer's calls rig_on_tick(&device), one a millisecond rig_on_watch(&device) at the
- * same priority, a lower one gives the line's bytes to rig_byte_in(&device, byte). */
+ * same priority, a lower one gives the line's bytes to rig_byte_in(&device, byte). Their places are
+ * in startup.c. */
 
 int main(void);
 int main(void) {
