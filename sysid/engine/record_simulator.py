@@ -11,7 +11,6 @@ from sysid.engine.scheme import LANES, work_area
 from sysid.engine.windows import (
     average,
     compared,
-    slopes,
     weights_of_mean,
     weights_of_sums,
     with_integrals,
@@ -249,23 +248,6 @@ class RecordSimulator:
         signals = self._measured[:n_samples], self._weights[:n_samples]
         start = self._initial(starts, lanes)
         return self._run(self.kernels, parameters, start, lanes, n_steps, signals, residuals)
-
-    def window_errors(
-        self, parameters: FloatArray, starts: FloatArray | None, n_steps: int
-    ) -> FloatArray:
-        """Standard deviations (n_samples, n_outputs) that jitter makes of means over windows.
-
-        parameters: (1, n_parameters). As far as an output changes over its window.
-        """
-        errors = np.zeros_like(self._measured)
-        if self.averaged and self.record.jitter.any():
-            outputs, integrals, _ = self._integrated(
-                parameters, starts, np.zeros(1, dtype=np.int64), n_steps, len(errors)
-            )
-            for j, integral in zip(self.averaged, integrals, strict=True):
-                change = slopes(outputs[:, j, 0].copy(), integral[:, 0].copy(), self._windows[j])
-                errors[:, j] = np.abs(change) * self.record.jitter[:, j] / self.record.dt
-        return errors
 
     def _means(
         self, averaged: Sequence[int], corrects: bool

@@ -248,22 +248,6 @@ class BatchSimulator:
             sse=innovations.sse * factor[:, None] ** 2,
         )
 
-    def scatter(
-        self,
-        vector: FloatArray,
-        records: Sequence[Dataset],
-        n_steps: IntArray,
-        starts: Sequence[FloatArray | None],
-    ) -> list[FloatArray]:
-        """Variances (n_samples, n_outputs) that the jitter of each record's windows makes.
-
-        vector: (n_parameters,), of the run that tells how outputs change; n_steps: (n_records,).
-        """
-        return [
-            self._on(record).window_errors(vector[None], start, int(steps)) ** 2
-            for record, steps, start in zip(records, n_steps, starts, strict=True)
-        ]
-
     def tangents(
         self,
         parameters: FloatArray,

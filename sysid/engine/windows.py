@@ -17,7 +17,6 @@ from sysid.arrays import BoolArray, FloatArray
 from sysid.problem.model import Output, ProcessModel, State, picker
 
 _INSTANT = 1e-6  # samples that no window is shorter than, unless it is an instant
-_BESIDE = 0.05  # samples by which a window is widened to see how fast an output changes
 
 
 def with_integrals(model: ProcessModel, places: Sequence[int]) -> ProcessModel:
@@ -130,27 +129,6 @@ def weights_of_sums(windows: FloatArray, seen: BoolArray) -> FloatArray | None:
         weights[i, 1, :3] = [0.0, 0.0, 1.0] - part
         weights[i + 1 : k, 1, 2:] = 1.0
     return weights
-
-
-@njit(cache=True, nogil=True)
-def slopes(outputs: FloatArray, integrals: FloatArray, windows: FloatArray) -> FloatArray:
-    """Mean change of an output per sample time over its windows, (n_samples,).
-
-    outputs, integrals: (n_samples,); as of ``average``.
-    """
-    n = len(outputs)
-    means = np.empty(n)
-    for k in range(n):
-        begin = min(max(k + windows[k, 0] - _BESIDE, 0.0), n - 1.0)
-        end = min(max(k + windows[k, 1] + _BESIDE, 0.0), n - 1.0)
-        total = 0.0
-        for place, sign in ((begin, -1.0), (end, 1.0)):
-            i = min(math.floor(place), n - 2)
-            v0, v1, area = _parabola(place - i)
-            change = integrals[i + 1] - integrals[i]
-            total += sign * (v0 * outputs[i] + v1 * outputs[i + 1] + area * change)
-        means[k] = total / max(end - begin, _BESIDE)
-    return means
 
 
 @njit(cache=True, nogil=True)

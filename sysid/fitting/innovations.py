@@ -32,10 +32,11 @@ import numpy as np
 
 from sysid.arrays import BoolArray, FloatArray, IntArray
 from sysid.engine.simulation import BatchResult, Residuals, Status
-from sysid.fitting.means import each_mean_once
+from sysid.fitting.means import each_mean_once, scatter
 from sysid.fitting.objective import Objective
 
 _ROUNDS, _STEADY = 30, 1e-4  # of the outputs' noise, and its relative change at the end
+_FARTHEST = 2.3  # change of its logarithm that two rounds may foretell
 # Noise of an output is not below this share of its free run's error; where it comes near, noise
 # of the inputs explains more than there is to explain.
 _LEAST_NOISE, _NEAR = 1e-2, 0.1
@@ -50,8 +51,8 @@ class Innovations(Objective):
     the same of the free run's errors at the chromosome that it began with. corrects: whether
     outputs correct the states. process: (n_states,), noise of the states' rates, in their units
     over the root of a second. scatter: per record, (n_samples, n_outputs), variances of single
-    samples beside the noise, by the jitter of their windows at the chromosome that was settled.
-    Where it corrects, the records have each mean over a window once.
+    samples beside the noise, by the jitter of their windows. Where it corrects, the records have
+    each mean over a window once.
     """
 
     noise: FloatArray
@@ -77,7 +78,7 @@ class Innovations(Objective):
             seen = [np.isfinite(record.outputs).sum(axis=0) for record in variant.records]
             variant.counts = np.sum(seen, axis=0)
         variant.noise = variant.error = np.maximum(noise, _TINY)
-        variant.scatter = [np.zeros(record.outputs.shape) for record in objective.records]
+        variant.scatter = [scatter(record) for record in variant.records]
         variant.corrects = corrects
         n_states = len(objective.simulator.model.states)
         variant.process = np.zeros(n_states) if process is None else process
@@ -98,26 +99,23 @@ class Innovations(Objective):
         variant = cls.of(objective, error, corrects=corrects, process=process)
         return variant.settled(chromosome)
 
-    def scattered(self, chromosome: FloatArray) -> Self:
-        """With the scatter of single samples at a chromosome, (n_free,)."""
-        steps = self.steps_needed(chromosome[None])[0]
-        vector, starts = self.space.full(chromosome), self._starts(chromosome[None])
-        scatter = self.simulator.scatter(vector, self.records, steps, starts)
-        return self._with(scatter=scatter)
-
     def settled(self, chromosome: FloatArray) -> Self:
-        """With scatter, and the noise that the innovations show at a chromosome, (n_free,)."""
+        """With the noise that the innovations show at a chromosome, (n_free,)."""
         steps = self.steps_needed(chromosome[None])
         # Noise of the inputs and of the process may explain nearly all of a free run's error.
         least = (_LEAST_OF_FILTER if self.corrects else _LEAST_NOISE) * self.error
-        settled = self.scattered(chromosome)
+        settled, last = self, None
         for _ in range(_ROUNDS):
             innovations = settled._simulated(chromosome[None], steps, balanced=False).values[..., 0]
             before, noise = settled.noise, np.maximum(self.in_units(innovations), least)
             if not np.isfinite(noise).all():
                 return self
+            change = np.log(noise / before)
+            if last is not None:
+                noise = np.maximum(noise * np.exp(_to_the_end(last, change)), least)
+            last = change if last is None else None
             settled = settled._with(noise=noise)
-            if np.allclose(noise, before, rtol=_STEADY):
+            if np.abs(change).max() < _STEADY:
                 break
         return settled
 
@@ -170,3 +168,14 @@ class Innovations(Objective):
             corrects=self.corrects,
             balanced=balanced,
         )
+
+
+def _to_the_end(first: FloatArray, second: FloatArray) -> FloatArray:
+    """How far two changes in turn go on, were each a constant part of that before (Aitken).
+
+    Where an output's noise is little beside what that of the inputs does, it is nearly all of it.
+    """
+    slow = (first * second > 0.0) & (np.abs(second) < np.abs(first))
+    part = np.divide(second, first, out=np.zeros_like(first), where=slow)
+    end: FloatArray = np.clip(second * part / (1.0 - part), -_FARTHEST, _FARTHEST)
+    return end

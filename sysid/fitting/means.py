@@ -32,13 +32,10 @@ def each_mean_once(record: Dataset) -> Dataset:
         return record
     outputs, windows = record.outputs.copy(), record.windows.astype(np.float64)
     jitter = record.jitter.astype(np.float64)
-    for j in np.flatnonzero(record.windows.any(axis=(0, 2))):
-        rows = np.flatnonzero(np.isfinite(outputs[:, j]))
+    for j in np.flatnonzero(record.windows.any(axis=(0, 2))).tolist():
+        rows, firsts, spans = _distinct(record, j)
         if not len(rows):
             continue
-        spans = windows[rows, j] / record.dt + rows[:, None]
-        changes = np.abs(np.diff(spans, axis=0)).max(axis=1) > _SAME
-        firsts = np.flatnonzero(np.append(True, changes))
         counts = np.diff(np.append(firsts, len(rows)))
         ends = np.ceil(spans[firsts, 1] - _SAME).astype(np.int64)
         within = (spans[firsts, 0] > -_SAME) & (ends > 0) & (ends < record.n_samples)
@@ -69,3 +66,41 @@ def _apart(begins: FloatArray, ends: IntArray) -> FloatArray | None:
         return None
     begins[long] = np.maximum(begins[long], earliest)
     return begins
+
+
+def scatter(record: Dataset) -> FloatArray:
+    """Variances (n_samples, n_outputs) that the jitter of the windows makes of their means.
+
+    By how fast an output changes between the means beside each, as measured: a free run changes by
+    the noise of its inputs as well.
+
+    >>> windows = np.tile([-1.0, 0.0], (4, 1, 1))
+    >>> ramp = Dataset(np.ones(4), [1, 3, 5, 7], 1.0, windows=windows, jitter=np.full((4, 1), 0.1))
+    >>> np.sqrt(scatter(ramp))[:, 0]
+    array([0.2, 0.2, 0.2, 0.2])
+    """
+    variances = np.zeros(record.outputs.shape)
+    if not (record.windows.size and record.jitter.any()):
+        return variances
+    for j in np.flatnonzero(record.windows.any(axis=(0, 2))).tolist():
+        rows, firsts, spans = _distinct(record, j)
+        if len(firsts) < 2:
+            continue
+        values, middles = record.outputs[rows[firsts], j], record.dt * spans[firsts].mean(axis=1)
+        beside = np.clip(np.arange(len(firsts)) + np.array([[-1], [1]]), 0, len(firsts) - 1)
+        change, time = np.diff(values[beside], axis=0)[0], np.diff(middles[beside], axis=0)[0]
+        slopes = change / np.maximum(time, _SAME * record.dt)
+        place = np.searchsorted(firsts, np.arange(len(rows)), side="right") - 1
+        variances[rows, j] = (slopes[place] * record.jitter[rows, j]) ** 2
+    return variances
+
+
+def _distinct(record: Dataset, output: int) -> tuple[IntArray, IntArray, FloatArray]:
+    """Rows of an output that were measured, and which of them begin another window.
+
+    And begin and end of each row's window in samples, (n_rows, 2).
+    """
+    rows = np.flatnonzero(np.isfinite(record.outputs[:, output]))
+    spans = record.windows[rows, output] / record.dt + rows[:, None]
+    changes = np.abs(np.diff(spans, axis=0)) > _SAME
+    return rows, np.flatnonzero(np.append(len(rows) > 0, changes.any(axis=1))), spans

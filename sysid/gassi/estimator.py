@@ -347,10 +347,9 @@ class GASSI(RecordEstimator):
         if self.output_noise_ is None:
             return objective
         corrects = self.criterion_ == "innovations"
-        innovations = Innovations.of(
+        return Innovations.of(
             objective, self.output_noise_, corrects=corrects, process=self._process()
         )
-        return innovations.scattered(self.chromosome_)
 
     def _at_final_accuracy(self, objective: Objective) -> Objective:
         """The objective, simulated as accurately as at the end of ``fit``."""

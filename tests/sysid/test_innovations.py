@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
+from scipy.signal import lfilter
 
 from sysid import (
     GASSI,
@@ -28,6 +29,7 @@ from sysid.uncertainty.sensitivity import sensitivity
 from tests.sysid.support import lag, linear_response, prbs
 
 DT, TAU, GAIN = 0.02, 0.05, 2.0
+PART = 1.0 - math.exp(-DT / TAU)  # of the way that the lag goes in a sample
 OF_INPUT, OF_OUTPUT = 0.3, 0.2
 
 
@@ -347,6 +349,20 @@ def test_where_a_filter_jumps_slopes_are_those_of_the_side_without():
     size = corrected.residuals(at[None], [8]).values.max()
     # A thousandth of the jump, over a change of a millionth, would be a slope of a thousand.
     assert np.abs(slopes[:, 1]).max() < 10.0 * size
+
+
+def test_little_noise_of_an_output_is_found_beside_what_that_of_an_input_does():
+    """Plain rounds change it by little each, and would stop above."""
+    rng, truth = np.random.default_rng(3), 0.02
+    u = prbs(rng, 1500, -1.0, 1.0)
+    exact = np.concatenate([[0.0], lfilter([PART], [1.0, PART - 1.0], GAIN * u)[:-1]])
+    y = exact + truth * rng.standard_normal(1500)
+    noisy = u + OF_INPUT * rng.standard_normal(1500)
+    record = Dataset(noisy, y, DT, input_noise=np.array([OF_INPUT]))
+    objective = Objective(BatchSimulator(lag()), SearchSpace.of(lag()), [record])
+    settled = Innovations.starting(objective, np.array([GAIN, TAU]), corrects=True)
+    squares = settled.rms(np.array([[GAIN, TAU]]))[0] * settled.scales[0] / settled.noise
+    assert squares**2 == pytest.approx(1.0, abs=1e-3)
 
 
 @pytest.mark.soak

@@ -10,7 +10,7 @@ import pytest
 from sysid import GASSI, BatchSimulator, Dataset, ModelError
 from sysid.engine.filter_kernel import FilterKernel
 from sysid.examples import lag
-from sysid.fitting.means import each_mean_once
+from sysid.fitting.means import each_mean_once, scatter
 
 DT, TAU = 1e-3, 0.05
 N = 300
@@ -157,15 +157,13 @@ def test_of_means_over_many_samples_innovations_are_those_of_their_joint_normal(
 
 
 def test_jitter_of_windows_counts_by_how_fast_an_output_changes():
-    record = averaged_step()
-    record = replace(record, jitter=np.full((N, 1), 2e-4))
-    (scatter,) = BatchSimulator(lag()).scatter(
-        np.array([1.0, TAU]), [record], np.array([4]), [None]
-    )
-    k = 150 + np.flatnonzero(np.ptp(record.windows[150:, 0], axis=1) > 0.0)
-    middle = record.time[k] + record.windows[k, 0].mean(axis=1)
-    slope = np.exp(-middle / TAU) / TAU
-    np.testing.assert_allclose(np.sqrt(scatter[k, 0]), 2e-4 * slope, rtol=0.01)
+    t, middles = DT * np.arange(N), DT * (np.arange(N) - 0.6)
+    before = np.tile([-1.0 * DT, -0.2 * DT], (N, 1))
+    means = np.diff([rising(t - DT)[1], rising(t - 0.2 * DT)[1]], axis=0)[0] / (0.8 * DT)
+    jitter = np.full((N, 1), 2e-4)
+    record = Dataset(np.ones(N), means, DT, windows=before[:, None], jitter=jitter)
+    slope = np.exp(-middles / TAU) / TAU
+    np.testing.assert_allclose(np.sqrt(scatter(record))[2:-1, 0], 2e-4 * slope[2:-1], rtol=0.01)
 
 
 def test_a_part_keeps_its_windows():
