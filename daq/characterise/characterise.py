@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import datetime
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from daq.errors import RigError, Terminated
 from daq.files import make_folder
 from daq.identification.fit import check_writable, fit
 from daq.identification.request import CHECKPOINT, SettingsRequest
+from daq.identification.result import Identification
 from daq.identification.settings import problem_of
 from daq.logs.capture import LOG_NAME
 from daq.lookup.models import whole_name
@@ -139,6 +140,7 @@ def _continued(root: Path, request: Request, watch: Watch) -> Characterisation:
         current = Round(root, len(done) + 1)
         if not _design(current, request, done, watch):
             reason = "no run within the limits would tell more"
+            _identify(done, request, watch, ends=True)
             break
         _run(current, request, done, watch)
         _identify([*done, current], request, watch)
@@ -157,12 +159,12 @@ def _absolute(path: str | Path) -> str:
     return str(Path(path).resolve())
 
 
-def _end(request: Request, done: Sequence[Round]) -> str:
-    """Why there is no further round; empty where there is one."""
+def _end(request: Request, done: Sequence[Round], result: Mapping[str, Any] | None = None) -> str:
+    """Why there is no further round; empty where there is one. result: as of ``intervals``."""
     if not done:
         return ""
     if request.precision is not None:
-        widths = [interval.width for interval in done[-1].intervals()]
+        widths = [interval.width for interval in done[-1].intervals(result)]
         if all(w is not None and 100.0 * w <= request.precision for w in widths):
             return f"all that experiments tell is known to {request.precision:g} %"
     if _spent(done) + done[-1].seconds / len(done[-1].experiments) > request.time * (1.0 + 1e-9):
@@ -220,8 +222,13 @@ def _run(current: Round, request: Request, done: Sequence[Round], watch: Watch) 
             record(experiment, request.rig, current.runs, options=options, watch=watch)
 
 
-def _identify(rounds: Sequence[Round], request: Request, watch: Watch) -> None:
-    """Identify from all runs until now, and publish the result."""
+def _identify(
+    rounds: Sequence[Round], request: Request, watch: Watch, *, ends: bool = False
+) -> None:
+    """Identify from all runs until now, and publish the result.
+
+    What the model may lack is tested where this is the end, from all that there is to judge by.
+    """
     folder = rounds[-1].identification
     problem = problem_of(SettingsRequest(request.config, {"model": request.model}), watch)
     logs = [
@@ -230,7 +237,11 @@ def _identify(rounds: Sequence[Round], request: Request, watch: Watch) -> None:
         for experiment in each.experiments
     ]
     going_on = (folder / CHECKPOINT).exists()
-    identification = fit(problem, logs, [], folder, watch, resume=going_on)
+
+    def is_last(result: Identification) -> bool:
+        return ends or bool(_end(request, rounds, result.document))
+
+    identification = fit(problem, logs, [], folder, watch, resume=going_on, examine=is_last)
     if identification.interrupted:
         raise KeyboardInterrupt
     make_folder(rounds[-1].root / "report")

@@ -142,9 +142,9 @@ class Round:
         """The result's document."""
         return yaml_file.load(self.identification / PARAMETERS).content
 
-    def intervals(self) -> list[Interval]:
-        """All that experiments can tell, after this round."""
-        result = self.result
+    def intervals(self, result: Mapping[str, Any] | None = None) -> list[Interval]:
+        """All that experiments can tell, after this round; result: one not yet written."""
+        result = result or self.result
         entries: dict[str, Mapping[str, Any]] = dict(result["parameters"])
         for ambiguity in result.get("ambiguities") or ():
             entries |= {entry["name"]: entry for entry in ambiguity["determined"]}

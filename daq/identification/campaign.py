@@ -79,7 +79,7 @@ class Group:
         problem = dataclasses.replace(self.problem, settings=settings)
         logs = self.training, self.validation
         # Of many runs what each may lack is not worth its time.
-        return assemble(problem, outcome.estimator, logs, None, ignore, test_missing=False)
+        return assemble(problem, outcome.estimator, logs, None, ignore)
 
 
 @dataclass(frozen=True)

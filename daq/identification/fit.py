@@ -5,7 +5,8 @@ from __future__ import annotations
 import datetime
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -116,11 +117,13 @@ def fit(
     folder: Path | None = None,
     watch: Watch = ignore,
     resume: bool = False,
+    examine: Callable[[Identification], bool] = lambda result: True,
 ) -> Identification:
     """Fit a problem that has been checked to logs.
 
     folder: for ``parameters.yaml``, and while the search runs for what it takes to continue it.
-    resume: continue from there. Raises ConfigError.
+    resume: continue from there. examine: whether what the model may lack is to be tested, which
+    may take longer than the fit. Raises ConfigError.
     """
     train, check = load_logs(problem, training, validation)
     warn(watch, *(log.warning for log in (*train, *check)))
@@ -138,6 +141,8 @@ def fit(
     try:
         estimator = _searched(problem, train, folder, watch, resume)
         result = assemble(problem, estimator, logs, folder, watch, faults)
+        if examine(result):
+            result = examined(result, logs, watch)
     except (KeyboardInterrupt, Terminated) as stop:
         if folder is not None and (folder / request.CHECKPOINT).exists():
             command = request.resume_command(folder) + trust_option(problem.model_name)
@@ -252,17 +257,13 @@ def assemble(
     folder: Path | None,
     watch: Watch,
     faults: tuple[DataFault, ...] | None = None,
-    *,
-    test_missing: bool = True,
 ) -> Identification:
     """A fitted estimator with its intervals and profiles, and how it does on every log.
 
-    faults: of the logs, where they have been looked for. test_missing: whether what the model may
-    lack is tested, and the surest variant fitted.
+    faults: of the logs, where they have been looked for.
     """
     # It loads scikit-learn, which takes a second and those that fit nothing do without.
     from sysid.gassi import PRESETS
-    from sysid.judging.examination import suspected
 
     datasets = [log.dataset for log in logs[0]]
     refined = PRESETS[estimator.preset].refine and estimator.stopped_ != "interrupted"
@@ -274,16 +275,19 @@ def assemble(
         watch(Progress("Profiles", k + 1, len(names), f"of {name}"))
     training, validation = ([_fitted(log, estimator, uncertainty) for log in part] for part in logs)
     faults = faults_of(problem, logs) if faults is None else faults
-    suspicion = None
-    if test_missing:
-        watch(Progress("Verdict", 0, 1, "what the model may lack"))
-        datasets_of = [[log.dataset for log in part] for part in logs]
-        suspicion = suspected(estimator, uncertainty, *datasets_of)
-        watch(Progress("Verdict", 1, 1, "what the model may lack"))
     parts = profiles, training, validation, folder
-    return Identification(
-        problem, estimator, uncertainty, *parts, faults=faults, suspicion=suspicion
-    )
+    return Identification(problem, estimator, uncertainty, *parts, faults=faults)
+
+
+def examined(result: Identification, logs: Split, watch: Watch) -> Identification:
+    """With what the model may lack tested, and the surest variant fitted."""
+    from sysid.judging.examination import suspected
+
+    watch(Progress("Verdict", 0, 1, "what the model may lack"))
+    datasets_of = [[log.dataset for log in part] for part in logs]
+    suspicion = suspected(result.estimator, result.uncertainty, *datasets_of)
+    watch(Progress("Verdict", 1, 1, "what the model may lack"))
+    return replace(result, suspicion=suspicion)
 
 
 def take(

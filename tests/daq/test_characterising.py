@@ -61,6 +61,12 @@ def test_the_intervals_hold_what_the_simulated_rig_is_made_of(finished):
         assert abs(quantity["value"] / truth[quantity["name"]] - 1.0) <= quantity["width"] < 0.1
 
 
+def test_what_the_model_may_lack_is_tested_at_the_end(finished):
+    *before, last = rounds_of(finished[0] / "c")
+    assert "missing" in last.result
+    assert before and not any("missing" in each.result for each in before)
+
+
 def test_what_was_done_is_not_done_again(finished, tmp_path):
     shutil.copytree(finished[0], tmp_path, dirs_exist_ok=True)
     last = rounds_of(tmp_path / "c")[-1]
