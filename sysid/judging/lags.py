@@ -134,8 +134,9 @@ def _faults(
             channel=channel,
             statement=says,
             effect="the fit makes inertias and time constants of what a channel lags",
-            cure=f"log {channel} with the others, or move its column by {time}; a plant with a "
-            "dead time needs one in its inputs",
+            cure=f"log {channel} with the others, or take its lag out: "
+            f"'delay: {{{channel}: {count * records[0].dt:.3g} s}}'; a plant with a dead time "
+            "needs one in its inputs",
             share=1.0,
             moves_parameters=part == "training",
         )
