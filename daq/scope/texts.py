@@ -29,8 +29,9 @@ HELP = (
 def heading(log: FollowedLog | None, root: Path, newer: bool) -> str:
     """Which run, in which state, and what is wrong with it; newer: another one has begun."""
     if log is None:
+        missing = "" if root.is_dir() else ", nor that folder"
         return (
-            f"<b>No run under {escape(str(root))} yet.</b> "
+            f"<b>No run under {escape(str(root))} yet{missing}.</b> "
             "It is shown as soon as one begins: <code>rig run prbs.yaml</code>"
         )
     lines = [_title(log)]

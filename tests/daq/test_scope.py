@@ -24,6 +24,7 @@ from daq.process import RunProcess
 from daq.scope.history import History
 from daq.scope.planes import spectra
 from daq.scope.tail import LogTail
+from daq.scope.texts import heading
 from daq.scope.watch import FollowedLog, RunState, Watch
 from tests.daq.support import (
     environment,
@@ -533,6 +534,11 @@ def test_a_record_that_names_no_process_of_a_run_stops_nothing(change):
     record = {"pid": 1234, "started": 1, "boot": "b", "stop": int(signal.SIGINT)}
     assert RunProcess.of(record) is not None
     assert RunProcess.of({**record, **change}) is None and RunProcess.of(None) is None
+
+
+def test_a_folder_that_is_not_there_is_not_called_empty(tmp_path):
+    assert "rusn yet, nor that folder." in heading(None, tmp_path / "rusn", newer=False)
+    assert f"No run under {tmp_path} yet." in heading(None, tmp_path, newer=False)
 
 
 def test_limits_of_a_record_are_those_of_the_quantities(tmp_path):

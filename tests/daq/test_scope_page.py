@@ -145,7 +145,7 @@ def recording(root, name, **facts):
 
 def test_it_follows_a_run_of_the_rig_from_its_beginning_to_its_end(scope, tmp_path):
     tab = scope()
-    assert "No run under runs yet" in tab.head()
+    assert "No run under runs yet, nor that folder" in tab.head()
     write_experiment(tmp_path / "e.yaml", duration=300.0)
     write_rig(tmp_path / "rig.yaml", options={"time": "real"})
     with start_rig("run", "e.yaml", "--rig", "rig.yaml", cwd=tmp_path) as process:
