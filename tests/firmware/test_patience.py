@@ -30,22 +30,24 @@ def test_something():
     tries = Path("tries")
     n = len(tries.read_text()) if tries.exists() else 0
     tries.write_text("x" * (n + 1))
+    if {varied} and n % 2:
+        assert not "here now and then"
     assert n + 1 >= {good}
 """
 
 
 @pytest.mark.parametrize(
-    ("load", "good", "tries", "outcome"),
+    ("load", "good", "varied", "tries", "outcome"),
     [
-        ("", 1, 1, "1 passed"),
-        ("", 2, 1, "1 failed"),
-        ("a busy core", 3, 3, "1 passed"),
-        ("a busy core", 9, 5, "1 skipped"),
+        ("", 2, False, 1, "1 failed"),
+        ("a busy core", 3, False, 3, "1 passed"),
+        ("a busy core", 9, True, 5, "1 skipped"),
+        ("a busy core", 9, False, 5, "1 failed"),
     ],
 )
-def test_only_what_fails_on_load_is_tried_again(tmp_path, load, good, tries, outcome):
+def test_only_what_fails_on_load_is_tried_again(tmp_path, load, good, varied, tries, outcome):
     (tmp_path / "conftest.py").write_text(_CONFTEST.format(root=str(ROOT), load=load))
-    (tmp_path / "test_it.py").write_text(_TEST.format(good=good))
+    (tmp_path / "test_it.py").write_text(_TEST.format(good=good, varied=varied))
     (tmp_path / "pytest.ini").write_text("[pytest]\nmarkers = patient")
     words = [sys.executable, "-m", "pytest", "-rs", "-p", "no:cacheprovider", "-p", "no:hybrid-rig"]
     done = subprocess.run(
@@ -53,4 +55,4 @@ def test_only_what_fails_on_load_is_tried_again(tmp_path, load, good, tries, out
     )
     assert outcome in done.stdout, done.stdout + done.stderr
     assert len((tmp_path / "tries").read_text()) == tries
-    assert ("too busy a machine for real time: a busy core" in done.stdout) == (tries == 5)
+    assert ("too busy a machine for real time: a busy core" in done.stdout) == (outcome == "1 skipped")
