@@ -1,9 +1,8 @@
 """Tests in real time on a busy machine: what fails on load is tried again, at last skipped.
 
 Load is a tick of QEMU's that came late, which the emulator notes in its journal, or other programs
-that keep a core for a good part of the time. A test that fails without either has failed, and so has
-one whose every try ends at the same line: that is no accident. Unless the host says there what it
-says of a line that is too slow.
+that keep a core for a good part of the time. A test that fails without either has failed. So has
+one whose every try ends at the same line, which is no accident, unless the host gives up there.
 """
 
 import os

@@ -17,7 +17,7 @@ from daq.lookup.shipped import find_file
 from daq.serial.backend import SerialDevice, SerialOptions
 from tests.daq.hal_contract import Bench, HalContract
 from tests.daq.serial.support import emulator
-from tests.daq.support import rig, start_rig, until, write_yaml
+from tests.daq.support import record_of, rig, rows_in, start_rig, until, write_yaml
 from tests.daq.test_hal import _exact_currents
 from tests.firmware import lockstep, patience
 from tests.firmware.build import needs
@@ -111,6 +111,30 @@ def test_an_identification_on_it_is_that_of_the_simulated_rig(elf, tmp_path):
         name: (there[name], here[name]) for name in both if not overlap(there[name], here[name])
     }
     assert not apart
+
+
+@pytest.mark.soak
+def test_the_shipped_experiment_runs_on_it_homing_and_all(elf, tmp_path):
+    rate = 200  # Hz, at which QEMU keeps up with a closed loop
+    changes = {"sample_rate": rate, "calibration": {"samples": rate}}
+    experiment = changed("protocol", "prbs.yaml", tmp_path / "prbs.yaml", **changes)
+    serial = changed("backend", "serial.yaml", tmp_path / "serial.yaml", options={"watchdog": 1})
+
+    def wired():
+        folder = Path(tempfile.mkdtemp(dir=tmp_path))
+        with emulated(elf, folder / "qemu", seed=5) as running:
+            patience.watch(running)
+            recorded(experiment, "--rig", serial, "--port", running.port, folder=folder)
+        return folder, running.journal
+
+    folder, journal = patience.on_load(wired)
+    (run,) = folder.glob("runs/*/")
+    record = record_of(run)
+    assert record["status"] == "completed" and record["outputs"]["confirmed"]
+    assert record["timing"]["late"]["commands"] == 0 and rows_in(run) == 1.25 * rate
+    phases = [entry["phase"] for entry in journal]
+    assert phases.index("homing") < phases.index("run")
+    assert journal[-1]["outputs"] == [0, 0]
 
 
 def recorded(*words, folder):
