@@ -81,7 +81,8 @@ def _used(lines: Iterable[Line], values: Iterable[str]) -> set[str]:
 
 def block(head: str, *parts: Iterable[str]) -> list[str]:
     """Lines that begin a block, and those within it."""
-    return [head, *(f"    {line}" for part in parts for line in part)]
+    lines = [line for part in parts for line in part] or ["pass"]
+    return [head, *(f"    {line}" for line in lines)]
 
 
 def listed(items: Iterable[str]) -> str:

@@ -42,6 +42,16 @@ def test_of_a_linear_system_innovations_are_those_of_a_kalman_filter():
     assert innovations[:, 0] == pytest.approx(kalman_filter(u, y), abs=1e-12)
 
 
+def test_without_noise_of_inputs_innovations_are_the_errors():
+    rng = np.random.default_rng(1)
+    u, y = prbs(rng, 30, -1.0, 1.0), rng.standard_normal(30)
+    innovations = simulate(lag(), [GAIN, TAU], Dataset(u, y, DT), [OF_OUTPUT], steps=2)
+    a, x = math.exp(-DT / TAU), y[0]
+    for k in range(30):
+        assert innovations[k, 0] == pytest.approx(x - y[k], abs=1e-12)
+        x = a * x + GAIN * (1.0 - a) * u[k]
+
+
 def kalman_filter(u, y):
     """Innovations of the lag by the textbook: states are y and the noise of the present input."""
     a = np.exp(-DT / TAU)
