@@ -87,9 +87,10 @@ class RealTime:
         """No garbage collection in the middle of a tick; what there is by now is left aside."""
         if gc.isenabled():
             gc.collect()
-            gc.freeze()
+            if not gc.get_freeze_count():  # what a host program has left aside stays there
+                gc.freeze()
+                self._undo.callback(gc.unfreeze)
             gc.disable()
-            self._undo.callback(gc.unfreeze)
             self._undo.callback(gc.enable)
         self.granted["garbage_collector"] = "off"
 
