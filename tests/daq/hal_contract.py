@@ -28,7 +28,8 @@ class Bench:
     make: a new, closed device. config: its calibration and limits. resolution: largest
     difference between a command and what is applied for it [V]. noise: largest deviation of a
     current at rest from zero [A]. step: least motor current one sample after a step of 1 V [A].
-    encoder: whether a shaft turns and the device itself watches its counter.
+    encoder: whether a shaft turns and the device itself watches its counter. slow: whether a frame
+    of commands may take longer to cross than those before it have left to play.
     """
 
     name: str
@@ -38,6 +39,7 @@ class Bench:
     noise: float
     step: float = 0.2
     encoder: bool = True
+    slow: bool = False
 
     def needs_encoder(self):
         if not self.encoder:
@@ -278,7 +280,7 @@ class HalContract:
         held = played.flagged(Flag.HELD)
         assert held[3:behind].all() and not held[:3].any()
         caught_up = int(np.flatnonzero(~held[behind:])[0]) + behind
-        assert not held[caught_up:end].any()
+        assert bench.slow or not held[caught_up:end].any()
         played, held = first(played, end), held[:end]
         on_time = played.tick[~held]
         np.testing.assert_allclose(

@@ -62,6 +62,7 @@ class TestFirmware(HalContract):
             config=RigConfig(),
             resolution=RESOLUTION,
             noise=NOISE,
+            slow=True,
         )
 
     @pytest.fixture
