@@ -1,6 +1,7 @@
 """Files and folders written for a user: whole or not at all, with the cure where it fails."""
 
 import contextlib
+import hashlib
 from pathlib import Path
 
 from daq.errors import ConfigError, RunError
@@ -19,6 +20,11 @@ def write_whole(path: Path, content: str | bytes) -> None:
         if not path.parent.is_dir():
             reason = f"there is no folder {path.parent}, make it first"
         raise RunError(f"cannot be written: {reason}", file=path) from None
+
+
+def digest(path: Path) -> str:
+    """SHA-256 of a file's content, by which it is known again."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def make_folder(folder: Path, exist_ok: bool = True) -> None:

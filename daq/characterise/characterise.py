@@ -140,7 +140,8 @@ def _continued(root: Path, request: Request, watch: Watch) -> Characterisation:
         current = Round(root, len(done) + 1)
         if not _design(current, request, done, watch):
             reason = "no run within the limits would tell more"
-            _identify(done, request, watch, ends=True)
+            if "missing" not in done[-1].result:
+                _identify(done, request, watch, ends=True)
             break
         _run(current, request, done, watch)
         _identify([*done, current], request, watch)

@@ -1,7 +1,6 @@
 """The report of an identification: a page, figures, a LaTeX table and a JSON document."""
 
 import datetime
-import hashlib
 import json
 import shlex
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -10,7 +9,7 @@ from typing import Any
 
 from daq.documents import plain
 from daq.figures import style
-from daq.files import make_folder, write_whole
+from daq.files import digest, make_folder, write_whole
 from daq.identification.baseline import Baseline, baselines_of
 from daq.identification.records import LoggedRecord, Split
 from daq.identification.request import SettingsRequest
@@ -95,16 +94,12 @@ def fingerprints(logs: Split) -> list[dict[str, Any]]:
             "use": use,
             "samples": log.dataset.n_samples,
             "sample_rate": 1.0 / log.dataset.dt,
-            "sha256": _hash(log.path),
-            **({"merged": {str(f): _hash(f) for f in log.merged}} if log.merged else {}),
+            "sha256": digest(log.path),
+            **({"merged": {str(f): digest(f) for f in log.merged}} if log.merged else {}),
         }
         for use, part in zip(("training", "validation"), logs, strict=True)
         for log in part
     ]
-
-
-def _hash(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def _document(

@@ -1,6 +1,5 @@
 """The figures of a finished identification's report, in other formats."""
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -8,6 +7,7 @@ from typing import Any
 from daq.config import json_file
 from daq.errors import ConfigError
 from daq.figures.style import FORMATS
+from daq.files import digest
 from daq.identification import records
 from daq.identification.baseline import baselines_of
 from daq.identification.records import LoggedRecord, Split
@@ -93,11 +93,11 @@ def _logs(reproduction: Mapping[str, Any], model: ProcessModel) -> Split:
     logs: dict[str, dict[Path, LoggedRecord]] = {"training": {}, "validation": {}}
     for entry in reproduction["logs"]:
         path = root / entry["log"]
-        for name, digest in {entry["log"]: entry["sha256"], **entry.get("merged", {})}.items():
+        for name, known in {entry["log"]: entry["sha256"], **entry.get("merged", {})}.items():
             file = root / name
             if not file.exists():
                 raise ConfigError("this log of the report is gone", cure=_AGAIN, file=file)
-            if hashlib.sha256(file.read_bytes()).hexdigest() != digest:
+            if digest(file) != known:
                 raise ConfigError("this log is another than the report's", cure=_AGAIN, file=file)
         logs[entry["use"]][path] = records.load(path, model, columns, selection)
     training, ends = records.hold_back(list(logs["training"].values()), reproduction["hold_back"])

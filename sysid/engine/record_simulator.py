@@ -57,6 +57,9 @@ class Population:
     spent: IntArray
 
 
+_Means = tuple[FloatArray, dict[int, FloatArray]]
+
+
 @dataclass(eq=False)
 class RecordSimulator:
     """Simulates one record under many parameter vectors.
@@ -89,6 +92,7 @@ class RecordSimulator:
             windows = record.windows / record.dt  # in samples
         self.averaged = np.flatnonzero(windows.any(axis=(0, 2))).tolist()
         self._windows = np.ascontiguousarray(np.moveaxis(windows, 1, 0))
+        self._means_of: dict[tuple[tuple[int, ...], bool], _Means] = {}
         if self.averaged:
             if self.scale is not None:
                 # What a window saw before the record is not known.
@@ -194,7 +198,10 @@ class RecordSimulator:
         kept = np.empty((record.n_samples, len(noise), LANES))
         sums = np.empty((2 * len(noise), LANES))
         work = work_area(kernel.work_rows * LANES)
-        mean, cut = self._means(kernel.averaged, corrects)
+        wanted = tuple(kernel.averaged), corrects
+        if wanted not in self._means_of:  # the same in every run of a fit
+            self._means_of[wanted] = self._means(*wanted)
+        mean, cut = self._means_of[wanted]
         weights[0, [j for j in self.averaged if j not in cut]] = 0.0  # its mean is not over yet
         measured = self._after_the_last(cut, parameters, starts, lanes, n_steps)
         with explained_errors(model):
@@ -249,9 +256,7 @@ class RecordSimulator:
         start = self._initial(starts, lanes)
         return self._run(self.kernels, parameters, start, lanes, n_steps, signals, residuals)
 
-    def _means(
-        self, averaged: Sequence[int], corrects: bool
-    ) -> tuple[FloatArray, dict[int, FloatArray]]:
+    def _means(self, averaged: Sequence[int], corrects: bool) -> _Means:
         """Weights (n_samples, n_outputs, 2, 4) as of ``weights_of_sums`` for a filter.
 
         And those (n_samples, 3) of outputs whose means are cut off at the sample before.

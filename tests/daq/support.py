@@ -53,6 +53,19 @@ def write_rig(path, **changes):
     return write_yaml(path, RIG_FILE, **changes)
 
 
+OF_LAG = {
+    "model": "lag.py:model",
+    "population": 16,
+    "generations": 2,
+    "columns": {
+        "time": {"column": "t"},
+        "inputs": {"u": {"column": "u"}},
+        "outputs": {"y": {"column": "y"}},
+    },
+}
+"""Settings of an identification of a model in lag.py from a table of t, u and y."""
+
+
 def few_free(*free, **parts):
     """Settings of an identification of the actuator in which only ``free`` are searched.
 

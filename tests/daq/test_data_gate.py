@@ -14,19 +14,9 @@ from daq.identification.request import SettingsRequest
 from daq.identification.settings import problem_of
 from daq.logs.table import read_table
 from sysid.examples import lag_record
-from tests.daq.support import rig
+from tests.daq.support import OF_LAG, rig
 
 MODEL = "from sysid.examples import lag\nmodel = lag()\n"
-CONFIG = {
-    "model": "lag.py:model",
-    "population": 16,
-    "generations": 2,
-    "columns": {
-        "time": {"column": "t"},
-        "inputs": {"u": {"column": "u"}},
-        "outputs": {"y": {"column": "y"}},
-    },
-}
 
 
 def table(seed=0):
@@ -44,7 +34,7 @@ def folder(tmp_path):
 
 def configured(folder, **changes):
     path = folder / "id.yaml"
-    path.write_text(yaml.safe_dump({**CONFIG, **changes}))
+    path.write_text(yaml.safe_dump({**OF_LAG, **changes}))
     return path
 
 
@@ -157,7 +147,7 @@ def test_null_frees_a_parameter_that_the_model_fixes(folder):
 
 
 def test_a_reciprocal_is_a_unit(folder):
-    columns = json.loads(json.dumps(CONFIG["columns"]))
+    columns = json.loads(json.dumps(OF_LAG["columns"]))
     columns["inputs"]["u"] = {"constant": "5 1/mm"}
     text = (MODEL + "from dataclasses import replace\n"
             "model = replace(model, inputs=(replace(model.inputs[0], unit='1/m'),))\n")  # fmt: skip

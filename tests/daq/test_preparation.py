@@ -17,18 +17,9 @@ from daq.report.reprint import redraw
 from sysid import GASSI, Dataset
 from sysid.examples import lag
 from sysid.problem.preparation import Preparation, low_pass, prepare
+from tests.daq.support import OF_LAG
 
 GAIN, TAU, DT, N = 3.0, 0.04, 1e-3, 3000
-CONFIG = {
-    "model": "lag.py:model",
-    "population": 16,
-    "generations": 2,
-    "columns": {
-        "time": {"column": "t"},
-        "inputs": {"u": {"column": "u"}},
-        "outputs": {"y": {"column": "y"}},
-    },
-}
 
 
 def clean():
@@ -121,7 +112,7 @@ def folder(tmp_path):
 
 def problem(folder, **changes):
     path = folder / "id.yaml"
-    path.write_text(yaml.safe_dump({**CONFIG, **changes}))
+    path.write_text(yaml.safe_dump({**OF_LAG, **changes}))
     return problem_of(SettingsRequest(str(path)))
 
 
