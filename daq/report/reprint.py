@@ -93,11 +93,11 @@ def _logs(reproduction: Mapping[str, Any], model: ProcessModel) -> Split:
     logs: dict[str, dict[Path, LoggedRecord]] = {"training": {}, "validation": {}}
     for entry in reproduction["logs"]:
         path = root / entry["log"]
-        for name, known in {entry["log"]: entry["sha256"], **entry.get("merged", {})}.items():
+        for name, sha256 in {entry["log"]: entry["sha256"], **entry.get("merged", {})}.items():
             file = root / name
             if not file.exists():
                 raise ConfigError("this log of the report is gone", cure=_AGAIN, file=file)
-            if digest(file) != known:
+            if digest(file) != sha256:
                 raise ConfigError("this log is another than the report's", cure=_AGAIN, file=file)
         logs[entry["use"]][path] = records.load(path, model, columns, selection)
     training, ends = records.hold_back(list(logs["training"].values()), reproduction["hold_back"])

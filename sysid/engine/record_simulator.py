@@ -198,10 +198,10 @@ class RecordSimulator:
         kept = np.empty((record.n_samples, len(noise), LANES))
         sums = np.empty((2 * len(noise), LANES))
         work = work_area(kernel.work_rows * LANES)
-        wanted = tuple(kernel.averaged), corrects
-        if wanted not in self._means_of:  # the same in every run of a fit
-            self._means_of[wanted] = self._means(*wanted)
-        mean, cut = self._means_of[wanted]
+        key = tuple(kernel.averaged), corrects
+        if key not in self._means_of:  # the same in every run of a fit
+            self._means_of[key] = self._means(*key)
+        mean, cut = self._means_of[key]
         weights[0, [j for j in self.averaged if j not in cut]] = 0.0  # its mean is not over yet
         measured = self._after_the_last(cut, parameters, starts, lanes, n_steps)
         with explained_errors(model):
