@@ -12,8 +12,8 @@ from typing import Any
 from daq.characterise.page import write_page
 from daq.characterise.rounds import Interval, Request, Round, rounds_of
 from daq.config.yaml_file import TypedSettings
-from daq.designs.design import choose, set_up, write
-from daq.errors import RigError, Terminated
+from daq.designs.design import DATA, choose, set_up, write
+from daq.errors import ConfigError, RigError, Terminated
 from daq.files import make_folder
 from daq.identification.fit import check_writable, fit
 from daq.identification.request import CHECKPOINT, SettingsRequest
@@ -121,15 +121,17 @@ def characterise(
 def resume(folder: str | Path, *, watch: Watch = ignore) -> Characterisation:
     """Go on with a characterisation from what is there, however it ended.
 
-    Raises ConfigError where none has begun, and what a run raises.
+    Raises ConfigError where none has begun, or where not even a first round would tell anything,
+    and what a run raises.
     """
     root = Path(folder)
     request = Request.load(root)
     try:
         return _continued(root, request, watch)
     except (KeyboardInterrupt, Terminated, RigError) as stop:
-        command = f"rig characterise --resume {shlex.quote(str(root))}"
-        stop.add_note(f"what was done until then is kept; go on with: {command}")
+        if not isinstance(stop, ConfigError) or rounds_of(root):
+            command = f"rig characterise --resume {shlex.quote(str(root))}"
+            stop.add_note(f"what was done until then is kept; go on with: {command}")
         raise
 
 
@@ -139,6 +141,8 @@ def _continued(root: Path, request: Request, watch: Watch) -> Characterisation:
     while not reason:
         current = Round(root, len(done) + 1)
         if not _design(current, request, done, watch):
+            if not done:
+                raise _nothing_to_tell(current)
             reason = "no run within the limits would tell more"
             if "missing" not in done[-1].result:
                 _identify(done, request, watch, ends=True)
@@ -154,6 +158,23 @@ def _continued(root: Path, request: Request, watch: Watch) -> Characterisation:
         root, tuple(done), tuple(last.intervals()), _spent(done), reason,
         last.result["verdict"], page, root / "report" / "report.html",
     )  # fmt: skip
+
+
+def _nothing_to_tell(first: Round) -> ConfigError:
+    """Why there is not even a first round, and the cure."""
+    quantities = first.design["quantities"]
+    if not quantities:
+        problem = "the model has no free parameter that an experiment tells"
+        cure = "free one in the configuration"
+    else:
+        best = min(quantities, key=lambda q: q["after"] / q["before"])
+        widths = " to ".join(f"{100.0 * best[key]:.3g}" for key in ("before", "after"))
+        problem = (
+            "no run within the limits would tell the parameters better than they are known: "
+            f"most it would {best['name']}, from {widths} %"
+        )
+        cure = "give more time or longer runs (--set run=5s), wider limits, or less noise"
+    return ConfigError(f"nothing was run: {problem}", cure=cure, file=first.folder / DATA)
 
 
 def _absolute(path: str | Path) -> str:

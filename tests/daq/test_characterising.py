@@ -108,6 +108,16 @@ def test_mistakes_are_named_before_anything_is_written(folder):
     assert "name the folder that rig characterise made" in done.stderr
 
 
+def test_a_first_design_that_promises_nothing_is_refused_in_words(folder):
+    deaf = ["--set", "noise={current_motor: 1e4, current_brake: 1e4, omega: 1e7, torque: 1e4}"]
+    for words_of_it in (words("--time", "1", *deaf), ["characterise", "--resume", "c"]):
+        done = rig(*words_of_it, cwd=folder, timeout=120)
+        assert done.returncode == 2
+        assert "no run within the limits would tell the parameters better" in done.stderr
+        assert "give more time or longer runs" in done.stderr
+        assert "go on with" not in done.stderr
+
+
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no SIGKILL")
 def test_a_killed_characterisation_goes_on_to_the_same_end(finished, folder):
     """Killed again at every further file that it goes on to write."""
