@@ -19,6 +19,9 @@ _HEADER = """\
 
 typedef {real} rig_real;
 
+#define RIG_CONTROLLER_PERIOD {period!r} /* s */
+#define RIG_CONTROLLER_AHEAD {n_ahead} /* samples from a sample to its answer */
+
 /* The controller. It answers a sample of every {period:g} s; its commands act {ahead} later.
    theta [rad], omega [rad/s], torque [N*m] at the hand's sensor, current_motor [A]: the sample.
    reference: torque that the hand is to feel [N*m]. lost: samples missing before this one.
@@ -107,6 +110,7 @@ def device_code(controller: str | Path, precision: Precision = "double") -> Devi
         precision=precision,
         real="float" if precision == "single" else "double",
         period=program.step.time,
+        n_ahead=tuned.control.ahead,
         ahead=f"{tuned.control.ahead} samples" if tuned.control.ahead > 1 else "a sample",
         n_states=program.n_states,
         n=len(program.step.initial),

@@ -64,6 +64,7 @@ class Type(enum.IntEnum):
     SAFE = 0x05
     CLEAR = 0x06
     ANNOUNCE = 0x07
+    LAW = 0x08
     COMMANDS = 0x10
     PING = 0x11
     WELCOME = 0x81
@@ -117,6 +118,7 @@ _STATUS = struct.Struct("<HBBIIIII")
 _REPLY = struct.Struct("<BB2x")
 _START = struct.Struct("<HBxIH2x2h2h3i3i2ifI")
 _COMMANDS = struct.Struct("<HHI")
+_LAW = struct.Struct("<HBxIH2xi6f")
 _PONG = struct.Struct("<QQQ")
 _SAMPLES = struct.Struct("<IH2xQ")
 _SAMPLES_HEAD = struct.Struct(_STATUS.format + _SAMPLES.format[1:])
@@ -352,6 +354,39 @@ def unpack_commands(payload: bytes) -> tuple[int, int, Codes]:
     run, count, first = _COMMANDS.unpack_from(payload)
     codes = np.frombuffer(payload, COMMAND_DTYPE, offset=_COMMANDS.size)
     return run, first, codes.reshape(count, len(CHANNELS))
+
+
+class Law(NamedTuple):
+    """Let the device's own torque controller answer from tick ``first`` on, or commands again.
+
+    blend: ticks over which the outputs move over. angle: rad of a count, from ``count`` on.
+    current_motor [A], torque [N*m]: of a code, and of code 0. reference: N*m of a command's code.
+
+    >>> Law(1, True, 400, 160, 0, 7.7e-4, (1.5e-4, 0.0), (2.2e-4, 0.01), 1e-4).on
+    True
+    """
+
+    run: int
+    on: bool
+    first: int
+    blend: int
+    count: int
+    angle: float
+    current_motor: tuple[float, float]
+    torque: tuple[float, float]
+    reference: float
+
+    def pack(self) -> bytes:
+        """Payload of the frame."""
+        scales = (self.angle, *self.current_motor, *self.torque, self.reference)
+        return _LAW.pack(self.run, self.on, self.first, self.blend, self.count, *scales)
+
+    @classmethod
+    def unpack(cls, payload: bytes) -> Self:
+        """The message."""
+        run, on, first, blend, count, angle, *pairs, reference = _LAW.unpack(payload)
+        current, torque = (pairs[0], pairs[1]), (pairs[2], pairs[3])
+        return cls(run, bool(on), first, blend, count, angle, current, torque, reference)
 
 
 class Pong(NamedTuple):

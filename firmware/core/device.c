@@ -215,6 +215,12 @@ static void forget_run(struct rig_device *device) {
     device->number = 0u;
     device->run.tick = 0u;
     device->run.overflow = 0u;
+#if RIG_HAS_LAW
+    rig_law_clear(&device->run.law);
+    for (uint32_t i = 0u; i < RIG_OUTPUTS; i++) {
+        device->run.law.per_volt[i] = (float)(1.0 / device->identity->channels[RIG_INPUTS + i].scale);
+    }
+#endif
 }
 
 static enum rig_result on_start(struct rig_device *device, const struct rig_frame *frame) {
@@ -315,6 +321,31 @@ static enum rig_result on_announce(const struct rig_frame *frame) {
     return RIG_OK;
 }
 
+#if RIG_HAS_LAW
+/* Nothing is switched in a tick that has passed: commands would be taken for references. */
+static enum rig_result on_law(struct rig_device *device, const struct rig_frame *frame) {
+    struct rig_run *run = &device->run;
+    struct rig_law_order order;
+    if (frame->length != RIG_LAW_SIZE) {
+        return RIG_BAD_VALUE;
+    }
+    if ((look(device).state == RIG_IDLE) || (rig_get16(frame->payload) != device->number)) {
+        return RIG_WRONG_STATE;
+    }
+    if (!rig_law_read(&order, frame->payload, run->period, device->identity->clock)) {
+        return RIG_BAD_VALUE;
+    }
+    const uint32_t token = board_lock();
+    const bool ahead = order.first >= run->tick;
+    if (ahead) {
+        run->law.order = order;
+        run->law.waits = true;
+    }
+    board_unlock(token);
+    return ahead ? RIG_OK : RIG_WRONG_STATE;
+}
+#endif
+
 static enum rig_result carry_out(struct rig_device *device, const struct rig_frame *frame) {
     enum rig_result result = RIG_UNKNOWN;
     switch (frame->type) {
@@ -336,6 +367,11 @@ static enum rig_result carry_out(struct rig_device *device, const struct rig_fra
     case RIG_ANNOUNCE:
         result = on_announce(frame);
         break;
+#if RIG_HAS_LAW
+    case RIG_LAW:
+        result = on_law(device, frame);
+        break;
+#endif
     default:
         break;
     }

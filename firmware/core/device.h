@@ -16,6 +16,7 @@
 #include "config.h"
 #include "frame.h"
 #include "guard.h"
+#include "law.h"
 #include "samples.h"
 #include "watchdog.h"
 #include "wire.h"
@@ -36,6 +37,9 @@ struct rig_run {
     int16_t last[RIG_OUTPUTS]; /* what closed loop holds */
     struct rig_guard guard;
     struct rig_watchdog watchdog;
+#if RIG_HAS_LAW
+    struct rig_law law;
+#endif
 };
 
 /* A device; one that is all zeros has not been initialised. */

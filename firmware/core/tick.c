@@ -14,16 +14,34 @@ static void watch(struct rig_run *run) {
     }
 }
 
-/* The output of a tick, and its flags. */
+/* Whether this tick's commands are a controller's references, not outputs. */
+static bool is_answered(struct rig_run *run) {
+#if RIG_HAS_LAW
+    const bool before = run->law.on;
+    if (rig_law_switch(&run->law, run->tick) && (run->law.on != before)) {
+        run->last[0] = 0; /* what was held is of another kind */
+        run->last[1] = 0;
+    }
+    return run->law.on;
+#else
+    (void)run;
+    return false;
+#endif
+}
+
+/* What the host wants of a tick, and its flags. */
 static uint32_t command(struct rig_device *device, int16_t codes[RIG_OUTPUTS]) {
     struct rig_run *run = &device->run;
     uint32_t flags = 0u;
     codes[0] = 0;
     codes[1] = 0;
     if (run->latch != RIG_LATCH_NONE) {
-        flags = (run->latch == RIG_LATCH_UNDERFLOW) ? (uint32_t)RIG_FLAG_UNDERFLOW : 0u;
-    } else if (rig_commands_take(&device->commands, run->tick, codes)) {
-        flags = rig_guard_clamp(&run->guard, codes) ? (uint32_t)RIG_FLAG_CLAMPED : 0u;
+        return (run->latch == RIG_LATCH_UNDERFLOW) ? (uint32_t)RIG_FLAG_UNDERFLOW : 0u;
+    }
+    const bool answered = is_answered(run);
+    if (rig_commands_take(&device->commands, run->tick, codes)) {
+        const bool clamped = !answered && rig_guard_clamp(&run->guard, codes);
+        flags = clamped ? (uint32_t)RIG_FLAG_CLAMPED : 0u;
         run->last[0] = codes[0];
         run->last[1] = codes[1];
     } else if (device->commands.closed) {
@@ -37,6 +55,26 @@ static uint32_t command(struct rig_device *device, int16_t codes[RIG_OUTPUTS]) {
     return flags;
 }
 
+#if RIG_HAS_LAW
+/* What a controller makes of it, within the clamps like any command. */
+static uint32_t answer(struct rig_run *run, int16_t codes[RIG_OUTPUTS], uint32_t flags) {
+    struct rig_law *law = &run->law;
+    if (law->on) {
+        law->reference = codes[0];
+        if (!rig_law_outputs(law, codes)) {
+            close_latch(run, RIG_LATCH_INTERLOCK);
+            return RIG_FLAG_INTERLOCK;
+        }
+    }
+    const bool blended = rig_law_blend(law, codes);
+    if (!law->on && !blended) {
+        return flags;
+    }
+    const bool clamped = rig_guard_clamp(&run->guard, codes);
+    return flags | (uint32_t)RIG_FLAG_LAW | (clamped ? (uint32_t)RIG_FLAG_CLAMPED : 0u);
+}
+#endif
+
 void rig_on_tick(struct rig_device *device) {
     struct rig_run *run = &device->run;
     if ((run->state != RIG_RUNNING) || (run->tick == UINT32_MAX)) {
@@ -47,6 +85,11 @@ void rig_on_tick(struct rig_device *device) {
     watch(run);
     int16_t codes[RIG_OUTPUTS];
     uint32_t flags = command(device, codes);
+#if RIG_HAS_LAW
+    if (run->latch == RIG_LATCH_NONE) {
+        flags = answer(run, codes, flags);
+    }
+#endif
     if ((run->latch == RIG_LATCH_NONE) && rig_guard_beyond(&run->guard, &inputs)) {
         close_latch(run, RIG_LATCH_INTERLOCK);
         flags = RIG_FLAG_INTERLOCK;
@@ -61,6 +104,11 @@ void rig_on_tick(struct rig_device *device) {
                                 .flags = flags};
     sample.flags |= inputs.at_end ? (uint32_t)RIG_FLAG_SATURATED : 0u;
     board_apply(codes, sample.applied);
+#if RIG_HAS_LAW
+    if (run->latch == RIG_LATCH_NONE) {
+        rig_law_answer(&run->law, &inputs, codes);
+    }
+#endif
     if (!rig_samples_put(&device->samples, &sample)) {
         run->overflow++;
     }

@@ -18,6 +18,7 @@ enum rig_type {
     RIG_SAFE = 0x05,
     RIG_CLEAR = 0x06,
     RIG_ANNOUNCE = 0x07,
+    RIG_LAW = 0x08,
     RIG_COMMANDS = 0x10,
     RIG_PING = 0x11,
     RIG_WELCOME = 0x81,
@@ -51,7 +52,8 @@ enum rig_flag {
     RIG_FLAG_HELD = 2,
     RIG_FLAG_INTERLOCK = 8,
     RIG_FLAG_UNDERFLOW = 16,
-    RIG_FLAG_SATURATED = 32
+    RIG_FLAG_SATURATED = 32,
+    RIG_FLAG_LAW = 128
 };
 
 /* Sizes in bytes. */
@@ -60,6 +62,7 @@ enum rig_flag {
 #define RIG_START_SIZE 60u
 #define RIG_RUN_SIZE 2u
 #define RIG_ANNOUNCE_SIZE 8u
+#define RIG_LAW_SIZE 40u
 #define RIG_COMMANDS_HEAD 8u
 #define RIG_COMMAND_SIZE 4u
 #define RIG_PING_SIZE 8u

@@ -277,7 +277,13 @@ class _Function:
                 return f"((real){a} / (real){b})"
         if type(op) not in _SIGNS:
             raise CTextError(node, f"{ast.unparse(node)} has no C here")
+        if self._whole(left) != self._whole(right):
+            a, b = self._as_real(left, a), self._as_real(right, b)
         return f"({a} {_SIGNS[type(op)]} {b})"
+
+    def _as_real(self, node: ast.expr, text: str) -> str:
+        """A whole number that is reckoned with others; C would convert it, and some ask to see it."""
+        return f"(real){text}" if self._whole(node) else text
 
     def _call(self, node: ast.expr, function: ast.expr, arguments: list[ast.expr]) -> str:
         values = [self._value(argument) for argument in arguments]

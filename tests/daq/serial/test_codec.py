@@ -140,6 +140,8 @@ def test_a_block_of_samples_comes_back_as_it_was(n, first, time):
         (messages.unpack_commands, messages.pack_commands(1, 2, np.zeros((3, 2), "<i2"))),
         (messages.ANNOUNCE.unpack, messages.ANNOUNCE.pack(2, 5.0)),
         (messages.RUN.unpack, messages.RUN.pack(3)),
+        (messages.Law.unpack, messages.Law(
+            1, True, 9, 5, -3, 0.5, (0.25, 1.0), (2.0, 3.0), 0.125).pack()),
         (messages.PING.unpack, messages.PING.pack(3)),
         (messages.Start.unpack, messages.Start(
             1, Mode.OPEN_LOOP, 60_000, 100, messages.CodedGuard(

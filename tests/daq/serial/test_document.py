@@ -105,6 +105,7 @@ SIZES = {
     "START": messages._START.size,
     "GO, STOP": messages.RUN.size,
     "ANNOUNCE": messages.ANNOUNCE.size,
+    "LAW": messages._LAW.size,
     "COMMANDS": messages._COMMANDS.size,
     "PING": messages.PING.size,
     "REPLY": messages._REPLY.size + messages._STATUS.size,
