@@ -359,7 +359,7 @@ def unpack_commands(payload: bytes) -> tuple[int, int, Codes]:
 class Law(NamedTuple):
     """Let the device's own torque controller answer from tick ``first`` on, or commands again.
 
-    blend: ticks over which the outputs move over. angle: rad of a count, from ``count`` on.
+    blend: ticks over which the outputs move over. angle: rad of a count, from ``counts_zero`` on.
     current_motor [A], torque [N*m]: of a code, and of code 0. reference: N*m of a command's code.
 
     >>> Law(1, True, 400, 160, 0, 7.7e-4, (1.5e-4, 0.0), (2.2e-4, 0.01), 1e-4).on
@@ -370,7 +370,7 @@ class Law(NamedTuple):
     on: bool
     first: int
     blend: int
-    count: int
+    counts_zero: int
     angle: float
     current_motor: tuple[float, float]
     torque: tuple[float, float]
@@ -379,14 +379,14 @@ class Law(NamedTuple):
     def pack(self) -> bytes:
         """Payload of the frame."""
         scales = (self.angle, *self.current_motor, *self.torque, self.reference)
-        return _LAW.pack(self.run, self.on, self.first, self.blend, self.count, *scales)
+        return _LAW.pack(self.run, self.on, self.first, self.blend, self.counts_zero, *scales)
 
     @classmethod
     def unpack(cls, payload: bytes) -> Self:
         """The message."""
-        run, on, first, blend, count, angle, *pairs, reference = _LAW.unpack(payload)
+        run, on, first, blend, zero, angle, *pairs, reference = _LAW.unpack(payload)
         current, torque = (pairs[0], pairs[1]), (pairs[2], pairs[3])
-        return cls(run, bool(on), first, blend, count, angle, current, torque, reference)
+        return cls(run, bool(on), first, blend, zero, angle, current, torque, reference)
 
 
 class Pong(NamedTuple):

@@ -75,7 +75,7 @@ bool rig_law_outputs(const struct rig_law *law, int16_t codes[RIG_OUTPUTS]) {
     for (uint32_t i = 0u; i < RIG_OUTPUTS; i++) {
         const bool number = law->answer[i] == law->answer[i];
         numbers = numbers && number;
-        codes[i] = number ? rounded(law->answer[i]) : 0;
+        codes[i] = rounded(number ? law->answer[i] : 0.0f);
     }
     return numbers;
 }

@@ -282,7 +282,7 @@ class _Function:
         return f"({a} {_SIGNS[type(op)]} {b})"
 
     def _as_real(self, node: ast.expr, text: str) -> str:
-        """A whole number that is reckoned with others; C would convert it, and some ask to see it."""
+        """With the conversion that C makes of a whole number beside a real one, to be seen."""
         return f"(real){text}" if self._whole(node) else text
 
     def _call(self, node: ast.expr, function: ast.expr, arguments: list[ast.expr]) -> str:

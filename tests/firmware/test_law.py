@@ -52,7 +52,7 @@ def host(running):
 def law(host, on, first, blend=BLEND, **scales):
     """A payload of LAW."""
     values = {"angle": ANGLE, "current_motor": (CURRENT, 0.0), "torque": (TORQUE, 0.0)}
-    values |= {"count": 0, "reference": REFERENCE, **scales}
+    values |= {"counts_zero": 0, "reference": REFERENCE, **scales}
     return messages.Law(host._run, on, first, blend, **values).pack()
 
 
