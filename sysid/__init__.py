@@ -12,7 +12,16 @@ if TYPE_CHECKING:
     from sysid.campaigns.runs import Campaign, Outcome, Run, Spread, campaign, combinations
     from sysid.engine.simulation import BatchResult, BatchSimulator, Status
     from sysid.engine.stepper import Stepper
-    from sysid.experiments import Design, Excitation, Prior, Setting, design
+    from sysid.experiments import (
+        Contest,
+        Design,
+        Discrimination,
+        Excitation,
+        Prior,
+        Setting,
+        design,
+        discriminate,
+    )
     from sysid.fitting.free_run import free_run
     from sysid.gassi import GASSI
     from sysid.identifiability.combination import Combination
@@ -47,8 +56,10 @@ __all__ = [
     "Combination",
     "Comparison",
     "Constraint",
+    "Contest",
     "Dataset",
     "Design",
+    "Discrimination",
     "Excitation",
     "Given",
     "Guess",
@@ -74,6 +85,7 @@ __all__ = [
     "combinations",
     "compare",
     "design",
+    "discriminate",
     "equilibrium",
     "evaluate",
     "fit_percent",
@@ -95,7 +107,9 @@ _NAMES = {
     "sysid.campaigns.runs": "Campaign Outcome Run Spread campaign combinations",
     "sysid.engine.simulation": "BatchResult BatchSimulator Status",
     "sysid.engine.stepper": "Stepper",
-    "sysid.experiments": "Design Excitation Prior Setting design",
+    "sysid.experiments": (
+        "Contest Design Discrimination Excitation Prior Setting design discriminate"
+    ),
     "sysid.fitting.free_run": "free_run",
     "sysid.gassi": "GASSI",
     "sysid.identifiability.findings": "Identifiability TiedGroup",

@@ -1,7 +1,19 @@
 """Experiments that tell most about a model's parameters, before they are run."""
 
+from sysid.experiments.discrimination import Contest, Discrimination, discriminate
 from sysid.experiments.excitation import Excitation, Setting
 from sysid.experiments.experiment import Design, DesignedRun, PredictedQuantity, design
 from sysid.experiments.prior import Prior
 
-__all__ = ["Design", "DesignedRun", "Excitation", "PredictedQuantity", "Prior", "Setting", "design"]
+__all__ = [
+    "Contest",
+    "Design",
+    "DesignedRun",
+    "Discrimination",
+    "Excitation",
+    "PredictedQuantity",
+    "Prior",
+    "Setting",
+    "design",
+    "discriminate",
+]

@@ -162,7 +162,7 @@ def design(
     space = SearchSpace.of(model, ranges, fixed, tied=tied)
     # Candidates are evaluated side by side, each by one thread.
     simulator = BatchSimulator(model, accuracy=accuracy, threads=1)
-    informant = Informant(simulator, space, *_deviations(model, noise))
+    informant = Informant(simulator, space, *deviations_of(model, noise))
     measured = [name for name in model.output_names if name in noise]
     structure = kept_identifiability(space.as_model().with_outputs(measured))
     wanted = chosen(tuple(targets or quantities), structure, space)
@@ -191,7 +191,7 @@ def design(
     for expected, chromosome in zip(total, robust, strict=True):
         refuse_phantoms(expected, informant.null_directions(chromosome))
     return Design(
-        tuple(_run(search.pool[i]) for i in search.chosen),
+        tuple(designed_run(search.pool[i]) for i in search.chosen),
         _predicted(determined(structure, space), space, robust, information, total, targets or {}),
         structure.tied,
         structure.unseen,
@@ -201,7 +201,8 @@ def design(
     )
 
 
-def _run(candidate: RunCandidate) -> DesignedRun:
+def designed_run(candidate: RunCandidate) -> DesignedRun:
+    """A candidate that was chosen."""
     excitation, genes = candidate.excitation, candidate.genes
     return DesignedRun(
         excitation.name, excitation.at(genes), excitation.signal(genes), excitation.dt
@@ -242,7 +243,7 @@ def _information(
     return np.array([informant.information(record, row[None])[0] for record, row in pairs])
 
 
-def _deviations(model: ProcessModel, noise: Mapping[str, float]) -> tuple[FloatArray, FloatArray]:
+def deviations_of(model: ProcessModel, noise: Mapping[str, float]) -> tuple[FloatArray, FloatArray]:
     """Noise of the outputs, infinite for those that do not count, and of the inputs, else none."""
     names = (*model.output_names, *model.input_names)
     for name, deviation in noise.items():

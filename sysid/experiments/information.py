@@ -58,49 +58,80 @@ class Informant:
         Of the record only inputs, first samples and jitter count. Not finite where a simulation
         failed.
         """
-        model, n_free = self._simulator.model, len(self._space.index)
-        unknown = [i for i in range(len(model.states)) if record.initial_range(model, i)]
-        slopes = self._slopes(record, chromosomes, unknown)
-        errors = self._errors(record, chromosomes)
+        n_free, unknown = len(self._space.index), self._unknown(record)
+        n_draws = _DRAWS if len(self._noisy) else 0
+        slopes = self._slopes(record, chromosomes, n_free, unknown, n_draws)
+        errors = self.variances(record, chromosomes)
         joint = [
             self._joint(each, scatter, n_free + len(unknown))
             for each, scatter in zip(slopes, errors, strict=True)
         ]
-        return np.array([_without_starts(each, n_free) for each in joint])
+        return np.array([without_starts(each, n_free) for each in joint])
+
+    def tangents(
+        self, record: Dataset, chromosome: FloatArray, n_steps: int | None = None
+    ) -> FloatArray:
+        """Slopes of the outputs, (n_samples, n_outputs, n_free + n_unknown), starts behind.
+
+        chromosome: (n_free,). n_steps: integration steps per sample, default what it needs.
+        """
+        unknown, n_free = self._unknown(record), len(self._space.index)
+        slopes = self._slopes(record, chromosome[None], n_free, unknown, 0, n_steps)
+        return np.asarray(slopes[0])
+
+    def pushes(self, record: Dataset, chromosome: FloatArray) -> FloatArray:
+        """What draws of the inputs' noise do to the outputs, (n_samples, n_outputs, n_draws)."""
+        if not len(self._noisy):
+            return np.zeros((*record.outputs.shape, 0))
+        return np.asarray(self._slopes(record, chromosome[None], 0, (), _DRAWS)[0])
+
+    def _unknown(self, record: Dataset) -> list[int]:
+        """Places of the states whose start a record does not tell."""
+        model = self._simulator.model
+        return [i for i in range(len(model.states)) if record.initial_range(model, i)]
 
     def _slopes(
-        self, record: Dataset, chromosomes: FloatArray, unknown: Sequence[int]
+        self,
+        record: Dataset,
+        chromosomes: FloatArray,
+        n_free: int,
+        unknown: Sequence[int],
+        n_draws: int,
+        n_steps: int | None = None,
     ) -> FloatArray:
         """Tangents by search coordinates, unknown starts, and draws of the inputs' noise.
 
-        (n, n_samples, n_outputs, n_free + n_unknown + n_draws).
+        n_free: number of the coordinates, or 0 for none. (n, n_samples, n_outputs, n_free +
+        n_unknown + n_draws).
         """
-        model, vectors = self._disturbed.model, self._space.full(chromosomes)
-        n, n_free, n_starts = len(vectors), len(self._space.index), len(unknown)
-        n_draws = _DRAWS if len(self._noisy) else 0
+        simulator = self._disturbed if n_draws else self._simulator
+        model, vectors = simulator.model, self._space.full(chromosomes)
+        n, n_starts = len(vectors), len(unknown)
         quiet = np.zeros((n, n_draws))
         along = np.zeros((n, n_free + n_starts + n_draws, len(model.parameters)))
-        along[:, :n_free, : vectors.shape[1]] = self._directions(chromosomes)
+        along[:, :n_free, : vectors.shape[1]] = self._directions(chromosomes)[:, :n_free]
         along[:, n_free + n_starts :, vectors.shape[1] :] = np.eye(n_draws)
         moved = np.zeros((*along.shape[:2], len(model.states)))
         moved[:, np.arange(n_starts) + n_free, unknown] = 1.0
-        steps = self._simulator.steps_of_each(vectors, record)[:, None]
-        errors = np.random.default_rng(0).standard_normal(
-            (record.n_samples, len(self._noisy), n_draws)
-        )
-        channels = (errors * self._input_noise[self._noisy, None]).reshape(record.n_samples, -1)
+        if n_steps is None:
+            steps = self._simulator.steps_of_each(vectors, record)[:, None]
+        else:
+            steps = np.full((n, 1), n_steps)
+        places = self._noisy if n_draws else self._noisy[:0]
+        errors = np.random.default_rng(0).standard_normal((record.n_samples, len(places), n_draws))
+        channels = (errors * self._input_noise[places, None]).reshape(record.n_samples, -1)
         with_errors = replace(
             record,
             inputs=np.hstack([record.inputs, channels]),
             input_zero=np.zeros(0),
             input_noise=np.zeros(0),
         )
-        (slopes,) = self._disturbed.tangents(
+        (slopes,) = simulator.tangents(
             np.hstack([vectors, quiet]), [with_errors], along, steps, start_directions=[moved]
         )
         return slopes
 
-    def _errors(self, record: Dataset, chromosomes: FloatArray) -> FloatArray:
+    def variances(self, record: Dataset, chromosomes: FloatArray) -> FloatArray:
         """Variances of the samples' errors, inputs without noise, (n, n_samples, n_outputs)."""
         white = np.broadcast_to(self._noise**2, (len(chromosomes), *record.outputs.shape))
         if not record.jitter.any():
@@ -176,7 +207,7 @@ def refuse_phantoms(information: FloatArray, null: FloatArray) -> None:
         )
 
 
-def _without_starts(joint: FloatArray, n_free: int) -> FloatArray:
+def without_starts(joint: FloatArray, n_free: int) -> FloatArray:
     """Information of the first coordinates where the others are unknown, (n_free, n_free)."""
     alone, cross, others = joint[:n_free, :n_free], joint[:n_free, n_free:], joint[n_free:, n_free:]
     if not len(others) or not np.isfinite(joint).all():

@@ -10,11 +10,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from threading import Lock
+from typing import Protocol
 
 import numpy as np
 
 from sysid.arrays import FloatArray
-from sysid.experiments.criteria import Criterion
 from sysid.experiments.excitation import Excitation
 from sysid.problem.model import ModelError
 from sysid.threads import Workers
@@ -23,6 +23,16 @@ _WIDEST, _FINEST = 0.3, 0.02  # deviation of a moved setting, in parts of its ra
 _HALVINGS = 3  # of the way from a run that passes a limit to one that does not
 _ROUNDS = 20  # of exchanges
 _GAIN = 1e-9  # by which an exchange must lower the loss
+
+
+class Aim(Protocol):
+    """What a set of runs is to bring, by the sum of its runs' information."""
+
+    def losses(self, information: FloatArray) -> FloatArray:
+        """Of information (n, n_draws, n_free, n_free), (n,), less is better."""
+
+    def met(self, information: FloatArray) -> bool:
+        """Whether information (n_draws, n_free, n_free) is enough."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +71,7 @@ class Search:
 
     excitations: Sequence[Excitation]
     evaluate: Evaluate
-    criterion: Criterion
+    aim: Aim
     rng: np.random.Generator
     most: int
     workers: Workers
@@ -78,11 +88,6 @@ class Search:
         Raises ModelError where none of the candidates keeps the limits.
         """
         self.scatter(candidates)
-        if not self.pool:
-            raise ModelError(
-                f"each of {candidates} runs that were tried would pass a limit; let the settings "
-                "reach down to less, or know the parameters better"
-            )
         self.choose()
         if not self.chosen:
             raise ModelError(
@@ -95,7 +100,8 @@ class Search:
     def scatter(self, n: int) -> None:
         """Candidates anywhere in the settings' ranges, of each excitation alike many.
 
-        One that passes a limit is drawn to where its settings excite less.
+        One that passes a limit is drawn to where its settings excite less. Raises ModelError where
+        none of them keeps the limits.
         """
         trials = []
         for k in range(n):
@@ -103,6 +109,11 @@ class Search:
             genes = self.rng.random(len(excitation.settings))
             trials.append(_Trial(excitation, genes, excitation.calmer))
         self._settle(trials)
+        if not self.pool:
+            raise ModelError(
+                f"each of {n} runs that were tried would pass a limit; let the settings "
+                "reach down to less, or know the parameters better"
+            )
 
     def generation(self, n: int, progress: float) -> None:
         """Offspring of the chosen; progress: 0 at the first generation, 1 at the last."""
@@ -119,6 +130,14 @@ class Search:
             back = partial(_midway, mother.genes)
             trials.append(_Trial(mother.excitation, np.clip(genes + moves, 0.0, 1.0), back))
         self._settle(trials)
+
+    def revise(self, revised: Callable[[RunCandidate], RunCandidate]) -> None:
+        """Replace each candidate, the chosen ones included, by what is now known of it."""
+
+        def replaced(place: int) -> None:
+            self.pool[place] = revised(self.pool[place])
+
+        self.workers.each(replaced, range(len(self.pool)))
 
     def choose(self) -> None:
         """The best set that greed and exchanges lead to."""
@@ -138,14 +157,14 @@ class Search:
     def _greedily(self, stack: FloatArray) -> None:
         """One run after the other, until there are enough or all targets are met."""
         total = np.zeros_like(stack[0])
-        while len(self.chosen) < self.most and not self.criterion.met(total):
-            self.chosen.append(int(np.argmin(self.criterion.losses(total + stack))))
+        while len(self.chosen) < self.most and not self.aim.met(total):
+            self.chosen.append(int(np.argmin(self.aim.losses(total + stack))))
             total = total + stack[self.chosen[-1]]
 
     def _exchange(self, stack: FloatArray, place: int) -> bool:
         """Replace a chosen run by the best for its place; whether that was another."""
         others = self.total() - stack[self.chosen[place]]
-        losses = self.criterion.losses(others + stack)
+        losses = self.aim.losses(others + stack)
         best = int(np.argmin(losses))
         better = bool(losses[best] < losses[self.chosen[place]] - _GAIN)
         if better:

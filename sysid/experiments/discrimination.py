@@ -1,0 +1,260 @@
+"""Experiments that tell model structures apart: the runs at which the best rival errs most."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sysid.arrays import BoolArray, FloatArray
+from sysid.engine.simulation import BatchSimulator
+from sysid.experiments.bench import Bench, FreeRun
+from sysid.experiments.excitation import Excitation
+from sysid.experiments.experiment import DesignedRun, designed_run, deviations_of
+from sysid.experiments.information import Informant
+from sysid.experiments.prior import Prior
+from sysid.experiments.rivals import Answer, Hypothesis
+from sysid.experiments.search import RunCandidate, Search
+from sysid.experiments.tournament import EVEN, AnsweredRun, Point, Tournament, power
+from sysid.problem.model import ModelError, ProcessModel
+from sysid.problem.space import SearchSpace
+from sysid.threads import Workers, available_cores, one_thread
+
+_REFITS = 3  # of all rivals, between generations of runs
+_SURE = 0.95  # power from which a pair counts as told apart
+_SHARPER = 0.1  # of the accuracy, with which the end is computed once more
+
+
+@dataclass(frozen=True)
+class Contest:
+    """Whether a rival is found out where another structure is right.
+
+    distance: noncentrality of the refitted rival's chi-square: how much more than the noise it
+    leaves. probability: that a test at 1 % refuses it. values: the rival's, where it does best.
+    possible: whether any run that was tried could do it; a rival that holds the truth as a special
+    case is never refused.
+
+    >>> one = Contest("square", "linear", 25.0, 0.996, {"k": 1.2}, possible=True)
+    >>> one.told
+    True
+    """
+
+    truth: str
+    rival: str
+    distance: float
+    probability: float
+    values: Mapping[str, float]
+    possible: bool
+
+    @property
+    def told(self) -> bool:
+        """Whether the test refuses the rival in 95 of 100 such sets of runs."""
+        return self.probability >= _SURE
+
+
+@dataclass(frozen=True)
+class Discrimination:
+    """Runs that tell structures apart, and how surely.
+
+    contests: of each ordered pair. attempts, refused: as of ``Design``.
+
+    >>> run = DesignedRun("step", {"height": 1.0}, np.ones((50, 1)), dt=0.01)
+    >>> one = Contest("a", "b", 25.0, 0.996, {}, possible=True)
+    >>> other = Contest("b", "a", 0.0, 0.01, {}, possible=False)
+    >>> Discrimination((run,), (one, other), attempts=64, refused=3).inseparable
+    ()
+    """
+
+    runs: tuple[DesignedRun, ...]
+    contests: tuple[Contest, ...]
+    attempts: int
+    refused: int
+
+    @property
+    def duration(self) -> float:
+        """Length of all runs together [s]."""
+        return float(sum(len(run.inputs) * run.dt for run in self.runs))
+
+    @property
+    def inseparable(self) -> tuple[tuple[str, str], ...]:
+        """Pairs that no run tells apart, whichever of the two is right."""
+        possible = {frozenset((c.truth, c.rival)) for c in self.contests if c.possible}
+        pairs = dict.fromkeys(
+            (c.truth, c.rival)
+            for c in self.contests
+            if frozenset((c.truth, c.rival)) not in possible
+        )
+        return tuple(pair for pair in pairs if pair == tuple(sorted(pair)))
+
+
+@one_thread()
+def discriminate(
+    models: Mapping[str, ProcessModel],
+    excitations: Sequence[Excitation],
+    *,
+    noise: Mapping[str, float],
+    runs: int = 4,
+    spaces: Mapping[str, SearchSpace] | None = None,
+    priors: Mapping[str, Prior] | None = None,
+    limits: Mapping[str, tuple[float, float]] | None = None,
+    margin: float = 0.1,
+    benches: Mapping[str, Bench] | None = None,
+    checks: int = 16,
+    candidates: int = 64,
+    generations: int = 6,
+    offspring: int = 16,
+    starts: int = 3,
+    accuracy: float = 1e-4,
+    seed: int = 0,
+    watch: Callable[[int, int], None] | None = None,
+) -> Discrimination:
+    """Choose the runs that tell model structures apart most surely.
+
+    Each structure in turn is taken for the truth, at the likeliest of its parameters, and each
+    other one fitted to what the runs would then log (T-optimality: Atkinson and Fedorov 1975). The
+    runs make the least of the distances that are left as large as can be.
+
+    models: by a name each, with the same inputs and outputs. noise, runs, limits, margin, checks,
+    candidates, generations, offspring, watch: as of ``design``; limits must hold whichever
+    structure is right. spaces, priors: by the same names, what is searched and what is known; by
+    default the models' ranges around their nominal values. benches: by the same names, what a run
+    would log if that structure were right. starts: points from which each rival is fitted.
+
+    Raises ModelError for unknown names, models whose inputs or outputs differ, equations that
+    cannot be differentiated, where every candidate would pass a limit, and where no run tells any
+    pair apart.
+
+    >>> from dataclasses import replace
+    >>> from sysid.experiments import Excitation, Setting
+    >>> from sysid.examples import lag
+    >>> def saturating(x, u, p):
+    ...     return ((p[0] * u[0] / (1.0 + u[0] * u[0]) - x[0]) / p[1],)
+    >>> models = {"linear": lag(), "saturating": replace(lag(), derivative=saturating)}
+    >>> step = Excitation(
+    ...     "step", {"height": Setting(0.1, 2.0)}, lambda s: np.full((50, 1), s["height"]), 0.01
+    ... )
+    >>> result = discriminate(
+    ...     models, [step], noise={"y": 0.05}, runs=2, candidates=8, generations=0
+    ... )
+    >>> [contest.probability > 0.99 for contest in result.contests]
+    [True, True]
+    """
+    structures = _structures(models, noise, spaces or {}, priors or {}, accuracy)
+    rng, workers = np.random.default_rng(seed), Workers(available_cores())
+    benches = benches or _free_runs(structures, limits or {}, margin)
+    knowledge = [
+        (priors or {}).get(each.name) or Prior.of_ranges(each.space) for each in structures
+    ]
+    vectors = [
+        each.space.full(prior.draws(each.space, checks, rng))
+        for each, prior in zip(structures, knowledge, strict=True)
+    ]
+    counted = np.array([name in noise for name in structures[0].simulator.model.output_names])
+    tournament = Tournament(structures, counted, workers, rng)
+
+    def evaluate(excitation: Excitation, genes: FloatArray) -> RunCandidate | None:
+        inputs, records = excitation.signal(genes), []
+        for structure, of_it in zip(structures, vectors, strict=True):
+            logged = benches[structure.name].records(inputs, excitation.dt, of_it)
+            if logged is None:
+                return None
+            records.append(logged[0])
+        answers = tournament.answers(records)
+        run = tournament.judged(AnsweredRun(excitation, genes, tournament.unjudged(), answers))
+        finite = np.isfinite(run.information).all() and all(a.finite for a in answers)
+        return run if finite else None
+
+    search = Search(excitations, evaluate, tournament.criterion(), rng, runs, workers, watch)
+    search.scatter(candidates)
+    begins = [tournament.likeliest(), *(tournament.drawn() for _ in range(starts - 1))]
+    tournament.points.append(tournament.refit(_answers(search.pool[:runs]), begins)[0])
+    search.revise(tournament.judged)
+    tournament.judge_possible(search.pool, runs)
+    best: tuple[float, list[RunCandidate]] = (-1.0, [])
+    for part in np.array_split(np.arange(generations), _REFITS):
+        search.aim = tournament.criterion()
+        search.choose()
+        for k in part:
+            search.generation(offspring, k / max(generations - 1, 1))
+            search.choose()
+        chosen = [search.pool[i] for i in search.chosen]
+        point, distances = tournament.refit(_answers(chosen), tournament.points[-1:])
+        worst = float(distances[tournament.possible].min())
+        best = max(best, (worst, chosen), key=lambda each: each[0])
+        tournament.points.append(point)
+        search.revise(tournament.judged)
+    sharp = tournament.sharper(_SHARPER * accuracy)
+    logged = [sharp.answers([a.record for a in run]) for run in _answers(best[1])]
+    begins = [*tournament.points, *(tournament.drawn() for _ in range(starts - 1))]
+    contests = _contests(sharp, tournament.possible, *sharp.refit(logged, begins))
+    runs_of_it = tuple(designed_run(candidate) for candidate in best[1])
+    return Discrimination(runs_of_it, contests, search.attempts, search.attempts - search.kept)
+
+
+def _answers(runs: Sequence[RunCandidate]) -> list[tuple[Answer, ...]]:
+    return [run.answers for run in runs if isinstance(run, AnsweredRun)]
+
+
+def _contests(
+    tournament: Tournament, possible: BoolArray, point: Point, distances: FloatArray
+) -> tuple[Contest, ...]:
+    """Every pair, its rival fitted as it is at a point."""
+    contests = []
+    for c, (i, j) in enumerate(tournament.pairs):
+        truth, rival = tournament.structures[i], tournament.structures[j]
+        probability = float(power(distances[c]))
+        values = dict(zip(rival.space.names, point[c].tolist(), strict=True))
+        whether = bool(possible[c]) or probability > EVEN
+        contests.append(
+            Contest(truth.name, rival.name, float(distances[c]), probability, values, whether)
+        )
+    return tuple(contests)
+
+
+def _structures(
+    models: Mapping[str, ProcessModel],
+    noise: Mapping[str, float],
+    spaces: Mapping[str, SearchSpace],
+    priors: Mapping[str, Prior],
+    accuracy: float,
+) -> list[Hypothesis]:
+    if len(models) < 2:
+        raise ModelError("name two structures at least, between which runs are to decide")
+    first, *others = models.values()
+    for model in others:
+        for kind in ("input_names", "output_names"):
+            if getattr(model, kind) != getattr(first, kind):
+                raise ModelError(
+                    f"structures have the same inputs and outputs, in one order: {first.name} has "
+                    f"{', '.join(getattr(first, kind))}, {model.name} "
+                    f"{', '.join(getattr(model, kind))}"
+                )
+    structures = []
+    for name, model in models.items():
+        space = spaces.get(name) or SearchSpace.of(model)
+        ranges = Prior.of_ranges(space)
+        # Runs are evaluated side by side, each by one thread.
+        simulator = BatchSimulator(model, accuracy=accuracy, threads=1)
+        informant = Informant(simulator, space, *deviations_of(model, noise))
+        values = (priors.get(name) or ranges).values
+        structures.append(
+            Hypothesis(name, simulator, informant, space, values, ranges.information())
+        )
+    return structures
+
+
+def _free_runs(
+    structures: Sequence[Hypothesis], limits: Mapping[str, tuple[float, float]], margin: float
+) -> dict[str, Bench]:
+    """Benches of models that run by themselves, each with the limits of what it has."""
+    benches: dict[str, Bench] = {}
+    kept: set[str] = set()
+    for each in structures:
+        model = each.simulator.model
+        names = {*model.input_names, *model.output_names, *model.state_names}
+        within = {name: ends for name, ends in limits.items() if name in names}
+        benches[each.name] = FreeRun(each.simulator, within, margin)
+        kept |= within.keys()
+    for name in limits:
+        if name not in kept:
+            raise ModelError(f"limits: no structure has a signal {name!r}")
+    return benches

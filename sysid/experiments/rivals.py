@@ -1,0 +1,204 @@
+"""Rival structures, refitted to what a run would log if another structure were right.
+
+Structure i says that a run logs y_i. Of a rival j at coordinates x let e = y_i - y_j(x) be what is
+left, S its tangents, and W the inverse variances of the samples, noise of measured inputs included.
+All that matters of a run, as long as x moves little, is
+
+    M = [S e]' W [S e]
+
+which adds over runs as information does. What the best x leaves is the Schur complement of the last
+entry, e' W e - e' W S (S' W S)^-1 S' W e: the T-criterion (Atkinson and Fedorov, "The design of
+experiments for discriminating between two rival models", Biometrika 62, 1975).
+
+It is the noncentrality of a test along W e where the noise is white. Noise of an input moves the
+outputs by G n, which is not: the test's statistic then scatters by the variance e' W V W e, V = R +
+G G', and its noncentrality is (e' W e)^2 / e' W V W e. A run's M is scaled to that.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sysid.arrays import BoolArray, FloatArray
+from sysid.engine.simulation import BatchSimulator
+from sysid.experiments.information import Informant, without_starts
+from sysid.problem.data import Dataset
+from sysid.problem.space import SearchSpace
+
+_ITERATIONS = 40  # of a refit
+_HEAVIEST = 1e9  # damping with which a refit gives up
+_ENOUGH = 1e-3  # share of what is left, by which an iteration must lower it
+_NOTHING = 1e-3  # what is left of which nothing need be fitted
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A structure: what simulates it, and the values that are likeliest if it is right.
+
+    values: (n_free,). ridge: (n_free, n_free), information that its ranges are, which damps moves.
+    """
+
+    name: str
+    simulator: BatchSimulator
+    informant: Informant
+    space: SearchSpace
+    values: FloatArray
+    ridge: FloatArray
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a run would log if a structure were right.
+
+    outputs: (n_samples, n_outputs). weights: inverse variances of the samples' errors, 0 for an
+    output that does not count; white: share of the variances that is not from the inputs' noise;
+    pushes: (n_samples, n_outputs, n_draws), what draws of that noise do. n_steps: of the
+    integration, for all structures.
+    """
+
+    record: Dataset
+    outputs: FloatArray
+    weights: FloatArray
+    white: FloatArray
+    pushes: FloatArray
+    n_steps: int
+
+    @property
+    def finite(self) -> bool:
+        """Whether its simulation did not fail."""
+        return bool(np.isfinite(self.outputs).all() and np.isfinite(self.weights).all())
+
+
+def answer(structure: Hypothesis, record: Dataset, n_steps: int, counted: BoolArray) -> Answer:
+    """What a structure says that a run of a record's inputs logs.
+
+    counted: (n_outputs,), whether an output does.
+    """
+    vector, values = structure.space.full(structure.values), structure.values
+    outputs = structure.simulator.trajectories(vector[None], record, n_steps)[0]
+    variances = structure.informant.variances(record, values[None])[0]
+    pushes = structure.informant.pushes(record, values)
+    moved = np.sum(pushes**2, axis=-1) / max(pushes.shape[-1], 1)
+    with np.errstate(invalid="ignore"):
+        white = np.where(counted, variances / (variances + moved), 0.0)
+    weights = np.where(counted, 1.0 / (variances + moved), 0.0)
+    return Answer(record, outputs, weights, white, pushes.astype(np.float32), n_steps)
+
+
+@dataclass(frozen=True)
+class Contrast:
+    """What a rival leaves of an answer, and how it would move.
+
+    errors: (n_samples * n_outputs,), slopes: (..., n_free + n_unknown). joint: (n_free + 1,
+    n_free + 1), the M above, unknown starts eliminated.
+    """
+
+    answer: Answer
+    errors: FloatArray
+    slopes: FloatArray
+    joint: FloatArray
+
+    def efficiency(self, ridge: FloatArray | None = None) -> float:
+        """Noncentrality over what is left: 1 where all noise is white.
+
+        ridge: refits first the run alone, with that damping; None: no coordinate moves.
+        """
+        if not self.answer.pushes.shape[-1]:
+            return 1.0
+        n_free, weights = len(self.joint) - 1, self.answer.weights.reshape(-1)
+        slopes = self.slopes[:, n_free:] if ridge is None else self.slopes
+        left = self.errors
+        if slopes.shape[1]:
+            curvature = slopes.T @ (weights[:, None] * slopes)
+            if ridge is not None:
+                curvature[:n_free, :n_free] += ridge
+            moves = np.linalg.lstsq(curvature, slopes.T @ (weights * left), rcond=1e-12)[0]
+            left = left - slopes @ moves
+        test = weights * left
+        pushes = self.answer.pushes.reshape(len(test), -1)
+        along = pushes.T @ test
+        scatter = float(test @ (self.answer.white.reshape(-1) * left) + along @ along / len(along))
+        return float(left @ test) / scatter if scatter > 0.0 else 1.0
+
+
+def contrast(truth: Answer, rival: Hypothesis, chromosome: FloatArray) -> Contrast:
+    """What a rival at a chromosome (n_free,) leaves of an answer."""
+    n_free, vector = len(chromosome), rival.space.full(chromosome)
+    outputs = rival.simulator.trajectories(vector[None], truth.record, truth.n_steps)[0]
+    slopes = rival.informant.tangents(truth.record, chromosome, truth.n_steps)
+    columns = slopes.reshape(truth.outputs.size, -1)
+    errors = (truth.outputs - outputs).reshape(-1)
+    counted = truth.weights.reshape(-1) > 0.0
+    columns, errors = np.where(counted[:, None], columns, 0.0), np.where(counted, errors, 0.0)
+    beside = np.column_stack([columns[:, :n_free], errors, columns[:, n_free:]])
+    joint = beside.T @ (truth.weights.reshape(-1)[:, None] * beside)
+    return Contrast(truth, errors, columns, without_starts(joint, n_free + 1))
+
+
+def scaled(truth: Answer, rival: Hypothesis, chromosome: FloatArray) -> FloatArray:
+    """The M of a run in units of noncentrality, (n_free + 1, n_free + 1)."""
+    each = contrast(truth, rival, chromosome)
+    if not np.isfinite(each.joint).all():
+        return each.joint
+    matrix: FloatArray = each.efficiency(rival.ridge) * each.joint
+    return matrix
+
+
+def remainders(joint: FloatArray, ridge: FloatArray) -> FloatArray:
+    """What refits leave, (...), of sums of M (..., n_free + 1, n_free + 1) with damping ridge."""
+    curvature, push = joint[..., :-1, :-1] + ridge, joint[..., :-1, -1]
+    moves = np.linalg.solve(curvature, push[..., None])[..., 0]
+    left: FloatArray = joint[..., -1, -1] - np.sum(push * moves, axis=-1)
+    return np.maximum(left, 0.0)
+
+
+def noncentrality(answers: Sequence[Answer], rival: Hypothesis, chromosome: FloatArray) -> float:
+    """Of the test of a rival at a chromosome (n_free,) on all answers."""
+    contrasts = [contrast(truth, rival, chromosome) for truth in answers]
+    return float(sum(each.efficiency() * each.joint[-1, -1] for each in contrasts))
+
+
+def refit(answers: Sequence[Answer], rival: Hypothesis, start: FloatArray) -> FloatArray:
+    """Chromosome (n_free,) within the ranges at which a rival leaves least of all answers.
+
+    Damped Gauss-Newton steps along exact tangents (Marquardt 1963), from a chromosome.
+    """
+    space = rival.space
+    low, high = space.coded_lower, space.coded_lower + space.width
+    at = np.clip(space.encode(start), low, high)
+    joint, damping = _joint(answers, rival, space.decode(at)), 1.0
+    for _ in range(_ITERATIONS):
+        left = joint[-1, -1]
+        if not np.isfinite(left) or left < _NOTHING:
+            break
+        move = _move(joint, damping * rival.ridge, at <= low, at >= high)
+        onward = np.clip(at + move, low, high)
+        chromosome = space.decode(onward)
+        offered = _joint(answers, rival, chromosome) if space.feasible(chromosome) else None
+        if offered is not None and offered[-1, -1] < left:
+            at, joint, damping = onward, offered, max(0.1 * damping, 1e-9)
+            if left - joint[-1, -1] < _ENOUGH * left:
+                break
+        else:
+            damping *= 10.0
+            if damping > _HEAVIEST:
+                break
+    return space.decode(at)
+
+
+def _joint(answers: Sequence[Answer], rival: Hypothesis, chromosome: FloatArray) -> FloatArray:
+    total: FloatArray = np.sum([contrast(a, rival, chromosome).joint for a in answers], axis=0)
+    return np.asarray(np.where(np.isfinite(total), total, np.inf), dtype=np.float64)
+
+
+def _move(joint: FloatArray, ridge: FloatArray, low: BoolArray, high: BoolArray) -> FloatArray:
+    """A damped step; coordinates on a bound of their range do not move across it."""
+    curvature, push = joint[:-1, :-1] + ridge, joint[:-1, -1]
+    move = np.asarray(np.linalg.solve(curvature, push), dtype=np.float64)
+    across = (low & (move < 0.0)) | (high & (move > 0.0))
+    if across.any() and not across.all():
+        inside = np.flatnonzero(~across)
+        move = np.zeros_like(push)
+        move[inside] = np.linalg.solve(curvature[np.ix_(inside, inside)], push[inside])
+    return move

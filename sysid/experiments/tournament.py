@@ -1,0 +1,188 @@
+"""All ordered pairs of structures: which of them sets of runs tell apart."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+from scipy.stats import norm
+
+from sysid.arrays import BoolArray, FloatArray
+from sysid.experiments import rivals
+from sysid.experiments.rivals import Answer, Hypothesis
+from sysid.experiments.search import RunCandidate
+from sysid.problem.data import Dataset
+from sysid.problem.model import ModelError
+from sysid.threads import Workers
+
+LEVEL = 0.01  # of the test by which a rival is refused
+EVEN = 0.5  # power below which a pair counts as not told apart
+_SECOND = 1e-3  # what pairs beside the worst count, so that of equal sets one is the best
+_LEAST = 1e-9  # noncentrality that counts as none
+
+Point = Sequence[FloatArray]
+"""For each pair the rival's chromosome, (n_free,)."""
+
+
+def power(noncentrality: FloatArray | float, level: float = LEVEL) -> FloatArray:
+    """Probability that a test at a level refuses a rival that errs by a noncentrality.
+
+    Of the one-sided test along what the best rival leaves (Cox, "Tests of separate families of
+    hypotheses", 4th Berkeley Symposium, 1961).
+
+    >>> power(np.array([0.0, 5.41, 25.0])).round(3).tolist()
+    [0.01, 0.5, 0.996]
+    """
+    distance = np.sqrt(np.maximum(noncentrality, 0.0))
+    return np.asarray(norm.cdf(distance - norm.isf(level)), dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class Separation:
+    """A loss of what rivals leave: the worst pair counts.
+
+    ridges: (n_points * n_pairs, n, n). possible: (n_pairs,), the pairs that count. Each pair is as
+    far apart as at the worst of the points at which its rival was tried.
+    """
+
+    ridges: FloatArray
+    possible: BoolArray
+
+    def losses(self, information: FloatArray) -> FloatArray:
+        """Of sums of runs' M, (n, n_points * n_pairs, n + 1, n + 1)."""
+        left = rivals.remainders(information, self.ridges)
+        left = left.reshape(len(left), -1, len(self.possible)).min(axis=1)[:, self.possible]
+        logarithms = np.log(np.maximum(left, _LEAST))
+        losses: FloatArray = -logarithms.min(axis=1) - _SECOND * logarithms.mean(axis=1)
+        return losses
+
+    def met(self, _information: FloatArray) -> bool:
+        """Never: more runs tell more."""
+        return False
+
+
+@dataclass(frozen=True)
+class AnsweredRun(RunCandidate):
+    """A candidate with what each structure says that it logs; information: M of each pair."""
+
+    answers: tuple[Answer, ...]
+
+
+class Tournament:
+    """Each structure as the truth against each other as its rival.
+
+    pairs: places of truth and rival. points: at which rivals have been fitted to some runs.
+    possible: (n_pairs,), whether any run that was tried can tell. counted: (n_outputs,).
+    """
+
+    def __init__(
+        self,
+        structures: Sequence[Hypothesis],
+        counted: BoolArray,
+        workers: Workers,
+        rng: np.random.Generator,
+    ) -> None:
+        self.structures, self._counted, self._workers = structures, counted, workers
+        self._rng, places = rng, range(len(structures))
+        self.pairs = [(i, j) for i in places for j in places if i != j]
+        self.points: list[Point] = []
+        self.possible: BoolArray = np.ones(len(self.pairs), dtype=bool)
+        self._n_free = max(len(each.values) for each in structures)
+
+    def sharper(self, accuracy: float) -> Self:
+        """The same pairs, no points, by simulations of another accuracy."""
+        finer = [
+            replace(each, simulator=each.simulator.finer(accuracy)) for each in self.structures
+        ]
+        return type(self)(finer, self._counted, self._workers, self._rng)
+
+    def answers(self, records: Sequence[Dataset]) -> tuple[Answer, ...]:
+        """What each structure says of a run; records: of it, by the structures' benches."""
+        pairs = list(zip(self.structures, records, strict=True))
+        n_steps = max(
+            int(each.simulator.steps_of_each(each.space.full(each.values)[None], record)[0])
+            for each, record in pairs
+        )
+        return tuple(rivals.answer(*each, n_steps, self._counted) for each in pairs)
+
+    def judged(self, run: RunCandidate) -> AnsweredRun:
+        """A run with the M of each pair at each point, points one after another."""
+        assert isinstance(run, AnsweredRun)
+        n, n_pairs = self._n_free + 1, len(self.pairs)
+        matrices = np.zeros((len(self.points) * n_pairs, n, n))
+        done = len(run.information)
+        matrices[:done] = run.information
+        for k, point in enumerate(self.points[done // n_pairs :], done // n_pairs):
+            for c, ((i, j), chromosome) in enumerate(zip(self.pairs, point, strict=True)):
+                matrix = rivals.scaled(run.answers[i], self.structures[j], chromosome)
+                matrices[k * n_pairs + c] = self._padded(matrix)
+        return replace(run, information=matrices)
+
+    def unjudged(self) -> FloatArray:
+        """Information of a run before any rival has been fitted."""
+        return np.zeros((0, self._n_free + 1, self._n_free + 1))
+
+    def criterion(self) -> Separation:
+        """The loss at the points so far."""
+        ridges = np.tile(np.eye(self._n_free), (len(self.pairs), 1, 1))
+        for ridge, (_, j) in zip(ridges, self.pairs, strict=True):
+            of_rival = self.structures[j].ridge
+            ridge[: len(of_rival), : len(of_rival)] = of_rival
+        return Separation(np.tile(ridges, (len(self.points), 1, 1)), self.possible)
+
+    def likeliest(self) -> Point:
+        """All rivals at their likeliest values."""
+        return [self.structures[j].values for _, j in self.pairs]
+
+    def drawn(self) -> Point:
+        """All rivals anywhere in their ranges."""
+        spaces = [self.structures[j].space for _, j in self.pairs]
+        return [s.decode(s.coded_lower + self._rng.random(len(s.width)) * s.width) for s in spaces]
+
+    def refit(
+        self, runs: Sequence[Sequence[Answer]], begins: Sequence[Point]
+    ) -> tuple[Point, FloatArray]:
+        """Fit all rivals to runs from several points: the best, and noncentralities (n_pairs,).
+
+        runs: what each structure says of each.
+        """
+        n_pairs = len(self.pairs)
+        ends: list[tuple[float, FloatArray]] = [(np.inf, begin) for p in begins for begin in p]
+
+        def fit(place: int) -> None:
+            i, j = self.pairs[place % n_pairs]
+            answers, rival = [each[i] for each in runs], self.structures[j]
+            end = rivals.refit(answers, rival, ends[place][1])
+            left = rivals.noncentrality(answers, rival, end)
+            ends[place] = left if np.isfinite(left) else np.inf, end
+
+        self._workers.each(fit, range(len(ends)))
+        best = [min(ends[c::n_pairs], key=lambda end: end[0]) for c in range(n_pairs)]
+        return [end for _, end in best], np.array([left for left, _ in best])
+
+    def judge_possible(self, pool: Sequence[RunCandidate], most: int) -> None:
+        """Find out which pairs so many of the runs in a pool could tell apart.
+
+        A rival fitted to all of them leaves more of the best run, so many times, than one fitted
+        to any set leaves of that set. Raises ModelError where there is none.
+        """
+        n_pairs = len(self.pairs)
+        stack = np.array([each.information[-n_pairs:] for each in pool])
+        curvature = stack.sum(axis=0)
+        ridges = self.criterion().ridges[-n_pairs:]
+        moves = np.linalg.solve(curvature[:, :-1, :-1] + ridges, curvature[:, :-1, -1, None])
+        along = np.concatenate([-moves[..., 0], np.ones((n_pairs, 1))], axis=1)
+        left = np.einsum("ci,rcij,cj->rc", along, stack, along)
+        self.possible = power(most * left.max(axis=0)) > EVEN
+        if not self.possible.any():
+            raise ModelError(
+                "no run within the limits tells any of the structures from another; give longer "
+                "or more runs, wider limits, other excitations, or less noise"
+            )
+
+    def _padded(self, matrix: FloatArray) -> FloatArray:
+        """The M of a rival with parameters to spare, which do nothing."""
+        n, whole = len(matrix) - 1, np.zeros((self._n_free + 1,) * 2)
+        places = [*range(n), self._n_free]
+        whole[np.ix_(places, places)] = matrix
+        return whole

@@ -1,0 +1,169 @@
+"""Experiments that tell structures apart, where the best rival is known in closed form."""
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from sysid import (
+    BatchSimulator,
+    Excitation,
+    Input,
+    ModelError,
+    Output,
+    Parameter,
+    ProcessModel,
+    SearchSpace,
+    Setting,
+    State,
+    discriminate,
+)
+from sysid.experiments.information import Informant
+from sysid.experiments.prior import Prior
+from sysid.experiments.rivals import Hypothesis, answer, contrast, noncentrality, refit
+from sysid.experiments.tournament import power
+from tests.sysid.support import blank
+
+DT, NOISE = 0.01, 0.05
+QUICK = {"noise": {"y": NOISE}, "candidates": 10, "generations": 3, "offspring": 4, "starts": 2}
+
+
+def spring(name, law, *parameters):
+    """Something whose output is a law of its input, at once."""
+    return ProcessModel(
+        name=name,
+        states=(State("s", "1"),),
+        inputs=(Input("u", "m"),),
+        outputs=(Output("y", "N"),),
+        parameters=tuple(
+            Parameter(key, "1", value, low, high, minimum=-10.0)
+            for key, value, low, high in parameters
+        ),
+        derivative=lambda x, u, p: (-x[0],),
+        output=lambda x, u, p: (law(u[0], p),),
+    )
+
+
+STIFFNESS = ("k", 1.0, 0.2, 5.0)
+LINEAR = spring("linear", lambda u, p: p[0] * u, STIFFNESS)
+SQUARE = spring("square", lambda u, p: p[0] * u + p[1] * u * u, STIFFNESS, ("q", 0.3, -1.0, 1.0))
+CUBIC = spring("cubic", lambda u, p: p[0] * u + p[1] * u * u * u, STIFFNESS, ("c", 0.3, -1.0, 1.0))
+
+
+def waves(lowest=0.0):
+    """A triangle of a size about an offset."""
+
+    def inputs(s):
+        ramp = np.abs(np.linspace(-1.0, 1.0, 81)) * 2.0 - 1.0
+        return (s["offset"] + s["size"] * ramp)[:, None]
+
+    settings = {"size": Setting(0.1, 3.0, calm=0.1), "offset": Setting(lowest, 1.0, calm=0.0)}
+    return Excitation("wave", settings, inputs, DT)
+
+
+def structure(model, input_noise=0.0):
+    space, simulator = SearchSpace.of(model), BatchSimulator(model)
+    prior = Prior.of_ranges(space)
+    noise = np.array([NOISE]), np.array([input_noise])
+    informant = Informant(simulator, space, *noise)
+    return Hypothesis(model.name, simulator, informant, space, prior.values, prior.information())
+
+
+def test_what_a_refitted_rival_leaves_is_that_of_the_closed_form():
+    u = np.linspace(-0.5, 1.5, 60)
+    truth, rival = structure(SQUARE), structure(LINEAR)
+    told = answer(truth, blank(SQUARE, u[:, None], DT), 1, np.array([True]))
+    end = refit([told], rival, np.array([4.0]))
+    y = u + 0.3 * u * u
+    best = float(y @ u / (u @ u))
+    assert end == pytest.approx([best], rel=1e-6)
+    exact = np.sum((y - best * u) ** 2) / NOISE**2
+    assert noncentrality([told], rival, end) == pytest.approx(exact, rel=1e-6)
+
+
+def test_noise_of_an_input_counts_as_the_test_scatters():
+    u, sigma = np.linspace(-0.5, 1.5, 60), 0.1
+    truth, rival = structure(SQUARE, sigma), structure(LINEAR, sigma)
+    told = answer(truth, blank(SQUARE, u[:, None], DT), 1, np.array([True]))
+    # Drawn 16 times a sample: to within the mean of so many squares.
+    variances = NOISE**2 + ((1.0 + 0.6 * u) * sigma) ** 2
+    assert 1.0 / told.weights[:, 0] == pytest.approx(variances, rel=1.5)
+    assert float(np.mean(1.0 / told.weights[:, 0] / variances)) == pytest.approx(1.0, rel=0.1)
+    left = contrast(told, rival, np.array([1.2]))
+    assert 0.6 < left.efficiency() < 1.7  # white after all, for the spring answers at once
+
+
+def test_the_runs_that_tell_pairs_apart_are_at_the_limits_and_beside_zero():
+    models = {"linear": LINEAR, "square": SQUARE, "cubic": CUBIC}
+    result = discriminate(models, [waves(-1.0)], limits={"u": (-2.0, 2.0)}, runs=2, **QUICK)
+    contests = {(c.truth, c.rival): c for c in result.contests}
+    assert len(contests) == 6
+    for truth in ("square", "cubic"):
+        for rival in {"linear", "square", "cubic"} - {truth}:
+            assert contests[truth, rival].probability > 0.999
+    # A spring with another term does what a linear one does, without it.
+    for rival in ("square", "cubic"):
+        contest = contests["linear", rival]
+        assert not contest.possible
+        assert contest.distance < 1e-3
+        assert contest.values["k"] == pytest.approx(1.0, rel=1e-3)
+    assert result.inseparable == ()
+    for run in result.runs:
+        reach = np.abs(run.inputs).max()
+        assert 1.5 < reach <= 1.8
+
+
+def test_the_worst_pair_is_as_far_apart_as_a_search_of_all_runs_finds():
+    models = {"square": SQUARE, "cubic": CUBIC}
+    more = {**QUICK, "candidates": 24, "generations": 6, "offspring": 8}
+    result = discriminate(models, [waves()], limits={"u": (-1.0, 1.0)}, runs=1, **more)
+    best = 0.0
+    excitation = waves()
+    for size in np.linspace(0.1, 0.9, 30):
+        for offset in np.linspace(0.0, 0.9 - size, 20):
+            u = excitation.inputs({"size": size, "offset": offset})[:, 0]
+            square, cubic = u + 0.3 * u**2, u + 0.3 * u**3
+            left = []
+            for y, power_of_u in ((square, u**3), (cubic, u**2)):
+                columns = np.column_stack([u, power_of_u])
+                fitted = columns @ np.linalg.lstsq(columns, y, rcond=None)[0]
+                left.append(np.sum((y - fitted) ** 2) / NOISE**2)
+            best = max(best, min(left))
+    worst = min(contest.distance for contest in result.contests)
+    assert 0.85 * best < worst <= 1.01 * best
+
+
+def test_structures_that_do_the_same_are_told_apart_by_no_run():
+    twin = spring("twin", lambda u, p: 2.0 * p[0] * u, ("half", 0.6, 0.1, 2.5))
+    with pytest.raises(ModelError, match="no run within the limits tells any"):
+        discriminate({"a": LINEAR, "b": twin}, [waves()], **QUICK)
+    result = discriminate({"a": LINEAR, "b": twin, "cubic": CUBIC}, [waves()], runs=1, **QUICK)
+    assert result.inseparable == (("a", "b"),)
+
+
+def test_the_power_of_the_test_is_how_often_it_refuses_the_rival():
+    rng, u = np.random.default_rng(0), np.linspace(0.0, 0.6, 30)
+    y = u + 0.3 * u * u
+    left = y - u * float(y @ u / (u @ u))
+    along = left / np.linalg.norm(left)
+    distance = float(left @ left) / NOISE**2
+    logs = y + NOISE * rng.standard_normal((20_000, len(u)))
+    refused = logs @ along / NOISE > norm.isf(0.01)
+    assert float(refused.mean()) == pytest.approx(float(power(distance)), abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("models", "options", "named"),
+    [
+        ({"a": LINEAR}, {}, "name two structures at least"),
+        (
+            {"a": LINEAR, "b": CUBIC.with_outputs(("s",))},
+            {},
+            "structures have the same inputs and outputs, in one order: linear has y, cubic s",
+        ),
+        ({"a": LINEAR, "b": CUBIC}, {"limits": {"v": (0.0, 1.0)}}, "no structure has a signal 'v'"),
+        ({"a": LINEAR, "b": CUBIC}, {"limits": {"u": (-0.01, 0.01)}}, "would pass a limit"),
+    ],
+)
+def test_mistakes_are_named(models, options, named):
+    with pytest.raises(ModelError, match=named):
+        discriminate(models, [waves()], **{**QUICK, **options})
