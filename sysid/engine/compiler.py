@@ -114,7 +114,7 @@ def _compiled(
 ) -> list[Any]:
     """Functions of kernels' text, compiled; called: the model's functions that it calls."""
     # Numba is slow to import.
-    from sysid.engine import float_types, intrinsics, vector_math  # noqa: F401
+    from sysid.engine import intrinsics, vector_math
     from sysid.engine.phi import scheme_matrices
 
     name = "".join(c if c.isalnum() else "_" for c in model.name)[:40]
@@ -129,11 +129,20 @@ def _compiled(
         "__name__": __name__,  # a module that exists when Numba loads the kernel from its cache
         **{name: machine_code(function) for name, function in called.items()},
     }
-    exec(compile(text, str(path or "<kernel>"), "exec"), scope)
+    _execute(text, scope, path)
     for name in ("constants", "remainder", "observe", "margins", "gains"):
         if name in scope:
             scope[name] = _njit(scope[name])
     return [_njit(scope[name], nogil=True, cache=path is not None) for name in functions]
+
+
+def _execute(text: str, scope: dict[str, Any], path: Path | None) -> None:
+    """Define the functions of a text in a scope, its runs of assignments outlined."""
+    from sysid.engine.straight_line import outlined
+
+    module, called = outlined(text, scope)
+    scope |= called
+    exec(compile(module, str(path or "<kernel>"), "exec"), scope)
 
 
 def compiled_text(name: str, text: str, functions: Sequence[str]) -> list[Any]:
@@ -148,7 +157,7 @@ def compiled_text(name: str, text: str, functions: Sequence[str]) -> list[Any]:
     """
     path = _source_file(f"{name}_{_key(text, {})}.py", text)
     scope: dict[str, Any] = {"math": math, "__name__": __name__}
-    exec(compile(text, str(path or "<text>"), "exec"), scope)
+    _execute(text, scope, path)
     for key, item in scope.items():
         if isinstance(item, types.FunctionType) and key not in functions:
             scope[key] = _njit(item)
@@ -201,7 +210,7 @@ def _key(text: str, called: Mapping[str, Any]) -> str:
     import numba
 
     key = hashlib.sha256(f"{numba.__version__}\n{sorted(_OPTIONS['fastmath'])}\n{text}".encode())
-    for library in ("intrinsics.py", "phi.py", "vector_math.py"):
+    for library in ("intrinsics.py", "phi.py", "straight_line.py", "vector_math.py"):
         key.update(Path(__file__).with_name(library).read_bytes())
     for function in called.values():
         _fingerprint(function, key, set())
