@@ -12,22 +12,24 @@ from bokeh.models.annotations import Span
 from bokeh.models.widgets import Div
 from bokeh.plotting import figure
 
-from daq.hal import Flag, FloatArray
+from daq.hal import FloatArray
 from daq.logs.columns import UNITS
 from daq.scope.history import View
+from daq.scope.looks import (
+    FLAG_COLORS,
+    GREY,
+    RED,
+    color_of,
+    flag_name,
+    groups_of,
+    is_wanted,
+    quantity_of,
+)  # fmt: skip
 
-# Okabe & Ito's palette: told apart with any colour vision.
-BLUE, ORANGE, GREEN, RED = "#0072B2", "#E69F00", "#009E73", "#D55E00"
-PURPLE, GREY = "#CC79A7", "#666666"
-_FLAG_COLORS = {
-    Flag.CLAMPED: ORANGE, Flag.HELD: BLUE, Flag.LOST: RED, Flag.INTERLOCK: RED,
-    Flag.UNDERFLOW: RED, Flag.SATURATED: PURPLE, Flag.DOUBTFUL: PURPLE,
-}  # fmt: skip
 _CALM = 0.03  # of a column's span that a stretch may cover and still be drawn as broad: 3 pixels
 _MARGIN, _FILLED = 0.06, 0.7  # parts of a figure's height: free at each end, filled at least
 _NEAR = 0.7  # of a limit from which its line is shown
 FLAGS = "flags"
-_UNDRAWN = ("t", "tick", "flags")  # columns without a curve
 _GRAVE = ("lost", "interlock", "underflow")  # marked across all figures
 
 
@@ -38,28 +40,6 @@ class Sources:
         self.samples = ColumnDataSource({"t": []}, name="samples")
         self.flags = ColumnDataSource({"time": [], "flag": [], "color": []}, name="flags")
         self.lines = ColumnDataSource({"time": [], "color": [], "dash": []}, name="lines")
-
-
-def groups_of(columns: Sequence[str]) -> list[list[str]]:
-    """Columns that share a figure: a command asked and applied, a quantity and its reference."""
-    groups: dict[str, list[str]] = {}
-    for name in columns:
-        if name not in _UNDRAWN:
-            group = groups.setdefault(quantity_of(name), [])
-            group.insert(0 if is_wanted(name) else len(group), name)
-    return list(groups.values())
-
-
-def is_wanted(column: str) -> bool:
-    """Whether a column was asked for, and is drawn behind what came of it."""
-    return column.startswith("cmd_") or column.endswith("_ref")
-
-
-def color_of(column: str) -> str:
-    """Color of a column's curve; none of one that has no curve."""
-    if column in _UNDRAWN:
-        return "transparent"
-    return ORANGE if is_wanted(column) else BLUE
 
 
 def make_figures(
@@ -173,15 +153,10 @@ def as_data(columns: Sequence[str], view: View, span: FloatArray) -> dict[str, A
     return data
 
 
-def flag_name(flag: Flag) -> str:
-    """A flag's name for people."""
-    return str(flag.name).lower()
-
-
 def flag_marks(view: View) -> dict[str, list[Any]]:
     """Times, names and colors of a view's flags."""
     marks: dict[str, list[Any]] = {"time": [], "flag": [], "color": []}
-    for flag, color in _FLAG_COLORS.items():
+    for flag, color in FLAG_COLORS.items():
         at = view.time[(view.flags & int(flag)) != 0].tolist()
         marks["time"] += at
         marks["flag"] += [flag_name(flag)] * len(at)
@@ -199,11 +174,6 @@ def lines_at(flags: Mapping[str, Any], mark: float | None) -> dict[str, list[Any
         "color": [RED] * len(grave) + ["black"] * len(marks),
         "dash": ["solid"] * len(grave) + ["dashed"] * len(marks),
     }
-
-
-def quantity_of(name: str) -> str:
-    """What a column is of: the same for what was asked, what was applied and what followed."""
-    return name.removeprefix("cmd_").removeprefix("applied_").removesuffix("_ref")
 
 
 def _curve_figure(group: Sequence[str], sources: Sources, time: Range1d, cursor: Span) -> figure:
@@ -230,7 +200,7 @@ def _draw(plot: figure, sources: Sources, column: str, name: str, width: float) 
 
 
 def _flag_strip(sources: Sources, time: Range1d, cursor: Span) -> figure:
-    names = [flag_name(flag) for flag in _FLAG_COLORS]
+    names = [flag_name(flag) for flag in FLAG_COLORS]
     plot = _empty(time, cursor, 110, FactorRange(factors=names[::-1]))
     plot.yaxis.axis_label = "flags"
     plot.scatter("time", "flag", source=sources.flags, marker="square", size=7, color="color")

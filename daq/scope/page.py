@@ -16,6 +16,7 @@ from daq.hal import FloatArray
 from daq.scope import figures
 from daq.scope.figures import Sources
 from daq.scope.history import History, View, nothing, step_for
+from daq.scope.looks import GREY, groups_of, quantity_of
 from daq.scope.planes import TIME, VIEWS, Planes
 from daq.scope.texts import FAILED, HELP, VALUE_FIELDS, heading, readout
 from daq.scope.watch import FollowedLog, Watch
@@ -196,7 +197,7 @@ class Page:
     def _fit(self) -> None:
         limits = self._log.state.limits if self._log is not None else {}
         for plot in self._plots:
-            ends = limits.get(figures.quantity_of(str(plot.tags[-1])), ()) if plot.tags else ()
+            ends = limits.get(quantity_of(str(plot.tags[-1])), ()) if plot.tags else ()
             figures.fit(plot, self._sources, ends)
 
     def _clear(self) -> None:
@@ -206,10 +207,10 @@ class Page:
 
     def _make_figures(self, columns: tuple[str, ...]) -> None:
         self._columns, self._plots = columns, []
-        names = [figures.quantity_of(group[-1]) for group in figures.groups_of(columns)]
+        names = [quantity_of(group[-1]) for group in groups_of(columns)]
         names += [figures.FLAGS] * (figures.FLAGS in columns)
         self._clear()
-        words = Div(text=HELP, width=380, styles={"color": figures.GREY})
+        words = Div(text=HELP, width=380, styles={"color": GREY})
         self._side.children = [figures.make_value_table(self._values, len(columns) + 1), words]
         self._channels.labels, everything = names, list(range(len(names)))
         if self._channels.active == everything:

@@ -13,7 +13,7 @@ from bokeh.plotting import figure
 
 from daq.hal import FloatArray
 from daq.logs.columns import UNITS
-from daq.scope.figures import BLUE, groups_of, quantity_of
+from daq.scope.looks import BLUE, groups_of, quantity_of
 
 TIME, SPECTRUM = "time", "spectrum"
 _XY = {"torque–speed": ("omega", "torque"), "torque–angle": ("theta", "torque")}

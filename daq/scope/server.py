@@ -1,30 +1,31 @@
 """Serving the page to this machine, and on it to who has the address that was printed."""
 
+from __future__ import annotations
+
 import asyncio
+import importlib.util
 import logging
 import secrets
 import signal
 import socket
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from weakref import WeakSet
 
-from bokeh.application import Application
-from bokeh.application.handlers.function import FunctionHandler
-from bokeh.document import Document
-from bokeh.server.server import BaseServer
-from bokeh.server.tornado import BokehTornado
 from tornado.httpserver import HTTPServer
 from tornado.httputil import HTTPServerRequest
-from tornado.ioloop import IOLoop
-from tornado.iostream import IOStream
-from tornado.web import RequestHandler
+from tornado.iostream import IOStream, StreamClosedError
+from tornado.web import Application, RequestHandler, StaticFileHandler
 
 from daq.errors import ConfigError
-from daq.scope.page import Page
+from daq.scope.texts import first_page, heading
 from daq.scope.watch import Watch
+
+if TYPE_CHECKING:
+    from daq.scope.pages import Pages
 
 HOST = "127.0.0.1"
 USUAL_PORT = 5006
@@ -58,27 +59,39 @@ async def _serve(watch: Watch, port: int, ready: Callable[[str], None]) -> None:
     def end(number: int, frame: FrameType | None) -> None:
         loop.call_soon_threadsafe(ended.set)
 
-    def make_page(document: Document) -> None:
-        Page(document, watch)
-
     key = secrets.token_urlsafe()
-    pages = _PrivatePages(Application(FunctionHandler(make_page)), key, port)
-    http = _ClosingServer(pages)
+    door = _Door(watch, key, port)
+    http = _ClosingServer(door)
     http.listen(port, HOST)
-    server = BaseServer(IOLoop.current(), pages, http)
     before = [(number, signal.signal(number, end)) for number in (signal.SIGINT, signal.SIGTERM)]
     try:
-        server.start()
         ready(f"http://{HOST}:{port}/{key}/")
+        await asyncio.to_thread(_load)  # while a browser starts, and shows what there is to say
+        from daq.scope.pages import Pages
+
+        pages = Pages(watch, key, door.hosts, http)
+        pages.start()
+        door.open_to(pages)
         await ended.wait()
-    finally:
-        server.stop()
+        pages.stop()
         http.close_streams()
-        # Whoever waited for a tab to read has heard of that once the page is free again.
-        for session in server.get_sessions():
-            await session.with_document_locked(int)  # type: ignore[misc]  # declared without await
+        await pages.leave()
+    finally:
+        http.close_streams()
         for number, handler in before:
             signal.signal(number, handler)
+
+
+def _bokeh_folder() -> Path:
+    """Where Bokeh is, without the second that importing it takes."""
+    spec = importlib.util.find_spec("bokeh")
+    assert spec is not None and spec.submodule_search_locations
+    return Path(spec.submodule_search_locations[0])
+
+
+def _load() -> None:
+    """Import Bokeh, which takes about a second."""
+    import daq.scope.pages  # noqa: F401
 
 
 class _ClosingServer(HTTPServer):
@@ -99,32 +112,64 @@ class _ClosingServer(HTTPServer):
             stream.close()
 
 
-class _PrivatePages(BokehTornado):
-    """The page and its socket below ``/KEY/``, refused to what comes by way of another site.
+class _Door(Application):
+    """Leads to the page at ``/KEY/``, its scripts, and its sockets once Bokeh is loaded.
 
-    A name of another site may lead to this machine (DNS rebinding): the browser then takes the page
-    for one of that site's, and says so in ``Host`` and ``Origin``.
+    Refused is what comes by way of another site: a name of another site may lead to this machine
+    (DNS rebinding). The browser then takes the page for one of that site's, and says so in ``Host``
+    and ``Origin``.
     """
 
-    def __init__(self, page: Application, key: str, port: int) -> None:
+    def __init__(self, watch: Watch, key: str, port: int) -> None:
         # Browsers leave the usual port of the web out.
-        self._hosts = [name if port == 80 else f"{name}:{port}" for name in _NAMES]
-        self._origins = [f"http://{host}" for host in self._hosts]
+        self.hosts = [name if port == 80 else f"{name}:{port}" for name in _NAMES]
+        self._origins = [f"http://{host}" for host in self.hosts]
+        self._opened: asyncio.Future[Pages] = asyncio.get_running_loop().create_future()
+        self._key = key
+        parts = {"watch": watch, "opened": self._opened}
+        scripts = {"path": str(_bokeh_folder() / "server" / "static" / "js")}
         super().__init__(
-            page,
-            prefix=key,
-            extra_websocket_origins=self._hosts,
-            default_handler_class=_Refusal,
-            default_handler_args={"problem": f"there is no page at this address; {_CURE}"},
+            [
+                (rf"/{key}/?", _Page, parts),
+                (rf"/{key}/static/js/(.*)", StaticFileHandler, scripts),
+            ]
         )
 
+    def open_to(self, pages: Pages) -> None:
+        """Lead to the pages from now on."""
+        self._opened.set_result(pages)
+
     def find_handler(self, request: HTTPServerRequest, **kwargs: Any) -> Any:
-        """What answers a request; the refusal where its host or its origin is a foreign one."""
+        """What answers a request; the refusal where its host, origin or key is a foreign one."""
         host, origin = request.host.lower(), request.headers.get("Origin")
-        if host in self._hosts and (origin is None or origin.lower() in self._origins):
-            return super().find_handler(request, **kwargs)
-        problem = f"this page answers to {', '.join(self._hosts)} alone; {_CURE}"
+        if host not in self.hosts or (origin is not None and origin.lower() not in self._origins):
+            problem = f"this page answers to {', '.join(self.hosts)} alone; {_CURE}"
+        elif request.path.split("/")[1:2] != [self._key]:
+            problem = f"there is no page at this address; {_CURE}"
+        else:
+            first = request.path.rstrip("/").split("/")[2:3] in ([], ["static"])
+            if first or not self._opened.done():
+                return super().find_handler(request)
+            return self._opened.result().application.find_handler(request)
         return self.get_handler_delegate(request, _Refusal, {"problem": problem})
+
+
+class _Page(RequestHandler):
+    """Says which run it is at once, while the browser reads scripts; then adds the figures."""
+
+    def initialize(self, watch: Watch, opened: asyncio.Future[Pages]) -> None:
+        self._watch, self._opened = watch, opened
+
+    async def get(self) -> None:
+        """The page."""
+        address = f"http://{self.request.host}{self.request.path.rstrip('/')}"
+        try:
+            self.write(first_page(heading(self._watch.followed, self._watch.root, False), address))
+            await self.flush()
+            pages = await asyncio.shield(self._opened)
+            self.finish(pages.figures(address))
+        except StreamClosedError:
+            return  # the tab was closed meanwhile
 
 
 class _Refusal(RequestHandler):

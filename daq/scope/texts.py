@@ -8,7 +8,7 @@ from typing import Any
 
 from daq.hal import Flag, FloatArray
 from daq.logs.columns import UNITS
-from daq.scope.figures import BLUE, GREEN, GREY, ORANGE, RED, color_of, flag_name
+from daq.scope.looks import BLUE, GREEN, GREY, ORANGE, RED, color_of, flag_name
 from daq.scope.watch import FollowedLog
 
 _STATES = {
@@ -24,6 +24,27 @@ HELP = (
     "Drag: zoom in time. Wheel: zoom. Click: set a mark; double click: remove it. "
     "Live, or the toolbar's reset: follow again."
 )
+
+_FIRST_PAGE = """<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<title>rig scope</title>
+<style>
+body {{ font: 14px/1.5 system-ui, sans-serif; margin: 8px; }}
+#first:has(~ [data-root-id] *) {{ display: none; }}
+</style>
+</head>
+<body>
+<div id="first">{head}</div>
+<script src="{address}/static/js/bokeh.min.js"></script>
+<script src="{address}/static/js/bokeh-widgets.min.js"></script>
+"""
+
+
+def first_page(head: str, address: str) -> str:
+    """The page's beginning: a heading that stands until the figures do, and Bokeh's scripts."""
+    return _FIRST_PAGE.format(head=head, address=escape(address))
 
 
 def heading(log: FollowedLog | None, root: Path, newer: bool) -> str:

@@ -353,6 +353,7 @@ def test_its_json_has_the_address_with_a_key_that_nobody_guesses(page_address, t
 @pytest.fixture(scope="module")
 def page_address(tmp_path_factory):
     process, address = start_scope(cwd=tmp_path_factory.mktemp("scope"))
+    request(address)  # is answered in whole when there are sockets too
     yield address
     process.terminate()
     process.communicate(timeout=30)
@@ -372,10 +373,10 @@ def asking(address, path=None, **headers):
 
 def request(address, path=None, **headers):
     """Status and body of what a server answers."""
-    with asking(address, path, **headers) as connection, connection.makefile("rb") as answer:
-        status = int(answer.readline().split()[1])
-        length = int(http.client.parse_headers(answer).get("Content-Length", 0))
-        return status, answer.read(length)
+    with asking(address, path, **headers) as connection:
+        answer = http.client.HTTPResponse(connection)
+        answer.begin()
+        return answer.status, answer.read()
 
 
 def socket_of(address):
@@ -448,9 +449,37 @@ def test_another_site_is_refused_even_with_the_key(page_address, knock, foreign)
     assert body.startswith(words.encode())
 
 
+# Loads Bokeh when its input ends.
+SLOW = """
+import sys
+import daq.scope.server
+daq.scope.server._load = sys.stdin.read
+from daq.cli import main
+main()
+"""
+
+
+def test_the_page_says_something_before_bokeh_is_loaded(tmp_path):
+    process = subprocess.Popen(
+        [sys.executable, "-c", SLOW, "scope", "--no-browser", "--port", "0"],
+        cwd=tmp_path, env=environment(), stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    address = process.stdout.readline().split()[0]
+    with asking(address) as connection:
+        answer = http.client.HTTPResponse(connection)
+        answer.begin()
+        first = answer.read1()
+        assert b"No run under runs yet" in first and b"bokeh.min.js" in first
+        assert request(f"{address}static/js/bokeh.min.js")[0] == 200
+        process.stdin.close()
+        assert b"autoload.js" in answer.read()
+    process.terminate()
+    assert process.wait(30) == 0
+
+
 # Has more to say than a reader takes who stands still.
 FLOOD = """
-import daq.scope.server
+import daq.scope.pages
 from bokeh.models import ColumnDataSource
 
 class Flood:
@@ -463,7 +492,7 @@ class Flood:
         for _ in range(4):
             self.source.data = {"x": ["x" * 10_000_000]}
 
-daq.scope.server.Page = Flood
+daq.scope.pages.Page = Flood
 from daq.cli import main
 main()
 """
@@ -476,6 +505,7 @@ def test_a_tab_that_does_not_read_leaves_no_word_at_the_end(tmp_path, number):
         cwd=tmp_path, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
     address = process.stdout.readline().split()[0]
+    request(address)
     with asking(address, **socket_of(address)) as tab, tab.makefile("rb") as stream:
         assert len(stream.read(1_000_000)) == 1_000_000
         process.send_signal(getattr(signal, number))
