@@ -30,6 +30,7 @@ _FIRST_PAGE = """<!DOCTYPE html>
 <head>
 <meta charset="utf-8">
 <title>rig scope</title>
+<link rel="icon" href="data:,">
 <style>
 body {{ font: 14px/1.5 system-ui, sans-serif; margin: 8px; }}
 #first:has(~ [data-root-id] *) {{ display: none; }}

@@ -473,8 +473,9 @@ def test_the_page_says_something_before_bokeh_is_loaded(tmp_path):
         assert request(f"{address}static/js/bokeh.min.js")[0] == 200
         process.stdin.close()
         assert b"autoload.js" in answer.read()
-    process.terminate()
-    assert process.wait(30) == 0
+    with process:
+        process.terminate()
+    assert process.returncode == 0
 
 
 # Has more to say than a reader takes who stands still.
