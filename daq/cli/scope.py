@@ -11,9 +11,12 @@ from daq.cli import options, terminal
 
 
 def scope(
-    run: Annotated[
-        Path | None,
-        Argument(metavar="[RUN_OR_CSV]", help="Capture folder or log; default the newest run."),
+    runs: Annotated[
+        list[Path] | None,
+        Argument(
+            metavar="[RUN_OR_CSV]...",
+            help="Capture folder or log, and others to lay behind it; default the newest run.",
+        ),
     ] = None,
     out: Annotated[Path, Option(metavar="DIR", help="Where the runs are that it follows.")] = Path(
         "runs"
@@ -29,14 +32,17 @@ def scope(
     """Show a run in the browser, also while it is recorded."""
     from daq import scope as use_case
 
+    named = runs or []
+
     def ready(address: str) -> None:
         if json:
-            terminal.print_json({"address": address, "run": run, "out": out})
+            shown = {"run": named[0] if named else None, "behind": named[1:]}
+            terminal.print_json({"address": address, **shown, "out": out})
         else:
-            shown = str(run) if run else f"the newest run under {out}"
-            print(f"{address} shows {shown}; Ctrl-C ends it")
+            what = " over ".join(map(str, named)) or f"the newest run under {out}"
+            print(f"{address} shows {what}; Ctrl-C ends it")
         sys.stdout.flush()
         if browser and not json and not webbrowser.open(address):
             terminal.report("note", f"no browser could be opened; open {address} in one")
 
-    use_case.show(run, out, port, ready)
+    use_case.show(named, out, port, ready)

@@ -17,6 +17,7 @@ from daq.logs.columns import UNITS
 from daq.scope.history import View
 from daq.scope.looks import (
     FLAG_COLORS,
+    GREEN,
     GREY,
     RED,
     color_of,
@@ -24,12 +25,15 @@ from daq.scope.looks import (
     groups_of,
     is_wanted,
     quantity_of,
-)  # fmt: skip
+)
+from daq.scope.overlay import Overlay
+from daq.scope.trigger import Trigger
 
 _CALM = 0.03  # of a column's span that a stretch may cover and still be drawn as broad: 3 pixels
 _MARGIN, _FILLED = 0.06, 0.7  # parts of a figure's height: free at each end, filled at least
 _NEAR = 0.7  # of a limit from which its line is shown
 FLAGS = "flags"
+_BEHIND, _LEVEL = "curve behind", "level of the trigger"
 _GRAVE = ("lost", "interlock", "underflow")  # marked across all figures
 
 
@@ -84,15 +88,48 @@ def make_figures(
     return grid, plots
 
 
-def fit(plot: figure, sources: Sources, limits: Sequence[float] = ()) -> None:
+def lay_behind(plots: Sequence[figure], overlays: Sequence[Overlay]) -> None:
+    """Draw runs behind the one that is shown, instead of those that were; cheaper than anew."""
+    for plot in plots:
+        kept = [curve for curve in plot.renderers if curve.name != _BEHIND]
+        if plot.tags:
+            name = plot.tags[-1]
+            behind = [_draw(plot, run.samples, name, name, run.color) for run in overlays]
+            for curve in behind:
+                curve.name = _BEHIND
+            kept = [*behind, *kept]
+        if plot.renderers != kept:
+            plot.renderers = kept
+
+
+def show_level(plots: Sequence[figure], trigger: Trigger | None) -> None:
+    """Draw a trigger's level as a line, instead of the one before."""
+    for plot in plots:
+        kept = [curve for curve in plot.renderers if curve.name != _LEVEL]
+        if trigger is not None and trigger.channel in plot.tags:
+            line = plot.hspan(y=[trigger.level], line_color=GREEN, line_dash="dashed")
+            line.name = _LEVEL
+            kept.append(line)
+        if plot.renderers != kept:
+            plot.renderers = kept
+
+
+def fit(
+    plot: figure,
+    sources: Sources,
+    limits: Sequence[float] = (),
+    overlays: Sequence[Overlay] = (),
+) -> None:
     """Have a figure's curves fill its height, without moving its axis at every little change.
 
-    limits: there is room for those that the curves come near to.
+    limits: there is room for those that the curves come near to. overlays: drawn behind.
     """
     drawn = [np.asarray(sources.samples.data[name]) for name in plot.tags]
     if not drawn or not len(drawn[0]):
         return
-    low, high = float(np.fmin.reduce(drawn, None)), float(np.fmax.reduce(drawn, None))
+    drawn += [np.asarray(run.samples.data[plot.tags[-1]]) for run in overlays]
+    together = np.concatenate(drawn)
+    low, high = float(np.fmin.reduce(together)), float(np.fmax.reduce(together))
     high = max([high, *(end for end in limits if end > 0.0 and high > _NEAR * end)])
     low = min([low, *(end for end in limits if end < 0.0 and low < _NEAR * end)])
     if not high - low > 0.0:
@@ -164,16 +201,18 @@ def flag_marks(view: View) -> dict[str, list[Any]]:
     return marks
 
 
-def lines_at(flags: Mapping[str, Any], mark: float | None) -> dict[str, list[Any]]:
-    """Lines across all figures: where a grave flag stands, and at the mark that was set."""
+def lines_at(
+    flags: Mapping[str, Any], mark: float | None, trigger: float | None = None
+) -> dict[str, list[Any]]:
+    """Lines across all figures: where a grave flag stands, at the mark and at the trigger."""
     flagged = zip(flags["time"], flags["flag"], strict=True)
     grave = sorted({time for time, name in flagged if name in _GRAVE})
-    marks = [] if mark is None else [mark]
-    return {
-        "time": [*grave, *marks],
-        "color": [RED] * len(grave) + ["black"] * len(marks),
-        "dash": ["solid"] * len(grave) + ["dashed"] * len(marks),
-    }
+    lines = [(time, RED, "solid") for time in grave]
+    lines += [
+        (at, color, "dashed") for at, color in ((mark, "black"), (trigger, GREEN)) if at is not None
+    ]
+    names = ("time", "color", "dash")
+    return {name: [line[k] for line in lines] for k, name in enumerate(names)}
 
 
 def _curve_figure(group: Sequence[str], sources: Sources, time: Range1d, cursor: Span) -> figure:
@@ -182,21 +221,23 @@ def _curve_figure(group: Sequence[str], sources: Sources, time: Range1d, cursor:
     label = quantity_of(group[-1]).replace("_", " ")
     plot.yaxis.axis_label = label + (f"\n[{unit}]" if unit else "")
     plot.yaxis.ticker = BasicTicker(desired_num_ticks=4)  # with three there may be but one
+    # A line of one pixel costs a browser without a graphics card a tenth of one of 1.2 pixels.
     for column in group:
+        color = color_of(column)
         if is_wanted(column):
-            _draw(plot, sources, column, broad_name(column), 3.0)
-        # A line of one pixel costs a browser without a graphics card a tenth of one of 1.2 pixels.
-        _draw(plot, sources, column, column, 1.0)
+            _draw(plot, sources.samples, column, broad_name(column), color, 3.0)
+        _draw(plot, sources.samples, column, column, color)
     plot.name, plot.tags = f"figure of {label}", list(group)
     return plot
 
 
-def _draw(plot: figure, sources: Sources, column: str, name: str, width: float) -> None:
-    look: dict[str, Any] = {"line_color": color_of(column), "line_width": width}
+def _draw(
+    plot: figure, source: ColumnDataSource, column: str, name: str, color: str, width: float = 1.0
+) -> Any:
+    look: dict[str, Any] = {"source": source, "line_color": color, "line_width": width}
     if column.startswith(("cmd_", "applied_")):  # held from a sample to the next
-        plot.step("t", name, mode="after", source=sources.samples, **look)
-    else:
-        plot.line("t", name, source=sources.samples, **look)
+        return plot.step("t", name, mode="after", **look)
+    return plot.line("t", name, **look)
 
 
 def _flag_strip(sources: Sources, time: Range1d, cursor: Span) -> figure:

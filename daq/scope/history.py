@@ -77,6 +77,12 @@ class History:
         spread: FloatArray = self._highest - self._lowest
         return spread
 
+    @property
+    def middle(self) -> FloatArray:
+        """Between the lowest and the highest value of each column so far, (n_columns,)."""
+        middle: FloatArray = 0.5 * (self._lowest + self._highest)
+        return middle
+
     def add(self, values: FloatArray, starts: IntArray) -> None:
         """Take rows (n, n_columns) whose lines begin at ``starts`` (n + 1,)."""
         if not len(values):

@@ -7,7 +7,7 @@ from daq.hal import Flag
 # Okabe & Ito's palette: told apart with any colour vision.
 BLUE, ORANGE, GREEN, RED = "#0072B2", "#E69F00", "#009E73", "#D55E00"
 PURPLE, GREY = "#CC79A7", "#666666"
-OTHERS = (GREEN, PURPLE, "#56B4E9", RED)  # of runs behind the one that is shown
+OTHERS = (PURPLE, GREEN, "#56B4E9", RED)  # of runs behind the one that is shown
 FLAG_COLORS = {
     Flag.CLAMPED: ORANGE, Flag.HELD: BLUE, Flag.LOST: RED, Flag.INTERLOCK: RED,
     Flag.UNDERFLOW: RED, Flag.SATURATED: PURPLE, Flag.DOUBTFUL: PURPLE,

@@ -1,30 +1,36 @@
 """One browser tab: what is drawn 30 times a second, and what the controls do."""
 
+import math
 import time
 from html import escape
 from typing import Any, cast
 
 import numpy as np
 from bokeh.document import Document
-from bokeh.events import DoubleTap, MouseLeave, MouseMove, RangesUpdate, Reset, Tap
+from bokeh.events import DocumentReady, DoubleTap, MouseLeave, MouseMove, RangesUpdate, Reset, Tap
 from bokeh.layouts import column, row
-from bokeh.models import ColumnDataSource, Range1d
-from bokeh.models.widgets import Button, CheckboxGroup, Div, RadioButtonGroup
+from bokeh.models import ColumnDataSource, CustomJS, Range1d
+from bokeh.models.widgets import Button, CheckboxGroup, Div, MultiChoice, RadioButtonGroup
 from bokeh.plotting import figure
 
 from daq.hal import FloatArray
 from daq.scope import figures
 from daq.scope.figures import Sources
 from daq.scope.history import History, View, nothing, step_for
-from daq.scope.looks import GREY, groups_of, quantity_of
+from daq.scope.looks import GREY, OTHERS, groups_of, quantity_of
+from daq.scope.overlay import Overlay
 from daq.scope.planes import TIME, VIEWS, Planes
 from daq.scope.texts import FAILED, HELP, VALUE_FIELDS, heading, readout
+from daq.scope.trigger import BEFORE, Trigger
+from daq.scope.trigger_controls import TriggerControls
 from daq.scope.watch import FollowedLog, Watch
 
 _PERIOD = 28  # ms between updates: 30 a second and some, for no timer is exact
 _POINTS = 500  # stretches drawn at least over the width of the page
-_WINDOWS: dict[str, float | None] = {"2 s": 2.0, "10 s": 10.0, "60 s": 60.0, "whole run": None}
-_USUAL, _WHOLE = 1, len(_WINDOWS) - 1
+_WINDOWS: dict[str, float | None] = {
+    "0.2 s": 0.2, "2 s": 2.0, "10 s": 10.0, "60 s": 60.0, "whole run": None,
+}  # fmt: skip
+_USUAL, _TRIGGERED, _WHOLE = 2, 1, len(_WINDOWS) - 1
 _VALUES_EVERY = 3  # updates between two of the table: ten a second can be read
 _PLANE_EVERY = 6  # and of what is not drawn over time
 _HEAD_EVERY = 15  # and of the heading, after which a browser lays the whole page out anew
@@ -75,17 +81,27 @@ class Page:
         )
         self._stop.on_click(self._stop_run)
         self._planes = Planes()
+        self._trigger = TriggerControls(self._middle, self._wait_for_trigger)
+        self._overlays: list[Overlay] = []
+        self._behind = MultiChoice(
+            placeholder="lay earlier runs behind", name="behind", max_items=len(OTHERS),
+            option_limit=200, width=280, value=list(watch.others),
+        )  # fmt: skip
+        self._behind.on_change("value", lambda attr, old, new: self._lay_behind())
         self._figures = column(
             sizing_mode="stretch_width", name="figures", styles={"flex": _WIDE, "min-width": "0"}
         )
         controls = row(self._button, self._window, self._view, self._stop, styles=_WRAPPED)
+        more = row(*self._trigger.parts, self._behind, styles=_WRAPPED)
         self._side = column(name="side")
         body = row(self._figures, self._side, sizing_mode="stretch_width", styles=_WRAPPED)
-        parts = (self._head, controls, self._channels, body)
+        parts = (self._head, controls, more, self._channels, body)
         page = column(*parts, sizing_mode="stretch_width")
         page.tags = [self._sent, self._seen]
         document.add_root(page)
         document.title = "rig scope"
+        done = CustomJS(code="document.getElementById('first')?.remove()")
+        document.js_on_event(DocumentReady, done)  # the words before the figures
         self._document = document
         self._timer = document.add_periodic_callback(self._update, _PERIOD)
         self._update()
@@ -129,6 +145,7 @@ class Page:
         self._ended = False
         self._set_mark(None)
         self._clear()
+        self._trigger.renew()
         if log is not None:
             self._window.active = _USUAL if log.state.running else _WHOLE
 
@@ -140,7 +157,10 @@ class Page:
             self._make_figures(log.tail.columns)
         if not history.n_rows:
             return
-        if self._live:
+        trigger = self._trigger.trigger
+        if self._live and trigger is not None:
+            self._draw_triggered(trigger, history)
+        elif self._live:
             self._draw_live(log, history)
         elif self._zoomed_to is not None:
             start, end = self._zoomed_to
@@ -148,6 +168,26 @@ class Page:
             margin = _MARGIN * (end - start)
             points = round(_POINTS * (1.0 + 2.0 * _MARGIN))
             self._replace(history.view(start - margin, end + margin, points), history.spread)
+        drawn = [run.draw(*self._shown) for run in self._overlays]
+        if any(drawn):
+            self._fit()
+
+    @property
+    def _shown(self) -> tuple[float, float]:
+        """The stretch of time that is shown [s]."""
+        return cast("float", self._time.start), cast("float", self._time.end)
+
+    def _draw_triggered(self, trigger: Trigger, history: History) -> None:
+        """Draw what is around the newest passage of the trigger, once it is there."""
+        width = list(_WINDOWS.values())[self._window.active or 0] or math.inf
+        if not trigger.look(history, self._columns, width):
+            return
+        assert trigger.at is not None
+        start = trigger.at - BEFORE * width
+        self._replace(history.view(start, start + width, _POINTS), history.spread)
+        self._time.update(start=start, end=start + width)
+        if self._trigger.holds:
+            self._hold()
 
     def _draw_live(self, log: FollowedLog, history: History) -> None:
         """Draw the newest rows; all anew where stretches change their length."""
@@ -192,13 +232,15 @@ class Page:
 
     def _draw_lines(self) -> None:
         flags: Any = self._sources.flags.data
-        self._sources.lines.data = {**figures.lines_at(flags, self._mark)}
+        trigger = self._trigger.trigger
+        at = trigger.at if trigger is not None else None
+        self._sources.lines.data = {**figures.lines_at(flags, self._mark, at)}
 
     def _fit(self) -> None:
         limits = self._log.state.limits if self._log is not None else {}
         for plot in self._plots:
             ends = limits.get(quantity_of(str(plot.tags[-1])), ()) if plot.tags else ()
-            figures.fit(plot, self._sources, ends)
+            figures.fit(plot, self._sources, ends, self._overlays)
 
     def _clear(self) -> None:
         self._drawn_step = 0
@@ -212,6 +254,8 @@ class Page:
         self._clear()
         words = Div(text=HELP, width=380, styles={"color": GREY})
         self._side.children = [figures.make_value_table(self._values, len(columns) + 1), words]
+        channels = [group[-1] for group in groups_of(columns)]
+        self._trigger.offer(channels)
         self._channels.labels, everything = names, list(range(len(names)))
         if self._channels.active == everything:
             self._lay_out()
@@ -227,14 +271,19 @@ class Page:
         view, self._plots = VIEWS[self._view.active or 0], []
         if not self._columns:
             return
+        self._make_overlays()
         if view != TIME:
-            self._figures.children = [self._planes.layout(view, self._columns, self._chosen)]
+            others = [run.planes for run in self._overlays]
+            layout = self._planes.layout(view, self._columns, self._chosen, others)
+            self._figures.children = [layout]
             if self._log is not None:
                 self._draw_plane(self._log)
             return
         limits = self._log.state.limits if self._log is not None else {}
         parts = self._columns, self._sources, self._time, self._chosen, limits
         grid, self._plots = figures.make_figures(*parts)
+        figures.lay_behind(self._plots, self._overlays)
+        figures.show_level(self._plots, self._trigger.trigger)
         for plot in self._plots:
             plot.on_event(RangesUpdate, self._zoom)
             plot.on_event(Reset, lambda event: self._follow())
@@ -250,9 +299,43 @@ class Page:
         view, history = VIEWS[self._view.active or 0], log.history
         if view == TIME or history is None or not history.n_rows:
             return
-        start, end = cast("float", self._time.start), cast("float", self._time.end)
-        rows = history.rows(start, end, self._planes.most)
+        rows = history.rows(*self._shown, self._planes.most)
         self._planes.draw(view, self._columns, self._chosen, rows, history.dt)
+        for run in self._overlays:
+            other = run.log.history
+            if other is not None and other.n_rows:
+                rows = other.rows(*self._shown, self._planes.most)
+                parts = view, run.log.tail.columns, self._chosen, rows, other.dt
+                self._planes.draw(*parts, run.planes, self._columns)
+
+    def _lay_behind(self) -> None:
+        if VIEWS[self._view.active or 0] != TIME:
+            self._lay_out()
+            return
+        self._make_overlays()
+        figures.lay_behind(self._plots, self._overlays)
+
+    def _make_overlays(self) -> None:
+        """Read the runs that are chosen to lie behind the one that is shown."""
+        logs = [self._watch.logs[name] for name in self._behind.value if name in self._watch.logs]
+        columns = tuple(name for group in groups_of(self._columns) for name in group)
+        before = {(run.log.path, run.color, run.columns): run for run in self._overlays}
+        keys = [(log, color, columns) for log, color in zip(logs, OTHERS, strict=False)]
+        self._overlays = [before.get(key) or Overlay(*key) for key in keys]
+
+    def _middle(self, channel: str) -> float:
+        """Between the lowest and the highest value of a channel so far; NaN without any."""
+        history = self._log.history if self._log is not None else None
+        if history is None or channel not in self._columns:
+            return math.nan
+        return float(history.middle[self._columns.index(channel)])
+
+    def _wait_for_trigger(self, before: bool) -> None:
+        """Follow another trigger, or none again; before: whether there was one."""
+        if not before and list(_WINDOWS.values())[self._window.active or 0] is None:
+            self._window.active = _TRIGGERED
+        self._follow()
+        figures.show_level(self._plots, self._trigger.trigger)
 
     def _stop_run(self) -> None:
         """End the run as Ctrl-C does."""
@@ -271,7 +354,17 @@ class Page:
     def _show_head(self) -> None:
         self._show_stop()
         newer = self._log is not self._watch.followed
-        head = heading(self._log, self._watch.root, newer)
+        notes = [
+            f'<span style="color:{run.color}">&#9632;</span> behind it: {escape(run.log.name)}'
+            for run in self._overlays
+        ]
+        if self._trigger.trigger is not None:
+            notes.append(f"trigger: {escape(self._trigger.trigger.text())}")
+        head = heading(self._log, self._watch.root, newer, notes)
+        shown = self._log.path if self._log is not None else None
+        others: list[Any] = [name for name, log in self._watch.logs.items() if log != shown]
+        if others != self._behind.options:
+            self._behind.options = others
         if head != self._head.text:
             self._head.text = head
 
@@ -289,6 +382,8 @@ class Page:
         """Show the end of the run as it grows, or all of it."""
         self._live, self._zoomed_to = True, None
         self._drawn_step = 0
+        if self._trigger.trigger is not None:
+            self._trigger.trigger.forget()
         self._button.update(label="Pause", button_type="primary")
 
     def _hold(self) -> None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Self
 
 import numpy as np
 from bokeh.layouts import gridplot
@@ -23,25 +24,52 @@ _SAMPLES = 65_536  # that are looked at
 _SEGMENT = 8192  # samples, at most, of a spectrum's segment
 
 
+@dataclass(frozen=True)
+class PlaneSources:
+    """What is drawn of one run, in its color."""
+
+    xy: ColumnDataSource
+    spectra: ColumnDataSource
+    color: str
+
+    @classmethod
+    def of(cls, color: str, xy: str | None = None, spectra: str | None = None) -> Self:
+        """Sources without data yet, under names by which they are found."""
+        sources = ColumnDataSource({"x": [], "y": []}), ColumnDataSource({"f": []})
+        for source, name in zip(sources, (xy, spectra), strict=True):
+            source.name = name
+        return cls(*sources, color)
+
+
 class Planes:
     """The figures of one view at a time, and their data."""
 
     def __init__(self) -> None:
-        self._xy = ColumnDataSource({"x": [], "y": []}, name="xy")
-        self._spectra = ColumnDataSource({"f": []}, name="spectra")
+        self.shown = PlaneSources.of(BLUE, "xy", "spectra")
 
-    def layout(self, view: str, columns: Sequence[str], chosen: Collection[str]) -> Any:
-        """The figures of a view; a sentence where the log lacks what it needs."""
+    def layout(
+        self,
+        view: str,
+        columns: Sequence[str],
+        chosen: Collection[str],
+        others: Sequence[PlaneSources] = (),
+    ) -> Any:
+        """The figures of a view; a sentence where the log lacks what it needs.
+
+        others: of runs behind the one that is shown.
+        """
+        runs = [*others, self.shown]
         if view in _XY:
             x, y = _XY[view]
             if x not in columns or y not in columns:
                 return Div(text=f"This log has no {x} or no {y}.")
-            return _xy_figure(self._xy, x, y)
+            return _xy_figure(runs, x, y)
         names = _drawn(columns, chosen)
-        self._spectra.data = {"f": np.zeros(0), **{name: np.zeros(0) for name in names}}
+        for run in runs:
+            run.spectra.data = {"f": np.zeros(0), **{name: np.zeros(0) for name in names}}
         if not names:
             return Div(text="No channel is chosen.")
-        plots = [_spectrum_figure(self._spectra, name) for name in names]
+        plots = [_spectrum_figure(runs, name) for name in names]
         for plot in plots[:-1]:
             plot.x_range = plots[-1].x_range
             plot.below = []
@@ -59,18 +87,25 @@ class Planes:
         chosen: Collection[str],
         rows: FloatArray,
         dt: float,
+        run: PlaneSources | None = None,
+        quantities: Sequence[str] | None = None,
     ) -> None:
-        """Show neighbouring rows, (n, n_columns), ``dt`` apart [s]."""
+        """Show neighbouring rows, (n, n_columns), ``dt`` apart [s].
+
+        run: another one than that which is shown; then quantities: the columns of that.
+        """
+        run = self.shown if run is None else run
         if view in _XY and all(name in columns for name in _XY[view]):
             step = max(1, -(-len(rows) // _POINTS))
             x, y = (rows[::step, columns.index(name)] for name in _XY[view])
-            self._xy.data = {"x": x, "y": y}
+            run.xy.data = {"x": x, "y": y}
         elif view == SPECTRUM and dt > 0.0:
-            names = _drawn(columns, chosen)
-            places = [columns.index(name) for name in names]
-            frequency, amplitudes = spectra(rows[:, places], dt)
+            names = _drawn(columns if quantities is None else quantities, chosen)
+            blank = np.full((len(rows), 1), np.nan)
+            places = [columns.index(name) if name in columns else -1 for name in names]
+            frequency, amplitudes = spectra(np.hstack([rows, blank])[:, places], dt)
             amplitude_of = dict(zip(names, amplitudes.T, strict=True))
-            self._spectra.data = {"f": frequency, **amplitude_of}
+            run.spectra.data = {"f": frequency, **amplitude_of}
 
     @property
     def most(self) -> int:
@@ -112,18 +147,19 @@ def _drawn(columns: Sequence[str], chosen: Collection[str]) -> list[str]:
     return [group[-1] for group in groups_of(columns) if quantity_of(group[-1]) in chosen]
 
 
-def _xy_figure(source: ColumnDataSource, x: str, y: str) -> figure:
+def _xy_figure(runs: Sequence[PlaneSources], x: str, y: str) -> figure:
     plot = figure(
         height=520, sizing_mode="stretch_width", tools="pan,box_zoom,wheel_zoom,reset,save",
         x_axis_label=f"{x} [{UNITS[x]}]", y_axis_label=f"{y} [{UNITS[y]}]", name="figure of xy",
     )  # fmt: skip
     plot.toolbar.logo = None
     plot.toolbar_location = "above"
-    plot.line("x", "y", source=source, line_color=BLUE, line_width=1.0)
+    for run in runs:
+        plot.line("x", "y", source=run.xy, line_color=run.color, line_width=1.0)
     return plot
 
 
-def _spectrum_figure(source: ColumnDataSource, name: str) -> figure:
+def _spectrum_figure(runs: Sequence[PlaneSources], name: str) -> figure:
     plot = figure(
         height=150, x_axis_type="log", y_axis_type="log",
         tools="xpan,box_zoom,xwheel_zoom,reset,save", name=f"spectrum of {name}",
@@ -133,5 +169,6 @@ def _spectrum_figure(source: ColumnDataSource, name: str) -> figure:
     plot.yaxis.axis_label = label + (f"\n[{unit}]" if unit else "")
     plot.yaxis.axis_label_text_font_style = "normal"
     plot.min_border_left = 95
-    plot.line("f", name, source=source, line_color=BLUE, line_width=1.0)
+    for run in runs:
+        plot.line("f", name, source=run.spectra, line_color=run.color, line_width=1.0)
     return plot

@@ -33,7 +33,6 @@ _FIRST_PAGE = """<!DOCTYPE html>
 <link rel="icon" href="data:,">
 <style>
 body {{ font: 14px/1.5 system-ui, sans-serif; margin: 8px; }}
-#first:has(~ [data-root-id] *) {{ display: none; }}
 </style>
 </head>
 <body>
@@ -48,8 +47,11 @@ def first_page(head: str, address: str) -> str:
     return _FIRST_PAGE.format(head=head, address=escape(address))
 
 
-def heading(log: FollowedLog | None, root: Path, newer: bool) -> str:
-    """Which run, in which state, and what is wrong with it; newer: another one has begun."""
+def heading(log: FollowedLog | None, root: Path, newer: bool, notes: Sequence[str] = ()) -> str:
+    """Which run, in which state, and what is wrong with it; newer: another one has begun.
+
+    notes: more lines, as HTML.
+    """
     if log is None:
         missing = "" if root.is_dir() else ", nor that folder"
         return (
@@ -67,6 +69,7 @@ def heading(log: FollowedLog | None, root: Path, newer: bool) -> str:
         lines.append("waiting for the first sample: offset calibration, winding of the load")
     elif not log.n_rows and not log.complaints():
         lines.append("no sample in this log yet; what is written to it will be shown")
+    lines += notes
     lines += [
         f'<span style="color:#a33c00">&#9888; {escape(text)}</span>' for text in log.complaints()
     ]

@@ -2,6 +2,7 @@
 
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
@@ -148,16 +149,18 @@ class FollowedLog:
 class Watch:
     """The log that all pages show; it is read once for all of them.
 
-    named: the run to stay with, or None to follow the newest under ``root``. Raises ConfigError
-    where there is no such run.
+    named: the run to stay with, or None to follow the newest under ``root``; others: runs to lay
+    behind it. Raises ConfigError where there is no such run.
     """
 
-    def __init__(self, root: Path, named: Path | None) -> None:
-        self.root = root
+    def __init__(self, root: Path, named: Path | None, others: Sequence[Path] = ()) -> None:
+        self.root = root if named is None or not named.is_dir() else named.resolve().parent
         self.followed = FollowedLog(_log_of(named)) if named is not None else None
+        self.others = {path.name: _log_of(path) for path in map(Path.absolute, others)}
         self._stays = named is not None
         self._started: dict[str, str] = {}
         self._looked = self._polled = 0.0
+        self.logs: dict[str, Path] = dict(self.others)  # of all runs that can be laid behind
         self.poll()
 
     def poll(self) -> None:
@@ -168,26 +171,29 @@ class Watch:
         self._polled = now
         if now - self._looked > _LOOK:
             self._looked = now
-            newest = None if self._stays else self._newest()
+            runs = self._runs()
+            newest = None if self._stays or not runs else self.root / runs[0] / LOG_NAME
             if newest is not None and (self.followed is None or self.followed.path != newest):
                 self.followed = FollowedLog(newest)
+            found = {name: self.root / name / LOG_NAME for name in runs}
+            self.logs = {**self.others, **found, **self.others}
             if self.followed is not None:
                 self.followed.look()
         if self.followed is not None:
             self.followed.read()
 
-    def _newest(self) -> Path | None:
-        """Log of the run that began last."""
+    def _runs(self) -> list[str]:
+        """Folders of runs, that which began last first."""
         try:
             folders = {item.name: item for item in self.root.iterdir() if item.is_dir()}
         except OSError:
-            return None
+            return []
         for name in folders.keys() - self._started.keys():
             began = _began(folders[name])
             if began is not None:
                 self._started[name] = began
         runs = [(began, name) for name, began in self._started.items() if name in folders]
-        return folders[max(runs)[1]] / LOG_NAME if runs else None
+        return [name for _, name in sorted(runs, reverse=True)]
 
 
 def _limits(limits: Any) -> dict[str, list[float]]:

@@ -25,6 +25,7 @@ from daq.scope.history import History
 from daq.scope.planes import spectra
 from daq.scope.tail import LogTail
 from daq.scope.texts import heading
+from daq.scope.trigger import Trigger
 from daq.scope.watch import FollowedLog, RunState, Watch
 from tests.daq.support import (
     environment,
@@ -259,6 +260,25 @@ def test_what_is_added_to_a_view_is_what_a_later_view_shows():
     n = 6000 // view.step
     np.testing.assert_array_equal(low[:, 1], rows[: n * view.step, 1].reshape(n, -1).min(axis=1))
     np.testing.assert_array_equal(high[:, 1], rows[: n * view.step, 1].reshape(n, -1).max(axis=1))
+
+
+def test_a_trigger_stands_at_the_newest_passage_that_is_shown_whole():
+    time = np.arange(4000) / RATE
+    wave = np.sin(2.0 * np.pi * time)
+    noise = 0.01 * np.random.default_rng(3).normal(size=len(time))
+    rows = np.column_stack([time, wave + noise])
+    history, columns = History(("t", "torque"), lambda start, end: rows[start:end]), ("t", "torque")
+    found = {"rises": [], "falls": []}
+    triggers = {name: Trigger("torque", 0.5, name == "rises") for name in found}
+    for first in range(0, len(rows), 40):
+        history.add(rows[first : first + 40], np.arange(first, first + 41))
+        for name, trigger in triggers.items():
+            if trigger.look(history, columns, 0.5):
+                found[name].append(trigger.at)
+    assert np.allclose(found["rises"], np.arange(5) + 1.0 / 12.0, atol=0.02)
+    assert np.allclose(found["falls"], np.arange(5) + 5.0 / 12.0, atol=0.02)
+    lost = Trigger("speed", 0.5, rising=True)
+    assert not lost.look(history, columns, 0.5) and lost.text().endswith("0.5: not yet")
 
 
 # --- which run ----------------------------------------------------------------------------

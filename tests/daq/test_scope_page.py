@@ -229,6 +229,43 @@ def test_a_paused_page_stands_still_until_it_is_let_go_on(scope, tmp_path):
         assert len(tab.drawn()) == 0 and "waiting for the first sample" in tab.head()
 
 
+def test_a_trigger_holds_where_it_is_and_earlier_runs_lie_behind(scope, tmp_path):
+    n, period = 1600, 400  # two seconds of a sine of 2 Hz
+    sine = np.sin(2.0 * np.pi * (np.arange(n) - 100) / period)
+    with recording(tmp_path, "earlier") as (earlier, log):
+        log.append(samples(n, torque=5.0 * sine))
+    with recording(tmp_path, "later") as (later, log):
+        log.append(samples(n, torque=sine))
+        tab = scope(later.folder, earlier.folder)
+        behind = "m.renderers.map((r) => Array.from(r.data_source.data.torque ?? []))[0]"
+        until(lambda: len(tab.model("figure of torque", behind) or []) > 500, "the earlier run")
+        assert max(tab.model("figure of torque", behind)) == pytest.approx(5.0)
+        until(lambda: f"behind it: {earlier.folder.name}" in tab.head(), "word of it")
+        until(lambda: tab.height("torque")[1] > 5.0, "room for both")
+        assert tab.driver.execute_script("return document.getElementById('first')") is None
+        tab.model("behind", "(m.value = [])")
+        count = "m.renderers.filter((r) => r.name == 'curve behind').length"
+        until(lambda: tab.model("figure of torque", count) == 0, "the later run alone")
+        tab.model("window", "(m.active = 0)")  # 0.2 s
+        tab.model("trigger channel", "(m.value = 'torque')")
+        tab.model("level", "(m.value = 0.5)")
+        tab.model("edge", "(m.active = 1)")
+        # The last rise through 0.5 of which what follows for 0.16 s is there.
+        rises = np.flatnonzero((sine[1:] >= 0.5) & (sine[:-1] < 0.5)) + 1
+        at = rises[rises / RATE + 0.16 < (n - 1) / RATE][-1] / RATE
+        until(lambda: tab.time() == pytest.approx((at - 0.04, at + 0.16)), "the trigger")
+        assert tab.model("lines", "m.data.time") == [at]
+        assert tab.model("level of the trigger", "Array.from(m.data_source.data.y)") == [0.5]
+        tab.model("once", "(m.active = true)")
+        until(lambda: tab.button() == "Live", "the page to hold")
+        log.append(samples(n, first=n, torque=sine))
+        until(lambda: tab.values().get("tick") == str(2 * n - 1), "data that go on")
+        assert tab.time() == pytest.approx((at - 0.04, at + 0.16))
+        tab.press()
+        until(lambda: tab.time()[0] > at, "the next time")
+        assert tab.button() == "Live" and not tab.errors()
+
+
 def test_a_finished_run_is_shown_whole_and_magnified_to_its_samples(scope, tmp_path):
     n = 100_000  # more than is kept as it is
     torque = np.sin(np.arange(n) / 5000.0)
