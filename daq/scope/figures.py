@@ -26,7 +26,7 @@ from daq.scope.looks import (
     is_wanted,
     quantity_of,
 )
-from daq.scope.overlay import Overlay
+from daq.scope.overlay import EarlierRun
 from daq.scope.trigger import Trigger
 
 _CALM = 0.03  # of a column's span that a stretch may cover and still be drawn as broad: 3 pixels
@@ -88,7 +88,7 @@ def make_figures(
     return grid, plots
 
 
-def lay_behind(plots: Sequence[figure], overlays: Sequence[Overlay]) -> None:
+def lay_behind(plots: Sequence[figure], overlays: Sequence[EarlierRun]) -> None:
     """Draw runs behind the one that is shown, instead of those that were; cheaper than anew."""
     for plot in plots:
         kept = [curve for curve in plot.renderers if curve.name != _BEHIND]
@@ -118,7 +118,7 @@ def fit(
     plot: figure,
     sources: Sources,
     limits: Sequence[float] = (),
-    overlays: Sequence[Overlay] = (),
+    overlays: Sequence[EarlierRun] = (),
 ) -> None:
     """Have a figure's curves fill its height, without moving its axis at every little change.
 

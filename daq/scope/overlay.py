@@ -17,7 +17,7 @@ _MARGIN = 0.5  # of the width that is drawn beyond either edge
 _WIDEST = 6.0  # widths that may be drawn before it is looked at more closely
 
 
-class Overlay:
+class EarlierRun:
     """A run's curves over the same time as those of the run that is shown.
 
     columns: those that are drawn, of the run that is shown; a run without one has a gap.
@@ -49,12 +49,12 @@ class Overlay:
         return True
 
     def _data(self, view: View) -> dict[str, Any]:
-        own = self.log.tail.columns
+        columns = self.log.tail.columns
         each = 1 if view.step == 1 else 2
         data: dict[str, Any] = {"t": np.repeat(view.time, each)}
         for name in self.columns:
-            if name in own:
-                place = own.index(name)
+            if name in columns:
+                place = columns.index(name)
                 both = np.stack([view.low[:, place], view.high[:, place]], axis=1)
                 data[name] = both[:, :each].ravel()
             else:

@@ -18,7 +18,7 @@ from daq.scope import figures
 from daq.scope.figures import Sources
 from daq.scope.history import History, View, nothing, step_for
 from daq.scope.looks import GREY, OTHERS, groups_of, quantity_of
-from daq.scope.overlay import Overlay
+from daq.scope.overlay import EarlierRun
 from daq.scope.planes import TIME, VIEWS, Planes
 from daq.scope.texts import FAILED, HELP, VALUE_FIELDS, heading, readout
 from daq.scope.trigger import BEFORE, Trigger
@@ -82,7 +82,7 @@ class Page:
         self._stop.on_click(self._stop_run)
         self._planes = Planes()
         self._trigger = TriggerControls(self._middle, self._wait_for_trigger)
-        self._overlays: list[Overlay] = []
+        self._overlays: list[EarlierRun] = []
         self._behind = MultiChoice(
             placeholder="lay earlier runs behind", name="behind", max_items=len(OTHERS),
             option_limit=200, width=280, value=list(watch.others),
@@ -302,10 +302,10 @@ class Page:
         rows = history.rows(*self._shown, self._planes.most)
         self._planes.draw(view, self._columns, self._chosen, rows, history.dt)
         for run in self._overlays:
-            other = run.log.history
-            if other is not None and other.n_rows:
-                rows = other.rows(*self._shown, self._planes.most)
-                parts = view, run.log.tail.columns, self._chosen, rows, other.dt
+            earlier = run.log.history
+            if earlier is not None and earlier.n_rows:
+                rows = earlier.rows(*self._shown, self._planes.most)
+                parts = view, run.log.tail.columns, self._chosen, rows, earlier.dt
                 self._planes.draw(*parts, run.planes, self._columns)
 
     def _lay_behind(self) -> None:
@@ -321,7 +321,7 @@ class Page:
         columns = tuple(name for group in groups_of(self._columns) for name in group)
         before = {(run.log.path, run.color, run.columns): run for run in self._overlays}
         keys = [(log, color, columns) for log, color in zip(logs, OTHERS, strict=False)]
-        self._overlays = [before.get(key) or Overlay(*key) for key in keys]
+        self._overlays = [before.get(key) or EarlierRun(*key) for key in keys]
 
     def _middle(self, channel: str) -> float:
         """Between the lowest and the highest value of a channel so far; NaN without any."""

@@ -68,7 +68,7 @@ def passages(values: FloatArray, level: float, rising: bool, noise: float = 0.0)
     sign = 1.0 if rising else -1.0
     above = sign * (values - level)
     side = np.where(above >= 0.0, 1, np.where(above < -noise, -1, 0))
-    known = np.flatnonzero(side)
-    sides = side[known]
-    found: IntArray = known[1:][(sides[:-1] < 0) & (sides[1:] > 0)]
-    return found
+    rows = np.flatnonzero(side)
+    sides = side[rows]
+    passed: IntArray = rows[1:][(sides[:-1] < 0) & (sides[1:] > 0)]
+    return passed

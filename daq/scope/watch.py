@@ -175,8 +175,8 @@ class Watch:
             newest = None if self._stays or not runs else self.root / runs[0] / LOG_NAME
             if newest is not None and (self.followed is None or self.followed.path != newest):
                 self.followed = FollowedLog(newest)
-            found = {name: self.root / name / LOG_NAME for name in runs}
-            self.logs = {**self.others, **found, **self.others}
+            logs = {name: self.root / name / LOG_NAME for name in runs}
+            self.logs = {**self.others, **logs, **self.others}
             if self.followed is not None:
                 self.followed.look()
         if self.followed is not None:
