@@ -42,7 +42,7 @@ class Question(Section):
         "D",
         description="without targets: information of all (D), mean variance (A), worst one (E)",
     )
-    structures: dict[str, list[str | bool | float]] | list[str] | None = Field(
+    structures: dict[str, list[str | bool | Part]] | list[str] | None = Field(
         None,
         description="model structures to tell apart, in place of parameters to know: options of "
         "model and plant, each combined with each; or models by name",
