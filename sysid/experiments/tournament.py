@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtr, ndtri
 
 from sysid.arrays import BoolArray, FloatArray
 from sysid.experiments import rivals
@@ -35,7 +35,7 @@ def power(noncentrality: FloatArray | float, level: float = LEVEL) -> FloatArray
     [0.01, 0.5, 0.996]
     """
     distance = np.sqrt(np.maximum(noncentrality, 0.0))
-    return np.asarray(norm.cdf(distance - norm.isf(level)), dtype=np.float64)
+    return np.asarray(ndtr(distance + ndtri(level)), dtype=np.float64)
 
 
 @dataclass(frozen=True)
