@@ -3,6 +3,7 @@
 import itertools
 import math
 import time
+from pathlib import Path
 from typing import Annotated, Literal, Self
 
 import numpy as np
@@ -13,13 +14,15 @@ from daq.config.base import Section
 from daq.config.units import Part, Radians, Seconds, Unit, Volts
 from daq.errors import DeviceError
 from daq.hal import ANALOG_INPUTS, CHANNELS, FloatArray, Guard, IntArray, Mode, Phase, RawSamples
+from sim_rig.co_simulation import MOTION, CoSimulation, ForeignStepper
 from sim_rig.device import command_queue, converters
 from sim_rig.device.command_queue import CommandQueue
 from sim_rig.device.converters import Converters, Interlock
 from sim_rig.device.encoder import EncoderCounter
 from sim_rig.device.user import SimulatedUser
+from sim_rig.foreign import ForeignPlant
 from sim_rig.plant import Plant, state_sizes
-from sysid import ProcessModel, Stepper
+from sysid import ModelError, ProcessModel, Stepper
 
 _BLOCK = 256  # ticks simulated at once in open loop
 _REAL_TIME_BLOCK = 0.02  # s between deliveries of a device in real time
@@ -60,6 +63,9 @@ class Simulation(Section):
         "virtual", description="as fast as it can, or at the pace of the clock"
     )
     plant: Plant = Field(Plant(), description="parts of the actuator and what hangs on it")
+    fmu: ForeignPlant | None = Field(
+        None, description="another program's plant instead: an FMU for co-simulation"
+    )
     imperfections: Imperfections = Field(Imperfections(), description="of the sensing chain")
     faults: Faults = Field(Faults(), description="of the connection")
     hand: list[tuple[Seconds, Radians]] = Field(
@@ -82,7 +88,7 @@ class Simulation(Section):
     @property
     def cable(self) -> bool:
         """Whether what hangs on the shaft has a cable that can be wound off."""
-        return self.plant.load == "pulley"
+        return self.fmu is None and self.plant.load == "pulley"
 
     @field_validator("hand")
     @classmethod
@@ -94,6 +100,12 @@ class Simulation(Section):
                     "write [time, angle] with times above 0 that rise"
                 )
         return path
+
+    @model_validator(mode="after")
+    def _has_one_plant(self) -> Self:
+        if self.fmu is not None and {"plant", "hand"} & self.model_fields_set:
+            raise ValueError("fmu: it stands instead of plant and hand; leave those out")
+        return self
 
     @model_validator(mode="after")
     def _has_a_hand(self) -> Self:
@@ -116,11 +128,14 @@ class SimulatedDevice:
 
     def __init__(self, options: Simulation) -> None:
         self.options = options
+        self._unit = CoSimulation(options.fmu) if options.fmu is not None else None
         self._plant = options.plant.build()
         self._motion = [self._plant.state_names.index(name) for name in ("theta", "omega")]
-        self._user = SimulatedUser(
-            options.plant.load == "hand", options.hand, options.hand_path == "smooth"
-        )
+        self._n_inputs = len(self._plant.inputs)
+        holds = options.plant.load == "hand"
+        if self._unit is not None:
+            self._motion, self._n_inputs = [0, 1], len(CHANNELS)
+        self._user = SimulatedUser(holds, options.hand, options.hand_path == "smooth")
         self._rng = np.random.default_rng(options.seed)
         worst = 0.0 if options.ideal else options.imperfections.offset
         senses = np.array([options.current_sense, options.current_sense, options.torque_sense])
@@ -128,9 +143,8 @@ class SimulatedDevice:
         step = 0.0 if options.ideal else 2.0 * converters.RANGE / 2**options.imperfections.bits
         self._converters = Converters(senses, offsets, options.imperfections.noise, step)
         self._noise, self._noise_used = np.empty((0, len(ANALOG_INPUTS))), 0
-        self._n_inputs = len(self._plant.inputs)
         self._single = np.zeros((2, self._n_inputs))
-        self._steppers: dict[float, Stepper] = {}
+        self._steppers: dict[float, Stepper | ForeignStepper] = {}
         # Draws of their own, so that the noise stays what it is without them.
         self._chance = np.random.default_rng([options.seed, 1])
         self._encoder_phase = float(np.random.default_rng([options.seed, 2]).random())
@@ -146,6 +160,9 @@ class SimulatedDevice:
         self._warm_up()
         self._open = True
         self._x = self._plant.initial_state
+        if self._unit is not None:
+            self._unit.open()
+            self._x = self._unit.values[MOTION]
         self._encoder = EncoderCounter(4 * self.options.encoder_cycles, self._encoder_phase)
         return hal.DeviceInfo(
             name="simulated rig",
@@ -214,7 +231,7 @@ class SimulatedDevice:
         self._require_running()
         before, memory = self._x.copy(), self._encoder.memory.copy()
         zeros, flags = np.zeros((1, len(CHANNELS))), np.zeros(1, dtype=np.int64)
-        raw, _ = self._simulate(zeros, flags, self._unit_noise(1))
+        raw, _ = self._simulate(zeros, flags, self._unit_noise(1), self._unit is None)
         self._x, self._encoder.memory = before, memory
         self._noise_used -= 1
         return raw
@@ -232,13 +249,17 @@ class SimulatedDevice:
         """Switch off."""
         self.safe()
         self._open = self._running = False
+        if self._unit is not None:
+            self._unit.close()
 
     def process_model(self) -> ProcessModel:
         """The plant's process model, with its values as nominal ones; may raise ModelError."""
+        self._require_equations()
         return self.options.plant.process_model()
 
     def plant_model(self, turns: float) -> ProcessModel:
         """The whole plant as commands drive it, so many turns wound up; may raise ModelError."""
+        self._require_equations()
         return self.options.plant.driven(turns if self.options.cable else 0.0)
 
     def board(self) -> hal.Electronics:
@@ -250,13 +271,20 @@ class SimulatedDevice:
         device = SimulatedDevice(options)
         return hal.Electronics(device, volts, step_in, step_out, device.latch)
 
+    def _require_equations(self) -> None:
+        if self.options.fmu is not None:
+            name = Path(self.options.fmu.file).name
+            raise ModelError(f"the plant is {name}, whose equations nobody knows; name a model")
+
     def _warm_up(self) -> None:
         """Import and compile what the plant is computed with, once."""
-        if not self._steppers:
+        if not self._steppers and self._unit is None:
             u = np.zeros((2, self._n_inputs))
             self._stepper_at(1000.0).advance(self._plant.initial_state, u)
 
-    def _stepper_at(self, sample_rate: float) -> Stepper:
+    def _stepper_at(self, sample_rate: float) -> Stepper | ForeignStepper:
+        if sample_rate not in self._steppers and self._unit is not None:
+            self._steppers[sample_rate] = ForeignStepper(self._unit, sample_rate)
         if sample_rate not in self._steppers:
             plant, scale = self._plant, state_sizes(self._plant)
             self._steppers[sample_rate] = Stepper(
@@ -278,7 +306,7 @@ class SimulatedDevice:
     def _due(self) -> int:
         """How many ticks to play now; waits for them in real time."""
         if self.options.time == "virtual":
-            return min(max(self._queue.queued, 1), _BLOCK)
+            return min(max(self._queue.queued, 1), self._block)
         if self._wall_start is None:
             self._wall_start = time.perf_counter()
         in_blocks = self._waits_for_commands and not self._queue.latched
@@ -288,13 +316,19 @@ class SimulatedDevice:
         while (wait := until - time.perf_counter()) > 0.0:
             time.sleep(wait)
         elapsed = math.floor((time.perf_counter() - self._wall_start) * self._rate) + 1
-        return max(1, min(elapsed - self._queue.tick, _BLOCK))
+        return max(1, min(elapsed - self._queue.tick, self._block))
+
+    @property
+    def _block(self) -> int:
+        """Ticks simulated at once: a single one of a plant that cannot go back to an interlock."""
+        return _BLOCK if self._unit is None else 1
 
     def _play(self, applied: FloatArray, flags: IntArray, guarded: bool) -> RawSamples:
         """Simulate the ticks; where an input passes its guard, again with zeros from there."""
         n = len(applied)
         noise, memory = self._unit_noise(n), self._encoder.memory.copy()
-        raw, trace = self._simulate(applied, flags, noise)
+        moving = self._unit is None or not guarded  # else looked at before it moves on
+        raw, trace = self._simulate(applied, flags.copy() if not moving else flags, noise, moving)
         row = self._interlock.first_beyond(raw.analog, raw.counts, raw.count_rate) if guarded else n
         if row < n:
             applied[row:] = 0.0
@@ -304,17 +338,25 @@ class SimulatedDevice:
             self._x, self._encoder.memory = trace[0].copy(), memory
             raw, _ = self._simulate(applied, flags, noise)
             self._queue.latch()
+        elif not moving:
+            raw, _ = self._simulate(applied, flags, noise)
         self._queue.advance(n)
         # Not summed up tick by tick: rounding would make it depend on the size of the blocks.
         self._clock = self._origin + self._queue.tick / self._rate
         return raw
 
     def _simulate(
-        self, applied: FloatArray, flags: IntArray, noise: FloatArray
+        self, applied: FloatArray, flags: IntArray, noise: FloatArray, moving: bool = True
     ) -> tuple[RawSamples, FloatArray]:
-        """Latch, apply, advance: the samples of n ticks, and the plant's trace."""
+        """Latch, apply, advance: the samples of n ticks, and the plant's trace.
+
+        moving: False to look at an FMU without advancing it.
+        """
         n, tick, per_tick = len(applied), self._queue.tick, self._stepper.n_steps
-        trace, true = self._stepper.advance(self._x, self._inputs(applied))
+        if isinstance(self._stepper, ForeignStepper) and not moving:
+            trace, true = self._stepper.look()
+        else:
+            trace, true = self._stepper.advance(self._x, self._inputs(applied))
         times = self._origin, tick * per_tick, 1.0 / (self._rate * per_tick), per_tick
         motion = self._motion
         counts, rates = self._encoder.latch(trace[:, motion], self._x[motion], *times)

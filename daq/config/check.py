@@ -36,7 +36,7 @@ def validate(
     """
     data = file.content if content is None else content
     refuse([*file.repeated, *others, *mistakes(file, model, data, at)])
-    return model.model_validate(data)
+    return model.model_validate(data, context={"folder": file.path.parent})
 
 
 def mistakes(
@@ -44,7 +44,7 @@ def mistakes(
 ) -> list[Mistake]:
     """What is wrong with the part of a file at a key by a model; one for each key."""
     try:
-        model.model_validate(content)
+        model.model_validate(content, context={"folder": file.path.parent})
     except ValidationError as error:
         errors = error.errors(include_url=False)
         first = _Explainer(file, model, content, at).mistakes(errors[:_MANY])

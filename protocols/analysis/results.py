@@ -44,9 +44,9 @@ def estimates(
     values: Sequence[float] | FloatArray, errors: FloatArray, freedom: int
 ) -> list[Estimate]:
     """Estimates of values by their standard errors and degrees of freedom."""
-    from scipy.special import stdtrit
+    from scipy.stats import t
 
-    quantile = float(stdtrit(freedom, 0.975))
+    quantile = float(t.ppf(0.975, freedom))
     return [Estimate(float(v), float(e), quantile) for v, e in zip(values, errors, strict=True)]
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Literal, Self, get_args
 
 import numpy as np
+from sklearn.utils.validation import check_is_fitted
 
 from sysid.arrays import FloatArray
 from sysid.engine.compiler import kalman_filter
@@ -139,8 +140,6 @@ class GASSI(RecordEstimator):
     >>> round(estimator.parameters_["tau"], 6)
     0.2
     """
-
-    fitted = "vector_"
 
     model: ProcessModel | None = None
     _: KW_ONLY
@@ -284,7 +283,7 @@ class GASSI(RecordEstimator):
         outputs are (n_samples,) if those of ``fit`` were; a Dataset starts from its first sample,
         and initial states that the model leaves open are estimated from its outputs.
         """
-        self._check_fitted()
+        check_is_fitted(self, "vector_")
         simulator = self.simulator()
         if isinstance(X, Dataset):
             return free_run(simulator, self.vector_, X)
@@ -299,7 +298,7 @@ class GASSI(RecordEstimator):
 
     def score(self, X: Data, y: FloatArray | None = None, *, records: Any = None) -> float:
         """Mean fit % over outputs and records, divided by 100: 1 is perfect."""
-        self._check_fitted()
+        check_is_fitted(self, "vector_")
         data = self._records(X, y, records, None, reset=False)
         fits = [fit_percent(record.outputs, self.predict(record)) for record in data]
         return float(np.nanmean(fits)) / 100.0
@@ -338,7 +337,7 @@ class GASSI(RecordEstimator):
 
         X, y, records: those of ``fit``. Raises ModelError as ``uncertainty``.
         """
-        self._check_fitted()
+        check_is_fitted(self, "vector_")
         if not PRESETS[self.preset].refine:
             raise ModelError(f"preset {self.preset} has no local refinement, so no intervals")
         if self.stopped_ == "interrupted":
@@ -517,3 +516,6 @@ class GASSI(RecordEstimator):
 
     def _named(self, vector: FloatArray) -> dict[str, float]:
         return dict(zip(self._model().parameter_names, vector.tolist(), strict=True))
+
+    def __sklearn_is_fitted__(self) -> bool:
+        return hasattr(self, "vector_")
