@@ -12,7 +12,9 @@ from typing import Any
 from daq.characterise.page import write_page
 from daq.characterise.rounds import Interval, Request, Round, rounds_of
 from daq.config.yaml_file import TypedSettings
-from daq.designs.design import DATA, choose, set_up, write
+from daq.designs.design import choose, write
+from daq.designs.runs import DATA
+from daq.designs.setup import set_up
 from daq.errors import ConfigError, RigError, Terminated
 from daq.files import make_folder
 from daq.identification.fit import check_writable, fit

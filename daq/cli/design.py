@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,7 +12,8 @@ from typer import Argument, Option
 from daq.cli import options, terminal
 
 if TYPE_CHECKING:
-    from daq.designs.result import DesignResult
+    from daq.designs.discrimination import DiscriminationResult
+    from daq.designs.result import DesignResult, PlannedRun
 
 
 def design(
@@ -56,9 +58,11 @@ def design(
     """Find the runs that tell most about the parameters, within the rig's limits.
 
     Writes them as experiments for rig run, and says beforehand how narrow the intervals will be,
-    what stays unknown, and what would tell it. Nothing is energised.
+    what stays unknown, and what would tell it. With structures in the question: the runs that tell
+    these apart, and how surely. Nothing is energised.
     """
     from daq.designs import design as use_case
+    from daq.designs.discrimination import DiscriminationResult
 
     typed = {
         "rig": rig,
@@ -74,24 +78,15 @@ def design(
         result = use_case.design_files(question, typed, settings or [], out, watch)
     if json:
         terminal.print_json(result.document)
-        return
-    _show(result)
+    elif isinstance(result, DiscriminationResult):
+        _show_pairs(result)
+    else:
+        _show(result)
 
 
 def _show(result: DesignResult) -> None:
     number, design = terminal.number, result.design
-    print()
-    rows = [
-        [
-            run.file.name,
-            run.protocol,
-            *(_span(run.commands[:, j].min(), run.commands[:, j].max()) for j in range(2)),
-        ]
-        for run in result.runs
-    ]
-    title = f"{len(rows)} runs on {result.rig_name}, {design.duration:g} s in all"
-    head = ["experiment", "protocol", "motor [V]", "brake [V]"]
-    terminal.print_table(title, head, rows, text=["protocol"])
+    _show_runs(result.runs, result.rig_name, design.duration)
     rows = [
         [
             quantity.name,
@@ -111,9 +106,63 @@ def _show(result: DesignResult) -> None:
         terminal.print_text(
             f"Stays unknown: {names}: {unknown.why}. What would tell: {unknown.cure}."
         )
-    print(f"Experiments, {result.figure.name} and design.json: {result.folder}")
-    rig = shlex.quote(str(result.runs[0].file))
-    terminal.print_next(f"rig check {rig}", f"rig run {rig}, and so each of them")
+    _show_next(result.runs, result.figure)
+
+
+def _show_pairs(result: DiscriminationResult) -> None:
+    number, contests = terminal.number, result.discrimination.contests
+    _show_runs(result.runs, result.rig_name, result.discrimination.duration)
+    rows = [
+        [
+            contest.truth,
+            contest.rival,
+            number(contest.distance, 3),
+            number(100.0 * contest.probability, 3),
+        ]
+        for contest in contests
+    ]
+    head = ["if right is", "how wrong is", "chi-square", "refused [%]"]
+    title = "What the best parameters of the other leave, and how often a test at 1 % refuses it"
+    terminal.print_table(title, head, rows, text=["how wrong is"])
+    for truth, rival in result.discrimination.inseparable:
+        terminal.print_text(
+            f"No run tells apart: {truth} and {rival}. What would: wider limits, longer runs, less "
+            "noise, or another sensor."
+        )
+    for contest in contests:
+        if not contest.possible and (contest.rival, contest.truth) not in _pairs(result):
+            terminal.print_text(
+                f"{contest.rival} does all that {contest.truth} does: where both fit alike, take "
+                f"{contest.truth}."
+            )
+    _show_next(result.runs, result.figure)
+
+
+def _pairs(result: DiscriminationResult) -> set[tuple[str, str]]:
+    """Ordered pairs that no run tells apart."""
+    pairs = result.discrimination.inseparable
+    return {*pairs, *((rival, truth) for truth, rival in pairs)}
+
+
+def _show_runs(runs: Sequence[PlannedRun], rig: str, seconds: float) -> None:
+    print()
+    rows = [
+        [
+            run.file.name,
+            run.protocol,
+            *(_span(run.commands[:, j].min(), run.commands[:, j].max()) for j in range(2)),
+        ]
+        for run in runs
+    ]
+    title = f"{len(rows)} runs on {rig}, {seconds:g} s in all"
+    head = ["experiment", "protocol", "motor [V]", "brake [V]"]
+    terminal.print_table(title, head, rows, text=["protocol"])
+
+
+def _show_next(runs: Sequence[PlannedRun], figure: Path) -> None:
+    print(f"Experiments, {figure.name} and design.json: {figure.parent}")
+    first = shlex.quote(str(runs[0].file))
+    terminal.print_next(f"rig check {first}", f"rig run {first}, and so each of them")
 
 
 def _span(low: float, high: float) -> str:

@@ -42,6 +42,12 @@ class Question(Section):
         "D",
         description="without targets: information of all (D), mean variance (A), worst one (E)",
     )
+    structures: dict[str, list[str | bool | Part]] | list[str] | None = Field(
+        None,
+        description="model structures to tell apart, in place of parameters to know: options of "
+        "model and plant, each combined with each; or models by name",
+        examples=[{"hysteresis": ["bouc-wen", "dahl"], "friction": ["none", "stribeck"]}],
+    )
     time: Seconds = Field(10.0, gt=0.0, le=3600.0, description="logged time of all runs, at most")
     run: Seconds | None = Field(
         None, gt=0.0, le=600.0, description="length of a run; default 1.25 s, or the time if less"

@@ -1,9 +1,12 @@
 """The figure of a design."""
 
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
 import numpy as np
 
 from daq.config.rig import RigConfig
-from daq.designs.result import DesignResult
+from daq.designs.result import DesignResult, PlannedRun
 from daq.figures import design as figures
 from daq.figures import style
 from daq.figures.design import Prediction
@@ -13,11 +16,26 @@ from daq.limits.base import TURN
 from daq.logs.columns import UNITS
 
 _Limits = tuple[float | None, float | None]
+Widths = tuple[float, float, float | None]
 
 
 def draw_design(result: DesignResult, rig: RigConfig) -> None:
     """Draw a design into its file. Raises RunError where the disk refuses."""
-    runs = result.runs
+    intervals = {
+        q.name: (100.0 * q.before, 100.0 * q.after, None if q.target is None else 100.0 * q.target)
+        for q in result.design.quantities
+    }
+    draw_runs(result.runs, rig, intervals, result.figure)
+
+
+def draw_runs(
+    runs: Sequence[PlannedRun], rig: RigConfig, intervals: Mapping[str, Widths], path: Path
+) -> None:
+    """Draw what runs do into a file, and below it intervals if there are any.
+
+    intervals: half widths before and after, and what is wanted, by quantity [%]. Raises RunError
+    where the disk refuses.
+    """
     commands = np.concatenate([run.commands for run in runs])
     ends = np.cumsum([len(run.commands) * run.dt for run in runs])
     time: FloatArray = np.arange(len(commands), dtype=np.float64) * runs[0].dt
@@ -31,12 +49,8 @@ def draw_design(result: DesignResult, rig: RigConfig) -> None:
         if name in runs[0].signals:
             values = np.concatenate([run.signals[name] for run in runs], axis=1)
             predictions.append(_prediction(name, values, limits))
-    intervals = {
-        q.name: (100.0 * q.before, 100.0 * q.after, None if q.target is None else 100.0 * q.target)
-        for q in result.design.quantities
-    }
     figure = figures.design(time, ends[:-1].tolist(), predictions, intervals)
-    write_whole(result.figure, style.render(figure, style.format_of(result.figure)))
+    write_whole(path, style.render(figure, style.format_of(path)))
 
 
 def _limits_of(rig: RigConfig) -> dict[str, _Limits]:

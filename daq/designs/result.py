@@ -37,6 +37,16 @@ class PlannedRun:
     signals: Mapping[str, FloatArray]
     dt: float
 
+    @property
+    def document(self) -> dict[str, Any]:
+        """What it is, for machines."""
+        return {
+            "file": str(self.file),
+            "protocol": self.protocol,
+            "seconds": len(self.commands) * self.dt,
+            "settings": dict(self.settings),
+        }
+
 
 @dataclass(frozen=True, repr=False)
 class DesignResult(Shown):
@@ -80,15 +90,7 @@ class DesignResult(Shown):
             "rig": self.rig_name,
             "duration_seconds": self.design.duration,
             "met": self.design.met,
-            "runs": [
-                {
-                    "file": str(run.file),
-                    "protocol": run.protocol,
-                    "seconds": len(run.commands) * run.dt,
-                    "settings": dict(run.settings),
-                }
-                for run in self.runs
-            ],
+            "runs": [run.document for run in self.runs],
             "quantities": [
                 {**asdict(quantity), "met": quantity.met} for quantity in self.design.quantities
             ],

@@ -40,20 +40,23 @@ def design(
     """Predicted signals over the time of all runs [s], and intervals before and after.
 
     breaks: where a run ends and the next begins [s]. intervals: half widths in per cent of the
-    value before and after, and the one that was asked for, by quantity.
+    value before and after, and the one that was asked for, by quantity; without any there is no
+    panel of them.
     """
-    heights = [*[0.62] * len(predictions), _ROW * len(intervals) + 0.1]
-    gaps = [*[0.13] * (len(predictions) - 1), 0.55]
+    heights, gaps = [0.62] * len(predictions), [0.13] * (len(predictions) - 1)
+    if intervals:
+        heights, gaps = [*heights, _ROW * len(intervals) + 0.1], [*gaps, 0.55]
     labels, left = style.row_names(list(intervals))
     figure, axes = style.stack(heights, gaps, left=max(left, style.LEFT), share_x=False)
-    *panels, below = axes
+    panels = axes[: len(predictions)]
     for panel, prediction in zip(panels, predictions, strict=True):
         _predicted(panel, time, breaks, prediction)
         panel.tick_params(labelbottom=panel is panels[-1])
     panels[-1].set_xlabel("logged time [s]")
     style.legend(figure, panels[-1])
-    _intervals(below, labels, np.array([(b, a) for b, a, _ in intervals.values()]),
-               [target for _, _, target in intervals.values()])  # fmt: skip
+    if intervals:
+        _intervals(axes[-1], labels, np.array([(b, a) for b, a, _ in intervals.values()]),
+                   [target for _, _, target in intervals.values()])  # fmt: skip
     return figure
 
 

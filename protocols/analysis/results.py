@@ -44,9 +44,9 @@ def estimates(
     values: Sequence[float] | FloatArray, errors: FloatArray, freedom: int
 ) -> list[Estimate]:
     """Estimates of values by their standard errors and degrees of freedom."""
-    from scipy.stats import t
+    from scipy.special import stdtrit
 
-    quantile = float(t.ppf(0.975, freedom))
+    quantile = float(stdtrit(freedom, 0.975))
     return [Estimate(float(v), float(e), quantile) for v, e in zip(values, errors, strict=True)]
 
 

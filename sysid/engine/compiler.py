@@ -118,7 +118,6 @@ def _compiled(
     from sysid.engine.phi import scheme_matrices
 
     name = "".join(c if c.isalnum() else "_" for c in model.name)[:40]
-    path = _source_file(f"{name}_{_key(text, called)}.py", text)
     scope = {
         "np": np,
         "math": vector_math,
@@ -129,20 +128,25 @@ def _compiled(
         "__name__": __name__,  # a module that exists when Numba loads the kernel from its cache
         **{name: machine_code(function) for name, function in called.items()},
     }
-    _execute(text, scope, path)
+    path = _define(f"{name}_{_key(text, called)}.py", text, scope)
     for name in ("constants", "remainder", "observe", "margins", "gains"):
         if name in scope:
             scope[name] = _njit(scope[name])
     return [_njit(scope[name], nogil=True, cache=path is not None) for name in functions]
 
 
-def _execute(text: str, scope: dict[str, Any], path: Path | None) -> None:
-    """Define the functions of a text in a scope, its runs of assignments outlined."""
-    from sysid.engine.straight_line import outlined
+def _define(name: str, text: str, scope: dict[str, Any]) -> Path | None:
+    """Define the functions of a text in a scope, with its runs of assignments outlined.
 
-    module, called = outlined(text, scope)
-    scope |= called
-    exec(compile(module, str(path or "<kernel>"), "exec"), scope)
+    The file of that name in the cache, of what was defined; None when nowhere is writable.
+    """
+    from sysid.engine.straight_line import intrinsics, outlined
+
+    names = dict(scope)
+    path, content = _kept(name, lambda: outlined(text, names))
+    exec(compile(content, str(path or "<kernel>"), "exec"), scope)
+    scope |= intrinsics(content, names)
+    return path
 
 
 def compiled_text(name: str, text: str, functions: Sequence[str]) -> list[Any]:
@@ -155,9 +159,8 @@ def compiled_text(name: str, text: str, functions: Sequence[str]) -> list[Any]:
     >>> double(1.5)
     3.0
     """
-    path = _source_file(f"{name}_{_key(text, {})}.py", text)
     scope: dict[str, Any] = {"math": math, "__name__": __name__}
-    _execute(text, scope, path)
+    path = _define(f"{name}_{_key(text, {})}.py", text, scope)
     for key, item in scope.items():
         if isinstance(item, types.FunctionType) and key not in functions:
             scope[key] = _njit(item)
@@ -321,19 +324,31 @@ def _intrusion(folder: Path) -> str | None:
     return "others may write to it" if status.st_mode & 0o022 else None
 
 
-def _source_file(name: str, text: str) -> Path | None:
-    """Write the kernel's text where Numba can cache beside it; None when nowhere is writable."""
+def _kept(name: str, write: Callable[[], str]) -> tuple[Path | None, str]:
+    """A text by its name in the cache, written where it is not there whole; its file, and the text.
+
+    Numba caches beside the file; there is none where nothing can be written.
+    """
     folder = cache_folder()
-    if folder is None:
-        return None
-    path = folder / name
-    try:
-        if path.exists():
-            return path
-        write_cached(path, text.encode())
-    except OSError:
-        return None
-    return path
+    path = folder and folder / name
+    if path is not None:
+        with contextlib.suppress(OSError, ValueError):
+            content = path.read_text("utf-8")
+            head, _, text = content.partition("\n")
+            if head == _digest(text):
+                return path, content
+    text = write()
+    content = f"{_digest(text)}\n{text}"
+    if path is not None:
+        with contextlib.suppress(OSError):
+            write_cached(path, content.encode())
+            return path, content
+    return None, content
+
+
+def _digest(text: str) -> str:
+    """A comment of Python by which a text is known to be whole."""
+    return f"# {hashlib.sha256(text.encode()).hexdigest()}"
 
 
 def write_cached(path: Path, content: bytes) -> None:

@@ -14,7 +14,8 @@ import ast
 import builtins
 import functools
 import inspect
-from collections.abc import Iterator, Mapping, Sequence
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -31,29 +32,55 @@ _COMPARISONS = {
     ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!="
 }  # fmt: skip
 _BINARY = (*_ARITHMETIC, ast.Div)
+_RUN = "_run_"  # how the names of runs begin
 _EXTREMES = {max: ast.Gt(), min: ast.Lt()}
 _BUILTINS = ("abs", "max", "min")
 
 
-def outlined(text: str, names: Mapping[str, Any]) -> tuple[ast.Module, dict[str, Any]]:
-    """A module's syntax tree with calls in the place of its runs, and what they call by name.
+def outlined(text: str, names: Mapping[str, Any]) -> str:
+    """A module's text with its runs as functions, called in their place: see ``intrinsics``.
 
     names: what the module's functions find beside each other.
     """
     module = ast.parse(text)
-    functions = [node for node in module.body if isinstance(node, ast.FunctionDef)]
-    straight = {node.name: node for node in functions if _Syntax(names).function(node)}
+    syntax = _syntax(module, names)
+    runs: list[ast.stmt] = []
+    for function in _functions(module):
+        if not syntax.is_straight(ast.Name(function.name)):
+            _Outliner(function, syntax, runs).replace(function.body)
+    module.body += runs
+    return ast.unparse(ast.fix_missing_locations(module))
+
+
+def intrinsics(text: str, names: Mapping[str, Any]) -> dict[str, Any]:
+    """What takes the place of the runs in an outlined text, by name.
+
+    The text is looked into once something is compiled that calls one.
+    """
+
+    @functools.cache
+    def parsed() -> tuple[dict[str, ast.FunctionDef], _Syntax]:
+        module = ast.parse(text)
+        return {node.name: node for node in _functions(module)}, _syntax(module, names)
+
+    heads = re.findall(rf"^def ({_RUN}\w+)\((.*)\):$", text, re.MULTILINE)
+    return {name: _intrinsic(name, takes.split(", "), parsed) for name, takes in heads}
+
+
+def _functions(module: ast.Module) -> list[ast.FunctionDef]:
+    return [node for node in module.body if isinstance(node, ast.FunctionDef)]
+
+
+def _syntax(module: ast.Module, names: Mapping[str, Any]) -> "_Syntax":
+    """Of runs in a module, which may call what is a run throughout."""
+    plain = _Syntax(names)
+    straight = {node.name: node for node in _functions(module) if plain.function(node)}
     numbers = {
         node.targets[0].id: node.value.value
         for node in module.body
         if isinstance(node, ast.Assign) and isinstance(node.value, ast.Constant)
     }
-    syntax = _Syntax({**names, **straight, **numbers})
-    called: dict[str, Any] = {}
-    for function in functions:
-        if function.name not in straight:
-            _Outliner(function, syntax, called).replace(function.body)
-    return ast.fix_missing_locations(module), called
+    return _Syntax({**names, **straight, **numbers})
 
 
 class _Syntax:
@@ -64,9 +91,10 @@ class _Syntax:
 
     def function(self, node: ast.FunctionDef) -> bool:
         """Whether a function is a run that ends with its result."""
-        *body, last = _without_marks(node.body)
-        plain = isinstance(last, ast.Return) and last.value and self.expression(last.value)
-        return bool(plain) and all(map(self.statement, body))
+        match _without_marks(node.body):
+            case [*body, ast.Return(ast.expr() as value)]:
+                return self.expression(value) and all(map(self.statement, body))
+        return False
 
     def statement(self, node: ast.stmt) -> bool:
         if isinstance(node, ast.AugAssign):
@@ -169,8 +197,8 @@ def _read_first(run: Sequence[ast.stmt]) -> set[str]:
 class _Outliner:
     """Puts calls in the place of one function's runs."""
 
-    def __init__(self, function: ast.FunctionDef, syntax: _Syntax, called: dict[str, Any]) -> None:
-        self._name, self._syntax, self._called = function.name, syntax, called
+    def __init__(self, function: ast.FunctionDef, syntax: _Syntax, runs: list[ast.stmt]) -> None:
+        self._syntax, self._runs = syntax, runs
         self._locals = _stored(function) | {argument.arg for argument in function.args.args}
         self._needed = self._needed_in(function.body)
 
@@ -221,14 +249,22 @@ class _Outliner:
     def _call(self, run: list[ast.stmt]) -> ast.stmt:
         takes = sorted(_read_first(run) & self._locals)
         leaves = sorted(set().union(*map(_stored, run)) & self._needed)
-        name = f"_{self._name}_{len(self._called)}"
-        self._called[name] = _intrinsic(run, self._syntax, takes, leaves)
-        call = ast.Call(ast.Name(name, ast.Load()), [ast.Name(n, ast.Load()) for n in takes], [])
-        place = {"lineno": run[0].lineno, "col_offset": run[0].col_offset}
-        if not leaves:
-            return ast.Expr(call, **place)
-        targets = [ast.Name(name, ast.Store()) for name in leaves]
-        return ast.Assign([ast.Tuple(targets, ast.Store())], call, **place)
+        name = f"{_RUN}{len(self._runs)}"
+        self._runs.append(_function(name, takes, run, leaves))
+        call = ast.Call(ast.Name(name), [ast.Name(n) for n in takes], [])
+        return ast.Assign([_names(leaves, ast.Store())], call) if leaves else ast.Expr(call)
+
+
+def _function(
+    name: str, takes: Sequence[str], run: Sequence[ast.stmt], leaves: Sequence[str]
+) -> ast.stmt:
+    """A function of names that does what a run does and gives what it leaves."""
+    arguments = ast.arguments([], [ast.arg(n) for n in takes], None, [], [], None, [])
+    return ast.FunctionDef(name, arguments, [*run, ast.Return(_names(leaves, ast.Load()))], [])
+
+
+def _names(names: Sequence[str], use: ast.expr_context) -> ast.Tuple:
+    return ast.Tuple([ast.Name(name, use) for name in names], use)
 
 
 def _inner(node: ast.stmt) -> list[list[ast.stmt]]:
@@ -237,33 +273,33 @@ def _inner(node: ast.stmt) -> list[list[ast.stmt]]:
 
 
 def _intrinsic(
-    run: Sequence[ast.stmt], syntax: _Syntax, takes: Sequence[str], leaves: Sequence[str]
+    name: str,
+    takes: Sequence[str],
+    parsed: Callable[[], tuple[Mapping[str, ast.FunctionDef], _Syntax]],
 ) -> Any:
-    """What does as a run does; takes, leaves: names of what it is given and gives."""
+    """What does as a run does."""
 
-    def left(writer: "_Writer", values: Sequence[Any]) -> tuple[Any, ...]:
-        after = writer.after(run, dict(zip(takes, values, strict=True)), syntax)
-        return tuple(after[name] for name in leaves)
+    def results(writer: "_Writer", values: Sequence[Any]) -> tuple[Any, ...]:
+        functions, syntax = parsed()
+        return _Frame(writer, {}, syntax).result(functions[name], values)
 
     def code(context: Any, *arguments: Any) -> Any:
         writer = _Writer(context)
         kinds = [_plain(kind) for kind in arguments]
-        results = left(writer, [writer.taken(kind) for kind in kinds])
-        result = _kind(results) if leaves else types.none
+        leaves = results(writer, [writer.taken(kind) for kind in kinds])
+        result = _kind(leaves) if leaves else types.none
 
         def generate(target: Any, builder: Any, signature: Any, given: Any) -> Any:
             writer = _Writer(context, target, builder)
-            results = left(writer, [*map(writer.taken, kinds, given)])
-            if not leaves:
-                return target.get_dummy_value()
-            return writer.held(results)
+            held = writer.held(results(writer, [*map(writer.taken, kinds, given)]))
+            return held if leaves else target.get_dummy_value()
 
         return result(*kinds), generate
 
     # Arguments by their names: what stands behind a star would come as one tuple.
-    names = ["context", *takes]
     kind = inspect.Parameter.POSITIONAL_OR_KEYWORD
-    code.__signature__ = inspect.Signature([inspect.Parameter(name, kind) for name in names])
+    names = [inspect.Parameter(argument, kind) for argument in ("context", *takes)]
+    code.__signature__ = inspect.Signature(names)
     return intrinsic(code)
 
 
@@ -308,15 +344,6 @@ class _Writer:
             return value.held
         items = [*map(self.held, value)]
         return self._target.make_tuple(self._builder, _kind(value), items)
-
-    def after(
-        self, run: Sequence[ast.stmt], values: dict[str, Any], syntax: _Syntax
-    ) -> dict[str, Any]:
-        """Values of all names after a run."""
-        frame = _Frame(self, dict(values), syntax)
-        for node in run:
-            frame.execute(node)
-        return frame.values
 
     def constant(self, number: float) -> _Value:
         kind = _INT if isinstance(number, int) else _FLOAT
@@ -492,14 +519,18 @@ class _Frame:
         index = self.value(place)
         return [*index] if isinstance(index, tuple) else [index]
 
-    def _result(self, function: ast.expr, arguments: list[Any]) -> Any:
+    def _result(self, function: ast.expr, arguments: Sequence[Any]) -> Any:
         called = self._syntax.function_of(function)
         if called in (max, min):
             return functools.reduce(functools.partial(self._extreme, called), arguments)
-        if not isinstance(called, ast.FunctionDef):
-            return self._writer.call(called, arguments)
-        names = [argument.arg for argument in called.args.args]
-        *body, last = _without_marks(called.body)
+        if isinstance(called, ast.FunctionDef):
+            return self.result(called, arguments)
+        return self._writer.call(called, arguments)
+
+    def result(self, function: ast.FunctionDef, arguments: Sequence[Any]) -> Any:
+        """What a function of the text gives."""
+        names = [argument.arg for argument in function.args.args]
+        *body, last = _without_marks(function.body)
         inner = _Frame(self._writer, dict(zip(names, arguments, strict=True)), self._syntax)
         for node in body:
             inner.execute(node)

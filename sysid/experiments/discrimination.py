@@ -103,7 +103,7 @@ def discriminate(
     generations: int = 6,
     offspring: int = 16,
     starts: int = 3,
-    accuracy: float = 1e-4,
+    accuracy: float = 1e-3,
     seed: int = 0,
     watch: Callable[[int, int], None] | None = None,
 ) -> Discrimination:
@@ -169,7 +169,7 @@ def discriminate(
     tournament.points.append(tournament.refit(_answers(search.pool[:runs]), begins)[0])
     search.revise(tournament.judged)
     tournament.judge_possible(search.pool, runs)
-    best: tuple[float, list[RunCandidate]] = (-1.0, [])
+    best: tuple[float, list[RunCandidate], Point] = (-1.0, [], [])
     for part in np.array_split(np.arange(generations), _REFITS):
         search.aim = tournament.criterion()
         search.choose()
@@ -179,13 +179,15 @@ def discriminate(
         chosen = [search.pool[i] for i in search.chosen]
         point, distances = tournament.refit(_answers(chosen), tournament.points[-1:])
         worst = float(distances[tournament.possible].min())
-        best = max(best, (worst, chosen), key=lambda each: each[0])
+        best = max(best, (worst, chosen, point), key=lambda each: each[0])
         tournament.points.append(point)
         search.revise(tournament.judged)
+    answers = _answers(best[1])
+    begins = [best[2], *(tournament.drawn() for _ in range(starts - 1))]
     sharp = tournament.sharper(_SHARPER * accuracy)
-    logged = [sharp.answers([a.record for a in run]) for run in _answers(best[1])]
-    begins = [*tournament.points, *(tournament.drawn() for _ in range(starts - 1))]
-    contests = _contests(sharp, tournament.possible, *sharp.refit(logged, begins))
+    logged = [sharp.answers([a.record for a in run]) for run in answers]
+    end = sharp.refit(logged, [tournament.refit(answers, begins)[0]])
+    contests = _contests(sharp, tournament.possible, *end)
     runs_of_it = tuple(designed_run(candidate) for candidate in best[1])
     return Discrimination(runs_of_it, contests, search.attempts, search.attempts - search.kept)
 

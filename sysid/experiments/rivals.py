@@ -19,6 +19,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import pinvh
 
 from sysid.arrays import BoolArray, FloatArray
 from sysid.engine.simulation import BatchSimulator
@@ -26,10 +27,13 @@ from sysid.experiments.information import Informant, without_starts
 from sysid.problem.data import Dataset
 from sysid.problem.space import SearchSpace
 
-_ITERATIONS = 40  # of a refit
-_HEAVIEST = 1e9  # damping with which a refit gives up
-_ENOUGH = 1e-3  # share of what is left, by which an iteration must lower it
-_NOTHING = 1e-3  # what is left of which nothing need be fitted
+_ITERATIONS = 30  # of a refit
+_DAMPING = 1e-2  # with which one begins, in parts of the curvature
+_LIGHTEST, _HEAVIEST = 1e-6, 1e4
+_DAMPINGS = 10.0 ** np.arange(-3.0, 5.0)  # that are tried at once, as many as there are lanes
+_ENOUGH = 0.01  # share of what is left, by which an iteration is to lower it
+_PATIENCE = 3  # iterations in a row that lower it by less
+_NOTHING = 0.01  # what is left of which nothing need be fitted
 
 
 @dataclass(frozen=True)
@@ -121,6 +125,24 @@ class Contrast:
         scatter = float(test @ (self.answer.white.reshape(-1) * left) + along @ along / len(along))
         return float(left @ test) / scatter if scatter > 0.0 else 1.0
 
+    def left(self, rival: Hypothesis, vectors: FloatArray) -> FloatArray:
+        """What a rival leaves at other parameters (n, n_parameters), (n,).
+
+        Unknown starts are eliminated by the slopes here.
+        """
+        truth, n_free = self.answer, len(self.joint) - 1
+        outputs = rival.simulator.trajectories(vectors, truth.record, truth.n_steps)
+        weights = truth.weights.reshape(-1)
+        errors = (truth.outputs - outputs).reshape(len(vectors), -1)
+        errors = np.where(weights > 0.0, errors, 0.0)
+        whole: FloatArray = np.sum(weights * errors**2, axis=1)
+        starts = self.slopes[:, n_free:]
+        if starts.shape[1]:
+            push = errors @ (weights[:, None] * starts)
+            inverse = pinvh(starts.T @ (weights[:, None] * starts))
+            whole -= np.einsum("ni,ij,nj->n", push, inverse, push)
+        return whole
+
 
 def contrast(truth: Answer, rival: Hypothesis, chromosome: FloatArray) -> Contrast:
     """What a rival at a chromosome (n_free,) leaves of an answer."""
@@ -162,43 +184,57 @@ def noncentrality(answers: Sequence[Answer], rival: Hypothesis, chromosome: Floa
 def refit(answers: Sequence[Answer], rival: Hypothesis, start: FloatArray) -> FloatArray:
     """Chromosome (n_free,) within the ranges at which a rival leaves least of all answers.
 
-    Damped Gauss-Newton steps along exact tangents (Marquardt 1963), from a chromosome.
+    Damped Gauss-Newton steps along exact tangents, the best of several dampings each (Marquardt,
+    "An algorithm for least-squares estimation of nonlinear parameters", 1963), from a chromosome.
     """
-    space = rival.space
+    space, small, damping = rival.space, 0, _DAMPING
     low, high = space.coded_lower, space.coded_lower + space.width
     at = np.clip(space.encode(start), low, high)
-    joint, damping = _joint(answers, rival, space.decode(at)), 1.0
+    contrasts = [contrast(each, rival, space.decode(at)) for each in answers]
     for _ in range(_ITERATIONS):
-        left = joint[-1, -1]
-        if not np.isfinite(left) or left < _NOTHING:
+        joint = np.sum([each.joint for each in contrasts], axis=0)
+        if not np.isfinite(joint).all() or joint[-1, -1] < _NOTHING:
             break
-        move = _move(joint, damping * rival.ridge, at <= low, at >= high)
-        onward = np.clip(at + move, low, high)
-        chromosome = space.decode(onward)
-        offered = _joint(answers, rival, chromosome) if space.feasible(chromosome) else None
-        if offered is not None and offered[-1, -1] < left:
-            at, joint, damping = onward, offered, max(0.1 * damping, 1e-9)
-            if left - joint[-1, -1] < _ENOUGH * left:
-                break
-        else:
-            damping *= 10.0
+        weights = damping * _DAMPINGS
+        offers = np.clip(at + _moves(joint, rival.ridge, weights, at <= low, at >= high), low, high)
+        rest = _rest(contrasts, rival, offers)
+        best = int(np.argmin(rest))
+        if rest[best] >= joint[-1, -1]:
+            damping = weights[-1]
             if damping > _HEAVIEST:
                 break
+            continue
+        at, damping = offers[best], float(max(weights[best], _LIGHTEST))
+        small = small + 1 if rest[best] > (1.0 - _ENOUGH) * joint[-1, -1] else 0
+        if small == _PATIENCE:
+            break
+        contrasts = [contrast(each, rival, space.decode(at)) for each in answers]
     return space.decode(at)
 
 
-def _joint(answers: Sequence[Answer], rival: Hypothesis, chromosome: FloatArray) -> FloatArray:
-    total: FloatArray = np.sum([contrast(a, rival, chromosome).joint for a in answers], axis=0)
-    return np.asarray(np.where(np.isfinite(total), total, np.inf), dtype=np.float64)
+def _rest(contrasts: Sequence[Contrast], rival: Hypothesis, coded: FloatArray) -> FloatArray:
+    """What is left of all answers at coordinates (n, n_free), infinite where one may not stand."""
+    chromosomes = rival.space.decode(coded)
+    places = [k for k, each in enumerate(chromosomes) if rival.space.feasible(each)]
+    left = np.full(len(coded), np.inf)
+    if places:
+        vectors = rival.space.full(chromosomes[places])
+        left[places] = sum(each.left(rival, vectors) for each in contrasts)
+    return np.where(np.isnan(left), np.inf, left)
 
 
-def _move(joint: FloatArray, ridge: FloatArray, low: BoolArray, high: BoolArray) -> FloatArray:
-    """A damped step; coordinates on a bound of their range do not move across it."""
-    curvature, push = joint[:-1, :-1] + ridge, joint[:-1, -1]
-    move = np.asarray(np.linalg.solve(curvature, push), dtype=np.float64)
-    across = (low & (move < 0.0)) | (high & (move > 0.0))
-    if across.any() and not across.all():
-        inside = np.flatnonzero(~across)
-        move = np.zeros_like(push)
-        move[inside] = np.linalg.solve(curvature[np.ix_(inside, inside)], push[inside])
-    return move
+def _moves(
+    joint: FloatArray, ridge: FloatArray, dampings: FloatArray, low: BoolArray, high: BoolArray
+) -> FloatArray:
+    """Damped steps, (n_dampings, n_free), none across a bound on which a coordinate stands."""
+    curvature, push = joint[:-1, :-1], joint[:-1, -1]
+    moves = np.zeros((len(dampings), len(push)))
+    for move, damping in zip(moves, dampings, strict=True):
+        damped = curvature + ridge + damping * np.diag(np.diag(curvature))
+        move[:] = np.linalg.solve(damped, push)
+        across = (low & (move < 0.0)) | (high & (move > 0.0))
+        if across.any():
+            inside = np.flatnonzero(~across)
+            move[across] = 0.0
+            move[inside] = np.linalg.solve(damped[np.ix_(inside, inside)], push[inside])
+    return moves

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtr, ndtri
 
 from sysid.arrays import BoolArray, FloatArray
 from sysid.experiments import rivals
@@ -18,6 +18,7 @@ from sysid.threads import Workers
 LEVEL = 0.01  # of the test by which a rival is refused
 EVEN = 0.5  # power below which a pair counts as not told apart
 _SECOND = 1e-3  # what pairs beside the worst count, so that of equal sets one is the best
+_ATTEMPTS = 200  # draws for one that keeps a model's constraints
 _LEAST = 1e-9  # noncentrality that counts as none
 
 Point = Sequence[FloatArray]
@@ -34,7 +35,7 @@ def power(noncentrality: FloatArray | float, level: float = LEVEL) -> FloatArray
     [0.01, 0.5, 0.996]
     """
     distance = np.sqrt(np.maximum(noncentrality, 0.0))
-    return np.asarray(norm.cdf(distance - norm.isf(level)), dtype=np.float64)
+    return np.asarray(ndtr(distance + ndtri(level)), dtype=np.float64)
 
 
 @dataclass(frozen=True)
@@ -136,8 +137,7 @@ class Tournament:
 
     def drawn(self) -> Point:
         """All rivals anywhere in their ranges."""
-        spaces = [self.structures[j].space for _, j in self.pairs]
-        return [s.decode(s.coded_lower + self._rng.random(len(s.width)) * s.width) for s in spaces]
+        return [self._anywhere(self.structures[j]) for _, j in self.pairs]
 
     def refit(
         self, runs: Sequence[Sequence[Answer]], begins: Sequence[Point]
@@ -179,6 +179,16 @@ class Tournament:
                 "no run within the limits tells any of the structures from another; give longer "
                 "or more runs, wider limits, other excitations, or less noise"
             )
+
+    def _anywhere(self, structure: Hypothesis) -> FloatArray:
+        """A chromosome that keeps the constraints, or the likeliest if that is hard to find."""
+        space = structure.space
+        for _ in range(_ATTEMPTS):
+            coded = space.coded_lower + self._rng.random(len(space.width)) * space.width
+            chromosome = space.decode(coded)
+            if space.feasible(chromosome):
+                return chromosome
+        return structure.values
 
     def _padded(self, matrix: FloatArray) -> FloatArray:
         """The M of a rival with parameters to spare, which do nothing."""

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, Literal, Self, get_args
 
 import numpy as np
-from sklearn.utils.validation import check_is_fitted
 
 from sysid.arrays import FloatArray
 from sysid.engine.compiler import kalman_filter
@@ -140,6 +139,8 @@ class GASSI(RecordEstimator):
     >>> round(estimator.parameters_["tau"], 6)
     0.2
     """
+
+    fitted = "vector_"
 
     model: ProcessModel | None = None
     _: KW_ONLY
@@ -283,7 +284,7 @@ class GASSI(RecordEstimator):
         outputs are (n_samples,) if those of ``fit`` were; a Dataset starts from its first sample,
         and initial states that the model leaves open are estimated from its outputs.
         """
-        check_is_fitted(self, "vector_")
+        self._check_fitted()
         simulator = self.simulator()
         if isinstance(X, Dataset):
             return free_run(simulator, self.vector_, X)
@@ -298,7 +299,7 @@ class GASSI(RecordEstimator):
 
     def score(self, X: Data, y: FloatArray | None = None, *, records: Any = None) -> float:
         """Mean fit % over outputs and records, divided by 100: 1 is perfect."""
-        check_is_fitted(self, "vector_")
+        self._check_fitted()
         data = self._records(X, y, records, None, reset=False)
         fits = [fit_percent(record.outputs, self.predict(record)) for record in data]
         return float(np.nanmean(fits)) / 100.0
@@ -337,7 +338,7 @@ class GASSI(RecordEstimator):
 
         X, y, records: those of ``fit``. Raises ModelError as ``uncertainty``.
         """
-        check_is_fitted(self, "vector_")
+        self._check_fitted()
         if not PRESETS[self.preset].refine:
             raise ModelError(f"preset {self.preset} has no local refinement, so no intervals")
         if self.stopped_ == "interrupted":
@@ -516,6 +517,3 @@ class GASSI(RecordEstimator):
 
     def _named(self, vector: FloatArray) -> dict[str, float]:
         return dict(zip(self._model().parameter_names, vector.tolist(), strict=True))
-
-    def __sklearn_is_fitted__(self) -> bool:
-        return hasattr(self, "vector_")

@@ -7,7 +7,7 @@ Single errors far from those beside them are outliers too small to be seen in th
 """
 
 import numpy as np
-from scipy.stats import binom, spearmanr
+from scipy.special import bdtrc
 
 from sysid.arrays import BoolArray, FloatArray
 from sysid.judging.residual_tests import residual_test
@@ -60,7 +60,7 @@ def errors_by_speed(
         errors, speeds = np.abs(residual[seen, j]), rates[seen, j]
         if seen.sum() < 50 or not np.ptp(errors) or not np.ptp(speeds):
             continue
-        correlation = float(spearmanr(errors, speeds).statistic)
+        correlation = float(np.corrcoef(_ranks(errors), _ranks(speeds))[0, 1])
         trend[j] = correlation if correlation > _SURE / np.sqrt(seen.sum()) else 0.0
     return trend
 
@@ -86,7 +86,7 @@ def errors_alone(residual: FloatArray) -> FloatArray:
         limit = _ALONE / _ROBUST * float(np.median(size[size > 0.0]))
         beside = np.maximum(np.roll(size, 1), np.roll(size, -1))
         count = int(np.sum((size > limit) & (size > beside)))
-        if binom.sf(count - 1, n, _HEAVY) < _BY_CHANCE:
+        if bdtrc(count - 1, n, _HEAVY) < _BY_CHANCE:
             share[j] = count / n
     return share
 
@@ -99,3 +99,9 @@ def _explained(residual: FloatArray, systematic: FloatArray) -> BoolArray:
     expected = np.sqrt(np.mean(np.sum(systematic**2, axis=2), axis=0))
     explained: BoolArray = ~(expected < _EXPECTED * size)
     return explained
+
+
+def _ranks(values: FloatArray) -> FloatArray:
+    """Rank of each value (n,), the mean of their ranks for equal ones."""
+    _, place, counts = np.unique(values, return_inverse=True, return_counts=True)
+    return np.asarray((np.cumsum(counts) - 0.5 * (counts - 1))[place], dtype=np.float64)

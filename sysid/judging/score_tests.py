@@ -16,6 +16,7 @@ residuals; their own, whatever their variance along the record and with what col
 the smallest probability is taken into the regression, and the rest asked again.
 """
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -24,7 +25,7 @@ from typing import get_args
 import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.optimize import nnls
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from sysid.arrays import BoolArray, FloatArray
 from sysid.fitting.objective import Objective
@@ -367,7 +368,7 @@ class _Regression:
         whole = np.zeros(len(size))
         whole[used] = amplitudes / size[used]
         return _Result(
-            float(chi2.logsf(self._statistic(left, score), freedom)),
+            _log(float(chdtrc(freedom, self._statistic(left, score)))),
             whole,
             self._coefficients + move,
             move,
@@ -533,3 +534,7 @@ def description(finding: Finding) -> str:
 
 
 __all__ = ["Finding", "ModelError", "Move", "describe", "description", "missing_physics"]
+
+
+def _log(chance: float) -> float:
+    return math.log(chance) if chance > 0.0 else -math.inf

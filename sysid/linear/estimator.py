@@ -6,7 +6,6 @@ from dataclasses import KW_ONLY, dataclass
 from typing import Any, ClassVar, Self
 
 import numpy as np
-from sklearn.utils.validation import check_is_fitted
 
 from sysid.arrays import BoolArray, FloatArray
 from sysid.linear.output_error import Drive, OutputErrorFit, fit_output_error
@@ -35,6 +34,8 @@ Fit = EquationFit | OutputErrorFit
 @dataclass(repr=False, eq=False)
 class PolynomialModel(RecordEstimator):
     """A(q) y = B(q) u + offset + C(q) e, at rest at an operating point before each record."""
+
+    fitted = "theta_"
 
     _: KW_ONLY
     offset: bool = True
@@ -70,7 +71,7 @@ class PolynomialModel(RecordEstimator):
         A Dataset starts with those ``n_lags_`` first rows with which the whole record fits best;
         each of the ``records`` of an array from rest. (n_samples,) if the outputs of ``fit`` were.
         """
-        check_is_fitted(self)
+        self._check_fitted()
         datasets = given_datasets(X)
         if datasets is not None:
             return self._fitted_run(self._checked(datasets))
@@ -85,7 +86,7 @@ class PolynomialModel(RecordEstimator):
         them define the start. Before the first row inputs are at ``input_mean_`` and outputs at
         ``initial[0]``, by default ``output_mean_``.
         """
-        check_is_fitted(self)
+        self._check_fitted()
         inputs, q = self._inputs(X, reset=False), len(self.offset_)
         if initial is None:
             return self._shaped(self._free_run(inputs))
@@ -110,7 +111,7 @@ class PolynomialModel(RecordEstimator):
         prediction. The model starts from rest, so that k >= n_samples gives ``simulate(X)``; no
         noise is read off the first ``n_lags_`` rows. Ljung, System Identification, section 3.2.
         """
-        check_is_fitted(self)
+        self._check_fitted()
         if isinstance(k, bool) or not isinstance(k, int | np.integer) or k < 1:
             raise ModelError(f"k is {k!r}; predict 1 or more whole samples ahead")
         datasets = given_datasets(X)
@@ -136,7 +137,7 @@ class PolynomialModel(RecordEstimator):
         self, X: Data, y: FloatArray | None = None, *, records: Any = None, dt: float | None = None
     ) -> float:
         """Mean fit % of free runs, as ``predict`` of a Dataset, divided by 100; 1 is perfect."""
-        check_is_fitted(self)
+        self._check_fitted()
         data = given_datasets(X) or self._arrays(X, y, records, dt, reset=False)
         fits = [free_run_fit(r.outputs, self._fitted_run(self._checked([r])))[0] for r in data]
         return float(np.nanmean(fits)) / 100.0

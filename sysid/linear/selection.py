@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from sklearn.base import clone
 
 from sysid.arrays import FloatArray
 from sysid.linear.estimator import PolynomialModel, check_alike, free_run_fit
@@ -122,7 +121,7 @@ def select_orders(
     if threads < 1:
         raise ModelError(f"threads is {threads}; it must be 1 or more")
     grid = _grid(estimator, {"nf": nf, "na": na, "nb": nb, "nc": nc, "nk": nk})
-    lag = max(clone(estimator).set_params(**orders)._layout(train[0]).lag for orders in grid)
+    lag = max(estimator.like(**orders)._layout(train[0]).lag for orders in grid)
     judge = _Judge(estimator, train, test, lag)
     with one_thread(), ThreadPoolExecutor(threads) as pool:
         candidates = list(pool.map(judge.candidate, grid))
@@ -151,7 +150,7 @@ def tuned(
         last.append(record.part(cut, record.n_samples, record.name))
     grid = {name: TRIED[name] for name in TRIED.keys() & estimator.get_params()}
     selection = select_orders(estimator, first, last, **grid | orders)
-    return replace(selection, model=clone(estimator).set_params(**selection.best.orders).fit(data))
+    return replace(selection, model=estimator.like(**selection.best.orders).fit(data))
 
 
 class _Judge(NamedTuple):
@@ -163,7 +162,7 @@ class _Judge(NamedTuple):
     lag: int
 
     def fitted(self, orders: Orders) -> PolynomialModel:
-        model: PolynomialModel = clone(self.estimator).set_params(**orders)
+        model: PolynomialModel = self.estimator.like(**orders)
         model._fit_rows(self.lag, self.training)
         return model
 

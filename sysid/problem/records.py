@@ -1,11 +1,15 @@
-"""What a user hands to an estimator, arrays or Datasets, as a list of records."""
+"""Estimators of records, and what a user hands to them, arrays or Datasets.
+
+They are estimators of scikit-learn's kind that do not import it, which takes a second: of its
+tools only arrays need any, and all of them take such estimators
+(https://scikit-learn.org/stable/developers/develop.html).
+"""
 
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import fields
+from typing import Any, ClassVar, Self
 
 import numpy as np
-from sklearn.base import BaseEstimator, RegressorMixin
-from sklearn.utils.validation import check_array, validate_data
 
 from sysid.arrays import FloatArray
 from sysid.problem.data import Dataset
@@ -43,10 +47,51 @@ def split(n: int, labels: Any) -> list[slice]:
     return [slice(a, b) for a, b in zip(starts, [*starts[1:], n], strict=True)]
 
 
-class RecordEstimator(RegressorMixin, BaseEstimator):  # type: ignore[misc]
-    """A scikit-learn regressor whose rows are samples in time."""
+class RecordEstimator:
+    """A regressor of scikit-learn's kind whose rows are samples in time; a dataclass of settings.
 
+    It is fitted once it has what ``fitted`` names.
+    """
+
+    fitted: ClassVar[str]
     _flat = False  # whether the outputs of ``fit`` were one-dimensional
+
+    def get_params(self, deep: bool = True) -> dict[str, Any]:
+        """The settings by name; ``deep`` changes nothing: none is an estimator."""
+        return {name: getattr(self, name) for name in _settings(self)}
+
+    def set_params(self, **settings: Any) -> Self:
+        """Change settings in place; ValueError for what is none."""
+        for name, value in settings.items():
+            if name not in _settings(self):
+                raise ValueError(
+                    f"Invalid parameter {name!r} for estimator {self}: it has "
+                    f"{', '.join(_settings(self))}"
+                )
+            setattr(self, name, value)
+        return self
+
+    def like(self, **settings: Any) -> Self:
+        """A new estimator, not fitted, with its settings but for those given."""
+        return type(self)(**self.get_params()).set_params(**settings)
+
+    def __repr__(self) -> str:
+        plain = {field.name: field.default for field in _settings(self).values()}
+        changed = [
+            f"{name}={value!r}"
+            for name, value in self.get_params().items()
+            if value is not plain[name] and repr(value) != repr(plain[name])
+        ]
+        return f"{type(self).__name__}({', '.join(changed)})"
+
+    def __sklearn_is_fitted__(self) -> bool:
+        return hasattr(self, self.fitted)
+
+    def _check_fitted(self) -> None:
+        if not self.__sklearn_is_fitted__():
+            from sklearn.exceptions import NotFittedError
+
+            raise NotFittedError(f"{type(self).__name__} is not fitted yet: call fit first")
 
     def _step(self, dt: float | None) -> float:
         """Sample time [s] of arrays, given as ``dt`` or otherwise known."""
@@ -63,11 +108,9 @@ class RecordEstimator(RegressorMixin, BaseEstimator):  # type: ignore[misc]
             return self._arrays(X, y, records, dt, reset)
         if y is not None:
             raise ModelError("Datasets bring their outputs: leave y out")
-        if reset and data[0].inputs.shape[1] > 0:
-            self._inputs(data[0].inputs, reset=True)
-        elif reset:
-            # A free motion: scikit-learn knows no table without columns.
-            self.n_features_in_ = 0
+        if reset:
+            self.n_features_in_ = data[0].inputs.shape[1]
+            vars(self).pop("feature_names_in_", None)  # of an earlier fit to a table
         return data
 
     def _arrays(self, X: Any, y: Any, records: Any, dt: float | None, reset: bool) -> list[Dataset]:
@@ -78,6 +121,8 @@ class RecordEstimator(RegressorMixin, BaseEstimator):  # type: ignore[misc]
                 f"{name} requires y to be passed, but the target y is None: give Datasets, or "
                 "the outputs as y"
             )
+        from sklearn.utils.validation import check_array
+
         outputs = check_array(
             y, ensure_2d=False, ensure_all_finite="allow-nan", dtype=np.float64, input_name="y",
             estimator=name,
@@ -96,6 +141,8 @@ class RecordEstimator(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         ]
 
     def _inputs(self, X: Any, reset: bool) -> FloatArray:
+        from sklearn.utils.validation import validate_data
+
         inputs: FloatArray = validate_data(
             self, X, reset=reset, dtype=np.float64, ensure_min_samples=2 if reset else 1
         )
@@ -105,6 +152,12 @@ class RecordEstimator(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         return outputs[:, 0] if self._flat else outputs
 
     def __sklearn_tags__(self) -> Any:
-        tags = super().__sklearn_tags__()
-        tags.target_tags.multi_output = True
-        return tags
+        from sklearn.utils import InputTags, RegressorTags, Tags, TargetTags
+
+        target = TargetTags(required=True, multi_output=True)
+        return Tags("regressor", target, regressor_tags=RegressorTags(), input_tags=InputTags())
+
+
+def _settings(estimator: Any) -> dict[str, Any]:
+    """The fields of an estimator's settings by name."""
+    return {field.name: field for field in fields(estimator) if field.init}

@@ -13,7 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import linalg, stats
+from scipy import linalg, special
 
 from sysid.arrays import FloatArray
 from sysid.uncertainty.colour import record_rows
@@ -55,7 +55,7 @@ class LogSpread:
         variance = (n - 1) / n * np.sum((moves - moves.mean()) ** 2)
         shares = np.einsum("p,kpr,r->k", gradient, self.information, gradient)
         if np.sum(shares) ** 2 > _FEWEST * np.sum(shares**2):
-            quantile = stats.t.ppf(0.975, _freedom(shares / shares.sum())) / Z95
+            quantile = special.stdtrit(_freedom(shares / shares.sum()), 0.975) / Z95
             return max(noise, float(quantile * np.sqrt(variance)))
         return max(noise * float(np.sqrt(self.ratio)), float(np.sqrt(variance)))
 
@@ -93,7 +93,7 @@ def spread(
     # The jackknife's own variance is too large on average where some logs tell most.
     ratios = np.sum(parts**2, axis=0) / np.maximum(noise, 1e-12 * noise[-1])
     chance = _CHANCE if logs else _CHANCE_OF_PARTS
-    if stats.chi2.sf(freedom @ ratios, freedom.sum()) > chance:
+    if special.chdtrc(freedom.sum(), freedom @ ratios) > chance:
         return None
     information = np.einsum("pi,kij,rj->kpr", back, leverages, back, optimize=True)
     return LogSpread(moves @ back.T, information, float(freedom @ ratios / freedom.sum()))

@@ -9,8 +9,8 @@ import yaml
 from daq import record
 from daq.config.yaml_file import TypedSettings
 from daq.designs.bench import PlantBench
-from daq.designs.design import set_up
 from daq.designs.knowledge import expected_jitter
+from daq.designs.setup import set_up
 from daq.experiment import RunFrame
 from daq.logs.encoder import mean_speeds
 from daq.lookup.classes import find_class

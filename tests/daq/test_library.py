@@ -136,6 +136,20 @@ def test_importing_daq_imports_nothing_heavy(tmp_path):
     assert result.stdout == "[]\n"
 
 
+def test_an_identification_loads_no_statistics_package():
+    # Each takes half a second or more of every command.
+    code = (
+        "import sys, sysid.gassi, sysid.linear, daq.identification.fit, daq.cli.identify, "
+        "daq.identification.baseline; print([m for m in sys.modules if m in sys.argv[1:]])"
+    )
+    heavy = ("sklearn", "scipy.stats", "scipy.signal", "pandas", "matplotlib", "joblib")
+    result = subprocess.run(
+        [sys.executable, "-c", code, *heavy],
+        env=environment(), capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert result.stdout == "[]\n"
+
+
 @pytest.mark.soak
 def test_the_notebook_does_what_it_shows(tmp_path, monkeypatch):
     cells = json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 
 import numpy as np
 
@@ -187,3 +188,12 @@ class Formula:
         needed = np.stack([self.steps_of_each(vectors, record) for record in records], axis=1)
         sse = self.residuals(vectors, records, scales, needed, starts).sse
         return BatchResult(sse, np.zeros(len(vectors), dtype=int), needed.sum(axis=1))
+
+
+def scikit_learn_checks(estimators, **options):
+    """``parametrize_with_checks`` of estimators that are none of scikit-learn's own classes."""
+    from sklearn.utils.estimator_checks import parametrize_with_checks
+
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", ".*does not inherit from")
+        return parametrize_with_checks(estimators, **options)

@@ -8,7 +8,6 @@ from scipy.optimize import least_squares
 from scipy.signal import cont2discrete
 from sklearn.base import clone
 from sklearn.exceptions import NotFittedError
-from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from sysid import ARMAX, ARX, Dataset, ModelError, fit_percent
 from tests.sysid.linear_systems import (
@@ -22,6 +21,7 @@ from tests.sysid.linear_systems import (
     recursion,
     telegraph,
 )
+from tests.sysid.support import scikit_learn_checks
 
 WHITE = np.ones((1, 2))
 
@@ -582,11 +582,11 @@ def expected_failures(model):
 
 # nk=0, because scikit-learn's rows have no time: an output depends on its own row.
 @pytest.mark.soak
-@parametrize_with_checks(
+@scikit_learn_checks(
     [ARX(1, 1, 0), ARMAX(1, 1, 1, 0), ARMAX(1, 1, 1, 0, stable=True, offset=False)],
     expected_failed_checks=expected_failures,
 )
-@pytest.mark.filterwarnings("ignore:.*SCIPY_ARRAY_API")
+@pytest.mark.filterwarnings("ignore:.*SCIPY_ARRAY_API", "ignore:.*does not inherit")
 def test_scikit_learn_checks(estimator, check):
     check(estimator)
 

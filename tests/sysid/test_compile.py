@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from sysid.engine.compiler import compiled_text
 from tests.soak import mostly_soak
 
 PREFIX = """
@@ -216,3 +217,18 @@ def test_a_chosen_folder_of_another_user_is_refused(workshop):
     _, errors = workshop.start(NAME_ONLY="1").communicate(timeout=120)
     assert f"ModelError: RIG_CACHE_DIR: {workshop.cache}: it belongs to another user, and" in errors
     assert not workshop.files()
+
+
+def test_a_kept_text_that_was_cut_is_written_anew(tmp_path, monkeypatch):
+    folder = tmp_path / "kernels"
+    monkeypatch.setenv("RIG_CACHE_DIR", str(folder))
+    text = "def raised(x, y):\n    a = x + y\n    b = a * y\n    c = b - x\n    return c * c\n"
+    (function,) = compiled_text("cut", text, ["raised"])
+    assert function(1.0, 2.0) == 25.0
+    (file,) = folder.glob("cut_*.py")
+    whole = file.read_bytes()
+    for content in (whole[: len(whole) // 2], whole[:-9], b"", b"\xff\0"):
+        file.write_bytes(content)
+        (function,) = compiled_text("cut", text, ["raised"])
+        assert function(1.0, 2.0) == 25.0
+        assert file.read_bytes() == whole

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 from sklearn.model_selection import GroupKFold, cross_val_score
-from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from sysid import GASSI, Input, Output, Parameter, ProcessModel, State
-from tests.sysid.support import motor, motor_record
+from tests.sysid.support import motor, motor_record, scikit_learn_checks
 
 
 def fading(x, u, p):
@@ -50,10 +49,10 @@ def expected_failures(model):
 
 
 @pytest.mark.soak
-@parametrize_with_checks(
+@scikit_learn_checks(
     [AnyWidth(population=8, generations=2, dt=1.0)], expected_failed_checks=expected_failures
 )
-@pytest.mark.filterwarnings("ignore:.*SCIPY_ARRAY_API")
+@pytest.mark.filterwarnings("ignore:.*SCIPY_ARRAY_API", "ignore:.*does not inherit")
 def test_scikit_learn_checks(estimator, check):
     check(estimator)
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numba import njit
 
 from sysid.engine import vector_math
-from sysid.engine.straight_line import outlined
+from sysid.engine.straight_line import intrinsics, outlined
 
 PARTS = """
 def mixed(x, u):
@@ -43,10 +43,11 @@ def kernel(X, rows, n, flag):
 
 def _compiled(text: str, name: str, module: Any) -> Callable[..., Any]:
     scope: dict[str, Any] = {"math": module}
-    tree, runs = outlined(text, scope)
+    content = outlined(text, scope)
+    runs = intrinsics(content, dict(scope))
     assert runs, "nothing was outlined"
+    exec(compile(content, "<test>", "exec"), scope)
     scope |= runs
-    exec(compile(tree, "<test>", "exec"), scope)
     function: Callable[..., Any] = njit(error_model="numpy")(scope[name])
     return function
 

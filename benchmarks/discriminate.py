@@ -1,0 +1,192 @@
+"""Which structures designed experiments tell apart, beside the shipped PRBS of equal time.
+
+python -m benchmarks.discriminate [--json] [--seeds 2] [--time 5] [--candidates 32]
+    [--hysteresis bouc-wen dahl lugre] [--friction none stribeck]
+
+For each pair the noncentrality of the refitted rival, and the probability that a test at 1 %
+refuses it, both at the models' nominal values. Then, for each seed and each structure as the truth,
+hidden parameters are drawn anew, a factor of 0.6 to 1.6 each, the runs are simulated with noise on
+all that is measured, and every structure is fitted to them: a pair is separated where the BIC of
+the rival is larger by more than 10. A truth of which a run would pass a limit is counted beside.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from benchmarks._common import arguments, report
+from daq.config.yaml_file import TypedSettings
+from daq.designs import discrimination
+from daq.designs.setup import Setup, set_up_structures
+from daq.lookup.experiments import load_experiment
+from sysid import BatchSimulator, Discrimination, Excitation, ModelError, SearchSpace, discriminate
+from sysid.arrays import FloatArray
+from sysid.experiments import rivals
+from sysid.experiments.experiment import deviations_of
+from sysid.experiments.information import Informant
+from sysid.experiments.rivals import Answer, Hypothesis
+from sysid.threads import Workers, available_cores, one_thread
+
+RATE, RUN = 800.0, 1.25  # Hz, s
+STRONG = 10.0  # difference of BIC
+SPREAD = 0.6, 1.6  # of hidden values about the nominal ones
+
+
+def main() -> None:
+    parser = arguments(__doc__ or "")
+    parser.add_argument("--seeds", type=int, default=2, help="hidden parameters drawn")
+    parser.add_argument("--time", type=float, default=5.0, help="of all runs [s]")
+    parser.add_argument("--candidates", type=int, default=32, help="runs tried at random")
+    parser.add_argument("--hysteresis", nargs="+", default=["bouc-wen", "dahl", "lugre"])
+    parser.add_argument("--friction", nargs="+", default=["none", "stribeck"])
+    options = parser.parse_args()
+    structures = {"hysteresis": options.hysteresis, "friction": options.friction}
+    question = {"structures": structures, "time": options.time, "run": RUN, "checks": 8}
+    search = {"candidates": options.candidates, "generations": 3, "offspring": 8}
+    report(figures(TypedSettings.of({**question, **search}), options.seeds), options.json, show)
+
+
+def figures(question: TypedSettings, seeds: int) -> dict[str, Any]:
+    setups = set_up_structures(question)
+    begin = time.perf_counter()
+    designed = discrimination.choose(setups)
+    seconds = time.perf_counter() - begin
+    shipped = load_experiment("prbs.yaml").experiment.plan().commands
+    runs = {"designed": [run.inputs for run in designed.runs]}
+    runs["prbs"] = [shipped[: round(RUN * RATE)]] * len(designed.runs)
+    judged = {"designed": designed, "prbs": of_fixed(setups, runs["prbs"])}
+    return {
+        "seconds": seconds,
+        "attempts": designed.attempts,
+        "runs": [{"protocol": run.excitation, **run.settings} for run in designed.runs],
+        "predicted": {name: table(each) for name, each in judged.items()},
+        "separated": {
+            name: [separated(setups, commands, seed) for seed in range(seeds)]
+            for name, commands in runs.items()
+        },
+    }
+
+
+def of_fixed(setups: Mapping[str, Setup], commands: Sequence[FloatArray]) -> Discrimination | None:
+    """What runs that are given would tell; None where they would pass a limit."""
+    first = next(iter(setups.values()))
+    fixed = Excitation("fixed", {}, lambda _: commands[0], 1.0 / RATE)
+    try:
+        return discriminate(
+            {name: each.problem.model for name, each in setups.items()},
+            [fixed],
+            noise=first.noise,
+            runs=len(commands),
+            spaces={name: each.space for name, each in setups.items()},
+            priors={name: each.prior for name, each in setups.items()},
+            benches={name: each.bench for name, each in setups.items()},
+            checks=1,
+            candidates=1,
+            generations=0,
+        )
+    except ModelError:
+        return None
+
+
+def table(judged: Discrimination | None) -> list[dict[str, Any]] | None:
+    if judged is None:
+        return None
+    return [
+        {"truth": c.truth, "rival": c.rival, "distance": c.distance, "probability": c.probability}
+        for c in judged.contests
+    ]
+
+
+@one_thread()
+def separated(
+    setups: Mapping[str, Setup], commands: Sequence[FloatArray], seed: int
+) -> dict[str, Any]:
+    """Pairs that fits to noisy runs of hidden rigs separate, of how many."""
+    hypotheses = [hypothesis(name, each) for name, each in setups.items()]
+    rng = np.random.default_rng(seed)
+    tasks, beyond = [], 0
+    for i, truth in enumerate(hypotheses):
+        answers = noisy(truth, list(setups.values())[i], commands, rng)
+        if answers is None:
+            beyond += 1
+            continue
+        tasks += [(i, j, answers) for j in range(len(hypotheses))]
+    scores: dict[tuple[int, int], float] = {}
+
+    def fit(task: tuple[int, int, list[Answer]]) -> None:
+        i, j, answers = task
+        rival = hypotheses[j]
+        end = rivals.refit(answers, rival, rival.values)
+        left = sum(rivals.contrast(each, rival, end).joint[-1, -1] for each in answers)
+        n = sum(each.outputs.size for each in answers)
+        scores[i, j] = float(left) + len(end) * float(np.log(n))
+
+    Workers(available_cores()).each(fit, tasks)
+    names = [each.name for each in hypotheses]
+    told = {f"{names[i]} / {names[j]}": scores[i, j] - scores[i, i] for i, j, _ in tasks if i != j}
+    return {
+        "separated": sum(difference > STRONG for difference in told.values()),
+        "pairs": len(told),
+        "beyond_limits": beyond,
+        "differences": told,
+    }
+
+
+def noisy(
+    truth: Hypothesis, setup: Setup, commands: Sequence[FloatArray], rng: np.random.Generator
+) -> list[Answer] | None:
+    """What a hidden rig of a structure logs; None where a run would pass a limit."""
+    hidden = drawn(truth.space, rng)
+    there = replace(truth, values=hidden)
+    noise = np.array([setup.noise[name] for name in setup.problem.model.output_names])
+    of_inputs = np.array([setup.noise.get(name, 0.0) for name in setup.problem.model.input_names])
+    answers = []
+    for each in commands:
+        records = setup.bench.records(each, 1.0 / RATE, truth.space.full(hidden[None]))
+        if records is None:
+            return None
+        (record,) = records
+        steps = int(truth.simulator.steps_of_each(truth.space.full(hidden[None]), record)[0])
+        answer = rivals.answer(there, record, steps, np.isfinite(noise))
+        outputs = answer.outputs + noise * rng.standard_normal(answer.outputs.shape)
+        inputs = record.inputs + of_inputs * rng.standard_normal(record.inputs.shape)
+        answers.append(replace(answer, outputs=outputs, record=replace(record, inputs=inputs)))
+    return answers
+
+
+def drawn(space: SearchSpace, rng: np.random.Generator) -> FloatArray:
+    """Hidden values about the nominal ones that keep the model's constraints."""
+    nominal = np.array([parameter.nominal for parameter in space.parameters])
+    while True:
+        hidden = np.clip(nominal * rng.uniform(*SPREAD, len(nominal)), space.lower, space.upper)
+        if space.feasible(hidden):
+            return np.asarray(hidden, dtype=np.float64)
+
+
+def hypothesis(name: str, setup: Setup) -> Hypothesis:
+    model, space, prior = setup.problem.model, setup.space, setup.prior
+    simulator = BatchSimulator(model, threads=1)
+    informant = Informant(simulator, space, *deviations_of(model, setup.noise))
+    return Hypothesis(name, simulator, informant, space, prior.values, prior.information())
+
+
+def show(figures: dict[str, Any]) -> None:
+    print(f"\n{figures['seconds']:.0f} s, {figures['attempts']} runs simulated")
+    for name, rows in figures["predicted"].items():
+        print(f"\n{name}: chi-square distance, probability of refusal")
+        for row in rows or ():
+            print(f"  {row['truth']:38} {row['rival']:38} {row['distance']:10.4g} "
+                  f"{100 * row['probability']:6.1f} %")  # fmt: skip
+    for name, seeds in figures["separated"].items():
+        shares = [f"{each['separated']} of {each['pairs']}" for each in seeds]
+        print(f"\n{name}: separated {', '.join(shares)}; beyond limits "
+              f"{[each['beyond_limits'] for each in seeds]}")  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
