@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import datetime
+import math
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from daq.characterise.mounts import Ask, MountedRig, mounted_rigs
 from daq.characterise.page import write_page
 from daq.characterise.rounds import Interval, Request, Round, rounds_of
 from daq.config.yaml_file import TypedSettings
 from daq.designs.design import choose, write
 from daq.designs.runs import DATA
-from daq.designs.setup import set_up
+from daq.designs.setup import Setup, set_up
 from daq.errors import ConfigError, RigError, Terminated
 from daq.files import make_folder
 from daq.identification.fit import check_writable, fit
@@ -25,15 +29,17 @@ from daq.logs.capture import LOG_NAME
 from daq.lookup.models import whole_name
 from daq.lookup.rigs import load_rig
 from daq.notation import quantity
-from daq.progress import Started, Watch, ignore
+from daq.progress import Note, Started, Watch, ignore
 from daq.recording.session import record
 from daq.report.publication import publish
 from daq.views import Lines, Shown
+from sysid import Design
 
 _FIRST = 0.25  # of the time, for a first round, from what little is known
 _LATER = 0.5  # of what is left, for each that follows
 _LEAST = 2  # runs of a last round: fewer join the round before
 _SEEDS = 2**32  # that a simulated rig takes
+_WORTH = 0.9  # of the widths, to which another mounting must be expected to bring them
 _GAIN = 0.98  # of the widths, to which a round must be expected to bring them
 
 
@@ -94,13 +100,16 @@ def characterise(
     plant: str | None = None,
     config: str | Path | None = None,
     settings: Sequence[str] = (),
+    ask: Ask | None = None,
     watch: Watch = ignore,
 ) -> Characterisation:
     """Find a rig's parameters: design runs, run them, identify, and again.
 
     time: logged time of all runs, at most [s]. precision: half width wanted of all 95 % intervals
     [%], None for as narrow as they get. out: a new folder for all of it. settings: keys of the
-    designs, as ``key=value``. Raises ConfigError before anything moves, and what a run raises.
+    designs, as ``key=value``. ask: tells a person to change to another mounting of the rig's
+    file where that tells more; None: it stays as it is. Raises ConfigError before anything moves,
+    and what a run raises.
     """
     request = Request(
         _absolute(rig) if Path(rig).exists() else str(rig),
@@ -110,34 +119,39 @@ def characterise(
         None if plant is None else whole_name(plant),
         None if config is None else _absolute(config),
         tuple(settings),
+        ask is not None,
     )
     load_rig(str(rig), watch=watch)
     now = datetime.datetime.now(datetime.UTC)
     folder = Path(out) if out is not None else Path("runs") / f"{now:%Y%m%dT%H%M%SZ}-characterise"
     check_writable(folder)
-    set_up(_question(request, [], request.time), watch)
+    for mounted in mounted_rigs(request):
+        set_up(_question(request, mounted, [], request.time), watch)
     request.save(folder)
-    return resume(folder, watch=watch)
+    return resume(folder, ask=ask, watch=watch)
 
 
-def resume(folder: str | Path, *, watch: Watch = ignore) -> Characterisation:
+def resume(
+    folder: str | Path, *, ask: Ask | None = None, watch: Watch = ignore
+) -> Characterisation:
     """Go on with a characterisation from what is there, however it ended.
 
-    Raises ConfigError where none has begun, or where not even a first round would tell anything,
-    and what a run raises.
+    ask: as of ``characterise``; None: the mounting stays as it is. Raises ConfigError where none
+    has begun, or where not even a first round would tell anything, and what a run raises.
     """
     root = Path(folder)
-    request = Request.load(root)
+    request = replace(Request.load(root), ask=ask is not None)
     try:
-        return _continued(root, request, watch)
+        return _continued(root, request, ask, watch)
     except (KeyboardInterrupt, Terminated, RigError) as stop:
         if not isinstance(stop, ConfigError) or rounds_of(root):
             command = f"rig characterise --resume {shlex.quote(str(root))}"
+            command += " --ask" * (ask is not None)
             stop.add_note(f"what was done until then is kept; go on with: {command}")
         raise
 
 
-def _continued(root: Path, request: Request, watch: Watch) -> Characterisation:
+def _continued(root: Path, request: Request, ask: Ask | None, watch: Watch) -> Characterisation:
     done = rounds_of(root)
     reason = _end(request, done)
     while not reason:
@@ -149,7 +163,8 @@ def _continued(root: Path, request: Request, watch: Watch) -> Characterisation:
             if "missing" not in done[-1].result:
                 _identify(done, request, watch, ends=True)
             break
-        _run(current, request, done, watch)
+        _change_mounting(current, request, done, ask)
+        _run(current, done, watch)
         _identify([*done, current], request, watch)
         done.append(current)
         write_page(root, done, "still running")
@@ -200,13 +215,15 @@ def _spent(done: Sequence[Round]) -> float:
     return sum(each.seconds for each in done)
 
 
-def _question(request: Request, done: Sequence[Round], seconds: float) -> TypedSettings:
-    """What the design of the next round is asked, of so many seconds."""
+def _question(
+    request: Request, mounted: MountedRig, done: Sequence[Round], seconds: float
+) -> TypedSettings:
+    """What the design of the next round is asked, of so many seconds, on a rig as it is mounted."""
     last = done[-1] if done else None
     options = {
-        "rig": request.rig,
+        "rig": mounted.rig,
         "model": request.model,
-        "plant": request.plant,
+        "plant": mounted.plant,
         "config": request.config,
         "parameters": None if last is None else str(last.identification),
         "log": None if last is None else str(last.captures(last.experiments[0])[0]),
@@ -218,32 +235,78 @@ def _question(request: Request, done: Sequence[Round], seconds: float) -> TypedS
 
 
 def _design(current: Round, request: Request, done: Sequence[Round], watch: Watch) -> bool:
-    """Design a round, unless it is there; whether it promises to tell more."""
+    """Design a round, unless it is there; whether it promises to tell more.
+
+    The first one is for the rig as it is mounted, each later one for the mounting that tells most.
+    """
     if not current.is_designed:
         watch(Started(f"round {current.number}"))
-        left = request.time - _spent(done)
-        share = _LATER * left if done else _FIRST * left
-        question = set_up(_question(request, done, left), watch).question
-        runs, most = max(1, round(share / question.seconds)), question.most_runs
-        if most - runs < _LEAST:
-            runs = most
-        setup = set_up(_question(request, done, runs * question.seconds))
-        write(setup, choose(setup, watch), current.folder)
+        at = done[-1].rig if done else request.rig
+        rigs = mounted_rigs(request)
+        # That on which it is comes first: where another tells hardly more nobody has to change it.
+        rigs = sorted(rigs if done else rigs[:1], key=lambda mounted: mounted.rig != at)
+        best: tuple[float, Setup, Design] | None = None
+        for mounted in rigs:
+            try:
+                setup, chosen = _chosen(request, mounted, done, watch)
+            except ConfigError as error:
+                if best is None and mounted is rigs[-1]:
+                    raise
+                watch(Note("note", f"no run for the mounting of {mounted.rig}: {error}"))
+                continue
+            width = float(np.mean([np.log(q.after) for q in chosen.quantities]))
+            if best is None or width < best[0] + math.log(_WORTH):
+                best = width, setup, chosen
+        assert best is not None
+        write(*best[1:], current.folder)
     return any(q["after"] < _GAIN * q["before"] for q in current.design["quantities"])
 
 
-def _run(current: Round, request: Request, done: Sequence[Round], watch: Watch) -> None:
+def _chosen(
+    request: Request, mounted: MountedRig, done: Sequence[Round], watch: Watch
+) -> tuple[Setup, Design]:
+    """The runs of the next round on a rig as it is mounted."""
+    left = request.time - _spent(done)
+    share = _LATER * left if done else _FIRST * left
+    question = set_up(_question(request, mounted, done, left), watch).question
+    runs, most = max(1, round(share / question.seconds)), question.most_runs
+    if most - runs < _LEAST:
+        runs = most
+    setup = set_up(_question(request, mounted, done, runs * question.seconds))
+    return setup, choose(setup, watch)
+
+
+def _change_mounting(
+    current: Round, request: Request, done: Sequence[Round], ask: Ask | None
+) -> None:
+    """Have a person mount the rig for a round, unless it is mounted so.
+
+    Raises ConfigError where nobody can be asked.
+    """
+    at = done[-1].rig if done else request.rig
+    if current.rig == at or any(current.captures(each) for each in current.experiments):
+        return
+    changes = {each.rig: each.change for each in mounted_rigs(replace(request, ask=True))}
+    change = changes.get(current.rig, f"mount it as {current.rig} says")
+    if ask is None:
+        cure = "go on with --ask, and change it when it says so"
+        problem = f"round {current.number} is for another mounting: {change}"
+        raise ConfigError(problem, cure=cure, file=current.folder / DATA)
+    ask(f"round {current.number}: {change} ({current.rig})")
+
+
+def _run(current: Round, done: Sequence[Round], watch: Watch) -> None:
     """Run what of a round's experiments has not been run to its end.
 
     A simulated rig makes the same noise from the same seed: each run has a seed of its own.
     """
-    config, _ = load_rig(request.rig, watch=watch)
+    config, _ = load_rig(current.rig, watch=watch)
     seed: int | None = getattr(config.options, "seed", None)
     first = sum(len(each.experiments) for each in done)
     for place, experiment in enumerate(current.experiments, first):
         if not current.captures(experiment):
             options = None if seed is None else {"seed": (seed + place) % _SEEDS}
-            record(experiment, request.rig, current.runs, options=options, watch=watch)
+            record(experiment, current.rig, current.runs, options=options, watch=watch)
 
 
 def _identify(

@@ -30,6 +30,7 @@ class Request:
 
     time: logged, of all runs together [s]. precision: half width of the 95 % intervals [%], None
     for as narrow as the time allows. settings: further keys of the designs, as ``key=value``.
+    ask: whether a person changes the mounting where another one tells more.
     """
 
     rig: str
@@ -39,6 +40,7 @@ class Request:
     plant: str | None = None
     config: str | None = None
     settings: tuple[str, ...] = ()
+    ask: bool = False
 
     def save(self, folder: Path) -> None:
         """Write it into the folder of the rounds. Raises ConfigError for one with another in it."""
@@ -123,6 +125,11 @@ class Round:
     def experiments(self) -> list[Path]:
         """Its experiments' files, in order."""
         return [self.folder / Path(run["file"]).name for run in self.design["runs"]]
+
+    @property
+    def rig(self) -> str:
+        """The rig's file, as it is mounted for the round."""
+        return str(self.design["rig"])
 
     @property
     def seconds(self) -> float:

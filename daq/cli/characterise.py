@@ -51,6 +51,10 @@ def characterise(
     resume: Annotated[
         Path | None, Option(metavar="DIR", help="Go on with what was interrupted there.")
     ] = None,
+    ask: Annotated[
+        bool,
+        Option("--ask", help="Have another mounting of the rig's file put on where it tells more."),
+    ] = False,
     json: options.AsJson = False,
 ) -> None:
     """Find a rig's parameters: design runs, run them, identify, and again.
@@ -62,7 +66,7 @@ def characterise(
 
     with terminal.watching(json) as watch:
         if resume is not None:
-            result = use_case.resume(resume, watch=watch)
+            result = use_case.resume(resume, ask=_asked if ask else None, watch=watch)
         else:
             result = use_case.characterise(
                 rig,
@@ -73,12 +77,21 @@ def characterise(
                 plant=plant,
                 config=config,
                 settings=settings or [],
+                ask=_asked if ask else None,
                 watch=watch,
             )
     if json:
         terminal.print_json(result.document)
     else:
         _show(result)
+
+
+def _asked(change: str) -> None:
+    """Wait until a person has done what a round needs."""
+    if not terminal.wait_for(f"{change}; then press Enter"):
+        raise ConfigError(
+            f"nobody has answered to: {change}", cure="go on at a terminal, or answer with Enter"
+        )
 
 
 def _number(option: str, text: str, unit: str) -> float:

@@ -86,6 +86,13 @@ def report(level: Level, text: str) -> None:
         sys.stderr.write(f"rig: {mark}{text}\n")
 
 
+def wait_for(text: str) -> bool:
+    """Say what is to be done, and wait for Enter; False where nobody can answer."""
+    sys.stderr.write(f"rig: {text} ")
+    sys.stderr.flush()
+    return bool(sys.stdin.readline())
+
+
 def report_event(event: Event) -> None:
     """A note as loud as it is meant, without showing progress: a ``watch`` for what is quick."""
     if isinstance(event, Note):

@@ -252,6 +252,17 @@ class Amplifiers(Section):
     )
 
 
+class Mounting(Section):
+    """The same rig with something else on its shaft, which a person changes."""
+
+    rig: str = Field(min_length=1, description="rig file that then holds, beside this one")
+    plant: str | None = Field(
+        None,
+        description="model of the whole rig then; default what a simulated rig is",
+        examples=["actuator:load=free,limits=true"],
+    )
+
+
 class RigConfig(Section):
     """A rig: the backend that talks to it, its calibration and its limits."""
 
@@ -267,6 +278,13 @@ class RigConfig(Section):
         "prefer",
         description="real-time scheduling during a run: off, prefer (as far as it is granted), "
         "or require (no run without)",
+    )
+
+    mountings: dict[str, Mounting] = Field(
+        default_factory=dict,
+        description="other ways to mount it, by what a person is told to do; for rig characterise "
+        "--ask",
+        examples=[{"take the load off the shaft": {"rig": "free.yaml"}}],
     )
 
     @property

@@ -159,9 +159,10 @@ def discriminate(
                 return None
             records.append(logged[0])
         answers = tournament.answers(records)
+        if not all(each.finite for each in answers):
+            return None
         run = tournament.judged(AnsweredRun(excitation, genes, tournament.unjudged(), answers))
-        finite = np.isfinite(run.information).all() and all(a.finite for a in answers)
-        return run if finite else None
+        return run if np.isfinite(run.information).all() else None
 
     search = Search(excitations, evaluate, tournament.criterion(), rng, runs, workers, watch)
     search.scatter(candidates)

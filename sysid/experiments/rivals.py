@@ -71,7 +71,8 @@ class Answer:
     @property
     def finite(self) -> bool:
         """Whether its simulation did not fail."""
-        return bool(np.isfinite(self.outputs).all() and np.isfinite(self.weights).all())
+        parts = (self.outputs, self.weights, self.pushes)
+        return all(bool(np.isfinite(part).all()) for part in parts)
 
 
 def answer(structure: Hypothesis, record: Dataset, n_steps: int, counted: BoolArray) -> Answer:
@@ -108,7 +109,7 @@ class Contrast:
 
         ridge: refits first the run alone, with that damping; None: no coordinate moves.
         """
-        if not self.answer.pushes.shape[-1]:
+        if not self.answer.pushes.shape[-1] or not np.isfinite(self.joint).all():
             return 1.0
         n_free, weights = len(self.joint) - 1, self.answer.weights.reshape(-1)
         slopes = self.slopes[:, n_free:] if ridge is None else self.slopes
@@ -135,12 +136,13 @@ class Contrast:
         weights = truth.weights.reshape(-1)
         errors = (truth.outputs - outputs).reshape(len(vectors), -1)
         errors = np.where(weights > 0.0, errors, 0.0)
-        whole: FloatArray = np.sum(weights * errors**2, axis=1)
         starts = self.slopes[:, n_free:]
-        if starts.shape[1]:
-            push = errors @ (weights[:, None] * starts)
-            inverse = pinvh(starts.T @ (weights[:, None] * starts))
-            whole -= np.einsum("ni,ij,nj->n", push, inverse, push)
+        with np.errstate(over="ignore", invalid="ignore"):  # of a simulation that blows up
+            whole: FloatArray = np.sum(weights * errors**2, axis=1)
+            if starts.shape[1]:
+                push = errors @ (weights[:, None] * starts)
+                inverse = pinvh(starts.T @ (weights[:, None] * starts))
+                whole -= np.einsum("ni,ij,nj->n", push, inverse, push)
         return whole
 
 
@@ -154,7 +156,8 @@ def contrast(truth: Answer, rival: Hypothesis, chromosome: FloatArray) -> Contra
     counted = truth.weights.reshape(-1) > 0.0
     columns, errors = np.where(counted[:, None], columns, 0.0), np.where(counted, errors, 0.0)
     beside = np.column_stack([columns[:, :n_free], errors, columns[:, n_free:]])
-    joint = beside.T @ (truth.weights.reshape(-1)[:, None] * beside)
+    with np.errstate(over="ignore", invalid="ignore"):  # of a simulation that blows up
+        joint = beside.T @ (truth.weights.reshape(-1)[:, None] * beside)
     return Contrast(truth, errors, columns, without_starts(joint, n_free + 1))
 
 

@@ -118,6 +118,29 @@ def test_a_first_design_that_promises_nothing_is_refused_in_words(folder):
         assert "go on with" not in done.stderr
 
 
+def test_a_person_is_asked_for_the_mounting_that_tells_more(folder):
+    """Wound up by next to nothing the cable leaves hardly any room; off the shaft there is more."""
+    free = {"backend": "simulated", "options": {"plant": {"load": "free"}}}
+    write_yaml(folder / "free.yaml", free)
+    change = {"take the load off": {"rig": "free.yaml"}}
+    tight = {"backend": "simulated", "limits": {"speed": 4.0}, "mountings": change}
+    write_yaml(folder / "rig.yaml", tight)
+    begin = [*words("rig.yaml", "--time", "2", "--json"), "--ask"]
+    done = rig(*begin, cwd=folder, timeout=400, input="")
+    assert done.returncode == 2
+    assert "round 2: take the load off" in done.stderr
+    assert "--resume c --ask" in done.stderr
+    waiting = rig("characterise", "--resume", "c", cwd=folder, timeout=100)
+    assert waiting.returncode == 2
+    assert "round 2 is for another mounting: take the load off" in waiting.stderr
+    again = ["characterise", "--resume", "c", "--ask", "--json"]
+    done = rig(*again, cwd=folder, timeout=400, input="\n" * 5)
+    assert done.returncode == 0, done.stderr
+    first, second, *_ = rounds_of(folder / "c")
+    assert (folder / "rig.yaml").samefile(first.rig)
+    assert (folder / "free.yaml").samefile(second.rig)
+
+
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no SIGKILL")
 def test_a_killed_characterisation_goes_on_to_the_same_end(finished, folder):
     """Killed again at every further file that it goes on to write."""

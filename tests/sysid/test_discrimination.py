@@ -80,6 +80,23 @@ def test_what_a_refitted_rival_leaves_is_that_of_the_closed_form():
     assert noncentrality([told], rival, end) == pytest.approx(exact, rel=1e-6)
 
 
+def test_a_rival_that_blows_up_on_its_way_is_fitted_all_the_same():
+    grows = ProcessModel(
+        name="growth",
+        states=(State("y", "N"),),
+        inputs=(Input("u", "m"),),
+        outputs=(Output("y", "N"),),
+        parameters=(Parameter("rate", "1/s", -1.0, -5.0, 800.0, minimum=-10.0),),
+        derivative=lambda x, u, p: (p[0] * x[0] + u[0],),
+    )
+    one = structure(grows)
+    told = answer(one, blank(grows, np.ones((60, 1)), DT), 4, np.array([True]))
+    for start in (3.0, 790.0):
+        end = refit([told], one, np.array([start]))
+        assert np.isfinite(end).all()
+    assert refit([told], one, np.array([3.0])) == pytest.approx([-1.0], rel=1e-3)
+
+
 def test_noise_of_an_input_counts_as_the_test_scatters():
     u, sigma = np.linspace(-0.5, 1.5, 60), 0.1
     truth, rival = structure(SQUARE, sigma), structure(LINEAR, sigma)
