@@ -161,8 +161,7 @@ def discriminate(
         answers = tournament.answers(records)
         if not all(each.finite for each in answers):
             return None
-        run = tournament.judged(AnsweredRun(excitation, genes, tournament.unjudged(), answers))
-        return run if np.isfinite(run.information).all() else None
+        return tournament.judged(AnsweredRun(excitation, genes, tournament.unjudged(), answers))
 
     search = Search(excitations, evaluate, tournament.criterion(), rng, runs, workers, watch)
     search.scatter(candidates)

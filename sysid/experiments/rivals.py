@@ -96,7 +96,7 @@ class Contrast:
     """What a rival leaves of an answer, and how it would move.
 
     errors: (n_samples * n_outputs,), slopes: (..., n_free + n_unknown). joint: (n_free + 1,
-    n_free + 1), the M above, unknown starts eliminated.
+    n_free + 1), the M above, unknown starts eliminated; infinite where a simulation failed.
     """
 
     answer: Answer
@@ -158,14 +158,20 @@ def contrast(truth: Answer, rival: Hypothesis, chromosome: FloatArray) -> Contra
     beside = np.column_stack([columns[:, :n_free], errors, columns[:, n_free:]])
     with np.errstate(over="ignore", invalid="ignore"):  # of a simulation that blows up
         joint = beside.T @ (truth.weights.reshape(-1)[:, None] * beside)
+    if not np.isfinite(joint).all():
+        failed = np.full((n_free + 1, n_free + 1), np.inf)
+        return Contrast(truth, errors, columns, failed)
     return Contrast(truth, errors, columns, without_starts(joint, n_free + 1))
 
 
 def scaled(truth: Answer, rival: Hypothesis, chromosome: FloatArray) -> FloatArray:
-    """The M of a run in units of noncentrality, (n_free + 1, n_free + 1)."""
+    """The M of a run in units of noncentrality, (n_free + 1, n_free + 1).
+
+    A run in which the rival fails counts as one that tells nothing.
+    """
     each = contrast(truth, rival, chromosome)
     if not np.isfinite(each.joint).all():
-        return each.joint
+        return np.zeros_like(each.joint)
     matrix: FloatArray = each.efficiency(rival.ridge) * each.joint
     return matrix
 

@@ -19,7 +19,7 @@ from sysid import (
 )
 from sysid.experiments.information import Informant
 from sysid.experiments.prior import Prior
-from sysid.experiments.rivals import Hypothesis, answer, contrast, noncentrality, refit
+from sysid.experiments.rivals import Hypothesis, answer, contrast, noncentrality, refit, scaled
 from sysid.experiments.tournament import power
 from tests.sysid.support import blank
 
@@ -47,6 +47,18 @@ STIFFNESS = ("k", 1.0, 0.2, 5.0)
 LINEAR = spring("linear", lambda u, p: p[0] * u, STIFFNESS)
 SQUARE = spring("square", lambda u, p: p[0] * u + p[1] * u * u, STIFFNESS, ("q", 0.3, -1.0, 1.0))
 CUBIC = spring("cubic", lambda u, p: p[0] * u + p[1] * u * u * u, STIFFNESS, ("c", 0.3, -1.0, 1.0))
+
+
+def growth():
+    """A lag, or what grows without end, by the sign of its rate."""
+    return ProcessModel(
+        name="growth",
+        states=(State("y", "N"),),
+        inputs=(Input("u", "m"),),
+        outputs=(Output("y", "N"),),
+        parameters=(Parameter("rate", "1/s", -1.0, -5.0, 800.0, minimum=-10.0),),
+        derivative=lambda x, u, p: (p[0] * x[0] + u[0],),
+    )
 
 
 def waves(lowest=0.0):
@@ -81,14 +93,7 @@ def test_what_a_refitted_rival_leaves_is_that_of_the_closed_form():
 
 
 def test_a_rival_that_blows_up_on_its_way_is_fitted_all_the_same():
-    grows = ProcessModel(
-        name="growth",
-        states=(State("y", "N"),),
-        inputs=(Input("u", "m"),),
-        outputs=(Output("y", "N"),),
-        parameters=(Parameter("rate", "1/s", -1.0, -5.0, 800.0, minimum=-10.0),),
-        derivative=lambda x, u, p: (p[0] * x[0] + u[0],),
-    )
+    grows = growth()
     one = structure(grows)
     told = answer(one, blank(grows, np.ones((60, 1)), DT), 4, np.array([True]))
     for start in (3.0, 790.0):
@@ -147,6 +152,22 @@ def test_the_worst_pair_is_as_far_apart_as_a_search_of_all_runs_finds():
             best = max(best, min(left))
     worst = min(contest.distance for contest in result.contests)
     assert 0.85 * best < worst <= 1.01 * best
+
+
+def test_a_run_in_which_a_rival_fails_tells_nothing():
+    one = structure(growth())
+    told = answer(one, blank(growth(), np.ones((60, 1)), DT), 4, np.array([True]))
+    assert scaled(told, one, np.array([0.5]))[-1, -1] > 1.0
+    assert not scaled(told, one, np.array([5000.0])).any()
+
+
+def test_one_seed_gives_one_result_whatever_the_threads(monkeypatch):
+    models, few = {"square": SQUARE, "cubic": CUBIC}, {**QUICK, "candidates": 4, "generations": 1}
+    several = discriminate(models, [waves()], runs=1, **few)
+    monkeypatch.setattr("sysid.experiments.discrimination.available_cores", lambda: 1)
+    alone = discriminate(models, [waves()], runs=1, **few)
+    assert several.runs[0].settings == alone.runs[0].settings
+    assert several.contests == alone.contests
 
 
 def test_structures_that_do_the_same_are_told_apart_by_no_run():
