@@ -1,7 +1,7 @@
 """How well torque controllers give a torque to a moving hand, beside the static baseline.
 
 python -m benchmarks.torque [--json] [--rigs 3] [--seconds 10] [--identify] [--worn]
-                            [--controllers static feedforward lqg]
+                            [--controllers static feedforward lqg hinf]
 
 Rigs are drawn: each of the actuator's parameters 0.8 to 1.25 times the simulated rig's, the hand's
 stiffness and damping 0.25 to 4 times theirs, the hand's motion at random, at up to 10 rad/s. The
@@ -50,7 +50,8 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--identify", action="store_true")
     parser.add_argument("--worn", action="store_true")
-    parser.add_argument("--controllers", nargs="+", default=["static", "feedforward", "lqg"])
+    controllers = ["static", "feedforward", "lqg", "hinf"]
+    parser.add_argument("--controllers", nargs="+", default=controllers)
     options = parser.parse_args()
     rows = [
         measure(

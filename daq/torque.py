@@ -211,13 +211,20 @@ class TorqueControl(Section, abc.ABC):
         """
         return self
 
+    def tuned_over(self, model: ProcessModel, parameters: FloatArray, draws: FloatArray) -> Self:
+        """The settings that ``tuned`` gave, as they are best for plausible parameters.
+
+        draws: (n, n_parameters); none where no spread is known. By default unchanged.
+        """
+        return self
+
     @abc.abstractmethod
     def most_volts(self, model: ProcessModel, parameters: FloatArray) -> tuple[float, float]:
         """Largest commands of motor, either way, and brake [V]."""
 
     def program(self, model: ProcessModel, parameters: FloatArray) -> LawProgram:
         """The law as a program. Raises ConfigError for a controller that has none."""
-        cure = "give it a method 'program', or take feedforward, lqg or static"
+        cure = "give it a method 'program', or take feedforward, lqg, hinf or static"
         raise ConfigError(f"controller {self.controller} is Python alone", cure=cure)
 
     @abc.abstractmethod

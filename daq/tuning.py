@@ -167,7 +167,7 @@ def tune(
         )
     try:
         facts = control.facts(chosen, vector, plausible)
-        tuned = control.tuned(chosen, vector, facts)
+        tuned = control.tuned(chosen, vector, facts).tuned_over(chosen, vector, plausible)
     except ModelError as error:
         raise ConfigError(str(error), file=source) from None
     named = dict(zip(chosen.parameter_names, vector.tolist(), strict=True))

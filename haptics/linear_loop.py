@@ -4,9 +4,11 @@ The law is linearised as it is run: central differences of one step of its progr
 the actuator is discretised exactly, its commands held, and answered ``ahead`` ticks later.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from daq.torque import LawProgram
@@ -16,6 +18,9 @@ from haptics.operating_points import Branch, operating_point
 from haptics.program import law_functions
 from sysid import ProcessModel
 from sysid.arrays import FloatArray
+
+BoolArray = NDArray[np.bool_]
+Step = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
 
 _DIFFERENCE = 1e-6
 _SETTLED = 400  # samples until a law has settled
@@ -34,12 +39,14 @@ class LinearLaw:
     """s+ = F s + G y, u = H s + D y of a law about a motion.
 
     y: angle, speed, torque sensor, motor current, reference. u: commands of motor and brake [V].
+    states: which of the law's memory s is, (n_states,).
     """
 
     F: FloatArray
     G: FloatArray
     H: FloatArray
     D: FloatArray
+    states: BoolArray
 
     @classmethod
     def of(
@@ -48,19 +55,28 @@ class LinearLaw:
         """That of a program on a branch of the hysteresis."""
         run = getattr(law_functions(model), program.entry)
         c, p = list(program.constants), list(program.parameters)
-        speed = _DIRECTIONS[branch] * _SPEED
 
         def step(s: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
             later, volts = s.tolist(), [0.0, 0.0]
             run(*y.tolist(), 0, later, c, p, volts)
             return np.array(later), np.array(volts)
 
-        s, y = np.zeros(program.n_states), np.zeros(5)
+        return cls.about(step, program.n_states, c[laws.TIME], branch)
+
+    @classmethod
+    def about(
+        cls, step: Step, n: int, time: float, branch: Branch, states: BoolArray | None = None
+    ) -> "LinearLaw":
+        """That of a step (s, y) -> (s+, u) of n states, from rest.
+
+        states: (n,), those that carry something; by default all that y moves and that move u.
+        """
+        speed = _DIRECTIONS[branch] * _SPEED
+        s, y = np.zeros(n), np.zeros(5)
         for k in range(_SETTLED):
-            y[:2] = speed * k * c[laws.TIME], speed
+            y[:2] = speed * k * time, speed
             s, _ = step(s, y)
-        y[0] += speed * c[laws.TIME]
-        n = len(s)
+        y[0] += speed * time
         columns = []
         for j in range(n + 5):
             change = np.zeros(n + 5)
@@ -72,12 +88,22 @@ class LinearLaw:
                 / (2.0 * _DIFFERENCE)
             )
         J = np.stack(columns, axis=1)
-        moving = np.any(J[:n] != 0.0, axis=1)
-        keep = np.append(moving, np.ones(5, dtype=bool))
-        # States that nothing changes carry nothing.
-        small = J[np.append(moving, np.ones(2, dtype=bool))][:, keep]
-        m = int(moving.sum())
-        return cls(small[:m, :m], small[:m, m:], small[m:, :m], small[m:, m:])
+        if states is None:
+            linked = J != 0.0
+            states = _reached(linked[:n, :n], linked[:n, n:].any(axis=1))
+            states &= _reached(linked[:n, :n].T, linked[n:, :n].any(axis=0))
+        small = J[np.append(states, [True] * 2)][:, np.append(states, [True] * 5)]
+        m = int(states.sum())
+        return cls(small[:m, :m], small[:m, m:], small[m:, :m], small[m:, m:], states)
+
+
+def _reached(linked: BoolArray, first: BoolArray) -> BoolArray:
+    """States that these move, and those that they move in turn; linked: (n, n), by column."""
+    before, reached = np.zeros_like(first), first.copy()
+    while np.any(reached != before):
+        before = reached
+        reached = before | linked[:, before].any(axis=1)
+    return reached
 
 
 @dataclass(frozen=True)

@@ -51,12 +51,11 @@ _FREQUENCIES = 60
 _SHARES = np.linspace(1.0, 0.3, 8)
 
 
-class Lqg(ActuatorControl):
-    """LQG with a disturbance observer on top of the inverse; takes the torque sensor."""
+class TorqueFeedback(ActuatorControl):
+    """Settings of a filter and a regulator on top of the inverse; LQG makes their gains."""
 
     takes_torque: ClassVar[bool] = True
 
-    controller: Literal["lqg"] = Field(description="lqg")
     encoder_counts: int = Field(8192, ge=4, description="of the encoder in a revolution")
     torque_noise: NewtonMetres = Field(
         0.007, gt=0.0, le=10.0, description="rms, of the torque sensor"
@@ -168,7 +167,7 @@ class Regulator:
     lead: float
 
     @classmethod
-    def of(cls, control: Lqg, inertia: float) -> "Regulator":
+    def of(cls, control: TorqueFeedback, inertia: float) -> "Regulator":
         """That of least e^2 + effort (change of delta)^2."""
         decay = math.exp(-control.hand_damping / inertia / control.sample_rate)
         n = 1 + control.ahead
@@ -190,10 +189,16 @@ class Regulator:
         return placed
 
 
+class Lqg(TorqueFeedback):
+    """LQG with a disturbance observer on top of the inverse; takes the torque sensor."""
+
+    controller: Literal["lqg"] = Field(description="lqg")
+
+
 class TorqueLoop:
     """Filter, regulator and delay around a shaft in a hand, friction taken off."""
 
-    def __init__(self, control: Lqg, dynamics: ActuatorDynamics) -> None:
+    def __init__(self, control: TorqueFeedback, dynamics: ActuatorDynamics) -> None:
         self._control, self._inertia = control, dynamics.inertia
         self._filter = control.shaft_filter(dynamics.inertia)
         self._constants = Regulator.of(control, dynamics.inertia).placed([0.0] * laws.CONSTANTS)
