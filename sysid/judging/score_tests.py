@@ -36,7 +36,6 @@ from sysid.judging.suspects import (
     change_suspects,
     channel_suspects,
     disturbance_suspects,
-    dominant_shape,
     function_suspects,
     head,
     in_single_records,
@@ -251,7 +250,8 @@ class _Tests:
                 return
             surest = min(significant, key=lambda i: logs[i])
             result, residual = results[surest]
-            self.findings.append(self._finding(suspects[surest], result, logs[surest]))
+            shape = self._shape(changes[surest], residual)
+            self.findings.append(self._finding(suspects[surest], result, logs[surest], shape))
             size = np.sqrt(np.mean(changes[surest] ** 2, axis=(0, 1)))
             admitted = changes[surest][..., size > 0.0] / size[size > 0.0]
             self._columns = np.concatenate([self._columns, admitted], axis=2)
@@ -279,7 +279,13 @@ class _Tests:
         whitening = _Whitening.of(self._local, residual)
         return _Regression(whitening, self._columns, self._free, self._residual, self._noises)
 
-    def _finding(self, suspect: Suspect, result: "_Result", log_p: float) -> Finding:
+    def _shape(self, changes: FloatArray, residual: FloatArray) -> int:
+        """Which of a suspect's columns by itself explains most; residual: what all leave."""
+        regression = self._coloured_by(residual)
+        alone = [regression.test(changes[..., [k]], False) for k in range(changes.shape[2])]
+        return int(np.argmax([0.0 if result is None else result.share for result in alone]))
+
+    def _finding(self, suspect: Suspect, result: "_Result", log_p: float, shape: int) -> Finding:
         moved = self._gradients @ result.move[: self._gradients.shape[1]]
         moves = [
             Move(e, float(change), float(change) / e.std)
@@ -297,7 +303,7 @@ class _Tests:
             result.share,
             tuple(moves),
             suspect.of,
-            dominant_shape(amplitudes) if suspect.kind == "function" else "",
+            suspect.shapes[shape] if suspect.kind == "function" else "",
         )
 
 
@@ -518,7 +524,9 @@ def description(finding: Finding) -> str:
     if finding.kind == "variant":
         return finding.name
     if finding.kind == "function":
-        return f"a term in {finding.of} ({finding.shape}) in d{finding.name}/dt"
+        friction = finding.shape == "sign" and finding.of == finding.name
+        term = f"the sign of {finding.of}" if friction else f"{finding.of} ({finding.shape})"
+        return f"a term in {term} in d{finding.name}/dt" + ", like dry friction" * friction
     if finding.kind == "disturbance":
         return f"a slow signal in d{finding.name}/dt that nobody measured"
     assert amplitude is not None

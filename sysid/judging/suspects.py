@@ -35,8 +35,9 @@ _SHAPES = ("sign", "square", "cube")
 class Suspect:
     """What may be missing: columns of changes per unit of its amplitudes.
 
-    name: of the channel, the variant, or the equation. of: the signal that a function is of.
-    changes: (n_rows, n_outputs, n_amplitudes), records one after another, in the outputs' units.
+    name: of the channel, the variant, or the equation. of: the signal that a function is of, its
+    amplitudes those of ``shapes``. changes: (n_rows, n_outputs, n_amplitudes), records one after
+    another, in the outputs' units.
     """
 
     kind: Kind
@@ -44,6 +45,7 @@ class Suspect:
     unit: str
     changes: FloatArray
     of: str = ""
+    shapes: tuple[str, ...] = ()
 
     @property
     def one_sided(self) -> bool:
@@ -208,9 +210,12 @@ def function_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
             if len(np.unique(together)) < _LEVELS or _jumps(together):
                 continue
             unit = f"{state.unit}/s"
-            for values in ([stretched(together)], shapes(together)):
+            for values, names in (
+                ([stretched(together)], ("straight",)),
+                (shapes(together), _SHAPES),
+            ):
                 columns = np.stack([_added(runs, i, shape) for shape in values], axis=2)
-                yield Suspect("function", state.name, unit, columns, signal.name)
+                yield Suspect("function", state.name, unit, columns, signal.name, shapes=names)
 
 
 def disturbance_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
@@ -286,13 +291,6 @@ def _rates_at(run: DisturbedRun, rows: Any) -> Callable[[FloatArray], FloatArray
         return np.array(values).reshape(-1, len(run.model.states))
 
     return rates
-
-
-def dominant_shape(amplitudes: FloatArray) -> str:
-    """Which of the shapes of a function weighs most."""
-    if len(amplitudes) == 1:
-        return "straight"
-    return _SHAPES[int(np.argmax(np.abs(amplitudes)))]
 
 
 def head(records: Sequence[Dataset], samples: int) -> list[Dataset]:

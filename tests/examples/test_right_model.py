@@ -12,7 +12,7 @@ FOLDER = EXAMPLES / "right_model"
 @pytest.mark.parametrize(
     ("case", "words", "cure"),
     [
-        ("friction", "omega (square)", None),  # whose cure takes half a minute
+        ("friction", "sign of omega", None),  # whose cure takes half a minute
         ("late", "3 samples (0.006 s) later", {"delay": {"omega": 0.006}}),
         ("clipped", "omega ends at 180 rad/s", {"robust": True}),
     ],
