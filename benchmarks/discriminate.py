@@ -111,24 +111,31 @@ def separated(
     rng = np.random.default_rng(seed)
     tasks, beyond = [], 0
     for i, truth in enumerate(hypotheses):
-        answers = noisy(truth, list(setups.values())[i], commands, rng)
+        hidden = drawn(truth.space, rng)
+        answers = noisy(truth, hidden, list(setups.values())[i], commands, rng)
         if answers is None:
             beyond += 1
             continue
-        tasks += [(i, j, answers) for j in range(len(hypotheses))]
+        # From what a wide search would come to as well: the truth, and any other point.
+        tasks += [
+            (i, j, answers, hidden if i == j else drawn(each.space, rng))
+            for j, each in enumerate(hypotheses)
+        ]
     scores: dict[tuple[int, int], float] = {}
 
-    def fit(task: tuple[int, int, list[Answer]]) -> None:
-        i, j, answers = task
-        rival = hypotheses[j]
-        end = rivals.refit(answers, rival, rival.values)
-        left = sum(rivals.contrast(each, rival, end).joint[-1, -1] for each in answers)
+    def fit(task: tuple[int, int, list[Answer], FloatArray]) -> None:
+        i, j, answers, start = task
+        rival, left = hypotheses[j], []
+        for begin in (rival.values, start):
+            end = rivals.refit(answers, rival, begin)
+            joints = [rivals.contrast(each, rival, end).joint for each in answers]
+            left.append(sum(joint[-1, -1] for joint in joints))
         n = sum(each.outputs.size for each in answers)
-        scores[i, j] = float(left) + len(end) * float(np.log(n))
+        scores[i, j] = float(min(left)) + len(rival.values) * float(np.log(n))
 
     Workers(available_cores()).each(fit, tasks)
     names = [each.name for each in hypotheses]
-    told = {f"{names[i]} / {names[j]}": scores[i, j] - scores[i, i] for i, j, _ in tasks if i != j}
+    told = {f"{names[i]} / {names[j]}": scores[i, j] - scores[i, i] for i, j, *_ in tasks if i != j}
     return {
         "separated": sum(difference > STRONG for difference in told.values()),
         "pairs": len(told),
@@ -138,10 +145,16 @@ def separated(
 
 
 def noisy(
-    truth: Hypothesis, setup: Setup, commands: Sequence[FloatArray], rng: np.random.Generator
+    truth: Hypothesis,
+    hidden: FloatArray,
+    setup: Setup,
+    commands: Sequence[FloatArray],
+    rng: np.random.Generator,
 ) -> list[Answer] | None:
-    """What a hidden rig of a structure logs; None where a run would pass a limit."""
-    hidden = drawn(truth.space, rng)
+    """What a rig of a structure logs; None where a run would pass a limit.
+
+    hidden: (n_free,), its parameters.
+    """
     there = replace(truth, values=hidden)
     noise = np.array([setup.noise[name] for name in setup.problem.model.output_names])
     of_inputs = np.array([setup.noise.get(name, 0.0) for name in setup.problem.model.input_names])
