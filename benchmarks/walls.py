@@ -1,13 +1,15 @@
 """Which virtual walls are passive for certain, and which rest in simulation: the Z-width.
 
 python -m benchmarks.walls [--json] [--rates 800 4000] [--hands 24] [--plot z_width.png]
+                           [--measure]
 
 Walls rendered by the static law and by the inverse without what it takes off (friction, inertia),
 by the motor alone and with the brake: switched on in contact, or shared by its hysteresis state.
 Guaranteed: passive by ``haptics.passivity`` with 95 % over actuators whose parameters are uncertain
 by 3 %, in any passive hand. Simulated: the stiffest wall that rests in all of so many hands from
 1/4 to 4 times that of (A.2), each with an actuator of its own, after a tap. The best rendered
-damping of each.
+damping of each. Measured: the stiffest wall that ``virtual_wall`` finds stable on the simulated
+rig, electronics, limits and all, in hands of both ends and the middle; a limit that trips ends it.
 """
 
 from __future__ import annotations
@@ -20,12 +22,14 @@ from typing import Any
 import numpy as np
 import yaml
 
+import protocols
 from benchmarks._common import arguments, report
-from daq import tune
+from daq import analyse, record, tune
+from daq.errors import RunError
 from daq.experiment import TripLimits
 from daq.lookup.controllers import TunedController, load_controller
 from haptics import trial
-from haptics.evidence import Scene, run_trials
+from haptics.evidence import HAND, HAND_RANGE, Scene, run_trials
 from haptics.passivity import Passivity, Tracker
 from protocols.control.loop import tracker_gains
 
@@ -41,7 +45,9 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "inverse, friction taken off": {"controller": "feedforward", "inertia_share": 0.0},
 }
 DAMPINGS = (0.0, 2e-4, 3e-3)  # N*m*s/rad
+MEASURED = (0.0, 3e-3)  # of them, in runs
 STIFFEST = 400.0  # N*m/rad
+GRID = (0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0)  # N*m/rad, of runs
 COUNT = 2.0 * math.pi / 8192.0
 LIMITS = TripLimits(math.inf, math.inf, math.inf, math.inf, (-5.0, 5.0), (0.0, 0.38), COUNT)
 BANDWIDTH = 150.0  # Hz
@@ -53,9 +59,14 @@ def main() -> None:
     parser.add_argument("--rates", type=float, nargs="+", default=[800.0, 4000.0])
     parser.add_argument("--hands", type=int, default=12)
     parser.add_argument("--plot", type=Path)
+    parser.add_argument("--measure", action="store_true")
     options = parser.parse_args()
     rows = [
-        {"rate": rate, "variant": name, **measure(rate, dict(settings), options.hands)}
+        {
+            "rate": rate,
+            "variant": name,
+            **measure(rate, dict(settings), options.hands, options.measure),
+        }
         for rate in options.rates
         for name, settings in VARIANTS.items()
     ]
@@ -64,9 +75,10 @@ def main() -> None:
     report({"walls": rows}, options.json, show)
 
 
-def measure(rate: float, settings: dict[str, Any], hands: int) -> dict[str, Any]:
-    """Stiffest walls of one variant, guaranteed and simulated, by rendered damping."""
+def measure(rate: float, settings: dict[str, Any], hands: int, run: bool = False) -> dict[str, Any]:
+    """Stiffest walls of one variant, guaranteed, simulated and measured, by rendered damping."""
     contact = settings.pop("contact", 0.0)
+    stable = measured(rate, settings, contact) if run else []
     tuned = controller(rate, settings)
     tracker = Tracker(*tracker_gains(BANDWIDTH, 1.0 / rate))
     actuators = np.concatenate([tuned.parameters[None], tuned.plausible(40)])
@@ -83,7 +95,8 @@ def measure(rate: float, settings: dict[str, Any], hands: int) -> dict[str, Any]
         "colgate": promise.colgate,
         "abbott": promise.abbott,
         "simulated": max(simulated),
-        "by_damping": {"guaranteed": guaranteed, "simulated": simulated},
+        "measured": max(stable) if run else None,
+        "by_damping": {"guaranteed": guaranteed, "simulated": simulated, "measured": stable},
     }
 
 
@@ -100,6 +113,53 @@ def controller(rate: float, settings: dict[str, Any]) -> TunedController:
         content["covariance"] = {"parameters": list(UNCERTAIN), "factor": factor.tolist()}
         path.write_text(yaml.safe_dump(content))
         return load_controller(str(path), folder)
+
+
+def measured(rate: float, settings: dict[str, Any], contact: float) -> list[float]:
+    """The stiffest wall that runs find stable in all hands [N*m/rad], by damping."""
+    by_hand = [
+        [_run_of_walls(rate, settings, contact, damping, scale) for damping in MEASURED]
+        for scale in (1.0 / HAND_RANGE, 1.0, HAND_RANGE)
+    ]
+    return [min(column) for column in zip(*by_hand, strict=True)]
+
+
+def _run_of_walls(
+    rate: float, settings: dict[str, Any], contact: float, damping: float, scale: float
+) -> float:
+    """The stiffest wall of a run of them in one hand, or before a limit [N*m/rad]."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        file, path = folder / "settings.yaml", folder / "controller.yaml"
+        file.write_text(yaml.safe_dump({"sample_rate": rate, **settings}))
+        tune(file, model=MODEL).save(path)
+        content = yaml.safe_load(
+            (Path(protocols.__file__).parent / "virtual_wall.yaml").read_text()
+        )
+        content |= {"sample_rate": rate, "torque_controller": str(path), "dampings": [damping]}
+        content |= {"stiffnesses": list(GRID), "brake_commands": [contact]}
+        content["rest"] = {**content["rest"], "stiffness": 0.1, "damping": damping}
+        experiment = folder / "walls.yaml"
+        experiment.write_text(yaml.safe_dump(content))
+        grip = {"K_u": scale * HAND[0], "B_u": scale * HAND[1]}
+        options = {"plant": {"load": "hand", "parameters": grip}}
+        best = 0.0
+        for stiffness in (None, *GRID):
+            if stiffness is not None:
+                experiment.write_text(yaml.safe_dump({**content, "stiffnesses": [stiffness]}))
+            try:
+                run = record(experiment, "hand.yaml", folder / "runs", options=options)
+            except RunError:
+                if stiffness is None:
+                    continue  # a limit: one wall at a time tells which
+                return best
+            numbers = {n.name: n.value for n in analyse(run.path.parent).findings.numbers}
+            if stiffness is None:
+                return float(numbers["stiffest"])
+            if numbers["stiffest"] < stiffness:
+                return best
+            best = stiffness
+        return best
 
 
 def stiffest(tuned: TunedController, damping: float, contact: float, hands: int) -> float:
@@ -177,12 +237,18 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
 
 def show(figures: dict[str, Any]) -> None:
     print("stiffest walls [N*m/rad]")
-    print(f"{'rate':>6} {'variant':<30} {'guaranteed':>10} {'simulated':>10} {'Colgate':>8} Abbott")
+    heads = ("guaranteed", "simulated", "measured", "Colgate")
+    print(f"{'rate':>6} {'variant':<30} " + " ".join(f"{h:>10}" for h in heads) + " Abbott")
     for row in figures["walls"]:
         print(
             f"{row['rate']:>6g} {row['variant']:<30} {row['guaranteed']:>10.3g} "
-            f"{row['simulated']:>10.3g} {row['colgate']:>8.3g} {row['abbott']:.3g}"
+            f"{row['simulated']:>10.3g} {_cell(row['measured']):>10} {row['colgate']:>10.3g} "
+            f"{row['abbott']:.3g}"
         )
+
+
+def _cell(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3g}"
 
 
 if __name__ == "__main__":

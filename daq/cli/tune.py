@@ -79,6 +79,9 @@ def _show(tuning: Tuning) -> None:
     head = ["branch of the hysteresis", "brake [A]", "stiffness [N*m/rad]", "damping [N*m*s/rad]"]
     terminal.print_table("The shaft by operating point", head, rows, text=head[:1])
     for key, (before, after) in tuning.changes.items():
+        if isinstance(after, list):
+            terminal.print_text(f"{key}: {len(after)} numbers are set, for all of them at once.")
+            continue
         text = f"{key} is {number(after)} in place of {number(before)}: no more is safe with every"
         terminal.print_text(f"{text} actuator, and every hand, that must be reckoned with.")
     if not len(tuning.draws):

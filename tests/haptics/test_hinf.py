@@ -1,14 +1,20 @@
 """The structured synthesis: its slopes, what it promises over a family, what a file keeps."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from daq import tune
+from daq.cli.tune import _show as show
 from haptics import laws
 from haptics.dynamics import ActuatorDynamics
 from haptics.hinf import Hinf, LoopFamily, extremes, places
 from haptics.linear_loop import LinearLaw, loop_margins
 from haptics.minimax import Responses, least_largest
 from sim_rig.actuator import actuator
+from sysid import ModelError
+from tests.haptics.test_tune import write
 
 MODEL = actuator(parameters="rig")
 START = Hinf(controller="hinf", yield_share=0.7)
@@ -79,6 +85,19 @@ def test_a_file_s_gains_are_those_of_the_program(tuned):
     again = Hinf.model_validate(tuned.model_dump(mode="json"))
     constants = again.program(MODEL, MODEL.nominal).constants
     assert [constants[place] for place in places(1)] == tuned.gains
+
+
+def test_rig_tune_says_that_gains_are_set(tmp_path, capsys):
+    tuning = tune(write(tmp_path / "t.yaml", {"controller": "static"}), model="actuator")
+    control = Hinf(controller="hinf", gains=[0.1] * 14)
+    show(replace(tuning, requested=START, control=control))
+    assert "gains: 14 numbers are set" in capsys.readouterr().out
+
+
+def test_gains_of_another_delay_are_refused():
+    control = Hinf(controller="hinf", gains=[0.1] * 14, ahead=2)
+    with pytest.raises(ModelError, match=r"14 numbers, but with ahead: 2 there are 15; tune again"):
+        control.program(MODEL, MODEL.nominal)
 
 
 def test_the_least_largest_of_a_bounded_problem():
