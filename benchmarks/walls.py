@@ -205,6 +205,12 @@ def scene(tuned: TunedController, stiffness: float, damping: float, contact: flo
     return Scene(np.zeros(n), np.ones(n), path, wall)
 
 
+_DRAWN = {
+    "guaranteed": ("guaranteed for any hand", "#0072B2"),
+    "simulated": ("at rest in simulation", "#E69F00"),
+}
+
+
 def draw(rows: list[dict[str, Any]], path: Path) -> None:
     """The Z-width at each rate: guaranteed and simulated, motor alone and with the brake."""
     import matplotlib
@@ -213,26 +219,34 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
     import matplotlib.pyplot as plt
 
     rates = sorted({row["rate"] for row in rows})
-    figure, axes = plt.subplots(1, len(rates), figsize=(5.2 * len(rates), 4.2), squeeze=False)
+    figure, axes = plt.subplots(1, len(rates), figsize=(5.6 * len(rates), 4.4),
+                                squeeze=False, layout="constrained")  # fmt: skip
     names = list(VARIANTS)
     for rate, axis in zip(rates, axes[0], strict=True):
         chosen = {row["variant"]: row for row in rows if row["rate"] == rate}
         place = np.arange(len(names))
-        for shift, key, color in ((-0.2, "guaranteed", "#1f77b4"), (0.2, "simulated", "#ff7f0e")):
-            heights = [max(chosen[name][key], 1e-2) for name in names]
-            bars = axis.bar(place + shift, heights, 0.38, label=key, color=color)
-            labels = [f"{chosen[name][key]:.2g}" for name in names]
-            axis.bar_label(bars, labels, fontsize=7)
+        lowest = 0.3 * min(row[key] for row in rows for key in _DRAWN if row[key] > 0.0)
+        for shift, (key, (label, color)) in zip((-0.2, 0.2), _DRAWN.items(), strict=True):
+            stiffest = [chosen[name][key] for name in names]
+            bars = axis.bar(place + shift, stiffest, 0.38, label=label, color=color)
+            labels = [f"{float(f'{value:.2g}'):g}" if value > 0.0 else "" for value in stiffest]
+            axis.bar_label(bars, labels, fontsize=8)
+            for k, value in enumerate(stiffest):
+                if not value > 0.0:
+                    axis.text(k + shift, 1.1 * lowest, "none", ha="center", fontsize=8)
+        axis.set_ylim(lowest, 3.0 * max(row["simulated"] for row in rows))
         first = chosen[names[0]]
-        axis.axhline(first["colgate"], color="0.4", lw=0.8, ls="--", label="Colgate, no delay")
+        bound = "2b/T, which leaves the delay out"
+        axis.axhline(first["colgate"], color="0.4", lw=0.8, ls="--", label=bound)
         axis.set_yscale("log")
-        axis.set_xticks(place, [name.replace(", ", ",\n") for name in names], fontsize=7)
-        axis.set_title(f"{rate:g} Hz", fontsize=9)
-        axis.set_ylabel("stiffest wall [N·m/rad]", fontsize=8)
-        axis.tick_params(labelsize=7)
-    axes[0][0].legend(fontsize=7)
-    figure.tight_layout()
-    figure.savefig(path, dpi=110)
+        axis.set_xticks(place, [name.replace(", ", ",\n") for name in names], fontsize=8)
+        axis.set_title(f"{rate:g} Hz", fontsize=10, loc="left")
+        axis.set_ylabel("stiffest wall [N·m/rad]", fontsize=9)
+        axis.tick_params(labelsize=8)
+        axis.spines[["top", "right"]].set_visible(False)
+    figure.legend(*axes[0][0].get_legend_handles_labels(), loc="outside upper left", ncols=3,
+                  fontsize=9, frameon=False)  # fmt: skip
+    figure.savefig(path, dpi=150)
 
 
 def show(figures: dict[str, Any]) -> None:

@@ -14,6 +14,8 @@ from daq.hal import FloatArray
 
 _DEEPEST = 1e-4  # of the largest line: what is below it is rounding or leakage
 _FEW = 200  # lines that are drawn one by one
+_INSIDE = 0.04  # of a frame's height, from its edge to what marks a curve beyond
+_MARKS = 15  # of a curve beyond its frame, at most about so many at an edge
 _EXCESS = 4.0  # times the first model's residual that another's is drawn to
 # Of the first simulated line and the second; further ones have colours of their own.
 _LOOKS: tuple[dict[str, Any], ...] = (
@@ -87,15 +89,18 @@ def responses(time: FloatArray, outputs: Sequence[Panel]) -> Figure:
     """
     heights, gaps = [0.78, 0.4] * len(outputs), ([0.06, 0.26] * len(outputs))[:-1]
     figure, axes = style.stack(heights, gaps, top=0.36)
-    for j, output in enumerate(outputs):
-        _respond(time, output, axes[2 * j], axes[2 * j + 1])
+    leaves = [
+        _respond(time, output, axes[2 * j], axes[2 * j + 1]) for j, output in enumerate(outputs)
+    ]
+    if any(leaves):
+        axes[0].plot([], [], ls="", marker="^", ms=3, color="0.4", label="beyond")
     axes[-1].set_xlabel("time [s]")
     style.legend(figure, axes[0])
     return figure
 
 
-def _respond(time: FloatArray, output: Panel, above: Axes, below: Axes) -> None:
-    """One output's two panels."""
+def _respond(time: FloatArray, output: Panel, above: Axes, below: Axes) -> bool:
+    """One output's two panels; whether a curve leaves its frame."""
     unit, (measured, *simulated) = notation.bracketed(output.unit), output.lines.values()
     above.plot(*style.thinned(time, measured), color=style.MEASURED, lw=1.5, label="measured")
     residuals = [measured - values for values in simulated]
@@ -112,6 +117,11 @@ def _respond(time: FloatArray, output: Panel, above: Axes, below: Axes) -> None:
     sizes = [_largest(residual) for residual in residuals]
     largest = 1.06 * min(max(sizes), _EXCESS * sizes[0]) or 1.2
     below.set_ylim(-largest, largest)
+    leaves = False
+    for panel, curves in ((above, simulated), (below, residuals)):
+        for k, curve in enumerate(curves):
+            color = str(_LOOKS[k]["color"]) if k < len(_LOOKS) else f"C{k}"
+            leaves |= _mark_leaving(panel, time, curve, color)
     below.axhline(0.0, color="black", lw=0.4, zorder=1)
     style.name_y(above, notation.words(output.name), unit)
     style.name_y(below, "residual", unit)
@@ -120,6 +130,24 @@ def _respond(time: FloatArray, output: Panel, above: Axes, below: Axes) -> None:
     below.locator_params(axis="y", nbins=3)
     if output.note:
         above.set_title(output.note, loc="right", fontsize=6.5, pad=2.0)
+    return leaves
+
+
+def _mark_leaving(panel: Axes, time: FloatArray, values: FloatArray, color: str) -> bool:
+    """Mark each stretch of a curve beyond its frame at the edge; whether there is one."""
+    low, high = panel.get_ylim()
+    inside, places = _INSIDE * (high - low), list[tuple[float, float, str]]()
+    ends = ((values > high, high - inside, "^"), (values < low, low + inside, "v"))
+    for beyond, edge, marker in ends:
+        steps = np.flatnonzero(np.diff(np.concatenate([[False], beyond, [False]]).astype(int)))
+        middles = time[(steps[::2] + steps[1::2] - 1) // 2]
+        places += [(at, edge, marker) for at in middles[:: max(1, len(middles) // _MARKS)]]
+    for marker in ("^", "v"):
+        here = [(at, edge) for at, edge, kind in places if kind == marker]
+        if here:
+            panel.plot(*np.transpose(here), ls="", marker=marker, ms=2.5, color=color,
+                       clip_on=False, scalex=False, scaley=False)  # fmt: skip
+    return bool(places)
 
 
 def _largest(residual: FloatArray) -> float:

@@ -122,7 +122,7 @@ class WallTheory:
             bound = np.array([loop.critical_stiffness(damping) for damping in drawn])
             series.append(Series(label, drawn, np.where(bound <= stiffest, bound, math.nan)))
         passive = Series(
-            "passive by (1.1)" if brake == 0.0 else "passive by (1.2)",
+            "passive: KT/2 + |B| < b" + (" + brake's" if brake else ""),
             np.array([0.0, self.damping(brake)]),
             np.array([self.passive_stiffness(brake, 0.0), 0.0]),
         )

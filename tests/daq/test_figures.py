@@ -160,3 +160,5 @@ def test_a_model_that_runs_away_does_not_flatten_what_was_measured(figures):
     response, residual = figures["responses"].axes[:2]
     assert response.get_ylim()[1] < 2.0
     assert residual.get_ylim()[1] < 2.0
+    marks = {line.get_marker() for panel in (response, residual) for line in panel.lines}
+    assert marks & {"^", "v"}  # where it is beyond the frame
