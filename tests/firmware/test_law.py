@@ -124,6 +124,21 @@ def test_the_device_answers_as_python_does_and_goes_there_without_a_jump(host, t
     assert max(played.costs) < MOST_INSTRUCTIONS
 
 
+def test_a_law_that_comes_again_begins_from_rest(host, tuned):
+    switches = {0: (True, ON), 110: (False, 200), 210: (True, 300)}
+
+    def at_tick(tick):
+        if tick in switches:
+            orders(host, lambda host: law(host, *switches[tick], blend=10))(0)
+
+    commands = references(500)
+    commands[200:300] = [ZERO] * 100
+    played = host.play(len(commands), commands, Limits(), at_tick=at_tick)
+    expected = answers(tuned, played, commands, 300, 499)[10:]
+    outputs = np.array(played.outputs[311:500])
+    assert np.abs((outputs - expected[: len(outputs)]) / FULL_SCALE).max() < 1e-3
+
+
 MOST_INSTRUCTIONS = 2000
 """Of rig_on_tick with lqg: at two clocks each 24 us of 250 at 168 MHz."""
 
