@@ -17,7 +17,13 @@ from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
 from matplotlib.textpath import text_to_path
-from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator, StrMethodFormatter
+from matplotlib.ticker import (
+    FuncFormatter,
+    LogLocator,
+    MaxNLocator,
+    NullLocator,
+    StrMethodFormatter,
+)
 
 from daq import notation
 from daq.errors import ConfigError
@@ -117,8 +123,12 @@ def stack(
 def name_y(panel: Axes, name: str, unit: str) -> None:
     """Label of a vertical axis, ``name [unit]``, wrapped to the panel's height.
 
-    It stands at the figure's edge, so that those of all panels align.
+    It stands at the figure's edge, so that those of all panels align. Numbers beside it that go by
+    quarters (0.0425) would have a digit more than there is room for.
     """
+    locator = panel.yaxis.get_major_locator()
+    if isinstance(locator, MaxNLocator):
+        locator.set_params(steps=[1, 2, 5, 10])
     figure = panel.get_figure(root=True)
     assert figure is not None
     width, tall = figure.get_size_inches()
