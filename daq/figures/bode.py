@@ -1,9 +1,10 @@
 """Frequency responses: measured, of a model treated likewise, and of linear models."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import numpy.typing as npt
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from daq import notation
@@ -11,6 +12,7 @@ from daq.figures import style
 from daq.hal import FloatArray
 
 ComplexArray = npt.NDArray[np.complex128]
+ESTIMATED = "identified"  # of the curves: by the same estimate as the measured points
 _MEASURED = "measured, 95 %"
 _Z95 = 1.959963984540054
 _SEEN = 0.3  # coherence below which a measured point is drawn faintly
@@ -29,13 +31,15 @@ def bode(
 
     response, coherence, deviation: as estimated, (n,), with a magnitude's standard deviation.
     curves: responses at the same frequencies by name. units: of output and input. Measured
-    magnitudes carry 95 % bars; points of low coherence are faint.
+    magnitudes carry 95 % bars; points of low coherence are faint, and what was estimated from the
+    logs with the same inputs (``ESTIMATED``) has gaps there. Phases do not jump by a turn.
     """
     figure, (size, angle, seen) = style.stack(
         [1.1, 0.8, 0.45], 0.1, top=style.legend_room([_MEASURED, *curves])
     )
     magnitude = np.abs(response)
     good = coherence >= _SEEN
+    phases = _phases([response, *curves.values()])
     for chosen, colour in ((~good, style.FAINT), (good, style.MEASURED)):
         if not chosen.any():
             continue
@@ -47,17 +51,19 @@ def bode(
         )  # fmt: skip
         size.plot(frequency[chosen], magnitude[chosen], ".", ms=2.5, color=colour,
                   label=_MEASURED if colour == style.MEASURED else None)  # fmt: skip
-        degrees = np.angle(response[chosen], deg=True)
-        angle.plot(frequency[chosen], degrees, ".", ms=2.5, color=colour)
+        angle.plot(frequency[chosen], phases[0][chosen], ".", ms=2.5, color=colour)
     for k, (name, curve) in enumerate(curves.items()):
+        seen_there = good if name == ESTIMATED and good.any() else np.ones(len(good), dtype=bool)
         look = {"color": style.CYCLE[(1, 0, 2, 3)[k % 4]], "ls": style.DASHES[k % 4]}
-        size.plot(frequency, np.abs(curve), label=name, **look)  # type: ignore[arg-type]
-        angle.plot(frequency, np.angle(curve, deg=True), **look)  # type: ignore[arg-type]
+        height = np.where(seen_there, np.abs(curve), np.nan)
+        size.plot(frequency, height, label=name, **look)  # type: ignore[arg-type]
+        turned = np.where(seen_there, phases[1 + k], np.nan)
+        angle.plot(frequency, turned, **look)  # type: ignore[arg-type]
     limits = _limits(magnitude, good, curves)
     size.set_ylim(*limits)
     style.logarithmic(size.yaxis, np.array(limits))
-    angle.set_ylim(-190, 190)
-    angle.set_yticks([-180, -90, 0, 90, 180])
+    shown = np.concatenate([phases[0][good], *phases[1:]])
+    _limit_phase(angle, shown[np.isfinite(shown)])
     seen.plot(frequency, coherence, color=style.MEASURED, lw=0.8)
     seen.set_ylim(-0.05, 1.05)
     style.logarithmic(seen.xaxis, frequency)
@@ -67,6 +73,23 @@ def bode(
     style.name_y(seen, "coherence", "[1]")
     style.legend(figure, size)
     return figure
+
+
+def _phases(responses: Sequence[ComplexArray]) -> list[FloatArray]:
+    """Phases [degrees] without jumps of a turn: the last goes on, the others keep near it."""
+    *others, last = (np.nan_to_num(response) for response in responses)
+    smooth = np.degrees(np.unwrap(np.angle(last)))
+    phases = [np.angle(response, deg=True) for response in others]
+    return [*(each + 360.0 * np.round((smooth - each) / 360.0) for each in phases), smooth]
+
+
+def _limit_phase(angle: Axes, degrees: FloatArray) -> None:
+    low, high = (degrees.min(), degrees.max()) if len(degrees) else (-180.0, 180.0)
+    first, last = np.floor(low / 90.0), np.ceil(high / 90.0)
+    step = max(1.0, np.ceil((last - first) / 4.0))
+    ticks = 90.0 * np.arange(first, last + step, step)
+    angle.set_yticks(ticks)
+    angle.set_ylim(ticks[0] - 10.0, ticks[-1] + 10.0)
 
 
 def _limits(

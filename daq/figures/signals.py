@@ -1,5 +1,6 @@
 """Signals over time and their spectra: planned, recorded, simulated, left in the residuals."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -15,6 +16,7 @@ from daq.hal import FloatArray
 _DEEPEST = 1e-4  # of the largest line: what is below it is rounding or leakage
 _FEW = 200  # lines that are drawn one by one
 _INSIDE = 0.04  # of a frame's height, from its edge to what marks a curve beyond
+_PLAIN = 1e-2, 1e4  # sizes whose numbers need no power of ten
 _MARKS = 15  # of a curve beyond its frame, at most about so many at an edge
 _EXCESS = 4.0  # times the first model's residual that another's is drawn to
 # Of the first simulated line and the second; further ones have colours of their own.
@@ -101,9 +103,16 @@ def responses(time: FloatArray, outputs: Sequence[Panel]) -> Figure:
 
 def _respond(time: FloatArray, output: Panel, above: Axes, below: Axes) -> bool:
     """One output's two panels; whether a curve leaves its frame."""
-    unit, (measured, *simulated) = notation.bracketed(output.unit), output.lines.values()
+    measured, *simulated = output.lines.values()
+    factor, unit = _multiple(_largest(measured), output.unit)
+    measured, simulated = factor * measured, [factor * values for values in simulated]
     above.plot(*style.thinned(time, measured), color=style.MEASURED, lw=1.5, label="measured")
     residuals = [measured - values for values in simulated]
+    if residuals:
+        smaller, unit_below = _multiple(_largest(residuals[0]) / factor, output.unit)
+        residuals = [smaller / factor * residual for residual in residuals]
+    else:
+        unit_below = unit
     for k, (name, values) in enumerate(zip(list(output.lines)[1:], simulated, strict=True)):
         look = _LOOKS[k] if k < len(_LOOKS) else {**_LOOKS[1], "color": f"C{k}"}
         above.plot(*style.thinned(time, values), label=name, **look)
@@ -124,13 +133,26 @@ def _respond(time: FloatArray, output: Panel, above: Axes, below: Axes) -> bool:
             leaves |= _mark_leaving(panel, time, curve, color)
     below.axhline(0.0, color="black", lw=0.4, zorder=1)
     style.name_y(above, notation.words(output.name), unit)
-    style.name_y(below, "residual", unit)
+    style.name_y(below, "residual", unit_below)
     for panel in (above, below):
         panel.margins(x=0.01)
     below.locator_params(axis="y", nbins=3)
     if output.note:
         above.set_title(output.note, loc="right", fontsize=6.5, pad=2.0)
     return leaves
+
+
+def _multiple(largest: float, unit: str) -> tuple[float, str]:
+    """By what values are multiplied to need no power of ten at their axis; their unit there."""
+    if not math.isfinite(largest) or largest == 0.0 or _PLAIN[0] <= largest < _PLAIN[1]:
+        return 1.0, notation.bracketed(unit)
+    factor, prefixed = notation.engineering(largest, unit)
+    if factor != 1.0:
+        return factor, notation.bracketed(prefixed)
+    power = 3 * math.floor(math.log10(largest) / 3.0)
+    text = notation.unit_text(unit)
+    raised = notation.raised(str(power))
+    return 10.0**-power, f"[10{raised} {text}]" if text not in ("", "1") else f"[10{raised}]"
 
 
 def _mark_leaving(panel: Axes, time: FloatArray, values: FloatArray, color: str) -> bool:

@@ -162,3 +162,28 @@ def test_a_model_that_runs_away_does_not_flatten_what_was_measured(figures):
     assert residual.get_ylim()[1] < 2.0
     marks = {line.get_marker() for panel in (response, residual) for line in panel.lines}
     assert marks & {"^", "v"}  # where it is beyond the frame
+
+
+def test_a_small_residual_and_a_small_signal_are_in_multiples_of_their_units():
+    lines = {"measured": 3e-5 * WAVE, "identified": 2.8e-5 * WAVE}
+    figure = responses(TIME, [Panel("gap", "m", lines), Panel("rate", "1/s", lines)])
+    labels = [panel.get_ylabel().split("\n")[-1].split()[-1] for panel in figure.axes]
+    assert labels[:2] == ["[µm]", "[µm]"]
+    assert "10⁻⁶" in figure.axes[2].get_ylabel()
+    figure.canvas.draw()
+    assert not any(panel.yaxis.get_offset_text().get_text() for panel in figure.axes)
+    residual = figure.axes[1].lines[0].get_ydata()
+    assert np.nanmax(np.abs(residual)) == pytest.approx(2.0 * np.abs(WAVE).max(), rel=0.1)
+
+
+def test_phases_go_on_beyond_a_turn_and_estimates_have_gaps_without_coherence():
+    frequency = np.linspace(1.0, 40.0, 79)
+    late = np.exp(-2j * np.pi * frequency * 0.05) / frequency
+    seen = np.where((frequency > 15.0) & (frequency < 20.0), 0.1, 0.9)
+    curves = {"identified": late, "linear": late}
+    figure = bode(frequency, late, seen, 0.1 * np.abs(late), curves, ("rad", "V"))
+    estimated, linear = figure.axes[1].lines[-2:]
+    np.testing.assert_allclose(linear.get_ydata(), -360.0 * 0.05 * frequency, atol=1e-9)
+    gaps = np.isnan(np.asarray(estimated.get_ydata(), dtype=float))
+    assert gaps.tolist() == (seen < 0.3).tolist()
+    assert figure.axes[1].get_ylim()[0] < -720.0
