@@ -31,7 +31,7 @@ def draws(n):
 
 @pytest.fixture(scope="module")
 def tuned():
-    return START.tuned_over(MODEL, MODEL.nominal, draws(8))
+    return START.tuned_over(MODEL, MODEL.nominal, draws(2))
 
 
 def largest_sensitivity(control, actuators):
@@ -65,14 +65,14 @@ def test_slopes_of_the_responses_are_those_of_differences():
 
 
 def test_margins_of_actuators_that_it_has_not_seen_are_larger_than_lqgs(tuned):
-    unseen = draws(14)[8:]
+    unseen = draws(6)[2:]
     before, after = (largest_sensitivity(control, unseen) for control in (START, tuned))
     print(f"largest |S|: {before:.2f} with lqg's gains, {after:.2f}")
     assert after < 0.9 * before
 
 
 def test_errors_are_those_that_are_allowed_and_friction_is_not_taken_off_twice(tuned):
-    family = [MODEL.nominal, *extremes(MODEL, draws(8))]
+    family = [MODEL.nominal, *extremes(MODEL, draws(2))]
     loops = LoopFamily(START, MODEL, MODEL.nominal, family)
     gains = dict(zip(loops.places, tuned.gains, strict=True))
     start = dict(zip(loops.places, loops.gains(np.zeros(len(loops.free))), strict=True))
