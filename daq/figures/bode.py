@@ -32,14 +32,15 @@ def bode(
     response, coherence, deviation: as estimated, (n,), with a magnitude's standard deviation.
     curves: responses at the same frequencies by name. units: of output and input. Measured
     magnitudes carry 95 % bars; points of low coherence are faint, and what was estimated from the
-    logs with the same inputs (``ESTIMATED``) has gaps there. Phases do not jump by a turn.
+    logs with the same inputs (``ESTIMATED``) has gaps there. Phases do not jump by a
+    turn where there is a linear model to go by.
     """
     figure, (size, angle, seen) = style.stack(
         [1.1, 0.8, 0.45], 0.1, top=style.legend_room([_MEASURED, *curves])
     )
     magnitude = np.abs(response)
     good = coherence >= _SEEN
-    phases = _phases([response, *curves.values()])
+    phases = _phases([response, *curves.values()], any(name != ESTIMATED for name in curves))
     for chosen, colour in ((~good, style.FAINT), (good, style.MEASURED)):
         if not chosen.any():
             continue
@@ -75,12 +76,13 @@ def bode(
     return figure
 
 
-def _phases(responses: Sequence[ComplexArray]) -> list[FloatArray]:
-    """Phases [degrees] without jumps of a turn: the last goes on, the others keep near it."""
-    *others, last = (np.nan_to_num(response) for response in responses)
-    smooth = np.degrees(np.unwrap(np.angle(last)))
-    phases = [np.angle(response, deg=True) for response in others]
-    return [*(each + 360.0 * np.round((smooth - each) / 360.0) for each in phases), smooth]
+def _phases(responses: Sequence[ComplexArray], go_on: bool) -> list[FloatArray]:
+    """Phases [degrees]; go_on: the last does not jump by a turn, and the others keep near it."""
+    phases = [np.angle(np.nan_to_num(response), deg=True) for response in responses]
+    if not go_on:
+        return phases
+    smooth = np.unwrap(phases[-1], period=360.0)
+    return [each + 360.0 * np.round((smooth - each) / 360.0) for each in phases]
 
 
 def _limit_phase(angle: Axes, degrees: FloatArray) -> None:

@@ -34,6 +34,7 @@ from sysid.problem.plots import Evidence, Plot
 from sysid.response.frequency import FrequencyResponse, frequency_response, sampled_response
 from sysid.time_limit import AT_LENGTH, time_limit
 
+_MOTIONS = {"N": ("m", "m/s"), "N*m": ("rad", "rad/s")}  # that a force or torque is drawn over
 _OUTPUTS_A_FIGURE = 4
 _LOGS_A_PART = 3  # of more logs the worst, the middle and the best are shown
 _COHERENT = 0.5  # coherence above which an input is seen in an output
@@ -279,13 +280,13 @@ def _frequency(subject: Subject) -> Iterator[Picture]:
         f"{measured.n_segments} segments.",
         spectra(measured.frequency, densities, {signal.name: signal.unit for signal in inputs}),
     )  # fmt: skip
-    curves = _model_responses(subject, measured.frequency)
+    curves, lacking = _model_responses(subject, measured.frequency)
     for j, i in _pairs(measured):
         output, given = subject.model.outputs[j], inputs[i]
         yield Picture(
             _stem("bode", output.name), "frequency",
             f"Frequency response from {given.name} to {output.name}, estimated from "
-            f"{measured.n_segments} segments of the logs.",
+            f"{measured.n_segments} segments of the logs.{lacking}",
             bode(
                 measured.frequency, measured.response[:, j, i], measured.coherence[:, j, i],
                 measured.deviation[:, j, i] / np.sqrt(2.0),
@@ -295,8 +296,13 @@ def _frequency(subject: Subject) -> Iterator[Picture]:
         )  # fmt: skip
 
 
-def _model_responses(subject: Subject, frequency: FloatArray) -> dict[str, ComplexArray]:
-    """Of the identified model: estimated from its free runs like the logs', and linearised."""
+def _model_responses(
+    subject: Subject, frequency: FloatArray
+) -> tuple[dict[str, ComplexArray], str]:
+    """Of the identified model: estimated from its free runs like the logs', and linearised.
+
+    Also a sentence on operating points that have no linear model, or none.
+    """
     model, records = subject.model, subject.records
     runs = [run for _, run in (*subject.training, *subject.validation)]
     curves = {}
@@ -308,11 +314,15 @@ def _model_responses(subject: Subject, frequency: FloatArray) -> dict[str, Compl
         curves["identified"] = frequency_response(simulated).response
     u = np.concatenate([record.inputs for record in records]).mean(axis=0)
     points = _by_model(model, model.operating_points, records) if model.operating_points else {}
+    lacking = []
     for name, held in (points or {"linear, mean inputs": {}}).items():
         response = _linear_response(subject, u, held, frequency, records[0].dt)
         if response is not None:
             curves[name] = response
-    return curves
+        else:
+            lacking.append(name)
+    why = "the model has no equilibrium there, or no derivatives at it"
+    return curves, f" Not drawn is {'; '.join(lacking)}: {why}." if lacking else ""
 
 
 def _linear_response(
@@ -333,6 +343,7 @@ def _plots_of_model(subject: Subject) -> Iterator[Picture]:
     """Plots that the process model brings along."""
     plots = subject.model.plots
     if plots is None:
+        yield from _loops(subject)
         return
     log = {} if subject.foreign else _columns(subject.training[0][0])
     records = [logged.dataset for logged, _ in subject.training]
@@ -347,6 +358,29 @@ def _plots_of_model(subject: Subject) -> Iterator[Picture]:
                 {axis.name: axis.unit for axis in item.over},
                 Axis(item.quantity.name, item.quantity.unit),
                 {curve.label: curve.values for curve in item.curves}, item.points,
+            ),
+        )  # fmt: skip
+
+
+def _loops(subject: Subject) -> Iterator[Picture]:
+    """Forces and torques over the motion, of a model that brings no figures of its own."""
+    log, run = subject.training[0][0].dataset, subject.training[0][1]
+    model = subject.model
+    inputs = {s.name: (s.unit, log.inputs[:, k]) for k, s in enumerate(model.inputs)}
+    measured = inputs | {s.name: (s.unit, log.outputs[:, k]) for k, s in enumerate(model.outputs)}
+    simulated = inputs | {s.name: (s.unit, run[:, k]) for k, s in enumerate(model.outputs)}
+    for name, (unit, _) in measured.items():
+        over = {n: u for n, (u, _) in measured.items() if u in _MOTIONS.get(unit, ())}
+        if not over or not any(s.name in (name, *over) for s in model.outputs):
+            continue
+        runs = {"measured": measured, "identified": simulated}
+        yield Picture(
+            _stem("loop", name), "torque",
+            f"{name} over {' and over '.join(over)} in the training log {log.name}, as measured "
+            "and of the identified model, simulated freely.",
+            plot(
+                over, Axis(name, unit),
+                {label: {n: values[n][1] for n in (name, *over)} for label, values in runs.items()},
             ),
         )  # fmt: skip
 

@@ -3,6 +3,7 @@
 import json
 import math
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,9 @@ from scipy.signal import lfilter
 from daq.errors import ConfigError
 from daq.identification import records as datasets
 from daq.logs.capture import RUN_NAME
+from daq.report.pictures import _loops
 from sim_rig.actuator import actuator
+from sysid import Dataset, Input, Output, Parameter, ProcessModel, State
 from tests.daq.support import forked_rig, only_capture, write_experiment
 
 # A gain of which only a product acts, another that wants to be lower than its range allows, and a
@@ -333,3 +336,28 @@ def test_the_command_line_refuses_it_too(command, captured, record):
     result = command(("identify", captured), captured.parent)
     assert result.returncode == 2 and result.stdout == ""
     assert result.stderr.count("\n") == 1 and f"{path}: 'calibration' must hold" in result.stderr
+
+
+def test_a_users_model_has_its_forces_over_its_motion():
+    model = ProcessModel(
+        name="damper",
+        states=(State("position", "m"),),
+        inputs=(Input("velocity", "m/s"), Input("current", "A")),
+        outputs=(Output("force", "N"), Output("position", "m")),
+        parameters=(Parameter("c", "N*s/m", 1.0, 0.1, 10.0),),
+        derivative=lambda x, u, p: (u[0],),
+        output=lambda x, u, p: (p[0] * u[0], x[0]),
+    )
+    u, y = np.random.default_rng(0).normal(size=(2, 50, 2))
+    data = Dataset(u, y, 0.01, "one")
+    log = SimpleNamespace(dataset=data)
+    (picture,) = _loops(SimpleNamespace(model=model, training=[(log, 2.0 * y)]))
+    assert picture.topic == "torque" and picture.caption.startswith("force over velocity")
+    drawn = {
+        (panel.get_xlabel(), line.get_label()): line.get_xydata()
+        for panel in picture.figure.axes
+        for line in panel.lines
+    }
+    np.testing.assert_array_equal(drawn["velocity [m/s]", "measured"], np.c_[u[:, 0], y[:, 0]])
+    twice = np.c_[2.0 * y[:, 1], 2.0 * y[:, 0]]
+    np.testing.assert_array_equal(drawn["position [m]", "identified"], twice)
