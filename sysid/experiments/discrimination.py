@@ -178,6 +178,7 @@ def discriminate(
             search.choose()
         chosen = [search.pool[i] for i in search.chosen]
         point, distances = tournament.refit(_answers(chosen), tournament.points[-1:])
+        tournament.possible = tournament.possible | (power(distances) > EVEN)
         worst = float(distances[tournament.possible].min())
         best = max(best, (worst, chosen, point), key=lambda each: each[0])
         tournament.points.append(point)
