@@ -29,6 +29,9 @@ def doctor(
             help="Measure when outputs come: +-0.5 V on the motor's, amplifiers unplugged.",
         ),
     ] = False,
+    wakes: Annotated[
+        int, Option(min=2, max=1_000_000, help="Times to wake from sleep, half of them under load.")
+    ] = 20_000,
     out: options.RunsFolder = Path("runs"),
     json: options.AsJson = False,
 ) -> None:
@@ -42,9 +45,9 @@ def doctor(
     if loopback and rig is None:
         raise ConfigError("--loopback: no rig is named", cure="add --rig RIG.yaml")
     if rig is None or names:
-        checks = diagnose(ports_of(names or []), out)
+        checks = diagnose(ports_of(names or []), out, wakes)
     else:
-        checks = [*_of_rig(rig, loopback), *diagnose(None, out)]
+        checks = [*_of_rig(rig, loopback), *diagnose(None, out, wakes)]
     bad = [check.subject for check in checks if check.verdict == "bad"]
     if json:
         rows = [

@@ -454,7 +454,7 @@ def test_a_card_that_is_unplugged_ends_a_run_that_says_what_is_not_known(tmp_pat
 def test_doctor_measures_the_phase_and_says_what_to_write(tmp_path):
     without_seed(rig_file(tmp_path, phase=None, watchdog=None))
     env = environment(phase=1, loopback="rc")
-    command = ("doctor", "--rig", "rig.yaml", "--loopback", "--json")
+    command = ("doctor", "--rig", "rig.yaml", "--loopback", "--json", "--wakes", 200)
     result = rig(*command, cwd=tmp_path, env=env)
     assert result.returncode in (0, 1), result.stderr  # by what the computer is like
     checks = {check["what"]: check for check in json.loads(result.stdout)["checks"]}

@@ -40,7 +40,7 @@ def test_ports_sends_nothing_when_told_only_to_list(tmp_path, run, running):
 
 
 def test_doctor_has_a_verdict_on_everything_and_leaves_nothing_behind(tmp_path, run, running):
-    result = run(["doctor", running.port, "--json"], tmp_path)
+    result = run(["doctor", running.port, "--json", "--wakes", "200"], tmp_path)
     document = json.loads(result.stdout)
     assert (result.returncode == 0) == document["good"]
     checks = {check["what"]: check for check in document["checks"]}
@@ -51,7 +51,7 @@ def test_doctor_has_a_verdict_on_everything_and_leaves_nothing_behind(tmp_path, 
 
 
 def test_doctor_ends_with_1_and_a_cure_when_something_is_bad(tmp_path, run):
-    result = run(["doctor", "/dev/no-such-port"], tmp_path)
+    result = run(["doctor", "/dev/no-such-port", "--wakes", "200"], tmp_path)
     assert result.returncode == 1
     assert "access to /dev/no-such-port: 'rig ports' lists" in result.stdout
     assert "access to /dev/no-such-port" in result.stderr
