@@ -79,9 +79,11 @@ def _real_time(wakes: int) -> list[Check]:
     """Scheduling and memory that a run is granted, and how late it wakes from short sleeps."""
     words = [sys.executable, "-S", "-c", _BUSY]
     with contextlib.ExitStack() as ending:
-        others = [ending.enter_context(subprocess.Popen(words)) for _ in range(os.cpu_count() or 1)]
-        for other in others:
-            ending.callback(other.kill)
+        busy_ones = [
+            ending.enter_context(subprocess.Popen(words)) for _ in range(os.cpu_count() or 1)
+        ]
+        for process in busy_ones:
+            ending.callback(process.kill)
         run = RealTime()
         run.begin("prefer")
         ending.callback(run.undo)

@@ -314,15 +314,27 @@ def _check_space(
     file: YamlFile, settings: IdentificationConfig, model: ProcessModel, earlier: Given | None
 ) -> None:
     ranges, fixed, tied, scale = settings.ranges, settings.fixed, settings.tied, settings.scale
-    # One parameter at a time first, so that the message can point at it.
-    for name in ranges:
-        _try_space(file, ("ranges", name), model, {name: ranges[name]})
+    # One parameter at a time first, so that each message can point at it.
+    singles: list[tuple[str, str, dict[str, Any]]] = [
+        *(("ranges", name, {"ranges": {name: ranges[name]}}) for name in ranges),
+        *(("tied", name, {"tied": {name: tied[name]}}) for name in tied),
+    ]
     for name in scale:
-        single = {name: ranges[name]} if name in ranges else {}
+        within = {"ranges": {name: ranges[name]}} if name in ranges else {}
         if name not in fixed and name not in tied:
-            _try_space(file, ("scale", name), model, single, scale={name: scale[name]})
-    for name in tied:
-        _try_space(file, ("tied", name), model, tied={name: tied[name]})
+            singles.append(("scale", name, {"scale": {name: scale[name]}, **within}))
+    mistakes: list[Mistake] = []
+    for name in fixed:
+        try:
+            model.with_parameters(**{name: {"nominal": fixed[name], "fixed": True}})
+        except ModelError as error:
+            mistakes += file.error(("fixed", name), str(error)).mistakes
+    for group, name, part in singles:
+        try:
+            SearchSpace.of(model, **part)
+        except ModelError as error:
+            mistakes += file.error((group, name), str(error)).mistakes
+    check.refuse(mistakes)
     groups = ("tied", "fixed", "scale", "ranges")
     group = next((key for key in groups if file.content.get(key)), "ranges")
     values = {**fixed, **(earlier.values if earlier else {})}

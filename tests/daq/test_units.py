@@ -11,6 +11,7 @@ from pydantic import Field, ValidationError
 from daq.config.base import Section
 from daq.config.identification import Column
 from daq.config.units import Hertz, Part, RadiansPerSecond, Unit, Volts, factor, unit_of
+from daq.errors import ConfigError
 from daq.identification.request import SettingsRequest
 from daq.identification.settings import problem_of
 from sim_rig.plant import Plant
@@ -126,3 +127,13 @@ def test_the_plants_parameters_are_taken_in_its_units():
 def test_a_constant_column_may_have_its_unit_with_it():
     column = Column.model_validate({"constant": "3 mm"})
     assert (column.constant, column.unit) == (3.0, "mm")
+
+
+def test_values_that_no_such_part_can_have_are_told_each_at_its_key(tmp_path):
+    text = "fixed:\n  R_m: -5\n  K_m: -0.1\ntied:\n  L_m: 0.5*nothing\n"
+    (tmp_path / "c.yaml").write_text(text)
+    with pytest.raises(ConfigError) as error:
+        problem_of(SettingsRequest(str(tmp_path / "c.yaml")))
+    keys = [mistake.key for mistake in error.value.mistakes]
+    assert keys == ["fixed.R_m", "fixed.K_m", "tied.L_m"]
+    assert [mistake.line for mistake in error.value.mistakes] == [2, 3, 5]
