@@ -93,6 +93,8 @@ void rig_on_tick(struct rig_device *device) {
     if ((run->latch == RIG_LATCH_NONE) && rig_guard_beyond(&run->guard, &inputs)) {
         close_latch(run, RIG_LATCH_INTERLOCK);
         flags = RIG_FLAG_INTERLOCK;
+    }
+    if (run->latch != RIG_LATCH_NONE) {
         codes[0] = 0;
         codes[1] = 0;
     }

@@ -192,6 +192,44 @@ def test_an_answer_that_is_no_number_is_a_limit_passed(host):
     assert len(tripped) == 1 and set(played.outputs[tripped[0] :]) == {ZERO}
 
 
+HALF_BROKEN = """
+typedef float rig_real;
+typedef struct { rig_real volts[2]; int ticks; } rig_controller;
+#define RIG_CONTROLLER_AHEAD 1
+#define RIG_CONTROLLER_PERIOD 0.00025f
+void rig_controller_reset(rig_controller *law);
+void rig_controller_step(rig_controller *law, rig_real theta, rig_real omega, rig_real torque,
+                         rig_real current_motor, rig_real reference, int lost);
+"""
+HALF_BROKEN_STEP = """
+#include "half.h"
+void rig_controller_reset(rig_controller *law) { law->ticks = 0; }
+void rig_controller_step(rig_controller *law, rig_real theta, rig_real omega, rig_real torque,
+                         rig_real current_motor, rig_real reference, int lost) {
+    (void)theta, (void)omega, (void)torque, (void)current_motor, (void)reference, (void)lost;
+    law->ticks++;
+    law->volts[0] = (law->ticks < 50) ? 0.0f : 0.0f / (rig_real)(law->ticks - law->ticks);
+    law->volts[1] = 100.0f;
+}
+"""
+
+
+def test_where_one_answer_is_no_number_the_other_is_not_given_either(tmp_path):
+    needs("make", "arm-none-eabi-gcc", "qemu-system-arm")
+    (tmp_path / "half.h").write_text(f"#ifndef HALF\n#define HALF{HALF_BROKEN}#endif\n")
+    (tmp_path / "half.c").write_text(HALF_BROKEN_STEP)
+    make(BOARD="qemu", LAW=tmp_path, BUILD=tmp_path)
+    with EmulatedFirmware(tmp_path / "qemu-law" / "rig.elf", True) as qemu:
+        host = Host(qemu, Bench(QUIET))
+        host.connect()
+        at_tick = orders(host, lambda host: law(host, True, ON, blend=0))
+        limits = Limits(highest=(1000, 1000))
+        played = host.play(300, [(0, 0)] * 300, limits, at_tick=at_tick)
+    (tripped,) = [s.tick for s in played.samples if s.flags & INTERLOCK]
+    assert played.outputs[tripped - 1] == (0, 1000), "until then within its limit"
+    assert set(played.outputs[tripped:]) == {ZERO}
+
+
 def test_what_no_law_can_mean_is_refused(host):
     assert host.request(line.LAW, law(host, True, 0)) == line.WRONG_STATE, "no run"
     host._run += 1
