@@ -5,6 +5,7 @@ import os
 import signal
 import sys
 import threading
+from collections.abc import Sequence
 from types import FrameType
 
 from daq.errors import RigError, Terminated
@@ -15,7 +16,8 @@ _NAMES = ("SIGINT", "SIGTERM", "SIGHUP")  # where there is such a signal
 
 def main() -> None:
     """Run the command line; expected errors end it with their message and exit status."""
-    heard = _hear_signals()
+    ended: list[bool] = []
+    heard = _hear_signals(ended)
     end: BaseException | None = None
     try:
         # Ctrl-C may come while this is imported, too.
@@ -24,8 +26,10 @@ def main() -> None:
         app()
     except BaseException as error:
         end = error
-    # What is left is to say how it ended: another signal has nothing to stop there. ``_interrupt``
-    # keeps the way from above to here free of them.
+    # What is left is to say how it ended: another signal has nothing to stop there. The way from
+    # above to here is kept free of them by their handler, and so is the ignoring itself, which
+    # Python does in Python.
+    ended.append(True)
     for number in heard:
         signal.signal(number, signal.SIG_IGN)
     status = _status(end)
@@ -39,24 +43,27 @@ def main() -> None:
     sys.exit(status)
 
 
-def _hear_signals() -> list[int]:
-    """Have signals that end a program raise, but those ignored from its start; which they are."""
+def _hear_signals(ended: Sequence[bool]) -> list[int]:
+    """Have signals that end a program raise, but those ignored from its start; which they are.
+
+    ended: not empty once there is nothing left to end.
+    """
     if threading.current_thread() is not threading.main_thread():
         return []
     numbers = [getattr(signal, name) for name in _NAMES if hasattr(signal, name)]
     defaults = (signal.default_int_handler, signal.SIG_DFL)
     heard = [number for number in numbers if signal.getsignal(number) in defaults]
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        if ended or (frame is not None and frame.f_code is main.__code__):
+            return  # the command has ended, and nothing would catch what is raised here
+        if number == signal.SIGINT:
+            raise KeyboardInterrupt
+        raise Terminated(signal.Signals(number).name)
+
     for number in heard:
-        signal.signal(number, _interrupt)
+        signal.signal(number, interrupt)
     return heard
-
-
-def _interrupt(number: int, frame: FrameType | None) -> None:
-    if frame is not None and frame.f_code is main.__code__:
-        return  # the command has ended, and nothing would catch what is raised here
-    if number == signal.SIGINT:
-        raise KeyboardInterrupt
-    raise Terminated(signal.Signals(number).name)
 
 
 def _status(end: BaseException | None) -> int | str | None:

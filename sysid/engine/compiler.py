@@ -12,12 +12,13 @@ import math
 import os
 import sys
 import tempfile
+import threading
 import types
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
@@ -38,6 +39,23 @@ _OPTIONS: dict[str, Any] = {
 }
 
 
+P = ParamSpec("P")
+R = TypeVar("R")
+_MAKING = threading.RLock()
+
+
+def _once(make: Callable[P, R]) -> Callable[P, R]:
+    """Keep what was made last, as ``lru_cache``; threads that ask for one thing at once get one."""
+    kept = functools.lru_cache(maxsize=8)(make)
+
+    @functools.wraps(make)
+    def called(*args: P.args, **kwargs: P.kwargs) -> R:
+        with _MAKING:
+            return kept(*args, **kwargs)  # type: ignore[arg-type]  # what cannot be hashed is told
+
+    return called
+
+
 @dataclass(frozen=True)
 class Kernels:
     """A model's compiled functions: two of the batch kernel, then two of the trajectory's."""
@@ -51,7 +69,7 @@ class Kernels:
     advance: Callable[..., None]
 
 
-@functools.lru_cache(maxsize=8)
+@_once
 def kernels(model: ProcessModel, *, exact: bool = True) -> Kernels:
     """Compile a model's kernels, or load them from the cache folder.
 
@@ -71,7 +89,7 @@ class Filter:
     innovations: Callable[..., None]
 
 
-@functools.lru_cache(maxsize=8)
+@_once
 def kalman_filter(
     model: ProcessModel,
     noisy: tuple[int, ...],
@@ -96,7 +114,7 @@ class Tangents:
     simulate: Callable[..., None]
 
 
-@functools.lru_cache(maxsize=8)
+@_once
 def tangents(model: ProcessModel) -> Tangents:
     """Compile the tangents of a model; as ``kernels``.
 

@@ -15,6 +15,7 @@ import builtins
 import functools
 import inspect
 import re
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -32,6 +33,7 @@ _COMPARISONS = {
     ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!="
 }  # fmt: skip
 _BINARY = (*_ARITHMETIC, ast.Div)
+_PARSING = threading.Lock()
 _RUN = "_run_"  # how the names of runs begin
 _EXTREMES = {max: ast.Gt(), min: ast.Lt()}
 _BUILTINS = ("abs", "max", "min")
@@ -42,7 +44,7 @@ def outlined(text: str, names: Mapping[str, Any]) -> str:
 
     names: what the module's functions find beside each other.
     """
-    module = ast.parse(text)
+    module = _parsed(text)
     syntax = _syntax(module, names)
     runs: list[ast.stmt] = []
     for function in _functions(module):
@@ -60,11 +62,17 @@ def intrinsics(text: str, names: Mapping[str, Any]) -> dict[str, Any]:
 
     @functools.cache
     def parsed() -> tuple[dict[str, ast.FunctionDef], _Syntax]:
-        module = ast.parse(text)
+        module = _parsed(text)
         return {node.name: node for node in _functions(module)}, _syntax(module, names)
 
     heads = re.findall(rf"^def ({_RUN}\w+)\((.*)\):$", text, re.MULTILINE)
     return {name: _intrinsic(name, takes.split(", "), parsed) for name, takes in heads}
+
+
+def _parsed(text: str) -> ast.Module:
+    # Two threads that parse at once may fail: https://github.com/python/cpython/issues/106905
+    with _PARSING:
+        return ast.parse(text)
 
 
 def _functions(module: ast.Module) -> list[ast.FunctionDef]:

@@ -38,6 +38,21 @@ from sim_rig.backend import SimulatedDevice as Impatient
 
 atexit.register(os.kill, os.getpid(), signal.SIGINT)
 '''
+_SHUT_OUT = (
+    _IMPATIENT.partition("atexit.register")[0]
+    + """
+hear = signal.signal
+
+
+def late(number, handler):
+    if handler == signal.SIG_IGN:
+        os.kill(os.getpid(), signal.SIGTERM)
+    return hear(number, handler)
+
+
+signal.signal = late
+"""
+)
 
 _MODEL = """
 import time
@@ -53,8 +68,9 @@ def lag():
 """
 
 
-def test_ctrl_c_at_the_very_end_leaves_the_status_as_it_is(tmp_path):
-    (tmp_path / "impatient.py").write_text(_IMPATIENT)
+@pytest.mark.parametrize("backend", [_IMPATIENT, _SHUT_OUT], ids=["at exit", "while shut out"])
+def test_a_signal_at_the_very_end_leaves_the_status_as_it_is(tmp_path, backend):
+    (tmp_path / "impatient.py").write_text(backend)
     write_experiment(tmp_path / "e.yaml")
     write_rig(tmp_path / "rig.yaml", backend="impatient.py:Impatient")
     result = rig("run", "e.yaml", "--rig", "rig.yaml", cwd=tmp_path, fresh=True)

@@ -3,11 +3,13 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
-from sysid.engine.compiler import compiled_text
+from sysid.engine.compiler import compiled_text, kernels, tangents
+from sysid.examples import lag
 from tests.soak import mostly_soak
 
 PREFIX = """
@@ -232,3 +234,10 @@ def test_a_kept_text_that_was_cut_is_written_anew(tmp_path, monkeypatch):
         (function,) = compiled_text("cut", text, ["raised"])
         assert function(1.0, 2.0) == 25.0
         assert file.read_bytes() == whole
+
+
+def test_threads_that_ask_for_the_same_kernels_get_the_same():
+    model = lag()
+    with ThreadPoolExecutor(8) as pool:
+        made = list(pool.map(lambda _: (kernels(model), tangents(model)), range(16)))
+    assert all(one is made[0][0] and other is made[0][1] for one, other in made)

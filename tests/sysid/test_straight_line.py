@@ -1,7 +1,10 @@
 """Runs of assignments written as instructions, against Python that runs the same text."""
 
+import gc
 import math
+import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -145,3 +148,21 @@ def kernel(X):
     _plain(text, "kernel")(expected)
     _compiled(text, "kernel", vector_math)(X)
     np.testing.assert_allclose(X, expected, rtol=1e-12)
+
+
+def _let_others_work(phase, info):
+    time.sleep(0.0)
+
+
+def test_threads_may_do_it_at_once():
+    """Python's parser fails where another thread parses while it collects garbage."""
+    threshold = gc.get_threshold()
+    gc.callbacks.append(_let_others_work)
+    gc.set_threshold(100)
+    try:
+        with ThreadPoolExecutor(4) as pool:
+            texts = list(pool.map(lambda _: outlined(PARTS * 4, {"math": math}), range(8)))
+    finally:
+        gc.callbacks.remove(_let_others_work)
+        gc.set_threshold(*threshold)
+    assert len(set(texts)) == 1
