@@ -250,7 +250,7 @@ class _Tests:
                 return
             surest = min(significant, key=lambda i: logs[i])
             result, residual = results[surest]
-            shape = self._shape(changes[surest], residual)
+            shape = self._shape(suspects[surest], changes[surest], residual)
             self.findings.append(self._finding(suspects[surest], result, logs[surest], shape))
             size = np.sqrt(np.mean(changes[surest] ** 2, axis=(0, 1)))
             admitted = changes[surest][..., size > 0.0] / size[size > 0.0]
@@ -279,13 +279,16 @@ class _Tests:
         whitening = _Whitening.of(self._local, residual)
         return _Regression(whitening, self._columns, self._free, self._residual, self._noises)
 
-    def _shape(self, changes: FloatArray, residual: FloatArray) -> int:
-        """Which of a suspect's columns by itself explains most; residual: what all leave."""
+    def _shape(self, suspect: Suspect, changes: FloatArray, residual: FloatArray) -> str:
+        """Which of a suspect's shapes by itself explains most; residual: what all leave."""
+        if len(suspect.shapes) < 2:
+            return "".join(suspect.shapes)
         regression = self._coloured_by(residual)
         alone = [regression.test(changes[..., [k]], False) for k in range(changes.shape[2])]
-        return int(np.argmax([0.0 if result is None else result.share for result in alone]))
+        shares = [0.0 if result is None else result.share for result in alone]
+        return suspect.shapes[int(np.argmax(shares))]
 
-    def _finding(self, suspect: Suspect, result: "_Result", log_p: float, shape: int) -> Finding:
+    def _finding(self, suspect: Suspect, result: "_Result", log_p: float, shape: str) -> Finding:
         moved = self._gradients @ result.move[: self._gradients.shape[1]]
         moves = [
             Move(e, float(change), float(change) / e.std)
@@ -303,7 +306,7 @@ class _Tests:
             result.share,
             tuple(moves),
             suspect.of,
-            suspect.shapes[shape] if suspect.kind == "function" else "",
+            shape,
         )
 
 
@@ -541,8 +544,8 @@ def description(finding: Finding) -> str:
     return text.format(name=finding.name, late=late, amplitude=size, unit=unit).replace("  ", " ")
 
 
-__all__ = ["Finding", "ModelError", "Move", "describe", "description", "missing_physics"]
-
-
 def _log(chance: float) -> float:
     return math.log(chance) if chance > 0.0 else -math.inf
+
+
+__all__ = ["Finding", "ModelError", "Move", "describe", "description", "missing_physics"]
