@@ -112,8 +112,8 @@ def write(setup: Setup, chosen: Design, folder: Path) -> DesignResult:
     """
     runs = write_runs([setup], chosen.runs, folder)
     result = DesignResult(
-        setup.question, setup.problem.model, setup.problem.model_name, setup.rig_name, chosen,
-        runs, setup.noise, folder, folder / FIGURE,
+        setup.question, setup.rig_name, runs, setup.noise, folder, folder / FIGURE,
+        setup.problem.model, setup.problem.model_name, chosen,
     )  # fmt: skip
     draw_design(result, setup.rig)
     write_whole(folder / DATA, json.dumps(plain(result.document), indent=1) + "\n")

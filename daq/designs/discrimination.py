@@ -8,40 +8,33 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from daq.config.question import Question
 from daq.designs.pictures import draw_runs
-from daq.designs.result import PlannedRun
+from daq.designs.result import RunsResult
 from daq.designs.runs import DATA, FIGURE, progress_of, write_runs
 from daq.designs.setup import Setup
 from daq.documents import plain
 from daq.files import write_whole
 from daq.progress import Watch, ignore
-from daq.views import Lines, Shown
+from daq.views import Lines
 from sysid import Discrimination, ModelError, discriminate
 
 
 @dataclass(frozen=True, repr=False)
-class DiscriminationResult(Shown):
+class DiscriminationResult(RunsResult):
     """Runs that tell structures apart on a rig, and their files.
 
-    models: names of the structures' models, by what the structures are called. noise: standard
-    deviations that it counts on.
+    models: names of the structures' models, by what the structures are called.
     """
 
-    question: Question
     models: Mapping[str, str]
-    rig_name: str
     discrimination: Discrimination
-    runs: tuple[PlannedRun, ...]
-    noise: Mapping[str, float]
-    folder: Path
-    figure: Path
 
     @property
     def headline(self) -> str:
         """What is run, between what it decides, and where its files are."""
-        count = f"{len(self.runs)} run{'s' * (len(self.runs) != 1)}"
-        return f"{count} between {len(self.models)} structures on {self.rig_name}, {self.folder}"
+        return (
+            f"{self.count} between {len(self.models)} structures on {self.rig_name}, {self.folder}"
+        )
 
     def lines(self) -> Lines:
         """Each pair, how far apart it is, and how surely a test tells."""
@@ -56,15 +49,9 @@ class DiscriminationResult(Shown):
         """The same for machines."""
         return {
             "structures": dict(self.models),
-            "rig": self.rig_name,
-            "duration_seconds": self.discrimination.duration,
-            "runs": [run.document for run in self.runs],
             "pairs": [{**asdict(c), "told": c.told} for c in self.discrimination.contests],
             "inseparable": [list(pair) for pair in self.discrimination.inseparable],
-            "noise": dict(self.noise),
-            "simulated": self.discrimination.attempts,
-            "beyond_limits": self.discrimination.refused,
-            "figure": str(self.figure),
+            **self.of_runs(self.discrimination),
         }
 
 
@@ -103,7 +90,7 @@ def write(
     runs = write_runs(list(setups.values()), chosen.runs, folder)
     models = {name: each.problem.model_name for name, each in setups.items()}
     result = DiscriminationResult(
-        first.question, models, first.rig_name, chosen, runs, first.noise, folder, folder / FIGURE
+        first.question, first.rig_name, runs, first.noise, folder, folder / FIGURE, models, chosen
     )
     draw_runs(runs, first.rig, {}, result.figure)
     write_whole(folder / DATA, json.dumps(plain(result.document), indent=1) + "\n")

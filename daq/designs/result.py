@@ -9,6 +9,7 @@ from daq.config.question import Question
 from daq.hal import FloatArray
 from daq.views import Shown
 from sysid import Design, ProcessModel
+from sysid.experiments import ChosenRuns
 
 _WIDE = 0.5  # half width in parts of the value, from which a quantity counts as hardly known
 
@@ -49,10 +50,42 @@ class PlannedRun:
 
 
 @dataclass(frozen=True, repr=False)
-class DesignResult(Shown):
+class RunsResult(Shown):
+    """Runs chosen for a rig, and their files.
+
+    rig_name: as it is typed. noise: standard deviations that the choice counts on.
+    """
+
+    question: Question
+    rig_name: str
+    runs: tuple[PlannedRun, ...]
+    noise: Mapping[str, float]
+    folder: Path
+    figure: Path
+
+    @property
+    def count(self) -> str:
+        """How many runs there are, in words."""
+        return f"{len(self.runs)} run{'s' * (len(self.runs) != 1)}"
+
+    def of_runs(self, chosen: ChosenRuns) -> dict[str, Any]:
+        """What documents hold of the runs and of how they were chosen."""
+        return {
+            "rig": self.rig_name,
+            "duration_seconds": chosen.duration,
+            "runs": [run.document for run in self.runs],
+            "noise": dict(self.noise),
+            "simulated": chosen.attempts,
+            "beyond_limits": chosen.refused,
+            "figure": str(self.figure),
+        }
+
+
+@dataclass(frozen=True, repr=False)
+class DesignResult(RunsResult):
     """A design for a rig, and its files.
 
-    model_name, rig_name: as they are typed. noise: standard deviations that it counts on.
+    model_name: as it is typed.
 
     >>> from daq import design
     >>> few = {"candidates": 4, "generations": 0, "draws": 1, "checks": 1}
@@ -61,21 +94,14 @@ class DesignResult(Shown):
     ['K_dm', 'omega_dm']
     """
 
-    question: Question
     model: ProcessModel
     model_name: str
-    rig_name: str
     design: Design
-    runs: tuple[PlannedRun, ...]
-    noise: Mapping[str, float]
-    folder: Path
-    figure: Path
 
     @property
     def headline(self) -> str:
         """What is run, for which model, and where its files are."""
-        count = f"{len(self.runs)} run{'s' * (len(self.runs) != 1)}"
-        return f"{count} for {self.model_name} on {self.rig_name}, {self.folder}"
+        return f"{self.count} for {self.model_name} on {self.rig_name}, {self.folder}"
 
     @property
     def unknown(self) -> list[Unknown]:
@@ -87,18 +113,12 @@ class DesignResult(Shown):
         """The same for machines."""
         return {
             "model": self.model_name,
-            "rig": self.rig_name,
-            "duration_seconds": self.design.duration,
             "met": self.design.met,
-            "runs": [run.document for run in self.runs],
             "quantities": [
                 {**asdict(quantity), "met": quantity.met} for quantity in self.design.quantities
             ],
             "unknown": [asdict(unknown) for unknown in self.unknown],
-            "noise": dict(self.noise),
-            "simulated": self.design.attempts,
-            "beyond_limits": self.design.refused,
-            "figure": str(self.figure),
+            **self.of_runs(self.design),
         }
 
     def _of_structure(self) -> list[Unknown]:

@@ -2,10 +2,17 @@
 
 from sysid.experiments.discrimination import Contest, Discrimination, discriminate
 from sysid.experiments.excitation import Excitation, Setting
-from sysid.experiments.experiment import Design, DesignedRun, PredictedQuantity, design
+from sysid.experiments.experiment import (
+    ChosenRuns,
+    Design,
+    DesignedRun,
+    PredictedQuantity,
+    design,
+)
 from sysid.experiments.prior import Prior
 
 __all__ = [
+    "ChosenRuns",
     "Contest",
     "Design",
     "DesignedRun",

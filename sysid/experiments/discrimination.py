@@ -9,7 +9,7 @@ from sysid.arrays import BoolArray, FloatArray
 from sysid.engine.simulation import BatchSimulator
 from sysid.experiments.bench import Bench, FreeRun
 from sysid.experiments.excitation import Excitation
-from sysid.experiments.experiment import DesignedRun, designed_run, deviations_of
+from sysid.experiments.experiment import ChosenRuns, designed_run, deviations_of
 from sysid.experiments.information import Informant
 from sysid.experiments.prior import Prior
 from sysid.experiments.rivals import Answer, Hypothesis
@@ -52,10 +52,10 @@ class Contest:
 
 
 @dataclass(frozen=True)
-class Discrimination:
+class Discrimination(ChosenRuns):
     """Runs that tell structures apart, and how surely.
 
-    contests: of each ordered pair. attempts, refused: as of ``Design``.
+    contests: of each ordered pair.
 
     >>> run = DesignedRun("step", {"height": 1.0}, np.ones((50, 1)), dt=0.01)
     >>> one = Contest("a", "b", 25.0, 0.996, {}, possible=True)
@@ -64,15 +64,7 @@ class Discrimination:
     ()
     """
 
-    runs: tuple[DesignedRun, ...]
     contests: tuple[Contest, ...]
-    attempts: int
-    refused: int
-
-    @property
-    def duration(self) -> float:
-        """Length of all runs together [s]."""
-        return float(sum(len(run.inputs) * run.dt for run in self.runs))
 
     @property
     def inseparable(self) -> tuple[tuple[str, str], ...]:
@@ -190,7 +182,9 @@ def discriminate(
     end = sharp.refit(logged, [tournament.refit(answers, begins)[0]])
     contests = _contests(sharp, tournament.possible, *end)
     runs_of_it = tuple(designed_run(candidate) for candidate in best[1])
-    return Discrimination(runs_of_it, contests, search.attempts, search.attempts - search.kept)
+    return Discrimination(
+        runs_of_it, contests, attempts=search.attempts, refused=search.attempts - search.kept
+    )
 
 
 def _answers(runs: Sequence[RunCandidate]) -> list[tuple[Answer, ...]]:

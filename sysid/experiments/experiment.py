@@ -1,7 +1,7 @@
 """Experiments that design themselves: which runs tell most about a model's parameters."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -62,31 +62,39 @@ class PredictedQuantity:
 
 
 @dataclass(frozen=True)
-class Design:
+class ChosenRuns:
+    """Runs that a search has chosen.
+
+    attempts: runs that were simulated; refused: those of them that would have passed a limit.
+    """
+
+    runs: tuple[DesignedRun, ...]
+    attempts: int = field(kw_only=True)
+    refused: int = field(kw_only=True)
+
+    @property
+    def duration(self) -> float:
+        """Length of all runs together [s]."""
+        return float(sum(len(run.inputs) * run.dt for run in self.runs))
+
+
+@dataclass(frozen=True)
+class Design(ChosenRuns):
     """Runs that together tell most, and what they would tell.
 
     quantities: of all that the equations let experiments tell. tied, unseen: what no experiment
     with these outputs tells, with what would (``fix``). information: (n_free, n_free), of the
-    search coordinates, of all runs at the values that the design starts from. attempts: runs that
-    were simulated; refused: those of them that would have passed a limit.
+    search coordinates, of all runs at the values that the design starts from.
 
     >>> run = DesignedRun("step", {"height": 1.0}, np.ones((50, 1)), dt=0.01)
     >>> Design((run, run), (), (), (), np.eye(2), attempts=64, refused=3).duration
     1.0
     """
 
-    runs: tuple[DesignedRun, ...]
     quantities: tuple[PredictedQuantity, ...]
     tied: tuple[TiedGroup, ...]
     unseen: tuple[str, ...]
     information: FloatArray
-    attempts: int
-    refused: int
-
-    @property
-    def duration(self) -> float:
-        """Length of all runs together [s]."""
-        return float(sum(len(run.inputs) * run.dt for run in self.runs))
 
     @property
     def met(self) -> bool:
@@ -196,8 +204,8 @@ def design(
         structure.tied,
         structure.unseen,
         total[0],
-        search.attempts,
-        search.attempts - len(search.pool),
+        attempts=search.attempts,
+        refused=search.attempts - len(search.pool),
     )
 
 
