@@ -57,6 +57,7 @@ class Discrimination(ChosenRuns):
 
     contests: of each ordered pair.
 
+    >>> from sysid.experiments import DesignedRun
     >>> run = DesignedRun("step", {"height": 1.0}, np.ones((50, 1)), dt=0.01)
     >>> one = Contest("a", "b", 25.0, 0.996, {}, possible=True)
     >>> other = Contest("b", "a", 0.0, 0.01, {}, possible=False)
