@@ -41,9 +41,11 @@ _PLAIN = {"F": "h", "G": "h3"}  # what they are for such a row, where phi_k is 1
 class Scheme:
     """Lines of code of which the kernels of a model are made.
 
-    guarded: rows of N that guarded numbers count in. closure: entries of exp(A t) that can differ
-    from zero. entries: matrix and place in it of all that is stored, in order. fewest_steps: per
-    sample, below which the error estimate is not to be trusted.
+    guarded: rows of N that guarded numbers count in. twins: for each state that of the first group
+    of linked ones that A treats alike, itself where there is none before: deviations by several
+    causes have one A. closure: entries of exp(A t) that can differ from zero, of first groups.
+    entries: matrix and place in it of all that is stored, in order. fewest_steps: per sample, below
+    which the error estimate is not to be trusted.
     """
 
     first_row = 0
@@ -66,12 +68,15 @@ class Scheme:
             "margins": self.n_margins,
         }
         self.guarded = sorted({i for guard in structure.guards for i in guard.gains})
+        self._groups = self._linked_states()
+        self.twins = self._first_alike()
         self.closure = self._closure()
+        driven = {self.twins[j] for j in structure.driven}
         self.entries = [
             (matrix, (i, j))
             for matrix in _MATRICES
             for i, j in self.closure
-            if not self.plain(i) and (matrix in "QF" or j in structure.driven)
+            if not self.plain(i) and (matrix in "QF" or j in driven)
         ]
         self.n_entries = len(self.entries)
         # Fast linear parts that feed a nonlinear one swing within a sample: a single step of any
@@ -82,11 +87,32 @@ class Scheme:
         """Where an entry of the matrices stands."""
         raise NotImplementedError
 
+    def _linked_states(self) -> list[list[int]]:
+        """For each state all that A links it with, directly or through others, in order."""
+        groups = [[i] for i in range(self.n_states)]
+        for i, j in self.structure.coefficients:
+            if groups[i] is not groups[j]:
+                merged = sorted(groups[i] + groups[j])
+                for k in merged:
+                    groups[k] = merged
+        return groups
+
+    def _first_alike(self) -> list[int]:
+        coefficients = self.structure.coefficients
+        first: dict[tuple[str | None, ...], list[int]] = {}
+        twins = list(range(self.n_states))
+        for i, group in enumerate(self._groups):
+            texts = tuple(coefficients.get((row, column)) for row in group for column in group)
+            twins[i] = first.setdefault(texts, group)[group.index(i)]
+        return twins
+
     def _closure(self) -> list[tuple[int, int]]:
-        reach = {(i, i) for i in range(self.n_states)} | set(self.structure.coefficients)
-        for k in range(self.n_states):
-            via = [i for i in range(self.n_states) if (i, k) in reach]
-            to = [j for j in range(self.n_states) if (k, j) in reach]
+        states = sorted(set(self.twins))
+        reach = {(i, i) for i in states}
+        reach |= {(i, j) for i, j in self.structure.coefficients if self.twins[i] == i}
+        for k in states:
+            via = [i for i in states if (i, k) in reach]
+            to = [j for j in states if (k, j) in reach]
             reach |= {(i, j) for i in via for j in to}
         return sorted(reach)
 
@@ -113,6 +139,7 @@ class Scheme:
         return [
             f"A[{self.closure.index(entry)}, l] = {coefficient}"
             for entry, coefficient in sorted(self.structure.coefficients.items())
+            if self.twins[entry[0]] == entry[0]
         ]
 
     def call(
@@ -197,10 +224,12 @@ class Scheme:
             columns = range(self.n_states) if vector == "k" else self.structure.driven
         if self.plain(row):
             return f" + {_PLAIN[matrix]} * {vector}{row}" if row in columns else ""
+        place = {entry: k for k, entry in enumerate(self.entries)}
+        pairs = [(j, (matrix, (self.twins[row], self.twins[j]))) for j in self._groups[row]]
         return "".join(
-            f" + {factor}{self._place(k)} * {vector}{j}"
-            for k, (name, (i, j)) in enumerate(self.entries)
-            if name == matrix and i == row and j in columns
+            f" + {factor}{self._place(place[entry])} * {vector}{j}"
+            for j, entry in pairs
+            if j in columns and entry in place
         )
 
     def error_of_n(self) -> list[str]:

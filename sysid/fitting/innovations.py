@@ -114,10 +114,14 @@ class Innovations(Objective):
             if last is not None:
                 noise = np.maximum(noise * np.exp(_to_the_end(last, change)), least)
             last = change if last is None else None
-            settled = settled._with(noise=noise)
+            settled = settled.of_noise(noise)
             if np.abs(change).max() < _STEADY:
                 break
         return settled
+
+    def of_noise(self, noise: FloatArray) -> Self:
+        """With other noise of the outputs, (n_outputs,)."""
+        return self._with(noise=noise)
 
     @property
     def free_run(self) -> Objective:

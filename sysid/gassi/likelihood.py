@@ -32,6 +32,7 @@ from sysid.uncertainty.sensitivity import Sensitivity, sensitivity
 _ROUNDS = 6  # of weights and parameters in turn
 _NOISE_ROUNDS = 20  # the same of noise, weights and parameters
 _STEADY = 1e-3  # share by which weights may still change
+_SWINGING = -0.5  # a round's change of a noise's logarithm in parts of the one before
 # An output explained much better than the others keeps this share of the largest error, or the
 # arithmetic of its last digits would decide.
 _LEAST_SHARE = 1e-2
@@ -105,15 +106,9 @@ def fit_likelihood(
             break  # nothing better was found around it
         explored = best
         starts = lookalikes(best.objective, best.chromosome)
-        for end in refine_each(
-            best.objective,
-            [begin(best.objective, start, tolerance=_ROUGHLY) for start in starts],
-            max_iterations=_QUICKLY,
-            enough=lambda point: not optima.new(objective.space.decode(point.at)),
-        ):
-            # By the best one's weights, until it turns out to matter.
-            rough = _optimum(best.objective, end.chromosome, end.rms)
-            if optima.new(end.chromosome) and optima.deviance(rough, best) < _CONCEIVABLE:
+        # By the best one's weights, until it turns out to matter.
+        for end in _conceivable(best.objective, starts, optima, best):
+            if optima.new(end.chromosome):
                 optima.add(_weighed(objective, end.chromosome, watch))
     best, *others = optima.ranked()
     refitted = None
@@ -180,8 +175,11 @@ class _Optima:
 
     def deviance(self, optimum: Optimum, reference: Optimum) -> float:
         """Twice the logarithm of the likelihood ratio of the reference and the optimum."""
-        floor = _LEAST_SHARE * max(optimum.rms.max(), reference.rms.max(), 1e-300)
-        ratio = np.log(np.maximum(optimum.rms, floor) / np.maximum(reference.rms, floor))
+        return self._deviance(optimum.rms, reference.rms)
+
+    def _deviance(self, rms: FloatArray, reference: FloatArray) -> float:
+        floor = _LEAST_SHARE * max(rms.max(), reference.max(), 1e-300)
+        ratio = np.log(np.maximum(rms, floor) / np.maximum(reference, floor))
         return float(2.0 * np.sum(self._independent_samples * ratio))
 
     def connected(self, optimum: Optimum, rival: Optimum) -> bool:
@@ -194,18 +192,23 @@ class _Optima:
         place = int(np.argmax(np.abs(end - at) / objective.space.width))
         for coordinate in at[place] + _WAY * (end - at)[place]:
             at = at + (coordinate - at[place]) / (end - at)[place] * (end - at)
-            fit = refine(
+            held = Restriction(held=(place, float(coordinate)))
+            start = objective.space.decode(at)
+            (fit,) = refine_each(
                 objective,
-                objective.space.decode(at),
+                [begin(objective, start, tolerance=_ROUGHLY, restriction=held)],
                 max_iterations=_QUICKLY,
-                tolerance=_ROUGHLY,
-                restriction=Restriction(held=(place, float(coordinate))),
+                enough=lambda point: self._alike(point, optimum),
             )
-            between = _optimum(objective, fit.chromosome, fit.rms)
-            if self.deviance(between, optimum) >= _TOLD_APART:
+            if self.deviance(_optimum(objective, fit.chromosome, fit.rms), optimum) >= _TOLD_APART:
                 return False
             at = coded(fit.chromosome)
         return True
+
+    def _alike(self, point: Point, optimum: Optimum) -> bool:
+        """Whether the data do not tell a point that was simulated from an optimum."""
+        rms = point.accurate_rms
+        return rms is not None and self._deviance(rms, optimum.rms) < _TOLD_APART
 
     @cached_property
     def _independent_samples(self) -> FloatArray:
@@ -295,14 +298,34 @@ def _refitted(
         first = better_around(fit, first, ranked[0], watch)
     optima = _Optima(objective)
     optima.add(first)
-    likely = (o for o in ranked[1:] if by_error.deviance(o, ranked[0]) < _CONCEIVABLE)
-    descents = [begin(first.objective, optimum.chromosome) for optimum in likely]
+    likely = [o for o in ranked[1:] if by_error.deviance(o, ranked[0]) < _CONCEIVABLE]
+    starts = [optimum.chromosome for optimum in likely]
+    ends = _conceivable(first.objective, starts, optima, first)
+    descents = [begin(first.objective, end.chromosome) for end in ends]
     for end in refine_each(first.objective, descents):
         optima.add(_optimum(first.objective, end.chromosome, end.rms))
     best = optima.ranked()[0]
     if best is not first:
         optima.refit(best, fit(replace(best, objective=ranked[0].objective), watch))
     return optima
+
+
+def _conceivable(
+    objective: Objective, starts: Sequence[FloatArray], optima: _Optima, best: Optimum
+) -> list[Refinement]:
+    """Where descents come to soon, what is no minimum yet known and not far behind the best."""
+    ends = refine_each(
+        objective,
+        [begin(objective, start, tolerance=_ROUGHLY) for start in starts],
+        max_iterations=_QUICKLY,
+        enough=lambda point: not optima.new(objective.space.decode(point.at)),
+    )
+    return [
+        end
+        for end in ends
+        if optima.new(end.chromosome)
+        and optima.deviance(_optimum(objective, end.chromosome, end.rms), best) < _CONCEIVABLE
+    ]
 
 
 def better_around(
@@ -349,6 +372,7 @@ def noisy_fit(
     """
     chromosome, rms = optimum.chromosome, optimum.rms
     fitted = Innovations.starting(optimum.objective, chromosome, corrects=corrects, process=process)
+    last = np.zeros(len(fitted.noise))
     for _ in range(_NOISE_ROUNDS):
         if not corrects and fitted.overwhelmed.any():
             return None
@@ -360,8 +384,23 @@ def noisy_fit(
         chromosome, rms, fitted = end.chromosome, end.rms, weighed
         if steady:
             break
-        fitted = fitted.settled(chromosome)
+        fitted, last = towards(fitted, fitted.settled(chromosome), last)
     return _optimum(fitted, chromosome, rms)
+
+
+def towards(
+    fitted: Innovations, settled: Innovations, last: FloatArray
+) -> tuple[Innovations, FloatArray]:
+    """With the noise of the next round, and by how much its logarithms change, (n_outputs,).
+
+    settled: with the noise that the parameters of this round ask for. last: change of the round
+    before. Where one undoes most of the other, noise and parameters would go to and fro for ever:
+    between the two is where a secant puts the end (Aitken).
+    """
+    change = np.log(settled.noise / fitted.noise)
+    part = np.divide(change, last, out=np.zeros_like(change), where=last != 0.0)
+    change = np.where(part < _SWINGING, change / (1.0 - part), change)
+    return settled.of_noise(fitted.noise * np.exp(change)), change
 
 
 def _optimum(objective: Objective, chromosome: FloatArray, rms: FloatArray) -> Optimum:

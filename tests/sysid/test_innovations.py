@@ -24,7 +24,7 @@ from sysid import (
 )
 from sysid.fitting.innovations import Innovations
 from sysid.fitting.objective import Objective
-from sysid.gassi.likelihood import Optimum, better_around, noisy_fit
+from sysid.gassi.likelihood import Optimum, better_around, noisy_fit, towards
 from sysid.uncertainty.sensitivity import sensitivity
 from tests.sysid.support import lag, linear_response, prbs
 
@@ -373,6 +373,19 @@ def test_little_noise_of_an_output_is_found_beside_what_that_of_an_input_does():
     settled = Innovations.starting(objective, np.array([GAIN, TAU]), corrects=True)
     squares = settled.rms(np.array([[GAIN, TAU]]))[0] * settled.scales[0] / settled.noise
     assert squares**2 == pytest.approx(1.0, abs=1e-3)
+
+
+@pytest.mark.parametrize("answer", [-1.3, -1.0, -0.6, -0.2, 0.4])
+def test_noise_that_each_round_undoes_comes_to_rest(answer):
+    """Rounds whose parameters ask for a noise of (noise / 3)^answer times 3."""
+    record = Dataset(np.ones(20), np.zeros(20), DT, input_noise=np.array([OF_INPUT]))
+    objective = Objective(BatchSimulator(lag()), SearchSpace.of(lag()), [record])
+    fitted = Innovations.of(objective, np.array([70.0]), corrects=True)
+    last = np.zeros(1)
+    for _ in range(10):
+        asked = fitted.of_noise(3.0 * (fitted.noise / 3.0) ** answer)
+        fitted, last = towards(fitted, asked, last)
+    assert fitted.noise == pytest.approx(3.0, rel=1e-3)
 
 
 @pytest.mark.soak

@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
+from sysid import BatchSimulator, Dataset, Input, Output, Parameter, ProcessModel, State
 from sysid.engine import vector_math as _vector_math
+from sysid.engine.batch_kernel import BatchKernel
 from sysid.engine.phi import scheme_matrices
 from sysid.engine.scheme import LANES
+from sysid.engine.structure import analyse
 
 
 def tables(pattern):
@@ -129,3 +132,39 @@ def test_logarithms_at_the_edges():
 @pytest.mark.parametrize("name", ["exp", "tanh", "sin", "cos", "log"])
 def test_vector_functions_pass_not_a_number_on(name):
     assert math.isnan(getattr(_vector_math, name)(math.nan))
+
+
+def test_parts_that_are_alike_share_their_matrices_and_run_as_each_alone():
+    """Two oscillators of the same parameters, each driven by an input of its own."""
+    rng = np.random.default_rng(0)
+    inputs, values = rng.standard_normal((40, 2)), np.array([30.0, 4.0, 0.5])
+    record, pair = Dataset(inputs, np.zeros((40, 2)), 0.02), oscillators(2)
+    both = BatchSimulator(pair).trajectories(values, record, 3, np.zeros((1, 4)))[0]
+    for k in range(2):
+        own = Dataset(inputs[:, [k]], np.zeros(40), 0.02)
+        alone = BatchSimulator(oscillators(1)).trajectories(values, own, 3, np.zeros((1, 2)))[0]
+        np.testing.assert_array_equal(both[:, k], alone[:, 0])
+    one, two = (BatchKernel(m, analyse(m)) for m in (oscillators(1), pair))
+    assert two.n_entries == one.n_entries > 0
+
+
+def oscillators(count):
+    """x'' = w (u - x) - d x' - c x^3, so many times beside one another."""
+
+    def derivative(x, u, p):
+        rows = []
+        for k in range(count):
+            place, speed = x[2 * k], x[2 * k + 1]
+            force = p[0] * (u[k] - place) - p[1] * speed - p[2] * place * place * place
+            rows += [speed, force]
+        return tuple(rows)
+
+    return ProcessModel(
+        name=f"oscillators{count}",
+        states=tuple(State(f"{kind}{k}", "1") for k in range(count) for kind in "xv"),
+        inputs=tuple(Input(f"u{k}", "1") for k in range(count)),
+        outputs=tuple(Output(f"x{k}", "1") for k in range(count)),
+        parameters=tuple(Parameter(name, "1", 1.0, 0.1, 100.0) for name in ("w", "d", "c")),
+        derivative=derivative,
+        output=lambda x, u, p: tuple(x[2 * k] for k in range(count)),
+    )
