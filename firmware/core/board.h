@@ -1,5 +1,6 @@
 /* What a board gives the core: everything that touches hardware. Outputs are zero from the first
- * instruction after reset on, before any of these is called. */
+ * instruction after reset on, before any of these is called. All take constant time, a few dozen
+ * instructions, and wait for nothing, but board_latch and board_apply for their converters. */
 #ifndef RIG_BOARD_H
 #define RIG_BOARD_H
 

@@ -66,11 +66,12 @@ struct rig_device {
     uint8_t waiting_bytes[RIG_TRANSMIT];
 };
 
-/* IDLE, outputs zero, no session. Main, before any interrupt is on; RIG_QUEUE steps. */
+/* IDLE, outputs zero, no session. Main, before any interrupt is on; a step for every byte of it. */
 void rig_init(struct rig_device *device, const struct rig_identity *identity);
 
 /* What there is to do now: up to 256 bytes received, samples to be sent, the independent watchdog.
- * Main, again and again; a few thousand steps at most. */
+ * Main, again and again. At most 4 frames of RIG_BLOCK samples, three steps a byte, and RIG_QUEUE
+ * steps for each session and each run that these bytes begin, of which there is room for 13. */
 void rig_poll(struct rig_device *device);
 
 /* Whether rig_poll has something to do at once; where not, the main loop may sleep until the next

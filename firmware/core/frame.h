@@ -38,7 +38,7 @@ void rig_decoder_reset(struct rig_decoder *decoder);
  * else that is wrong is dropped. Main; constant time, but for the CRC of RIG_BODY_IN bytes. */
 bool rig_decode(struct rig_decoder *decoder, uint8_t byte, struct rig_frame *frame);
 
-/* Bytes on the wire of a body (header to CRC) of n bytes, at most. */
+/* Bytes on the wire of a body (header to CRC) of n bytes, at most. Any context; constant time. */
 static inline uint32_t rig_wire_size(uint32_t n) {
     return n + n / 254u + 3u;
 }

@@ -49,9 +49,10 @@ def test_only_what_fails_on_load_is_tried_again(tmp_path, load, good, varied, tr
     (tmp_path / "conftest.py").write_text(_CONFTEST.format(root=str(ROOT), load=load))
     (tmp_path / "test_it.py").write_text(_TEST.format(good=good, varied=varied))
     (tmp_path / "pytest.ini").write_text("[pytest]\nmarkers = patient")
-    words = [sys.executable, "-m", "pytest", "-rs", "-p", "no:cacheprovider", "-p", "no:hybrid-rig"]
+    words = [sys.executable, "-m", "pytest", "-rs", "-p", "no:cacheprovider"]
+    alone = environment(PYTEST_DISABLE_PLUGIN_AUTOLOAD="1")
     done = subprocess.run(
-        words, cwd=tmp_path, env=environment(), capture_output=True, text=True, check=False
+        words, cwd=tmp_path, env=alone, capture_output=True, text=True, check=False
     )
     assert outcome in done.stdout, done.stdout + done.stderr
     assert len((tmp_path / "tries").read_text()) == tries

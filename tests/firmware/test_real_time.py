@@ -6,6 +6,7 @@ tried again on load alone (``patience``). Among all other tests those are the lo
 """
 
 import os
+import signal
 import tempfile
 from pathlib import Path
 
@@ -188,6 +189,38 @@ def test_a_host_that_is_killed_leaves_zero_outputs(elf, tmp_path):
 
 def moving(journal):
     return bool(journal) and any(journal[-1]["outputs"])
+
+
+@pytest.fixture
+def rehearsal(elf, tmp_path):
+    """``rig emulate --firmware`` in a group of its own, and the number of its QEMU."""
+    process = start_rig("emulate", "--firmware", elf, cwd=tmp_path, start_new_session=True)
+    try:
+        assert process.stdout.readline().startswith("/dev/pts/"), process.communicate()[1]
+        children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+        yield process, int(children[0])
+    finally:
+        process.kill()
+        process.communicate()
+
+
+@pytest.mark.soak
+def test_ctrl_c_ends_it_even_where_qemu_stands_still(rehearsal):
+    process, qemu = rehearsal
+    os.kill(qemu, signal.SIGSTOP)
+    os.killpg(process.pid, signal.SIGINT)
+    _, errors = process.communicate(timeout=15)
+    assert process.returncode == 0 and "QEMU" not in errors, errors
+    assert not Path(f"/proc/{qemu}").exists()
+
+
+@pytest.mark.soak
+def test_a_qemu_that_is_killed_is_told_in_words(rehearsal):
+    process, qemu = rehearsal
+    os.kill(qemu, signal.SIGKILL)
+    _, errors = process.communicate(timeout=15)
+    assert process.returncode == 1 and "QEMU with the firmware ended: by signal 9" in errors
+    assert "Traceback" not in errors
 
 
 def test_what_the_emulator_has_and_the_firmware_not_is_refused(tmp_path):

@@ -33,6 +33,8 @@ _OUT = struct.Struct("<I2hBBBBfIHBxHHH2x")
 _IN = struct.Struct("<3iifBBH")
 _INSTRUCTIONS = 1e9 / 168e6 / 8.0  # in a step of SysTick, at 8 ns each
 _PATIENCE = 20.0  # s for QEMU to begin, and between two exchanges
+_FAULT = 3  # status of the firmware's fault handler (boards/qemu/startup.c)
+_BUILD = "make -C firmware BOARD=qemu"
 _LOOK = 0.01  # s
 
 
@@ -86,7 +88,7 @@ class EmulatedFirmware:
         if not elf.is_file():
             raise ConfigError(
                 f"--firmware {elf}: there is no such file",
-                cure="build it with 'make -C firmware BOARD=qemu'",
+                cure=f"build it with '{_BUILD}'",
             )
         if shutil.which(_PROGRAM) is None:
             raise ConfigError(
@@ -132,6 +134,10 @@ class EmulatedFirmware:
         except BrokenPipeError:
             raise self._failure() from None
 
+    def kill(self) -> None:
+        """End QEMU at once; ``exchange`` and ``answer`` then raise DeviceError."""
+        self._process.kill()
+
     def _start(self) -> None:
         folder = Path(self._files.enter_context(tempfile.TemporaryDirectory(prefix="rig-qemu-")))
         pipes = folder / "plant.out", folder / "plant.in"
@@ -141,9 +147,11 @@ class EmulatedFirmware:
         command = [_PROGRAM, *_MACHINE, *_SEMIHOSTING, *self._line(), "-kernel", str(self._elf)]
         command = command if self._virtual else [*_AHEAD_OF_OTHERS, *command]
         self._log = folder / "qemu.txt"
+        # In a group of its own: a terminal's Ctrl-C is for this process.
         self._process = subprocess.Popen(
-            command, cwd=folder, stdin=subprocess.DEVNULL, stdout=output, stderr=output
-        )
+            command, cwd=folder, stdin=subprocess.DEVNULL, stdout=output, stderr=output,
+            process_group=0,
+        )  # fmt: skip
         self._files.callback(self._end)
         # Both ends of a pipe wait for each other; in the order in which the firmware opens them.
         self._from = self._opened(pipes[0], os.O_RDONLY)
@@ -189,18 +197,27 @@ class EmulatedFirmware:
         return data
 
     def _failure(self) -> DeviceError:
+        """What became of QEMU, in words."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(timeout=1.0)
         status = self._process.poll()
+        if status is None:
+            return DeviceError(
+                f"QEMU with the firmware has told nothing for {_PATIENCE:g} s",
+                cure=f"is it the firmware of '{_BUILD}', and QEMU not held up?",
+                file=str(self._elf),
+            )
         lines = self._log.read_text(errors="replace").strip().splitlines()
-        word = lines[-1] if lines else "no word"
-        return DeviceError(
-            f"QEMU with the firmware ended with status {status}: {word}",
-            file=str(self._elf),
-        )
+        said = [line for line in lines if "redirected to" not in line]
+        words = said[-1] if said else f"status {status}"
+        if status < 0:
+            words = f"by signal {-status}"
+        elif status == _FAULT:
+            words = "the firmware came to a fault"
+        return DeviceError(f"QEMU with the firmware ended: {words}", file=str(self._elf))
 
     def _end(self) -> None:
-        self._process.kill()
+        self.kill()
         self._process.wait()
 
 

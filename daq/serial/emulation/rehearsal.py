@@ -10,10 +10,12 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import FrameType
 from typing import Any, TextIO
 
 import numpy as np
 
+from daq.errors import DeviceError
 from daq.hal import ANALOG_INPUTS, CHANNELS, Flag, Phase, Simulation
 from daq.run.realtime import RealTime
 from daq.serial.emulation.emulator import SimulatedBoard, opened_journal, warm_up
@@ -81,20 +83,35 @@ def serve(
     and by how much QEMU was late. Raises ConfigError for files and ports that cannot be,
     DeviceError where QEMU ends.
     """
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda number, frame: stop.set())
     plant = SimulatedPlant(rig)
     with contextlib.ExitStack() as stack:
         notes = Journal(stack.enter_context(opened_journal(journal)))
         RealTime().begin("prefer")
         _share_core()
         firmware = stack.enter_context(EmulatedFirmware(elf, tcp=tcp))
+        told = _told_to_end(firmware)
         ready(stack.enter_context(named(firmware.port, link)))
-        while not stop.is_set():
-            exchange = firmware.exchange()
-            notes.add(exchange)
-            firmware.answer(plant.read(exchange))
+        try:
+            while not told.is_set():
+                exchange = firmware.exchange()
+                notes.add(exchange)
+                firmware.answer(plant.read(exchange))
+        except DeviceError:
+            if not told.is_set():
+                raise
+
+
+def _told_to_end(firmware: EmulatedFirmware) -> threading.Event:
+    """Set by Ctrl-C and SIGTERM, which end QEMU, for it may stand still."""
+    told = threading.Event()
+
+    def end(number: int, frame: FrameType | None) -> None:
+        told.set()
+        firmware.kill()
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, end)
+    return told
 
 
 def _share_core() -> None:

@@ -1,6 +1,6 @@
 /* Damages frames and feeds them to the decoder: fuzz FRAMES SEED. None may be accepted.
  *
- * Damage: bits turned, bytes replaced, dropped, inserted, the end cut off, two frames' halves
+ * Of each new frame there are fifteen damaged ones, and then itself. Damage: bits turned, bytes replaced, dropped, inserted, the end cut off, two frames' halves
  * joined. A code that decodes to the very bytes that were sent is another way to write the same
  * frame, not a damaged one, and counts as such. */
 #include <stdio.h>
@@ -10,6 +10,7 @@
 #include "host.h"
 
 #define ROOM 1024u
+#define SHARE 16u /* one of so many goes through whole */
 
 static uint64_t state;
 
@@ -50,10 +51,8 @@ static uint32_t make(uint8_t *wire, uint8_t *body, uint32_t *size) {
     return n;
 }
 
-static uint32_t damage(uint8_t *wire, uint32_t n) {
-    uint8_t other[ROOM];
-    uint8_t body[ROOM];
-    uint32_t size;
+/* other: a frame of m bytes whose halves may be joined to it. */
+static uint32_t damage(uint8_t *wire, uint32_t n, const uint8_t *other, uint32_t m) {
     const uint32_t times = 1u + draw(3u);
     for (uint32_t i = 0u; (i < times) && (n > 1u); i++) {
         const uint32_t at = draw(n);
@@ -80,15 +79,13 @@ static uint32_t damage(uint8_t *wire, uint32_t n) {
         case 4:
             n = at + 1u;
             break;
-        default: {
+        default:
             /* Behind session and number, which differ: else it would be the other one, whole. */
-            const uint32_t m = make(other, body, &size);
             for (uint32_t k = (at < 8u) ? 8u : at; (k < m) && (k < ROOM / 2u); k++) {
                 wire[k] = other[k];
                 n = k + 1u;
             }
             break;
-        }
         }
     }
     return n;
@@ -103,17 +100,26 @@ int main(int count, char **words) {
     state = strtoull(words[2], NULL, 10) * 2u + 1u;
     struct rig_decoder decoder;
     struct rig_frame frame;
-    uint8_t wire[ROOM];
     uint8_t body[ROOM];
+    uint8_t scratch[ROOM];
+    uint8_t made[ROOM];
+    uint8_t other[ROOM];
+    uint8_t wire[ROOM];
+    uint32_t size = 0u;
+    uint32_t length = 0u;
+    uint32_t joined = 0u;
     unsigned long accepted = 0u;
     unsigned long same = 0u;
     unsigned long whole = 0u;
     rig_decoder_reset(&decoder);
     for (unsigned long i = 0u; i < frames; i++) {
-        uint32_t size;
-        uint32_t n = make(wire, body, &size);
-        const bool hurt = (i % 16u) != 15u; /* one of sixteen goes through whole */
-        n = hurt ? damage(wire, n) : n;
+        if (i % SHARE == 0u) {
+            joined = make(other, scratch, &size);
+            length = make(made, body, &size);
+        }
+        (void)memcpy(wire, made, length);
+        const bool hurt = (i % SHARE) != SHARE - 1u;
+        const uint32_t n = hurt ? damage(wire, length, other, joined) : length;
         for (uint32_t k = 0u; k <= n; k++) {
             if (rig_decode(&decoder, (k < n) ? wire[k] : 0u, &frame)) {
                 const bool equal = (frame.length + RIG_FRAME_OVERHEAD == size) &&
@@ -126,5 +132,5 @@ int main(int count, char **words) {
     }
     (void)printf("{\"frames\": %lu, \"accepted\": %lu, \"same\": %lu, \"whole\": %lu}\n", frames,
                  accepted, same, whole);
-    return ((accepted == 0u) && (whole == frames / 16u)) ? 0 : 1;
+    return ((accepted == 0u) && (whole == frames / SHARE)) ? 0 : 1;
 }

@@ -231,8 +231,8 @@ void board_latch(struct rig_inputs *inputs) {
 }
 
 void board_apply(const int16_t codes[RIG_OUTPUTS], int16_t applied[RIG_OUTPUTS]) {
-    applied[0] = cleared ? 0 : codes[0];
-    applied[1] = cleared ? 0 : codes[1];
+    applied[0] = (int16_t)(cleared ? 0 : codes[0]);
+    applied[1] = (int16_t)(cleared ? 0 : codes[1]);
     write_dac(0x00u, (uint16_t)applied[0]);
     write_dac(0x02u, (uint16_t)applied[1]);
     if ((codes[0] == 0) && (codes[1] == 0)) {

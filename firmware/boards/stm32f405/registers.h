@@ -87,7 +87,6 @@
 #define NVIC_IPR7 REG(0xE000E41Cu) /* interrupts 28 to 31 */
 #define NVIC_IPR9 REG(0xE000E424u) /* 36 to 39 */
 #define SHPR3 REG(0xE000ED20u)     /* PendSV, SysTick */
-#define CPACR REG(0xE000ED88u)
 
 #define IRQ_PVD 1u
 #define IRQ_DMA2_STREAM7 70u

@@ -2,5 +2,8 @@
 # 8 bytes a command, the samples 32 each.
 SIZES := -DRIG_QUEUE=1024u -DRIG_SAMPLES=256u
 
+# Left out where your vendor's startup code has a reset_handler.
+RESET := boards/cortex_m/reset.c
+
 # Another processor than a Cortex-M4 with floating point:
 # TARGET := -mcpu=cortex-m0plus -mthumb
