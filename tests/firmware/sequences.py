@@ -64,14 +64,35 @@ class Inputs:
         )
 
 
-@dataclass(frozen=True)
-class Block:
-    """Whether the line takes no more bytes from now on."""
+ANY = U32 - 1
 
-    blocked: bool
+
+@dataclass(frozen=True)
+class Takes:
+    """So many bytes the line takes from now on; ANY: without an end."""
+
+    bytes: int
 
     def pack(self):
-        return struct.pack("<BB", 3, self.blocked)
+        return struct.pack("<BI", 3, self.bytes)
+
+
+@dataclass(frozen=True)
+class TimerStops:
+    """The timer's interrupt comes no more."""
+
+    def pack(self):
+        return b"\x04"
+
+
+@dataclass(frozen=True)
+class Flood:
+    """Bytes that come from the host while the main loop hangs."""
+
+    data: bytes
+
+    def pack(self):
+        return struct.pack("<BH", 5, len(self.data)) + self.data
 
 
 class Author:
@@ -250,6 +271,7 @@ class Author:
 class Trace:
     """What an event came to. frames: (type, session, seq, payload) in order, samples left out, and
     numbers of STATUS. samples: (tick, record, time). applied: (tick, motor, brake) of every tick.
+    fed: how often the firmware has fed the independent watchdog.
     """
 
     frames: list = field(default_factory=list)
@@ -259,6 +281,7 @@ class Trace:
     latch: int = 0
     outputs: tuple = (0, 0)
     announced: tuple = (0, 0.0)
+    fed: int = 0
 
 
 class Board:
@@ -426,8 +449,8 @@ class Firmware:
         rows = struct.iter_unpack("<I2h", data[place + 2 : place + 2 + 8 * n])
         trace.applied = list(rows)
         place += 2 + 8 * n
-        end = struct.Struct("<BBhhBf")
-        trace.state, trace.latch, *rest = end.unpack_from(data, place)
+        end = struct.Struct("<BBhhBfI")
+        trace.state, trace.latch, *rest, trace.fed = end.unpack_from(data, place)
         trace.outputs, trace.announced = tuple(rest[:2]), tuple(rest[2:])
         return trace, place + end.size
 

@@ -86,6 +86,8 @@ class DeviceMachine:
     def receive(self, data: bytes, now: int) -> None:
         """Take bytes from the line that arrived at ``now``."""
         for frame in self.decoder.feed(data):
+            if len(frame.payload) > self.identity.max_payload:
+                continue  # longer than it takes
             if frame.type == Type.HELLO:
                 self._hello(frame, now)
             elif frame.session != self._session or self._session == 0:

@@ -4,12 +4,15 @@
  *   0  u16 n, n bytes                    from the line
  *   1  u32                               ticks of the clock that pass
  *   2  3 x i32, i32, i32, f32, u8        inputs: analog, count, its increment, rate, at the end
- *   3  u8                                whether the line takes no more bytes from now on
+ *   3  u32                               bytes that the line takes from now on, the largest: any
+ *   4                                    the timer stands still: a fault
+ *   5  u16 n, n bytes                    from the line, while the main loop hangs
  * Its trace is u32 n and n bytes: for every event
  *   u32 n, n bytes                       to the line
  *   u16 n, n x (u32 tick, 2 x i16)       ticks, and what each applied
  *   u8 state, u8 latch, 2 x i16          afterwards, with the outputs
  *   u8 phase, f32 turns                  announced last
+ *   u32                                  times that the independent watchdog was fed
  */
 #include <stdio.h>
 #include <stdlib.h>
@@ -24,7 +27,7 @@ static uint8_t trace[LONGEST];
 static uint32_t traced;
 static uint8_t ticks[LONGEST];
 static uint32_t ticked_bytes;
-static bool blocked;
+static uint32_t takes;
 
 static void reserve(uint32_t used, uint32_t n) {
     if (LONGEST - used < n) {
@@ -51,8 +54,9 @@ static void put32(uint32_t value) {
 
 static void drain(void) {
     uint8_t byte;
-    while (!blocked && rig_byte_out(&device, &byte)) {
+    while ((takes != 0u) && rig_byte_out(&device, &byte)) {
         put8(byte);
+        takes -= (takes != UINT32_MAX) ? 1u : 0u;
     }
 }
 
@@ -81,9 +85,21 @@ static uint32_t play(const uint8_t *event, uint32_t place) {
         place += 5u;
         break;
     case 3:
-        blocked = event[1] != 0u;
-        place += 2u;
+        takes = rig_get32(event + 1);
+        place += 5u;
         break;
+    case 4:
+        host_board.period = 0u;
+        place += 1u;
+        break;
+    case 5: {
+        const uint32_t n = rig_get16(event + 1);
+        for (uint32_t i = 0u; i < n; i++) {
+            rig_byte_in(&device, event[3u + i]);
+        }
+        place += 3u + n;
+        break;
+    }
     default:
         for (uint32_t i = 0u; i < RIG_INPUTS; i++) {
             host_board.inputs.analog[i] = rig_signed32(rig_get32(event + 1u + 4u * i));
@@ -107,6 +123,7 @@ static uint32_t play(const uint8_t *event, uint32_t place) {
     put16((uint16_t)host_board.outputs[1]);
     put8(host_board.phase);
     put32(rig_float_bits(host_board.turns));
+    put32(host_board.fed);
     return place;
 }
 
@@ -120,7 +137,7 @@ int main(void) {
         }
         host_reset(&device);
         traced = 0u;
-        blocked = false;
+        takes = UINT32_MAX;
         for (uint32_t place = 0u; place < n;) {
             place = play(events + place, place);
         }
