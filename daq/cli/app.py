@@ -2,11 +2,12 @@
 
 import functools
 import os
+import re
 import sys
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext, suppress
-from inspect import Parameter, signature
-from typing import Annotated, Any
+from inspect import Parameter, cleandoc, signature
+from typing import Annotated, Any, Literal
 
 from typer import BadParameter, Exit, Option, Typer
 from typer.core import TyperGroup
@@ -136,6 +137,17 @@ class _Commands(TyperGroup):
             raise
 
 
+# Frames are for people: in a pipe help and errors are plain lines.
+_MARKUP: Literal["rich"] | None = "rich" if sys.stderr.isatty() else None
+
+
+def _register(group: Typer, name: str | None, command: Callable[..., None], example: str) -> None:
+    """Add a command; its docstring is its help, a line for each paragraph, brackets kept."""
+    text = re.sub(r"(?<!\n)\n(?!\n)", " ", cleandoc(command.__doc__ or ""))
+    text = text.replace("[", r"\[") if _MARKUP else text
+    group.command(name, help=text, epilog=f"Example:  {example}")(_with_volume(command))
+
+
 app = Typer(
     name="rig",
     cls=_Commands,
@@ -145,15 +157,14 @@ app = Typer(
         "Start with:  rig run prbs.yaml --identify"
     ),
     no_args_is_help=True,
-    # Frames are for people: in a pipe help and errors are plain lines.
-    rich_markup_mode="rich" if sys.stderr.isatty() else None,
+    rich_markup_mode=_MARKUP,
     pretty_exceptions_enable=False,
 )
 for _command, _example in _COMMANDS:
-    app.command(epilog=f"Example:  {_example}")(_with_volume(_command))
+    _register(app, None, _command, _example)
 _export = Typer(help="Write what other programs read.", no_args_is_help=True)
 for _name, _command, _example in _EXPORTS:
-    _export.command(_name, epilog=f"Example:  {_example}")(_with_volume(_command))
+    _register(_export, _name, _command, _example)
 app.add_typer(_export, name="export")
 
 

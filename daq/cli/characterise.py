@@ -19,7 +19,7 @@ def characterise(
     rig: Annotated[
         str,
         Argument(
-            metavar="[RIG.yaml]",
+            metavar="RIG.yaml",
             help="Rig file; default the simulated rig.",
             autocompletion=completion.rigs,
         ),

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from daq.recording.preview import ChannelFacts, Preview
 
 _BARS = " ▁▂▃▄▅▆▇█"
-_WIDTH, _HEIGHT = 60, 48.0  # characters and dB of a spectrum's sketch
+_WIDTH, _HEIGHT = 58, 48.0  # characters and dB of a spectrum's sketch
 
 
 def check(
@@ -71,7 +71,7 @@ def _show(checked: Preview) -> None:
     _show_references(checked)
     _sketch(checked)
     for remark in plan.remarks:
-        print(remark)
+        terminal.print_text(remark)
     if plan.commands is not None:
         print(f"Frequency resolution: {checked.resolution:.4g} Hz")
     before = [f"{experiment.calibration.samples} samples of offset calibration"]
@@ -79,11 +79,11 @@ def _show(checked: Preview) -> None:
         before.append(
             f"{experiment.homing.turns:g} turns to wind within {experiment.homing.timeout:g} s"
         )
-    print(f"Before it: {', '.join(before)}.")
+    terminal.print_text(f"Before it: {', '.join(before)}.")
     if checked.evidence is not None:
         _show_evidence(checked.evidence)
     for caveat in checked.caveats:
-        print(f"Caveat: {caveat.text}.")
+        terminal.print_text(f"Caveat: {caveat.text}.")
     if not plan.excites:
         print("Its commands are zero throughout: it excites nothing, and logs everything.")
     elif checked.concludes:
@@ -91,7 +91,7 @@ def _show(checked: Preview) -> None:
     elif session.validation:
         print("With --identify a validation run follows.")
     else:
-        print(
+        terminal.print_text(
             "It has no 'validation' section: rig run --identify will identify without validation."
         )
 
@@ -149,11 +149,15 @@ def _sketch(checked: Preview) -> None:
     if plan.commands is None or not sys.stdout.isatty() or not has_bars:
         return
     low = high = 0.0
+    drawn = False
     for column, name in zip(plan.commands[plan.steady].T, CHANNELS, strict=True):
         frequency, amplitudes = spectral_lines(column, checked.experiment.sample_rate)
         low, high = float(frequency[0]), float(frequency[-1])
         if amplitudes.any():
             print(f"{name:<8} {_bars(frequency, amplitudes)}")
+            drawn = True
+    if not drawn:
+        return
     ends = f"{low:.3g} Hz", f"{high:.3g} Hz"
     scale = f"{ends[0]}{' logarithmic '.center(_WIDTH - len(''.join(ends)), '·')}{ends[1]}"
     print(f"{'':<8} {scale}  bars: {_HEIGHT:g} dB\n")

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 def design(
     question: Annotated[
         Path | None,
-        Argument(metavar="[QUESTION.yaml]", help="What to know, from what, within what time."),
+        Argument(metavar="QUESTION.yaml", help="What to know, from what, within what time."),
     ] = None,
     rig: options.RigOfRun = None,
     time: Annotated[

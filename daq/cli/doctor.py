@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 def doctor(
     names: Annotated[
         list[str] | None,
-        Argument(metavar="[PORT...]", help="Device names; default all that exist."),
+        Argument(metavar="PORT", help="Device names; default all that exist."),
     ] = None,
     rig: Annotated[
         str | None, Option(metavar="RIG.yaml", help="Open this rig, outputs at zero, and ask it.")

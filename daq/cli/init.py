@@ -11,7 +11,7 @@ from daq.cli.completion import protocols, rig_names
 
 def init(
     folder: Annotated[
-        Path, Argument(metavar="[FOLDER]", help="Where the files go; default this folder.")
+        Path, Argument(metavar="FOLDER", help="Where the files go; default this folder.")
     ] = Path(),
     protocol: Annotated[
         str | None,

@@ -21,7 +21,7 @@ def models(
     name: Annotated[
         str | None,
         Argument(
-            metavar="[NAME|FILE.py:OBJECT]",
+            metavar="NAME|FILE.py:OBJECT",
             help="Show this model in full.",
             autocompletion=completion.models,
         ),

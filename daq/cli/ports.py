@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 def ports(
     names: Annotated[
         list[str] | None,
-        Argument(metavar="[PORT...]", help="Device names or URLs; default all that exist."),
+        Argument(metavar="PORT", help="Device names or URLs; default all that exist."),
     ] = None,
     unasked: Annotated[
         bool, Option("--list", help="Send nothing: list the ports without asking.")

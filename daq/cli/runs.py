@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+import shutil
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -16,14 +19,15 @@ if TYPE_CHECKING:
 
 _FACTS = ("protocol", "rig", "status", "trust")
 _MOST_COLUMNS = 6  # runs beside each other in a table
+_RUN_COLUMN = 19  # characters
 
 
 def runs(
     terms: Annotated[
         list[str] | None,
         Argument(
-            metavar="[TERM...]",
-            help="Runs that all of these hold of: a word, KEY=VALUE with *, '<KEY>0.1' and the "
+            metavar="TERM",
+            help="Runs that all of these hold of: a word, KEY=VALUE with *, 'KEY>0.1' and the "
             "like, or capture folders; keys are facts, metadata, parameters.",
         ),
     ] = None,
@@ -90,7 +94,11 @@ def runs(
 
 
 def _list(entries: Sequence[RunEntry], names: Sequence[str], title: str) -> None:
-    """A row for each run; what none of them has is left out."""
+    """A row for each run; what none of them has is left out.
+
+    A terminal has little room: what is the same in all runs is said once there, above them, and a
+    date only where the run's name does not begin with it.
+    """
     noted = list(dict.fromkeys(key for entry in entries for key in entry.metadata))
     head = ["run", "date (UTC)", *_FACTS, *names, *noted]
     rows = [
@@ -104,25 +112,45 @@ def _list(entries: Sequence[RunEntry], names: Sequence[str], title: str) -> None
         for entry in entries
     ]
     kept = [k for k in range(len(head)) if any(row[k] for row in rows)]
+    if sys.stdout.isatty():
+        if all(map(_is_dated, entries)):
+            kept.remove(1)
+        facts = [k for k in kept[1:] if head[k] not in names]
+        same = [k for k in facts if len({row[k] for row in rows}) == 1]
+        title += "".join(f"; {head[k]} {rows[0][k]}" for k in same)
+        kept = [k for k in kept if k not in same]
     texts = [name for name in head if name not in names]
     terminal.print_table(
         title, [head[k] for k in kept], [[row[k] for k in kept] for row in rows], text=texts
     )
 
 
+def _is_dated(entry: RunEntry) -> bool:
+    """Whether a run's name begins with when it started, as 20260101T1200."""
+    name = entry.folder.rsplit("/", 1)[-1]
+    return bool(entry.started) and name.startswith(re.sub("[-:]", "", entry.started[:16]))
+
+
 def _compare(entries: Sequence[RunEntry], names: Sequence[str]) -> None:
-    """A row for each parameter, a column for each run."""
-    if len(entries) > _MOST_COLUMNS:
+    """A row for each parameter, a column for each run; on a terminal as many as it has room for."""
+    on_terminal, most = sys.stdout.isatty(), _MOST_COLUMNS
+    if on_terminal:
+        units = (len(row.unit) for entry in entries for row in entry.quantities)
+        beside = max(map(len, ("parameter", *names))) + max(units, default=0) + 5
+        room = (shutil.get_terminal_size().columns - beside) // _RUN_COLUMN
+        most = min(max(room, 2), most)
+    if len(entries) > most:
         terminal.report(
-            "note", f"of {len(entries)} runs the last {_MOST_COLUMNS} are compared; --plot has all"
+            "note", f"of {len(entries)} runs the last {most} are compared; --plot has all"
         )
-    shown = entries[-_MOST_COLUMNS:]
+    shown = entries[-most:]
+    between = "\n" if on_terminal else " "
     head = ["parameter", "unit", *(entry.folder for entry in shown)]
     rows = [["trust", "", *(entry.trust for entry in shown)]]
     for name in names:
         quantities = [entry.quantity(name) for entry in shown]
         unit = next(row.unit for row in quantities if row is not None) if any(quantities) else ""
-        rows.append([name, unit, *(_quantity(row, interval=True) for row in quantities)])
+        rows.append([name, unit, *(_quantity(row, between) for row in quantities)])
     terminal.print_table("Parameters, with their 95 % intervals", head, rows, text=["unit"])
     if not names:
         terminal.report("note", "nothing has been identified from them; try rig identify RUN")
@@ -156,14 +184,14 @@ def _show(entry: RunEntry, folder: Path) -> None:
         print()
 
 
-def _quantity(row: QuantityRow | None, interval: bool = False) -> str:
-    """A value, and its interval in brackets where that is wanted; empty where there is none."""
+def _quantity(row: QuantityRow | None, between: str = "") -> str:
+    """A value, and its interval in brackets behind ``between``; empty where there is none."""
     if row is None:
         return ""
     value, ends = _cells(row)
     if not ends:
         return f"({value})"  # no data stand behind it
-    return f"{value} ({ends})" if interval else value
+    return f"{value}{between}({ends})" if between else value
 
 
 def _cells(row: QuantityRow) -> tuple[str, str]:

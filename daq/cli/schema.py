@@ -12,7 +12,7 @@ from daq.cli import options, terminal
 def schema(
     context: Context,
     folder: Annotated[
-        Path, Argument(metavar="[FOLDER]", help="Where the schemas go; default schemas.")
+        Path, Argument(metavar="FOLDER", help="Where the schemas go; default schemas.")
     ] = Path("schemas"),
     reference: Annotated[
         Path | None, Option(metavar="DIR", help="Write reference pages (Markdown) there as well.")

@@ -14,7 +14,7 @@ def scope(
     runs: Annotated[
         list[Path] | None,
         Argument(
-            metavar="[RUN_OR_CSV]...",
+            metavar="RUN_OR_CSV",
             help="Capture folder or log, and others to lay behind it; default the newest run.",
         ),
     ] = None,

@@ -7,7 +7,7 @@ import sys
 import textwrap
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext, redirect_stdout
 from contextvars import ContextVar
 from enum import IntEnum
@@ -76,14 +76,14 @@ def _show_warning(
 def report_error(message: str) -> None:
     """An error message on standard error, the cure included; one line for each mistake."""
     for line in message.splitlines():
-        sys.stderr.write(f"rig: {line}\n")
+        sys.stderr.write(f"{_wrapped(f'rig: {line}', sys.stderr)}\n")
 
 
 def report(level: Level, text: str) -> None:
     """One line on standard error, where that level is to be heard."""
     if _volume.get() >= _VOLUMES[level]:
         mark = "" if level == "detail" else f"{level}: "
-        sys.stderr.write(f"rig: {mark}{text}\n")
+        sys.stderr.write(f"{_wrapped(f'rig: {mark}{text}', sys.stderr)}\n")
 
 
 def wait_for(text: str) -> bool:
@@ -157,13 +157,17 @@ def print_json_usage_error(error: Any) -> None:
 
 def print_text(text: str) -> None:
     """Sentences: on a terminal wrapped between words, its indent kept, in a pipe one line."""
-    if sys.stdout.isatty():
-        indent = " " * (len(text) - len(text.lstrip()))
-        text = textwrap.fill(
-            text.strip(), shutil.get_terminal_size().columns, initial_indent=indent,
-            subsequent_indent=indent, break_long_words=False, break_on_hyphens=False,
-        )  # fmt: skip
-    print(text)
+    print(_wrapped(text, sys.stdout))
+
+
+def _wrapped(text: str, stream: TextIO) -> str:
+    if not stream.isatty():
+        return text
+    indent = " " * (len(text) - len(text.lstrip()))
+    return textwrap.fill(
+        text.strip(), shutil.get_terminal_size().columns, initial_indent=indent,
+        subsequent_indent=indent, break_long_words=False, break_on_hyphens=False,
+    )  # fmt: skip
 
 
 def print_table(
@@ -181,7 +185,7 @@ def print_table(
     # A unit in brackets is no markup, nor is text between colons an emoji.
     console = Console(file=sys.stdout, highlight=False, markup=False, emoji=False)
     words = [index == 0 or name in text for index, name in enumerate(head)]
-    columns = [[name, *(row[index] for row in rows)] for index, name in enumerate(head)]
+    columns = [[name, *_lines(row[index] for row in rows)] for index, name in enumerate(head)]
     whole = [max(map(len, column)) for column in columns]
     narrow = console.is_terminal and sum(whole) + 3 * len(head) > console.width
     room = console.width - 2 * len(head)
@@ -200,8 +204,12 @@ def print_table(
     # Where even the longest words have no room, the terminal breaks the lines.
     console.width = max(console.width, sum(widths) + 3 * len(head))
     # Above the table rather than in it, where a long title would wrap to the table's width.
-    console.print(title, style="bold", soft_wrap=True)
+    console.print(_wrapped(title, sys.stdout), style="bold", soft_wrap=True)
     console.print(table)
+
+
+def _lines(cells: Iterable[str]) -> list[str]:
+    return [line for cell in cells for line in cell.split("\n")]
 
 
 def _narrowed(columns: Sequence[Sequence[str]], words: Sequence[bool], room: int) -> list[int]:
@@ -218,8 +226,8 @@ def _narrowed(columns: Sequence[Sequence[str]], words: Sequence[bool], room: int
 
 
 def _parts(head: str) -> list[str]:
-    """Where a head may be wrapped: between words, and of a name behind an underscore."""
-    return [part for part in re.split(r"(?<=_)| +", head) if part]
+    """Where a head may be wrapped: between words, and of a name behind an underscore or hyphen."""
+    return [part for part in re.split(r"(?<=[_-])| +", head) if part]
 
 
 def _folded(head: str, width: int) -> str:
@@ -228,7 +236,7 @@ def _folded(head: str, width: int) -> str:
         return head
     lines = [""]
     for part in _parts(head):
-        between = "" if lines[-1].endswith("_") or not lines[-1] else " "
+        between = "" if lines[-1].endswith(("_", "-")) or not lines[-1] else " "
         if len(lines[-1] + between + part) <= width or not lines[-1]:
             lines[-1] += between + part
         else:

@@ -11,8 +11,9 @@ def summary_line(run: RunResult) -> str | None:
     if not run.realtime["needed"]:
         return None
     arrival, answer = run.timing["arrival"], run.timing["answer"]
+    blocks = f"in blocks of {_lot(run):.0f}, " if _lot(run) > _IN_LOTS else ""
     line = (
-        f"Timing: samples came every {_short(arrival['mean_seconds'])}, "
+        f"Timing: samples came {blocks}every {_short(arrival['mean_seconds'])}, "
         f"at worst after {_short(arrival['worst_seconds'])}"
     )
     if answer is not None:
@@ -44,13 +45,18 @@ def notes(run: RunResult) -> list[str]:
     return texts
 
 
+def _lot(run: RunResult) -> float:
+    """Samples that came at once, on average."""
+    return float(run.n_samples / max(run.timing["blocks"], 1))
+
+
 def _haste(run: RunResult) -> str:
     if not run.realtime["needed"]:
         return ""
-    apart = run.timing["arrival"]["mean_seconds"]
-    if apart > _IN_LOTS * run.timing["wall_seconds"] / run.n_samples:
+    if _lot(run) > _IN_LOTS:
+        apart = run.timing["arrival"]["mean_seconds"]
         return (
-            f" Samples come in lots, {_short(apart)} apart: the line or its adapter holds them "
+            f" Samples come in blocks, {_short(apart)} apart: the line or its adapter holds them "
             "back. 'rig doctor' looks at an adapter's latency timer"
         )
     cure = " Raise 'ahead' or lower 'sample_rate' in the experiment"

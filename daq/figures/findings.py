@@ -4,6 +4,8 @@ import textwrap
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
@@ -17,6 +19,7 @@ _LETTERS_A_LINE = 62  # of a title across a column of print
 _LEFT, _SHORT = 0.6, 34  # in, left of a panel, and letters of a label on one line
 _SCALE = 0.12  # in, for a power of ten above the panel
 _EDGE = 0.16  # in, where the legend's room begins
+_THIN = {"lw": 0.5, "alpha": 0.7, "label": None}
 _POINTS = 700  # of a cloud, beyond which a part looks the same
 
 
@@ -79,6 +82,14 @@ def _add(panel: Axes, series: Series, k: int, over: bool) -> None:
         panel.plot(*style.thinned(series.x, series.y), ls=dash, **look)
 
 
+def _shade(panel: Axes, x: FloatArray, low: FloatArray, high: FloatArray, color: str) -> None:
+    """A band along a curve that may turn back, each way a part of its own."""
+    turns = 1 + np.flatnonzero(np.diff(np.sign(np.diff(x))))
+    for part in np.split(np.arange(len(x)), turns):
+        rows = slice(max(part[0] - 1, 0), part[-1] + 1)
+        panel.fill_between(x[rows], low[rows], high[rows], color=color, alpha=0.15, lw=0)
+
+
 def _label(axis: Axis) -> str:
     return f"{notation.words(axis.label)} {notation.bracketed(axis.unit)}"
 
@@ -89,11 +100,14 @@ def plot(
     quantity: Axis,
     curves: Mapping[str, Mapping[str, FloatArray]],
     points: bool = False,
+    bands: Mapping[str, tuple[FloatArray, FloatArray]] | None = None,
+    beyond: Mapping[str, npt.NDArray[np.bool_]] | None = None,
 ) -> Figure:
     """A panel over each of several quantities, such as a torque over angle and over speed.
 
     over: their units by name. curves: by label, values by the quantities' names, (n,). points:
-    curves are clouds of measured samples.
+    curves are clouds of measured samples. bands: by label, ends of the quantity, (n,) each. beyond:
+    by label, (n,), where a curve is drawn thin.
     """
     figure, panels = style.stack(
         [1.45] * len(over), 0.42, top=style.legend_room(list(curves)), share_x=False
@@ -105,7 +119,13 @@ def plot(
             look: dict[str, Any] = {"ls": style.DASHES[k % len(style.DASHES)]}
             if points:
                 look = {"ls": "", "marker": "ox^s"[k % 4], "ms": 1.4, "mew": 0.3, "mfc": "none"}
-            panel.plot(x, y, label=label, color=style.CYCLE[k % len(style.CYCLE)], **look)
+            look |= {"label": label, "color": style.CYCLE[k % len(style.CYCLE)]}
+            if bands and label in bands:
+                _shade(panel, x, *bands[label], look["color"])
+            if beyond and label in beyond:
+                panel.plot(x, np.where(beyond[label], y, np.nan), **look | _THIN)
+                y = np.where(beyond[label], np.nan, y)
+            panel.plot(x, y, **look)
         panel.set_xlabel(f"{name} {notation.bracketed(unit)}", labelpad=1.5)
         style.name_y(panel, quantity.label, notation.bracketed(quantity.unit))
     style.legend(figure, panels[0])

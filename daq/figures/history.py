@@ -19,6 +19,7 @@ _SIGNAL, _TREND = 0.62, 0.48  # in, heights of panels
 _GAP, _ABOVE, _BETWEEN = 0.13, 0.2, 0.62  # in, between signals, parameters, and both
 _DIGITS = 3  # of the numbers beside an axis
 _DATES = 6  # marks of the axis of dates at most
+_CROWD = 60  # runs, from which on their marks would run together
 
 
 @dataclass(frozen=True)
@@ -99,8 +100,10 @@ def _draw_trend(axis: Axes, trend: Trend) -> None:
     when: FloatArray = date2num(list(trend.dates))  # type: ignore[no-untyped-call]
     value, low, high = trend.values.T
     bars = np.nan_to_num(np.vstack([value - low, high - value]), nan=0.0)
+    thin = len(when) > _CROWD
     axis.errorbar(
-        when, value, yerr=np.maximum(bars, 0.0), fmt="o", ms=2.8, capsize=2.0, elinewidth=1.0,
+        when, value, yerr=np.maximum(bars, 0.0), fmt="o", ms=1.2 if thin else 2.8,
+        capsize=0.0 if thin else 2.0, elinewidth=0.3 if thin else 1.0,
         color=style.IDENTIFIED, ecolor=style.BASELINE,
     )  # fmt: skip
     # Above the panel: a combination's name would not stand upright beside it.

@@ -25,6 +25,7 @@ from daq.identification.rows import ParameterRow, Rows
 from daq.logs.columns import UNITS
 from daq.logs.recording import load
 from daq.report.page import Picture
+from daq.torque import plausible_parameters
 from sysid import Dataset, ModelError, Output, equilibrium, evaluate, linearize
 from sysid.arrays import FloatArray
 from sysid.judging.residual_tests import residual_test
@@ -36,6 +37,7 @@ from sysid.time_limit import AT_LENGTH, time_limit
 
 _MOTIONS = {"N": ("m", "m/s"), "N*m": ("rad", "rad/s")}  # that a force or torque is drawn over
 _OUTPUTS_A_FIGURE = 4
+_DRAWS = 24  # of the parameters, for bands
 _LOGS_A_PART = 3  # of more logs the worst, the middle and the best are shown
 _COHERENT = 0.5  # coherence above which an input is seen in an output
 _FEWEST_COHERENT = 4  # frequencies at which it must be, for a Bode plot
@@ -351,15 +353,27 @@ def _plots_of_model(subject: Subject) -> Iterator[Picture]:
     def drawn(model: ProcessModel, evidence: Evidence) -> list[Plot]:
         return list(plots(model, evidence))
 
-    for item in _by_model(subject.model, drawn, Evidence(subject.vector, records, log)):
+    evidence = Evidence(subject.vector, records, log, _draws(subject))
+    for item in _by_model(subject.model, drawn, evidence):
         yield Picture(
             item.name, item.topic, item.caption,
             plot(
                 {axis.name: axis.unit for axis in item.over},
                 Axis(item.quantity.name, item.quantity.unit),
                 {curve.label: curve.values for curve in item.curves}, item.points,
+                {curve.label: curve.band for curve in item.curves if curve.band is not None},
+                {curve.label: curve.beyond for curve in item.curves if curve.beyond is not None},
             ),
         )  # fmt: skip
+
+
+def _draws(subject: Subject) -> FloatArray:
+    """Parameters drawn from their covariance, (n_draws, n_parameters); none where there is none."""
+    model, covariance = subject.model, subject.document.get("covariance") or {}
+    names = [name for name in covariance.get("parameters", ()) if name in model.parameter_names]
+    # Behind the parameters stand states at the start of a log.
+    factor = np.array(covariance.get("factor") or [], dtype=np.float64)[:, : len(names)]
+    return plausible_parameters(model, subject.vector, names, factor, _DRAWS, seed=0)
 
 
 def _loops(subject: Subject) -> Iterator[Picture]:

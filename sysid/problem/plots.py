@@ -8,7 +8,7 @@ brake over its angle: ``ProcessModel(..., plots=plots)`` with a function of the 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from sysid.arrays import FloatArray
+from sysid.arrays import BoolArray, FloatArray
 from sysid.problem.data import Dataset
 
 
@@ -22,10 +22,16 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Curve:
-    """A curve through several quantities, (n,) each, by their names."""
+    """A curve through several quantities, (n,) each, by their names.
+
+    band: the plotted quantity's lower and upper ends, (n,) each, by the parameters' uncertainty.
+    beyond: (n,), where the data that the parameters come from did not reach.
+    """
 
     label: str
     values: Mapping[str, FloatArray]
+    band: tuple[FloatArray, FloatArray] | None = None
+    beyond: BoolArray | None = None
 
 
 @dataclass(frozen=True)
@@ -57,9 +63,12 @@ class Evidence:
     """What a model's plots are made from.
 
     parameters: all of them, in the model's order. records: the training records. log: the first
-    log's columns by name, (n,) each, empty where it is not a log of the program's own.
+    log's columns by name, (n,) each, empty where it is not a log of the program's own. draws:
+    parameters as plausible, drawn from their covariance, (n_draws, n_parameters); none of an
+    identification without one.
     """
 
     parameters: FloatArray
     records: Sequence[Dataset]
     log: Mapping[str, FloatArray]
+    draws: FloatArray

@@ -4,13 +4,14 @@ import atexit
 import functools
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
 import sys
 import tempfile
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import yaml
@@ -29,6 +30,25 @@ EXPERIMENT = {
     "brake": {"amplitude": 0.07, "offset": 0.07, "minimum_period": 0.05, "seed": 5},
 }
 RIG_FILE = {"name": "test rig", "backend": "simulated", "options": {"seed": 3}}
+
+
+def on_terminal(words, folder, columns, **variables):
+    """What ``rig`` shows on a terminal so wide, without its colours; variables: environment's."""
+    import pty  # not on Windows
+
+    ours, theirs = pty.openpty()
+    process = subprocess.Popen(
+        [*RIG, *map(str, words)], cwd=folder, stdin=theirs, stdout=theirs, stderr=theirs,
+        env=environment(COLUMNS=str(columns), TERM="xterm", **variables),
+    )  # fmt: skip
+    os.close(theirs)
+    shown = b""
+    with suppress(OSError):  # whoever wrote there has gone
+        while part := os.read(ours, 65536):
+            shown += part
+    os.close(ours)
+    process.wait(60)
+    return re.sub(r"\x1b\[[?\d;]*[a-zA-Z]", "", shown.decode()).replace("\r\n", "\n")
 
 
 def merged(base, changes):

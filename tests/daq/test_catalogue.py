@@ -4,6 +4,7 @@ import datetime
 import json
 import os
 import sqlite3
+import sys
 
 import pytest
 import yaml
@@ -13,7 +14,7 @@ from hypothesis import strategies as st
 from daq.catalogue.entries import RunEntry
 from daq.catalogue.index import INDEX_NAME
 from daq.catalogue.query import ordered, select
-from tests.daq.support import rig, write_experiment
+from tests.daq.support import on_terminal, rig, write_experiment
 
 # The current follows its command by a gain and a lag: identified in a second.
 MODEL = """
@@ -152,6 +153,24 @@ def test_runs_stand_beside_each_other_in_a_table_and_in_a_figure(lab, tmp_path):
         value = next(q["value"] for q in run["quantities"] if q["name"] == "gain")
         assert f"{value:.4f}"[:5] in row
     assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a pty")
+def test_eighty_columns_hold_what_is_listed_compared_and_refused(lab):
+    def at_80_columns(*words):
+        text = on_terminal(words, lab, columns=80)
+        assert max(map(len, text.splitlines())) <= 80, text
+        return text
+
+    ann = at_80_columns("runs", "operator=Ann", "--parameters", "gain")
+    assert "2 of 3 runs in runs; protocol prbs; rig simulated rig;" in ann
+    row = next(line for line in ann.splitlines() if line.split()[-1:] == ["30"])
+    assert row.split()[0] == listed(lab)[2]["folder"]  # which says the date
+    assert "note brushes replaced" in " ".join(at_80_columns("runs", "brushes").split())
+    compared = at_80_columns("runs", "--compare", "--last", "2")
+    assert "of 2 runs" not in compared and "gain" in compared
+    refused = " ".join(at_80_columns("runs", "--sort", "nothing").split())
+    assert "known are" in refused and "parameters, predictions, protocol" in refused
 
 
 def test_tags_and_notes_are_put_on_runs_and_taken_away(lab):

@@ -61,7 +61,11 @@ def drawn():
         "bode": bode(FREQUENCY, LAG, np.abs(LAG), 0.1 * np.abs(LAG),
                      {"identified": LAG, "linear, ω = 0": LAG, "linear, ω = 4.12 rad/s": 1.1 * LAG},
                      ("rad/s", "V")),
-        "loops": plot(over, torque, {"brake 0.1 A": loop, "brake 0.2 A": loop}),
+        "loops": plot(
+            over, torque, {"brake 0.1 A": loop, "brake 0.2 A": loop},
+            bands={"brake 0.1 A": (loop["torque"] - 0.1, loop["torque"] + 0.1)},
+            beyond={"brake 0.2 A": loop["speed"] > 0.5},
+        ),
         "points": plot(over, torque, {"brake 0.1 A": loop}, points=True),
         "ratios": ratios(["lag", NASTY * 4, "ARX"],
                          np.array([[1.0, 1.0, 1.0], [1.1, 0.9, 1.3], [80.0, 52.0, 136.0]])),

@@ -151,7 +151,7 @@ def test_a_run_goes_on_over_what_can_be_borne(tmp_path, emulate, rig, fault, pha
     if name in {"merge", "stall"} and in_run and mode == "closed":
         assert flagged["held"] > 0 and "held" in result.stdout
     if name == "merge" and in_run and mode == "closed":
-        assert "Samples come in lots" in result.stderr
+        assert "Samples come in blocks" in result.stderr
     if mode == "open":
         assert set(flagged) <= {"lost"}, "what the line does is nothing to a preloaded waveform"
     if name == "stuck-encoder" and phase == "run":
