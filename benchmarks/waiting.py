@@ -1,0 +1,172 @@
+"""How long a user waits: commands timed as whole processes, warm, beside the bars.
+
+python -m benchmarks.waiting [--json] [--base COMMIT] [--runs 3] [--first] [COMMAND ...]
+
+Seconds by the clock and of the processors (which hardly depend on what else the machine does), to
+the last line of the printed tables and to the end; the least of some runs. --base: the same of
+another commit, its sources in a worktree of their own, turn by turn with these. --first: the run
+that compiles, too. The search alone is timed by ``benchmarks.identification``.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from benchmarks._common import arguments, report
+
+_ROOT = Path(__file__).parent.parent
+_TABLE = b"Parameters: "  # stands below the tables
+# Compiled Python is kept, as a user's is, and what is printed comes at once.
+_VARIABLES = {"PYTHONDONTWRITEBYTECODE": None, "PYTHONUNBUFFERED": "1"}
+_MEASURES = ("table", "table_cpu", "whole", "whole_cpu")
+
+
+@dataclass(frozen=True)
+class Command:
+    """Words behind ``rig``, and bars in seconds by the clock on two quiet cores.
+
+    {run}, {validation}: folders of runs; {parameters}: identified from them. table: to the
+    printed tables. first: whether nothing is compiled yet.
+    """
+
+    words: str
+    whole: float | None
+    table: float | None = None
+    first: bool = False
+
+
+COMMANDS = {
+    "run": Command("run prbs.yaml --identify", 7.0, 4.0),
+    "identify": Command("identify {run} --out identified", None, 3.0),
+    "replay": Command("replay {validation} --parameters {parameters}", 2.0),
+    "figures": Command("figures {run} --out figures", 5.0),
+    "models": Command("models", 0.5),
+}
+FIRST = {"first": Command("run prbs.yaml --identify", 25.0, first=True)}
+
+
+def main() -> None:
+    parser = arguments(__doc__ or "")
+    parser.add_argument("commands", nargs="*", metavar="COMMAND", help=", ".join(COMMANDS))
+    parser.add_argument("--base", metavar="COMMIT", help="time the same of another commit, too")
+    parser.add_argument("--runs", type=int, default=3, help="of which the least counts")
+    parser.add_argument("--first", action="store_true", help="the run that compiles, too")
+    options = parser.parse_args()
+    if unknown := set(options.commands) - set(COMMANDS):
+        parser.error(f"no command {', '.join(unknown)}; there are {', '.join(COMMANDS)}")
+    commands = {name: COMMANDS[name] for name in options.commands or COMMANDS}
+    with _sources(options.base) as base, tempfile.TemporaryDirectory() as folder:
+        trees = {"here": _ROOT} | ({} if base is None else {options.base: base})
+        places = {name: _prepared(tree, Path(folder) / str(k))
+                  for k, (name, tree) in enumerate(trees.items())}  # fmt: skip
+        figures = {
+            name: _least(command, trees, places, 1 if command.first else options.runs)
+            for name, command in {**commands, **(FIRST if options.first else {})}.items()
+        }
+    report({"waiting": figures}, options.json, show)
+
+
+@contextmanager
+def _sources(commit: str | None) -> Iterator[Path | None]:
+    """Sources of a commit, in a worktree that is taken away again."""
+    if commit is None:
+        yield None
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        tree = Path(folder) / "tree"
+        git = ["git", "-C", str(_ROOT), "worktree"]
+        subprocess.run(
+            [*git, "add", "--detach", str(tree), commit], check=True, capture_output=True
+        )
+        try:
+            yield tree
+        finally:
+            subprocess.run([*git, "remove", "--force", str(tree)], check=True)
+
+
+def _prepared(tree: Path, place: Path) -> dict[str, str]:
+    """A working folder with runs, identified by these sources; what commands are filled with."""
+    place.mkdir()
+    _timed(["run", "prbs.yaml", "--identify"], tree, place, None)
+    run, validation = sorted((place / "runs").iterdir())
+    found = run / "identification" / "parameters.yaml"
+    return {"place": str(place), "run": str(run), "validation": str(validation),
+            "parameters": str(found)}  # fmt: skip
+
+
+def _least(
+    command: Command, trees: dict[str, Path], places: dict[str, dict[str, str]], runs: int
+) -> dict[str, Any]:
+    """Least seconds of some runs by each tree's sources, turn by turn, and the bars."""
+    measured: dict[str, list[dict[str, float]]] = {name: [] for name in trees}
+    for _ in range(runs):
+        for name, tree in trees.items():
+            words = [word.format(**places[name]) for word in command.words.split()]
+            nowhere = tempfile.TemporaryDirectory() if command.first else nullcontext(None)
+            with nowhere as cache:
+                measured[name].append(_timed(words, tree, Path(places[name]["place"]), cache))
+    least = {
+        name: {key: min(run[key] for run in all_runs) for key in _MEASURES}
+        for name, all_runs in measured.items()
+    }
+    return {"bars": {"table": command.table, "whole": command.whole}, "seconds": least}
+
+
+def _timed(words: list[str], tree: Path, place: Path, cache: str | None) -> dict[str, float]:
+    """Seconds of a process by the clock and of the processors; cache: for compiled kernels."""
+    variables = {**os.environ, **_VARIABLES, "PYTHONPATH": str(tree)}
+    if cache is not None:
+        variables |= {"RIG_CACHE_DIR": cache, "NUMBA_CACHE_DIR": cache}
+    environment = {name: value for name, value in variables.items() if value is not None}
+    start = time.perf_counter()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "daq", *words], cwd=place, env=environment,
+        stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    assert process.stdout is not None
+    table = table_cpu = float("nan")
+    with process.stdout:
+        for line in process.stdout:
+            if line.startswith(_TABLE):
+                table, table_cpu = time.perf_counter() - start, _cpu_so_far(process.pid)
+    _, status, usage = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode != 0:
+        raise SystemExit(f"rig {' '.join(words)}: exit status {process.returncode}")
+    whole = time.perf_counter() - start
+    return dict(zip(_MEASURES, (table, table_cpu, whole, usage.ru_utime + usage.ru_stime),
+                    strict=True))  # fmt: skip
+
+
+def _cpu_so_far(process: int) -> float:
+    """Processor seconds of a running process, where the system tells."""
+    status = Path(f"/proc/{process}/stat")
+    if not status.exists():
+        return float("nan")
+    user, system = status.read_text().rpartition(")")[2].split()[11:13]
+    return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
+
+
+def show(figures: dict[str, Any]) -> None:
+    print(f"{'seconds':22s}{'to the table':>14s}{'of CPU':>8s}{'bar':>6s}", end="")
+    print(f"{'to the end':>14s}{'of CPU':>8s}{'bar':>6s}")
+    for command, result in figures["waiting"].items():
+        bars = {key: "" if bar is None else f"{bar:g}" for key, bar in result["bars"].items()}
+        for name, least in result["seconds"].items():
+            cells = [f"{least[key]:.2f}" if least[key] == least[key] else "" for key in _MEASURES]
+            print(f"{command if name == 'here' else '  ' + name[:12]:22s}", end="")
+            print(f"{cells[0]:>14s}{cells[1]:>8s}{bars['table']:>6s}", end="")
+            print(f"{cells[2]:>14s}{cells[3]:>8s}{bars['whole']:>6s}")
+
+
+if __name__ == "__main__":
+    main()
