@@ -65,6 +65,9 @@ _PLAIN = 30.0  # span of a logarithmic axis below which it needs more marks than
 # More points than a column of print can show are drawn as their envelope.
 _COLUMNS = 1400
 
+# The default takes a third more time in all, for files a twentieth smaller.
+_PNG_LEVEL = 3
+
 _SETTINGS: dict[str, Any] = {
     "font.family": "DejaVu Sans", "font.size": 7.0, "axes.labelsize": 7.0, "axes.titlesize": 7.0,
     "xtick.labelsize": 6.5, "ytick.labelsize": 6.5,
@@ -280,6 +283,9 @@ def render(figure: Figure, kind: str) -> bytes:
     """A figure as a file of one of ``FORMATS``; the same figure gives the same bytes."""
     # SVG goes as text, which is encoded once rather than piece by piece.
     target = io.StringIO() if kind == "svg" else io.BytesIO()
-    figure.savefig(target, format=kind, dpi=DPI, metadata=_NAMELESS[kind])
+    packed: dict[str, Any] = {}
+    if kind == "png":
+        packed["pil_kwargs"] = {"compress_level": _PNG_LEVEL}
+    figure.savefig(target, format=kind, dpi=DPI, metadata=_NAMELESS[kind], **packed)
     content = target.getvalue()
     return content.encode() if isinstance(content, str) else content

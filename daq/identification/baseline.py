@@ -1,6 +1,6 @@
 """Linear models beside an identification: what physics adds to knowing none."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -66,6 +66,17 @@ def baselines_of(
     except ModelError as error:
         return str(error)
     return baselines
+
+
+def refitted(
+    document: Mapping[str, Any],
+    training: Sequence[LoggedRecord],
+    validation: Sequence[LoggedRecord],
+) -> Baseline:
+    """A baseline once more, of the name and the orders that a report's document has of it."""
+    name, orders = document["name"], document["orders"]
+    records = [[log.dataset for log in logs] for logs in (training, validation)]
+    return _judged(name, orders, OE(**orders).fit(records[0]), *records)
 
 
 def _tuned(name: str, training: Sequence[Dataset], validation: Sequence[Dataset]) -> Baseline:

@@ -30,13 +30,13 @@ from sysid.judging.plausibility import implausible
 from sysid.problem.copies import shared_samples
 from sysid.problem.data import require_information
 from sysid.problem.faults import DataFault, Part, after_mending, data_faults
-from sysid.uncertainty import Uncertainty
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from sysid.gassi import GASSI
     from sysid.gassi import Progress as SearchProgress
+    from sysid.uncertainty import Uncertainty
 
     Source = str | Path | Recording | pd.DataFrame
 

@@ -27,7 +27,6 @@ from sysid.arrays import FloatArray
 from sysid.problem.data import Dataset
 from sysid.problem.faults import DataFault
 from sysid.problem.model import Parameter
-from sysid.uncertainty import Estimate, Profile, Uncertainty
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -36,6 +35,7 @@ if TYPE_CHECKING:
     from sysid.judging.assessment import RecordResult, Verdict
     from sysid.judging.examination import Suspicion
     from sysid.judging.starts import Starts
+    from sysid.uncertainty import Estimate, Profile, Uncertainty
 
 
 _RMSE = "mean over outputs of the RMSE on outputs normalised by max|y|"

@@ -1,11 +1,13 @@
 """The figures of an identification's report: which are drawn, from which arrays."""
 
+from __future__ import annotations
+
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -18,7 +20,6 @@ from daq.figures.parameters import convergence, correlation, intervals, ranges
 from daq.figures.signals import Panel, overlaid, residual_correlations, responses, signals, spectra
 from daq.files import write_whole
 from daq.findings import Axis
-from daq.identification.baseline import Baseline
 from daq.identification.records import LoggedRecord
 from daq.identification.replay import Replay, short_names
 from daq.identification.rows import ParameterRow, Rows
@@ -34,6 +35,9 @@ from sysid.problem.model import ProcessModel
 from sysid.problem.plots import Evidence, Plot
 from sysid.response.frequency import FrequencyResponse, frequency_response, sampled_response
 from sysid.time_limit import AT_LENGTH, time_limit
+
+if TYPE_CHECKING:
+    from daq.identification.baseline import Baseline
 
 _MOTIONS = {"N": ("m", "m/s"), "N*m": ("rad", "rad/s")}  # that a force or torque is drawn over
 _OUTPUTS_A_FIGURE = 4

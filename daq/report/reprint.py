@@ -9,7 +9,7 @@ from daq.errors import ConfigError
 from daq.figures.style import FORMATS
 from daq.files import digest
 from daq.identification import records
-from daq.identification.baseline import baselines_of
+from daq.identification.baseline import refitted
 from daq.identification.records import LoggedRecord, Split
 from daq.identification.replay import read_parameters
 from daq.identification.selection import Selection
@@ -80,8 +80,8 @@ def _restored(document: Mapping[str, Any], source: Path, trust: bool) -> Subject
     training, validation = (
         [(log, free_run(simulator, vector, log.dataset)) for log in logs] for logs in parts
     )
-    linear = "" if "left_out" in document["comparison"] else baselines_of(model, *parts)
-    baseline = None if isinstance(linear, str) else linear[0]
+    linear = document["comparison"].get("baselines")
+    baseline = refitted(linear[0], *parts) if linear else None
     return Subject(model, document, training, validation, baseline)
 
 

@@ -24,7 +24,6 @@ from typing import get_args
 
 import numpy as np
 from scipy.linalg import solve_triangular
-from scipy.optimize import nnls
 from scipy.special import chdtrc
 
 from sysid.arrays import BoolArray, FloatArray
@@ -363,6 +362,8 @@ class _Regression:
         if not new.any():
             return None
         if one_sided:
+            from scipy.optimize import nnls  # slow, and seldom needed
+
             amplitudes = nnls(beyond, self._residual)[0]
             best = beyond @ amplitudes
             length = float(np.linalg.norm(best))

@@ -15,7 +15,6 @@ from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
-import scipy.optimize
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.linalg import lapack
 
@@ -138,6 +137,8 @@ def fit_output_error(drive: Drive, nf: int, limit: int) -> OutputErrorFit:
     fit = OutputErrorFit(drive, np.zeros(nf))
     if nf == 0:
         return fit
+    import scipy.optimize  # slow, and not needed to predict
+
     starts = [fit]
     for _ in range(_REWEIGHTINGS):
         starts.append(OutputErrorFit(drive, starts[-1].reweighted()))
