@@ -22,6 +22,7 @@ def doctor(
     rig: Annotated[
         str | None, Option(metavar="RIG.yaml", help="Open this rig, outputs at zero, and ask it.")
     ] = None,
+    port: options.PortName = None,
     loopback: Annotated[
         bool,
         Option(
@@ -37,17 +38,19 @@ def doctor(
 ) -> None:
     """Check whether this computer suits a rig in real time.
 
-    What does not is told with its cure.
+    What does not is told with its cure. With --rig or --port it asks the device as well.
     """
     from daq.diagnose.computer import diagnose
     from daq.serial.ports import ports_of
 
     if loopback and rig is None:
         raise ConfigError("--loopback: no rig is named", cure="add --rig RIG.yaml")
-    if rig is None or names:
-        checks = diagnose(ports_of(names or []), out, wakes)
-    else:
-        checks = [*_of_rig(rig, loopback), *diagnose(None, out, wakes)]
+    if rig is None and port is not None:
+        rig = "serial.yaml"
+    checks = [] if rig is None else _of_rig(rig, port, loopback)
+    named = [*(names or []), *filter(None, [port])]
+    ports = None if rig is not None and not named else ports_of(named)
+    checks += diagnose(ports, out, wakes)
     bad = [check.subject for check in checks if check.verdict == "bad"]
     if json:
         rows = [
@@ -67,9 +70,9 @@ def doctor(
         raise RunError(problem, cure="the cures stand above")
 
 
-def _of_rig(name: str, loopback: bool) -> list[Check]:
+def _of_rig(name: str, port: str | None, loopback: bool) -> list[Check]:
     from daq.diagnose.card import diagnose_rig
-    from daq.lookup.rigs import load_rig
+    from daq.lookup.rigs import rig_on
 
-    _, device = load_rig(name, watch=terminal.report_event)
+    _, device = rig_on(name, port, watch=terminal.report_event)
     return diagnose_rig(device, name, loopback)

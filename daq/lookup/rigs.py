@@ -53,6 +53,30 @@ def load_rig(
     return config, device
 
 
+def rig_on(
+    rig: str, port: str | None, realtime: bool = False, watch: Watch = ignore
+) -> tuple[RigConfig, Device]:
+    """``load_rig`` on a port in place of its file's, or simulated at the pace of the clock.
+
+    Raises ConfigError for a port where the backend has none.
+    """
+    config, device = load_rig(rig, watch=watch)
+    fields = type(config.options).model_fields
+    if port is not None and "port" not in fields:
+        raise ConfigError(
+            f"--port {port}: the backend {config.backend!r} of {rig} has no port",
+            cure="name the rig file of one that has, such as --rig serial.yaml",
+        )
+    changes = {} if port is None else {"port": port}
+    if realtime and "time" in fields:
+        changes["time"] = "real"
+    elif realtime:
+        watch(Note("note", f"{rig}: its own clock paces it; --realtime changes nothing"))
+    if changes:
+        config, device = load_rig(rig, changes, watch)
+    return config, device
+
+
 def _backend(file: YamlFile) -> tuple[str, Any]:
     """Name and class of a rig's backend; ConfigError with all mistakes of its file."""
     name = file.content.get("backend", RigConfig.model_fields["backend"].default)

@@ -20,7 +20,7 @@ from daq.logs.capture import LOG_NAME
 from daq.logs.metadata import amended
 from daq.logs.recording import Recording, load
 from daq.lookup.experiments import LoadedExperiment, load_experiment
-from daq.lookup.rigs import load_rig, rig_for
+from daq.lookup.rigs import load_rig, rig_for, rig_on
 from daq.progress import Note, Progress, Started, Watch, ignore, warn
 from daq.recording.analysis import conclude_or_warn
 from daq.run.runner import RunResult, run_experiment
@@ -93,7 +93,7 @@ def open_session(
     name = rig or rig_for(experiment, watch)
     loaded, (config, device) = together(
         lambda: load_experiment(experiment, watch),
-        lambda: _rig_on(name, port, realtime, watch),
+        lambda: rig_on(name, port, realtime, watch),
     )
     # Checked even where it will not run: a mistake in the file is best heard of early.
     validation = loaded.validation()
@@ -140,25 +140,6 @@ def record(
 def _noting(loaded: LoadedExperiment, notes: list[str]) -> LoadedExperiment:
     metadata = amended(loaded.experiment.metadata, changes_of(notes))
     return replace(loaded, experiment=loaded.experiment.model_copy(update={"metadata": metadata}))
-
-
-def _rig_on(rig: str, port: str | None, realtime: bool, watch: Watch) -> tuple[RigConfig, Device]:
-    """A rig on a port in place of its file's, or simulated at the pace of the clock."""
-    config, device = load_rig(rig, watch=watch)
-    fields = type(config.options).model_fields
-    if port is not None and "port" not in fields:
-        raise ConfigError(
-            f"--port {port}: the backend {config.backend!r} of {rig} has no port",
-            cure="name the rig file of one that has, such as --rig serial.yaml",
-        )
-    changes = {} if port is None else {"port": port}
-    if realtime and "time" in fields:
-        changes["time"] = "real"
-    elif realtime:
-        watch(Note("note", f"{rig}: its own clock paces it; --realtime changes nothing"))
-    if changes:
-        config, device = load_rig(rig, changes, watch)
-    return config, device
 
 
 def _plan(runs: Sequence[LoadedExperiment], config: RigConfig, rig: str) -> Plan:

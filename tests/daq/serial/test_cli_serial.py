@@ -1,6 +1,7 @@
 """``rig ports``, ``rig doctor``, and what the command line says about ports."""
 
 import json
+import os
 import sys
 
 import pytest
@@ -48,6 +49,36 @@ def test_doctor_has_a_verdict_on_everything_and_leaves_nothing_behind(tmp_path, 
     for check in checks.values():
         assert (check["verdict"] == "good") == (check["cure"] == "")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_doctor_asks_the_device_at_a_port(tmp_path, run, running):
+    words = ["doctor", "--port", running.port, "--json", "--wakes", "20"]
+    checks = {c["what"]: c for c in json.loads(run(words, tmp_path).stdout)["checks"]}
+    assert "emulat" in checks["rig"]["found"] and checks["rig"]["verdict"] == "good"
+    assert f"access to {running.port}" in checks
+    # Also beside a rig's file, whose port it goes before.
+    write_serial_rig(tmp_path / "rig.yaml", "/dev/not-this-one")
+    result = run([*words, "--rig", "rig.yaml"], tmp_path)
+    assert '"rig"' in result.stdout, result.stderr
+    result = run(["doctor", "--rig", "simulated.yaml", "--port", running.port], tmp_path)
+    assert result.returncode == 2 and "has no port" in result.stderr
+
+
+def test_a_port_at_which_nobody_answers_is_not_good(tmp_path, run):
+    ours, theirs = os.openpty()
+    try:
+        result = run(["doctor", "--port", os.ttyname(theirs), "--wakes", "20"], tmp_path)
+    finally:
+        os.close(ours)
+        os.close(theirs)
+    assert result.returncode == 1 and "no answer in 2 s" in result.stderr
+
+
+def test_doctor_looks_at_a_port_and_at_a_rig(tmp_path, run):
+    words = ["doctor", "/dev/no-such-port", "--rig", "simulated.yaml", "--wakes", "20"]
+    result = run(words, tmp_path)
+    assert result.returncode == 1 and "access to /dev/no-such-port" in result.stderr
+    assert "rig  " in result.stdout
 
 
 def test_doctor_ends_with_1_and_a_cure_when_something_is_bad(tmp_path, run):
