@@ -1,21 +1,29 @@
 """Which virtual walls are passive for certain, and which rest in simulation: the Z-width.
 
 python -m benchmarks.walls [--json] [--rates 800 4000] [--hands 24] [--plot z_width.png]
-                           [--measure]
+                           [--measure] [--fresh 12]
 
 Walls rendered by the static law and by the inverse without what it takes off (friction, inertia),
 by the motor alone and with the brake: switched on in contact, or shared by its hysteresis state.
 Guaranteed: passive by ``haptics.passivity`` with 95 % over actuators whose parameters are uncertain
-by 3 %, in any passive hand. Simulated: the stiffest wall that rests in all of so many hands from
-1/4 to 4 times that of (A.2), each with an actuator of its own, after a tap. The best rendered
-damping of each. Measured: the stiffest wall that ``virtual_wall`` finds stable on the simulated
-rig, electronics, limits and all, in hands of both ends and the middle; a limit that trips ends it.
+by 3 %, in any passive hand. Held: the stiffest without damping that comes to rest, entered and
+left, in any hand that damps as a quarter of (A.2)'s does. Simulated: the stiffest wall that rests
+in all of so many hands from 1/4 to 4 times that of (A.2), each with an actuator of its own, after a
+tap. The best rendered damping of each. Measured: the stiffest wall that ``virtual_wall`` finds
+stable on the simulated rig, electronics, limits and all, in hands of both ends and the middle; a
+limit that trips ends it.
+
+``--fresh``: what is promised in hands that damp, against so many plants that were drawn anew. True
+is the stiffest wall whose linear loop is stable, without friction, in hands of that damping with a
+spring of 0.04 to 40 N*m/rad. And 1000 trials of the promised wall, friction and all, of hands that
+come in within 0.02 or 0.3 s, lean by up to 1.5 rad and are tapped with up to 0.6 N*m.
 """
 
 from __future__ import annotations
 
 import math
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,22 +35,26 @@ from benchmarks._common import arguments, report
 from daq import analyse, record, tune
 from daq.errors import RunError
 from daq.experiment import TripLimits
+from daq.hal import FloatArray
 from daq.lookup.controllers import TunedController, load_controller
 from haptics import trial
+from haptics.dynamics import ActuatorDynamics
 from haptics.evidence import HAND, HAND_RANGE, Scene, run_trials
-from haptics.passivity import Passivity, Tracker
+from haptics.linear_loop import LinearLaw, loop_margins
+from haptics.passivity import Passivity, Tracker, UnknownPassivityError
 from protocols.control.loop import tracker_gains
 
 MODEL = "actuator:parameters=rig"
 UNCERTAIN = ("K_m", "J_m", "B_m", "c0", "alpha0", "alpha1", "R_m", "L_m")
 SPREAD = 0.03
 PLAIN = {"friction_share": 0.0, "inertia_share": 0.0}
+MOTOR = {"allocation": "motor"}
 VARIANTS: dict[str, dict[str, Any]] = {
-    "static, motor": {"controller": "static", "allocation": "motor"},
-    "static, brake on in contact": {"controller": "static", "allocation": "motor", "contact": 0.1},
-    "inverse, motor": {"controller": "feedforward", "allocation": "motor", **PLAIN},
+    "static, motor": {"controller": "static", **MOTOR},
+    "static, brake on in contact": {"controller": "static", "contact": 0.1, **MOTOR},
+    "inverse, motor": {"controller": "feedforward", **MOTOR, **PLAIN},
     "inverse, shared": {"controller": "feedforward", "allocation": "heating", **PLAIN},
-    "inverse, friction taken off": {"controller": "feedforward", "inertia_share": 0.0},
+    "inverse, friction taken off": {"controller": "feedforward", "inertia_share": 0.0, **MOTOR},
 }
 DAMPINGS = (0.0, 2e-4, 3e-3)  # N*m*s/rad
 MEASURED = (0.0, 3e-3)  # of them, in runs
@@ -60,7 +72,17 @@ def main() -> None:
     parser.add_argument("--hands", type=int, default=12)
     parser.add_argument("--plot", type=Path)
     parser.add_argument("--measure", action="store_true")
+    parser.add_argument("--fresh", type=int)
     options = parser.parse_args()
+    if options.fresh is not None:
+        names = ("static, motor", "inverse, motor")
+        fresh_rows = [
+            {"rate": rate, "variant": name, **fresh(rate, VARIANTS[name], options.fresh)}
+            for rate in options.rates
+            for name in names
+        ]
+        report({"fresh": fresh_rows}, options.json, show_fresh)
+        return
     rows = [
         {
             "rate": rate,
@@ -80,24 +102,81 @@ def measure(rate: float, settings: dict[str, Any], hands: int, run: bool = False
     contact = settings.pop("contact", 0.0)
     stable = measured(rate, settings, contact) if run else []
     tuned = controller(rate, settings)
-    tracker = Tracker(*tracker_gains(BANDWIDTH, 1.0 / rate))
-    actuators = np.concatenate([tuned.parameters[None], tuned.plausible(40)])
-    passivity = Passivity(tuned, tracker, actuators)
-    promise = passivity.promise(COUNT)
     simulated = [stiffest(tuned, damping, contact, hands) for damping in DAMPINGS]
-    guaranteed = [
-        float(np.percentile([passivity.stiffest(port, B) for port in passivity.ports], 5.0))
-        for B in DAMPINGS
-    ]
+    return {
+        **guaranteed(tuned),
+        "simulated": max(simulated),
+        "measured": max(stable) if run else None,
+        "simulated_by_damping": simulated,
+        "measured_by_damping": stable,
+    }
+
+
+def guaranteed(tuned: TunedController) -> dict[str, float]:
+    """What is promised of a controller's walls, zeros where nothing is."""
+    tracker = Tracker(*tracker_gains(BANDWIDTH, 1.0 / tuned.control.sample_rate))
+    actuators = np.concatenate([tuned.parameters[None], tuned.plausible(40)])
+    try:
+        promise = Passivity(tuned, tracker, actuators).promise(COUNT)
+        held = Passivity(tuned, tracker, actuators, HAND[1] / HAND_RANGE).springs_promised()
+    except UnknownPassivityError:
+        return dict.fromkeys(("guaranteed", "held", "colgate", "abbott"), 0.0)
     return {
         "guaranteed": promise.stiffness,
         "guaranteed_damping": promise.damping,
+        "held": held,
         "colgate": promise.colgate,
         "abbott": promise.abbott,
-        "simulated": max(simulated),
-        "measured": max(stable) if run else None,
-        "by_damping": {"guaranteed": guaranteed, "simulated": simulated, "measured": stable},
     }
+
+
+def fresh(rate: float, settings: dict[str, Any], plants: int) -> dict[str, Any]:
+    """What is promised in hands that damp, in parts of what is true on plants drawn anew."""
+    tuned = controller(rate, settings)
+    promised = guaranteed(tuned)["held"]
+    drawn = tuned.plausible(plants, seed=1)
+    true = [linear_limit(tuned, plant) for plant in drawn]
+    program = tuned.control.program(tuned.model, tuned.parameters)
+    scenes = [
+        scene(tuned, promised, 0.0, 0.0, rise=rise, lean=lean, tap=tap)
+        for rise in (0.02, 0.3)
+        for lean in (0.05, 0.5, 1.5)
+        for tap in (0.06, 0.6)
+    ]
+    outcomes = run_trials(tuned, program, scenes, LIMITS, 1000, seed=1)
+    return {
+        "held": promised,
+        "part": float(np.median(promised / np.array(true))),
+        "above": sum(promised > stiffness for stiffness in true),
+        "plants": plants,
+        "restless": int(outcomes.restless.sum()),
+        "trials": len(outcomes.results),
+    }
+
+
+def linear_limit(tuned: TunedController, plant: FloatArray) -> float:
+    """The stiffest wall whose loop is stable with all springs at a lightly damped handle."""
+    control, dynamics = tuned.control, ActuatorDynamics(tuned.model, plant)
+    law = LinearLaw.of(control.program(tuned.model, tuned.parameters), tuned.model)
+
+    def stable(K: float) -> bool:
+        G, D = law.G.copy(), law.D.copy()
+        G[:, 0] -= K * law.G[:, 4]
+        D[:, 0] -= K * law.D[:, 4]
+        wall = replace(law, G=G, D=D)
+        return all(
+            loop_margins(
+                wall, dynamics, "sliding forwards", (spring, HAND[1] / HAND_RANGE),
+                1.0 / control.sample_rate, control.ahead,
+            ).stable
+            for spring in np.geomspace(0.04, 40.0, 25).tolist()
+        )  # fmt: skip
+
+    low, high = 0.0, STIFFEST
+    while high - low > 0.02 * high:
+        middle = math.sqrt(max(low, 0.02) * high)
+        low, high = (middle, high) if stable(middle) else (low, middle)
+    return low
 
 
 def controller(rate: float, settings: dict[str, Any]) -> TunedController:
@@ -191,15 +270,18 @@ def rests(
     return not (outcomes.restless | outcomes.left).any()
 
 
-def scene(tuned: TunedController, stiffness: float, damping: float, contact: float) -> Scene:
-    """A hand that leans against a wall, and a tap of 5 ms."""
+def scene(
+    tuned: TunedController, stiffness: float, damping: float, contact: float, *,
+    rise: float = 0.3, lean: float = LEAN, tap: float = 0.06,
+) -> Scene:  # fmt: skip
+    """A hand that comes within ``rise`` s, leans against a wall, and a tap of 5 ms."""
     time = 1.0 / tuned.control.sample_rate
     tapped, n = round(0.5 / time), round(1.4 / time)
-    path = np.clip(np.arange(n + 1) * time / 0.3, 0.0, 1.0) * (POSITION + LEAN)
+    path = np.clip(np.arange(n + 1) * time / rise, 0.0, 1.0) * (POSITION + lean)
     alpha, beta = tracker_gains(BANDWIDTH, time)
     wall = np.zeros(trial.WALL)
     wall[: trial.TAP] = stiffness, damping, POSITION, contact, alpha, beta / time
-    wall[trial.TAP : trial.SOFT] = 0.06, tapped, tapped + round(5e-3 / time)
+    wall[trial.TAP : trial.SOFT] = tap, tapped, tapped + round(5e-3 / time)
     # No softer wall before: it would ring by itself where the delay is long.
     wall[trial.SOFT :] = min(stiffness, 0.1), damping, 8.0
     return Scene(np.zeros(n), np.ones(n), path, wall)
@@ -207,6 +289,7 @@ def scene(tuned: TunedController, stiffness: float, damping: float, contact: flo
 
 _DRAWN = {
     "guaranteed": ("guaranteed for any hand", "#0072B2"),
+    "held": ("guaranteed for hands that damp", "#009E73"),
     "simulated": ("at rest in simulation", "#E69F00"),
 }
 
@@ -226,14 +309,14 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
         chosen = {row["variant"]: row for row in rows if row["rate"] == rate}
         place = np.arange(len(names))
         lowest = 0.3 * min(row[key] for row in rows for key in _DRAWN if row[key] > 0.0)
-        for shift, (key, (label, color)) in zip((-0.2, 0.2), _DRAWN.items(), strict=True):
+        for shift, (key, (label, color)) in zip((-0.27, 0.0, 0.27), _DRAWN.items(), strict=True):
             stiffest = [chosen[name][key] for name in names]
-            bars = axis.bar(place + shift, stiffest, 0.38, label=label, color=color)
+            bars = axis.bar(place + shift, stiffest, 0.25, label=label, color=color)
             labels = [f"{float(f'{value:.2g}'):g}" if value > 0.0 else "" for value in stiffest]
-            axis.bar_label(bars, labels, fontsize=8)
+            axis.bar_label(bars, labels, fontsize=7)
             for k, value in enumerate(stiffest):
                 if not value > 0.0:
-                    axis.text(k + shift, 1.1 * lowest, "none", ha="center", fontsize=8)
+                    axis.text(k + shift, 1.1 * lowest, "none", ha="center", fontsize=7)
         axis.set_ylim(lowest, 3.0 * max(row["simulated"] for row in rows))
         first = chosen[names[0]]
         bound = "2b/T, which leaves the delay out"
@@ -251,13 +334,23 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
 
 def show(figures: dict[str, Any]) -> None:
     print("stiffest walls [N*m/rad]")
-    heads = ("guaranteed", "simulated", "measured", "Colgate")
+    heads = ("guaranteed", "held", "simulated", "measured", "Colgate")
     print(f"{'rate':>6} {'variant':<30} " + " ".join(f"{h:>10}" for h in heads) + " Abbott")
     for row in figures["walls"]:
         print(
             f"{row['rate']:>6g} {row['variant']:<30} {row['guaranteed']:>10.3g} "
-            f"{row['simulated']:>10.3g} {_cell(row['measured']):>10} {row['colgate']:>10.3g} "
-            f"{row['abbott']:.3g}"
+            f"{row['held']:>10.3g} {row['simulated']:>10.3g} {_cell(row['measured']):>10} "
+            f"{row['colgate']:>10.3g} {row['abbott']:.3g}"
+        )
+
+
+def show_fresh(figures: dict[str, Any]) -> None:
+    print("stiffest walls without damping in hands that damp [N*m/rad]")
+    for row in figures["fresh"]:
+        print(
+            f"{row['rate']:>6g} {row['variant']:<20} promised {row['held']:.3g}, of the true one "
+            f"{row['part']:.2f} in the median, above it on {row['above']} of {row['plants']} "
+            f"plants; {row['restless']} of {row['trials']} trials do not come to rest"
         )
 
 

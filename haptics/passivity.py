@@ -18,9 +18,25 @@ For an ideal amplifier this is Colgate and Schenkel's theorem ("Passivity of a c
 sampled-data systems", Journal of Robotic Systems 14, 1997),
 b > T / 2 / (1 - cos omega T) Re((1 - e^(-j omega T)) H). The motor's back EMF is in b_k.
 
-The brake is passive, but it gives no b: within its yield travel it is a spring without loss.
+The brake is passive, but it gives no b: within its yield travel it is a spring without loss. It is
+passive while its current is constant: switched on under load that spring gives energy. Nothing is
+told of a law that shares its torque with the brake.
+
+A hand that damps adds to b. And a hand leaves a wall and comes back, which is no linear loop: a
+spring's torque phi(theta) is zero without, and rises by no more than K with the angle. With G from
+that torque to the angle, H_r X / (1 - H_a X) of the law's H_r by reference and H_a by angle, X in
+the disc above and G in its image, the hand comes to rest if for some multiplier
+M = sum h_i (1 - z^-i), h_i >= 0,
+
+    Re M (1 / K + G) > 0
+
+at every frequency (Zames and Falb, "Stability conditions for systems with monotone and
+slope-restricted nonlinearities", SIAM Journal on Control 6, 1968; sampled: Willems and Brockett,
+"Some new rearrangement inequalities having application in stability analysis", IEEE Transactions on
+Automatic Control 13, 1968). Clamped commands are such a phi as well.
 """
 
+import itertools
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -30,6 +46,7 @@ from scipy.linalg import expm
 
 from daq.hal import FloatArray
 from daq.lookup.controllers import TunedController
+from haptics.actuator_control import ActuatorControl
 from haptics.dynamics import SHAFT, ActuatorDynamics
 from haptics.linear_loop import LinearLaw
 
@@ -41,6 +58,8 @@ _STIFFEST = 1e4  # N*m/rad
 _BISECTIONS = 40
 _DAMPINGS = 25
 _SURE = 5.0  # %, of the draws may be below what is promised
+_TAPS = 7  # of multipliers, beside two for each sample of delay
+_MIXTURES = np.linspace(0.0, 1.0, 11)
 
 
 class UnknownPassivityError(ValueError):
@@ -79,9 +98,15 @@ class WallLaw:
     def of(cls, controller: TunedController, time: float) -> "WallLaw":
         """That of a controller at rest.
 
-        Raises UnknownPassivityError for one that takes the torque sensor.
+        Raises UnknownPassivityError for one that takes the torque sensor or uses the brake.
         """
         control = controller.control
+        if isinstance(control, ActuatorControl) and control.allocation != "motor":
+            raise UnknownPassivityError(
+                f"allocation: {control.allocation} shares a wall's torque with the brake, which "
+                "comes and goes under load: nothing is promised of it; with allocation: motor "
+                "something is"
+            )
         if control.takes_torque:
             raise UnknownPassivityError(
                 f"{control.controller} feeds the hand's torque back: its passivity is that of no "
@@ -114,15 +139,18 @@ class Port:
     friction: float
 
     @classmethod
-    def of(cls, dynamics: ActuatorDynamics, z: ComplexArray, time: float, ahead: int) -> "Port":
-        """That of an actuator, at frequencies z."""
+    def of(
+        cls, dynamics: ActuatorDynamics, z: ComplexArray, time: float, ahead: int,
+        held: float = 0.0,
+    ) -> "Port":  # fmt: skip
+        """That of an actuator, at frequencies z, in a hand with a damping [N*m*s/rad] at least."""
         omega = np.angle(z) / time
         s = 1j * (omega[:, None] + 2.0 * np.pi / time * np.arange(-_ALIASES, _ALIASES + 1))
         by_volts, by_speed = _currents(dynamics, s)
         constant = dynamics.motor_constant
         at_rest = dynamics.rest(0.0, 1.0, 0.0, 0.0), dynamics.rest(0.0, 0.0, 0.0, 0.0)
         damping = at_rest[1] - at_rest[0]
-        b = np.maximum(damping - constant * by_speed.real, 1e-12)
+        b = np.maximum(damping + held - constant * by_speed.real, 1e-12)
         centre, radius = disc(constant * by_volts, b, s, time, ahead)
         friction = abs(dynamics.rest(0.0, 0.0, dynamics.sliding, 0.0))
         return cls(centre, radius, damping, friction)
@@ -131,6 +159,15 @@ class Port:
         """Whether volts by -H times the angle leave the port passive."""
         margin = np.abs(1.0 + H * self.centre) - np.abs(H) * self.radius
         return bool(np.all(margin > 0.0))
+
+    def by_torque(self, law: WallLaw) -> tuple[ComplexArray, FloatArray]:
+        """Centre and radius, (n,), of the disc of angle by the torque that a law is asked for."""
+        a, C, R = law.by_angle, self.centre, self.radius
+        apart = np.abs(1.0 - a * C) ** 2 - np.abs(a * R) ** 2
+        if not np.all(apart > 0.0):  # the law alone leaves no stable loop in some hand
+            return C, np.full(R.shape, np.inf)
+        centre = (C * np.conj(1.0 - a * C) + np.conj(a) * R**2) / apart
+        return law.by_reference * centre, np.abs(law.by_reference) * R / apart
 
 
 def disc(
@@ -166,12 +203,13 @@ class Passivity:
     """Passivity of walls that a controller renders.
 
     tracker: of the speed that a wall's damping sees. actuators: (n, n_parameters), the identified
-    one first.
+    one first. held: damping that hands have at least [N*m*s/rad].
     """
 
     controller: TunedController
     tracker: Tracker
     actuators: FloatArray
+    held: float = 0.0
 
     @cached_property
     def law(self) -> WallLaw:
@@ -184,7 +222,8 @@ class Passivity:
         model, law = self.controller.model, self.law
         ahead = self.controller.control.ahead
         return [
-            Port.of(ActuatorDynamics(model, p), law.z, self._time, ahead) for p in self.actuators
+            Port.of(ActuatorDynamics(model, p), law.z, self._time, ahead, self.held)
+            for p in self.actuators
         ]
 
     def stiffest(self, port: Port, damping: float) -> float:
@@ -205,6 +244,36 @@ class Passivity:
             if high - low < 1e-4 * high:
                 break
         return low
+
+    @cached_property
+    def _multiplier(self) -> ComplexArray:
+        """The M of two terms that allows the identified actuator the stiffest spring."""
+        z, port = self.law.z, self.ports[0]
+        shares, best = _MIXTURES[:, None], (-1.0, z)
+        terms = [1.0 - z**-i for i in range(1, _TAPS + 2 * self.controller.control.ahead)]
+        for one, other in itertools.combinations(terms, 2):
+            M = shares * one + (1.0 - shares) * other
+            stiffness = self._by_multiplier(port, M)
+            k = int(np.argmax(stiffness))
+            best = max(best, (float(stiffness[k]), M[k]), key=lambda pair: pair[0])
+        return best[1]
+
+    def _by_multiplier(self, port: Port, M: ComplexArray) -> FloatArray:
+        """The stiffest springs that multipliers M, (..., n), allow [N*m/rad], (...)."""
+        C, R = port.by_torque(self.law)
+        with np.errstate(divide="ignore"):
+            need = np.maximum(np.abs(M) * R - (M * C).real, 1e-300)
+        stiffest: FloatArray = np.min(M.real / need, axis=-1)
+        return np.minimum(stiffest, _STIFFEST)
+
+    def springs(self) -> FloatArray:
+        """Stiffest walls without damping that come to rest, entered and left, by actuator, (n,)."""
+        M = self._multiplier
+        return np.array([float(self._by_multiplier(port, M)) for port in self.ports])
+
+    def springs_promised(self) -> float:
+        """The same with 95 %, over the actuators [N*m/rad]."""
+        return float(np.percentile(self.springs(), _SURE))
 
     def promise(self, count: float) -> WallPromise:
         """The stiffest walls; count: angle of one of the encoder [rad]."""

@@ -8,7 +8,7 @@ import numpy as np
 from daq.experiment import Controller, Evidence, Plan, TripLimits
 from daq.findings import Chart, Findings, Number, Series
 from daq.hal import FloatArray, Samples
-from haptics.evidence import Scene
+from haptics.evidence import HAND, HAND_RANGE, Scene
 from haptics.passivity import Passivity, Tracker, UnknownPassivityError
 from protocols.analysis.results import DAMPING, STIFFNESS
 from protocols.analysis.walls import WallFindings, WallTheory, visited
@@ -78,29 +78,50 @@ class VirtualWall(WallSettings):
         evidence = super().evidence(limits, draws)
         if evidence is None:
             return None
+        try:
+            numbers, remarks = self._promises(limits.count)
+        except UnknownPassivityError as error:
+            return replace(evidence, remarks=(*evidence.remarks, f"{error}."))
+        if evidence.refusal:
+            passive, held = (number.value for number in numbers)
+            told = (
+                f"walls up to {passive:.3g} N*m/rad are passive; without damping up to "
+                f"{held:.3g} N*m/rad they rest in hands that damp"
+            )
+            return replace(evidence, refusal=f"{evidence.refusal}; {told}")
+        return replace(
+            evidence,
+            numbers=(*evidence.numbers, *numbers),
+            remarks=(*evidence.remarks, *remarks),
+        )
+
+    def _promises(self, count: float) -> tuple[tuple[Number, ...], tuple[str, ...]]:
+        """Which walls are passive, and which rest in hands that damp.
+
+        count: angle of one of the encoder [rad]. Raises UnknownPassivityError.
+        """
         tuned = self.tuned_controller
         tracker = Tracker(*tracker_gains(self.speed_filter, 1.0 / self.sample_rate))
         drawn = tuned.plausible(_ACTUATORS)
         actuators = np.concatenate([tuned.parameters[None], drawn])
-        try:
-            promise = Passivity(tuned, tracker, actuators).promise(limits.count)
-        except UnknownPassivityError as error:
-            return replace(evidence, remarks=(*evidence.remarks, f"{error}."))
+        held = HAND[1] / HAND_RANGE
+        promise = Passivity(tuned, tracker, actuators).promise(count)
+        springs = Passivity(tuned, tracker, actuators, held).springs_promised()
         sure = "with 95 %" if len(drawn) else "if the parameters are right"
-        remark = (
+        remarks = (
             f"Walls up to {promise.stiffness:.3g} N*m/rad with a damping of "
             f"{promise.damping:.2g} N*m*s/rad are passive {sure}, in any passive hand, with the "
-            f"brake or without. Colgate and Schenkel without delay: {promise.colgate:.3g}; Abbott "
-            f"and Okamura: {promise.abbott:.3g} N*m/rad."
+            f"brake off or at a constant current. Colgate and Schenkel without delay: "
+            f"{promise.colgate:.3g}; Abbott and Okamura: {promise.abbott:.3g} N*m/rad.",
+            f"Walls without damping up to {springs:.3g} N*m/rad come to rest {sure}, entered and "
+            f"left, in any hand that damps by {held:.2g} N*m*s/rad or more, a quarter of (A.2)'s.",
         )
-        passive = Number(
-            "passive_stiffness", promise.stiffness, "N*m/rad", meaning="of walls in any hand"
+        meanings = "of walls in any hand", f"of springs in hands that damp by {held:.2g} or more"
+        numbers = (
+            Number("passive_stiffness", promise.stiffness, "N*m/rad", meaning=meanings[0]),
+            Number("held_stiffness", springs, "N*m/rad", meaning=meanings[1]),
         )
-        numbers = (*evidence.numbers, passive)
-        if evidence.refusal:
-            promised = f"walls up to {promise.stiffness:.3g} N*m/rad are passive {sure}"
-            return replace(evidence, refusal=f"{evidence.refusal}; {promised}")
-        return replace(evidence, numbers=numbers, remarks=(*evidence.remarks, remark))
+        return numbers, remarks
 
     def controller(self) -> Controller:
         """The renderer of the walls."""

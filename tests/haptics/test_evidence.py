@@ -16,7 +16,7 @@ from daq.lookup.controllers import load_controller
 from daq.lookup.experiments import load_experiment
 from daq.recording.preview import trip_limits
 from haptics.dynamics import ActuatorDynamics
-from haptics.evidence import HAND, run_trials
+from haptics.evidence import HAND, HAND_RANGE, run_trials
 from haptics.linear_loop import LinearLaw, loop_margins
 from haptics.passivity import Passivity, Tracker
 from protocols.analysis.walls import SampledWall
@@ -39,7 +39,7 @@ def walls(folder, path, **changes):
 @pytest.fixture(scope="module")
 def static(tmp_path_factory):
     folder = tmp_path_factory.mktemp("evidence")
-    path = controller(folder, "static")
+    path = controller(folder, "static", allocation="motor")
     return folder, path, load_controller(str(path), folder)
 
 
@@ -162,7 +162,8 @@ def test_limits_are_those_of_the_rig():
 
 
 @pytest.mark.soak
-def test_no_promised_wall_rings_on_a_thousand_plausible_actuators(static):
+@pytest.mark.parametrize("held", [0.0, HAND[1] / HAND_RANGE])
+def test_no_promised_wall_rings_on_a_thousand_plausible_actuators(static, held):
     """A wall just below the promise, in hands from 1/4 to 4 times that of (A.2)."""
     folder, path, _ = static
     content = yaml.safe_load((folder / path).read_text())
@@ -173,9 +174,13 @@ def test_no_promised_wall_rings_on_a_thousand_plausible_actuators(static):
     tuned = load_controller("wide.yaml", folder)
     tracker = Tracker(*tracker_gains(150.0, 1.0 / 800.0))
     actuators = np.concatenate([tuned.parameters[None], tuned.plausible(100)])
-    promise = Passivity(tuned, tracker, actuators).promise(LIMITS.count)
-    wall = {"stiffnesses": [promise.stiffness], "dampings": [promise.damping]}
-    rest = {"stiffness": promise.stiffness, "damping": 0.0, "time": 0.4}
+    check = Passivity(tuned, tracker, actuators, held)
+    promise = check.promise(LIMITS.count)
+    stiffness, damping = promise.stiffness, promise.damping
+    if held:
+        stiffness, damping = check.springs_promised(), 0.0
+    wall = {"stiffnesses": [stiffness], "dampings": [damping]}
+    rest = {"stiffness": stiffness, "damping": 0.0, "time": 0.4}
     file = walls(folder, folder / "wide.yaml", **wall, rest=rest, brake_commands=[0.0])
     outcomes = trials(tuned, file, 1000)
     assert not outcomes.restless.any() and not outcomes.left.any()
@@ -203,4 +208,6 @@ def test_rig_check_tells_which_walls_are_passive(static):
     assert done.returncode == 0, done.stderr
     trials_of_check = json.loads(done.stdout)["trials"]
     assert 0.2 < trials_of_check["passive_stiffness"] < 0.24
-    assert "in any passive hand" in trials_of_check["remarks"][-1]
+    assert 2.4 < trials_of_check["held_stiffness"] < 2.6
+    assert "in any passive hand" in trials_of_check["remarks"][-2]
+    assert "in any hand that damps by 0.0045" in trials_of_check["remarks"][-1]

@@ -5,11 +5,13 @@ import pytest
 
 from daq.lookup.controllers import load_controller
 from haptics.dynamics import ActuatorDynamics
+from haptics.evidence import HAND, HAND_RANGE
 from haptics.linear_loop import sampled_actuator
 from haptics.passivity import Passivity, Port, Tracker, UnknownPassivityError, disc
 from protocols.control.loop import tracker_gains
 from tests.haptics.test_torque_tracking import controller
 
+HELD = HAND[1] / HAND_RANGE  # N*m*s/rad
 COUNT = 2.0 * np.pi / 8192.0
 T = 1.0 / 800.0
 TRACKER = Tracker(*tracker_gains(150.0, T))
@@ -34,17 +36,17 @@ def test_of_an_ideal_amplifier_the_disc_is_the_theorem(delay, damping):
         assert port.passive(scale * stiffest + damping * (z - 1.0) / z / T) == passive
 
 
-def passivity(folder, kind, draws=0, **settings):
-    path = controller(folder, kind, **settings)
+def passivity(folder, kind, draws=0, held=0.0, **settings):
+    path = controller(folder, kind, **{"allocation": "motor", **settings})
     tuned = load_controller(str(path), folder)
     factors = np.random.default_rng(0).normal(1.0, 0.05, (draws, len(tuned.parameters)))
     actuators = np.concatenate([tuned.parameters[None], tuned.parameters * factors])
-    return Passivity(tuned, TRACKER, actuators)
+    return Passivity(tuned, TRACKER, actuators, held)
 
 
-def spectral_radius(dynamics, K, B, spring):
+def spectral_radius(dynamics, K, B, spring, damping=0.0):
     """Of the loop of a static law's wall, the sliding shaft and a spring at the handle."""
-    Phi, Gamma, C = sampled_actuator(dynamics, "sliding forwards", (spring, 0.0), T)
+    Phi, Gamma, C = sampled_actuator(dynamics, "sliding forwards", (spring, damping), T)
     n, gain = len(Phi), 1.0 / (dynamics.motor_constant * dynamics.motor.gain)
     alpha, beta = TRACKER.alpha, TRACKER.beta
     A = np.zeros((n + 3, n + 3))
@@ -84,6 +86,63 @@ def test_what_is_taken_off_cannot_be_promised(tmp_path):
     plain = {"friction_share": 0.0, "inertia_share": 0.0}
     inverse = passivity(tmp_path, "feedforward", **plain).promise(COUNT)
     assert 0.1 < inverse.stiffness < 0.2
+
+
+@pytest.mark.parametrize("held", [0.0, HELD])
+def test_a_promised_spring_is_nearly_the_stiffest_stable_one(tmp_path, held):
+    check = passivity(tmp_path, "static", held=held)
+    promised, dynamics = check.springs_promised(), ActuatorDynamics(check.controller.model)
+    springs = np.geomspace(1e-4, 100.0, 120)
+
+    def worst(K):
+        return max(spectral_radius(dynamics, K, 0.0, spring, held) for spring in springs)
+
+    assert worst(promised) < 1.0
+    assert worst(1.05 * promised) > 1.0
+
+
+def bounced(dynamics, K, spring, damping, lean, speed):
+    """Speeds, (n, m) [rad/s], of m sliding shafts thrown at a wall at 0 rad of a static law.
+
+    spring, damping: of the hands, (m,); lean: angles at which they rest without the wall, (m,).
+    """
+    parts = [
+        sampled_actuator(dynamics, "sliding forwards", hand, T)
+        for hand in zip(spring.tolist(), damping.tolist(), strict=True)
+    ]
+    Phi, Gamma, C = (np.stack(each) for each in zip(*parts, strict=True))
+    theta, omega = C[0, 0].argmax(), C[0, 1].argmax()
+    x = np.zeros((len(spring), Phi.shape[1]))
+    x[:, theta], x[:, omega] = -lean, speed  # from where the hand rests
+    gain, volts, speeds = dynamics.motor_constant * dynamics.motor.gain, np.zeros(len(spring)), []
+    for _ in range(3000):
+        depth = np.maximum(x[:, theta] + lean, 0.0)
+        x = np.einsum("mij,mj->mi", Phi, x) + Gamma[:, :, 0] * volts[:, None]
+        volts = np.clip(-K * depth / gain, -4.0, 4.0)
+        speeds.append(x[:, omega])
+    return np.array(speeds)
+
+
+def test_promised_springs_come_to_rest_however_they_are_entered_and_left(tmp_path):
+    """Shafts without friction, clamped commands, hands of every damping from the least on."""
+    check, rng = passivity(tmp_path, "static", held=HELD), np.random.default_rng(0)
+    dynamics, m = ActuatorDynamics(check.controller.model), 60
+    damping = HELD * rng.choice([1.0, 1.0, 4.0], m)
+    spring, lean = np.geomspace(0.04, 4.0, m), rng.uniform(-0.2, 0.5, m)
+    speed = rng.choice([1.0, 10.0, 40.0], m)
+
+    def left(K):
+        """Speeds of the last half second, in parts of those before."""
+        speeds = np.abs(bounced(dynamics, K, spring, damping, lean, speed))
+        return speeds[-400:].max(axis=0) / speeds[:400].max(axis=0)
+
+    assert left(0.95 * check.springs_promised()).max() < 0.05
+    assert left(1.05 * check.springs_promised()).max() > 0.5
+
+
+def test_of_torque_shared_with_the_brake_nothing_is_promised(tmp_path):
+    with pytest.raises(UnknownPassivityError, match="allocation: heating shares"):
+        passivity(tmp_path, "static", allocation="heating").promise(COUNT)
 
 
 def test_of_a_law_that_takes_the_torque_sensor_nothing_is_promised(tmp_path):
