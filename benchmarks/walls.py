@@ -56,6 +56,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "inverse, shared": {"controller": "feedforward", "allocation": "heating", **PLAIN},
     "inverse, friction taken off": {"controller": "feedforward", "inertia_share": 0.0, **MOTOR},
 }
+NOTHING = dict.fromkeys(("guaranteed", "held", "colgate", "abbott"), 0.0)
 DAMPINGS = (0.0, 2e-4, 3e-3)  # N*m*s/rad
 MEASURED = (0.0, 3e-3)  # of them, in runs
 STIFFEST = 400.0  # N*m/rad
@@ -104,7 +105,7 @@ def measure(rate: float, settings: dict[str, Any], hands: int, run: bool = False
     tuned = controller(rate, settings)
     simulated = [stiffest(tuned, damping, contact, hands) for damping in DAMPINGS]
     return {
-        **guaranteed(tuned),
+        **(NOTHING if contact else guaranteed(tuned)),  # a switched brake is not passive
         "simulated": max(simulated),
         "measured": max(stable) if run else None,
         "simulated_by_damping": simulated,
@@ -120,7 +121,7 @@ def guaranteed(tuned: TunedController) -> dict[str, float]:
         promise = Passivity(tuned, tracker, actuators).promise(COUNT)
         held = Passivity(tuned, tracker, actuators, HAND[1] / HAND_RANGE).springs_promised()
     except UnknownPassivityError:
-        return dict.fromkeys(("guaranteed", "held", "colgate", "abbott"), 0.0)
+        return NOTHING
     return {
         "guaranteed": promise.stiffness,
         "guaranteed_damping": promise.damping,
@@ -316,7 +317,7 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
             axis.bar_label(bars, labels, fontsize=7)
             for k, value in enumerate(stiffest):
                 if not value > 0.0:
-                    axis.text(k + shift, 1.1 * lowest, "none", ha="center", fontsize=7)
+                    axis.text(k + shift, 1.1 * lowest, "–", ha="center", fontsize=7)
         axis.set_ylim(lowest, 3.0 * max(row["simulated"] for row in rows))
         first = chosen[names[0]]
         bound = "2b/T, which leaves the delay out"

@@ -49,6 +49,7 @@ from daq.lookup.controllers import TunedController
 from haptics.actuator_control import ActuatorControl
 from haptics.dynamics import SHAFT, ActuatorDynamics
 from haptics.linear_loop import LinearLaw
+from haptics.operating_points import Branch
 
 ComplexArray = NDArray[np.complex128]
 
@@ -59,6 +60,7 @@ _BISECTIONS = 40
 _DAMPINGS = 25
 _SURE = 5.0  # %, of the draws may be below what is promised
 _TAPS = 7  # of multipliers, beside two for each sample of delay
+_SAME = 0.05  # of a law's response: by which the observers of a linear one differ
 _MIXTURES = np.linspace(0.0, 1.0, 11)
 
 
@@ -95,8 +97,10 @@ class WallLaw:
     time: float
 
     @classmethod
-    def of(cls, controller: TunedController, time: float) -> "WallLaw":
-        """That of a controller at rest.
+    def of(
+        cls, controller: TunedController, time: float, branch: Branch = "within yield"
+    ) -> "WallLaw":
+        """That of a controller on a branch of the hysteresis.
 
         Raises UnknownPassivityError for one that takes the torque sensor or uses the brake.
         """
@@ -113,7 +117,7 @@ class WallLaw:
                 "impedance by angle alone, and nothing is promised of it"
             )
         program = control.program(controller.model, controller.parameters)
-        law = LinearLaw.of(program, controller.model)
+        law = LinearLaw.of(program, controller.model, branch)
         dynamics = ActuatorDynamics(controller.model, controller.parameters)
         z = np.exp(1j * np.pi * np.geomspace(1e-3, 1.0, _FREQUENCIES))
         current = _sampled_current(dynamics, z, time) / z**control.ahead
@@ -266,8 +270,20 @@ class Passivity:
         stiffest: FloatArray = np.min(M.real / need, axis=-1)
         return np.minimum(stiffest, _STIFFEST)
 
+    @cached_property
+    def is_linear(self) -> bool:
+        """Whether the law is the same within the yield travel and sliding."""
+        sliding = WallLaw.of(self.controller, self._time, "sliding forwards").by_angle
+        apart = np.abs(sliding - self.law.by_angle).max()
+        return bool(apart <= _SAME * np.abs(self.law.by_angle).max())
+
     def springs(self) -> FloatArray:
-        """Stiffest walls without damping that come to rest, entered and left, by actuator, (n,)."""
+        """Stiffest walls without damping that come to rest, entered and left, by actuator, (n,).
+
+        Zeros for a law that is not linear, of which this cannot be told.
+        """
+        if not self.is_linear:
+            return np.zeros(len(self.actuators))
         M = self._multiplier
         return np.array([float(self._by_multiplier(port, M)) for port in self.ports])
 

@@ -108,14 +108,25 @@ class VirtualWall(WallSettings):
         promise = Passivity(tuned, tracker, actuators).promise(count)
         springs = Passivity(tuned, tracker, actuators, held).springs_promised()
         sure = "with 95 %" if len(drawn) else "if the parameters are right"
-        remarks = (
+        any_hand = (
             f"Walls up to {promise.stiffness:.3g} N*m/rad with a damping of "
             f"{promise.damping:.2g} N*m*s/rad are passive {sure}, in any passive hand, with the "
-            f"brake off or at a constant current. Colgate and Schenkel without delay: "
-            f"{promise.colgate:.3g}; Abbott and Okamura: {promise.abbott:.3g} N*m/rad.",
-            f"Walls without damping up to {springs:.3g} N*m/rad come to rest {sure}, entered and "
-            f"left, in any hand that damps by {held:.2g} N*m*s/rad or more, a quarter of (A.2)'s.",
+            "brake off or at a constant current."
+            if promise.stiffness > 0.0
+            else "No wall is passive in any passive hand: see friction_share and inertia_share."
         )
+        closed_forms = (
+            f"Colgate and Schenkel without delay: {promise.colgate:.3g}; Abbott and Okamura: "
+            f"{promise.abbott:.3g} N*m/rad."
+        )
+        damps = f"that damps by {held:.2g} N*m*s/rad or more, a quarter of (A.2)'s"
+        damped = (
+            f"Walls without damping up to {springs:.3g} N*m/rad come to rest {sure}, entered and "
+            f"left, in any hand {damps}."
+            if springs > 0.0
+            else f"No wall is promised to come to rest in a hand {damps}, either."
+        )
+        remarks = f"{any_hand} {closed_forms}", damped
         meanings = "of walls in any hand", f"of springs in hands that damp by {held:.2g} or more"
         numbers = (
             Number("passive_stiffness", promise.stiffness, "N*m/rad", meaning=meanings[0]),

@@ -82,6 +82,12 @@ def test_a_promise_holds_for_most_of_the_actuators(tmp_path):
 
 
 def test_what_is_taken_off_cannot_be_promised(tmp_path):
+    for check in (
+        passivity(tmp_path, "feedforward", held=HELD),
+        # Taken off within the yield travel and not beyond: a law for each, and none for both.
+        passivity(tmp_path, "feedforward", held=HELD, inertia_share=0.0),
+    ):
+        assert check.springs_promised() == 0.0
     assert passivity(tmp_path, "feedforward").promise(COUNT).stiffness == 0.0
     plain = {"friction_share": 0.0, "inertia_share": 0.0}
     inverse = passivity(tmp_path, "feedforward", **plain).promise(COUNT)
