@@ -255,8 +255,8 @@ class Passivity:
         z, port = self.law.z, self.ports[0]
         shares, best = _MIXTURES[:, None], (-1.0, z)
         terms = [1.0 - z**-i for i in range(1, _TAPS + 2 * self.controller.control.ahead)]
-        for one, other in itertools.combinations(terms, 2):
-            M = shares * one + (1.0 - shares) * other
+        for first, second in itertools.combinations(terms, 2):
+            M = shares * first + (1.0 - shares) * second
             stiffness = self._by_multiplier(port, M)
             k = int(np.argmax(stiffness))
             best = max(best, (float(stiffness[k]), M[k]), key=lambda pair: pair[0])

@@ -84,11 +84,11 @@ class VirtualWall(WallSettings):
             return replace(evidence, remarks=(*evidence.remarks, f"{error}."))
         if evidence.refusal:
             passive, held = (number.value for number in numbers)
-            told = (
+            promises = (
                 f"walls up to {passive:.3g} N*m/rad are passive; without damping up to "
                 f"{held:.3g} N*m/rad they rest in hands that damp"
             )
-            return replace(evidence, refusal=f"{evidence.refusal}; {told}")
+            return replace(evidence, refusal=f"{evidence.refusal}; {promises}")
         return replace(
             evidence,
             numbers=(*evidence.numbers, *numbers),
