@@ -248,6 +248,12 @@ def _show_notes(result: Identification) -> None:
     if rows.refined:
         criterion = result.document["criterion"]
         terminal.print_text(f"Criterion: {criterion['name']}, {criterion['reason']}.")
+    if excerpt := result.document["search"].get("excerpt"):
+        share = f"{excerpt['samples']} of {excerpt['of']} samples"
+        terminal.print_text(
+            f"Searched by {share}, in {len(excerpt['parts'])} parts, and fitted to all of them; "
+            "'search_samples: 0' searches by all."
+        )
     for name, how in result.document.get("averaged", {}).items():
         terminal.print_text(f"Output {name}: {how}.")
     statements = {"Predictions": verdict.predicted, "Parameters": verdict.parameters}

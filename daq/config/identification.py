@@ -270,6 +270,12 @@ class IdentificationConfig(Signals):
     max_steps: int = Field(
         512, ge=1, le=1_000_000, description="integration steps a sample may take"
     )
+    search_samples: int = Field(
+        8192,
+        ge=0,
+        le=1_000_000_000,
+        description="samples that a search of longer logs goes by before all are fitted; 0: all",
+    )
     elite_percent: Percent = Field(
         0.5,
         ge=0.0,

@@ -213,6 +213,7 @@ class Identification(Shown):
                 **{key: getattr(settings, key) for key in ("preset", "seed", "population")},
                 "generations": len(estimator.history_),
                 "simulations": estimator.n_simulations_,
+                **({"excerpt": excerpt} if (excerpt := _excerpt(self)) else {}),
                 "stopped": estimator.stopped_,
                 "flagged": estimator.flagged_,
                 "feasible": estimator.feasible_,
@@ -465,6 +466,20 @@ def _averaged(result: Identification) -> dict[str, str]:
         for j, name in enumerate(result.model.output_names)
         if any(record.windows.size and record.windows[:, j].any() for record in records)
     }
+
+
+def _excerpt(result: Identification) -> dict[str, Any]:
+    """What the search of long logs went by: samples, of how many, and rows counted from 1."""
+    excerpt = result.estimator.excerpt_
+    if excerpt is None:
+        return {}
+    logs = [log.log for log in result.training]
+    rows = [
+        {"log": str(logs[part.place].path), "rows": [part.begin + 1, part.end]}
+        for part in excerpt.parts
+    ]
+    total = sum(record.n_samples for record in excerpt.records)
+    return {"samples": excerpt.n_samples, "of": total, "parts": rows}
 
 
 def _preparation(result: Identification) -> list[dict[str, Any]]:

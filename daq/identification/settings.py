@@ -223,10 +223,12 @@ def _configuration(
 def gassi_settings(problem: Problem) -> dict[str, Any]:
     """Arguments of ``GASSI``, all but the model."""
     settings = problem.settings
-    search = ("preset", "population", "generations", "elite_percent", "accuracy", "max_steps")
+    search = ("preset", "population", "generations", "elite_percent", "search_samples")
+    simulation = ("accuracy", "max_steps")
     space = ("ranges", "fixed", "tied", "scale", "guess")
     error = ("per_log", "balance", "criterion")
-    arguments = {name: getattr(settings, name) for name in (*search, *space, *error)}
+    names = (*search, *simulation, *space, *error)
+    arguments = {name: getattr(settings, name) for name in names}
     arguments |= {"given": problem.given, "random_state": settings.seed}
     optional = {"weights": settings.weights, "process_noise": settings.process_noise}
     return {**arguments, **{name: value or None for name, value in optional.items()}}

@@ -106,10 +106,13 @@ class Objective:
         """The same objective with other weights of the outputs, (n_outputs,)."""
         return self._with(weights=weights / weights.sum())
 
-    def on(self, records: Sequence[Dataset]) -> Objective:
-        """The same objective, scales included, on the first of its records, or parts of them."""
+    def on(self, records: Sequence[Dataset], places: Sequence[int] | None = None) -> Objective:
+        """The same objective, scales included, on parts of its records.
+
+        places: which of its records each is a part of; default the first ones, in order.
+        """
         counts = sum(np.isfinite(record.outputs).sum(axis=0) for record in records)
-        scales = self.scales[: len(records)]
+        scales = [self.scales[place] for place in places or range(len(records))]
         return self._with(records=list(records), counts=counts, scales=scales)
 
     @property

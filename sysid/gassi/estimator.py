@@ -16,10 +16,12 @@ from sysid.fitting.descent import Point
 from sysid.fitting.free_run import free_run
 from sysid.fitting.innovations import Innovations
 from sysid.fitting.objective import Balance, Objective
+from sysid.fitting.refinement import begin, refine_each
 from sysid.gassi.cega_objective import CegaObjective
 from sysid.gassi.checkpoint import Checkpoint, load, origin
+from sysid.gassi.excerpt import Excerpt
 from sysid.gassi.genetic_search import PRESETS, GeneticSearch, Preset, PresetName
-from sysid.gassi.likelihood import NoisyInputs, fit_likelihood
+from sysid.gassi.likelihood import NoisyInputs, promising, fit_likelihood
 from sysid.gassi.search_run import Best, SearchRun
 from sysid.problem.data import Dataset, require_information
 from sysid.problem.given import Given
@@ -95,6 +97,9 @@ class GASSI(RecordEstimator):
     balance : ``samples``, several records count as one long one; ``logs``, each alike.
     accuracy : normalised RMS error that a simulation aims at.
     max_steps : integration steps a sample may take before a chromosome is flagged.
+    search_samples : of records that have more than twice as many samples, search and descents go
+        by parts of about so many, and only their minima are fitted to all; 0: all, always. Of the
+        presets that refine.
     threads : default all cores; the result does not depend on their number.
     random_state : seed; equal seeds give equal results.
     dt : sample time [s] of arrays; Datasets bring their own.
@@ -119,7 +124,8 @@ class GASSI(RecordEstimator):
     history_ : (n_generations,), the best error after each ``population`` simulations.
     stopped_ : ``generations``, ``converged`` or ``interrupted``.
     flagged_ : {status name: count} of simulations that failed during the search.
-    n_simulations_ : simulations of one chromosome on all records.
+    excerpt_ : the ``Excerpt`` of long records that the search went by, None where it was all.
+    n_simulations_ : simulations of one chromosome on all records, or on the excerpt.
 
     Examples
     --------
@@ -163,6 +169,7 @@ class GASSI(RecordEstimator):
     process_noise: Mapping[str, float] | None = None
     accuracy: float = 1e-3
     max_steps: int = 512
+    search_samples: int = 8192
     threads: int | None = None
     random_state: int = 0
     dt: float | None = None
@@ -215,13 +222,19 @@ class GASSI(RecordEstimator):
         self._final_accuracy = self.accuracy
         self.criterion_, self.criterion_reason_ = self._criterion(data, preset)
         self.output_noise_: FloatArray | None = None
-        run = self._search_run(objective, preset)
+        self.excerpt_ = Excerpt.of(data, self.search_samples) if preset.refine else None
+        searched = objective
+        if self.excerpt_ is not None:
+            searched = objective.on(self.excerpt_.datasets(), self.excerpt_.places)
+        run = self._search_run(searched, preset)
         checkpoints = self._checkpoints(data, run, checkpoint, resume)
         notify = on_progress or (lambda progress: None)
         self.stopped_ = self._search(run, checkpoints, notify)
         self._set_run(run)
-        if preset.refine and self.criterion_ != "error" and self.stopped_ != "interrupted":
-            self._maximise_likelihood(run, notify)
+        try:
+            self._conclude(run, objective, notify)
+        except KeyboardInterrupt:
+            self.stopped_ = "interrupted"
         return self
 
     def _search(
@@ -246,36 +259,65 @@ class GASSI(RecordEstimator):
                 checkpoints.flush()
         return "converged" if run.search.converged else "generations"
 
-    def _maximise_likelihood(self, run: SearchRun, notify: Callable[[Progress], None]) -> None:
-        """Refit the minima of the mean RMSE by likelihood, and keep the likeliest."""
+    def _conclude(
+        self, run: SearchRun, objective: Objective, notify: Callable[[Progress], None]
+    ) -> None:
+        """Fit the minima of a search to all of the records, and keep the best.
+
+        objective: of the records, over the parameters alone.
+        """
         iterations = itertools.count(1)
 
         def watch(_: Point) -> None:
             done = next(iterations)
             notify(Progress("weigh", done, done, self.error_))
 
-        try:
-            result = fit_likelihood(
-                run.objective,
-                run.minima(),
-                watch,
-                noise=_OF_NOISY_INPUTS.get(self.criterion_),
-                process=self._process(),
-            )
-        except KeyboardInterrupt:
-            self.stopped_ = "interrupted"
+        searched, excerpt, weighs = run.objective, self.excerpt_, self.criterion_ != "error"
+        if excerpt is not None:
+            space, (chromosome,) = excerpt.on_all(searched.space, [self.chromosome_])
+            objective = objective.over(space)
+            self._set_evaluated(objective, chromosome)
+        if self.stopped_ == "interrupted" or not self._preset().refine:
             return
+        if excerpt is None:
+            if weighs:
+                self._maximise_likelihood(searched, run.minima(), watch)
+            return
+        if weighs:
+            minima = promising(searched, run.minima(), watch)
+            minima = excerpt.on_all(searched.space, minima)[1]
+            self._maximise_likelihood(objective, minima, watch, explored=True)
+            return
+        minima = excerpt.on_all(searched.space, run.minima())[1]
+        ends = refine_each(objective, [begin(objective, minimum) for minimum in minima])
+        best = min(ends, key=lambda end: (not space.feasible(end.chromosome), end.error))
+        self._set_evaluated(objective, best.chromosome)
+
+    def _maximise_likelihood(
+        self,
+        objective: Objective,
+        minima: Sequence[FloatArray],
+        watch: Callable[[Point], None],
+        *,
+        explored: bool = False,
+    ) -> None:
+        """Refit the minima of the mean RMSE by likelihood, and keep the likeliest."""
+        result = fit_likelihood(
+            objective,
+            minima,
+            watch,
+            noise=_OF_NOISY_INPUTS.get(self.criterion_),
+            process=self._process(),
+            explored=explored,
+        )
         likeliest, self._rivals, self._ridge = result.optimum, result.rivals, result.ridge
         self._final_accuracy = likeliest.objective.simulator.accuracy
-        objective, chromosome = self._at_final_accuracy(run.objective), likeliest.chromosome
-        error = float(objective.evaluate(chromosome[None])[0][0])
-        self._set_best(Best(objective.space, chromosome, error, likeliest.feasible))
+        self._set_evaluated(self._at_final_accuracy(objective), likeliest.chromosome)
         self.output_weights_ = likeliest.objective.weights
         if isinstance(likeliest.objective, Innovations):
             self.output_noise_ = likeliest.objective.noise
             if likeliest.objective.corrects and self.criterion_ == "compensated":
                 self.criterion_, self.criterion_reason_ = "innovations", _OVERWHELMED
-        self.n_simulations_ = objective.simulations
 
     def predict(self, X: Dataset | FloatArray, *, records: Any = None) -> FloatArray:
         """Free-run outputs of the identified model, (n_samples, n_outputs).
@@ -508,6 +550,13 @@ class GASSI(RecordEstimator):
         self.history_: FloatArray = np.array(run.history)
         self.flagged_ = dict(run.flagged)
         self.n_simulations_ = run.objective.simulations
+
+    def _set_evaluated(self, objective: Objective, chromosome: FloatArray) -> None:
+        """Set the fitted attributes to a chromosome (n_free,) of an objective."""
+        error = float(objective.evaluate(chromosome[None])[0][0])
+        feasible = objective.space.feasible(chromosome)
+        self._set_best(Best(objective.space, chromosome, error, feasible))
+        self.n_simulations_ = objective.simulations
 
     def _set_best(self, best: Best) -> None:
         self.space_, self.chromosome_, self.error_, self.feasible_ = best

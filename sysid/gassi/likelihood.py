@@ -18,7 +18,7 @@ from typing import Literal
 import numpy as np
 
 from sysid.arrays import FloatArray
-from sysid.fitting.descent import Point, Restriction
+from sysid.fitting.descent import TOLERANCE, Point, Restriction
 from sysid.fitting.free_run import FINER, FINEST
 from sysid.fitting.innovations import Innovations
 from sysid.fitting.objective import Objective
@@ -45,6 +45,7 @@ _FEWEST = 30.0
 # parameters in which such minima typically differ.
 _TOLD_APART = 13.3
 _CONCEIVABLE = 40.0  # the same before a minimum has been refined to its end
+_MOST_PROMISING = 3  # minima of a part of the data that are fitted to all
 _QUICKLY, _ROUGHLY = 15, 1e-4  # iterations and tolerance until then
 _WAY = np.array([0.25, 0.5, 0.75])  # parts of the way between two minima that are tried
 _EXPLORED = 2  # minima whose lookalikes are descended from
@@ -89,27 +90,16 @@ def fit_likelihood(
     *,
     noise: NoisyInputs | None = None,
     process: FloatArray | None = None,
+    explored: bool = False,
 ) -> Likeliest:
     """The likeliest of some minima (n_free,) of the mean RMSE and of their lookalikes.
 
     noise: how all of them are refitted in the end, where inputs or the process are noisy; by
-    innovations, too, where free runs would not do. process: as of ``Innovations``.
+    innovations, too, where free runs would not do. process: as of ``Innovations``. explored:
+    whether the minima have their lookalikes among them.
     """
     objective = _resolved(objective, minima[0])
-    optima = _Optima(objective)
-    for minimum in minima:
-        optima.add(_weighed(objective, minimum, watch))
-    explored = None
-    for _ in range(_EXPLORED):
-        best = optima.ranked()[0]
-        if best is explored:
-            break  # nothing better was found around it
-        explored = best
-        starts = lookalikes(best.objective, best.chromosome)
-        # By the best one's weights, until it turns out to matter.
-        for end in _conceivable(best.objective, starts, optima, best):
-            if optima.new(end.chromosome):
-                optima.add(_weighed(objective, end.chromosome, watch))
+    optima = _explored(objective, minima, watch, lookalike=not explored)
     best, *others = optima.ranked()
     refitted = None
     if noise is not None:
@@ -127,6 +117,20 @@ def fit_likelihood(
     valley = itertools.compress(rivals, connected)
     ridge = [rival for rival in valley if optima.deviance(rival, best) < Z95**2]
     return Likeliest(_slid(best), _chromosomes(apart), _chromosomes(ridge))
+
+
+def promising(
+    objective: Objective, minima: Sequence[FloatArray], watch: Watch | None = None
+) -> list[FloatArray]:
+    """Of some minima (n_free,) and their lookalikes those that more data may favour.
+
+    At most three, the best first; where they are is known roughly, for they are meant to be fitted
+    to all data.
+    """
+    optima = _explored(objective, minima, watch, lookalike=True, roughly=True)
+    best, *others = optima.ranked()
+    near = [rival for rival in others if optima.deviance(rival, best) < _TOLD_APART]
+    return [optimum.chromosome for optimum in (best, *near)[:_MOST_PROMISING]]
 
 
 def _slid(optimum: Optimum) -> Optimum:
@@ -235,6 +239,32 @@ class _Optima:
         return sensitivity(self._optima[0].objective, self._optima[0].chromosome)
 
 
+def _explored(
+    objective: Objective,
+    minima: Sequence[FloatArray],
+    watch: Watch | None,
+    *,
+    lookalike: bool,
+    roughly: bool = False,
+) -> _Optima:
+    """Minima (n_free,) refined by likelihood, and those that look like the best."""
+    optima = _Optima(objective)
+    for minimum in minima:
+        optima.add(_weighed(objective, minimum, watch, roughly=roughly))
+    explored = None
+    for _ in range(_EXPLORED if lookalike else 0):
+        best = optima.ranked()[0]
+        if best is explored:
+            break  # nothing better was found around it
+        explored = best
+        starts = lookalikes(best.objective, best.chromosome)
+        # By the best one's weights, until it turns out to matter.
+        for end in _conceivable(best.objective, starts, optima, best):
+            if optima.new(end.chromosome):
+                optima.add(_weighed(objective, end.chromosome, watch, roughly=roughly))
+    return optima
+
+
 def _resolved(objective: Objective, chromosome: FloatArray) -> Objective:
     """The objective with simulations as accurate as they are meant to be, at a chromosome.
 
@@ -261,8 +291,11 @@ def _exact(optimum: Optimum) -> Optimum:
     return _optimum(objective, end.chromosome, end.rms)
 
 
-def _weighed(objective: Objective, chromosome: FloatArray, watch: Watch | None) -> Optimum:
+def _weighed(
+    objective: Objective, chromosome: FloatArray, watch: Watch | None, *, roughly: bool = False
+) -> Optimum:
     """The minimum by the inverse of its errors: weights and parameters in turn."""
+    tolerance = _ROUGHLY if roughly else TOLERANCE
     given, accuracy = objective.weights, objective.simulator.accuracy
     rms = objective.rms(chromosome[None])[0]
     # A refinement may end where a simulation takes more steps than a chromosome is allowed.
@@ -272,7 +305,7 @@ def _weighed(objective: Objective, chromosome: FloatArray, watch: Watch | None) 
         weighed = objective.weighed(weights)
         steady = np.allclose(weighed.weights, objective.weights, rtol=_STEADY)
         objective = weighed
-        end = refine(objective, chromosome, on_iteration=watch)
+        end = refine(objective, chromosome, tolerance=tolerance, on_iteration=watch)
         chromosome, rms = end.chromosome, end.rms
         if steady:
             break

@@ -144,6 +144,26 @@ def test_a_log_is_merged_moved_cut_and_decimated_and_the_report_shows_it(folder)
     assert folder / "again" / "preparation.png" in drawn
 
 
+def test_a_long_log_is_searched_by_parts_and_that_is_told(folder):
+    rng = np.random.default_rng(0)
+    inputs = np.repeat(rng.choice([-1.0, 1.0], 400), 20)
+    outputs = np.zeros(len(inputs))
+    for k, u in enumerate(inputs[:-1]):
+        outputs[k + 1] = GAIN * u + (outputs[k] - GAIN * u) * np.exp(-DT / TAU)
+    outputs[1:] += 0.01 * rng.standard_normal(len(outputs) - 1)
+    table = pd.DataFrame({"t": DT * np.arange(len(inputs)), "u": inputs, "y": outputs})
+    table.to_csv(folder / "long.csv", index=False)
+    problem(folder, search_samples=2048)
+    request = SettingsRequest(str(folder / "id.yaml"))
+    result = identify_files([folder / "long.csv"], [], request, folder / "out", lambda _: None)
+    values = result.parameters["value"]
+    assert values["gain"] == pytest.approx(GAIN, rel=0.01)
+    assert values["tau"] == pytest.approx(TAU, rel=0.01)
+    excerpt = yaml.safe_load((folder / "out" / "parameters.yaml").read_text())["search"]["excerpt"]
+    assert (excerpt["samples"], excerpt["of"]) == (2048, 8000)
+    assert excerpt["parts"][0] == {"log": str(folder / "long.csv"), "rows": [1, 1024]}
+
+
 @pytest.mark.parametrize(
     ("changes", "told"),
     [

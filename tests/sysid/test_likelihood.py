@@ -278,3 +278,48 @@ def test_the_likelihood_weighs_each_output_by_its_own_error():
     likeliest = fit_likelihood(target, [np.array([1.2])]).optimum
     assert likeliest.chromosome[0] == pytest.approx(exact.x, abs=1e-4)
     assert likeliest.objective.weights[0] > 5.0 * likeliest.objective.weights[1]
+
+
+# --- the same answer for every seed ---------------------------------------------------------
+
+
+def saturating_derivative(x, u, p):
+    rate, half = p
+    return (u[0] - rate * x[0] / (half + x[0]),)
+
+
+@pytest.fixture(scope="module")
+def far_below_half():
+    """Uptake that saturates, at concentrations where only rate / half is well known."""
+    model = ProcessModel(
+        name="uptake",
+        states=(State("x", "g/l"),),
+        inputs=(Input("u", "g/(l*s)"),),
+        outputs=(Output("x", "g/l"),),
+        parameters=(
+            Parameter("rate", "g/(l*s)", 10.0, 0.5, 500.0, "log"),
+            Parameter("half", "g/l", 5.0, 0.25, 250.0, "log"),
+        ),
+        derivative=saturating_derivative,
+    )
+    rng = np.random.default_rng(2)
+    inputs = prbs(rng, 200, 0.0, 0.8)[:, None]
+    blank = Dataset(inputs, np.full((200, 1), np.nan), 0.1)
+    outputs = BatchSimulator(model, accuracy=1e-6).trajectories(model.nominal, blank)[0]
+    return model, Dataset(inputs, outputs + 0.03 * rng.normal(size=outputs.shape), 0.1)
+
+
+def answer(model, record, seed):
+    fitted = GASSI(model, population=20, generations=6, random_state=seed).fit(record)
+    assert fitted.rivals_ == []
+    return fitted.uncertainty(record).parameters
+
+
+def test_a_ridge_is_told_alike_by_every_seed(far_below_half):
+    first, *others = (answer(*far_below_half, seed) for seed in range(3))
+    assert all(estimate.std is None for estimate in first)  # by the profile, not the curvature
+    for other in others:
+        for one, same in zip(first, other, strict=True):
+            assert one.why == same.why
+            ends = [[e.low or 0.0, np.inf if e.high is None else e.high] for e in (one, same)]
+            np.testing.assert_allclose(ends[0], ends[1], rtol=1e-2)

@@ -1,0 +1,121 @@
+"""Searches of long records by parts of them: which parts, and that the answer is that of all."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from sysid import GASSI, BatchSimulator, Dataset, Output, Parameter, State
+from sysid.fitting.objective import Objective
+from sysid.gassi.excerpt import Excerpt
+from tests.sysid.support import lag, prbs
+
+N = 12_000
+SETTINGS = {"population": 20, "generations": 6}
+
+
+def staircase():
+    """Levels held for 2000 samples, a ramp of 100 between them, with noise throughout."""
+    rng = np.random.default_rng(0)
+    level = np.repeat([0.0, 1.0, -2.0, 3.0, -1.0, 2.0], 2000)
+    ramp = np.convolve(level, np.full(100, 0.01), mode="full")[: len(level)]
+    noise = 0.01 * rng.standard_normal((len(level), 2))
+    return Dataset(level[:, None] + noise[:, :1], ramp[:, None] + noise[:, 1:], 0.01)
+
+
+def test_parts_are_where_channels_change():
+    excerpt = Excerpt.of([staircase()], 5120)
+    begins = [part.begin for part in excerpt.parts]
+    assert begins[0] == 0 and begins == sorted(begins) and len(begins) == 5
+    assert all(later - begin >= 1024 for begin, later in pairwise(begins))
+    steps = {2000, 4000, 6000, 8000, 10_000}
+    seen = {s for s in steps for p in excerpt.parts if p.begin < s and s + 100 < p.end}
+    assert len(seen) == 4  # one in each part behind the first, which begins at row 0
+
+
+def test_a_part_within_a_record_is_compared_once_its_start_is_forgotten():
+    record = staircase()
+    first, later = Excerpt.of([record], 2048).datasets()[:2]
+    assert np.isfinite(first.outputs).all()
+    seen = np.isfinite(later.outputs[:, 0])
+    assert seen[0] and not seen[1:256].any() and seen[256:].all()
+
+
+def test_every_record_has_its_share():
+    long, short = staircase(), staircase().part(0, 1500, "short")
+    excerpt = Excerpt.of([long, short], 4096)
+    assert excerpt.places == [0, 0, 0, 0, 1]
+    assert excerpt.parts[-1] == (1, 0, 1500)
+    assert excerpt.n_samples == 4 * 1024 + 1500
+
+
+@pytest.mark.parametrize("samples", [0, 6000, 20_000])
+def test_short_records_are_searched_whole(samples):
+    assert Excerpt.of([staircase()], samples) is None
+
+
+def hidden_lag_derivative(x, u, p):
+    return ((p[0] * u[0] - x[0]) / p[1], (x[0] - x[1]) / 0.02)
+
+
+def hidden_lag():
+    """A lag seen through another, whose own start is not measured."""
+    return lag(
+        states=(State("inside", "1", initial_range=(-5.0, 5.0)), State("y", "1")),
+        outputs=(Output("y", "1"),),
+        parameters=(
+            Parameter("gain", "1", 2.0, 0.2, 20.0, "log"),
+            Parameter("tau", "s", 0.05, 0.005, 0.5, "log"),
+        ),
+        derivative=hidden_lag_derivative,
+    )
+
+
+@pytest.fixture(scope="module")
+def long_record():
+    rng, model = np.random.default_rng(1), hidden_lag()
+    inputs = prbs(rng, N, -1.0, 1.0)[:, None]
+    blank = Dataset(inputs, np.full((N, 1), np.nan), 0.01)
+    start = np.array([[3.0, 0.0]])
+    outputs = BatchSimulator(model, accuracy=1e-6).trajectories(model.nominal, blank, starts=start)
+    noisy = outputs[0] + 0.05 * rng.standard_normal((N, 1))
+    noisy[0] = 0.0
+    return Dataset(inputs, noisy, 0.01)
+
+
+@pytest.mark.parametrize("criterion", ["likelihood", "error"])
+def test_minima_of_an_excerpt_are_fitted_to_all(long_record, criterion):
+    whole, parts = (
+        GASSI(hidden_lag(), criterion=criterion, search_samples=samples, **SETTINGS).fit(
+            long_record
+        )
+        for samples in (0, 2048)
+    )
+    assert whole.excerpt_ is None and parts.excerpt_.n_samples == 2048
+    assert parts.vector_ == pytest.approx(whole.vector_, rel=1e-4)
+    assert parts.error_ == pytest.approx(whole.error_, rel=1e-6)
+    (start,) = parts.initial_states_
+    assert start["inside"] == pytest.approx(3.0, abs=0.3)
+    assert parts.space_.names == ("gain", "tau", "inside(0)")
+    gain, tau, *_ = parts.uncertainty(long_record).parameters
+    assert gain.low < 2.0 < gain.high and tau.low < 0.05 < tau.high
+    assert gain.std == pytest.approx(whole.uncertainty(long_record).parameters[0].std, rel=0.05)
+
+
+def test_an_interrupted_search_of_an_excerpt_tells_the_error_of_all(long_record):
+    def stop(progress):
+        if progress.stage == "refine":
+            raise KeyboardInterrupt
+
+    estimator = GASSI(hidden_lag(), search_samples=2048, **SETTINGS)
+    estimator.fit(long_record, on_progress=stop)
+    assert estimator.stopped_ == "interrupted" and estimator.space_.names[-1] == "inside(0)"
+    of_all = Objective(BatchSimulator(hidden_lag()), estimator.space_, [long_record])
+    assert estimator.error_ == of_all.evaluate(estimator.chromosome_[None])[0][0]
+
+
+def test_what_writes_the_thesis_searches_all_samples(long_record):
+    estimator = GASSI(hidden_lag(), preset="thesis", search_samples=2048, **SETTINGS)
+    assert estimator.fit(long_record).excerpt_ is None
