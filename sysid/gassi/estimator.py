@@ -21,7 +21,7 @@ from sysid.gassi.cega_objective import CegaObjective
 from sysid.gassi.checkpoint import Checkpoint, load, origin
 from sysid.gassi.excerpt import Excerpt
 from sysid.gassi.genetic_search import PRESETS, GeneticSearch, Preset, PresetName
-from sysid.gassi.likelihood import NoisyInputs, promising, fit_likelihood
+from sysid.gassi.likelihood import NoisyInputs, fit_likelihood, promising
 from sysid.gassi.search_run import Best, SearchRun
 from sysid.problem.data import Dataset, require_information
 from sysid.problem.given import Given
