@@ -79,8 +79,8 @@ def _show(result: Identification) -> None:
 
 
 def _show_next(result: Identification) -> None:
-    if result.alternative_command is not None:
-        terminal.print_next(result.alternative_command)
+    if result.next_step is not None:
+        terminal.print_next(result.next_step.command)
         return
     mapping = result.problem.mapping
     columns = f" --config {mapping.file.path}" if mapping is not None else ""

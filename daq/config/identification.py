@@ -232,8 +232,30 @@ class Columns(Section):
     outputs: dict[str, Column] = Field(description="for each output that counts")
 
 
+class TermSetting(Section):
+    """A function of one signal that is added to an equation, times a parameter of its own."""
+
+    equation: str = Field(description="the state to whose rate it is added", examples=["omega"])
+    of: str = Field(description="the state or input that it is a function of", examples=["omega"])
+    shape: Literal["sign", "linear", "square", "cube", "stribeck"] = Field(
+        description="of z = (signal - centre) / scale: sign (in proportion where |z| < 1), linear, "
+        "square (z |z|), cube or stribeck (sign(z) exp(-z^2))"
+    )
+    scale: float = Field(gt=0.0, description="in the signal's unit", examples=[0.05])
+    centre: float = Field(0.0, description="in the signal's unit")
+    range: tuple[float, float] = Field(
+        description="where its parameter is searched, in the unit of the equation's rate",
+        examples=[[-500.0, 500.0]],
+    )
+
+
 class Signals(Section):
     """How a model is used where not as it declares."""
+
+    terms: list[TermSetting] = Field(
+        default_factory=list,
+        description="functions that are added to the model's equations, such as dry friction",
+    )
 
     outputs: list[str] = Field(
         default_factory=list,

@@ -40,6 +40,24 @@ class SettingsRequest:
         config = None if self.config is None else _absolute([self.config])[0]
         return SettingsRequest(config, options, list(self.settings))
 
+    def words(self, settings: Sequence[str] = (), **options: Any) -> list[str]:
+        """Words of ``rig identify`` behind its logs that ask for the same, but for what is given.
+
+        >>> asked = SettingsRequest("drive.yaml", {"seed": 1, "guess": True}, ["robust=true"])
+        >>> " ".join(asked.words(["delay.omega=4 ms"], model="lag"))
+        '--config drive.yaml --model lag --seed 1 --guess --set robust=true --set delay.omega=4 ms'
+        """
+        words = [] if self.config is None else ["--config", self.config]
+        whole = {**self.options, **options}
+        for name, value in sorted(whole.items(), key=lambda option: option[0] != "model"):
+            for each in value if isinstance(value, list | tuple) else [value]:
+                if each is not None:
+                    words.append(f"--{name.replace('_', '-')}")
+                    words += [] if each is True else [str(each)]
+        replaced = {setting.partition("=")[0] for setting in settings}
+        kept = [s for s in self.settings if s.partition("=")[0] not in replaced]
+        return [*words, *(word for setting in (*kept, *settings) for word in ("--set", setting))]
+
 
 def remember(
     folder: Path, settings: SettingsRequest, training: Sequence[Path], validation: Sequence[Path]

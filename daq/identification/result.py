@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -13,12 +14,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import yaml
 
-from daq.config.identification import Signals
+from daq.config.identification import Signals, TermSetting
 from daq.files import make_folder, write_whole
+from daq.identification.mending import mending
 from daq.identification.records import LoggedRecord
 from daq.identification.request import PARAMETERS, resume_command
 from daq.identification.rows import Rows
-from daq.identification.settings import Problem
+from daq.identification.settings import Problem, setting_of
 from daq.lookup.models import trust_option
 from daq.provenance import software_versions
 from daq.views import Lines, Shown
@@ -58,6 +60,14 @@ class FittedLog:
     log: LoggedRecord
     run: FloatArray
     result: RecordResult
+
+
+@dataclass(frozen=True)
+class NextStep:
+    """What makes an identification better, and what to type for it."""
+
+    purpose: str
+    command: str
 
 
 @dataclass(frozen=True, repr=False)
@@ -155,22 +165,69 @@ class Identification(Shown):
 
     @property
     def alternative_command(self) -> str | None:
-        """What to type to identify the variant that explains the data better; None for none."""
+        """What to type to identify what explains the data better; None for nothing."""
         alternative = None if self.suspicion is None else self.suspicion.alternative
-        if alternative is None or not alternative.better or self.trust_option:
+        if alternative is None or not alternative.better:
+            return None
+        if alternative.terms:
+            terms = [*self.problem.settings.terms, *map(setting_of, alternative.terms)]
+            return self._again(f"terms={_in_one_line(terms)}")
+        if self.trust_option:
             return None
         name = self.problem.model_name
+        return self._again(model=f"{name}{',' if ':' in name else ':'}{alternative.name}")
+
+    @property
+    def mending_command(self) -> str | None:
+        """What to type to identify without what is wrong with data or ranges; None for nothing."""
+        settings = mending(
+            self.problem.settings,
+            (*self.model.input_names, *self.model.output_names),
+            faults=self.faults,
+            findings=() if self.suspicion is None else self.suspicion.findings,
+            pushed=self._pushed,
+        )
+        return self._again(*settings) if settings else None
+
+    @property
+    def _pushed(self) -> dict[str, tuple[float, float, float]]:
+        """Value and range of parameters that the data want beyond an end of a logarithmic one."""
+        if self.uncertainty is None:
+            return {}
+        free = zip(self.estimator.space_.parameters, self.uncertainty.parameters, strict=True)
+        return {
+            p.name: (estimate.value, p.lower, p.upper)
+            for p, estimate in free
+            if estimate.pushed and p.scale == "log" and p.name in self.model.parameter_names
+        }
+
+    @property
+    def next_step(self) -> NextStep | None:
+        """What makes this identification better, and what to type for it; None for nothing."""
+        alternative = self.suspicion.alternative if self.suspicion is not None else None
+        if alternative is not None and (command := self.alternative_command) is not None:
+            return NextStep(
+                f"Identify with {alternative.name}, which explains these data better:", command
+            )
+        if (command := self.mending_command) is not None:
+            return NextStep(
+                "Identify again without what was found wrong with data or ranges:", command
+            )
+        if self.verdict.predicted.trust == "poor" and not self.interrupted:
+            settings = self.problem.settings
+            longer = {"seed": settings.seed + 1, "population": 2 * settings.population}
+            return NextStep("Search longer, and from elsewhere:", self._again(**longer))
+        return None
+
+    def _again(self, *settings: str, **options: Any) -> str:
+        """The command of this identification with other settings and options."""
         logs, checks = (
             list(dict.fromkeys(str(fitted.log.path) for fitted in part))
             for part in (self.training, self.validation)
         )
         words = ["rig", "identify", *logs]
         words += [word for path in checks if path not in logs for word in ("--validate", path)]
-        if self.problem.request.config is not None:
-            words += ["--config", self.problem.request.config]
-        return shlex.join(
-            [*words, "--model", f"{name}{',' if ':' in name else ':'}{alternative.name}"]
-        )
+        return shlex.join([*words, *self.problem.request.words(settings, **options)])
 
     @property
     def parameters_file(self) -> Path | None:
@@ -194,6 +251,7 @@ class Identification(Shown):
             **({"averaged": averaged} if (averaged := _averaged(self)) else {}),
             **({"preparation": prepared} if (prepared := _preparation(self)) else {}),
             "verdict": _verdict(verdict),
+            **({"next": asdict(self.next_step)} if self.next_step is not None else {}),
             **({"missing": _missing(self)} if self.suspicion is not None else {}),
             "data_faults": [_fault(fault) for fault in self.faults],
             "parameters": {p.name: _parameter(self, p) for p in self.model.parameters},
@@ -269,6 +327,12 @@ class Identification(Shown):
         return path
 
 
+def _in_one_line(terms: Sequence[TermSetting]) -> str:
+    entries = [term.model_dump(mode="json", exclude_defaults=True) for term in terms]
+    text = yaml.safe_dump(entries, default_flow_style=True, sort_keys=False, width=math.inf)
+    return text.strip()
+
+
 def _fault(fault: DataFault) -> dict[str, Any]:
     return {**asdict(fault), "records": list(fault.records), "sentence": fault.sentence}
 
@@ -296,7 +360,7 @@ def _missing(identification: Identification) -> dict[str, Any]:
                 "what": description(finding),
                 "kind": finding.kind,
                 "name": finding.name,
-                **({"of": finding.of} if finding.of else {}),
+                **({"of": finding.term.of} if finding.term is not None else {}),
                 "amplitude": finding.amplitude,
                 "p_value": float(f"{finding.p_value:.3g}"),
                 "moves": {

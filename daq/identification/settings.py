@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from daq.config import check, yaml_file
-from daq.config.identification import IdentificationConfig, Signals
+from daq.config.identification import IdentificationConfig, Signals, TermSetting
 from daq.config.units import converted
 from daq.config.yaml_file import TypedSettings, YamlFile
 from daq.errors import ConfigError, Mistake, suggestion
@@ -18,6 +18,7 @@ from daq.identification.selection import EVERYTHING, Selection
 from daq.lookup.models import DEFAULT_MODEL, find_model, whole_name
 from daq.progress import Note, Watch, ignore
 from sysid import Given, ModelError, ProcessModel, SearchSpace
+from sysid.problem.terms import Term, with_terms
 
 File = TypeVar("File", bound=YamlFile)
 
@@ -84,7 +85,9 @@ def problems_of(
     selection = Selection.under(settings, file)
     for model, name in declared:
         watch(Note("detail", f"model {name}: {model.description}"))
-    models = [_with_outputs(file, settings, model) for model, _ in declared]
+    models = [
+        _with_outputs(file, settings, _with_terms(file, settings, model)) for model, _ in declared
+    ]
     _check_names(file, settings, models)
     mapping = ColumnMapping(file, settings.columns) if settings.columns else None
     signals = [name for m, _ in declared for name in (*m.output_names, *m.state_names)]
@@ -187,6 +190,7 @@ def _with_freed(
 
 def with_signals(file: YamlFile, signals: Signals, model: ProcessModel) -> ProcessModel:
     """The model with outputs, starts and holds as a file has them; ConfigError names the key."""
+    model = _with_terms(file, signals, model)
     return _with_starts(file, signals, _with_outputs(file, signals, model))
 
 
@@ -264,6 +268,28 @@ def _find_model(
         if beside is None or configured is None:
             raise
         raise ConfigError.of(file.blamed(("model",), error)) from None
+
+
+def _with_terms(file: YamlFile, signals: Signals, model: ProcessModel) -> ProcessModel:
+    for k, setting in enumerate(signals.terms):
+        try:
+            model = with_terms(model, [_term(setting)])
+        except ModelError as error:
+            raise file.error(("terms", str(k)), str(error)) from None
+    return model
+
+
+def _term(setting: TermSetting) -> Term:
+    values = setting.model_dump(exclude={"range"})
+    low, high = setting.range
+    return Term(**values, low=low, high=high)
+
+
+def setting_of(term: Term) -> TermSetting:
+    """What makes a term in a configuration."""
+    values = dataclasses.asdict(term)
+    ends = values.pop("low"), values.pop("high")
+    return TermSetting(**values, range=ends)
 
 
 def _with_outputs(file: YamlFile, signals: Signals, model: ProcessModel) -> ProcessModel:

@@ -181,10 +181,8 @@ def _steps(document: Mapping[str, Any], rows: Rows) -> list[Step]:
         steps.insert(0, Step(use, command=command + trust_option(document["model"])))
     elif not steps:
         steps.append(Step("See in the residuals below when and where the model errs."))
-    fitted = document.get("missing", {}).get("fitted", {})
-    if fitted.get("better"):
-        lacking = f"Identify with {fitted['name']}, which explains these data better:"
-        steps.insert(0, Step(lacking, command=fitted.get("command", "")))
+    if better := document.get("next"):
+        steps.insert(0, Step(better["purpose"], command=better["command"]))
     unsure = verdict["predictions"]["trust"] != "good"
     if rows.logs["validation"] and unsure and rows.weak:
         steps.append(

@@ -1,4 +1,4 @@
-"""A variant of the model, fitted because the residuals ask for it, and whether it is better."""
+"""The model with what the residuals ask for, fitted as well, and whether it is better."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ import numpy as np
 
 from sysid.arrays import FloatArray
 from sysid.judging.comparison import Candidate, Comparison, compare
-from sysid.judging.score_tests import Finding
+from sysid.judging.score_tests import Finding, description
 from sysid.judging.suspects import variants_of
 from sysid.problem.data import Dataset
 from sysid.problem.metrics import fit_percent, mean_known
-from sysid.problem.model import ModelError
+from sysid.problem.model import ModelError, ProcessModel
+from sysid.problem.terms import Term, with_terms
 from sysid.uncertainty import Uncertainty
 
 if TYPE_CHECKING:
@@ -27,9 +28,10 @@ _STRONG = 10.0
 
 @dataclass(frozen=True)
 class Alternative:
-    """A variant that was fitted as well.
+    """A variant, or the model with a term added, that was fitted as well.
 
-    name: the option that makes it. better: whether it explains training by more than its further
+    name: the option that makes a variant; of a term what it is, in words. terms: those added, none
+    of a variant. better: whether it explains training by more than its further
     parameters would by chance, and validation no worse. fits: by output, fit [%] of the model and
     of the variant, on validation where there is any. values: quantities that the model determines
     and the variant has elsewhere: value of the model, of the variant, unit; the farthest first.
@@ -40,6 +42,7 @@ class Alternative:
     fits: dict[str, tuple[float, float]]
     values: dict[str, tuple[float, float, str]]
     comparison: Comparison
+    terms: tuple[Term, ...] = ()
 
 
 def best_alternative(
@@ -51,34 +54,54 @@ def best_alternative(
 ) -> Alternative | None:
     """The surest variant among findings, fitted with the settings of an estimator.
 
-    None where no variant is among them, or none of its simulations succeeds.
+    Without one, the model with the surest function that moves its parameters. None where there is
+    neither, or none of its simulations succeeds.
     """
     from sysid.gassi import GASSI
 
-    named = [finding.name for finding in findings if finding.kind == "variant"]
-    if not named or estimator.model is None:
+    if estimator.model is None:
         return None
-    variant = variants_of(estimator.model)[named[0]]
+    suspected = _surest(findings, estimator.model)
+    if suspected is None:
+        return None
+    name, variant, terms = suspected
     settings = {**estimator.get_params(deep=False), "model": variant}
     try:
         fitted = GASSI(**settings).fit(list(training))
     except ModelError:
         return None
-    pair = [(_MODEL, estimator), (named[0], fitted)]
+    pair = [(_MODEL, estimator), (name, fitted)]
     candidates = [Candidate.of(name, e, training, validation) for name, e in pair]
     comparison = compare(candidates, training, validation)
     rows = {row.name: row for row in comparison.rows}
-    better = rows[_MODEL].dbic - rows[named[0]].dbic > _STRONG and rows[named[0]].good
+    better = rows[_MODEL].dbic - rows[name].dbic > _STRONG and rows[name].good
     runs = [c.validation if validation else c.training for c in candidates]
     shares = [fits(validation or training, run) for run in runs]
     names = variant.output_names
     return Alternative(
-        named[0],
+        name,
         better,
         {n: (float(a), float(b)) for n, a, b in zip(names, *shares, strict=True)},
         _moved(uncertainty, fitted.parameters_),
         comparison,
+        terms,
     )
+
+
+def _surest(
+    findings: Sequence[Finding], model: ProcessModel
+) -> tuple[str, ProcessModel, tuple[Term, ...]] | None:
+    """Name and model of what is to be fitted, and the terms that were added."""
+    for finding in findings:
+        if finding.kind == "variant":
+            return finding.name, variants_of(model)[finding.name], ()
+    for finding in findings:
+        if finding.term is not None and finding.counts:
+            try:
+                return description(finding), with_terms(model, [finding.term]), (finding.term,)
+            except ModelError:  # it has a parameter of that name
+                return None
+    return None
 
 
 _MODEL = "the model"

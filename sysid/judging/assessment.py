@@ -5,6 +5,7 @@ data, with parameters that are not the plant's; one of the right structure may h
 right and predict hardly more than noise hides.
 """
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,7 +18,7 @@ from sysid.judging.alternatives import Alternative
 from sysid.judging.expected_errors import ExpectedErrors, FloorTest, floor_test
 from sysid.judging.residual_patterns import errors_alone, errors_by_speed, shared_errors
 from sysid.judging.residual_tests import ResidualTest, residual_test
-from sysid.judging.score_tests import Finding, description
+from sysid.judging.score_tests import MOVED, Finding, description
 from sysid.judging.starts import Starts
 from sysid.problem.data import Dataset
 from sysid.problem.faults import DataFault
@@ -49,9 +50,6 @@ _ABOVE_NOISE, _BY_CHANCE = 1.25, 0.01
 # output's rate of change; how far apart parameters of parts of the data are, in parts of chance.
 _SHARED, _BY_SPEED, _DISAGREEING = 0.3, 0.2, 1.5
 _ROUNDING = 2e-4  # of an output's deviation, below which errors may be those of a simulation
-# Standard deviations by which what is missing moves a parameter: an interval reaches 1.96. And
-# share of the residuals that it explains, from where it counts whatever it moves.
-_MOVED, _LARGE = 1.5, 0.25
 
 
 @dataclass(frozen=True)
@@ -177,16 +175,22 @@ def judge(
     if alternative is not None and alternative.better:
         light.append(_lacking(alternative))
     missing = [f for f in findings or () if f.kind != "variant"]
-    counting = [f for f in missing if f.farthest > _MOVED or f.share > _LARGE]
-    if not counting and _moved_together(missing) > _MOVED:
+    if alternative is not None and alternative.better and alternative.terms:
+        # Other functions were asked for beside a test's guess of this one.
+        missing = [f for f in missing if f.kind not in ("function", "disturbance")]
+    if any(fault.kind == "lag" for fault in doubts):
+        missing = [f for f in missing if f.kind != "delay"]  # the same, seen less sharply
+    counting = [f for f in missing if f.counts]
+    if not counting and _moved_together(missing) > MOVED:
         counting = missing
     light += map(_moving, counting)
-    if not light:
-        light += _unexplained(model, judged)
-    if not light:
-        light += _patterns(model, (*training, *validation))
-    if not light and uncertainty is not None:
-        light += _disagreement(uncertainty, len(training))
+    if predicted.trust != "poor":  # which is more than these can say
+        if not light:
+            light += _unexplained(model, judged)
+        if not light:
+            light += _patterns(model, (*training, *validation))
+        if not light and uncertainty is not None:
+            light += _disagreement(uncertainty, len(training))
     if uncertainty is None:
         light.append("The parameters have no intervals, so how surely each is known is not known.")
     else:
@@ -195,12 +199,9 @@ def judge(
     if predicted.trust == "poor" and not broken:
         grave.append("Of a model that predicts so poorly the parameters are not the plant's.")
     parameters = Statement.of(grave, light, _parameter_praise(findings))
-    notes = [
-        f"There, but moving no parameter by more than {_MOVED:g} of its standard deviations: "
-        f"{description(finding)}."
-        for finding in missing
-        if finding not in counting
-    ]
+    slight = "; ".join(description(f) for f in missing if f not in counting)
+    moving = f"Found, but moving no parameter by {MOVED:g} standard deviations: {slight}."
+    notes = [moving] if slight else []
     return Verdict(
         predicted, parameters, (*notes, *_untested(model, judged, findings, uncertainty))
     )
@@ -457,7 +458,7 @@ def _lacking(alternative: Alternative) -> str:
         if new - old >= 1.0
     ]
     moved = [
-        f"{name} {old:.3g} -> {new:.3g}" + (f" {unit}" if unit not in ("", "1") else "")
+        f"{name} {_change(old, new)}" + (f" {unit}" if unit not in ("", "1") else "")
         for name, (old, new, unit) in list(alternative.values.items())[:3]
     ]
     effect = ", ".join([*fits, *moved]) or "it explains the training data better"
@@ -467,7 +468,7 @@ def _lacking(alternative: Alternative) -> str:
 def _moving(finding: Finding) -> str:
     """Reason: something missing that moves parameters."""
     moved = [
-        f"{m.quantity.name} {m.quantity.value:.3g} -> {m.quantity.value + m.change:.3g}"
+        f"{m.quantity.name} {_change(m.quantity.value, m.quantity.value + m.change)}"
         for m in finding.moves[:3]
         if abs(m.deviations) > 1.0
     ]
@@ -479,7 +480,20 @@ def _moving(finding: Finding) -> str:
         if moved
         else f"{100.0 * finding.share:.0f} % of what is left"
     )
-    return f"{says}{text} ({chance}); {effect}."
+    # A line leads nowhere that far.
+    return f"{says}{text} ({chance})" + (f"; {effect}." if not finding.turned_round else ".")
+
+
+def _change(old: float, new: float) -> str:
+    """Two values, to as many digits as tell them apart.
+
+    >>> _change(0.0030012, 0.0030104), _change(1.2, 80.0)
+    ('0.003001 -> 0.00301', '1.2 -> 80')
+    """
+    size, difference = max(abs(old), abs(new)), abs(new - old)
+    apart = math.ceil(math.log10(size / difference)) + 1 if difference else 3
+    digits = min(max(apart, 3), 6)
+    return f"{old:.{digits}g} -> {new:.{digits}g}"
 
 
 def _untested(

@@ -6,7 +6,7 @@ compiled model with a further input added to every equation tells what any funct
 equation would do: the function's values along the run are that input's samples.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
@@ -159,17 +159,3 @@ class DisturbedRun:
         return self._stepper.advance(
             (self.start if start is None else start).copy(), np.ascontiguousarray(signals)
         )[1]
-
-
-def stretched(signal: FloatArray) -> FloatArray:
-    """A signal in parts of its largest value, from its middle where it keeps one sign."""
-    low, high = float(signal.min()), float(signal.max())
-    middle = 0.0 if low < 0.0 < high else 0.5 * (low + high)
-    size = max(high - middle, middle - low)
-    return (signal - middle) / size if size > 0.0 else np.zeros_like(signal)
-
-
-def shapes(signal: FloatArray) -> Sequence[FloatArray]:
-    """Functions of a signal that together are like most: its sign, its square, its cube."""
-    z = stretched(signal)
-    return np.tanh(z / 0.03), z * np.abs(z), z**3

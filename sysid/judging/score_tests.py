@@ -18,7 +18,7 @@ the smallest probability is taken into the regression, and the rest asked again.
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import get_args
 
@@ -42,6 +42,7 @@ from sysid.judging.suspects import (
     variant_suspects,
 )
 from sysid.problem.model import ModelError
+from sysid.problem.terms import Term
 from sysid.uncertainty import Estimate, Uncertainty
 from sysid.uncertainty.colour import Autoregression, colour, longest_memory, record_rows
 from sysid.uncertainty.sensitivity import (
@@ -66,6 +67,12 @@ _LAGS = 20  # of what colour whitening may leave
 _FORGETS = 20  # samples of a record that count as independent, from where its mean is no colour
 _NEW = 1e-2  # share of a suspect that no change of the parameters makes, below which it is theirs
 _INEXACT = 1e-2  # of the residuals' deviation, from where a simulation's error shows in them
+# Standard deviations by which a finding moves a parameter noticeably: an interval reaches 1.96. And
+# share of the residuals that it explains, from where it counts whatever it moves.
+MOVED, _LARGE = 1.5, 0.25
+_TURNED = -1.3  # change of a gain that is 1, below which it is its sign that is wrong
+_TIMES = (0.5, 2.5, 21)  # delays that are tried, in parts of what a small one tells
+_REACH = 10.0  # of a term's range in parts of the size that its test found
 _FREEDOM = 1.0  # standard deviation of a coordinate before the data: a factor of e
 
 
@@ -82,9 +89,10 @@ class Move:
 class Finding:
     """Something that the model lacks: what it is, how sure, and what it would move.
 
-    name, of, unit: as of its suspect. amplitude: of a channel's fault, in the unit; None of
-    others. shape: of a function, which it is most like. p_value: by chance, all tests counted.
-    share: of the whitened residuals' squares that it explains. moves: the farthest first.
+    name, unit: as of its suspect. amplitude: of a channel's fault, in the unit; None of others.
+    term: of a function the one that it is most like, with a range to fit it in. p_value: by chance,
+    all tests counted. share: of the whitened residuals' squares that it explains. moves: the
+    farthest first.
     """
 
     kind: Kind
@@ -94,13 +102,22 @@ class Finding:
     p_value: float
     share: float
     moves: tuple[Move, ...]
-    of: str = ""
-    shape: str = ""
+    term: Term | None = None
 
     @property
     def farthest(self) -> float:
         """Standard deviations by which it moves what it moves farthest."""
         return abs(self.moves[0].deviations) if self.moves else 0.0
+
+    @property
+    def counts(self) -> bool:
+        """Whether it moves a parameter noticeably, or is much of what is left."""
+        return self.farthest > MOVED or self.share > _LARGE
+
+    @property
+    def turned_round(self) -> bool:
+        """Whether a channel has the opposite sign of what the model has."""
+        return self.kind == "gain" and (self.amplitude or 0.0) < _TURNED
 
 
 def missing_physics(
@@ -249,8 +266,12 @@ class _Tests:
                 return
             surest = min(significant, key=lambda i: logs[i])
             result, residual = results[surest]
-            shape = self._shape(suspects[surest], changes[surest], residual)
-            self.findings.append(self._finding(suspects[surest], result, logs[surest], shape))
+            if suspects[surest].late is not None:
+                changes[surest], result, residual = self._as_late(
+                    suspects[surest], *results[surest]
+                )
+            term = self._term(suspects[surest], changes[surest], residual)
+            self.findings.append(self._finding(suspects[surest], result, logs[surest], term))
             size = np.sqrt(np.mean(changes[surest] ** 2, axis=(0, 1)))
             admitted = changes[surest][..., size > 0.0] / size[size > 0.0]
             self._columns = np.concatenate([self._columns, admitted], axis=2)
@@ -271,6 +292,23 @@ class _Tests:
             return first, residual
         return second, self._left(changes, second)
 
+    def _as_late(
+        self, suspect: Suspect, result: "_Result", residual: FloatArray
+    ) -> tuple[FloatArray, "_Result", FloatArray]:
+        """Changes, test and what is left of a delay as large as explains most of the residuals."""
+        assert suspect.late is not None
+        regression, little = self._coloured_by(residual), float(result.amplitudes[0])
+        best = None
+        for delay in little * np.linspace(*_TIMES):
+            changes = suspect.late(delay) / self._scales[..., None]
+            test = regression.test(changes, False)
+            if test is not None and (best is None or test.share > best[1].share):
+                best = changes, test, delay
+        if best is None:
+            return suspect.changes / self._scales[..., None], result, residual
+        changes, test, delay = best
+        return changes, replace(test, amplitudes=np.array([delay])), self._left(changes, test)
+
     def _left(self, changes: FloatArray, result: "_Result") -> FloatArray:
         return self._residual - self._columns @ result.coefficients - changes @ result.amplitudes
 
@@ -278,16 +316,23 @@ class _Tests:
         whitening = _Whitening.of(self._local, residual)
         return _Regression(whitening, self._columns, self._free, self._residual, self._noises)
 
-    def _shape(self, suspect: Suspect, changes: FloatArray, residual: FloatArray) -> str:
-        """Which of a suspect's shapes by itself explains most; residual: what all leave."""
-        if len(suspect.shapes) < 2:
-            return "".join(suspect.shapes)
+    def _term(self, suspect: Suspect, changes: FloatArray, residual: FloatArray) -> Term | None:
+        """The term of a suspect that by itself explains most; residual: what all leave."""
         regression = self._coloured_by(residual)
-        alone = [regression.test(changes[..., [k]], False) for k in range(changes.shape[2])]
-        shares = [0.0 if result is None else result.share for result in alone]
-        return suspect.shapes[int(np.argmax(shares))]
+        alone = [
+            (result.share, float(np.abs(result.amplitudes[0])), term)
+            for k, term in enumerate(suspect.terms)
+            if (result := regression.test(changes[..., [k]], False)) is not None
+        ]
+        if not alone:
+            return suspect.terms[0] if suspect.terms else None
+        _, size, term = max(alone, key=lambda test: test[0])
+        reach = float(f"{_REACH * size:.1g}") or 1.0
+        return replace(term, low=-reach, high=reach)
 
-    def _finding(self, suspect: Suspect, result: "_Result", log_p: float, shape: str) -> Finding:
+    def _finding(
+        self, suspect: Suspect, result: "_Result", log_p: float, term: Term | None
+    ) -> Finding:
         moved = self._gradients @ result.move[: self._gradients.shape[1]]
         moves = [
             Move(e, float(change), float(change) / e.std)
@@ -304,8 +349,7 @@ class _Tests:
             float(np.exp(min(log_p, 0.0))),
             result.share,
             tuple(moves),
-            suspect.of,
-            shape,
+            term,
         )
 
 
@@ -382,7 +426,7 @@ class _Regression:
             whole,
             self._coefficients + move,
             move,
-            float(score @ score) / max(self._squares, 1e-300),
+            min(float(score @ score) / max(self._squares, 1e-300), 1.0),
         )
 
     def _statistic(self, left: FloatArray, score: FloatArray) -> float:
@@ -515,7 +559,7 @@ def describe(findings: Iterable[Finding]) -> list[str]:
 
 
 _WORDS = {
-    "delay": "{name} comes {late} {amplitude:.3g} s than the model has it",
+    "delay": "{name} is logged {amplitude:.3g} s {late}",
     "offset": "{name} is {amplitude:.3g} {unit} off",
     "drift": "{name} drifts by {amplitude:.3g} {unit} from a record's first to last sample",
     "saturation": "{name} saturates near its largest values",
@@ -527,10 +571,8 @@ def description(finding: Finding) -> str:
     amplitude, unit = finding.amplitude, "" if finding.unit == "1" else finding.unit
     if finding.kind == "variant":
         return finding.name
-    if finding.kind == "function":
-        friction = finding.shape == "sign" and finding.of == finding.name
-        term = f"the sign of {finding.of}" if friction else f"{finding.of} ({finding.shape})"
-        return f"a term in {term} in d{finding.name}/dt" + ", like dry friction" * friction
+    if finding.term is not None:
+        return _term_text(finding.term)
     if finding.kind == "disturbance":
         return f"a slow signal in d{finding.name}/dt that nobody measured"
     assert amplitude is not None
@@ -538,11 +580,26 @@ def description(finding: Finding) -> str:
         change = f"{100.0 * amplitude:+.0f} % of its value"
         return f"{finding.name} changes by {change} from a record's first to last sample"
     if finding.kind == "gain":
-        return f"{finding.name} is {1.0 + amplitude:.3g} times what the model has"
-    late = "later" if amplitude > 0.0 else "earlier"
+        times = f"is {1.0 + amplitude:.3g} times what"
+        is_what = "has the opposite sign of what" if finding.turned_round else times
+        return f"{finding.name} {is_what} the model has"
+    late = "late" if amplitude > 0.0 else "early, or acts so much later"
     text = _WORDS[finding.kind]
     size = abs(amplitude) if finding.kind == "delay" else amplitude
     return text.format(name=finding.name, late=late, amplitude=size, unit=unit).replace("  ", " ")
+
+
+def _term_text(term: Term) -> str:
+    """A term in a few words."""
+    equation = f"d{term.equation}/dt"
+    if term.shape == "stribeck":
+        return (
+            f"a term in {term.of} near its zero in {equation}, like friction that is larger near "
+            "standstill (Stribeck)"
+        )
+    if term.shape == "sign" and term.of == term.equation and term.centre == 0.0:
+        return f"a term in the sign of {term.of} in {equation}, like dry friction"
+    return f"a term in {term.of} ({term.shape}) in {equation}"
 
 
 def _log(chance: float) -> float:

@@ -13,9 +13,11 @@ from typing import Any, Literal
 import numpy as np
 
 from sysid.arrays import FloatArray
-from sysid.judging.disturbed import DisturbedRun, shapes, stretched
+from sysid.judging.disturbed import DisturbedRun
 from sysid.problem.data import Dataset
 from sysid.problem.model import Input, ProcessModel, State
+from sysid.problem.preparation import at_places
+from sysid.problem.terms import Shape, Term
 
 Kind = Literal[
     "variant", "delay", "offset", "drift", "gain", "saturation", "change", "function", "disturbance"
@@ -25,32 +27,43 @@ _PARTS = (0.5, 2.0)  # of a variant's further parameters
 _KNEE = 0.8  # share of a signal's peak from where its saturation is looked for
 _LEVELS = 8  # of a signal, below which it shows no function
 _JUMPING = 0.05  # mean square of a signal's steps in parts of its variance, from where it jumps
+_LITTLE = 0.1  # of a sample: a delay that is tested
 _PROBE = 1e-3  # part of a parameter that tells how rates follow it
 _PERIODS = (1, 2, 3, 4)  # of a disturbance that nobody measured, in a record
 _POINTS = 50  # at which an equation is asked for what it depends on
-_SHAPES = ("sign", "square", "cube")
+_STANDSTILL = (
+    0.02,
+    0.04,
+    0.08,
+    0.16,
+    0.32,
+)  # Stribeck speeds that are tried, in parts of the largest speed
+_STICTION = 1e-3  # of a signal's largest value, below which a sign is not a jump
+_ROUNDED = 0.03  # the same where it is tested: a wrong run passes zero a little early or late
 
 
 @dataclass(frozen=True, eq=False)
 class Suspect:
     """What may be missing: columns of changes per unit of its amplitudes.
 
-    name: of the channel, the variant, or the equation. of: the signal that a function is of, its
-    amplitudes those of ``shapes``. changes: (n_rows, n_outputs, n_amplitudes), records one after
-    another, in the outputs' units.
+    name: of the channel, the variant, or the equation. terms: of functions, one for each amplitude,
+    their ranges those of one unit. changes: (n_rows, n_outputs, n_amplitudes), records one after
+    another, in the outputs' units. late: of a delay, the change by so many seconds of it: where
+    outputs jump that by a little is no guide.
     """
 
     kind: Kind
     name: str
     unit: str
     changes: FloatArray
-    of: str = ""
-    shapes: tuple[str, ...] = ()
+    terms: tuple[Term, ...] = ()
+    late: Callable[[float], FloatArray] | None = None
 
     @property
     def one_sided(self) -> bool:
         """Whether only amplitudes above zero make sense: friction never drives."""
-        return self.kind in ("variant", "saturation")
+        rubs = any(term.shape == "stribeck" for term in self.terms)
+        return rubs or self.kind in ("variant", "saturation")
 
 
 def channel_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
@@ -60,15 +73,49 @@ def channel_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
     """
     model = runs[0].model
     for j, output in enumerate(model.outputs):
-        for kind, unit, signal in _output_faults(runs, j):
+        yield _delay(output.name, partial(_late_output, runs, j), runs[0].record.dt)
+        zeroed = any(run.record.output_zero[j] for run in runs)
+        for kind, unit, signal in _faults(partial(_output, j), zeroed):
             change = [_column(run.outputs, j, signal(run)) for run in runs]
             yield Suspect(kind, output.name, unit or output.unit, np.concatenate(change)[..., None])
     for i, given in enumerate(model.inputs):
         if not any(np.any(run.record.inputs[:, i]) for run in runs):
             continue
-        for kind, unit, signal in _input_faults(runs, i):
+        yield _delay(given.name, partial(_late_input, runs, i), runs[0].record.dt)
+        zeroed = any(run.record.input_zero[i] for run in runs)
+        for kind, unit, signal in _faults(partial(_input, i), zeroed):
             change = [run.driven(_column(run.record.inputs, i, signal(run))) for run in runs]
             yield Suspect(kind, given.name, unit or given.unit, np.concatenate(change)[..., None])
+
+
+def _delay(name: str, late: Callable[[float], FloatArray], dt: float) -> Suspect:
+    """A channel that is logged late, tested by a tenth of a sample."""
+    small = _LITTLE * dt
+    return Suspect("delay", name, "s", late(small) / small, late=late)
+
+
+def _late_output(runs: Sequence[DisturbedRun], j: int, delay: float) -> FloatArray:
+    parts = [
+        _column(run.outputs, j, _shifted(run.outputs[:, j], -delay / run.record.dt, False))
+        for run in runs
+    ]
+    return np.concatenate(parts)[..., None]
+
+
+def _late_input(runs: Sequence[DisturbedRun], i: int, delay: float) -> FloatArray:
+    """An input that is logged late has acted before."""
+    held = runs[0].model.inputs[i].hold == "zoh"
+    parts = []
+    for run in runs:
+        moved = _shifted(run.record.inputs[:, i], delay / run.record.dt, held)
+        parts.append(run.driven(_column(run.record.inputs, i, moved)))
+    return np.concatenate(parts)[..., None]
+
+
+def _shifted(signal: FloatArray, samples: float, held: bool) -> FloatArray:
+    """Change of a signal that is taken so many samples later."""
+    places = np.clip(np.arange(len(signal)) + samples, 0.0, len(signal) - 1.0)
+    return at_places(signal, places, held) - signal
 
 
 def in_single_records(
@@ -83,7 +130,16 @@ def in_single_records(
         for suspect in suspects:
             changes = np.zeros_like(suspect.changes)
             changes[rows] = suspect.changes[rows]
-            yield replace(suspect, name=f"{suspect.name} of {run.record.name}", changes=changes)
+            name = f"{suspect.name} of {run.record.name}"
+            late = None if suspect.late is None else partial(_within, rows, suspect.late)
+            yield replace(suspect, name=name, changes=changes, late=late)
+
+
+def _within(rows: slice, late: Callable[[float], FloatArray], delay: float) -> FloatArray:
+    whole = late(delay)
+    part = np.zeros_like(whole)
+    part[rows] = whole[rows]
+    return part
 
 
 def likely_noise(signal: FloatArray, deviation: float) -> FloatArray:
@@ -110,31 +166,20 @@ def likely_noise(signal: FloatArray, deviation: float) -> FloatArray:
 _Fault = tuple[Kind, str, Callable[[DisturbedRun], FloatArray]]
 
 
-def _output_faults(runs: Sequence[DisturbedRun], j: int) -> Iterator[_Fault]:
-    yield "delay", "s", lambda run: -np.gradient(run.outputs[:, j]) / run.record.dt
-    yield from _common_faults(
-        lambda run: run.outputs[:, j], any(run.record.output_zero[j] for run in runs)
-    )
+def _output(j: int, run: DisturbedRun) -> FloatArray:
+    return run.outputs[:, j]
 
 
-def _input_faults(runs: Sequence[DisturbedRun], i: int) -> Iterator[_Fault]:
-    yield "delay", "s", lambda run: _held_back(run.record.inputs[:, i]) / run.record.dt
-    yield from _common_faults(
-        lambda run: run.record.inputs[:, i], any(run.record.input_zero[i] for run in runs)
-    )
+def _input(i: int, run: DisturbedRun) -> FloatArray:
+    return run.record.inputs[:, i]
 
 
-def _common_faults(signal: Callable[[DisturbedRun], FloatArray], zeroed: bool) -> Iterator[_Fault]:
+def _faults(signal: Callable[[DisturbedRun], FloatArray], zeroed: bool) -> Iterator[_Fault]:
     if not zeroed:
         yield "offset", "", lambda run: np.ones(run.record.n_samples)
     yield "drift", "", lambda run: np.linspace(-0.5, 0.5, run.record.n_samples)
     yield "gain", "1", signal
     yield "saturation", "1", lambda run: _clipped(signal(run))
-
-
-def _held_back(signal: FloatArray) -> FloatArray:
-    """Change of a signal that comes a sample later: of a held one, a late edge moves its mean."""
-    return np.concatenate([signal[:1], signal[:-1]]) - signal
 
 
 def _clipped(signal: FloatArray) -> FloatArray:
@@ -209,13 +254,45 @@ def function_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
             together = np.concatenate([_signal(run, j) for run in runs])
             if len(np.unique(together)) < _LEVELS or _jumps(together):
                 continue
-            unit = f"{state.unit}/s"
-            for values, names in (
-                ([stretched(together)], ("straight",)),
-                (shapes(together), _SHAPES),
-            ):
-                columns = np.stack([_added(runs, i, shape) for shape in values], axis=2)
-                yield Suspect("function", state.name, unit, columns, signal.name, shapes=names)
+            for terms in _terms(state.name, signal.name, together):
+                columns = [_added(runs, i, _values(term, together)) for term in terms]
+                unit = f"{state.unit}/s"
+                yield Suspect("function", state.name, unit, np.stack(columns, axis=2), terms)
+
+
+def _terms(equation: str, of: str, signal: FloatArray) -> Iterator[tuple[Term, ...]]:
+    """Functions of a signal that are tested together.
+
+    A straight line by itself; shapes that together are like most; more friction near standstill.
+    """
+    low, high = float(signal.min()), float(signal.max())
+    centre = 0.0 if low < 0.0 < high else 0.5 * (low + high)
+    size = max(high - centre, centre - low)
+
+    def term(shape: Shape, part: float = 1.0) -> Term:
+        return Term(equation, of, shape, _short(part * size), -1.0, 1.0, _short(centre))
+
+    if size == 0.0:
+        return
+    yield (term("linear"),)
+    yield term("sign", _STICTION), term("square"), term("cube")
+    if of == equation and centre == 0.0:
+        yield tuple(term("stribeck", part) for part in _STANDSTILL)
+
+
+def _short(value: float) -> float:
+    """To be read and typed: no more than tells where a function is."""
+    return float(f"{value:.2g}")
+
+
+def _values(term: Term, signal: FloatArray) -> FloatArray:
+    """A term along a signal; signs smoothly, and friction such that it brakes."""
+    z = (signal - term.centre) / term.scale
+    if term.shape == "sign":
+        return np.tanh(_STICTION * z / _ROUNDED)
+    if term.shape == "stribeck":
+        return -np.sign(z) * np.exp(-(z**2))
+    return {"linear": z, "square": z * np.abs(z), "cube": z**3}[term.shape]
 
 
 def disturbance_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:

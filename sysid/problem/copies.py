@@ -19,9 +19,9 @@ def shared_samples(records: Sequence[Dataset]) -> FloatArray:
 
     Entry [i, j] is the share of record i that stands in record j. Rows are compared by their
     content, all inputs and outputs, bit for bit, and count where the row that follows is the same
-    in both. Rows that are common, as those at rest are, say nothing. Records of one length whose
-    outputs differ by less than noise are one, written with other digits. NaN of a record with
-    itself.
+    in both. Rows that are common, as those at rest are, say nothing. A record whose outputs differ
+    by less than noise from another's, or from a part of it, is a copy with other digits. NaN of a
+    record with itself.
 
     >>> rows = np.random.default_rng(0).standard_normal((400, 2))
     >>> whole = Dataset(rows[:, :1], rows[:, 1:], dt=0.01)
@@ -40,20 +40,40 @@ def shared_samples(records: Sequence[Dataset]) -> FloatArray:
             followed = same[:-1] & same[1:] & (np.diff(first[place]) == 1)
             moving = rows[1:] != rows[:-1]
             shares[i, j] = (followed & moving).sum() / max(moving.sum(), 1)
-            if shares[i, j] < 1.0 and _rewritten(records[i], records[j]):
-                shares[i, j] = 1.0
+            if shares[i, j] < 1.0:
+                shares[i, j] = max(shares[i, j], _rewritten(records[i], records[j]))
     return shares
 
 
-def _rewritten(record: Dataset, source: Dataset) -> bool:
-    """Whether two records are one, written with other digits.
+def _rewritten(record: Dataset, source: Dataset) -> float:
+    """Share of a record that is in another, or all of that, written with other digits."""
+    if record.outputs.shape[1] != source.outputs.shape[1]:
+        return 0.0
+    short, long = record, source
+    if record.n_samples > source.n_samples:
+        short, long = source, record
+    place = _place(short.outputs[:, 0], long.outputs[:, 0])
+    part = long.outputs[place : place + short.n_samples]
+    return short.n_samples / record.n_samples if _same(short.outputs, part) else 0.0
 
-    Their outputs are nearer than noise lets two records be, or than half a unit of the last digit.
+
+def _place(part: FloatArray, whole: FloatArray) -> int:
+    """Where in a channel (n,) a shorter one (m,) is most like it, by the squares of differences."""
+    from scipy.signal import fftconvolve
+
+    a, b = (np.where(np.isfinite(y), y, np.nanmean(y)) - np.nanmean(whole) for y in (part, whole))
+    squares = np.concatenate([[0.0], np.cumsum(b**2)])
+    products = fftconvolve(b, a[::-1], "valid")
+    return int(np.argmin(squares[len(a) :] - squares[: -len(a)] - 2.0 * products))
+
+
+def _same(outputs: FloatArray, originals: FloatArray) -> bool:
+    """Whether outputs of as many rows are one, written with other digits.
+
+    They are nearer than noise lets two records be, or than half a unit of the last digit.
     """
-    if record.outputs.shape != source.outputs.shape:
-        return False
     moves = False
-    for y, original in zip(record.outputs.T, source.outputs.T, strict=True):
+    for y, original in zip(outputs.T, originals.T, strict=True):
         both = np.isfinite(y) & np.isfinite(original)
         difference = np.abs(y - original)[both].max(initial=0.0)
         if difference > 0.1 * np.nanstd(original):

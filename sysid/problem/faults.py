@@ -36,7 +36,8 @@ class DataFault:
     is said of them; cure: how to mend it. severity: ``doubt`` where a result may be wrong by it,
     ``note`` where the user has to judge. share: of the samples of the worst record, the first of
     ``records``. moves_parameters: whether it biases parameters beyond what their intervals know.
-    voids_validation: whether it makes the errors in validation no evidence.
+    voids_validation: whether it makes the errors in validation no evidence. setting: ``KEY=VALUE``
+    of an identification's configuration that takes it out; empty for none.
 
     >>> fault = DataFault("still", "doubt", "validation", ("rest",), "", "it does not move",
     ...     "a validation that does not move is none", "validate with another log", 1.0,
@@ -56,6 +57,7 @@ class DataFault:
     share: float
     moves_parameters: bool = False
     voids_validation: bool = False
+    setting: str = ""
 
     @property
     def sentence(self) -> str:
@@ -226,7 +228,7 @@ class _Channel:
         )
         effect = "a channel that hangs looks like a plant that does not move"
         cure = (
-            f"leave it out with 'use: [0 s .. {begin:.4g} s]', or write 'robust: true', which "
+            f"leave it out with 'use: 0 s .. {begin:.4g} s', or write 'robust: true', which "
             "counts these samples as not measured"
         )
         yield self._fault("frozen", "doubt", statement, effect, cure, float(hang.at.mean()))
@@ -274,7 +276,10 @@ class _Channel:
     ) -> DataFault:
         where = self.part, (self.record.name,), self.name
         moves = severity == "doubt" and self.part == "training"
-        return DataFault(kind, severity, *where, statement, effect, cure, share, moves)
+        setting = "robust=true" if "'robust: true'" in cure else ""
+        return DataFault(
+            kind, severity, *where, statement, effect, cure, share, moves, setting=setting
+        )
 
 
 def _gaps(record: Dataset, part: Part) -> Iterator[DataFault]:

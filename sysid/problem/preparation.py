@@ -100,7 +100,7 @@ def _in_time(model: ProcessModel, before: Prepared, preparation: Preparation) ->
     held = [signal.hold == "zoh" for signal in model.inputs] + [False] * len(model.outputs)
     channels = np.column_stack((record.inputs, record.outputs)).T
     moved = np.column_stack(
-        [_at(values, rows + shifts[k], held[k]) for k, values in enumerate(channels)]
+        [at_places(values, rows + shifts[k], held[k]) for k, values in enumerate(channels)]
     )
     windows, jitter = record.windows, record.jitter
     if windows.size:
@@ -119,7 +119,7 @@ def _in_time(model: ProcessModel, before: Prepared, preparation: Preparation) ->
     return Prepared(made, before.start + first * record.dt, steps)
 
 
-def _at(values: FloatArray, places: FloatArray, held: bool) -> FloatArray:
+def at_places(values: FloatArray, places: FloatArray, held: bool) -> FloatArray:
     """A channel at places that may lie between its samples; NaN beside a sample without a value."""
     below: IntArray = np.floor(places).astype(np.int64)
     above, between = np.ceil(places).astype(np.int64), places - below

@@ -10,6 +10,7 @@ from scipy.io import savemat
 
 from daq import ConfigError, identify
 from daq.identification import records
+from daq.identification.replay import read_parameters
 from daq.identification.request import SettingsRequest
 from daq.identification.settings import problem_of
 from daq.logs.table import read_table
@@ -290,3 +291,37 @@ def test_a_report_of_a_part_of_a_log_is_drawn_again(folder):
     again = rig("figures", "results", "--format", "svg", "--trust", cwd=folder)
     assert again.returncode == 0, again.stderr
     assert figure.read_bytes() == before
+
+
+RUBBING = {"equation": "y", "of": "y", "shape": "sign", "scale": 0.01, "range": [-50.0, 50.0]}
+
+
+def test_terms_are_added_to_a_model_and_kept_in_its_result(folder):
+    problem = settled(folder, terms=[RUBBING])
+    assert problem.model.parameter_names == ("gain", "tau", "sign_of_y")
+    assert problem.model.parameters[-1].unit == "m/s"
+    at = ((1.0,), (0.0,), (2.0, 0.5, -3.0))
+    assert problem.model.derivative(*at) == (-5.0,)
+    typed = settled(folder, f"terms=[{json.dumps(RUBBING)}]", "ranges.tau=[1e-6, 9]")
+    assert typed.settings.ranges["tau"] == (1e-6, 9.0)
+    assert typed.model.parameter_names == problem.model.parameter_names
+    # A result is read with them.
+    values = {"gain": {"value": 2.0}, "tau": {"value": 0.5}, "sign_of_y": {"value": -3.0}}
+    document = {"model": str(folder / "lag.py:model"), "terms": [RUBBING], "parameters": values}
+    (folder / "found.yaml").write_text(yaml.safe_dump(document))
+    model, found = read_parameters(folder / "found.yaml", trust=True)
+    assert model.derivative(at[0], at[1], tuple(found[n] for n in model.parameter_names)) == (-5.0,)
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"of": "speed"}, r"id.yaml:\d+:\d+: terms.0: .*no state or input 'speed'"),
+        ({"scale": -1.0}, r"terms.0.scale"),
+        ({"shape": "sine"}, r"terms.0.shape"),
+        ({"range": [3.0, 2.0]}, r"terms.0: .*low end at or above"),
+    ],
+)
+def test_a_term_that_is_none_is_named(folder, change, named):
+    with pytest.raises(ConfigError, match=named):
+        settled(folder, terms=[{**RUBBING, **change}])

@@ -36,7 +36,9 @@ SHIPPED = sorted(
     if path.name != "simulated_controller.yaml"  # which rig tune made
 )
 # Numbers in a unit that stands elsewhere: in a model, or beside them.
-OF_A_MODEL = re.compile(r"^(ranges|fixed|constant|value|range|parameters|initial|process_noise)$")
+OF_A_MODEL = re.compile(
+    r"^(ranges|fixed|constant|value|range|parameters|initial|process_noise|scale|centre)$"
+)
 
 
 def schema_of(path):

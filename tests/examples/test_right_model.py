@@ -10,15 +10,15 @@ FOLDER = EXAMPLES / "right_model"
 
 @pytest.mark.soak
 @pytest.mark.parametrize(
-    ("case", "words", "cure"),
+    ("case", "words", "settings", "cure"),
     [
-        ("friction", "sign of omega", None),  # whose cure takes half a minute
-        ("late", "3 samples (0.006 s) later", {"delay": {"omega": 0.006}}),
-        ("clipped", "omega ends at 180 rad/s", {"robust": True}),
+        ("friction", "sign of omega", "shape: sign", None),  # whose cure takes half a minute
+        ("late", "3 samples (0.006 s) later", "delay.omega=0.006", {"delay": {"omega": 0.006}}),
+        ("clipped", "omega ends at 180 rad/s", "robust=true", {"robust": True}),
     ],
 )
 def test_what_is_wrong_is_told_and_its_cure_finds_the_truth(
-    example, monkeypatch, tmp_path, case, words, cure
+    example, monkeypatch, tmp_path, case, words, settings, cure
 ):
     monkeypatch.syspath_prepend(str(FOLDER))
     cases = example("cases")
@@ -30,6 +30,7 @@ def test_what_is_wrong_is_told_and_its_cure_finds_the_truth(
     assert words in " ".join(wrong.verdict.parameters.reasons)
     inertia = wrong.parameters.loc["inertia"]
     assert inertia.value > 1.03 * cases.TRUTH["inertia"]
+    assert settings in wrong.next_step.command
     if cure is None:
         return
     right = identify(*files, config=FOLDER / "drive.yaml", **cure)

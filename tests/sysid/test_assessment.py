@@ -15,6 +15,7 @@ from sysid.judging.comparison import Comparison
 from sysid.judging.expected_errors import ExpectedErrors
 from sysid.judging.score_tests import Finding, Move
 from sysid.problem.faults import DataFault
+from sysid.problem.terms import Term
 from sysid.uncertainty import Ambiguity, Estimate, Uncertainty
 
 MODEL = ProcessModel(
@@ -282,13 +283,17 @@ def test_what_is_missing_counts_by_how_far_it_moves_parameters():
     far = found([finding("delay", 2.5)])
     assert (far.predicted.trust, far.parameters.trust) == ("good", "limited")
     assert far.parameters.reasons == (
-        "speed comes later 0.002 s than the model has it (p = 1e-06); with that K_m 1 -> 1.25.",
+        "speed is logged 0.002 s late (p = 1e-06); with that K_m 1 -> 1.25.",
     )
     both = found([finding("delay", 1.0), finding("offset", 0.8)])
     assert len(both.parameters.reasons) == 2, "together they move it by 1.8 deviations"
     assert found([finding("delay", 1.0), finding("offset", -0.8)]).trust == "good"
     near = found([finding("delay", 0.5)])
-    assert near.trust == "good" and "speed comes later" in near.notes[0]
+    assert near.trust == "good" and "speed is logged 0.002 s late" in near.notes[0]
+    turned = found([replace(finding("gain", 2.5), amplitude=-2.4)])
+    assert turned.parameters.reasons == (
+        "speed has the opposite sign of what the model has (p = 1e-06).",
+    )
     # A variant counts by what its own fit says.
     variant = finding("variant", 2.5, "friction=stribeck")
     assert found([variant]).trust == "good"
@@ -300,6 +305,15 @@ def test_what_is_missing_counts_by_how_far_it_moves_parameters():
         "The model lacks friction=stribeck; fitted with it: speed 74 -> 82 %, K_m 0.124 -> 0.14 V.",
     )
     assert found([variant], replace(fitted, better=False)).trust == "good"
+    # Beside a term that was fitted no other function is said.
+    term = Term("speed", "speed", "sign", 0.1, -1.0, 1.0)
+    added = replace(fitted, name="a term", terms=(term,))
+    others = [finding("function", 3.0), finding("offset", 2.0)]
+    reasons = found(others, added).parameters.reasons
+    assert [reason.partition(";")[0] for reason in reasons] == [
+        "The model lacks a term",
+        "speed is 0.002 s off (p = 1e-06)",
+    ]
 
 
 def test_what_follows_a_noisy_input_is_not_held_against_the_model():

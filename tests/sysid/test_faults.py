@@ -145,10 +145,15 @@ def test_a_limited_command_is_left_to_the_user():
 
 def test_a_copy_is_no_validation_whatever_its_name():
     record = driven(levels())
-    for copy in (replace(record, name="other"), record.part(200, 700, "cut")):
+    cut = record.part(200, 700, "cut")
+    rounded = replace(cut, inputs=np.round(cut.inputs, 3), outputs=np.round(cut.outputs, 3))
+    longer = replace(record, outputs=np.round(record.outputs, 3), name="longer")
+    for copy in (replace(record, name="other"), cut, replace(rounded, name="cut, fewer digits")):
         fault = one_fault([record], [copy])
         assert fault.kind == "copy" and fault.voids_validation and not fault.moves_parameters
         assert fault.records == (copy.name,) and "log 0" in fault.statement
+    fault = one_fault([record.part(0, 700, "begin")], [longer])
+    assert fault.kind == "copy" and fault.statement.startswith("70 %")
 
 
 def test_a_copy_in_training_counts_twice():
