@@ -16,8 +16,8 @@ import yaml
 
 from daq.config.identification import Signals, TermSetting
 from daq.files import make_folder, write_whole
-from daq.identification.mending import mending
 from daq.identification.records import LoggedRecord
+from daq.identification.remedies import remedies
 from daq.identification.request import PARAMETERS, resume_command
 from daq.identification.rows import Rows
 from daq.identification.settings import Problem, setting_of
@@ -178,9 +178,9 @@ class Identification(Shown):
         return self._again(model=f"{name}{',' if ':' in name else ':'}{alternative.name}")
 
     @property
-    def mending_command(self) -> str | None:
+    def remedy_command(self) -> str | None:
         """What to type to identify without what is wrong with data or ranges; None for nothing."""
-        settings = mending(
+        settings = remedies(
             self.problem.settings,
             (*self.model.input_names, *self.model.output_names),
             faults=self.faults,
@@ -209,7 +209,7 @@ class Identification(Shown):
             return NextStep(
                 f"Identify with {alternative.name}, which explains these data better:", command
             )
-        if (command := self.mending_command) is not None:
+        if (command := self.remedy_command) is not None:
             return NextStep(
                 "Identify again without what was found wrong with data or ranges:", command
             )

@@ -18,7 +18,7 @@ from daq.identification.selection import EVERYTHING, Selection
 from daq.lookup.models import DEFAULT_MODEL, find_model, whole_name
 from daq.progress import Note, Watch, ignore
 from sysid import Given, ModelError, ProcessModel, SearchSpace
-from sysid.problem.terms import Term, with_terms
+from sysid.problem.terms import AddedTerm, with_terms
 
 File = TypeVar("File", bound=YamlFile)
 
@@ -279,13 +279,13 @@ def _with_terms(file: YamlFile, signals: Signals, model: ProcessModel) -> Proces
     return model
 
 
-def _term(setting: TermSetting) -> Term:
+def _term(setting: TermSetting) -> AddedTerm:
     values = setting.model_dump(exclude={"range"})
     low, high = setting.range
-    return Term(**values, low=low, high=high)
+    return AddedTerm(**values, low=low, high=high)
 
 
-def setting_of(term: Term) -> TermSetting:
+def setting_of(term: AddedTerm) -> TermSetting:
     """What makes a term in a configuration."""
     values = dataclasses.asdict(term)
     ends = values.pop("low"), values.pop("high")

@@ -15,7 +15,7 @@ from sysid.judging.suspects import variants_of
 from sysid.problem.data import Dataset
 from sysid.problem.metrics import fit_percent, mean_known
 from sysid.problem.model import ModelError, ProcessModel
-from sysid.problem.terms import Term, with_terms
+from sysid.problem.terms import AddedTerm, with_terms
 from sysid.uncertainty import Uncertainty
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ class Alternative:
     fits: dict[str, tuple[float, float]]
     values: dict[str, tuple[float, float, str]]
     comparison: Comparison
-    terms: tuple[Term, ...] = ()
+    terms: tuple[AddedTerm, ...] = ()
 
 
 def best_alternative(
@@ -90,7 +90,7 @@ def best_alternative(
 
 def _surest(
     findings: Sequence[Finding], model: ProcessModel
-) -> tuple[str, ProcessModel, tuple[Term, ...]] | None:
+) -> tuple[str, ProcessModel, tuple[AddedTerm, ...]] | None:
     """Name and model of what is to be fitted, and the terms that were added."""
     for finding in findings:
         if finding.kind == "variant":

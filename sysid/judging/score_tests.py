@@ -42,7 +42,7 @@ from sysid.judging.suspects import (
     variant_suspects,
 )
 from sysid.problem.model import ModelError
-from sysid.problem.terms import Term
+from sysid.problem.terms import AddedTerm
 from sysid.uncertainty import Estimate, Uncertainty
 from sysid.uncertainty.colour import Autoregression, colour, longest_memory, record_rows
 from sysid.uncertainty.sensitivity import (
@@ -102,7 +102,7 @@ class Finding:
     p_value: float
     share: float
     moves: tuple[Move, ...]
-    term: Term | None = None
+    term: AddedTerm | None = None
 
     @property
     def farthest(self) -> float:
@@ -316,7 +316,9 @@ class _Tests:
         whitening = _Whitening.of(self._local, residual)
         return _Regression(whitening, self._columns, self._free, self._residual, self._noises)
 
-    def _term(self, suspect: Suspect, changes: FloatArray, residual: FloatArray) -> Term | None:
+    def _term(
+        self, suspect: Suspect, changes: FloatArray, residual: FloatArray
+    ) -> AddedTerm | None:
         """The term of a suspect that by itself explains most; residual: what all leave."""
         regression = self._coloured_by(residual)
         alone = [
@@ -331,7 +333,7 @@ class _Tests:
         return replace(term, low=-reach, high=reach)
 
     def _finding(
-        self, suspect: Suspect, result: "_Result", log_p: float, term: Term | None
+        self, suspect: Suspect, result: "_Result", log_p: float, term: AddedTerm | None
     ) -> Finding:
         moved = self._gradients @ result.move[: self._gradients.shape[1]]
         moves = [
@@ -589,7 +591,7 @@ def description(finding: Finding) -> str:
     return text.format(name=finding.name, late=late, amplitude=size, unit=unit).replace("  ", " ")
 
 
-def _term_text(term: Term) -> str:
+def _term_text(term: AddedTerm) -> str:
     """A term in a few words."""
     equation = f"d{term.equation}/dt"
     if term.shape == "stribeck":

@@ -17,7 +17,7 @@ from sysid.judging.disturbed import DisturbedRun
 from sysid.problem.data import Dataset
 from sysid.problem.model import Input, ProcessModel, State
 from sysid.problem.preparation import at_places
-from sysid.problem.terms import Shape, Term
+from sysid.problem.terms import AddedTerm, Shape
 
 Kind = Literal[
     "variant", "delay", "offset", "drift", "gain", "saturation", "change", "function", "disturbance"
@@ -56,7 +56,7 @@ class Suspect:
     name: str
     unit: str
     changes: FloatArray
-    terms: tuple[Term, ...] = ()
+    terms: tuple[AddedTerm, ...] = ()
     late: Callable[[float], FloatArray] | None = None
 
     @property
@@ -260,7 +260,7 @@ def function_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
                 yield Suspect("function", state.name, unit, np.stack(columns, axis=2), terms)
 
 
-def _terms(equation: str, of: str, signal: FloatArray) -> Iterator[tuple[Term, ...]]:
+def _terms(equation: str, of: str, signal: FloatArray) -> Iterator[tuple[AddedTerm, ...]]:
     """Functions of a signal that are tested together.
 
     A straight line by itself; shapes that together are like most; more friction near standstill.
@@ -269,8 +269,8 @@ def _terms(equation: str, of: str, signal: FloatArray) -> Iterator[tuple[Term, .
     centre = 0.0 if low < 0.0 < high else 0.5 * (low + high)
     size = max(high - centre, centre - low)
 
-    def term(shape: Shape, part: float = 1.0) -> Term:
-        return Term(equation, of, shape, _short(part * size), -1.0, 1.0, _short(centre))
+    def term(shape: Shape, part: float = 1.0) -> AddedTerm:
+        return AddedTerm(equation, of, shape, _short(part * size), -1.0, 1.0, _short(centre))
 
     if size == 0.0:
         return
@@ -285,7 +285,7 @@ def _short(value: float) -> float:
     return float(f"{value:.2g}")
 
 
-def _values(term: Term, signal: FloatArray) -> FloatArray:
+def _values(term: AddedTerm, signal: FloatArray) -> FloatArray:
     """A term along a signal; signs smoothly, and friction such that it brakes."""
     z = (signal - term.centre) / term.scale
     if term.shape == "sign":

@@ -15,14 +15,14 @@ _STICKS = 0.01  # of a Stribeck speed, below which it grows from zero
 
 
 @dataclass(frozen=True)
-class Term:
+class AddedTerm:
     """What is added to a state's rate: a parameter times a shape of z = (signal - centre) / scale.
 
     equation: the state. of: the signal, a state or an input. shape: ``sign`` (in proportion where
     abs(z) < 1), ``linear``, ``square`` (z abs(z)), ``cube`` or ``stribeck`` (sign(z) exp(-z^2)).
     scale, centre: in the signal's unit. low, high: range of the parameter, in the unit of the rate.
 
-    >>> Term("omega", of="omega", shape="sign", scale=0.05, low=-500.0, high=500.0).parameter
+    >>> AddedTerm("omega", of="omega", shape="sign", scale=0.05, low=-500.0, high=500.0).parameter
     'sign_of_omega'
     """
 
@@ -41,14 +41,14 @@ class Term:
         return name if self.of == self.equation else f"{name}_in_{self.equation}"
 
 
-def with_terms(model: ProcessModel, terms: Sequence[Term]) -> ProcessModel:
+def with_terms(model: ProcessModel, terms: Sequence[AddedTerm]) -> ProcessModel:
     """The model with terms added to its equations, and their parameters behind its own.
 
     Raises ModelError for a state or signal that it has not, a bad scale or range, or a name that
     it has already.
 
     >>> from sysid.examples import lag
-    >>> rubbing = with_terms(lag(), [Term("y", "y", "sign", 0.01, -5.0, 5.0)])
+    >>> rubbing = with_terms(lag(), [AddedTerm("y", "y", "sign", 0.01, -5.0, 5.0)])
     >>> rubbing.parameter_names, rubbing.derivative((1.0,), (0.0,), (2.0, 0.5, -3.0))
     (('gain', 'tau', 'sign_of_y'), (-5.0,))
     """
@@ -66,7 +66,7 @@ def rate_unit(unit: str) -> str:
     return product_unit([(unit, 1), ("s", -1)]) or f"{unit}/s"
 
 
-def _with_term(model: ProcessModel, term: Term) -> ProcessModel:
+def _with_term(model: ProcessModel, term: AddedTerm) -> ProcessModel:
     signals = (*model.state_names, *model.input_names)
     for kind, name, names in (
         ("state", term.equation, model.state_names),
@@ -117,7 +117,7 @@ def _added(derivative: Function, n: int, place: int, function: Callable[..., Any
     return rates
 
 
-def _function(term: Term, place: int) -> Callable[[Any, Any], Any]:
+def _function(term: AddedTerm, place: int) -> Callable[[Any, Any], Any]:
     shape, centre, scale = _SHAPES[term.shape], term.centre, term.scale
     return lambda x, u: shape(((x + u)[place] - centre) / scale)
 
@@ -127,7 +127,7 @@ def _of_first(constraint: Constraint, n: int) -> Constraint:
     return replace(constraint, function=lambda p: function(p[:n]))
 
 
-def _text(term: Term) -> str:
+def _text(term: AddedTerm) -> str:
     signal = term.of if term.centre == 0.0 else f"({term.of} - {term.centre:g})"
     return f"{term.shape}({signal} / {term.scale:g})"
 

@@ -15,7 +15,7 @@ from sysid.judging.comparison import Comparison
 from sysid.judging.expected_errors import ExpectedErrors
 from sysid.judging.score_tests import Finding, Move
 from sysid.problem.faults import DataFault
-from sysid.problem.terms import Term
+from sysid.problem.terms import AddedTerm
 from sysid.uncertainty import Ambiguity, Estimate, Uncertainty
 
 MODEL = ProcessModel(
@@ -306,7 +306,7 @@ def test_what_is_missing_counts_by_how_far_it_moves_parameters():
     )
     assert found([variant], replace(fitted, better=False)).trust == "good"
     # Beside a term that was fitted no other function is said.
-    term = Term("speed", "speed", "sign", 0.1, -1.0, 1.0)
+    term = AddedTerm("speed", "speed", "sign", 0.1, -1.0, 1.0)
     added = replace(fitted, name="a term", terms=(term,))
     others = [finding("function", 3.0), finding("offset", 2.0)]
     reasons = found(others, added).parameters.reasons

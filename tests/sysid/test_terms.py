@@ -13,7 +13,7 @@ from sysid import Constraint, Dataset, ModelError
 from sysid.gassi import GASSI
 from sysid.judging.alternatives import best_alternative
 from sysid.judging.examination import suspected
-from sysid.problem.terms import Term, with_terms
+from sysid.problem.terms import AddedTerm, with_terms
 from tests.sysid.reference import simulate
 
 POINTS = np.random.default_rng(0).uniform(-20.0, 20.0, (40, 2))
@@ -29,7 +29,7 @@ SHAPES = {
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_a_term_is_added_to_its_equation_alone(shape):
-    term = Term("omega", "current", shape, 4.0, -10.0, 10.0, centre=0.5)
+    term = AddedTerm("omega", "current", shape, 4.0, -10.0, 10.0, centre=0.5)
     extended = with_terms(MODEL, [term])
     assert extended.parameter_names[-1] == f"{shape}_of_current_in_omega"
     assert extended.parameters[-1].unit == "rad/s^2"
@@ -53,8 +53,8 @@ def test_outputs_constraints_and_variants_stay_those_of_the_models_own_parameter
         variants=lambda: {"twin": MODEL},
     )
     terms = [
-        Term("omega", "omega", "sign", 0.1, -10.0, 10.0),
-        Term("omega", "omega", "cube", 50.0, -10.0, 10.0),
+        AddedTerm("omega", "omega", "sign", 0.1, -10.0, 10.0),
+        AddedTerm("omega", "omega", "cube", 50.0, -10.0, 10.0),
     ]
     extended, values = with_terms(model, terms), (*VALUES, 1.0, 2.0)
     assert extended.output((1.0, 2.0), (0.0, 0.0), values) == load((1.0, 2.0), (), VALUES)
@@ -65,16 +65,16 @@ def test_outputs_constraints_and_variants_stay_those_of_the_models_own_parameter
 @pytest.mark.parametrize(
     ("term", "words"),
     [
-        (Term("speed", "omega", "sign", 0.1, -1.0, 1.0), "no state 'speed'"),
-        (Term("omega", "speed", "sign", 0.1, -1.0, 1.0), "no state or input 'speed'"),
-        (Term("omega", "omega", "sign", 0.0, -1.0, 1.0), "must be above 0"),
-        (Term("omega", "omega", "sign", 0.1, 1.0, -1.0), "low end at or above"),
+        (AddedTerm("speed", "omega", "sign", 0.1, -1.0, 1.0), "no state 'speed'"),
+        (AddedTerm("omega", "speed", "sign", 0.1, -1.0, 1.0), "no state or input 'speed'"),
+        (AddedTerm("omega", "omega", "sign", 0.0, -1.0, 1.0), "must be above 0"),
+        (AddedTerm("omega", "omega", "sign", 0.1, 1.0, -1.0), "low end at or above"),
     ],
 )
 def test_a_term_that_is_none_is_refused_in_words(term, words):
     with pytest.raises(ModelError, match=words):
         with_terms(MODEL, [term])
-    right = Term("omega", "omega", "sign", 0.1, -1.0, 1.0)
+    right = AddedTerm("omega", "omega", "sign", 0.1, -1.0, 1.0)
     with pytest.raises(ModelError, match="repeat the name 'sign_of_omega'"):
         with_terms(MODEL, [right, right])
 
@@ -119,6 +119,6 @@ def test_a_model_with_a_term_moves_as_one_with_the_function_written_out():
         return (rates[0], rates[1] - 130.0 * math.tanh(x[1] / 0.05))
 
     by_hand = simulate(replace(MODEL, derivative=rubbing), np.array(VALUES), record)
-    extended = with_terms(MODEL, [Term("omega", "omega", "sign", 0.05, -500.0, 0.0)])
+    extended = with_terms(MODEL, [AddedTerm("omega", "omega", "sign", 0.05, -500.0, 0.0)])
     by_term = simulate(extended, np.array([*VALUES, -130.0]), record)
     assert np.abs(by_term - by_hand).max() < 5e-3 * np.abs(by_hand).max()

@@ -3,7 +3,7 @@
 import pytest
 
 from daq.config.identification import IdentificationConfig
-from daq.identification.mending import mending
+from daq.identification.remedies import remedies
 from sysid.judging.score_tests import Finding
 from sysid.problem.faults import DataFault
 
@@ -29,7 +29,9 @@ def fault(kind, severity="doubt", setting=""):
 
 
 def mended(findings=(), faults=(), pushed=None, **content):
-    return mending(settings(**content), ("u", "y"), faults=faults, findings=findings, pushed=pushed)
+    return remedies(
+        settings(**content), ("u", "y"), faults=faults, findings=findings, pushed=pushed
+    )
 
 
 def test_a_delay_is_added_to_what_is_taken_out_already():

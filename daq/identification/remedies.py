@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 _WIDER = 10.0  # by which factor a range is widened
 
 
-def mending(
+def remedies(
     settings: IdentificationConfig,
     channels: Collection[str] = (),
     *,
@@ -31,20 +31,20 @@ def mending(
     >>> from sysid.problem.faults import DataFault
     >>> late = DataFault("lag", "doubt", "training", ("log",), "y", "", "", "", 1.0,
     ...     setting="delay.y=0.004")
-    >>> mending(IdentificationConfig(), faults=[late])
+    >>> remedies(IdentificationConfig(), faults=[late])
     ('delay.y=0.004',)
     """
     of_faults = [fault.setting for fault in faults if fault.severity == "doubt" and fault.setting]
-    found: dict[str, str] = {}
+    changes: dict[str, str] = {}
     for setting in of_faults:
         key, _, value = setting.partition("=")
-        found[key] = value
+        changes[key] = value
     lags = any(fault.kind == "lag" for fault in faults)  # which delays that were found are as well
     of_all_logs = [f for f in findings if f.name in channels and not (lags and f.kind == "delay")]
-    found |= dict(_of_channels(settings, of_all_logs))
-    if not found:  # what is wrong with the data drives parameters to the ends
-        found |= dict(_of_ranges(pushed or {}))
-    return tuple(f"{key}={value}" for key, value in found.items())
+    changes |= dict(_of_channels(settings, of_all_logs))
+    if not changes:  # what is wrong with the data drives parameters to the ends
+        changes |= dict(_of_ranges(pushed or {}))
+    return tuple(f"{key}={value}" for key, value in changes.items())
 
 
 def _of_channels(
