@@ -13,6 +13,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
+_PACKAGES = ("daq", "haptics", "protocols", "sim_rig", "sysid")  # of this program
+
 USER_CODE_ERRORS = (Exception, SystemExit)
 """What code of a user's own may raise without meaning to end the program."""
 
@@ -192,7 +194,8 @@ def raised_in(kind: type, error: BaseException) -> str:
         file = Path(inspect.getfile(kind))
     except (OSError, TypeError):
         return ""
-    if file.is_relative_to(Path(__file__).parents[1]):
+    installed = Path(__file__).parents[1]  # of an editable install the clone, users' files beside
+    if any(file.is_relative_to(installed / package) for package in _PACKAGES):
         return ""
     line = line_in(error, file)
     return f" ({file}:{line})" if line is not None else ""

@@ -188,11 +188,11 @@ def print_table(
     columns = [[name, *_lines(row[index] for row in rows)] for index, name in enumerate(head)]
     whole = [max(map(len, column)) for column in columns]
     narrow = console.is_terminal and sum(whole) + 3 * len(head) > console.width
-    room = console.width - 2 * len(head)
+    room = console.width - 2 * (len(head) - 1)
     widths = _narrowed(columns, words, room) if narrow else whole
     table = Table(
         header_style="bold", pad_edge=False, padding=(0, 1, 0, 0) if narrow else (0, 1),
-        box=box.SIMPLE_HEAD if console.is_terminal else box.SIMPLE,
+        box=box.SIMPLE_HEAD if console.is_terminal else box.SIMPLE, show_edge=not narrow,
     )  # fmt: skip
     for name, width, is_text in zip(head, widths, words, strict=True):
         table.add_column(
@@ -205,7 +205,10 @@ def print_table(
     console.width = max(console.width, sum(widths) + 3 * len(head))
     # Above the table rather than in it, where a long title would wrap to the table's width.
     console.print(_wrapped(title, sys.stdout), style="bold", soft_wrap=True)
+    blank = "\n" if narrow else ""  # which the edges are otherwise
+    console.print(blank, end="")
     console.print(table)
+    console.print(blank, end="")
 
 
 def _lines(cells: Iterable[str]) -> list[str]:

@@ -36,7 +36,7 @@ def text_of(path: Path) -> str:
         text = data.decode("utf-8")
     except UnicodeDecodeError as error:
         line = data[: error.start].count(b"\n") + 1
-        cure = "save the file with this encoding, or name the right one"
+        cure = "save the file with this encoding: editors have it beside 'Save as'"
         raise ConfigError("not text in UTF-8", cure=cure, file=path, line=line) from None
     control = yaml.reader.Reader.NON_PRINTABLE.search(text)
     if control:

@@ -179,7 +179,13 @@ def _built(text: str, path: Path | None) -> tuple["_Places", Any]:
     def tag_of(scalar: yaml.ScalarEvent) -> Any:
         return scalar.tag or loader.resolve(yaml.ScalarNode, scalar.value, scalar.implicit)
 
-    bounds.check_yaml(yaml.parse(text, Loader=_Loader), tag_of, path)
+    try:
+        bounds.check_yaml(yaml.parse(text, Loader=_Loader), tag_of, path)
+    except yaml.MarkedYAMLError as error:
+        # libyaml looks so far ahead that its own bound is met before ours is counted.
+        if "nesting" in (error.problem or ""):
+            bounds.check_yaml(yaml.parse(text, Loader=yaml.SafeLoader), tag_of, path)
+        raise
     node, places = loader.get_single_node(), _Places(path)
     if node is None:
         return places, None

@@ -1,8 +1,9 @@
 """From configuration and command line to a checked model and its search settings."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -10,7 +11,7 @@ from daq.config import check, yaml_file
 from daq.config.identification import IdentificationConfig, Signals, TermSetting
 from daq.config.units import converted
 from daq.config.yaml_file import TypedSettings, YamlFile
-from daq.errors import ConfigError, Mistake, suggestion
+from daq.errors import ConfigError, Mistake, suggestion, together
 from daq.identification import datasheets, stages
 from daq.identification.foreign import ColumnMapping, check_mapping
 from daq.identification.request import SettingsRequest
@@ -81,14 +82,19 @@ def problems_of(
     declared = _find_models(config, file, names, record)
     file, freed = _without_nulls(file, [model for model, _ in declared])
     file, unconverted = in_model_units(file, [model for model, _ in declared])
-    settings = check.validate(file, IdentificationConfig, others=unconverted)
+    doubts: Sequence[Mistake] = ()
+    if check.mistakes(file, IdentificationConfig, file.content):
+        # Terms give a model names of their own, of which nothing is known until all can be read.
+        known = [] if file.content.get("terms") else [model for model, _ in declared]
+        doubts = [*unconverted, *(_unknown_names(file, known) if known else ())]
+    settings = check.validate(file, IdentificationConfig, others=doubts)
     selection = Selection.under(settings, file)
     for model, name in declared:
         watch(Note("detail", f"model {name}: {model.description}"))
     models = [
         _with_outputs(file, settings, _with_terms(file, settings, model)) for model, _ in declared
     ]
-    _check_names(file, settings, models)
+    doubts = [*unconverted, *_unknown_names(file, models)]
     mapping = ColumnMapping(file, settings.columns) if settings.columns else None
     signals = [name for m, _ in declared for name in (*m.output_names, *m.state_names)]
     spare = {"inputs": _all_names(models, "input_names"), "outputs": signals}
@@ -98,8 +104,8 @@ def problems_of(
     entries = datasheets.load([beside / name for name in settings.datasheet], models)
     beside = config.parent if config is not None and "given" not in file.typed else Path()
     results = stages.load([beside / name for name in settings.given])
-    problems = []
-    for (_, name), model in zip(declared, models, strict=True):
+
+    def problem(model: ProcessModel, name: str) -> Problem:
         given = _restricted(settings, model)
         earlier, sources = stages.under(given, results, model, freed)
         sheet = {n: entry for n, entry in entries.items() if n not in freed or n in given.tied}
@@ -107,22 +113,40 @@ def problems_of(
         completed, of_sheets = datasheets.under(given, sheet, model)
         sources |= of_sheets
         completed = _with_freed(file, completed, model, freed)
-        _check_space(file, completed, model, earlier)
-        if mapping is not None:
-            check_mapping(model, mapping, spare)
-        started = _with_starts(file, completed, model)
-        if completed.guess and model.guesses is None:
-            missing = "no 'guesses' function that reads ranges from logs; leave this out"
-            raise file.error(("guess",), f"model {model.name} has {missing}")
+        started, *_ = together(
+            lambda: _with_starts(file, completed, model),
+            lambda: _check_space(file, completed, model, earlier),
+            lambda: None if mapping is None else check_mapping(model, mapping, spare),
+            lambda: _check_guesses(file, completed, model),
+        )
         sources |= {
             str(parameter): file.line((group, str(parameter)))
             for group in ("ranges", "fixed", "tied")
             for parameter in file.content.get(group) or {}
         }
         origin = request.absolute(name)
-        problem = Problem(started, name, completed, mapping, sources, origin, selection, earlier)
-        problems.append(problem)
+        return Problem(started, name, completed, mapping, sources, origin, selection, earlier)
+
+    _, *problems = _in_order(
+        partial(check.refuse, doubts),
+        *[partial(problem, model, name) for (_, name), model in zip(declared, models, strict=True)],
+    )
     return problems
+
+
+def _in_order(*steps: Callable[[], Any]) -> list[Any]:
+    """What each step returns; ConfigError with all their mistakes as a file has them."""
+    try:
+        return together(*steps)
+    except ConfigError as error:
+        check.refuse(error.mistakes)
+        raise
+
+
+def _check_guesses(file: YamlFile, settings: IdentificationConfig, model: ProcessModel) -> None:
+    if settings.guess and model.guesses is None:
+        missing = "no 'guesses' function that reads ranges from logs; leave this out"
+        raise file.error(("guess",), f"model {model.name} has {missing}")
 
 
 def in_model_units(file: File, models: Sequence[ProcessModel]) -> tuple[File, list[Mistake]]:
@@ -311,18 +335,19 @@ def _with_starts(file: YamlFile, signals: Signals, model: ProcessModel) -> Proce
         raise file.error(key, str(error)) from None
 
 
-def _check_names(
-    file: YamlFile, settings: IdentificationConfig, models: Sequence[ProcessModel]
-) -> None:
-    names = " or ".join(dict.fromkeys(model.name for model in models))
+def _unknown_names(file: YamlFile, models: Sequence[ProcessModel]) -> list[Mistake]:
+    """Names in the settings that no model has, each at its key; a list has no keys of its own."""
+    whose = " or ".join(dict.fromkeys(model.name for model in models))
+    unknown = []
     for group, kind in (*_KEYED_BY.items(), ("profile", "parameter_names")):
-        declared = _all_names(models, kind)
-        for name in getattr(settings, group):
-            if name not in declared:
-                hint = f"model {names} has no such name; {suggestion(name, declared)}"
-                if isinstance(file.content.get(group), dict):
-                    raise file.error((group, name), hint)
-                raise file.error((group,), f"{name}: {hint}")  # a list has no keys of its own
+        entries, declared = file.content.get(group), _all_names(models, kind)
+        names = entries if isinstance(entries, Mapping | list) else ()
+        for name in (name for name in names if isinstance(name, str) and name not in declared):
+            hint = f"model {whose} has no such name; {suggestion(name, declared)}"
+            keyed = isinstance(entries, Mapping)
+            problem = hint if keyed else f"{name}: {hint}"
+            unknown.append(file.mistake((group, name) if keyed else (group,), problem))
+    return unknown
 
 
 def _all_names(models: Sequence[ProcessModel], kind: str) -> tuple[str, ...]:

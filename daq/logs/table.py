@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import io
 import warnings
 from collections.abc import Collection, Sequence
@@ -27,6 +28,7 @@ _NO_NUMBERS = ("nan", "inf", "-inf")  # what a broken sensor may end a log with
 _HEAD = 1 << 20  # bytes in which a header stands
 _PIECE = 1 << 22  # bytes parsed at a time: what pandas makes of them stays in the processor's cache
 _COMPARED = 20  # lines whose decimals tell how a file is written
+_AS_TEXT = "export the table as CSV in UTF-8 (a worksheet by 'Save as', 'CSV UTF-8')"
 _TEXT_CONTROLS = b"\t\n\r\f"
 
 
@@ -262,8 +264,15 @@ def _complete_lines(
     complete = text[:cut] or text
     if "\0" in complete:
         line = complete[: complete.index("\0")].count("\n") + 1
-        raise ConfigError("not a text file: it holds bytes of zero", file=path, line=line)
+        problem = "not a text file: it holds bytes of zero"
+        raise ConfigError(problem, cure=_AS_TEXT, file=path, line=line)
     return complete.rstrip("\n") + "\n", bool(text[cut:].strip())
+
+
+def _cure_of(data: bytes) -> str:
+    """What to do about a file that is no text in UTF-8, by its first bytes."""
+    wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    return f"it is UTF-16; {_AS_TEXT}" if wide else _AS_TEXT
 
 
 def _decoded(path: Path, data: bytes) -> str:
@@ -275,7 +284,7 @@ def _decoded(path: Path, data: bytes) -> str:
         if data.translate(None, controls) != data:
             line = data[: error.start].count(b"\n") + 1
             problem = f"not a text file (byte {error.start})"
-            raise ConfigError(problem, file=path, line=line) from None
+            raise ConfigError(problem, cure=_cure_of(data), file=path, line=line) from None
         return data.decode("cp1252", errors="replace")
 
 

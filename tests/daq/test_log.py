@@ -375,9 +375,9 @@ def test_a_file_that_is_no_log_is_refused_by_file_line_and_column(tmp_path, text
     ("data", "said"),
     [
         (b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR", "not a text file"),
-        (original_text().encode("utf-16"), "not a text file"),
+        (original_text().encode("utf-16"), "it is UTF-16; export the table as CSV in UTF-8"),
         (b"PK\x03\x04" + bytes(range(256)), "not a text file"),
-        (bytes(4096), "not a text file"),
+        (bytes(4096), "not a text file: .*; export the table as CSV"),
     ],
     ids=["picture", "UTF-16", "spreadsheet", "zeros"],
 )

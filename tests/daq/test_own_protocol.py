@@ -1,10 +1,12 @@
 """Mistakes in a user's own protocol: named with their place, before the run where they can be."""
 
 import json
+import sys
+from types import SimpleNamespace
 
 import pytest
 
-from daq import analyse, record
+from daq import analyse, errors, record
 from daq.errors import ConfigError, RunError
 from tests.daq.support import only_capture, record_of, rig
 
@@ -202,3 +204,19 @@ def test_mistakes_in_findings_leave_the_run_and_name_their_line(written, tmp_pat
         with pytest.raises(RunError) as failed:
             analyse(folder, trust=True)
         assert says in str(failed.value)
+
+
+@pytest.mark.parametrize(
+    ("folder", "line"), [("mine", True), ("tests", True), ("protocols", False), ("daq", False)]
+)
+def test_files_beside_an_editable_install_are_the_users(tmp_path, monkeypatch, folder, line):
+    monkeypatch.setattr(errors, "__file__", str(tmp_path / "daq" / "errors.py"))
+    file = tmp_path / folder / "fading.py"
+    file.parent.mkdir()
+    file.write_text("class Fading:\n    def plan(self):\n        return 1 / 0\n")
+    names = {"__name__": "fading"}
+    exec(compile(file.read_text(), str(file), "exec"), names)
+    monkeypatch.setitem(sys.modules, "fading", SimpleNamespace(__file__=str(file)))
+    with pytest.raises(ZeroDivisionError) as failed:
+        names["Fading"]().plan()
+    assert errors.raised_in(names["Fading"], failed.value) == (f" ({file}:3)" if line else "")
