@@ -208,8 +208,8 @@ class EmulatedFirmware:
                 file=str(self._elf),
             )
         lines = self._log.read_text(errors="replace").strip().splitlines()
-        said = [line for line in lines if "redirected to" not in line]
-        words = said[-1] if said else f"status {status}"
+        remarks = [line for line in lines if "redirected to" not in line]
+        words = remarks[-1] if remarks else f"status {status}"
         if status < 0:
             words = f"by signal {-status}"
         elif status == _FAULT:

@@ -89,29 +89,29 @@ def serve(
         RealTime().begin("prefer")
         _share_core()
         firmware = stack.enter_context(EmulatedFirmware(elf, tcp=tcp))
-        told = _told_to_end(firmware)
+        ended = _asked_to_end(firmware)
         ready(stack.enter_context(named(firmware.port, link)))
         try:
-            while not told.is_set():
+            while not ended.is_set():
                 exchange = firmware.exchange()
                 notes.add(exchange)
                 firmware.answer(plant.read(exchange))
         except DeviceError:
-            if not told.is_set():
+            if not ended.is_set():
                 raise
 
 
-def _told_to_end(firmware: EmulatedFirmware) -> threading.Event:
+def _asked_to_end(firmware: EmulatedFirmware) -> threading.Event:
     """Set by Ctrl-C and SIGTERM, which end QEMU, for it may stand still."""
-    told = threading.Event()
+    ended = threading.Event()
 
     def end(number: int, frame: FrameType | None) -> None:
-        told.set()
+        ended.set()
         firmware.kill()
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, end)
-    return told
+    return ended
 
 
 def _share_core() -> None:
