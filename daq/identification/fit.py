@@ -267,7 +267,11 @@ def assemble(
 
     datasets = [log.dataset for log in logs[0]]
     refined = PRESETS[estimator.preset].refine and estimator.stopped_ != "interrupted"
-    uncertainty = estimator.uncertainty(datasets) if refined else None
+    uncertainty = None
+    if refined:
+        watch(Progress("Intervals", 0, 1, "what the data determine"))
+        uncertainty = estimator.uncertainty(datasets)
+        watch(Progress("Intervals", 1, 1, "what the data determine"))
     profiles, names = [], problem.settings.profile if refined else []
     for k, name in enumerate(names):
         watch(Progress("Profiles", k, len(names), f"of {name}"))

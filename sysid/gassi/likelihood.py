@@ -39,6 +39,7 @@ _LEAST_SHARE = 1e-2
 # Errors below this part of the simulation's accuracy are its own: there is no noise to weigh by.
 _SIMULATION_SHARE = 0.1
 _FINER, _FINEST = 1e-3, 1e-9
+_TINY = 1e-300
 # Colour does not make an output's errors count as fewer independent samples than this.
 _FEWEST = 30.0
 # Deviance above which one minimum is no rival to another: one in a hundred for the four
@@ -145,10 +146,13 @@ def _chromosomes(optima: Sequence[Optimum]) -> tuple[FloatArray, ...]:
 
 
 class _Optima:
-    """Minima far from each other, compared by what the data tell at the first."""
+    """Minima far from each other, compared by what the data tell at the first.
 
-    def __init__(self, objective: Objective) -> None:
-        self._objective = objective
+    scale: errors of the outputs (n_outputs,) that are alike to start from.
+    """
+
+    def __init__(self, objective: Objective, scale: FloatArray | float = 1.0) -> None:
+        self._objective, self._scale = objective, np.maximum(scale, _TINY)
         self._optima: list[Optimum] = []
 
     def add(self, optimum: Optimum) -> None:
@@ -182,9 +186,9 @@ class _Optima:
         return self._deviance(optimum.rms, reference.rms)
 
     def _deviance(self, rms: FloatArray, reference: FloatArray) -> float:
-        floor = _LEAST_SHARE * max(rms.max(), reference.max(), 1e-300)
-        ratio = np.log(np.maximum(rms, floor) / np.maximum(reference, floor))
-        return float(2.0 * np.sum(self._independent_samples * ratio))
+        sizes = np.log(np.maximum([rms, reference], _TINY)) - np.log(self._scale)
+        sizes = np.maximum(sizes, sizes.max() + np.log(_LEAST_SHARE))
+        return float(2.0 * np.sum(self._independent_samples * (sizes[0] - sizes[1])))
 
     def connected(self, optimum: Optimum, rival: Optimum) -> bool:
         """Whether a way leads from one to the other on which the data rule nothing out.
@@ -228,9 +232,9 @@ class _Optima:
     def _information(self) -> FloatArray:
         """Fisher information of the coordinates, (n_free, n_free), were errors white."""
         first = self._sensitivity
-        variance: FloatArray = np.mean(first.residual**2, axis=0)
-        variance = np.maximum(variance, max(_LEAST_SHARE**2 * variance.max(), 1e-300))
-        slopes = (first.slopes / np.sqrt(variance)[:, None]).reshape(-1, first.slopes.shape[2])
+        rms: FloatArray = np.sqrt(np.mean(first.residual**2, axis=0)) / self._scale
+        rms = self._scale * np.maximum(rms, max(_LEAST_SHARE * rms.max(), _TINY))
+        slopes = (first.slopes / rms[:, None]).reshape(-1, first.slopes.shape[2])
         information: FloatArray = slopes.T @ slopes
         return information
 
@@ -329,7 +333,7 @@ def _refitted(
         return None
     if isinstance(first.objective, Innovations) and first.objective.corrects:
         first = better_around(fit, first, ranked[0], watch)
-    optima = _Optima(objective)
+    optima = _Optima(objective, first.rms * _too_well(ranked[0].rms))
     optima.add(first)
     likely = [o for o in ranked[1:] if by_error.deviance(o, ranked[0]) < _CONCEIVABLE]
     starts = [optimum.chromosome for optimum in likely]
@@ -406,12 +410,12 @@ def noisy_fit(
     chromosome, rms = optimum.chromosome, optimum.rms
     fitted = Innovations.starting(optimum.objective, chromosome, corrects=corrects, process=process)
     last = np.zeros(len(fitted.noise))
+    too_well = _too_well(rms)
     for _ in range(_NOISE_ROUNDS):
         if not corrects and fitted.overwhelmed.any():
             return None
         rms = fitted.rms(chromosome[None])[0]
-        weights = objective.weights / np.maximum(rms, max(_LEAST_SHARE * rms.max(), 1e-300))
-        weighed = fitted.weighed(weights)
+        weighed = fitted.weighed(objective.weights / (too_well * np.maximum(rms, _TINY)))
         steady = np.allclose(weighed.weights, fitted.weights, rtol=_STEADY)
         end = refine(weighed, chromosome, on_iteration=watch)
         chromosome, rms, fitted = end.chromosome, end.rms, weighed
@@ -419,6 +423,16 @@ def noisy_fit(
             break
         fitted, last = towards(fitted, fitted.settled(chromosome), last)
     return _optimum(fitted, chromosome, rms)
+
+
+def _too_well(rms: FloatArray) -> FloatArray:
+    """By how much outputs are explained too well to count by what is left of them, (n_outputs,).
+
+    rms: of free runs' errors, for noise of the inputs may leave hardly anything of an innovation.
+    """
+    with np.errstate(over="ignore"):  # where simulations failed
+        factors: FloatArray = np.maximum(1.0, _LEAST_SHARE * rms.max() / np.maximum(rms, _TINY))
+    return factors
 
 
 def towards(

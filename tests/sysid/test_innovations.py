@@ -337,6 +337,35 @@ def test_a_filters_minimum_is_sought_around_that_of_free_runs():
     assert better_around(lambda optimum, watch: None, stuck, by_error, None) is stuck
 
 
+def test_an_output_whose_error_is_all_of_an_inputs_noise_counts_like_the_others():
+    """Hardly anything is left of it beside the other, which itself tells the lag badly."""
+    rng = np.random.default_rng(0)
+    u = np.column_stack([prbs(rng, 300, -1.0, 1.0), np.sin(0.1 * np.arange(300))])
+    y = lfilter([PART], [1.0, PART - 1.0], GAIN * u, axis=0)
+    y = np.vstack([np.zeros(2), y[:-1]]) + rng.standard_normal((300, 2)) * [1e-5, 0.3]
+    noisy = u + OF_INPUT * rng.standard_normal((300, 1)) * [1.0, 0.0]
+    record = Dataset(noisy, y, DT, input_noise=np.array([OF_INPUT, 0.0]))
+    objective = Objective(BatchSimulator(two_lags()), SearchSpace.of(two_lags()), [record])
+    start = np.array([GAIN, 1.3 * TAU])
+    by_error = Optimum(objective, start, objective.rms(start[None])[0], feasible=True)
+    fit = noisy_fit(True, None, objective, by_error)
+    assert fit.rms[0] < 1e-3 * fit.rms[1]
+    parts = fit.objective.weights * fit.rms
+    assert parts[0] == pytest.approx(parts[1], rel=0.01)
+    assert fit.chromosome == pytest.approx([GAIN, TAU], rel=0.15)
+
+
+def two_lags():
+    """Two lags beside one another, of one gain and one time constant."""
+    return lag(
+        states=(State("y", "1"), State("z", "1", first_sample=False)),
+        inputs=(Input("u", "1"), Input("v", "1")),
+        outputs=(Output("y", "1"), Output("z", "1")),
+        derivative=lambda x, u, p: tuple((p[0] * u[k] - x[k]) / p[1] for k in (0, 1)),
+        output=lambda x, u, p: (x[0], x[1]),
+    )
+
+
 def test_where_a_filter_jumps_slopes_are_those_of_the_side_without():
     """At rest on a kink: below it the state is damped, above it is not."""
     model = ProcessModel(
