@@ -39,6 +39,7 @@ DRAWN = (
 )
 SPREAD = 1.25  # factor either way
 HAND = 4.0  # likewise
+WINDER = 8.0  # hands that hold the wound load
 RATE = 800.0  # Hz
 COUNTS = 3e-3  # rad, four counts of the encoder
 
@@ -138,7 +139,8 @@ def shipped(package: Any, name: str) -> dict[str, Any]:
 def _identified(folder: Path, seed: int, plant: Mapping[str, Any]) -> Path:
     """What the shipped experiment tells of such a rig, as parameters.yaml."""
     # Whoever winds the load holds on as firmly as its friction asks for.
-    pulley = {**plant["parameters"], "K_u": HAND * HAND_STIFFNESS, "B_u": HAND * HAND_DAMPING}
+    grip = {"K_u": WINDER * HAND_STIFFNESS, "B_u": WINDER * HAND_DAMPING}
+    pulley = {**plant["parameters"], **grip}
     options = {"seed": seed, "plant": {**plant, "parameters": pulley}}
     run = record("prbs.yaml", "simulated.yaml", folder / "runs", options=options)
     name = "actuator:friction=stribeck" if "friction" in plant else "actuator"
