@@ -2,11 +2,12 @@
 
 python -m benchmarks.evidence [--json] [--experiments 12] [--draws 300] [--fresh 100] [--seed 0]
 
-Experiments are drawn: the controller, the largest torque (0.05 to 0.6 N*m) of a reference from 0.1
-to 10 Hz, and the limits of speed and torque, 10 to 100 rad/s and 0.3 to 3.5 N*m. Each is checked on
-``draws`` plausible actuators and hands; then it is tried on ``fresh`` others, of the same
-uncertainty (3 % of the parameters) and in the same simulation. Let through: how many of the fresh trials trip or do not come
-to rest. Refused: in how many experiments any of the fresh ones does, and the median part of them.
+Experiments are drawn: the controller, the largest torque (0.05 to 0.6 N*m) of a reference from
+0.1 to 10 Hz, and the limits of speed and torque, 10 to 100 rad/s and 0.3 to 3.5 N*m. Each is
+checked on ``draws`` plausible actuators and hands; then it is tried on ``fresh`` others of the same
+uncertainty (3 % of the parameters), by the same simulation. Let through: how many of the fresh
+trials trip or do not come to rest. Refused: in how many experiments any of the fresh ones does, and
+the median part of them.
 """
 
 from __future__ import annotations

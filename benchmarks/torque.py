@@ -1,6 +1,6 @@
 """How well torque controllers give a torque to a moving hand, beside the static baseline.
 
-python -m benchmarks.torque [--json] [--rigs 3] [--seconds 10] [--identify] [--worn]
+python -m benchmarks.torque [--json] [--rigs 3] [--seconds 10] [--identify] [--worn] [--free]
                             [--controllers static feedforward lqg hinf]
 
 Rigs are drawn: each of the actuator's parameters 0.8 to 1.25 times the simulated rig's, the hand's
@@ -9,11 +9,13 @@ reference is a multisine of 0.2 N*m from 0.1 to 10 Hz. Errors are those of the t
 truly felt, at all frequencies: the plant is simulated again with the voltages of the log. A sensor
 that a controller listens to is no judge of it. ``--identify``: parameters as ``prbs.yaml`` and
 ``rig identify`` find them, otherwise the true ones. ``--worn``: unevenly worn brushes, of which the
-controllers' model, with Stribeck friction, knows the mean.
+controllers' model, with Stribeck friction, knows the mean. ``--free``: the torque felt in free
+motion instead, by the shaft's speed and up to 5 Hz, in parts of what is felt without commands.
 """
 
 from __future__ import annotations
 
+import argparse
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,11 +23,13 @@ from typing import Any
 
 import numpy as np
 import yaml
+from scipy.signal import butter, sosfiltfilt
 
 import haptics
 import protocols
 from benchmarks._common import arguments, report
 from daq import Recording, identify, record, tune
+from daq.hal import FloatArray
 from daq.logs.recording import load
 from sim_rig.actuator import actuator
 from sim_rig.device.user import SimulatedUser
@@ -41,6 +45,8 @@ SPREAD = 1.25  # factor either way
 HAND = 4.0  # likewise
 WINDER = 8.0  # hands that hold the wound load
 RATE = 800.0  # Hz
+FREE_BAND = 5.0  # Hz
+SETTLED = 0.4  # s of a block, that do not count
 COUNTS = 3e-3  # rad, four counts of the encoder
 
 
@@ -51,22 +57,17 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--identify", action="store_true")
     parser.add_argument("--worn", action="store_true")
+    parser.add_argument("--free", action="store_true")
     controllers = ["static", "feedforward", "lqg", "hinf"]
     parser.add_argument("--controllers", nargs="+", default=controllers)
     options = parser.parse_args()
-    rows = [
-        measure(
-            options.seed + k, options.controllers, options.identify, options.worn, options.seconds
-        )
-        for k in range(options.rigs)
-    ]
-    report({"rigs": rows}, options.json, show)
+    rows = [measure(options.seed + k, options) for k in range(options.rigs)]
+    report({"rigs": rows}, options.json, show_free if options.free else show)
 
 
-def measure(
-    seed: int, controllers: list[str], identified: bool, worn: bool, seconds: float
-) -> dict[str, Any]:
-    """Errors of the controllers on one drawn rig [N*m]."""
+def measure(seed: int, options: argparse.Namespace) -> dict[str, Any]:
+    """What the controllers leave on one drawn rig."""
+    worn = options.worn
     rng = np.random.default_rng(seed)
     plant = drawn_plant(rng, worn)
     hand = drawn_motion(rng)
@@ -74,19 +75,21 @@ def measure(
     errors = {}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        model = _identified(folder, seed, plant) if identified else _true(folder, plant)
-        for controller in controllers:
+        model = _identified(folder, seed, plant) if options.identify else _true(folder, plant)
+        protocol = "transparency" if options.free else "torque_tracking"
+        changes = {} if options.free else {"duration": options.seconds, "seed": seed}
+        for controller in options.controllers:
             settings = folder / f"{controller}_settings.yaml"
-            changes = {"controller": controller}
-            settings.write_text(yaml.safe_dump({**shipped(haptics, "torque.yaml"), **changes}))
+            content = {**shipped(haptics, "torque.yaml"), "controller": controller}
+            settings.write_text(yaml.safe_dump(content))
             tune(settings, model).save(folder / f"{controller}.yaml")
-            experiment = folder / "torque_tracking.yaml"
-            content = shipped(protocols, "torque_tracking.yaml")
-            content |= {"torque_controller": str(folder / f"{controller}.yaml"), "seed": seed}
-            content |= {"duration": seconds}
+            experiment = folder / f"{protocol}.yaml"
+            content = shipped(protocols, f"{protocol}.yaml")
+            content |= {"torque_controller": str(folder / f"{controller}.yaml"), **changes}
             experiment.write_text(yaml.safe_dump(content))
             run = record(experiment, "moving_hand.yaml", folder / "runs", options=rig)
-            errors[controller] = felt(load(run.path, ("torque_ref",)), rig)
+            left = free if options.free else felt
+            errors[controller] = left(run.path, rig)
     return {"seed": seed, "hand": plant["parameters"]["K_u"], "errors": errors}
 
 
@@ -109,8 +112,33 @@ def drawn_motion(rng: np.random.Generator) -> list[list[float]]:
     return [[float(t), float(a)] for t, a in zip(times, angles, strict=True)]
 
 
-def felt(run: Recording, rig: Mapping[str, Any]) -> dict[str, float]:
+def felt(log: Path, rig: Mapping[str, Any]) -> dict[str, float]:
     """Error of the true torque on the hand [N*m], rms, and the largest speed [rad/s] of a run."""
+    run = load(log, ("torque_ref",))
+    torque, speed = replayed(run, rig)
+    error = torque - run.frame["torque_ref"].to_numpy()
+    return {
+        "error_rms": float(np.sqrt(np.mean(error**2))),
+        "speed": float(np.abs(speed).max()),
+    }
+
+
+def free(log: Path, rig: Mapping[str, Any]) -> dict[str, float]:
+    """The torque felt in free motion by the speed, in parts of that without commands."""
+    run = load(log, ("controlled",))
+    torque, speed = replayed(run, rig)
+    low = sosfiltfilt(butter(2, FREE_BAND, fs=RATE, output="sos"), torque)
+    controlled = run.frame["controlled"].to_numpy()
+    within = np.arange(len(controlled)) / RATE % shipped(protocols, "transparency.yaml")["block"]
+    ratios = []
+    for share in (1.0, 0.0):
+        rows = (controlled == share) & (within > SETTLED)
+        ratios.append(float(np.std(low[rows]) / np.std(speed[rows])))
+    return {"left": ratios[0] / ratios[1], "speed": float(np.abs(speed).max())}
+
+
+def replayed(run: Recording, rig: Mapping[str, Any]) -> tuple[FloatArray, FloatArray]:
+    """True torque on the hand [N*m] and speed [rad/s]: the plant with a run's voltages."""
     plant = Plant.model_validate(rig["plant"]).build()
     names = [output.name for output in plant.outputs]
     log = run.frame
@@ -121,12 +149,10 @@ def felt(run: Recording, rig: Mapping[str, Any]) -> dict[str, float]:
     inputs = np.hstack([np.vstack([applied, applied[-1:]]), motion])
     stepper = Stepper(plant, plant.nominal, 1.0 / RATE, scale=state_sizes(plant))
     _, true = stepper.advance(plant.initial_state, inputs)
-    error = -true[:, names.index("torque")] - log["torque_ref"].to_numpy()
-    speed = float(np.abs(true[:, names.index("omega")]).max())
     apart = log["theta"] - true[:, names.index("theta")]
     if np.abs(apart).max() > COUNTS:
         raise RuntimeError(f"the second simulation is {np.abs(apart).max():.2g} rad off the run")
-    return {"error_rms": float(np.sqrt(np.mean(error**2))), "speed": speed}
+    return -true[:, names.index("torque")], true[:, names.index("omega")]
 
 
 def shipped(package: Any, name: str) -> dict[str, Any]:
@@ -154,7 +180,7 @@ def _true(folder: Path, plant: Mapping[str, Any]) -> Path:
     values = dict(zip(model.parameter_names, model.nominal.tolist(), strict=True))
     values |= {k: v for k, v in plant["parameters"].items() if k in values}
     path = folder / "parameters.yaml"
-    covariance = {"parameters": [], "factor": []}
+    covariance: dict[str, list[Any]] = {"parameters": [], "factor": []}
     name = f"actuator:friction={friction}"
     content = {"model": name, "parameters": values, "covariance": covariance}
     path.write_text(yaml.safe_dump(content))
@@ -174,6 +200,13 @@ def show(figures: dict[str, Any]) -> None:
             f"{row['seed']:>4} {row['hand']:8.3f} {speed:6.1f} "
             + " ".join(f"{c:>18}" for c in cells)
         )
+
+
+def show_free(figures: dict[str, Any]) -> None:
+    print("torque felt in free motion up to 5 Hz, in parts of that without commands")
+    for row in figures["rigs"]:
+        parts = "  ".join(f"{name} {each['left']:.3f}" for name, each in row["errors"].items())
+        print(f"{row['seed']:>4} {row['hand']:8.3f}  {parts}")
 
 
 if __name__ == "__main__":
