@@ -125,6 +125,12 @@ QUANSER = {
         105, lambda h, c: after(
             c, lambda: setattr(c, "r", reader_of(c)), lambda: c.task_delete(c.r),
             lambda: read(c, c.r, 1))),
+    "a reader that starts behind its writer": (
+        "nobody sees", lambda h, c: after(
+            c, lambda: started(h, c, written(c, np.zeros(10))),
+            lambda: started(h, c, reader_of(c)))),
+    "a reader beside one that was not deleted": (
+        "is deleted", lambda h, c: after(c, lambda: reader_of(c), lambda: reader_of(c))),
     "a task deleted while it runs": (
         "while it runs", lambda h, c: c.task_delete(started(h, c, reader_of(c)))),
     "a watchdog without states": (604, lambda h, c: c.watchdog_start(0.1)),

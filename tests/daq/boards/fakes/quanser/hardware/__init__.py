@@ -224,6 +224,8 @@ class HIL:
             raise MisuseError("this bench has no digital lines")
         if encoders and self._mode != EncoderQuadratureMode.X4:
             raise MisuseError("the encoder is read before it was set to count four a cycle")
+        if self._of(Reader):
+            raise MisuseError("a reader is still there: a task that is no longer used is deleted")
         reader = Reader(_whole(samples_in_buffer, "samples_in_buffer"))
         return self._task(reader, analog=analog, encoders=encoders, other=other)
 
@@ -279,6 +281,8 @@ class HIL:
             raise MisuseError(
                 "a writer is filled before it is started, or puts out nothing at first"
             )
+        if isinstance(task.item, Reader) and self._of(Writer):
+            raise MisuseError("nobody sees what the writer puts out before this reader starts")
         task.rate = frequency
         self._world.start_clock(frequency)
         self._world.begin(task.item)
@@ -410,6 +414,11 @@ class HIL:
     def _supported(self, error):
         if not self._world.settings.watchdog:
             raise HILError(error)
+
+    def _of(self, kind):
+        """Tasks of a kind that are there; of writers, those that run."""
+        tasks = [task for task in self._tasks if isinstance(task.item, kind)]
+        return [task for task in tasks if kind is Reader or task.rate is not None]
 
     def _task(self, item, **channels):
         if item.capacity < 1:
