@@ -17,6 +17,7 @@ from sysid.arrays import FloatArray
 from sysid.problem.data import Dataset
 from sysid.problem.faults import DataFault, Part
 from sysid.problem.model import ProcessModel
+from sysid.threads import one_thread
 
 _REACH = 14  # samples that an input is looked at before and after
 _PAST = 4  # samples of the outputs' past
@@ -40,6 +41,7 @@ class Lag:
     samples: int
 
 
+@one_thread()
 def lags(records: Sequence[Dataset]) -> tuple[Lag, ...]:
     """Lags between inputs and outputs that are clear, of records with one sample time.
 
