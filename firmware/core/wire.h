@@ -101,7 +101,8 @@ static inline void rig_put64(uint8_t *at, uint64_t value) {
     rig_put32(at + 4, (uint32_t)(value >> 32));
 }
 
-/* Two's complement, without what C leaves to the compiler. */
+/* Two's complement, and floats by their bits, without what C leaves to the compiler. Any context;
+ * constant time. */
 static inline int32_t rig_signed32(uint32_t bits) {
     int32_t value;
     (void)memcpy(&value, &bits, sizeof value);
