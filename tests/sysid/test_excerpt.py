@@ -10,6 +10,7 @@ import pytest
 from sysid import GASSI, BatchSimulator, Dataset, Output, Parameter, State
 from sysid.fitting.objective import Objective
 from sysid.gassi.excerpt import Excerpt
+from sysid.problem.space import SearchSpace
 from tests.sysid.support import lag, prbs
 
 N = 12_000
@@ -71,6 +72,20 @@ def hidden_lag():
         ),
         derivative=hidden_lag_derivative,
     )
+
+
+def test_a_record_starts_where_the_part_at_its_beginning_does():
+    long, short = staircase(), staircase().part(0, 1500, "short")
+    excerpt = Excerpt.of([long, short], 4096)
+    plain = SearchSpace.of(hidden_lag())
+    of_parts = plain.with_starts(excerpt.datasets())
+    whole, (chromosome,) = excerpt.on_all(
+        of_parts, [np.array([2.0, 0.05, 1.0, 2.0, 3.0, 4.0, 5.0])]
+    )
+    assert whole.names == ("gain", "tau", "inside(0) 1", "inside(0) 2")
+    assert chromosome.tolist() == [2.0, 0.05, 1.0, 5.0]
+    bare, (alone,) = excerpt.on_all(plain, [np.array([2.0, 0.05])])
+    assert bare == plain and alone.tolist() == [2.0, 0.05]
 
 
 @pytest.fixture(scope="module")
