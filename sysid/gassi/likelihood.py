@@ -251,17 +251,20 @@ def _explored(
     lookalike: bool,
     roughly: bool = False,
 ) -> _Optima:
-    """Minima (n_free,) refined by likelihood, and those that look like the best."""
+    """Minima (n_free,) refined by likelihood, and those that look like the best.
+
+    Without lookalikes the first is the best, and the others are refined as long as they may be it.
+    """
     optima = _Optima(objective)
-    for minimum in minima:
+    for minimum in minima if lookalike else minima[:1]:
         optima.add(_weighed(objective, minimum, watch, roughly=roughly))
     explored = None
-    for _ in range(_EXPLORED if lookalike else 0):
+    for _ in range(_EXPLORED if lookalike else 1):
         best = optima.ranked()[0]
         if best is explored:
             break  # nothing better was found around it
         explored = best
-        starts = lookalikes(best.objective, best.chromosome)
+        starts = lookalikes(best.objective, best.chromosome) if lookalike else minima[1:]
         # By the best one's weights, until it turns out to matter.
         for end in _conceivable(best.objective, starts, optima, best):
             if optima.new(end.chromosome):

@@ -140,6 +140,15 @@ def test_lags_that_may_change_places_have_an_interval_for_each_answer():
     assert ambiguity.kind == "rival" and set(ambiguity.parameters) == {"first", "second"}
 
 
+def test_an_excerpt_leads_to_the_rivals_of_all_samples():
+    record = record_of(lags(), 0.01, n=6000, noise=0.1)
+    fitted = GASSI(lags(), population=30, generations=6, search_samples=1024).fit(record)
+    assert fitted.excerpt_ is not None
+    (rival,) = fitted.rivals_
+    assert rival["first"] == pytest.approx(fitted.parameters_["second"], rel=1e-2)
+    assert rival["second"] == pytest.approx(fitted.parameters_["first"], rel=1e-2)
+
+
 @pytest.mark.soak
 def test_a_measured_one_tells_them_apart():
     record = record_of(lags(), 0.01, noise=0.02)
