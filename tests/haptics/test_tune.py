@@ -51,6 +51,30 @@ def test_what_acts_only_together_moves_together(tmp_path):
 
 
 @pytest.mark.soak
+def test_operating_points_of_draws_go_to_python_control_with_their_ties(tmp_path):
+    pytest.importorskip("control")
+    shares = {"J_m": 0.3, "J_b": -0.3 * 7e-5 / 3.2e-5}
+    tie = {key: 0.1 * x for key, x in shares.items()}
+    tuning = tune(
+        write(tmp_path / "torque.yaml", SETTINGS),
+        result(tmp_path, tie=tie, spring={"alpha1": 0.05}),
+        draws=6,
+    )
+    J_m, alpha1 = (tuning.draws[:, RIG.parameter_names.index(k)] for k in ("J_m", "alpha1"))
+    points = [tuning.operating_points(draw=k) for k in range(6)]
+    systems = [each[0].state_space() for each in points]
+    omega, torque = (
+        systems[0].state_labels.index("omega"),
+        systems[0].input_labels.index("torque"),
+    )
+    inertias = np.array([1.0 / system.B[omega, torque] for system in systems])
+    assert np.ptp(J_m) > 0.05 * J_m.mean() and np.ptp(inertias) < 0.01 * inertias.mean()
+    # The brake's spring at its largest current, within the yield travel.
+    springs = np.array([max(point.stiffness for point in each) for each in points])
+    assert np.corrcoef(springs, alpha1)[0, 1] > 0.999
+
+
+@pytest.mark.soak
 def test_no_more_inertia_is_taken_off_than_the_least_plausible_one(tmp_path):
     settings = write(tmp_path / "t.yaml", SETTINGS)
     wide = tune(settings, result(tmp_path, J={"J_m": 0.1, "J_b": 0.1}))
