@@ -148,7 +148,7 @@ def recorded(*words, folder):
 def identified(folder):
     """Intervals of the parameters that have one, by name, of the one log in a folder."""
     (log,) = folder.glob("runs/*/log.csv")
-    done = rig("identify", log, "--out", folder, cwd=folder)
+    done = rig("identify", log, "--out", folder, cwd=folder, timeout=600)
     assert done.returncode == 0, done.stderr
     (file,) = folder.glob("**/parameters.yaml")
     rows = yaml.safe_load(file.read_text())["parameters"]
