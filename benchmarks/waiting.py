@@ -5,7 +5,7 @@ python -m benchmarks.waiting [--json] [--base COMMIT] [--runs 3] [--first] [COMM
 Seconds by the clock and of the processors (which hardly depend on what else the machine does), to
 the last line of the printed tables and to the end; the least of some runs. --base: the same of
 another commit, its sources in a worktree of their own, turn by turn with these. --first: the run
-that compiles, too. The search alone is timed by ``benchmarks.identification``.
+that compiles, too. Not on Windows. The search alone is timed by ``benchmarks.identification``.
 """
 
 from __future__ import annotations
