@@ -26,7 +26,7 @@ from daq.lookup.models import trust_option
 from daq.progress import Note, Progress, Watch, ignore, warn
 from sysid import ModelError, ProcessModel, SearchSpace
 from sysid.judging.lags import lag_faults
-from sysid.judging.plausibility import implausible
+from sysid.judging.plausibility import implausible, start_faults
 from sysid.problem.copies import shared_samples
 from sysid.problem.data import require_information
 from sysid.problem.faults import DataFault, Part, after_mending, data_faults
@@ -236,6 +236,7 @@ def faults_of(problem: Problem, logs: Split) -> tuple[DataFault, ...]:
         datasets = [log.dataset for log in records_of_part]
         try:
             units += implausible(model, _space(problem), datasets, part)
+            units += start_faults(model, datasets, part)
         except ModelError as error:
             raise ConfigError(str(error)) from None
     late = lag_faults(model, [log.dataset for log in logs[0]])

@@ -1,4 +1,4 @@
-"""Whether records can be of a model at all: units that are a factor off, before any fit.
+"""Whether records can be of a model at all: units a factor off, starts elsewhere, before any fit.
 
 Outputs of which the model says that one is the other's rate of change are compared. And it is
 simulated under a record's inputs with parameters drawn from their ranges: where outputs are far
@@ -14,12 +14,13 @@ from sysid.engine.simulation import BatchSimulator
 from sysid.problem.channels import noise
 from sysid.problem.data import Dataset
 from sysid.problem.faults import DataFault, Part
-from sysid.problem.model import ProcessModel
+from sysid.problem.model import AROUND_FIRST_SAMPLE, ProcessModel, State
 from sysid.problem.space import SearchSpace
 from sysid.time_limit import AT_A_POINT, time_limit
 
 _DRAWS = 32
 _ROWS = 1000  # of a record's beginning that are simulated
+_FAR = 0.25  # of the range of a start, by which a first sample is beyond it
 _BEYOND = 4.0  # times the largest of all draws, which do not reach the ends of their ranges
 
 # What people confuse, as the factor on the numbers.
@@ -111,6 +112,63 @@ def _confusion(ratio: float, low: float, high: float) -> str:
     """The confusion of units nearest to a ratio that mends it; low, high: what it mends it to."""
     factor = min(_FACTORS, key=lambda each: abs(np.log(abs(ratio) / each)))
     return f", as with {_FACTORS[factor]}" if low <= 1.0 / factor <= high else ""
+
+
+def start_faults(
+    model: ProcessModel, records: Sequence[Dataset], part: Part = "training"
+) -> tuple[DataFault, ...]:
+    """Faults of records that begin elsewhere than where their starts are searched.
+
+    >>> from dataclasses import replace
+    >>> from sysid.examples import lag, lag_record
+    >>> model = lag()
+    >>> model = replace(model, states=(replace(model.states[0], initial_range=(5.0, 6.0)),))
+    >>> fault, = start_faults(model, [lag_record()])
+    >>> fault.kind, fault.channel, fault.setting
+    ('start', 'y', 'initial.y=[-0.497, 6]')
+    """
+    return tuple(
+        fault
+        for state in model.states
+        if (fault := _start_fault(model, state, records, part)) is not None
+    )
+
+
+def _start_fault(
+    model: ProcessModel, state: State, records: Sequence[Dataset], part: Part
+) -> DataFault | None:
+    if state.initial_range in (None, AROUND_FIRST_SAMPLE) or state.name not in model.output_names:
+        return None
+    assert state.initial_range is not None
+    place, (low, high) = model.output_names.index(state.name), state.initial_range
+    firsts = np.array([record.outputs[0, place] for record in records])
+    margin = _FAR * (high - low)
+    beyond = (firsts < low - margin) | (firsts > high + margin)
+    if not beyond.any():
+        return None
+    at = int(np.flatnonzero(beyond)[0])
+    reach = 2.0 * margin
+    ends = min(low, firsts.min() - reach), max(high, firsts.max() + reach)
+    wider = f"[{ends[0]:.3g}, {ends[1]:.3g}]"
+    declared = [
+        s.name for s in model.states if s.name not in model.output_names and s.initial_range is None
+    ]
+    hidden = f"; where it moves there, {' and '.join(declared)} as well" if declared else ""
+    return DataFault(
+        "start",
+        "doubt",
+        part,
+        tuple(record.name for record, is_far in zip(records, beyond, strict=True) if is_far),
+        state.name,
+        f"{state.name} begins at {firsts[at]:.3g} {state.unit}, and its start is searched in "
+        f"{low:g} .. {high:g}",
+        "a simulation that begins elsewhere than the log follows it nowhere",
+        f"give its start another range, 'initial: {{{state.name}: {wider}}}'{hidden}",
+        1.0,
+        part == "training",
+        part == "validation",
+        f"initial.{state.name}={wider}",
+    )
 
 
 def _rates(model: ProcessModel, records: Sequence[Dataset], part: Part) -> Iterator[DataFault]:

@@ -15,7 +15,17 @@ from sysid.problem.model import Input, Output, ProcessModel
 Part = Literal["training", "validation"]
 Severity = Literal["doubt", "note"]
 FaultKind = Literal[
-    "clipped", "frozen", "outliers", "coarse", "copy", "still", "constant", "gap", "unit", "lag"
+    "clipped",
+    "frozen",
+    "outliers",
+    "coarse",
+    "copy",
+    "still",
+    "constant",
+    "gap",
+    "unit",
+    "lag",
+    "start",
 ]
 
 Role = Literal["command", "input", "sensor"]

@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import lfilter
 
 from sysid import Dataset, Input, Output, ProcessModel, SearchSpace, State
-from sysid.judging.plausibility import implausible
+from sysid.judging.plausibility import implausible, start_faults
 from sysid.problem.faults import after_mending, data_faults, mended
 from tests.sysid.support import lag
 
@@ -292,3 +292,24 @@ def test_a_plant_that_settles_until_the_next_step_does_not_hang():
     coarse = replace(settled, outputs=np.round(settled.outputs, 3))
     for record in (settled, coarse):
         assert not any(fault.severity == "doubt" for fault in data_faults(model(), [record]))
+
+
+def starting(*ends):
+    """The lag, whose start is searched in a range."""
+    whole = model()
+    return replace(whole, states=(replace(whole.states[0], initial_range=ends),))
+
+
+def test_a_record_that_begins_where_no_start_is_searched_is_named():
+    record = driven(levels(), noise=0.001)
+    at_rest, moving = record.part(0, 500, "from rest"), record.part(100, 500, "later")
+    first = float(moving.outputs[0, 0])
+    assert abs(first) > 0.18
+    (fault,) = start_faults(starting(-0.1, 0.1), [at_rest, moving])
+    assert (fault.kind, fault.channel, fault.records) == ("start", "y", ("later",))
+    assert f"begins at {first:.3g}" in fault.statement
+    low, high = map(float, fault.setting.partition("=")[2].strip("[]").split(","))
+    assert low < min(first, -0.09) and high > max(first, 0.09)
+    assert start_faults(starting(low, high), [at_rest, moving]) == ()
+    assert start_faults(starting(-0.1, 0.1), [at_rest]) == ()
+    assert start_faults(model(), [moving]) == ()
