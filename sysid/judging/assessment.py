@@ -514,7 +514,7 @@ def _untested(
         )
     if findings is None:
         parameters = () if uncertainty is None else uncertainty.parameters
-        ends = [p.name for p in parameters if p.on_bound and not p.why]
+        ends = [p.name for p in parameters if p.pushed and not p.why]
         since = f": {', '.join(ends)} on an end of the range would look like it" if ends else ""
         yield f"What the model may lack was not tested{since}."
 

@@ -94,7 +94,7 @@ def suspected(
     """
     if uncertainty is None:
         return None
-    if any(p.on_bound and not p.why for p in uncertainty.parameters):
+    if any(p.pushed and not p.why for p in uncertainty.parameters):
         runs = [estimator.predict(record) for record in training]
         if np.all(fits(training, runs) > FITTED):
             return None  # what an end of a range leaves looks like something missing

@@ -15,7 +15,7 @@ from benchmarks.stress import tried
 from sysid import BatchSimulator, Dataset, Input, Output, Parameter, ProcessModel, State
 from sysid.gassi import GASSI
 from sysid.judging.disturbed import DisturbedRun
-from sysid.judging.examination import verdict_of
+from sysid.judging.examination import suspected, verdict_of
 from sysid.judging.score_tests import colour_about_mean
 from tests.soak import mostly_soak
 from tests.sysid.reference import simulate
@@ -210,3 +210,15 @@ def test_what_a_search_says_of_ties_and_answers_is_the_same_for_every_seed():
 def test_what_fits_no_function_is_not_good(name):
     outcome = tried(CASES[name], 2)
     assert outcome.verdict.parameters.trust == "limited"
+
+
+@pytest.mark.soak
+def test_an_end_that_the_data_do_not_push_at_hides_nothing():
+    """Friction takes the damping's place: below its low end the damping would change little."""
+    (training,), _ = CASES["Stribeck friction"].records(0)
+    settings = {"ranges": {"B": (1e-4, 1e-3)}, "population": 60, "generations": 12}
+    estimator = GASSI(WITH_FRICTION, **settings).fit(training)
+    found = estimator.uncertainty([training])
+    damping = next(p for p in found.parameters if p.name == "B")
+    assert damping.on_bound and not damping.pushed
+    assert suspected(estimator, found, [training]) is not None
