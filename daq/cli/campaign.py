@@ -67,7 +67,7 @@ def campaign(
 
 
 def _show(result: CampaignResult) -> None:
-    from daq.lookup.models import trust_option
+    from daq.lookup.models import trust_option, without_folders
 
     runs = result.campaign
     print()
@@ -78,14 +78,18 @@ def _show(result: CampaignResult) -> None:
     models = [outcome.run.model for outcome in runs.outcomes]
     units = {output.name: output.unit for model in models for output in model.outputs}
     head += [f"RMSE of {name} [{unit}]" for name, unit in units.items()]
-    rows = [_spread_row(spread, result, list(units)) for spread in runs.spread()]
-    terminal.print_table(title, head, rows, text=["log"])
+    spreads = runs.spread()
+    shown = without_folders(spread.model for spread in spreads)
+    rows = [[shown[spread.model], *_spread_row(spread, result, list(units))] for spread in spreads]
+    terminal.print_table_of_differences(
+        title, head, rows, once=["model", "runs", "within 1 %", "failed"], text=["log"]
+    )
     for problem in dict.fromkeys(f"{o.run.name}: {o.problem}" for o in runs.failed):
         print(f"Failed: {problem}")
     if runs.interrupted:
         print(f"Stopped by Ctrl-C: {len(runs.outcomes)} runs are in the table.")
     for (model, data), path in result.files.items():
-        print(f"Best of {model} on {data}: {path}")
+        print(f"Best of {shown.get(model, model)} on {data}: {path}")
     print(f"All runs with their parameters: {result.table}")
     for (model, _), path in list(result.files.items())[:1]:
         terminal.print_next(f"rig replay LOG --parameters {path}{trust_option(model)}")
@@ -98,4 +102,4 @@ def _spread_row(spread: Spread, result: CampaignResult, outputs: Sequence[str]) 
     counts = [str(spread.agreeing), fit, str(spread.failed)]
     absolute = best.rmse_absolute if best is not None else {}
     in_units = [number(absolute.get(name, math.nan), 3) for name in outputs]
-    return [spread.model, spread.data, str(spread.runs), *errors, *counts, *in_units]
+    return [spread.data, str(spread.runs), *errors, *counts, *in_units]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from daq import notation
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
         Rows,
     )
     from sysid import Campaign
-    from sysid.judging.comparison import Row
+    from sysid.judging.comparison import Comparison, Row
     from sysid.uncertainty import Profile
 
 _STRONG = 0.95  # correlation above which two parameters are named together
@@ -313,14 +314,21 @@ def show_comparison(
 
 
 def _show_comparison(result: ComparisonResult) -> None:
-    comparison = result.comparison
+    from daq.lookup.models import without_folders
+
+    shown = without_folders([row.name for row in result.comparison.rows])
+    comparison = replace(
+        result.comparison,
+        rows=tuple(replace(row, name=shown[row.name]) for row in result.comparison.rows),
+        preferred=shown[result.comparison.preferred],
+    )
     print()
     if comparison.validated:
         title = "Validation, free run: RMSE in parts of max|y| (fit in %)"
         head = ["structure", *result.outputs, "squared errors", "95 % interval", ""]
         rows = [_validation_row(row) for row in comparison.rows]
         terminal.print_table(title, head, rows, text=[""])
-    _print_in_units(result)
+    _print_in_units(result, comparison)
     head = ["structure", "free parameters", "effective", "mean RMSE", "dAIC", "dBIC"]
     terminal.print_table("Training", head, [_training_row(row) for row in comparison.rows])
     terminal.print_text(
@@ -331,19 +339,19 @@ def _show_comparison(result: ComparisonResult) -> None:
     for line in _runs_lines(result.campaign):
         terminal.print_text(line)
     for name, path in result.files.items():
-        print(f"Parameters of {name}: {path}")
+        print(f"Parameters of {shown[name]}: {path}")
     print(f"Comparison: {result.file}")
 
 
-def _print_in_units(result: ComparisonResult) -> None:
+def _print_in_units(result: ComparisonResult, comparison: Comparison) -> None:
     """RMSE of every structure and output, in validation and in training."""
     outputs, number = result.group.problem.model.outputs, terminal.number
-    head, validated = ["structure"], result.comparison.validated
+    head, validated = ["structure"], comparison.validated
     if validated:
         head += [f"{output.name}, validation [{output.unit}]" for output in outputs]
     head += [f"{output.name}, training [{output.unit}]" for output in outputs]
     rows = []
-    for row in result.comparison.rows:
+    for row in comparison.rows:
         tested = row.rmse_absolute.tolist() if validated else []
         values = [*tested, *row.training_rmse_absolute.tolist()]
         rows.append([row.name, *(number(value, 3) for value in values)])

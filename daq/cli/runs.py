@@ -112,17 +112,13 @@ def _list(entries: Sequence[RunEntry], names: Sequence[str], title: str) -> None
         for entry in entries
     ]
     kept = [k for k in range(len(head)) if any(row[k] for row in rows)]
-    if sys.stdout.isatty():
-        if all(map(_is_dated, entries)):
-            kept.remove(1)
-        facts = [k for k in kept[1:] if head[k] not in names]
-        same = [k for k in facts if len({row[k] for row in rows}) == 1]
-        title += "".join(f"; {head[k]} {rows[0][k]}" for k in same)
-        kept = [k for k in kept if k not in same]
+    if sys.stdout.isatty() and all(map(_is_dated, entries)):
+        kept.remove(1)
     texts = [name for name in head if name not in names]
-    terminal.print_table(
-        title, [head[k] for k in kept], [[row[k] for k in kept] for row in rows], text=texts
-    )
+    terminal.print_table_of_differences(
+        title, [head[k] for k in kept], [[row[k] for k in kept] for row in rows],
+        once=texts[1:], text=texts,
+    )  # fmt: skip
 
 
 def _is_dated(entry: RunEntry) -> bool:

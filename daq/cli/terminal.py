@@ -211,6 +211,23 @@ def print_table(
     console.print(blank, end="")
 
 
+def print_table_of_differences(
+    title: str, head: Sequence[str], rows: Sequence[Sequence[str]], once: Sequence[str],
+    text: Sequence[str] = (),
+) -> None:  # fmt: skip
+    """A table; on a terminal, which has little room, without columns of ``once`` that are alike.
+
+    What they are in all rows is said behind the title.
+    """
+    alike: list[int] = []
+    if sys.stdout.isatty():
+        columns = [k for k, name in enumerate(head) if name in once]
+        alike = [k for k in columns if len({row[k] for row in rows}) == 1]
+        title += "".join(f"; {head[k]} {rows[0][k]}" for k in alike)
+    kept = [k for k in range(len(head)) if k not in alike]
+    print_table(title, [head[k] for k in kept], [[row[k] for k in kept] for row in rows], text)
+
+
 def _lines(cells: Iterable[str]) -> list[str]:
     return [line for cell in cells for line in cell.split("\n")]
 

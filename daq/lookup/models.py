@@ -2,7 +2,7 @@
 
 import inspect
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
@@ -74,6 +74,21 @@ def whole_name(name: str, relative_to: Path | None = None) -> str:
         return name
     path = locate(Path(source), "model", relative_to).resolve()
     return f"{path}{name.removeprefix(source)}"
+
+
+def without_folders(names: Iterable[str]) -> dict[str, str]:
+    """What to show of each name: a file without its folder, where that still tells them apart.
+
+    >>> without_folders(["actuator", "/home/ann/lag.py:model"])["/home/ann/lag.py:model"]
+    'lag.py:model'
+    """
+    short = {name: name.removeprefix(_folder(name)) for name in names}
+    return short if len(set(short.values())) == len(short) else {name: name for name in short}
+
+
+def _folder(name: str) -> str:
+    source, attribute, _ = name_parts(name)
+    return "" if attribute is None else source.removesuffix(Path(source).name)
 
 
 def trust_option(name: str) -> str:
