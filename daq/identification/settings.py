@@ -85,8 +85,8 @@ def problems_of(
     doubts: Sequence[Mistake] = ()
     if check.mistakes(file, IdentificationConfig, file.content):
         # Terms give a model names of their own, of which nothing is known until all can be read.
-        known = [] if file.content.get("terms") else [model for model, _ in declared]
-        doubts = [*unconverted, *(_unknown_names(file, known) if known else ())]
+        plain = [] if file.content.get("terms") else [model for model, _ in declared]
+        doubts = [*unconverted, *(_unknown_names(file, plain) if plain else ())]
     settings = check.validate(file, IdentificationConfig, others=doubts)
     selection = Selection.under(settings, file)
     for model, name in declared:
