@@ -21,7 +21,8 @@ MEASURED = ("current_motor", "current_brake", "torque", "theta", "omega")
 _STEP, _HOLD, _STEPS = 0.2, 0.05, 4  # of the commands: in parts of their ranges, s, number
 _WELL = 0.8  # of the draws, whose integration is to be as exact as that
 _FOLLOWED, _MINORITY = 5, 0.5  # draws that are compared, and their share that may go astray
-_ASTRAY = 0.5  # of the noise, by which a model may err where it is right
+_ASTRAY = 0.05  # of the noise, by which a model may err where it is right
+_BETWEEN = 0.5  # of a speed's noise or of what its edges make, by which it may err in that
 _ACCURACY = 1e-2  # of the plant, beside which margins are wide
 
 
@@ -72,7 +73,7 @@ class PlantBench:
         self._from = [model.parameter_names.index(name) for name in shared]
         self._to = [plant.parameter_names.index(name) for name in shared]
         self._choosing = Lock()
-        self._n_steps: int | None = None
+        self._steps_of: dict[bytes, IntArray] = {}
 
     def records(
         self, inputs: FloatArray, dt: float, vectors: FloatArray
@@ -84,10 +85,16 @@ class PlantBench:
         """
         if not self._commands_allowed(inputs, dt):
             return None
-        signals = self.signals(inputs, dt, vectors)
-        if not self._within_limits(inputs, dt, signals):
-            return None
-        if self._leads_astray(inputs, dt, vectors[:_FOLLOWED]):
+        steps = self._steps(dt, vectors)
+        signals: dict[str, FloatArray] = {}
+        # Those that are soon computed first: they refuse most of what is refused.
+        for places in _by_steps(steps):
+            some = self._run(inputs, dt, vectors[places], int(steps[places].max()))
+            if not self._within_limits(inputs, dt, some):
+                return None
+            for name, values in some.items():
+                signals.setdefault(name, np.empty((len(vectors), len(inputs))))[places] = values
+        if self._leads_astray(inputs, dt, vectors, steps):
             return None
         return [self._record(inputs, dt, signals, k) for k in range(len(vectors))]
 
@@ -96,12 +103,22 @@ class PlantBench:
 
         vectors: (n, n_parameters), of the model's parameters.
         """
-        plant = self._simulator.model
-        values = np.tile(plant.nominal, (len(vectors), 1))
+        return self._run(inputs, dt, vectors, int(self._steps(dt, vectors).max()))
+
+    def _run(
+        self, inputs: FloatArray, dt: float, vectors: FloatArray, n_steps: int
+    ) -> dict[str, FloatArray]:
+        """As ``signals``, by so many integration steps per sample."""
+        values, record = self._of_plant(vectors), self._driven(inputs, dt)
+        outputs = self._simulator.trajectories(values, record, n_steps)
+        names = self._simulator.model.output_names
+        return {name: outputs[:, :, j] for j, name in enumerate(names)}
+
+    def _of_plant(self, vectors: FloatArray) -> FloatArray:
+        """The plant's parameters at vectors of the model's, one for each."""
+        values: FloatArray = np.tile(self._simulator.model.nominal, (len(vectors), 1))
         values[:, self._to] = vectors[:, self._from]
-        record = self._driven(inputs, dt)
-        outputs = self._simulator.trajectories(values, record, self._steps(dt, values))
-        return {name: outputs[:, :, j] for j, name in enumerate(plant.output_names)}
+        return values
 
     def _driven(self, inputs: FloatArray, dt: float) -> Dataset:
         """A run of the plant, of which nothing was measured."""
@@ -110,22 +127,25 @@ class PlantBench:
         driven[:, [plant.input_names.index(name) for name in COMMANDS]] = inputs
         return Dataset(driven, np.full((len(inputs), len(plant.outputs)), np.nan), dt)
 
-    def _steps(self, dt: float, values: FloatArray) -> int:
-        """Integration steps per sample of all runs.
+    def _steps(self, dt: float, vectors: FloatArray) -> IntArray:
+        """Integration steps per sample of each of the vectors, (n,).
 
-        As many as most of the first parameters (n, n_parameters) need for steps of the commands;
-        with those that need more, runs are coarse, or blow up and count as beyond limits.
+        As many as it needs for steps of the commands, at most as many as most of them do: the
+        runs of others are coarse, or blow up and count as beyond limits.
         """
+        key = vectors.tobytes()
         with self._choosing:
-            if self._n_steps is None:
+            if key not in self._steps_of:
                 ranges = self._rig.limits.command
                 ends = np.array([ranges.motor, ranges.brake]).T
                 inputs = np.repeat(
                     np.tile(_STEP * ends, (_STEPS, 1)), round(_HOLD / dt) + 1, axis=0
                 )
-                steps = self._simulator.steps_of_each(values, self._driven(inputs, dt))
-                self._n_steps = int(np.quantile(steps, _WELL, method="higher"))
-            return self._n_steps
+                values, record = self._of_plant(vectors), self._driven(inputs, dt)
+                steps = self._simulator.steps_of_each(values, record)
+                most = int(np.quantile(steps, _WELL, method="higher"))
+                self._steps_of[key] = np.minimum(steps, most)
+            return self._steps_of[key]
 
     def _commands_allowed(self, inputs: FloatArray, dt: float) -> bool:
         plan = Plan(len(inputs), inputs.min(axis=0), inputs.max(axis=0), inputs)
@@ -135,40 +155,50 @@ class PlantBench:
             return False
         return True
 
-    def _leads_astray(self, inputs: FloatArray, dt: float, vectors: FloatArray) -> bool:
-        """Whether the plant does what the model does not, beyond half the noise.
+    def _leads_astray(
+        self, inputs: FloatArray, dt: float, vectors: FloatArray, steps: IntArray
+    ) -> bool:
+        """Whether the plant does what the model does not, beyond a part of the noise.
 
-        With the likeliest vector, or more than half of them; at commands that are larger by the
-        margin, for an amplifier ends at once.
+        With the likeliest vector, or more than half of some that are soon computed; at commands
+        that are larger by the margin, for an amplifier ends at once.
         """
         larger = self._scale * inputs
-        signals = self.signals(larger, dt, vectors)
+        others = 1 + np.argsort(steps[1:], kind="stable")[: _FOLLOWED - 1]
         astray = 0
-        for k in range(len(vectors)):
-            record = self._record(larger, dt, signals, k)
-            astray += not self._follows(record, vectors[k], {n: s[k] for n, s in signals.items()})
-            if astray and (k == 0 or astray > _MINORITY * len(vectors)):
-                return True
+        for places in (np.zeros(1, dtype=np.int64), others):
+            n_steps = int(steps[places].max(initial=1))
+            signals = self._run(larger, dt, vectors[places], n_steps)
+            for k, place in enumerate(places):
+                record, of_it = (
+                    self._record(larger, dt, signals, k),
+                    {n: s[k] for n, s in signals.items()},
+                )
+                astray += not self._follows(record, vectors[place], of_it, n_steps)
+                if astray and (place == 0 or astray > _MINORITY * (1 + len(others))):
+                    return True
         return False
 
     def _follows(
-        self, record: Dataset, vector: FloatArray, signals: Mapping[str, FloatArray]
+        self,
+        record: Dataset,
+        vector: FloatArray,
+        signals: Mapping[str, FloatArray],
+        n_steps: int,
     ) -> bool:
-        """Whether the model does what the plant does, to within the noise of its outputs."""
+        """Whether the model does what the plant does, to within part of the noise."""
         simulator = self._model_simulator
         # By as many steps, so that errors of the integration are alike.
-        outputs = simulator.trajectories(vector[None], record, self._n_steps, self._starts)[0]
-        errors = {
-            name: outputs[:, j] - signals[name]
+        outputs = simulator.trajectories(vector[None], record, n_steps, self._starts)[0]
+        most = {name: _ASTRAY * deviation for name, deviation in self._noise.items()}
+        if SPEED in self._noise:
+            # The torque between its samples is not known; it moves a speed, and no parameter.
+            edges = speed_noise(self._rig, 1.0 / record.dt) if self._timed else 0.0
+            most[SPEED] = _BETWEEN * max(self._noise[SPEED], edges)
+        return all(
+            float(np.sqrt(np.mean((outputs[:, j] - signals[name]) ** 2))) <= most[name]
             for j, name in enumerate(simulator.model.output_names)
             if name in self._noise and name in signals
-        }
-        # Noise of a speed that is timed is less than what its edges' instants make.
-        coarse = speed_noise(self._rig, 1.0 / record.dt) if self._timed else 0.0
-        most = {**self._noise, SPEED: max(self._noise.get(SPEED, 0.0), coarse)}
-        return all(
-            float(np.sqrt(np.mean(error**2))) <= _ASTRAY * most[name]
-            for name, error in errors.items()
         )
 
     def _within_limits(
@@ -229,3 +259,9 @@ def _wound(samples: Samples, turns: float) -> Samples:
     ends = {name: values[:2] * 0 for name, values in vars(samples).items()}
     angle = np.array([0.0, turns * TURN])
     return Samples(**{**ends, "tick": samples.tick[:2], "time": samples.time[:2], "theta": angle})
+
+
+def _by_steps(steps: IntArray) -> list[IntArray]:
+    """Places of the vectors that half as many steps as the most do for, and of the others."""
+    few = 2 * steps <= steps.max()
+    return [places for places in (np.flatnonzero(few), np.flatnonzero(~few)) if len(places)]
