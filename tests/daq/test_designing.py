@@ -107,6 +107,18 @@ def test_an_amplifier_is_kept_from_the_end_of_its_supply_by_the_margin(volts, ma
         assert careful.records(step, 1.0 / 800.0, of_most) is None
 
 
+@pytest.mark.parametrize(("frequency", "passes"), [(100.0, False), (4.0, True)])
+def test_a_shaft_that_turns_round_every_few_samples_tells_edges_no_speed(frequency, passes):
+    config, device = load_rig("simulated.yaml")
+    model, noise = actuator(parameters="rig"), {"current_motor": 0.005, "omega": 0.1}
+    time = np.arange(400) / 800.0
+    shaken = np.column_stack([0.1 + 0.9 * np.sin(2.0 * np.pi * frequency * time), np.zeros(400)])
+    for timed in (False, True):
+        careful = PlantBench(model, device.plant_model(5.0), config, 5.0, 0.1, noise, timed)
+        records = careful.records(shaken, 1.0 / 800.0, model.nominal[None])
+        assert (records is not None) == (passes or not timed)
+
+
 def test_the_instants_of_edges_err_as_a_log_shows(tmp_path):
     log = record("prbs.yaml", options={"seed": 1}, out=tmp_path).frame
     tick, theta, omega = (log[name].to_numpy() for name in ("tick", "theta", "omega"))

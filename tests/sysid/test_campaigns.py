@@ -4,6 +4,7 @@ import copy
 import importlib
 import os
 import shutil
+import signal
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -242,6 +243,29 @@ def test_every_run_of_a_lost_worker_is_accounted_for():
     found = campaign(combinations({"deadly": model}, {"a": [record()]}, (0, 1), SETTINGS), n_jobs=2)
     assert len(found.failed) == 2 and not found.interrupted
     assert "worker" in found.failed[0].problem
+
+
+@pytest.mark.soak
+@pytest.mark.filterwarnings("ignore")  # of dask, that a worker has gone
+def test_a_worker_of_a_cluster_that_is_killed_costs_no_run(serial):
+    distributed = pytest.importorskip("distributed", reason="dask.distributed is not installed")
+    todo, found = serial
+    killed = []
+    with (
+        distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, dashboard_address=":0"
+        ) as cluster,
+        distributed.Client(cluster),
+        joblib.parallel_config(backend="dask"),
+    ):
+
+        def kill(_):
+            if not killed:
+                killed.append(cluster.workers[0].process.pid)
+                os.kill(killed[0], signal.SIGKILL)
+
+        same(found, campaign(todo, on_outcome=kill))
+    assert killed
 
 
 @pytest.mark.soak
