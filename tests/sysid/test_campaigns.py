@@ -246,6 +246,7 @@ def test_every_run_of_a_lost_worker_is_accounted_for():
 
 
 @pytest.mark.soak
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no SIGKILL here")
 @pytest.mark.filterwarnings("ignore")  # of dask, that a worker has gone
 def test_a_worker_of_a_cluster_that_is_killed_costs_no_run(serial):
     distributed = pytest.importorskip("distributed", reason="dask.distributed is not installed")
