@@ -91,10 +91,10 @@ class PlantBench:
         signals: dict[str, FloatArray] = {}
         # Those that are soon computed first: they refuse most of what is refused.
         for places in _by_steps(steps):
-            some = self._run(inputs, dt, vectors[places], int(steps[places].max()))
-            if not self._within_limits(inputs, dt, some):
+            measured = self._run(inputs, dt, vectors[places], int(steps[places].max()))
+            if not self._within_limits(inputs, dt, measured):
                 return None
-            for name, values in some.items():
+            for name, values in measured.items():
                 signals.setdefault(name, np.empty((len(vectors), len(inputs))))[places] = values
         if self._leads_astray(inputs, dt, vectors, steps):
             return None
