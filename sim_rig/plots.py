@@ -172,4 +172,6 @@ class _DrivenShaft:
     def _torque(self, x: Mapping[str, Any]) -> FloatArray:
         """The torque that the load has to apply to keep the speed's derivative zero."""
         free, loaded = self._slope("omega", x), self._slope("omega", x, 1.0)
-        return -free / (loaded - free)
+        change = loaded - free
+        # Of draws whose friction outweighs any load the change is lost to rounding.
+        return np.divide(-free, change, out=np.full_like(change, np.nan), where=change != 0.0)
