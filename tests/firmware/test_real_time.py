@@ -108,7 +108,7 @@ def test_an_identification_on_it_is_that_of_the_simulated_rig(elf, tmp_path):
     recorded(experiment, "--rig", simulated, folder=tmp_path / "direct")
     here = identified(tmp_path / "direct")
     both = there.keys() & here.keys()
-    assert len(both) > 5
+    assert len(both) >= 5
     apart = {
         name: (there[name], here[name]) for name in both if not overlap(there[name], here[name])
     }
@@ -148,7 +148,10 @@ def recorded(*words, folder):
 def identified(folder):
     """Intervals of the parameters that have one, by name, of the one log in a folder."""
     (log,) = folder.glob("runs/*/log.csv")
-    done = rig("identify", log, "--out", folder, cwd=folder, timeout=600)
+    # The motor's two lags may change places: two answers, of which a known L_m tells one.
+    settings = write_yaml(folder / "id.yaml", {"model": "actuator", "fixed": {"L_m": 0.0013}})
+    words = ("identify", log, "--config", settings, "--out", folder)
+    done = rig(*words, cwd=folder, timeout=600)
     assert done.returncode == 0, done.stderr
     (file,) = folder.glob("**/parameters.yaml")
     rows = yaml.safe_load(file.read_text())["parameters"]
