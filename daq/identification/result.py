@@ -213,11 +213,20 @@ class Identification(Shown):
             return NextStep(
                 "Identify again without what was found wrong with data or ranges:", command
             )
-        if self.verdict.predicted.trust == "poor" and not self.interrupted:
+        if self._searched_in_vain and not self.interrupted:
             settings = self.problem.settings
             longer = {"seed": settings.seed + 1, "population": 2 * settings.population}
             return NextStep("Search longer, and from elsewhere:", self._again(**longer))
         return None
+
+    @property
+    def _searched_in_vain(self) -> bool:
+        """Whether what was found can hardly be the plant's, for all that is known of the data."""
+        from sysid.judging.assessment import coloured_innovations
+
+        if self.verdict.predicted.trust == "poor":
+            return True
+        return self.uncertainty is not None and bool(coloured_innovations(self.uncertainty).any())
 
     def _again(self, *settings: str, **options: Any) -> str:
         """The command of this identification with other settings and options."""
@@ -256,7 +265,7 @@ class Identification(Shown):
             "data_faults": [_fault(fault) for fault in self.faults],
             "parameters": {p.name: _parameter(self, p) for p in self.model.parameters},
             **({"initial_states": starts} if any(starts) else {}),
-            **(_uncertainty(self.uncertainty) if self.uncertainty is not None else {}),
+            **_uncertainty(self.uncertainty, self.model.output_names),
             **({"profiles": profiles} if profiles else {}),
             "error": {
                 "value": estimator.error_,
@@ -438,7 +447,9 @@ def _numbers(interval: tuple[float | None, float | None] | None) -> tuple[float,
     return float("nan") if low is None else low, float("nan") if high is None else high
 
 
-def _uncertainty(uncertainty: Uncertainty) -> dict[str, Any]:
+def _uncertainty(uncertainty: Uncertainty | None, outputs: Sequence[str]) -> dict[str, Any]:
+    if uncertainty is None:
+        return {}
     determined = {k: e.name for k, e in enumerate(uncertainty.parameters) if not e.why}
     correlation = uncertainty.correlation()
     pairs = [
@@ -453,6 +464,10 @@ def _uncertainty(uncertainty: Uncertainty) -> dict[str, Any]:
         }
         for rival in uncertainty.rivals
     ]
+    succession = {  # none without a filter
+        name: round(float(value), 3)
+        for name, value in zip(outputs, uncertainty.succession, strict=False)
+    }
     return {
         "determined_directions": uncertainty.rank,
         "singular_values": [float(f"{value:.4g}") for value in uncertainty.singular_values],
@@ -475,6 +490,7 @@ def _uncertainty(uncertainty: Uncertainty) -> dict[str, Any]:
             "widening": round(uncertainty.simultaneous, 3),
         },
         "disagreement": round(uncertainty.disagreement, 3),
+        **({"succession": succession} if succession else {}),
         "covariance": _covariance(uncertainty),
     }
 

@@ -49,6 +49,7 @@ _ABOVE_NOISE, _BY_CHANCE = 1.25, 0.01
 # Correlation of two outputs' residuals that is no sensor's; rank correlation of their size with an
 # output's rate of change; how far apart parameters of parts of the data are, in parts of chance.
 _SHARED, _BY_SPEED, _DISAGREEING = 0.3, 0.2, 1.5
+_SUCCESSIVE = 0.3  # correlation of an innovation with the one before
 _ROUNDING = 2e-4  # of an output's deviation, below which errors may be those of a simulation
 
 
@@ -191,6 +192,8 @@ def judge(
             light += _patterns(model, (*training, *validation))
         if not light and uncertainty is not None:
             light += _disagreement(uncertainty, len(training))
+        if uncertainty is not None:
+            light += _filter_errors(model, uncertainty)
     if uncertainty is None:
         light.append("The parameters have no intervals, so how surely each is known is not known.")
     else:
@@ -434,6 +437,26 @@ def _disagreement(uncertainty: Uncertainty, logs: int) -> Iterator[str]:
         yield (
             f"{parts} want parameters of their own, {ratio:.1f} times as far apart as noise "
             "explains: something is missing that is not the same throughout."
+        )
+
+
+def coloured_innovations(uncertainty: Uncertainty) -> BoolArray:
+    """Outputs whose innovations follow one another, (n_outputs,); empty where there was no filter.
+
+    Those of the right parameters of a right model are white (Kailath, "An innovations approach to
+    least-squares estimation", IEEE Transactions on Automatic Control 13, 1968).
+    """
+    coloured: BoolArray = np.abs(uncertainty.succession) > _SUCCESSIVE
+    return coloured
+
+
+def _filter_errors(model: ProcessModel, uncertainty: Uncertainty) -> Iterator[str]:
+    """Reason: a filter whose errors it could have foreseen."""
+    for j in np.flatnonzero(coloured_innovations(uncertainty)):
+        yield (
+            f"The filter's errors of {model.output_names[j]} follow one another (correlation "
+            f"{uncertainty.succession[j]:.2f} of each with the one before), which those of the "
+            "right parameters do not: the search has not found them, or the model lacks something."
         )
 
 

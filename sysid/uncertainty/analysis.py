@@ -14,9 +14,11 @@ from typing import Literal
 import numpy as np
 
 from sysid.arrays import BoolArray, FloatArray
+from sysid.fitting.innovations import Innovations
 from sysid.fitting.objective import Objective
 from sysid.problem.expressions import measuring_effort
 from sysid.problem.given import covariance_factor
+from sysid.uncertainty.colour import successive_correlation
 from sysid.uncertainty.covariance import covariance
 from sysid.uncertainty.estimate import Z95, Estimate, Invariant, Why
 from sysid.uncertainty.profile import Tracer, traced
@@ -68,7 +70,9 @@ class Uncertainty:
     simultaneous: factor by which to widen them for that to be 95 %. disagreement: variance of the
     estimates from single logs (or parts of the only one) in parts of what their noise makes, 1
     where that is chance. factor: (n, n_free), independent changes of the parameters, one standard
-    deviation each, and a unit of every tie: what a later stage is ``Given``.
+    deviation each, and a unit of every tie: what a later stage is ``Given``. succession:
+    (n_outputs,), correlation of each innovation with the one before where a filter's were
+    minimised, which are white at the right parameters of the right model; empty elsewhere.
     """
 
     parameters: tuple[Estimate, ...]
@@ -81,6 +85,7 @@ class Uncertainty:
     simultaneous: float = 1.0
     disagreement: float = 1.0
     factor: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    succession: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def correlation(self) -> FloatArray:
         """Correlation of the free parameters, NaN where there is no variance."""
@@ -145,9 +150,17 @@ def uncertainty(
         tuple(rival for rival in minima if any(e.excludes(rival.values) for e in apart)),
         disagreement=spread.ratio if spread else 1.0,
         factor=analysis.factor(),
+        succession=_succession(local),
     )
     joint, simultaneous = analysis.together([e.name for e in result.determined()])
     return replace(result, joint=joint, simultaneous=simultaneous)
+
+
+def _succession(local: Sensitivity) -> FloatArray:
+    criterion = local.criterion
+    if isinstance(criterion, Innovations) and criterion.corrects:
+        return successive_correlation(local.residual, local.seen, local.lengths)
+    return np.zeros(0)
 
 
 @dataclass(frozen=True)

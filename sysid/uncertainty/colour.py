@@ -16,6 +16,7 @@ from scipy.linalg import lapack
 from sysid.arrays import BoolArray, FloatArray
 
 _LARGEST_ORDER = 12
+_BY_CHANCE = 4.0  # standard deviations of a correlation, to which it may come by chance
 
 
 @dataclass(frozen=True)
@@ -60,6 +61,29 @@ def record_rows(lengths: Iterable[int]) -> list[slice]:
     """Rows of each record, of records of these lengths one after another."""
     ends = [0, *itertools.accumulate(lengths)]
     return [slice(begin, end) for begin, end in itertools.pairwise(ends)]
+
+
+def successive_correlation(
+    residual: FloatArray, seen: BoolArray, lengths: Sequence[int]
+) -> FloatArray:
+    """Correlation of each residual with the one before, (q,), 0 where chance explains it.
+
+    residual, seen: (n, q), of records of the given lengths; what was not measured is left out, so
+    that a residual may come before the next by more than a sample.
+
+    >>> wave = np.cos(0.1 * np.arange(1000.0))[:, None]
+    >>> successive_correlation(wave, np.full((1000, 1), True), [1000]).round(3)
+    array([0.993])
+    """
+    products, squares = np.zeros(residual.shape[1]), np.zeros(residual.shape[1])
+    for rows in record_rows(lengths):
+        for j, (errors, measured) in enumerate(zip(residual[rows].T, seen[rows].T, strict=True)):
+            e = errors[measured]
+            products[j] += e[1:] @ e[:-1]
+            squares[j] += e @ e
+    correlation = np.divide(products, squares, out=np.zeros_like(products), where=squares > 0.0)
+    by_chance = _BY_CHANCE / np.sqrt(np.maximum(seen.sum(axis=0), 1))
+    return np.where(np.abs(correlation) > by_chance, correlation, 0.0)
 
 
 def score_covariance(

@@ -457,3 +457,10 @@ def test_parts_of_a_log_that_want_their_own_parameters_make_them_doubtful():
     (reason,) = verdict(uncertainty=apart).parameters.reasons
     assert reason.startswith("Parts of the log want parameters of their own, 3.0 times")
     assert verdict(uncertainty=replace(apart, disagreement=2.0)).trust == "good"
+
+
+def test_a_filter_whose_errors_it_could_foresee_makes_parameters_doubtful():
+    coloured = replace(told(""), succession=np.array([0.1, -0.45]))
+    (reason,) = verdict(uncertainty=coloured).parameters.reasons
+    assert reason.startswith("The filter's errors of current follow one another (correlation -0.45")
+    assert verdict(uncertainty=replace(coloured, succession=np.array([0.1, 0.2]))).trust == "good"

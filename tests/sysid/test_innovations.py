@@ -25,6 +25,7 @@ from sysid import (
 from sysid.fitting.innovations import Innovations
 from sysid.fitting.objective import Objective
 from sysid.gassi.likelihood import Optimum, better_around, noisy_fit, towards
+from sysid.uncertainty import uncertainty
 from sysid.uncertainty.sensitivity import sensitivity
 from tests.sysid.support import lag, linear_response, prbs
 
@@ -320,6 +321,22 @@ def test_where_noise_explains_all_of_a_free_run_a_filter_takes_over():
     assert fit.parameters_["gain"] == pytest.approx(GAIN, rel=0.01)
     estimates = fit.uncertainty(record).parameters
     assert all(e.low < truth < e.high for e, truth in zip(estimates, (GAIN, TAU), strict=True))
+
+
+@pytest.mark.parametrize("share", [1.0, 0.5])
+def test_innovations_of_wrong_parameters_follow_one_another(share):
+    record = next(noisy_records(1))
+    objective = Objective(BatchSimulator(lag(), accuracy=1e-6), SearchSpace.of(lag()), [record])
+    chromosome = np.array([share * GAIN, TAU])
+    fitted = Innovations.starting(objective, chromosome, corrects=True)
+    (succession,) = uncertainty(fitted, chromosome).succession
+    innovations = fitted.residuals(chromosome[None], [8]).values[1:, 0, 0]
+    lagged = np.corrcoef(innovations[1:], innovations[:-1])[0, 1]
+    if share == 1.0:
+        assert succession == 0.0 and abs(lagged) < 0.15
+    else:
+        assert succession == pytest.approx(lagged, abs=0.02) and succession > 0.8
+    assert uncertainty(objective, chromosome).succession.size == 0
 
 
 def test_a_filters_minimum_is_sought_around_that_of_free_runs():
