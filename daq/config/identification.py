@@ -255,6 +255,12 @@ class Signals(Section):
     terms: list[TermSetting] = Field(
         default_factory=list,
         description="functions that are added to the model's equations, such as dry friction",
+        examples=[
+            [
+                {"equation": "omega", "of": "omega", "shape": "sign"}
+                | {"scale": 0.05, "range": [-500.0, 0.0]}
+            ]
+        ],
     )
 
     outputs: list[str] = Field(
