@@ -252,17 +252,6 @@ class TermSetting(Section):
 class Signals(Section):
     """How a model is used where not as it declares."""
 
-    terms: list[TermSetting] = Field(
-        default_factory=list,
-        description="functions that are added to the model's equations, such as dry friction",
-        examples=[
-            [
-                {"equation": "omega", "of": "omega", "shape": "sign"}
-                | {"scale": 0.05, "range": [-500.0, 0.0]}
-            ]
-        ],
-    )
-
     outputs: list[str] = Field(
         default_factory=list,
         description="outputs or states of the model that count; default its own outputs",
@@ -277,6 +266,16 @@ class Signals(Section):
         default_factory=dict,
         description="how inputs run between samples: held (zoh), linear (foh), spline",
         examples=[{"torque": "foh"}],
+    )
+    terms: list[TermSetting] = Field(
+        default_factory=list,
+        description="functions that are added to the model's equations, such as dry friction",
+        examples=[
+            [
+                {"equation": "omega", "of": "omega", "shape": "sign"}
+                | {"scale": 0.05, "range": [-500.0, 0.0]}
+            ]
+        ],
     )
 
 
