@@ -118,7 +118,7 @@ def _lateness(wakes: int) -> list[float]:
 
 def _late_text(late: Sequence[float]) -> str:
     most = late[min(int(0.999 * len(late)), len(late) - 1)]
-    return f"{1e3 * most:.2f} ms (p99.9), {1e3 * late[-1]:.1f} ms (worst)"
+    return f"{1e3 * most:.2f} ms (p99.9), {1e3 * late[-1]:.2f} ms (worst)"
 
 
 def _granted(run: RealTime, name: str, subject: str, line: str) -> Check:
