@@ -35,10 +35,7 @@ def remedies(
     ('delay.y=0.004',)
     """
     of_faults = [fault.setting for fault in faults if fault.severity == "doubt" and fault.setting]
-    changes: dict[str, str] = {}
-    for setting in of_faults:
-        key, _, value = setting.partition("=")
-        changes[key] = value
+    changes: dict[str, str] = dict(setting.split("=", 1) for setting in of_faults)
     lags = any(fault.kind == "lag" for fault in faults)  # which delays that were found are as well
     of_all_logs = [f for f in findings if f.name in channels and not (lags and f.kind == "delay")]
     changes |= dict(_of_channels(settings, of_all_logs))

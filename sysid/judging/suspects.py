@@ -31,13 +31,8 @@ _LITTLE = 0.1  # of a sample: a delay that is tested
 _PROBE = 1e-3  # part of a parameter that tells how rates follow it
 _PERIODS = (1, 2, 3, 4)  # of a disturbance that nobody measured, in a record
 _POINTS = 50  # at which an equation is asked for what it depends on
-_STANDSTILL = (
-    0.02,
-    0.04,
-    0.08,
-    0.16,
-    0.32,
-)  # Stribeck speeds that are tried, in parts of the largest speed
+# Stribeck speeds that are tried, in parts of the largest speed.
+_STANDSTILL = (0.02, 0.04, 0.08, 0.16, 0.32)
 _STICTION = 1e-3  # of a signal's largest value, below which a sign is not a jump
 _ROUNDED = 0.03  # the same where it is tested: a wrong run passes zero a little early or late
 
