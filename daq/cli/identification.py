@@ -80,15 +80,14 @@ def _show(result: Identification) -> None:
 
 
 def _show_next(result: Identification) -> None:
-    if result.next_step is not None:
-        terminal.print_next(result.next_step.command)
-        return
+    step = result.next_step
+    if step is not None:
+        terminal.print_text(step.purpose)
     mapping = result.problem.mapping
     columns = f" --config {mapping.file.path}" if mapping is not None else ""
     log = (*result.validation, *result.training)[0].log.path
-    terminal.print_next(
-        f"rig replay {log} --parameters {result.parameters_file}{columns}{result.trust_option}"
-    )
+    replay = f"rig replay {log} --parameters {result.parameters_file}{columns}{result.trust_option}"
+    terminal.print_next(*([step.command] if step is not None else []), replay)
 
 
 def _show_parameters(result: Identification) -> None:

@@ -16,6 +16,7 @@ import yaml
 
 from daq.config.identification import Signals, TermSetting
 from daq.files import make_folder, write_whole
+from daq.identification.further_runs import design_command, hardly_known, knowledge
 from daq.identification.records import LoggedRecord
 from daq.identification.remedies import remedies
 from daq.identification.request import PARAMETERS, resume_command
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from sysid.uncertainty import Estimate, Profile, Uncertainty
 
 
+_NOT_OF_DESIGNS = {"outputs", "terms"}  # settings that change the model, and stand in no result
 _RMSE = "mean over outputs of the RMSE on outputs normalised by max|y|"
 _CEGA = "mean over outputs of squares by range, weighed by the size of the velocity (4.6)"
 
@@ -217,7 +219,24 @@ class Identification(Shown):
             settings = self.problem.settings
             longer = {"seed": settings.seed + 1, "population": 2 * settings.population}
             return NextStep("Search longer, and from elsewhere:", self._again(**longer))
-        return None
+        return None if self.interrupted else self._further_runs
+
+    @property
+    def _further_runs(self) -> NextStep | None:
+        """Runs that tell what these data hardly do; None for nothing, and without a known rig."""
+        wide = [] if self.uncertainty is None else hardly_known(self.uncertainty)
+        typed = {s.partition("=")[0] for s in self.problem.request.settings}
+        if not wide or self.folder is None or typed & _NOT_OF_DESIGNS:
+            return None
+        request, model = self.problem.request, self.problem.model_name
+        more = [] if request.config is None else ["--config", request.config]
+        more += ["--model", model] if self.trust_option else []  # named, it needs no trust
+        logs = [fitted.log.path for fitted in self.training]
+        command = design_command(self.folder, logs, more)
+        if command is None:
+            return None
+        purpose = f"{knowledge(wide)}. Runs that would tell more, and how narrowly, finds:"
+        return NextStep(purpose, command)
 
     @property
     def _searched_in_vain(self) -> bool:

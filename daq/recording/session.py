@@ -37,7 +37,8 @@ _ACTIVITIES = {
 class Session:
     """An experiment and the rig it is for, both checked; plan: what the experiment will do.
 
-    validation: the same experiment as its ``validation`` section changes it.
+    validation: the same experiment as its ``validation`` section changes it. rig_file: of the rig,
+    as it is typed.
     """
 
     loaded: LoadedExperiment
@@ -45,6 +46,7 @@ class Session:
     rig: RigConfig
     device: Device
     plan: Plan
+    rig_file: str
 
     def noting(self, notes: Iterable[str]) -> Session:
         """The same with notes as they are typed, over those of its file. Raises ConfigError."""
@@ -58,11 +60,11 @@ class Session:
         Raises DeviceError, InterlockError, RunError, KeyboardInterrupt or Terminated, whose notes
         say whether the outputs were read as zero then.
         """
-        run = _run(self.loaded, self.rig, self.device, out, watch)
+        run = _run(self.loaded, self.rig, self.device, out, watch, self.rig_file)
         findings = conclude_or_warn(self.loaded.experiment, run.folder, watch)
         second = None
         if validation and self.validation is not None:
-            second = _run(self.validation, self.rig, self.device, out, watch)
+            second = _run(self.validation, self.rig, self.device, out, watch, self.rig_file)
         doubts = [doubt for each in (run, second) if each for doubt in each.doubts]
         doubts += currents.notes(run.folder / LOG_NAME, self.rig)
         return SessionResult(run, second, findings, doubts)
@@ -98,7 +100,7 @@ def open_session(
     # Checked even where it will not run: a mistake in the file is best heard of early.
     validation = loaded.validation()
     runs = [run for run in (loaded, validation) if run is not None]
-    return Session(loaded, validation, config, device, _plan(runs, config, name))
+    return Session(loaded, validation, config, device, _plan(runs, config, name), name)
 
 
 def record(
@@ -134,7 +136,7 @@ def record(
     name = str(rig or rig_for(str(experiment), watch))
     config, device = load_rig(name, options, watch)
     _plan([loaded], config, name)
-    return load(_run(loaded, config, device, Path(out), watch).folder)
+    return load(_run(loaded, config, device, Path(out), watch, name).folder)
 
 
 def _noting(loaded: LoadedExperiment, notes: list[str]) -> LoadedExperiment:
@@ -161,7 +163,12 @@ def _require_port(config: RigConfig, rig: str) -> None:
 
 
 def _run(
-    loaded: LoadedExperiment, rig: RigConfig, device: Device, out: Path, watch: Watch
+    loaded: LoadedExperiment,
+    rig: RigConfig,
+    device: Device,
+    out: Path,
+    watch: Watch,
+    rig_file: str,
 ) -> RunResult:
     watch(Started(f"{loaded.name} on {rig.name}"))
 
@@ -173,6 +180,6 @@ def _run(
         status = f"{done}/{step.total:.10g} {step.unit}"
         watch(Progress(_ACTIVITIES[step.phase], step.done, step.total, status))
 
-    result = run_experiment(loaded.experiment, loaded.name, rig, device, out, report)
+    result = run_experiment(loaded.experiment, loaded.name, rig, device, out, report, rig_file)
     warn(watch, *result.warnings)
     return result

@@ -215,8 +215,6 @@ def _cures(rows: Rows) -> list[Step]:
         Step("Give the start of ", list(dict.fromkeys(n.partition("(")[0] for n in starts)),
              " under `initial` in a file for `--config`."),
         Step("Record an experiment that makes ", [row.name for row in rows.weak], " matter, larger "
-             "or slower or faster than this one: these data hardly feel them. What it would be on "
-             "the rig, and how narrow the intervals would become, says:",
-             "rig design --parameters parameters.yaml"),
+             "or slower or faster than this one: these data hardly feel them."),
     )  # fmt: skip
     return [step for step in cures if step.names]

@@ -76,18 +76,24 @@ def run_experiment(
     device: Device,
     root: Path,
     watch: Watcher = nobody,
+    rig_file: str = "",
 ) -> RunResult:
     """Run an experiment on a device and log it under ``root``.
 
-    Whatever ends it, both outputs are zeroed first and the capture folder says why. Raises
-    ConfigError before energising; DeviceError, InterlockError, RunError, KeyboardInterrupt or
-    Terminated afterwards, with a note (``__notes__``) on the folder.
+    rig_file: which the configuration is of, as it is typed, for the record. Whatever ends it, both
+    outputs are zeroed first and the capture folder says why. Raises ConfigError before energising;
+    DeviceError, InterlockError, RunError, KeyboardInterrupt or Terminated afterwards, with a note
+    (``__notes__``) on the folder.
     """
     planned = plan(experiment, rig_config)
     description = description_of(experiment)
     dialogue = Dialogue(experiment, planned) if isinstance(experiment, ClosedLoop) else None
     limits = Limits(rig_config)
-    record = {"experiment": description, "rig": rig_config.model_dump(mode="json")}
+    record = {
+        "experiment": description,
+        "rig_file": rig_file,
+        "rig": rig_config.model_dump(mode="json"),
+    }
     sampling = Sampling(Rig(device, rig_config), limits, experiment.sample_rate, watch)
     with SignalHandling() as signals:
         capture = Capture.create(root, name, record, experiment.metadata)

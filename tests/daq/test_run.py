@@ -98,7 +98,7 @@ def test_the_capture_folder_holds_the_run_as_resolved(completed):
     assert {
         "status", "reason", "started", "experiment", "rig", "software", "host", "device",
         "calibration", "offsets", "homing", "phase", "timing", "log", "realtime", "outputs",
-        "saturated_samples", "doubts", "process",
+        "saturated_samples", "doubts", "process", "rig_file",
     } == set(record)  # fmt: skip
     assert (record["status"], record["reason"], record["phase"]) == ("completed", None, "close")
     assert record["experiment"] == {
@@ -109,6 +109,7 @@ def test_the_capture_folder_holds_the_run_as_resolved(completed):
         "validation": {},
         "metadata": {"operator": "", "sample": "", "note": "", "tags": []},
     }
+    assert record["rig_file"] == "rig.yaml"
     assert record["rig"]["sensors"]["encoder"] == {"cycles": 2048, "sign": 1, "speed": "auto"}, (
         "defaults too"
     )
