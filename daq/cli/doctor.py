@@ -23,6 +23,14 @@ def doctor(
         str | None, Option(metavar="RIG.yaml", help="Open this rig, outputs at zero, and ask it.")
     ] = None,
     port: options.PortName = None,
+    rate: Annotated[
+        float | None,
+        Option(
+            metavar="HZ",
+            min=1.0,
+            help="Sample rate to try; default 800, or the fastest of a slower device.",
+        ),
+    ] = None,
     loopback: Annotated[
         bool,
         Option(
@@ -38,7 +46,8 @@ def doctor(
 ) -> None:
     """Check whether this computer suits a rig in real time.
 
-    What does not is told with its cure. With --rig or --port it asks the device as well.
+    What does not is told with its cure. With --rig or --port it asks the device as well, and
+    samples for five seconds with both outputs at zero.
     """
     from daq.diagnose.computer import diagnose
     from daq.serial.ports import ports_of
@@ -47,7 +56,9 @@ def doctor(
         raise ConfigError("--loopback: no rig is named", cure="add --rig RIG.yaml")
     if rig is None and port is not None:
         rig = "serial.yaml"
-    checks = [] if rig is None else _of_rig(rig, port, loopback)
+    if rate is not None and rig is None:
+        raise ConfigError("--rate: no device is named", cure="add --port PORT or --rig RIG.yaml")
+    checks = [] if rig is None else _of_rig(rig, port, loopback, rate)
     named = [*(names or []), *filter(None, [port])]
     ports = None if rig is not None and not named else ports_of(named)
     checks += diagnose(ports, out, wakes)
@@ -70,9 +81,9 @@ def doctor(
         raise RunError(problem, cure="the cures stand above")
 
 
-def _of_rig(name: str, port: str | None, loopback: bool) -> list[Check]:
+def _of_rig(name: str, port: str | None, loopback: bool, rate: float | None) -> list[Check]:
     from daq.diagnose.card import diagnose_rig
     from daq.lookup.rigs import rig_on
 
     _, device = rig_on(name, port, watch=terminal.report_event)
-    return diagnose_rig(device, name, loopback)
+    return diagnose_rig(device, name, loopback, rate)

@@ -70,9 +70,12 @@ def _first_evening(experiment: str, on_port: bool) -> list[tuple[str, str]]:
     from daq.lookup.starter import FIRST_EXPERIMENTS, RIG
 
     zero, first = FIRST_EXPERIMENTS
-    first_steps = [("rig ports", f"who answers where: write the port into {RIG}")]
+    doctor = f"rig doctor --rig {RIG}"
+    first_steps = [
+        ("rig ports", f"who answers where: write the port into {RIG}"),
+        (doctor, "zero outputs: do samples and commands come in time?"),
+    ]
     if not on_port:
-        doctor = f"rig doctor --rig {RIG}"
         first_steps = [
             (doctor, "who answers, and what it cannot promise"),
             (f"{doctor} --loopback", f"amplifiers unplugged: write the phase into {RIG}"),

@@ -1,18 +1,22 @@
-"""A rig's device before its first run: who answers, what it cannot promise, when outputs come."""
+"""A rig's device before its first run: who answers, in time or not, and what it cannot promise."""
 
 from daq.boards import loopback
 from daq.boards.device import CardDevice
 from daq.contract import call, checked_info
 from daq.diagnose.computer import Check
+from daq.diagnose.sampling import sampling_checks
 from daq.errors import ConfigError, DeviceError
 from daq.hal import Device, Disclosing
 
 
-def diagnose_rig(device: Device, name: str, measure: bool) -> list[Check]:
-    """Check a rig's device by opening it, outputs at zero.
+def diagnose_rig(
+    device: Device, name: str, measure: bool, sample_rate: float | None = None
+) -> list[Check]:
+    """Check a rig's device by opening it and sampling for some seconds, outputs at zero.
 
-    measure: move its motor's output, wired to an input, to see when outputs come. Raises
-    ConfigError for a device of which that cannot be asked, and what ``open`` raises.
+    measure: move its motor's output, wired to an input, to see when outputs come. sample_rate
+    [Hz]: to try. Raises ConfigError for a device of which that cannot be asked, and what ``open``
+    raises.
     """
     if measure and not isinstance(device, CardDevice):
         cure = "leave --loopback out: what times its samples times its outputs as well"
@@ -21,7 +25,9 @@ def diagnose_rig(device: Device, name: str, measure: bool) -> list[Check]:
         info = checked_info(call(device.open))
         checks = [Check("rig", "good", info.name)]
         if measure and isinstance(device, CardDevice):
-            checks.append(_phase(device))
+            checks.append(_phase(device))  # without which it plays nothing
+        else:
+            checks += sampling_checks(device, info, sample_rate)
     finally:
         call(device.close)
     caveats = device.caveats() if isinstance(device, Disclosing) else []

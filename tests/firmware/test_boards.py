@@ -48,14 +48,6 @@ def test_vectors_begin_with_the_stack_and_reset(elf):
     assert 0 not in struct.unpack_from("<97I", image), "every interrupt ends somewhere"
 
 
-def test_the_template_compiles():
-    needs("gcc")
-    words = ["gcc", "-std=c11", "-pedantic", "-Wall", "-Wextra", "-Werror", "-Wconversion"]
-    words += ["-Icore", "-c", "boards/template/board.c", "-o", "/dev/null"]
-    done = subprocess.run(words, cwd=SOURCE, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-
-
 def test_a_copy_of_the_template_becomes_a_firmware():
     needs("make", "arm-none-eabi-gcc")
     image = (make(BOARD="template") / "template" / "rig.bin").read_bytes()

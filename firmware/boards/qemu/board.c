@@ -9,6 +9,7 @@
 #include "device.h"
 #include "plant.h"
 #include "semihosting.h"
+#include "sleep.h"
 
 #define REG(ADDRESS) (*(volatile uint32_t *)(ADDRESS))
 #define RCC_APB1ENR REG(0x40023840u)
@@ -60,16 +61,6 @@ static const struct rig_identity IDENTITY = {
                  INPUT("brake"),
                  {"encoder", "count", 1.0, 0.0, -2147483648.0, 2147483647.0}},
 };
-
-uint32_t board_lock(void) {
-    uint32_t primask;
-    __asm__ volatile("mrs %0, primask\n\tcpsid i" : "=r"(primask) : : "memory");
-    return primask;
-}
-
-void board_unlock(uint32_t token) {
-    __asm__ volatile("msr primask, %0" : : "r"(token) : "memory");
-}
 
 uint64_t board_clock(void) {
     const uint32_t token = board_lock();
@@ -202,10 +193,6 @@ int main(void) {
     board_unlock(token);
     for (;;) {
         rig_poll(&device);
-        const uint32_t locked = board_lock();
-        if (!rig_is_busy(&device)) {
-            __asm__ volatile("wfi" : : : "memory"); /* wakes though locked */
-        }
-        board_unlock(locked);
+        sleep_unless_busy(&device);
     }
 }

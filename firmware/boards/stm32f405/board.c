@@ -18,6 +18,7 @@
 #include "device.h"
 #include "encoder.h"
 #include "registers.h"
+#include "sleep.h"
 
 #define CLOCK 84000000u /* Hz, of TIM2 and TIM5 */
 #define LEAD 840u       /* ticks from GO to tick 0: 10 us */
@@ -451,10 +452,6 @@ int main(void) {
     for (;;) {
         receive();
         rig_poll(&device);
-        __asm__ volatile("cpsid i" : : : "memory");
-        if (!rig_is_busy(&device)) {
-            __asm__ volatile("wfi" : : : "memory"); /* wakes though locked */
-        }
-        __asm__ volatile("cpsie i" : : : "memory");
+        sleep_unless_busy(&device);
     }
 }

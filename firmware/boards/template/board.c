@@ -8,6 +8,7 @@
 
 #include "device.h"
 #include "encoder.h"
+#include "sleep.h"
 
 /* The clock that times everything: a timer that runs freely. Samples are whole numbers of its ticks
  * apart, so that rate and clock can only be wrong together. A quartz, no RC oscillator: a host
@@ -41,15 +42,10 @@ static const struct rig_identity IDENTITY = {
                  {"encoder", "count", 1.0, 0.0, -2147483648.0, 2147483647.0}},
 };
 
-/* Of the interrupts that call the core: those of rig_on_tick, rig_on_watch and the line. On a
- * Cortex-M3 or M4 by BASEPRI, so that a supply that sags is still heard. Nested: give back what was. */
-uint32_t board_lock(void) {
-    return 0u;
-}
 
-void board_unlock(uint32_t token) {
-    (void)token;
-}
+/* board_lock and board_unlock are those of cortex_m/lock.c, which keep all interrupts off. With a lock
+ * by BASEPRI, as boards/stm32f405 has it, a supply that sags is still heard; but it keeps off none of
+ * priority 0, which all have after reset. */
 
 /* A counter of 32 bits is extended here: note each time that it has become less. Then call this more
  * often than it runs over, from the interrupt of rig_on_watch. */
@@ -91,7 +87,9 @@ uint64_t board_timer_start(uint32_t period) {
 void board_timer_stop(void) {
 }
 
-/* Start the DMA, or the interrupt, that takes bytes by rig_byte_out until there is none. */
+/* Start the DMA, or the interrupt, that takes bytes by rig_byte_out until there is none. Waiting for
+ * the line here would keep the main loop from hearing the host, whose silence then trips the
+ * watchdog. */
 void board_transmit(void) {
 }
 
@@ -116,6 +114,6 @@ int main(void) {
     /* Interrupts on. */
     for (;;) {
         rig_poll(&device);
-        /* Sleep, interrupts locked, unless rig_is_busy(&device). */
+        sleep_unless_busy(&device);
     }
 }

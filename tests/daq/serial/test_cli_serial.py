@@ -52,16 +52,44 @@ def test_doctor_has_a_verdict_on_everything_and_leaves_nothing_behind(tmp_path, 
 
 
 def test_doctor_asks_the_device_at_a_port(tmp_path, run, running):
-    words = ["doctor", "--port", running.port, "--json", "--wakes", "20"]
+    before = len(running.journal)
+    # Also beside a rig's file, whose port it goes before.
+    write_serial_rig(tmp_path / "rig.yaml", "/dev/not-this-one")
+    words = ["doctor", "--port", running.port, "--rig", "rig.yaml", "--json", "--wakes", "20"]
     checks = {c["what"]: c for c in json.loads(run(words, tmp_path).stdout)["checks"]}
     assert "emulat" in checks["rig"]["found"] and checks["rig"]["verdict"] == "good"
     assert f"access to {running.port}" in checks
-    # Also beside a rig's file, whose port it goes before.
-    write_serial_rig(tmp_path / "rig.yaml", "/dev/not-this-one")
-    result = run([*words, "--rig", "rig.yaml"], tmp_path)
-    assert '"rig"' in result.stdout, result.stderr
+    # It samples at zero, in both modes; a busy computer's late commands are not the device's.
+    assert checks["open loop at 800 Hz"]["found"] == "2000 of 2000 samples came"
+    assert checks["open loop at 800 Hz"]["verdict"] == "good"
+    assert "2000 of 2000 samples came, " in checks["closed loop at 800 Hz"]["found"]
+    assert all(entry["outputs"] == [0, 0] for entry in running.journal[before:])
     result = run(["doctor", "--rig", "simulated.yaml", "--port", running.port], tmp_path)
     assert result.returncode == 2 and "has no port" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("fault", "found"),
+    [
+        ("overflow=100@open+1", "1900 of 2000 samples came"),
+        ("stall=2@open+1", "has come from the device for 1 s"),
+    ],
+)
+def test_a_device_that_does_not_sample_in_time_is_bad(tmp_path, run, fault, found):
+    with emulator(tmp_path / "board", "--fault", fault) as there:
+        result = run(["doctor", "--port", there.port, "--json", "--wakes", "20"], tmp_path)
+    checks = {check["what"]: check for check in json.loads(result.stdout)["checks"]}
+    check = checks["open loop at 800 Hz"]
+    assert result.returncode == 1 and check["verdict"] == "bad", check
+    assert found in check["found"] and check["cure"]
+    assert "closed loop at 800 Hz" not in checks, "nothing is asked further"
+
+
+def test_a_rate_that_a_device_has_not_is_named(tmp_path, run, running):
+    result = run(["doctor", "--port", running.port, "--rate", "1e6", "--wakes", "20"], tmp_path)
+    assert result.returncode == 1 and "too fast for it" in result.stdout
+    result = run(["doctor", "--rate", "100", "--wakes", "20"], tmp_path)
+    assert result.returncode == 2 and "add --port PORT" in result.stderr
 
 
 def test_a_port_at_which_nobody_answers_is_not_good(tmp_path, run):
