@@ -24,30 +24,15 @@ def characterise(
             autocompletion=completion.rigs,
         ),
     ] = "simulated.yaml",
-    time: Annotated[
-        str, Option(metavar="SECONDS", help="Logged time of all runs, at most.")
-    ] = "60 s",
-    precision: Annotated[
-        str | None,
-        Option(metavar="PERCENT", help="Half width wanted of all intervals, such as 5%."),
-    ] = None,
+    time: options.LoggedTime = "60 s",
+    precision: options.Precision = None,
     model: options.ModelName = None,
-    plant: Annotated[
-        str | None,
-        Option(metavar="NAME|FILE.py:OBJECT", help="The whole rig as a model, load included."),
-    ] = None,
+    plant: options.PlantName = None,
     config: options.ConfigFile = None,
     out: Annotated[
         Path | None, Option(metavar="DIR", help="New folder for all of it; default under runs/.")
     ] = None,
-    settings: Annotated[
-        list[str] | None,
-        Option(
-            "--set",
-            metavar="KEY=VALUE",
-            help="A key of the designs' question, such as protocols=[prbs]; may be repeated.",
-        ),
-    ] = None,
+    settings: options.DesignSettings = None,
     resume: Annotated[
         Path | None, Option(metavar="DIR", help="Go on with what was interrupted there.")
     ] = None,

@@ -21,19 +21,11 @@ def design(
         Path | None,
         Argument(metavar="QUESTION.yaml", help="What to know, from what, within what time."),
     ] = None,
-    rig: options.RigOfRun = None,
-    time: Annotated[
-        str | None, Option(metavar="SECONDS", help="Logged time of all runs, at most.")
-    ] = None,
-    precision: Annotated[
-        str | None,
-        Option(metavar="PERCENT", help="Half width wanted of all intervals, such as 5%."),
-    ] = None,
+    rig: options.RigOfDesign = None,
+    time: options.LoggedTimeOfDesign = None,
+    precision: options.Precision = None,
     model: options.ModelName = None,
-    plant: Annotated[
-        str | None,
-        Option(metavar="NAME|FILE.py:OBJECT", help="The whole rig as a model, load included."),
-    ] = None,
+    plant: options.PlantName = None,
     config: options.ConfigFile = None,
     parameters: Annotated[
         Path | None,
@@ -45,14 +37,7 @@ def design(
     out: Annotated[
         Path | None, Option(metavar="DIR", help="Where the files go; default under designs/.")
     ] = None,
-    settings: Annotated[
-        list[str] | None,
-        Option(
-            "--set",
-            metavar="KEY=VALUE",
-            help="Any key of the question, such as targets.K_m=1%; may be repeated.",
-        ),
-    ] = None,
+    settings: options.DesignSettings = None,
     json: options.AsJson = False,
 ) -> None:
     """Find the runs that tell most about the parameters, within the rig's limits.

@@ -22,6 +22,9 @@ RigName = Annotated[str, _rig(help="Rig file; default the simulated rig.")]
 RigOfRun = Annotated[
     str | None, _rig(help="Rig file; default what the experiment names, or the simulated rig.")
 ]
+RigOfDesign = Annotated[
+    str | None, _rig(help="Rig file; default what the question names, or the simulated rig.")
+]
 PortName = Annotated[
     str | None,
     Option(metavar="PORT", help="Port of a serial rig in place of its file's; see rig ports."),
@@ -42,6 +45,17 @@ ModelsWithValues = Annotated[
     list[str] | None,
     _model(help="In place of a result a model at its own values; may be repeated."),
 ]
+PlantName = Annotated[
+    str | None,
+    Option(metavar="NAME|FILE.py:OBJECT", help="The whole rig as a model, load included."),
+]
+Precision = Annotated[
+    str | None,
+    Option(metavar="PERCENT", help="Half width wanted of all intervals, such as 5%."),
+]
+_time = functools.partial(Option, metavar="SECONDS", help="Logged time of all runs, at most.")
+LoggedTime = Annotated[str, _time()]
+LoggedTimeOfDesign = Annotated[str | None, _time()]  # default what the question says
 ConfigFile = Annotated[
     Path | None, Option(metavar="ID.yaml", help="Search settings and column names.")
 ]
@@ -60,13 +74,14 @@ Generations = Annotated[int | None, Option(metavar="N", help="Generations evalua
 HoldBack = Annotated[
     float | None, Option(metavar="PART", help="Part of each log, its end, kept for validation.")
 ]
+_set = functools.partial(Option, "--set", metavar="KEY=VALUE")
 Settings = Annotated[
     list[str] | None,
-    Option(
-        "--set",
-        metavar="KEY=VALUE",
-        help="Any key of the configuration file, such as fixed.R_m=1.18; may be repeated.",
-    ),
+    _set(help="Any key of the configuration file, such as fixed.R_m=1.18; may be repeated."),
+]
+DesignSettings = Annotated[
+    list[str] | None,
+    _set(help="A key of the design's question, such as protocols=[prbs]; may be repeated."),
 ]
 Seeds = Annotated[str | None, Option(metavar="FIRST:END|LIST", help="0:10 for 0 to 9, or 3,5,8.")]
 Jobs = Annotated[int | None, Option(metavar="N", help="Runs at a time; default as many as cores.")]
