@@ -19,6 +19,7 @@ _HEADER = """\
 
 typedef {real} rig_real;
 
+#define RIG_CONTROLLER_FINGERPRINT "{fingerprint}" /* by which a host knows it */
 #define RIG_CONTROLLER_PERIOD {period!r} /* s */
 #define RIG_CONTROLLER_AHEAD {n_ahead} /* samples from a sample to its answer */
 
@@ -109,6 +110,7 @@ def device_code(controller: str | Path, precision: Precision = "double") -> Devi
         source=f"tuned to {Path(tuned.source).name}",
         precision=precision,
         real="float" if precision == "single" else "double",
+        fingerprint=program.fingerprint,
         period=program.step.time,
         n_ahead=tuned.control.ahead,
         ahead=f"{tuned.control.ahead} samples" if tuned.control.ahead > 1 else "a sample",

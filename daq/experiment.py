@@ -325,6 +325,22 @@ class Evidence:
     refusal: str = ""
 
 
+@dataclass(frozen=True)
+class Aboard:
+    """A loop that the device's own torque controller closes, while this computer supervises.
+
+    law: its fingerprint. reference: torque that the hand is to feel, (n_samples,) [N*m].
+    switches: samples from which on it answers, does no longer, answers again, ... blend: samples in
+    which the outputs move over. logged: the columns of the experiment, (n_samples,) each.
+    """
+
+    law: str
+    reference: FloatArray
+    switches: tuple[int, ...]
+    blend: int
+    logged: tuple[FloatArray, ...]
+
+
 class ClosedLoop(Experiment):
     """A protocol whose controller answers every sample with a command."""
 
@@ -345,6 +361,10 @@ class ClosedLoop(Experiment):
 
         Raises ConfigError, and ValueError as ``plan`` does.
         """
+        return None
+
+    def aboard(self) -> Aboard | None:
+        """What the device's own controller is asked for; None where this computer answers."""
         return None
 
     @abc.abstractmethod

@@ -37,9 +37,12 @@ class Flag(enum.IntFlag):
     UNDERFLOW = 16  #: The preloaded waveform ran dry; the outputs are zero.
     SATURATED = 32  #: An analog input stood at the end of its converter's range.
     DOUBTFUL = 64  #: What was measured disagrees in a way that does not end a run; see run.json.
+    LAW = 128  #: The device's own torque controller made the command, not the host.
 
 
-DEVICE_FLAGS = int(Flag.CLAMPED | Flag.HELD | Flag.INTERLOCK | Flag.UNDERFLOW | Flag.SATURATED)
+DEVICE_FLAGS = int(
+    Flag.CLAMPED | Flag.HELD | Flag.INTERLOCK | Flag.UNDERFLOW | Flag.SATURATED | Flag.LAW
+)
 """What a device may set; the others are the host's."""
 
 
@@ -132,7 +135,8 @@ class DeviceInfo:
 
     max_rate [Hz]; queue: commands it can hold ahead of time, one at least; volts_in: (low, high)
     of its analog inputs; virtual_time: whether its clock waits for the host. step_out [V]: by which
-    what an output applies may differ from its command.
+    what an output applies may differ from its command. law: which torque controller it has aboard,
+    the fingerprint of its ``daq.torque.LawProgram``; empty for none.
     """
 
     name: Annotated[str, Field(max_length=200)]
@@ -141,6 +145,21 @@ class DeviceInfo:
     volts_in: tuple[FiniteFloat, FiniteFloat]
     virtual_time: bool = False
     step_out: Annotated[float, Field(ge=0.0, allow_inf_nan=False)] = 0.01
+    law: Annotated[str, Field(max_length=40)] = ""
+
+
+@dataclass(frozen=True)
+class LawScales:
+    """What a device's own torque controller makes of its inputs and of its reference.
+
+    angle: rad of a count. current_motor: A per volt, and A at 0 V. torque: N*m per volt, and N*m at
+    0 V. reference: torque on the hand [N*m] that a volt of the motor's command asks for.
+    """
+
+    angle: float
+    current_motor: tuple[float, float]
+    torque: tuple[float, float]
+    reference: float
 
 
 @runtime_checkable
@@ -157,6 +176,19 @@ class Disclosing(Protocol):
 
     def caveats(self) -> list[Mistake]:
         """What it cannot promise, each with what to do about it; at any time."""
+
+
+@runtime_checkable
+class Answering(Protocol):
+    """A device that may have a torque controller aboard (``DeviceInfo.law``)."""
+
+    def answer(self, first: int, blend: int, scales: LawScales | None) -> None:
+        """From tick ``first`` on its controller answers the samples, flagged LAW; None: no longer.
+
+        The motor's commands are its references meanwhile, those of the brake count for nothing. The
+        outputs move over from the ones to the others in ``blend`` ticks. Limits hold as ever.
+        Between ``start`` and ``stop``, and before that tick.
+        """
 
 
 class Device(Protocol):

@@ -16,12 +16,14 @@ from daq.hal import (
     ANALOG_INPUTS,
     CHANNELS,
     DEVICE_FLAGS,
+    Answering,
     Device,
     DeviceInfo,
     Flag,
     FloatArray,
     Guard,
     IntArray,
+    LawScales,
     Mode,
     Phase,
     RawSamples,
@@ -134,6 +136,21 @@ class Rig:
         self._clamped[places] = changed.any(axis=1) if changed.any() else False
         self._next_command += len(commands)
         self._timed(self._device.send, tick, limited)
+
+    def answer(self, first: int, blend: int, reference: float | None) -> None:
+        """From tick ``first`` on the device's own torque controller answers; None: no longer.
+
+        blend: ticks over which the outputs move over. reference: torque on the hand that a volt of
+        the motor's command asks for meanwhile [N*m/V]. Raises DeviceError for a device without.
+        """
+        if not isinstance(self._device, Answering):
+            raise DeviceError(f"{self.info.name} has no torque controller aboard")
+        scales = None
+        if reference is not None:
+            zeros = -self._scale * self.offsets
+            current, _, torque = zip(self._scale.tolist(), zeros.tolist(), strict=True)
+            scales = LawScales(self._radians, current, torque, reference)
+        self._timed(self._device.answer, first, blend, scales)
 
     def take_offsets(self, means: Mapping[str, float]) -> None:
         """Make what the inputs read now, in SI units by name, their zero."""
@@ -249,6 +266,8 @@ class Rig:
         if flags.any():
             flags &= DEVICE_FLAGS
             self._count_saturated(raw)
+            answered = (flags & int(Flag.LAW)) != 0
+            commands[answered] = raw.applied[answered]  # what was sent were references
         if self._clamped[places].any():
             flags |= self._clamped[places] * int(Flag.CLAMPED)
         if first != self._last_tick + 1:

@@ -6,6 +6,7 @@ commands. Controllers are registered under the entry-point group ``rig.controlle
 """
 
 import abc
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol, Self
@@ -70,6 +71,12 @@ class LawProgram:
     constants: tuple[float, ...]
     parameters: tuple[float, ...]
     step: ModelStep
+
+    @property
+    def fingerprint(self) -> str:
+        """Eight hexadecimal digits that tell this law, its numbers to nine digits, from others."""
+        numbers = [f"{value:.9g}" for value in (*self.constants, *self.parameters)]
+        return hashlib.sha256("\n".join([self.entry, self.text, *numbers]).encode()).hexdigest()[:8]
 
 
 @dataclass(frozen=True)

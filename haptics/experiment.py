@@ -1,11 +1,12 @@
 """Experiments that a torque controller runs."""
 
+from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
 from pydantic import Field
 
-from daq.experiment import ClosedLoop, Evidence, SettingError, TripLimits
+from daq.experiment import Aboard, ClosedLoop, Evidence, SettingError, TripLimits
 from daq.hal import FloatArray
 from daq.lookup.controllers import TunedController, load_controller
 from haptics.evidence import Scene, family_margins, run_trials, weigh
@@ -69,3 +70,38 @@ class TorqueExperiment(ClosedLoop):
         outcomes = run_trials(tuned, program, scenes, limits, draws)
         walls = any(scene.wall is not None for scene in scenes)
         return weigh(outcomes, family_margins(tuned), bool(tuned.spread[0]), walls=walls)
+
+
+class ReferenceExperiment(TorqueExperiment):
+    """One whose torque is known beforehand, so that a device can close the loop by itself."""
+
+    on_device: bool = Field(
+        False,
+        description="whether the device closes the loop, the same controller aboard; this "
+        "computer sends references and supervises",
+    )
+
+    def controller_remarks(self) -> tuple[str, ...]:
+        """Which controller it is, what may judge it, and where it runs."""
+        if not self.on_device:
+            return super().controller_remarks()
+        return (
+            *super().controller_remarks(),
+            "It runs in the device's firmware (on_device); this computer sends references and "
+            "watches the limits.",
+        )
+
+    def asked_of_device(
+        self,
+        reference: FloatArray,
+        switches: Sequence[int],
+        blend: float,
+        logged: Sequence[FloatArray],
+    ) -> Aboard | None:
+        """What ``aboard`` returns; blend: time in which the outputs move over [s]."""
+        if not self.on_device:
+            return None
+        tuned = self.tuned_controller
+        law = tuned.control.program(tuned.model, tuned.parameters).fingerprint
+        samples = round(blend * self.sample_rate)
+        return Aboard(law, reference, tuple(switches), samples, tuple(logged))

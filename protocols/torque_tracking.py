@@ -9,12 +9,12 @@ from pydantic import Field
 from scipy.signal import butter, sosfiltfilt
 
 from daq.config.units import Hertz, NewtonMetres, Seconds
-from daq.experiment import Answer, Controller, Plan, Sample, SettingError
+from daq.experiment import Aboard, Answer, Controller, Plan, Sample, SettingError
 from daq.findings import Chart, Findings, Number, Series
 from daq.hal import FloatArray, Samples
 from daq.torque import TorqueLaw
 from haptics.evidence import Scene, fading, hand_path
-from haptics.experiment import TorqueExperiment
+from haptics.experiment import ReferenceExperiment
 from protocols.analysis.results import TIME, TORQUE
 from protocols.multisine import crest_factor
 
@@ -22,10 +22,11 @@ _DRAWS = 64  # sets of phases, of which the one with the lowest crest factor is 
 _STRETCH = 2.0  # s of a trial beforehand
 _SCENES = 50
 _FASTEST_HAND = 10.0  # rad/s
+_BLEND = 0.05  # s, in which a device's own controller comes and goes
 _SHOWN = 2.0  # s of the figure
 
 
-class TorqueTracking(TorqueExperiment):
+class TorqueTracking(ReferenceExperiment):
     """A multisine of torque at the hand, given by a controller that rig tune made."""
 
     columns: ClassVar[Mapping[str, str]] = {"torque_ref": "N*m"}
@@ -100,6 +101,14 @@ class TorqueTracking(TorqueExperiment):
         """The reference, sample by sample, through the controller's law."""
         law = self.tuned_controller.law()
         return _Tracking(law, self.reference(self.samples_in(self.duration)))
+
+    def aboard(self) -> Aboard | None:
+        """The reference, from the first sample until shortly before the last."""
+        reference = self.reference(self.samples_in(self.duration))
+        end = len(reference) - round(_BLEND * self.sample_rate)
+        reference[max(end, 0) :] = 0.0  # commands again, of which the last shall be zero
+        switches = [0, end] if end > 1 else [0]
+        return self.asked_of_device(reference, switches, _BLEND, [reference])
 
     def findings(self, samples: Samples, extra: Mapping[str, FloatArray]) -> Findings:
         """The error of the torque felt, beside the torque asked for."""

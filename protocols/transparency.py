@@ -9,12 +9,12 @@ from pydantic import Field
 from scipy.signal import butter, sosfiltfilt
 
 from daq.config.units import Hertz, Seconds
-from daq.experiment import Answer, Controller, Plan, Sample, SettingError
+from daq.experiment import Aboard, Answer, Controller, Plan, Sample, SettingError
 from daq.findings import Chart, Findings, Number, Series
 from daq.hal import FloatArray, Samples
 from daq.torque import TorqueLaw
 from haptics.evidence import Scene, hand_path
-from haptics.experiment import TorqueExperiment
+from haptics.experiment import ReferenceExperiment
 from protocols.analysis.results import TIME, TORQUE
 
 _RAMP = 0.1  # s, in which the controller comes and goes
@@ -25,7 +25,7 @@ _FASTEST_HAND = 10.0  # rad/s
 _MOVING = 0.1  # rad/s rms: below, nothing was moved
 
 
-class Transparency(TorqueExperiment):
+class Transparency(ReferenceExperiment):
     """Blocks without commands and with a controller that is to have the hand feel nothing."""
 
     columns: ClassVar[Mapping[str, str]] = {"controlled": "1"}
@@ -78,6 +78,14 @@ class Transparency(TorqueExperiment):
         """The controller's law for no torque, in every second block."""
         n_samples = self.samples_in(2 * self.pairs * self.block, "block")
         return _Alternation(self.tuned_controller.law(), self.share(n_samples))
+
+    def aboard(self) -> Aboard | None:
+        """No torque, by the controller in every second block."""
+        n_samples = self.samples_in(2 * self.pairs * self.block, "block")
+        blocks = np.arange(n_samples) // round(self.block * self.sample_rate)
+        switches = np.flatnonzero(np.diff(blocks)) + 1
+        share = self.share(n_samples)
+        return self.asked_of_device(np.zeros(n_samples), switches.tolist(), _RAMP, [share])
 
     def findings(self, samples: Samples, extra: Mapping[str, FloatArray]) -> Findings:
         """The torque felt with and without the controller, beside the speed of the shaft."""

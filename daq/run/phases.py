@@ -1,19 +1,24 @@
 """Phases of a run: offsets of the inputs, winding of the load, the run in open or closed loop."""
 
+import itertools
+from collections import deque
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 
-from daq.errors import DeviceError, IncompleteError, RunError
-from daq.experiment import Homing, OffsetCalibration
+from daq.errors import ConfigError, DeviceError, IncompleteError, RunError
+from daq.experiment import Aboard, Homing, OffsetCalibration
 from daq.hal import ANALOG_INPUTS, CHANNELS, Flag, FloatArray, Mode, Samples
 from daq.logs.writer import LogWriter
+from daq.rig import Rig
 from daq.run.protocol import Dialogue
 from daq.run.sampling import Sampling, before
 
 _REST_TIME = 1.0  # s that the shaft must stand still to end homing
 _REST_TURNS = 0.01  # turns it may creep meanwhile
 _TURN = 2.0 * np.pi
+_ROUNDING = 1.0 + 1e-9  # so that the largest reference is within the limits
 
 
 def calibrate(sampling: Sampling, calibration: OffsetCalibration, record: dict[str, Any]) -> None:
@@ -94,15 +99,58 @@ def home(sampling: Sampling, homing: Homing, record: dict[str, Any]) -> None:
     record["homing"] = {"turns": rest_turns - (start or 0.0), "rate": sampling.sample_rate}
 
 
-def play(sampling: Sampling, log: LogWriter, commands: FloatArray) -> None:
+def require_law(rig: Rig, law: str) -> None:
+    """Raise ConfigError unless an open device has this controller, within the rig's limits."""
+    slew, cure = rig.config.limits.slew, "leave it out"
+    if rig.info.law != law:
+        what = f"has the controller {rig.info.law}" if rig.info.law else "has no controller"
+        problem = f"{rig.info.name} {what} aboard; this experiment's is {law}"
+        cure = "build the firmware with what rig export c makes of the experiment's controller"
+    elif any(getattr(slew, channel) is not None for channel in CHANNELS):
+        problem = "limits.slew of the rig's file would not hold for what the device itself commands"
+    else:
+        return
+    raise ConfigError(problem, cure=f"{cure}; or write on_device: false", key="on_device")
+
+
+def supervise(sampling: Sampling, log: LogWriter, aboard: Aboard) -> None:
+    """Play references to the device's own torque controller, and log every sample.
+
+    Raises DeviceError, InterlockError and IncompleteError as ``play`` does.
+    """
+    low, high = sampling.rig.config.limits.command.motor  # beyond zero both, as the plan wants
+    largest = float(np.max(np.abs(aboard.reference)))
+    scale = (largest or 1.0) / min(-low, high)  # N*m by V
+    commands = np.zeros((len(aboard.reference), len(CHANNELS)))
+    commands[:, 0] = aboard.reference / (scale * _ROUNDING)
+    scales = itertools.cycle([scale * _ROUNDING, None])
+    switches = zip(aboard.switches, scales, strict=False)
+    play(sampling, log, commands, aboard.logged, switches, aboard.blend)
+
+
+def play(
+    sampling: Sampling,
+    log: LogWriter,
+    commands: FloatArray,
+    beside: Sequence[FloatArray] = (),
+    switches: Iterable[tuple[int, float | None]] = (),
+    blend: int = 0,
+) -> None:
     """Play commands (n_samples, 2) [V] and log every sample.
+
+    beside: further columns of the log, (n_samples,) each. switches: samples from which on the
+    device's own controller answers, by the reference [N*m] of a volt, or no longer (None).
 
     Raises DeviceError, InterlockError, and IncompleteError where too many samples are missing.
     """
     rig, n_samples = sampling.rig, len(commands)
     sampling.begin(Mode.OPEN_LOOP)
+    orders, ordered = deque(switches), -1  # one at a time, the next once that has been carried out
     sent = done = 0
     while done < n_samples:
+        if orders and done > ordered:
+            ordered, scale = orders.popleft()
+            rig.answer(ordered, blend, scale)
         room = rig.room()
         if sent < n_samples and room > 0:
             chunk = commands[sent : sent + room]
@@ -113,7 +161,8 @@ def play(sampling: Sampling, log: LogWriter, commands: FloatArray) -> None:
         samples, trip = sampling.receive(n_samples)
         if len(samples) == 0:
             break
-        done = sampling.keep(log, samples, (), trip, n_samples)
+        columns = [column[samples.tick] for column in beside]
+        done = sampling.keep(log, samples, columns, trip, n_samples)
         if np.any(samples.flags & int(Flag.UNDERFLOW)):
             raise DeviceError(
                 f"the device ran out of commands by sample {done - 1} and says that it zeroed "

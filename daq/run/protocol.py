@@ -12,6 +12,7 @@ import numpy as np
 from daq.errors import USER_CODE_ERRORS, ConfigError, RigError, RunError, raised_in
 from daq.experiment import (
     MOST_SAMPLES,
+    Aboard,
     Answer,
     ClosedLoop,
     Evidence,
@@ -155,6 +156,12 @@ def preview_of(experiment: Experiment) -> Chart | Heatmap | None:
     """What a protocol draws beforehand, if it has a closed loop. Raises ConfigError."""
     with _before_the_run(experiment, "in preview()"):
         return experiment.preview() if isinstance(experiment, ClosedLoop) else None
+
+
+def aboard_of(experiment: Experiment) -> Aboard | None:
+    """What a protocol asks of the device's own controller, if it does. Raises ConfigError."""
+    with _before_the_run(experiment, "in aboard()"):
+        return experiment.aboard() if isinstance(experiment, ClosedLoop) else None
 
 
 def evidence_of(experiment: ClosedLoop, limits: TripLimits, draws: int) -> Evidence | None:

@@ -13,7 +13,7 @@ from daq.errors import (
     RunError,
     Terminated,
 )
-from daq.experiment import ClosedLoop, Experiment, Plan
+from daq.experiment import Aboard, ClosedLoop, Experiment, Plan
 from daq.hal import ANALOG_INPUTS, Device, Phase
 from daq.limits import Limits
 from daq.limits.device import saturation_warnings
@@ -22,9 +22,9 @@ from daq.logs.writer import LogWriter
 from daq.rig import Rig
 from daq.run.hang import HangGuard
 from daq.run.outputs import INTERRUPTED, OutputState, read_back
-from daq.run.phases import calibrate, control, home, play
+from daq.run.phases import calibrate, control, home, play, require_law, supervise
 from daq.run.plan import plan
-from daq.run.protocol import Dialogue, description_of
+from daq.run.protocol import Dialogue, aboard_of, description_of
 from daq.run.realtime import RealTime
 from daq.run.sampling import Sampling, Watcher, nobody
 from daq.run.signals import SignalHandling
@@ -88,6 +88,7 @@ def run_experiment(
     planned = plan(experiment, rig_config)
     description = description_of(experiment)
     dialogue = Dialogue(experiment, planned) if isinstance(experiment, ClosedLoop) else None
+    aboard = aboard_of(experiment)
     limits = Limits(rig_config)
     record = {
         "experiment": description,
@@ -98,20 +99,23 @@ def run_experiment(
     with SignalHandling() as signals:
         capture = Capture.create(root, name, record, experiment.metadata)
         realtime = RealTime(overrun=signals.end_by)
-        return _Run(experiment, planned, dialogue, sampling, capture, signals, realtime).execute()
+        parts = experiment, planned, dialogue, aboard, sampling, capture, signals, realtime
+        return _Run(*parts).execute()
 
 
 @dataclass
 class _Run:
     """One run through its phases.
 
-    dialogue: with the controller of a closed loop. outputs: as they were at the end of a run whose
+    dialogue: with the controller of a closed loop. aboard: what the device's own controller is
+    asked for, where that closes the loop. outputs: as they were at the end of a run whose
     rig was opened.
     """
 
     experiment: Experiment
     plan: Plan
     dialogue: Dialogue | None
+    aboard: Aboard | None
     sampling: Sampling
     capture: Capture
     signals: SignalHandling
@@ -183,6 +187,8 @@ class _Run:
         sampling, record, homing = self.sampling, self.capture.record, self.experiment.homing
         info = sampling.rig.open()
         record["device"] = info.name
+        if self.aboard is not None:
+            require_law(sampling.rig, self.aboard.law)
         self._schedule(info.virtual_time)
         sampling.enter(Phase.CALIBRATION)
         calibrate(sampling, self.experiment.calibration, record)
@@ -190,7 +196,9 @@ class _Run:
             sampling.enter(Phase.HOMING, homing.turns)
             home(sampling, homing, record)
         sampling.enter(Phase.RUN)
-        if self.dialogue is not None:
+        if self.aboard is not None:
+            supervise(sampling, log, self.aboard)
+        elif self.dialogue is not None:
             control(sampling, log, self.dialogue, self.plan.n_samples)
         elif self.plan.commands is not None:
             play(sampling, log, self.plan.commands)

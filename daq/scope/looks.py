@@ -11,6 +11,7 @@ OTHERS = (PURPLE, GREEN, "#56B4E9", RED)  # of runs behind the one that is shown
 FLAG_COLORS = {
     Flag.CLAMPED: ORANGE, Flag.HELD: BLUE, Flag.LOST: RED, Flag.INTERLOCK: RED,
     Flag.UNDERFLOW: RED, Flag.SATURATED: PURPLE, Flag.DOUBTFUL: PURPLE,
+    Flag.LAW: GREEN,
 }  # fmt: skip
 _UNDRAWN = ("t", "tick", "flags")  # columns without a curve
 

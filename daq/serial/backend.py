@@ -2,6 +2,7 @@
 
 import contextlib
 import math
+import re
 from collections.abc import Sequence
 from typing import Annotated, Any
 
@@ -13,11 +14,21 @@ from daq.config.base import Section
 from daq.config.units import Seconds, Unit
 from daq.counter import Counter
 from daq.errors import DeviceError
-from daq.hal import ANALOG_INPUTS, CHANNELS, DeviceInfo, FloatArray, Guard, Mode, Phase, RawSamples
+from daq.hal import (
+    ANALOG_INPUTS,
+    CHANNELS,
+    DeviceInfo,
+    FloatArray,
+    Guard,
+    LawScales,
+    Mode,
+    Phase,
+    RawSamples,
+)
 from daq.serial import messages
 from daq.serial.connection import Connection
 from daq.serial.host import HostMachine
-from daq.serial.messages import Block, Channel, CodedGuard, Codes, Latch, Start, Type, Welcome
+from daq.serial.messages import Block, Channel, CodedGuard, Codes, Latch, Law, Start, Type, Welcome
 
 _SAFE_PATIENCE = 0.25  # s to hear that the outputs are zero
 _RATE_TOLERANCE = 5e-5  # as good as a quartz
@@ -26,6 +37,7 @@ _SIGMAS = 3.0  # of the drift's error that are not held against the device
 _N_IN, _N_OUT = len(ANALOG_INPUTS), len(CHANNELS)
 _SHORT, _NEAR = 2**16, 2**12  # counts of a short counter, and in a tick at its end
 _ROUNDING = 1e-9  # codes, by which a quotient may miss a whole number
+_LAW = re.compile(r", law ([0-9a-f]{8})$")  # in what a firmware says of itself
 _LARGEST_RATE = float(np.finfo(np.float32).max)  # 1/s
 
 
@@ -94,6 +106,7 @@ class SerialDevice:
             welcome.queue,
             volts_in,
             step_out=self._scaling.step_out,
+            law=_law_of(welcome),
         )
 
     def announce(self, phase: Phase, turns: float = 0.0) -> None:
@@ -129,6 +142,11 @@ class SerialDevice:
             connection.go()
             self._going = True
         return self._scaling.samples(connection.samples())
+
+    def answer(self, first: int, blend: int, scales: LawScales | None) -> None:
+        """Let the device's own torque controller answer from a tick on, or commands again."""
+        law = self._scaling.law(self._run, first, blend, scales)
+        self._sampling().ask(Type.LAW, law.pack())
 
     def stop(self) -> None:
         """End sampling; outputs are zero."""
@@ -227,6 +245,12 @@ def _name(welcome: Welcome) -> str:
     return f"{welcome.device} (firmware {welcome.firmware})"
 
 
+def _law_of(welcome: Welcome) -> str:
+    """Fingerprint of the controller in a firmware, as its name ends in; empty for none."""
+    end = _LAW.search(welcome.firmware)
+    return end[1] if end is not None else ""
+
+
 class Scaling:
     """Scales of a device's codes.
 
@@ -269,6 +293,19 @@ class Scaling:
         codes = np.where(within, np.clip(codes, self._low, self._high), codes)
         info = np.iinfo(np.int16)
         return np.clip(codes, info.min, info.max).astype(messages.COMMAND_DTYPE)
+
+    def law(self, run: int, first: int, blend: int, scales: LawScales | None) -> Law:
+        """LAW of a run, in codes; the counter's zero is the device's."""
+        if scales is None:
+            return Law(run, False, first, blend, 0, 0.0, (0.0, 0.0), (0.0, 0.0), 0.0)
+        analog = scales.current_motor, scales.torque
+        places = [ANALOG_INPUTS.index(name) for name in ("current_motor", "torque")]
+        current, torque = (
+            (float(slope * self._in_scale[at]), float(slope * self._in_offset[at] + zero))
+            for (slope, zero), at in zip(analog, places, strict=True)
+        )
+        reference = scales.reference * float(self._out_scale[0])
+        return Law(run, True, first, blend, 0, scales.angle, current, torque, reference)
 
     def samples(self, blocks: Sequence[Block]) -> RawSamples:
         """Blocks of records in volts and counts; DeviceError for a counter that runs over early."""

@@ -9,11 +9,14 @@
 #include "guard.h"
 #include "wire.h"
 
+/* RIG_FIRMWARE: what WELCOME calls the firmware, by which a host knows the controller. */
 #ifdef RIG_LAW_HEADER
 #define RIG_HAS_LAW 1
 #include RIG_LAW_HEADER
+#define RIG_FIRMWARE "hybrid-rig 1, law " RIG_CONTROLLER_FINGERPRINT
 #else
 #define RIG_HAS_LAW 0
+#define RIG_FIRMWARE "hybrid-rig 1"
 #endif
 
 #if RIG_HAS_LAW

@@ -196,6 +196,7 @@ HALF_BROKEN = """
 typedef float rig_real;
 typedef struct { rig_real volts[2]; int ticks; } rig_controller;
 #define RIG_CONTROLLER_AHEAD 1
+#define RIG_CONTROLLER_FINGERPRINT "00000000"
 #define RIG_CONTROLLER_PERIOD 0.00025f
 void rig_controller_reset(rig_controller *law);
 void rig_controller_step(rig_controller *law, rig_real theta, rig_real omega, rig_real torque,

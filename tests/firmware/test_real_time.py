@@ -10,10 +10,15 @@ import signal
 import tempfile
 from pathlib import Path
 
+import numpy as np
+import pandas as pd
 import pytest
 import yaml
 
 from daq.config.rig import RigConfig
+from daq.device_code import device_code
+from daq.experiment import Sample
+from daq.lookup.controllers import load_controller
 from daq.lookup.shipped import find_file
 from daq.serial.backend import SerialDevice, SerialOptions
 from tests.daq.hal_contract import Bench, HalContract
@@ -21,7 +26,7 @@ from tests.daq.serial.support import emulator
 from tests.daq.support import record_of, rig, rows_in, start_rig, until, write_yaml
 from tests.daq.test_hal import _exact_currents
 from tests.firmware import lockstep, patience
-from tests.firmware.build import needs
+from tests.firmware.build import make, needs
 
 pytestmark = pytest.mark.skipif(
     not os.environ.get("RIG_REAL_TIME_TESTS"),
@@ -30,6 +35,7 @@ pytestmark = pytest.mark.skipif(
 
 RESOLUTION, NOISE = 1.6e-4, 0.05
 WATCHDOG = 2.0  # s
+CONTROLLER = "simulated_controller.yaml"
 
 
 @pytest.fixture(scope="module")
@@ -113,6 +119,45 @@ def test_an_identification_on_it_is_that_of_the_simulated_rig(elf, tmp_path):
         name: (there[name], here[name]) for name in both if not overlap(there[name], here[name])
     }
     assert not apart
+
+
+@pytest.mark.soak
+def test_its_own_torque_controller_answers_a_run(tmp_path):
+    """``rig run`` with ``on_device``: what was applied is what the same law in Python answers."""
+    needs("make", "arm-none-eabi-gcc", "qemu-system-arm")
+    (tmp_path / "law").mkdir()
+    device_code(CONTROLLER, "single").save(tmp_path / "law", "law")
+    elf = make(BOARD="qemu", LAW=tmp_path / "law") / "qemu-law" / "rig.elf"
+    experiment = changed(
+        "protocol", "torque_tracking.yaml", tmp_path / "e.yaml",
+        on_device=True, duration=3, calibration={"samples": 200},
+    )  # fmt: skip
+    serial = changed(
+        "backend", "serial.yaml", tmp_path / "serial.yaml", options={"watchdog": 2}, limits=NO_CABLE
+    )
+    hand = {"seed": 5, "plant": {"load": "hand"}, "hand": [[0.5, 1.0], [1.5, -1.0]]}
+
+    def wired():
+        folder = Path(tempfile.mkdtemp(dir=tmp_path))
+        with emulated(elf, folder / "qemu", **hand) as running:
+            patience.watch(running)
+            recorded(experiment, "--rig", serial, "--port", running.port, folder=folder)
+        return next(folder.glob("runs/*/log.csv"))
+
+    log = pd.read_csv(patience.on_load(wired))
+    tuned = load_controller(CONTROLLER, tmp_path)
+    law, fields = tuned.law(), [name for name in Sample._fields if name in log]
+    rows = log[fields].to_dict("records")
+    samples = (Sample(time=t, **row) for t, row in zip(log.t, rows, strict=True))
+    answers = np.array([law.volts(*each) for each in zip(samples, log.torque_ref, strict=True)])
+    applied = log[["applied_voltage_motor", "applied_voltage_brake"]].to_numpy()
+    blend = 40  # samples at either end
+    error = np.abs(applied[blend + 1 : -blend] - answers[blend : -blend - 1])
+    assert (error.max(axis=0) < 1e-3 * np.array(tuned.most_volts)).all()
+    assert np.abs(answers[:, 0]).max() > 0.5
+    assert (log["flags"] == 128).all()
+    steps = np.abs(np.diff(applied[-blend:, 0], append=0.0))
+    assert steps.max() < 1.5 * np.abs(applied[-blend, 0]) / blend + 1e-3, "it went without a jump"
 
 
 @pytest.mark.soak

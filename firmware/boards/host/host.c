@@ -12,7 +12,7 @@ struct host_board host_board;
 
 const struct rig_identity host_identity = {
     .device = "host",
-    .firmware = "hybrid-rig 1",
+    .firmware = RIG_FIRMWARE,
     .serial = "0",
     .clock = HOST_CLOCK,
     .shortest_period = 250u,

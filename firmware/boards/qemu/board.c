@@ -49,7 +49,7 @@ static uint64_t exchanged;
 #define INPUT(NAME) {NAME, "V", STEP, 0.0, -32768 * STEP, 32767 * STEP}
 static const struct rig_identity IDENTITY = {
     .device = "board in QEMU",
-    .firmware = "hybrid-rig 1",
+    .firmware = RIG_FIRMWARE,
     .serial = "netduinoplus2",
     .clock = CLOCK,
     .shortest_period = 250u,

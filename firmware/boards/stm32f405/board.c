@@ -73,7 +73,7 @@ static uint8_t sending[SENDING];
 #define INPUT(NAME) {NAME, "V", STEP, 0.0, -32768 * STEP, 32767 * STEP}
 static const struct rig_identity IDENTITY = {
     .device = "STM32F405",
-    .firmware = "hybrid-rig 1",
+    .firmware = RIG_FIRMWARE,
     .serial = serial,
     .clock = CLOCK,
     .shortest_period = CLOCK / 4000u,

@@ -26,7 +26,7 @@ static struct rig_encoder encoder;
  * 0 of an output must be 0 V. */
 static const struct rig_identity IDENTITY = {
     .device = "my board",
-    .firmware = "hybrid-rig 1",
+    .firmware = RIG_FIRMWARE,
     .serial = "0001",
     .clock = CLOCK,
     .shortest_period = CLOCK / 4000u, /* by the longest that board_latch and board_apply take */
