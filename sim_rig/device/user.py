@@ -4,7 +4,6 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from daq.hal import FloatArray
 
@@ -26,9 +25,12 @@ class SimulatedUser:
     ) -> None:
         self._holds = holds
         self._path = np.array([(0.0, 0.0), *path]).T
-        # At rest at both ends.
-        times, angles = self._path
-        self._spline = CubicSpline(times, angles, bc_type="clamped") if smooth and path else None
+        self._spline = None
+        if smooth and path:
+            from scipy.interpolate import CubicSpline  # half a second, of every simulated rig
+
+            times, angles = self._path
+            self._spline = CubicSpline(times, angles, bc_type="clamped")  # at rest at both ends
         self._run_start = math.inf
         self._rest_angle = 0.0
         self._turns = 0.0

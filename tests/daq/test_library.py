@@ -140,9 +140,14 @@ def test_an_identification_loads_no_statistics_package():
     # Each takes half a second or more of every command.
     code = (
         "import sys, sysid.gassi, sysid.linear, daq.identification.fit, daq.cli.identify, "
-        "daq.identification.baseline; print([m for m in sys.modules if m in sys.argv[1:]])"
+        "daq.identification.baseline, sim_rig.backend\n"
+        "from sysid.problem.copies import shared_samples\n"
+        "from sysid.examples import lag_record\n"
+        "shared_samples([lag_record(seed=0), lag_record(seed=1)])\n"
+        "print([m for m in sys.modules if m in sys.argv[1:]])"
     )
-    heavy = ("sklearn", "scipy.stats", "scipy.signal", "pandas", "matplotlib", "joblib")
+    scipy = ("scipy.stats", "scipy.signal", "scipy.interpolate")
+    heavy = (*scipy, "sklearn", "pandas", "matplotlib", "joblib")
     result = subprocess.run(
         [sys.executable, "-c", code, *heavy],
         env=environment(), capture_output=True, text=True, check=True,
