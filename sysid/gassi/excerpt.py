@@ -91,7 +91,7 @@ class Excerpt:
         """
         n, head = len(space.index), {part.place: k for k, part in enumerate(self.parts)}
         head |= {part.place: k for k, part in enumerate(self.parts) if part.begin == 0}
-        plain = replace(space, parameters=space.parameters[:n], estimated=())
+        plain = space.without_starts()
         if not space.estimated:
             return plain, [chromosome[:n] for chromosome in chromosomes]
         whole = plain.with_starts(self.records)

@@ -23,6 +23,7 @@ from sysid.fitting.free_run import FINER, FINEST
 from sysid.fitting.innovations import Innovations
 from sysid.fitting.objective import Objective
 from sysid.fitting.refinement import Refinement, begin, refine, refine_each
+from sysid.gassi.filter_search import by_filter, coloured
 from sysid.gassi.lookalikes import lookalikes
 from sysid.gassi.slide import slid
 from sysid.uncertainty.colour import colour, longest_memory
@@ -50,9 +51,6 @@ _MOST_PROMISING = 3  # minima of a part of the data that are fitted to all
 _QUICKLY, _ROUGHLY = 15, 1e-4  # iterations and tolerance until then
 _WAY = np.array([0.25, 0.5, 0.75])  # parts of the way between two minima that are tried
 _EXPLORED = 2  # minima whose lookalikes are descended from
-# Descents by innovations around the first minimum, in parts of the ranges to either side, and error
-# in parts of the first's beyond which one is given up.
-_AROUND, _SPREAD, _FAR_BEHIND = 8, 0.25, 1.5
 # Minima are one when the way between them, were all linear, changed twice the log-likelihood by
 # less than this.
 _ONE = 16.0
@@ -100,7 +98,9 @@ def fit_likelihood(
     whether the minima have their lookalikes among them.
     """
     objective = _resolved(objective, minima[0])
-    optima = _explored(objective, minima, watch, lookalike=not explored)
+    # A filter begins at the minima of free runs, and does not end there.
+    roughly = noise == "innovations"
+    optima = _explored(objective, minima, watch, lookalike=not explored, roughly=roughly)
     best, *others = optima.ranked()
     refitted = None
     if noise is not None:
@@ -334,12 +334,12 @@ def _refitted(
     first = fit(ranked[0], watch)
     if first is None:
         return None
-    if isinstance(first.objective, Innovations) and first.objective.corrects:
-        first = better_around(fit, first, ranked[0], watch)
-    optima = _Optima(objective, first.rms * _too_well(ranked[0].rms))
-    optima.add(first)
     likely = [o for o in ranked[1:] if by_error.deviance(o, ranked[0]) < _CONCEIVABLE]
     starts = [optimum.chromosome for optimum in likely]
+    if isinstance(first.objective, Innovations) and first.objective.corrects:
+        first, starts = better_by_filter(fit, first, starts, ranked[0], watch)
+    optima = _Optima(objective, first.rms * _too_well(ranked[0].rms))
+    optima.add(first)
     ends = _conceivable(first.objective, starts, optima, first)
     descents = [begin(first.objective, end.chromosome) for end in ends]
     for end in refine_each(first.objective, descents):
@@ -368,35 +368,40 @@ def _conceivable(
     ]
 
 
-def better_around(
+def better_by_filter(
     fit: Callable[[Optimum, Watch | None], Optimum | None],
     first: Optimum,
+    others: list[FloatArray],
     by_error: Optimum,
     watch: Watch | None,
-) -> Optimum:
-    """The best of a filter's minimum and of descents from points spread around it.
+) -> tuple[Optimum, list[FloatArray]]:
+    """A filter's minimum and starts (n_free,) for others, or better ones.
 
-    Minima of free runs say little of a filter's, so that one of them is no place to end at.
-    Descents that are far behind after a few iterations are given up.
+    Sought where its innovations could be foreseen, which are white at the right parameters.
+    by_error: the minimum of free runs that it began with.
     """
-    objective, space = first.objective, first.objective.space
-    spread = _SPREAD * np.random.default_rng(0).uniform(-1.0, 1.0, (_AROUND, len(space.names)))
-    starts = space.decode(space.encode(first.chromosome) + spread * space.width)
-    least = float(objective.evaluate(first.chromosome[None])[0][0])
-    ends: Sequence[Refinement] = ()
-    for iterations, behind in ((_QUICKLY // 3, _FAR_BEHIND), (_QUICKLY, 1.0)):
-        descents = [begin(objective, start, tolerance=_ROUGHLY) for start in starts]
-        ends = refine_each(objective, descents, max_iterations=iterations)
-        ends = [end for end in ends if end.error < behind * least]
-        starts = np.array([end.chromosome for end in ends]).reshape(-1, len(space.names))
-    if not ends:
-        return first
-    best = min(ends, key=lambda end: end.error)
-    nearby = fit(replace(by_error, chromosome=best.chromosome), watch)
-    if nearby is None or not nearby.feasible >= first.feasible:
-        return first
-    better = float(objective.evaluate(nearby.chromosome[None])[0][0]) < least
-    return nearby if better else first
+    fitted = first.objective
+    assert isinstance(fitted, Innovations)
+    little = coloured(fitted, first.chromosome)
+    if not little.any():
+        return first, others
+    start, *rest = by_filter(by_error.objective, fitted, little)
+    found = fit(replace(by_error, chromosome=start), watch)
+    if found is None or not _foresees_more(found, first):
+        return first, others
+    return found, rest
+
+
+def _foresees_more(optimum: Optimum, other: Optimum) -> bool:
+    """Whether its innovations are the less, by the lesser noise of both filters."""
+    fitted, before = optimum.objective, other.objective
+    assert isinstance(fitted, Innovations) and isinstance(before, Innovations)
+    if optimum.feasible != other.feasible:
+        return optimum.feasible
+    common = fitted.of_noise(np.minimum(fitted.noise, before.noise))
+    rms = common.rms(np.stack([optimum.chromosome, other.chromosome]))
+    loss = np.log(np.maximum(rms, _TINY)) @ (fitted.counts * (fitted.weights > 0.0))
+    return bool(loss[0] < loss[1])
 
 
 def noisy_fit(

@@ -25,6 +25,7 @@ from sysid.problem.faults import DataFault
 from sysid.problem.metrics import Metrics, evaluate, mean_known
 from sysid.problem.model import ProcessModel
 from sysid.uncertainty import Uncertainty
+from sysid.uncertainty.colour import SUCCESSIVE
 
 Trust = Literal["good", "limited", "poor"]
 
@@ -49,7 +50,6 @@ _ABOVE_NOISE, _BY_CHANCE = 1.25, 0.01
 # Correlation of two outputs' residuals that is no sensor's; rank correlation of their size with an
 # output's rate of change; how far apart parameters of parts of the data are, in parts of chance.
 _SHARED, _BY_SPEED, _DISAGREEING = 0.3, 0.2, 1.5
-_SUCCESSIVE = 0.3  # correlation of an innovation with the one before
 _ROUNDING = 2e-4  # of an output's deviation, below which errors may be those of a simulation
 
 
@@ -446,7 +446,7 @@ def coloured_innovations(uncertainty: Uncertainty) -> BoolArray:
     Those of the right parameters of a right model are white (Kailath, "An innovations approach to
     least-squares estimation", IEEE Transactions on Automatic Control 13, 1968).
     """
-    coloured: BoolArray = np.abs(uncertainty.succession) > _SUCCESSIVE
+    coloured: BoolArray = np.abs(uncertainty.succession) > SUCCESSIVE
     return coloured
 
 

@@ -142,6 +142,10 @@ class SearchSpace:
                 starts.append((k, i))
         return replace(self, parameters=tuple(parameters), estimated=tuple(starts))
 
+    def without_starts(self) -> SearchSpace:
+        """The same space of the parameters alone."""
+        return replace(self, parameters=self.parameters[: len(self.index)], estimated=())
+
     def with_nominal_starts(self, chromosomes: FloatArray) -> FloatArray:
         """Chromosomes of the parameters alone, completed by where the states start otherwise."""
         begin = [parameter.nominal for parameter in self.parameters[len(self.index) :]]

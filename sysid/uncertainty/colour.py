@@ -17,6 +17,7 @@ from sysid.arrays import BoolArray, FloatArray
 
 _LARGEST_ORDER = 12
 _BY_CHANCE = 4.0  # standard deviations of a correlation, to which it may come by chance
+SUCCESSIVE = 0.3  # correlation from which an innovation could be foreseen by the one before
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from sysid import (
 )
 from sysid.fitting.innovations import Innovations
 from sysid.fitting.objective import Objective
-from sysid.gassi.likelihood import Optimum, better_around, noisy_fit, towards
+from sysid.gassi.likelihood import Optimum, better_by_filter, noisy_fit, towards
 from sysid.uncertainty import uncertainty
 from sysid.uncertainty.sensitivity import sensitivity
 from tests.sysid.support import lag, linear_response, prbs
@@ -339,19 +339,23 @@ def test_innovations_of_wrong_parameters_follow_one_another(share):
     assert uncertainty(objective, chromosome).succession.size == 0
 
 
-def test_a_filters_minimum_is_sought_around_that_of_free_runs():
+def test_a_filters_minimum_is_sought_all_over_where_innovations_can_be_foreseen():
     (record, _) = noisy_records(1)
     space = SearchSpace.of(lag())
     objective = Objective(BatchSimulator(lag(), accuracy=1e-4), space, [record])
-    wrong = np.array([1.5 * GAIN, 1.5 * TAU])
+    wrong = np.array([0.5 * GAIN, TAU])
     by_error = Optimum(objective, wrong, objective.rms(wrong[None])[0], feasible=True)
     criterion = Innovations.starting(objective, wrong, corrects=True)
     stuck = replace(by_error, objective=criterion, rms=criterion.rms(wrong[None])[0])
     fit = partial(noisy_fit, True, None, objective)
-    better = better_around(fit, stuck, by_error, None)
+    better, _ = better_by_filter(fit, stuck, [], by_error, None)
     from_truth = fit(replace(by_error, chromosome=np.array([GAIN, TAU])))
-    np.testing.assert_allclose(better.chromosome, from_truth.chromosome, rtol=0.02)
-    assert better_around(lambda optimum, watch: None, stuck, by_error, None) is stuck
+    assert better.chromosome == pytest.approx(from_truth.chromosome, rel=0.15)
+    # Neither what cannot be fitted nor what is no better, and nothing where they are white.
+    assert better_by_filter(lambda optimum, watch: None, stuck, [wrong], by_error, None)[0] is stuck
+    assert better_by_filter(lambda optimum, watch: stuck, stuck, [], by_error, None)[0] is stuck
+    rest = [wrong]
+    assert better_by_filter(fit, from_truth, rest, by_error, None) == (from_truth, rest)
 
 
 def test_an_output_whose_error_is_all_of_an_inputs_noise_counts_like_the_others():
