@@ -43,6 +43,7 @@ DRAWN = (
 )
 SPREAD = 1.25  # factor either way
 HAND = 4.0  # likewise
+WEIGHT = 0.12  # kg
 WINDER = 8.0  # hands that hold the wound load
 RATE = 800.0  # Hz
 FREE_BAND = 5.0  # Hz
@@ -164,9 +165,9 @@ def shipped(package: Any, name: str) -> dict[str, Any]:
 
 def _identified(folder: Path, seed: int, plant: Mapping[str, Any]) -> Path:
     """What the shipped experiment tells of such a rig, as parameters.yaml."""
-    # Whoever winds the load holds on as firmly as its friction asks for.
+    # Whoever winds the load holds on as firmly as its friction asks for, and hangs what it holds.
     grip = {"K_u": WINDER * HAND_STIFFNESS, "B_u": WINDER * HAND_DAMPING}
-    pulley = {**plant["parameters"], **grip}
+    pulley = {**plant["parameters"], **grip, "mass": WEIGHT}
     options = {"seed": seed, "plant": {**plant, "parameters": pulley}}
     run = record("prbs.yaml", "simulated.yaml", folder / "runs", options=options)
     name = "actuator:friction=stribeck" if "friction" in plant else "actuator"

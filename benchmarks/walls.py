@@ -7,11 +7,11 @@ Walls rendered by the static law and by the inverse without what it takes off (f
 by the motor alone and with the brake: switched on in contact, or shared by its hysteresis state.
 Guaranteed: passive by ``haptics.passivity`` with 95 % over actuators whose parameters are uncertain
 by 3 %, in any passive hand. Held: the stiffest without damping that comes to rest, entered and
-left, in any hand that damps as a quarter of (A.2)'s does. Simulated: the stiffest wall that rests
-in all of so many hands from 1/4 to 4 times that of (A.2), each with an actuator of its own, after a
-tap. The best rendered damping of each. Measured: the stiffest wall that ``virtual_wall`` finds
-stable on the simulated rig, electronics, limits and all, in hands of both ends and the middle; a
-limit that trips ends it.
+left, in any hand that damps as a quarter of (A.2)'s does and is no stiffer than 40 N*m/rad.
+Simulated: the stiffest wall that rests in all of so many hands from 1/4 to 4 times that of (A.2),
+each with an actuator of its own, after a tap. The best rendered damping of each. Measured: the
+stiffest wall that ``virtual_wall`` finds stable on the simulated rig, electronics, limits and all,
+in hands of both ends and the middle; a limit that trips ends it.
 
 ``--fresh``: what is promised in hands that damp, against so many plants that were drawn anew. True
 is the stiffest wall whose linear loop is stable, without friction, in hands of that damping with a
@@ -39,9 +39,9 @@ from daq.hal import FloatArray
 from daq.lookup.controllers import TunedController, load_controller
 from haptics import trial
 from haptics.dynamics import ActuatorDynamics
-from haptics.evidence import HAND, HAND_RANGE, Scene, run_trials
+from haptics.evidence import HAND, HAND_RANGE, STIFFEST_HAND, Scene, run_trials
 from haptics.linear_loop import LinearLaw, loop_margins
-from haptics.passivity import Passivity, Tracker, UnknownPassivityError
+from haptics.passivity import Hands, Passivity, Tracker, UnknownPassivityError
 from protocols.control.loop import tracker_gains
 
 MODEL = "actuator:parameters=rig"
@@ -64,6 +64,7 @@ GRID = (0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0)  # N*m/rad, of runs
 COUNT = 2.0 * math.pi / 8192.0
 LIMITS = TripLimits(math.inf, math.inf, math.inf, math.inf, (-5.0, 5.0), (0.0, 0.38), COUNT)
 BANDWIDTH = 150.0  # Hz
+HELD = Hands(HAND[1] / HAND_RANGE, STIFFEST_HAND)
 POSITION, LEAN = 0.2, 0.5  # rad
 
 
@@ -119,7 +120,7 @@ def guaranteed(tuned: TunedController) -> dict[str, float]:
     actuators = np.concatenate([tuned.parameters[None], tuned.plausible(40)])
     try:
         promise = Passivity(tuned, tracker, actuators).promise(COUNT)
-        held = Passivity(tuned, tracker, actuators, HAND[1] / HAND_RANGE).springs_promised()
+        held = Passivity(tuned, tracker, actuators, HELD).springs_promised()
     except UnknownPassivityError:
         return NOTHING
     return {
@@ -167,10 +168,10 @@ def linear_limit(tuned: TunedController, plant: FloatArray) -> float:
         wall = replace(law, G=G, D=D)
         return all(
             loop_margins(
-                wall, dynamics, "sliding forwards", (spring, HAND[1] / HAND_RANGE),
+                wall, dynamics, "sliding forwards", (spring, HELD.damping),
                 1.0 / control.sample_rate, control.ahead,
             ).stable
-            for spring in np.geomspace(0.04, 40.0, 25).tolist()
+            for spring in np.geomspace(0.04, HELD.stiffness, 25).tolist()
         )  # fmt: skip
 
     low, high = 0.0, STIFFEST

@@ -26,6 +26,7 @@ BoolArray = NDArray[np.bool_]
 
 HAND = (0.16, 0.0179)  # N*m/rad, N*m*s/rad, by (A.2)
 HAND_RANGE = 4.0  # factor either way
+STIFFEST_HAND = 40.0  # N*m/rad, of those that walls are promised for: 250 times (A.2)'s
 NOISE = (5e-3, 5e-3, 7e-3)  # A, A, N*m: rms of the sensors
 
 _LONGEST_STEP = 1.6e-4  # s; an amplifier at its end is faster than its linear part

@@ -22,7 +22,15 @@ The brake is passive, but it gives no b: within its yield travel it is a spring 
 passive while its current is constant: switched on under load that spring gives energy. Nothing is
 told of a law that shares its torque with the brake.
 
-A hand that damps adds to b. And a hand leaves a wall and comes back, which is no linear loop: a
+A hand that damps adds to b. A hand no stiffer than k lets no impedance of the shaft fall below
+x = J omega - k / omega in its imaginary part, with any mass; so of each phi from 0 to pi / 2
+
+    Re e^(-j phi) Z >= d = b cos phi + x sin phi,
+
+and where d > 0 Y is in the disc with the centre e^(-j phi) / 2 d and the radius 1 / 2 d. Each of
+these discs holds all admittances, so that at every frequency one that proves it is enough.
+
+And a hand leaves a wall and comes back, which is no linear loop: a
 spring's torque phi(theta) is zero without, and rises by no more than K with the angle. With G from
 that torque to the angle, H_r X / (1 - H_a X) of the law's H_r by reference and H_a by angle, X in
 the disc above and G in its image, the hand comes to rest if for some multiplier
@@ -37,6 +45,7 @@ Automatic Control 13, 1968). Clamped commands are such a phi as well.
 """
 
 import itertools
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -53,8 +62,9 @@ from haptics.operating_points import Branch
 
 ComplexArray = NDArray[np.complex128]
 
-_ALIASES = 40  # either side
-_FREQUENCIES = 160
+_ALIASES = 10  # either side
+_FREQUENCIES = 640
+_BETWEEN = 0.99  # of what is found at them, for the least may lie between
 _STIFFEST = 1e4  # N*m/rad
 _BISECTIONS = 40
 _DAMPINGS = 25
@@ -62,6 +72,15 @@ _SURE = 5.0  # %, of the draws may be below what is promised
 _TAPS = 7  # of multipliers, beside two for each sample of delay
 _SAME = 0.05  # of a law's response: by which the observers of a linear one differ
 _MIXTURES = np.linspace(0.0, 1.0, 11)
+_TURNS = np.linspace(0.0, 0.5 * np.pi, 19)  # phi, of the discs
+
+
+@dataclass(frozen=True)
+class Hands:
+    """Passive hands of any mass: damping [N*m*s/rad] at least, stiffness [N*m/rad] at most."""
+
+    damping: float = 0.0
+    stiffness: float = math.inf
 
 
 class UnknownPassivityError(ValueError):
@@ -132,7 +151,7 @@ class WallLaw:
 
 @dataclass(frozen=True)
 class Port:
-    """The shaft at which a wall is rendered: centre and radius of its disc, by frequency.
+    """The shaft at which a wall is rendered: centres and radii, (m, n), of discs by frequency.
 
     damping [N*m*s/rad], friction [N*m]: of the sliding shaft without a current.
     """
@@ -145,44 +164,65 @@ class Port:
     @classmethod
     def of(
         cls, dynamics: ActuatorDynamics, z: ComplexArray, time: float, ahead: int,
-        held: float = 0.0,
+        hands: Hands = Hands(),
     ) -> "Port":  # fmt: skip
-        """That of an actuator, at frequencies z, in a hand with a damping [N*m*s/rad] at least."""
+        """That of an actuator whose brake is off, at frequencies z, in any of the hands."""
         omega = np.angle(z) / time
         s = 1j * (omega[:, None] + 2.0 * np.pi / time * np.arange(-_ALIASES, _ALIASES + 1))
         by_volts, by_speed = _currents(dynamics, s)
         constant = dynamics.motor_constant
         at_rest = dynamics.rest(0.0, 1.0, 0.0, 0.0), dynamics.rest(0.0, 0.0, 0.0, 0.0)
         damping = at_rest[1] - at_rest[0]
-        b = np.maximum(damping + held - constant * by_speed.real, 1e-12)
-        centre, radius = disc(constant * by_volts, b, s, time, ahead)
+        emf = constant * by_speed
+        b = np.maximum(damping + hands.damping - emf.real, 1e-12)
+        # Within its yield travel the brake is one more spring.
+        spring = hands.stiffness + _yield_stiffness(dynamics)
+        size = np.abs(s.imag)
+        x = dynamics.inertia * size - spring / size - emf.imag * np.sign(s.imag)
+        centre, radius = discs(constant * by_volts, b, x, s, time, ahead)
         friction = abs(dynamics.rest(0.0, 0.0, dynamics.sliding, 0.0))
         return cls(centre, radius, damping, friction)
 
     def passive(self, H: ComplexArray) -> bool:
         """Whether volts by -H times the angle leave the port passive."""
         margin = np.abs(1.0 + H * self.centre) - np.abs(H) * self.radius
-        return bool(np.all(margin > 0.0))
+        return bool(np.all(np.any(margin > 0.0, axis=0)))
 
     def by_torque(self, law: WallLaw) -> tuple[ComplexArray, FloatArray]:
-        """Centre and radius, (n,), of the disc of angle by the torque that a law is asked for."""
+        """Centres and radii, (m, n), of discs of the angle by the torque that a law is asked for.
+
+        An infinite radius: with that disc the law alone is not known to be stable in every hand.
+        """
         a, C, R = law.by_angle, self.centre, self.radius
-        apart = np.abs(1.0 - a * C) ** 2 - np.abs(a * R) ** 2
-        if not np.all(apart > 0.0):  # the law alone leaves no stable loop in some hand
-            return C, np.full(R.shape, np.inf)
+        bounded = np.isfinite(R)
+        R = np.where(bounded, R, 0.0)
+        stable = bounded & (np.abs(1.0 - a * C) > np.abs(a) * R)
+        apart = np.where(stable, np.abs(1.0 - a * C) ** 2 - np.abs(a * R) ** 2, 1.0)
         centre = (C * np.conj(1.0 - a * C) + np.conj(a) * R**2) / apart
-        return law.by_reference * centre, np.abs(law.by_reference) * R / apart
+        radius = np.where(stable, np.abs(law.by_reference) * R / apart, np.inf)
+        return law.by_reference * centre, radius
 
 
-def disc(
-    torque: ComplexArray, b: FloatArray, s: ComplexArray, time: float, ahead: int
+def discs(
+    torque: ComplexArray, b: FloatArray, x: FloatArray, s: ComplexArray, time: float, ahead: int
 ) -> tuple[ComplexArray, FloatArray]:
-    """Centre and radius of the disc, (n,), by torque per volt and damping at all aliases s, (n, m).
+    """Centres and radii of discs, (m, n), by torque per volt at all aliases s, (n, k).
 
-    time: of a sample [s].
+    b, x: least real part of the impedance and, for positive frequencies, least imaginary one,
+    (n, k); -infinity: none. time: of a sample [s]. The middle of the aliases is the frequency
+    itself, whose disc is turned; of the others the smallest is taken.
     """
     P = torque * (1.0 - np.exp(-s * time)) / s * np.exp(-s * (ahead * time)) / s / time
-    return (P / (2.0 * b)).sum(axis=1), (np.abs(P) / (2.0 * b)).sum(axis=1)
+    least = 2.0 * (b + 1j * np.maximum(x, 0.0) * np.sign(s.imag))
+    middle = s.shape[1] // 2
+    others = np.delete(P / least, middle, axis=1)
+    turn = _TURNS[:, None] if np.isfinite(x[:, middle]).any() else _TURNS[:1, None]
+    d = b[:, middle] * np.cos(turn) + np.maximum(x[:, middle], -_STIFFEST) * np.sin(turn)
+    with np.errstate(divide="ignore"):
+        half = np.where(d > 0.0, 0.5 / np.maximum(d, 0.0), np.inf)
+    direct, bounded = P[:, middle], np.where(d > 0.0, half, 0.0)
+    centre = others.sum(axis=1) + direct * bounded * np.exp(-1j * turn * np.sign(s[:, middle].imag))
+    return centre, np.abs(others).sum(axis=1) + np.abs(direct) * half
 
 
 @dataclass(frozen=True)
@@ -207,13 +247,13 @@ class Passivity:
     """Passivity of walls that a controller renders.
 
     tracker: of the speed that a wall's damping sees. actuators: (n, n_parameters), the identified
-    one first. held: damping that hands have at least [N*m*s/rad].
+    one first. hands: at the handle.
     """
 
     controller: TunedController
     tracker: Tracker
     actuators: FloatArray
-    held: float = 0.0
+    hands: Hands = Hands()
 
     @cached_property
     def law(self) -> WallLaw:
@@ -226,7 +266,7 @@ class Passivity:
         model, law = self.controller.model, self.law
         ahead = self.controller.control.ahead
         return [
-            Port.of(ActuatorDynamics(model, p), law.z, self._time, ahead, self.held)
+            Port.of(ActuatorDynamics(model, p), law.z, self._time, ahead, self.hands)
             for p in self.actuators
         ]
 
@@ -247,7 +287,7 @@ class Passivity:
             low, high = (middle, high) if passive(middle) else (low, middle)
             if high - low < 1e-4 * high:
                 break
-        return low
+        return _BETWEEN * low
 
     @cached_property
     def _multiplier(self) -> ComplexArray:
@@ -265,9 +305,9 @@ class Passivity:
     def _by_multiplier(self, port: Port, M: ComplexArray) -> FloatArray:
         """The stiffest springs that multipliers M, (..., n), allow [N*m/rad], (...)."""
         C, R = port.by_torque(self.law)
-        with np.errstate(divide="ignore"):
-            need = np.maximum(np.abs(M) * R - (M * C).real, 1e-300)
-        stiffest: FloatArray = np.min(M.real / need, axis=-1)
+        M = M[..., None, :]
+        need = np.maximum(np.abs(M) * R - (M * C).real, 1e-300)
+        stiffest: FloatArray = np.min(np.max(M.real / need, axis=-2), axis=-1)
         return np.minimum(stiffest, _STIFFEST)
 
     @cached_property
@@ -285,7 +325,7 @@ class Passivity:
         if not self.is_linear:
             return np.zeros(len(self.actuators))
         M = self._multiplier
-        return np.array([float(self._by_multiplier(port, M)) for port in self.ports])
+        return _BETWEEN * np.array([float(self._by_multiplier(port, M)) for port in self.ports])
 
     def springs_promised(self) -> float:
         """The same with 95 %, over the actuators [N*m/rad]."""
@@ -312,6 +352,13 @@ class Passivity:
     @property
     def _time(self) -> float:
         return 1.0 / self.controller.control.sample_rate
+
+
+def _yield_stiffness(dynamics: ActuatorDynamics) -> float:
+    """Of the brake without a current, by a turn of a thousandth of its yield travel [N*m/rad]."""
+    share = 1e-3
+    torques = [dynamics.rest(0.0, 0.0, z, 0.0) for z in (0.0, share * dynamics.sliding)]
+    return abs(torques[1] - torques[0]) * dynamics.stiffness / share
 
 
 def _electrical(dynamics: ActuatorDynamics) -> tuple[FloatArray, FloatArray, FloatArray, int]:

@@ -8,8 +8,8 @@ import numpy as np
 from daq.experiment import Controller, Evidence, Plan, TripLimits
 from daq.findings import Chart, Findings, Number, Series
 from daq.hal import FloatArray, Samples
-from haptics.evidence import HAND, HAND_RANGE, Scene
-from haptics.passivity import Passivity, Tracker, UnknownPassivityError
+from haptics.evidence import HAND, HAND_RANGE, STIFFEST_HAND, Scene
+from haptics.passivity import Hands, Passivity, Tracker, UnknownPassivityError
 from protocols.analysis.results import DAMPING, STIFFNESS
 from protocols.analysis.walls import WallFindings, WallTheory, visited
 from protocols.control.loop import command_bounds, tracker_gains
@@ -104,9 +104,9 @@ class VirtualWall(WallSettings):
         tracker = Tracker(*tracker_gains(self.speed_filter, 1.0 / self.sample_rate))
         drawn = tuned.plausible(_ACTUATORS)
         actuators = np.concatenate([tuned.parameters[None], drawn])
-        held = HAND[1] / HAND_RANGE
+        hands = Hands(HAND[1] / HAND_RANGE, STIFFEST_HAND)
         promise = Passivity(tuned, tracker, actuators).promise(count)
-        springs = Passivity(tuned, tracker, actuators, held).springs_promised()
+        springs = Passivity(tuned, tracker, actuators, hands).springs_promised()
         sure = "with 95 %" if len(drawn) else "if the parameters are right"
         any_hand = (
             f"Walls up to {promise.stiffness:.3g} N*m/rad with a damping of "
@@ -119,7 +119,10 @@ class VirtualWall(WallSettings):
             f"Colgate and Schenkel without delay: {promise.colgate:.3g}; Abbott and Okamura: "
             f"{promise.abbott:.3g} N*m/rad."
         )
-        damps = f"that damps by {held:.2g} N*m*s/rad or more, a quarter of (A.2)'s"
+        damps = (
+            f"that damps by {hands.damping:.2g} N*m*s/rad or more, a quarter of (A.2)'s, and is no "
+            f"stiffer than {hands.stiffness:g} N*m/rad, with the brake off"
+        )
         damped = (
             f"Walls without damping up to {springs:.3g} N*m/rad come to rest {sure}, entered and "
             f"left, in any hand {damps}."
@@ -127,7 +130,7 @@ class VirtualWall(WallSettings):
             else f"No wall is promised to come to rest in a hand {damps}, either."
         )
         remarks = f"{any_hand} {closed_forms}", damped
-        meanings = "of walls in any hand", f"of springs in hands that damp by {held:.2g} or more"
+        meanings = "of walls in any hand", f"of springs in hands that damp by {hands.damping:.2g}"
         numbers = (
             Number("passive_stiffness", promise.stiffness, "N*m/rad", meaning=meanings[0]),
             Number("held_stiffness", springs, "N*m/rad", meaning=meanings[1]),

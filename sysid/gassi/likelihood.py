@@ -386,20 +386,20 @@ def better_by_filter(
     if not little.any():
         return first, others
     start, *rest = by_filter(by_error.objective, fitted, little)
-    found = fit(replace(by_error, chromosome=start), watch)
-    if found is None or not _foresees_more(found, first):
+    anew = fit(replace(by_error, chromosome=start), watch)
+    if anew is None or not _foresees_more(anew, first):
         return first, others
-    return found, rest
+    return anew, rest
 
 
-def _foresees_more(optimum: Optimum, other: Optimum) -> bool:
+def _foresees_more(optimum: Optimum, rival: Optimum) -> bool:
     """Whether its innovations are the less, by the lesser noise of both filters."""
-    fitted, before = optimum.objective, other.objective
+    fitted, before = optimum.objective, rival.objective
     assert isinstance(fitted, Innovations) and isinstance(before, Innovations)
-    if optimum.feasible != other.feasible:
+    if optimum.feasible != rival.feasible:
         return optimum.feasible
     common = fitted.of_noise(np.minimum(fitted.noise, before.noise))
-    rms = common.rms(np.stack([optimum.chromosome, other.chromosome]))
+    rms = common.rms(np.stack([optimum.chromosome, rival.chromosome]))
     loss = np.log(np.maximum(rms, _TINY)) @ (fitted.counts * (fitted.weights > 0.0))
     return bool(loss[0] < loss[1])
 

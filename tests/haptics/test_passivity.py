@@ -1,13 +1,15 @@
 """Which walls are passive: against the closed form, against hands that would make them unstable."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from daq.lookup.controllers import load_controller
 from haptics.dynamics import ActuatorDynamics
 from haptics.evidence import HAND, HAND_RANGE
-from haptics.linear_loop import sampled_actuator
-from haptics.passivity import Passivity, Port, Tracker, UnknownPassivityError, disc
+from haptics.linear_loop import LinearLaw, loop_margins, sampled_actuator
+from haptics.passivity import Hands, Passivity, Port, Tracker, UnknownPassivityError, discs
 from protocols.control.loop import tracker_gains
 from tests.haptics.test_torque_tracking import controller
 
@@ -24,7 +26,8 @@ def test_of_an_ideal_amplifier_the_disc_is_the_theorem(delay, damping):
     b, angle = 2e-4, np.pi * np.geomspace(1e-3, 1.0, 200)
     z = np.exp(1j * angle)
     s = 1j * (angle[:, None] / T + 2.0 * np.pi / T * np.arange(-400, 401))
-    centre, radius = disc(np.ones_like(s), np.full(s.shape, b), s, T, delay)
+    nothing = np.full(s.shape, -np.inf)
+    centre, radius = discs(np.ones_like(s), np.full(s.shape, b), nothing, s, T, delay)
     port = Port(centre, radius, b, 0.0)
 
     def needed(K):
@@ -36,12 +39,12 @@ def test_of_an_ideal_amplifier_the_disc_is_the_theorem(delay, damping):
         assert port.passive(scale * stiffest + damping * (z - 1.0) / z / T) == passive
 
 
-def passivity(folder, kind, draws=0, held=0.0, **settings):
+def passivity(folder, kind, draws=0, held=0.0, stiffest=np.inf, **settings):
     path = controller(folder, kind, **{"allocation": "motor", **settings})
     tuned = load_controller(str(path), folder)
     factors = np.random.default_rng(0).normal(1.0, 0.05, (draws, len(tuned.parameters)))
     actuators = np.concatenate([tuned.parameters[None], tuned.parameters * factors])
-    return Passivity(tuned, TRACKER, actuators, held)
+    return Passivity(tuned, TRACKER, actuators, Hands(held, stiffest))
 
 
 def spectral_radius(dynamics, K, B, spring, damping=0.0):
@@ -127,6 +130,60 @@ def bounced(dynamics, K, spring, damping, lean, speed):
         volts = np.clip(-K * depth / gain, -4.0, 4.0)
         speeds.append(x[:, omega])
     return np.array(speeds)
+
+
+@pytest.mark.parametrize("stiffest", [np.inf, 40.0, 0.5])
+def test_every_hand_is_in_every_disc(tmp_path, stiffest):
+    check = passivity(tmp_path, "static", held=HELD, stiffest=stiffest)
+    port, law, rng = check.ports[0], check.law, np.random.default_rng(1)
+    dynamics, n = ActuatorDynamics(check.controller.model), 400
+    s = 1j * (np.angle(law.z)[:, None] / T + 2.0 * np.pi / T * np.arange(-n, n + 1))
+    by_volts, by_speed = actuator_currents(dynamics, s)
+    hold = (1.0 - np.exp(-s * T)) / s * np.exp(-s * T) / s / T  # a sample late
+    for _ in range(50):
+        damping = HELD * (1.0 + rng.exponential(3.0) * rng.integers(2))
+        spring = min(stiffest, 1e3) * rng.choice([0.0, 1.0, rng.uniform()])
+        mass = rng.choice([0.0, 1e-5, 1e-3]) * rng.uniform()
+        hand = damping + spring / s + mass * s
+        shaft = dynamics.inertia * s + port.damping - dynamics.motor_constant * by_speed + hand
+        angle = (dynamics.motor_constant * by_volts * hold / shaft).sum(axis=1)
+        beyond = np.abs(angle - port.centre) - port.radius
+        assert (beyond < 1e-3 * np.abs(angle)).all()
+
+
+def actuator_currents(dynamics, s):
+    """Motor current by command and by speed, from the sums of the electrical states."""
+    names, inputs = dynamics.model.state_names, dynamics.model.input_names
+    A, B, _, _ = dynamics.linear(0.0, 0.0, 0.0)
+    inner = [k for k, name in enumerate(names) if name not in ("omega", "z", "theta")]
+    poles, vectors = np.linalg.eig(A[np.ix_(inner, inner)])
+    row = vectors[inner.index(names.index("current_motor"))]
+    columns = B[inner, inputs.index("applied_voltage_motor")], A[inner, names.index("omega")]
+    weights = [row * np.linalg.solve(vectors, column) for column in columns]
+    return [sum(w / (s - p) for w, p in zip(weight, poles, strict=True)) for weight in weights]
+
+
+def test_hands_that_are_no_clamps_let_the_inverse_hold_stiffer_walls(tmp_path):
+    plain = {"friction_share": 0.0, "inertia_share": 0.0}
+    checks = [
+        passivity(tmp_path, "feedforward", held=HELD, stiffest=stiffest, **plain)
+        for stiffest in (np.inf, 40.0, 4.0)
+    ]
+    clamps, promised, soft = (check.springs_promised() for check in checks)
+    assert clamps < 0.75 * promised and promised < soft
+    tuned, dynamics = checks[1].controller, ActuatorDynamics(checks[1].controller.model)
+    law = LinearLaw.of(tuned.control.program(tuned.model, tuned.parameters), tuned.model)
+
+    def stable(K):
+        wall = replace(law, G=law.G.copy(), D=law.D.copy())
+        wall.G[:, 0] -= K * law.G[:, 4]
+        wall.D[:, 0] -= K * law.D[:, 4]
+        return all(
+            loop_margins(wall, dynamics, "sliding forwards", (spring, HELD), T, 1).stable
+            for spring in np.geomspace(0.04, 40.0, 25)
+        )
+
+    assert stable(promised) and not stable(1.1 * promised)
 
 
 def test_promised_springs_come_to_rest_however_they_are_entered_and_left(tmp_path):
