@@ -42,7 +42,7 @@ def characterise(
     ] = False,
     json: options.AsJson = False,
 ) -> None:
-    """Find a rig's parameters: design runs, run them, identify, and again.
+    """Find a rig's parameters: design, run, identify, and again.
 
     Until the intervals are narrow enough, the time is used up, or no run would tell more. One
     folder holds designs, logs, results and a page; after an interruption it goes on from there.

@@ -40,9 +40,9 @@ def design(
     settings: options.DesignSettings = None,
     json: options.AsJson = False,
 ) -> None:
-    """Find the runs that tell most about the parameters, within the rig's limits.
+    """Find the runs that tell most about the parameters.
 
-    Writes them as experiments for rig run, and says beforehand how narrow the intervals will be,
+    Writes experiments for rig run, within the rig's limits, and says how narrow intervals will be,
     what stays unknown, and what would tell it. With structures in the question: the runs that tell
     these apart, and how surely. Nothing is energised.
     """

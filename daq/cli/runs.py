@@ -57,7 +57,7 @@ def runs(
     ] = None,
     json: options.AsJson = False,
 ) -> None:
-    """List recorded runs, search and compare them, note something of them."""
+    """List recorded runs; search, compare and annotate them."""
     from daq.catalogue.annotation import annotate
     from daq.catalogue.comparison import draw_comparison, quantities_of
     from daq.catalogue.index import catalogue

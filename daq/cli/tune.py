@@ -38,9 +38,9 @@ def tune(
     ),
     json: options.AsJson = False,
 ) -> None:
-    """Make a torque controller of identified parameters, for experiments to name.
+    """Make a torque controller of identified parameters.
 
-    It says what the controller rests on, and how well the identification knows that.
+    Experiments name its file. It says what the controller rests on, and how well that is known.
     """
     from daq.tuning import tune as make
 

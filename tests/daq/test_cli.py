@@ -55,6 +55,7 @@ def test_help_lists_the_commands_and_where_to_start(tmp_path):
     assert "rig run prbs.yaml --identify" in result.stdout
     for command in COMMANDS:
         assert re.search(rf"\b{command}\b", result.stdout)
+    assert result.stdout.count("...") == 1, "a command's line is cut; but for ARGS..."
 
 
 @pytest.mark.parametrize("command", COMMANDS)
