@@ -35,12 +35,14 @@ def pytest_collection_finish():
 def pytest_collection_modifyitems(items):
     # The longest begin first, so that no process waits for one alone at the end.
     longest = [
-        "test_tutorial", "test_characterising", "test_ends", "faults/test_analysis",
-        "test_evidence", "test_cli", "faults/test_device", "test_combinations", "test_docstrings",
-        "serial/test_faults", "test_scope_page", "test_uncertainty", "test_missing_physics",
-        "boards/test_boards", "sim_rig/test_device", "test_simulation", "test_replay",
-        "test_compile", "test_hal_boards", "test_guesses", "firmware/test_core",
-        "test_friction_identification", "test_real_time", "test_campaigns",
+        "test_tutorial", "test_characterising", "test_evidence", "test_scope_page", "test_ends",
+        "test_missing_physics", "faults/test_analysis", "test_cli", "test_docstrings",
+        "boards/test_boards", "firmware/test_core", "faults/test_device", "test_uncertainty",
+        "test_hal_boards", "test_friction_identification", "test_combinations", "test_compile",
+        "test_campaigns", "test_simulation", "test_structures", "test_constant_velocity",
+        "test_innovations", "test_contract", "test_library", "sim_rig/test_device",
+        "test_discrimination", "test_site", "test_exits", "test_replay", "test_hysteresis_loop",
+        "serial/test_faults", "test_guesses", "test_resuming", "test_real_time",
     ]  # fmt: skip
 
     def place(item):

@@ -127,7 +127,7 @@ def test_a_person_is_asked_for_the_mounting_that_tells_more(folder):
     change = {"take the load off": {"rig": "free.yaml"}}
     tight = {"backend": "simulated", "limits": {"speed": 4.0}, "mountings": change}
     write_yaml(folder / "rig.yaml", tight)
-    begin = [*words("rig.yaml", "--time", "2", "--json"), "--ask"]
+    begin = [*words("rig.yaml", "--time", "1.5", "--json"), "--ask"]
     done = rig(*begin, cwd=folder, timeout=400, input="")
     assert done.returncode == 2
     assert "round 2: take the load off" in done.stderr

@@ -124,8 +124,9 @@ def test_a_spread_of_the_parameters_is_in_the_trials(static):
 
 @pytest.mark.soak
 def test_what_is_refused_trips_on_the_simulated_rig(tmp_path):
-    """Walls by the inverse, which takes inertia off: some ring against the current's limit."""
-    file = walls(tmp_path, controller(tmp_path, "feedforward"))
+    """Walls by the inverse, which takes inertia off: these ring against the current's limit."""
+    stiff = {"stiffnesses": [12, 16], "dampings": [0.04, 0.05], "brake_commands": [0.0]}
+    file = walls(tmp_path, controller(tmp_path, "feedforward"), **stiff)
     done = rig("check", file.name, "--rig", "hand.yaml", "--draws", "100", cwd=tmp_path)
     assert done.returncode == 2 and "simulated trials trip current_motor" in done.stderr
     ended = 0
@@ -163,7 +164,7 @@ def test_limits_are_those_of_the_rig():
 
 @pytest.mark.soak
 @pytest.mark.parametrize("held", [0.0, HAND[1] / HAND_RANGE])
-def test_no_promised_wall_rings_on_a_thousand_plausible_actuators(static, held):
+def test_no_promised_wall_rings_on_hundreds_of_plausible_actuators(static, held):
     """A wall just below the promise, in hands from 1/4 to 4 times that of (A.2)."""
     folder, path, _ = static
     content = yaml.safe_load((folder / path).read_text())
@@ -182,7 +183,7 @@ def test_no_promised_wall_rings_on_a_thousand_plausible_actuators(static, held):
     wall = {"stiffnesses": [stiffness], "dampings": [damping]}
     rest = {"stiffness": stiffness, "damping": 0.0, "time": 0.4}
     file = walls(folder, folder / "wide.yaml", **wall, rest=rest, brake_commands=[0.0])
-    outcomes = trials(tuned, file, 1000)
+    outcomes = trials(tuned, file, 300)
     assert not outcomes.restless.any() and not outcomes.left.any()
 
 
