@@ -22,7 +22,7 @@ _STEP, _HOLD, _STEPS = 0.2, 0.05, 4  # of the commands: in parts of their ranges
 _WELL = 0.8  # of the draws, whose integration is to be as exact as that
 _FOLLOWED, _MINORITY = 5, 0.5  # draws that are compared, and their share that may go astray
 _ASTRAY = 0.05  # of the noise, by which a model may err where it is right
-_TURNS = 0.1  # of the samples, at which a shaft may turn round for edges to tell its speed
+_TURNS = 0.15  # of the samples, to which a shaft may turn round for torque and edges to tell why
 _BETWEEN = 0.5  # of a speed's noise or of what its edges make, by which it may err in that
 _ACCURACY = 1e-2  # of the plant, beside which margins are wide
 

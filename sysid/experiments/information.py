@@ -2,8 +2,8 @@
 
 With the tangents S of the outputs by the search coordinates and white noise of variance r on each
 output it is F = S' S / r. Where a sample's instant is known to a deviation j only (``jitter`` of a
-record), its error has the variance r + (j dy/dt)^2. Starts that a record does not tell take their
-part of it away; the Schur complement is left.
+record), its error has the variance r + (j dy/dt)^2, the mean of that before and of that after it.
+Starts that a record does not tell take their part of it away; the Schur complement is left.
 
 Noise of a measured input moves the outputs by G n, which is not white. A fit divides each error by
 the variance s = r + var(G n) of its sample (``criterion: compensated`` of an identification). With
@@ -20,6 +20,7 @@ from scipy.linalg import pinvh
 from sysid.arrays import FloatArray
 from sysid.engine.simulation import BatchSimulator
 from sysid.experiments.disturbance import with_disturbances
+from sysid.fitting.means import mean_of_sides
 from sysid.identifiability import null_directions
 from sysid.problem.data import Dataset
 from sysid.problem.model import ModelError
@@ -137,8 +138,8 @@ class Informant:
         if not record.jitter.any():
             return white
         outputs = self._simulator.trajectories(self._space.full(chromosomes), record)
-        rates = np.gradient(outputs, record.dt, axis=1)
-        return white + (rates * record.jitter) ** 2
+        rates = np.diff(outputs, axis=1) / record.dt
+        return white + np.array([mean_of_sides(each**2) for each in rates]) * record.jitter**2
 
     def _joint(self, slopes: FloatArray, errors: FloatArray, n: int) -> FloatArray:
         """Information of n coordinates and unknown starts together.

@@ -41,6 +41,7 @@ _FARTHEST = 2.3  # change of its logarithm that two rounds may foretell
 # of the inputs explains more than there is to explain.
 _LEAST_NOISE, _NEAR = 1e-2, 0.1
 _LEAST_OF_FILTER = 1e-4
+_TENTH = 0.1
 _TINY = 1e-300
 
 
@@ -104,6 +105,7 @@ class Innovations(Objective):
         steps = self.steps_needed(chromosome[None])
         # Noise of the inputs and of the process may explain nearly all of a free run's error.
         least = (_LEAST_OF_FILTER if self.corrects else _LEAST_NOISE) * self.error
+        least = np.maximum(least, self._least_scatter)
         settled, last = self, None
         for _ in range(_ROUNDS):
             innovations = settled._simulated(chromosome[None], steps, balanced=False).values[..., 0]
@@ -122,6 +124,15 @@ class Innovations(Objective):
     def of_noise(self, noise: FloatArray) -> Self:
         """With other noise of the outputs, (n_outputs,)."""
         return self._with(noise=noise)
+
+    @property
+    def _least_scatter(self) -> FloatArray:
+        """Deviation that nine samples of ten have, (n_outputs,): the tenth must not tell all."""
+        scatter, least = np.concatenate(self.scatter), np.zeros(len(self.noise))
+        seen = np.concatenate([np.isfinite(record.outputs) for record in self.records])
+        for j in np.flatnonzero(seen.any(axis=0)):
+            least[j] = np.sqrt(np.quantile(scatter[seen[:, j], j], _TENTH))
+        return least
 
     @property
     def free_run(self) -> Objective:

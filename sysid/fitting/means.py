@@ -12,6 +12,9 @@ _INSIDE = 1e-3  # samples behind the end of a sample where a window that is cut 
 # Overlap [samples] that comes of ends which are known so well only, and the share of long windows
 # that may overlap more.
 _OVERLAP, _FEW = 1.0, 0.05
+# Of the mean square of the slopes around, which that beside a mean is taken for at least: where it
+# seems to rest, between two turns, it does not.
+_AROUND = 0.5
 
 
 def each_mean_once(record: Dataset) -> Dataset:
@@ -71,12 +74,15 @@ def _apart(begins: FloatArray, ends: IntArray) -> FloatArray | None:
 def scatter(record: Dataset) -> FloatArray:
     """Variances (n_samples, n_outputs) that the jitter of the windows makes of their means.
 
-    By how fast an output changes between the means beside each, as measured: a free run changes by
-    the noise of its inputs as well.
+    By how fast an output changes to the means before and behind each, as measured: a free run
+    changes by the noise of its inputs as well. Not by the slope from one neighbour to the other,
+    which is none where a speed has its peak.
 
     >>> windows = np.tile([-1.0, 0.0], (4, 1, 1))
     >>> ramp = Dataset(np.ones(4), [1, 3, 5, 7], 1.0, windows=windows, jitter=np.full((4, 1), 0.1))
     >>> np.sqrt(scatter(ramp))[:, 0]
+    array([0.2, 0.2, 0.2, 0.2])
+    >>> np.sqrt(scatter(replace(ramp, outputs=np.array([[1], [3], [1], [-1]]))))[:, 0]
     array([0.2, 0.2, 0.2, 0.2])
     """
     variances = np.zeros(record.outputs.shape)
@@ -87,12 +93,30 @@ def scatter(record: Dataset) -> FloatArray:
         if len(firsts) < 2:
             continue
         values, middles = record.outputs[rows[firsts], j], record.dt * spans[firsts].mean(axis=1)
-        beside = np.clip(np.arange(len(firsts)) + np.array([[-1], [1]]), 0, len(firsts) - 1)
-        change, time = np.diff(values[beside], axis=0)[0], np.diff(middles[beside], axis=0)[0]
-        slopes = change / np.maximum(time, _SAME * record.dt)
+        slopes = np.diff(values) / np.maximum(np.diff(middles), _SAME * record.dt)
+        squares = np.maximum(mean_of_sides(slopes**2), _AROUND * _mean_around(slopes**2))
         place = np.searchsorted(firsts, np.arange(len(rows)), side="right") - 1
-        variances[rows, j] = (slopes[place] * record.jitter[rows, j]) ** 2
+        variances[rows, j] = squares[place] * record.jitter[rows, j] ** 2
     return variances
+
+
+def _mean_around(between: FloatArray) -> FloatArray:
+    """As ``mean_of_sides`` the mean of three on each side, (n - 1,) to (n,)."""
+    padded = np.pad(between, 3, mode="edge")
+    mean: FloatArray = np.convolve(padded, np.full(6, 1.0 / 6.0), "valid")
+    return mean
+
+
+def mean_of_sides(between: FloatArray) -> FloatArray:
+    """Of what is between neighbours, (n - 1, ...), the mean of both sides of each, (n, ...).
+
+    >>> mean_of_sides(np.array([4.0, 2.0]))
+    array([4., 3., 2.])
+    """
+    mean: FloatArray = 0.5 * (
+        np.concatenate([between[:1], between]) + np.concatenate([between, between[-1:]])
+    )
+    return mean
 
 
 def _distinct(record: Dataset, output: int) -> tuple[IntArray, IntArray, FloatArray]:

@@ -148,7 +148,7 @@ def uncertainty(
         analysis.covariance.singular_values,
         analysis.covariance.rank,
         tuple(rival for rival in minima if any(e.excludes(rival.values) for e in apart)),
-        disagreement=spread.ratio if spread else 1.0,
+        disagreement=spread.disagreement if spread else 1.0,
         factor=analysis.factor(),
         succession=_succession(local),
     )

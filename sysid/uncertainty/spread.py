@@ -5,7 +5,9 @@ residuals tells by how much. The spread of what is estimated without each log in
 infinitesimal jackknife by clusters; Bell & McCaffrey, "Bias reduction in standard errors for
 linear regression with multi-stage samples", Survey Methodology 28, 2002). It counts where
 Cochran's test finds the logs to disagree ("The combination of estimates from different
-experiments", Biometrics 10, 1954). A single log is cut into parts.
+experiments", Biometrics 10, 1954). Less than that, and what too few logs inform, is widened by
+what all quantities show together (Birge, "The calculation of errors by the method of least
+squares", Physical Review 40, 1932). A single log is cut into parts.
 """
 
 from __future__ import annotations
@@ -28,6 +30,9 @@ _ALONE = 0.98
 # Errors below this part of the simulation's accuracy are its own.
 _SIMULATION_SHARE = 0.1
 _FEWEST = 3.0  # logs, of like information, whose spread says something
+# Of a correct model's logs, that are widened a little, for all of a modest spread is not found.
+_MODEST = 0.1
+_APART = 0.01  # of quantities that differ no more than all do, those whose own spread counts
 
 
 @dataclass(frozen=True)
@@ -36,34 +41,48 @@ class LogSpread:
 
     influence: (n_logs, n_free), in search coordinates. information: (n_logs, n_free, n_free),
     parts of the covariance that each log's share of the curvature stands for. ratio: the spread's
-    variance in parts of what noise makes.
+    variance in parts of what noise makes, of so many degrees of freedom. at_odds: whether it is
+    more than chance.
     """
 
     influence: FloatArray
     information: FloatArray
     ratio: float
+    freedom: float
+    at_odds: bool
+
+    @property
+    def disagreement(self) -> float:
+        """Variance in parts of what noise makes, 1 where it is no more than chance."""
+        return self.ratio if self.at_odds else 1.0
 
     def deviation(self, gradient: FloatArray, noise: float) -> float:
         """Standard deviation of what changes so (n_free,) with the coordinates.
 
         noise: that by the noise. The normal distribution's 95 % interval of the result is Student's
-        of the spread. Of what too few logs inform, whose spread says little, it is at least that
-        by noise widened as much as those of all quantities together (Birge's ratio).
+        of the spread. Of what too few logs inform, whose spread says little, it is that by noise
+        widened as much as those of all quantities together, unless its own spread is apart.
         """
+        together = noise * max(1.0, float(np.sqrt(self.ratio)))
+        if not self.at_odds:
+            return together
+        together *= _student(self.freedom)
         moves = self.influence @ gradient
         n = len(moves)
-        variance = (n - 1) / n * np.sum((moves - moves.mean()) ** 2)
+        variance = float((n - 1) / n * np.sum((moves - moves.mean()) ** 2))
         shares = np.einsum("p,kpr,r->k", gradient, self.information, gradient)
+        freedom = _freedom(shares / shares.sum())
+        own = float(np.sqrt(variance)) * _student(freedom)
         if np.sum(shares) ** 2 > _FEWEST * np.sum(shares**2):
-            quantile = special.stdtrit(_freedom(shares / shares.sum()), 0.975) / Z95
-            return max(noise, float(quantile * np.sqrt(variance)))
-        return max(noise * float(np.sqrt(self.ratio)), float(np.sqrt(variance)))
+            return max(noise, own)
+        apart = special.fdtrc(freedom, self.freedom, variance / (self.ratio * noise**2))
+        return max(together, own if apart < _APART else float(np.sqrt(variance)))
 
 
 def spread(
     sensitivity: Sensitivity, weighted: FloatArray, back: FloatArray, score: FloatArray
 ) -> LogSpread | None:
-    """The spread between logs, or parts of one, where it is more than chance.
+    """The spread between logs where it may be more than chance, or parts of one where it is.
 
     weighted: (n_residuals, n_outputs, n_free), slopes times weights. back: (n_free, rank), in
     whose directions the curvature is one. score: (n_free, n_free), its covariance by noise. None
@@ -92,11 +111,13 @@ def spread(
     freedom = np.array([_freedom(shares) for shares in np.diagonal(leverages, axis1=1, axis2=2).T])
     # The jackknife's own variance is too large on average where some logs tell most.
     ratios = np.sum(parts**2, axis=0) / np.maximum(noise, 1e-12 * noise[-1])
-    chance = _CHANCE if logs else _CHANCE_OF_PARTS
-    if special.chdtrc(freedom.sum(), freedom @ ratios) > chance:
+    chance = float(special.chdtrc(freedom.sum(), freedom @ ratios))
+    at_odds = chance <= (_CHANCE if logs else _CHANCE_OF_PARTS)
+    if not at_odds and (not logs or chance > _MODEST):
         return None
     information = np.einsum("pi,kij,rj->kpr", back, leverages, back, optimize=True)
-    return LogSpread(moves @ back.T, information, float(freedom @ ratios / freedom.sum()))
+    ratio, total = float(freedom @ ratios / freedom.sum()), float(freedom.sum())
+    return LogSpread(moves @ back.T, information, ratio, total, at_odds)
 
 
 def _without(leverage: FloatArray, push: FloatArray, power: float) -> FloatArray:
@@ -114,6 +135,11 @@ def _without(leverage: FloatArray, push: FloatArray, power: float) -> FloatArray
 def _freedom(shares: FloatArray) -> float:
     """Degrees of freedom of a spread of logs with these shares of the information."""
     return max(1.0 / float(np.sum(shares**2)) - 1.0, 1.0)
+
+
+def _student(freedom: float) -> float:
+    """Student's 95 % interval in parts of the normal distribution's."""
+    return float(special.stdtrit(freedom, 0.975)) / Z95
 
 
 def _parts(length: int) -> list[int]:

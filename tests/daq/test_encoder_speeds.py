@@ -15,6 +15,8 @@ from daq.lookup.rigs import load_rig
 from daq.run.runner import run_experiment
 from sim_rig.actuator import actuator
 from sim_rig.backend import SimulatedDevice
+from sysid import Dataset
+from sysid.fitting.means import scatter
 
 COUNT = 2.0 * math.pi / 8192  # rad
 DT = 1.0 / 800.0  # s
@@ -86,6 +88,27 @@ def test_its_jitter_says_how_far_a_mean_may_be_off(angle):
     expected = np.abs(slope) * speeds.jitter
     clear = np.isfinite(error) & (expected > 1e-3)
     assert 0.4 < np.sqrt(np.mean((error[clear] / expected[clear]) ** 2)) < 1.2
+
+
+def cornered(t):
+    # The speed goes up and down in straight lines between -1.5 and 1.5 rad/s, 23 times a second.
+    u = (t * 23.0 + 0.13) % 1.0
+    area = np.where(u < 0.5, u * (u - 0.5), (u - 0.5) * (1.0 - u))
+    return 0.21 + 6.0 / 23.0 * area
+
+
+@pytest.mark.parametrize("angle", [swinging, cornered])
+def test_errors_are_as_large_as_their_variances_say_where_the_speed_has_its_corners_too(angle):
+    tick, theta, omega = logged(angle, 1.2)
+    speeds = mean_speeds(tick, theta, omega, DT, COUNT)
+    record = Dataset(
+        np.ones(len(tick)), speeds.values, DT,
+        windows=speeds.windows[:, None], jitter=speeds.jitter[:, None],
+    )  # fmt: skip
+    error = speeds.values - mean_over(angle, speeds.windows)
+    parts = error / np.sqrt(scatter(record)[:, 0] + 0.003**2)
+    assert 0.5 < np.sqrt(np.nanmean(parts**2)) < 1.1
+    assert np.nanmax(np.abs(parts)) < 5.0
 
 
 def shaking(t):

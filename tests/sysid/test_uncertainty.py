@@ -793,6 +793,25 @@ def test_logs_that_disagree_widen_to_the_spread_between_them():
     assert b.std == pytest.approx(quantile * expected, rel=0.15)
 
 
+def coverage_of_few(spread, n_logs, repeats=150):
+    """Share of intervals of a and b that hold their means, where those of logs spread so."""
+    rng, held = np.random.default_rng(1), []
+    for seed in range(repeats):
+        slopes = 1.0 + spread * rng.standard_normal(n_logs)
+        result = slopes_problem().tell(records=logs_with(slopes, n=40, seed=seed))
+        held += [e.low <= e.at({"a": 2.0, "b": 1.0}) <= e.high for e in result.parameters]
+    return np.mean(held)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("n_logs", [3, 5])
+@pytest.mark.parametrize("spread", [0.0, 0.01, 0.1])  # a log tells b to 0.009
+def test_intervals_of_few_logs_hold_whether_they_differ_or_not(spread, n_logs):
+    # Of three logs that differ in one direction only their spread is known too badly.
+    lowest = 0.88 if (n_logs, spread) == (3, 0.1) else 0.92
+    assert lowest <= coverage_of_few(spread, n_logs) <= 0.99
+
+
 @pytest.mark.soak
 def test_half_of_the_logs_does_not_contradict_the_other_half():
     rng = np.random.default_rng(3)
