@@ -249,6 +249,17 @@ class TermSetting(Section):
     )
 
 
+class ChannelErrors(Section):
+    """What is fitted of a channel's errors, each with the range of its parameter."""
+
+    gain: tuple[float, float] | None = Field(
+        None, description="by which it is to be multiplied", examples=[[0.5, 2.0]]
+    )
+    offset: tuple[float, float] | None = Field(
+        None, description="what is to be added to it, in its unit", examples=[[-0.5, 0.5]]
+    )
+
+
 class Signals(Section):
     """How a model is used where not as it declares."""
 
@@ -276,6 +287,11 @@ class Signals(Section):
                 | {"scale": 0.05, "range": [-500.0, 0.0]}
             ]
         ],
+    )
+    channels: dict[str, ChannelErrors] = Field(
+        default_factory=dict,
+        description="gains and offsets of inputs and outputs, fitted with the model's parameters",
+        examples=[{"torque": {"gain": [0.5, 2.0]}}],
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from daq.config.identification import IdentificationConfig
@@ -47,7 +47,7 @@ def remedies(
 def _of_channels(
     settings: IdentificationConfig, findings: Sequence[Finding]
 ) -> Iterator[tuple[str, str]]:
-    """Delays that channels of all logs have, and signs of a foreign file's columns."""
+    """Delays, gains and offsets that channels of all logs have, and signs of a foreign file's."""
     columns: Mapping[str, str] = {}
     if settings.columns is not None:
         parts = {"inputs": settings.columns.inputs, "outputs": settings.columns.outputs}
@@ -60,9 +60,21 @@ def _of_channels(
         if finding.kind == "delay" and finding.counts and finding.amplitude is not None:
             late = settings.delay.get(finding.name, 0.0) + finding.amplitude
             yield f"delay.{finding.name}", shortest(float(f"{late:.3g}"))
-        if finding.turned_round and finding.name in columns:
-            key, _, value = columns[finding.name].partition("=")
-            yield key, value
+        if finding.turned_round:
+            if finding.name in columns:
+                key, _, value = columns[finding.name].partition("=")
+                yield key, value
+        elif finding.kind in _ERRORS and finding.counts and finding.amplitude is not None:
+            ends = _ERRORS[finding.kind](finding.amplitude)
+            text = ", ".join(shortest(float(f"{end:.3g}")) for end in ends)
+            yield f"channels.{finding.name}.{finding.kind}", f"[{text}]"
+
+
+# Ranges of errors of channels, by the change of a gain of 1, and by an offset.
+_ERRORS: Mapping[str, Callable[[float], tuple[float, float]]] = {
+    "gain": lambda change: (min(1.0, 1.0 + change) / 2.0, max(1.0, 1.0 + change) * 2.0),
+    "offset": lambda size: (-5.0 * abs(size), 5.0 * abs(size)),
+}
 
 
 def _of_ranges(pushed: Mapping[str, tuple[float, float, float]]) -> Iterator[tuple[str, str]]:

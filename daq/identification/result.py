@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from sysid.uncertainty import Estimate, Profile, Uncertainty
 
 
-_NOT_OF_DESIGNS = {"outputs", "terms"}  # settings that change the model, and stand in no result
+_NOT_OF_DESIGNS = {"outputs", "terms", "channels"}  # they change the model, and are in no result
 _RMSE = "mean over outputs of the RMSE on outputs normalised by max|y|"
 _CEGA = "mean over outputs of squares by range, weighed by the size of the velocity (4.6)"
 

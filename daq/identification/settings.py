@@ -19,6 +19,7 @@ from daq.identification.selection import EVERYTHING, Selection
 from daq.lookup.models import DEFAULT_MODEL, find_model, whole_name
 from daq.progress import Note, Watch, ignore
 from sysid import Given, ModelError, ProcessModel, SearchSpace
+from sysid.problem.corrections import Correction, with_corrections
 from sysid.problem.terms import AddedTerm, with_terms
 
 File = TypeVar("File", bound=YamlFile)
@@ -84,16 +85,15 @@ def problems_of(
     file, unconverted = in_model_units(file, [model for model, _ in declared])
     doubts: Sequence[Mistake] = ()
     if check.mistakes(file, IdentificationConfig, file.content):
-        # Terms give a model names of their own, of which nothing is known until all can be read.
-        plain = [] if file.content.get("terms") else [model for model, _ in declared]
+        # What is added gives a model names of its own, of which nothing is known until then.
+        named = any(file.content.get(key) for key in ("terms", "channels"))
+        plain = [] if named else [model for model, _ in declared]
         doubts = [*unconverted, *(_unknown_names(file, plain) if plain else ())]
     settings = check.validate(file, IdentificationConfig, others=doubts)
     selection = Selection.under(settings, file)
     for model, name in declared:
         watch(Note("detail", f"model {name}: {model.description}"))
-    models = [
-        _with_outputs(file, settings, _with_terms(file, settings, model)) for model, _ in declared
-    ]
+    models = [_with_additions(file, settings, model) for model, _ in declared]
     doubts = [*unconverted, *_unknown_names(file, models)]
     mapping = ColumnMapping(file, settings.columns) if settings.columns else None
     signals = [name for m, _ in declared for name in (*m.output_names, *m.state_names)]
@@ -214,8 +214,7 @@ def _with_freed(
 
 def with_signals(file: YamlFile, signals: Signals, model: ProcessModel) -> ProcessModel:
     """The model with outputs, starts and holds as a file has them; ConfigError names the key."""
-    model = _with_terms(file, signals, model)
-    return _with_starts(file, signals, _with_outputs(file, signals, model))
+    return _with_starts(file, signals, _with_additions(file, signals, model))
 
 
 def columns_of(config: Path | None, model: ProcessModel) -> ColumnMapping | None:
@@ -292,6 +291,21 @@ def _find_model(
         if beside is None or configured is None:
             raise
         raise ConfigError.of(file.blamed(("model",), error)) from None
+
+
+def _with_additions(file: YamlFile, signals: Signals, model: ProcessModel) -> ProcessModel:
+    """The model with terms in its equations, the outputs that count, and errors of channels."""
+    model = _with_outputs(file, signals, _with_terms(file, signals, model))
+    for channel, errors in signals.channels.items():
+        for kind in ("gain", "offset"):
+            ends: tuple[float, float] | None = getattr(errors, kind)
+            if ends is None:
+                continue
+            try:
+                model = with_corrections(model, [Correction(channel, kind, *ends)])
+            except ModelError as error:
+                raise file.error(("channels", channel), str(error)) from None
+    return model
 
 
 def _with_terms(file: YamlFile, signals: Signals, model: ProcessModel) -> ProcessModel:

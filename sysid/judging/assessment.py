@@ -198,6 +198,7 @@ def judge(
         light.append("The parameters have no intervals, so how surely each is known is not known.")
     else:
         light += _parameters_on_bounds(uncertainty)
+        light += _corrected(model, uncertainty)
     grave = list(broken)
     if predicted.trust == "poor" and not broken:
         grave.append("Of a model that predicts so poorly the parameters are not the plant's.")
@@ -458,6 +459,21 @@ def _filter_errors(model: ProcessModel, uncertainty: Uncertainty) -> Iterator[st
             f"{uncertainty.succession[j]:.2f} of each with the one before), which those of the "
             "right parameters do not: the search has not found them, or the model lacks something."
         )
+
+
+def _corrected(model: ProcessModel, uncertainty: Uncertainty) -> Iterator[str]:
+    """Reason: errors of channels that were fitted; another channel's may look the same."""
+    neutral = {p.name: (p.corrects, p.nominal) for p in model.parameters if p.corrects}
+    for estimate in uncertainty.parameters:
+        low = -math.inf if estimate.low is None else estimate.low
+        high = math.inf if estimate.high is None else estimate.high
+        channel, none = neutral.get(estimate.name, ("", low))
+        if not low <= none <= high:
+            yield (
+                f"{channel} was corrected, {estimate.name} = {estimate.value:.4g}: data do not "
+                "always tell which channel is wrong, and with another corrected the parameters are "
+                "others. Find out which, and mend it before the next log."
+            )
 
 
 def _parameters_on_bounds(uncertainty: Uncertainty) -> Iterator[str]:

@@ -102,7 +102,7 @@ class Parameter:
     ``lower``/``upper`` bound where the search starts (outside is improbable);
     ``minimum``/``maximum`` bound what is physically possible (outside is infeasible).
     A ``fixed`` parameter stays at ``nominal``. ``scale`` is how a range spanning decades is
-    searched.
+    searched. ``corrects``: the channel whose error it is, with ``nominal`` for none.
 
     >>> Parameter("L", "H", nominal=2e-3, lower=2e-4, upper=2e-2, scale="log").minimum
     0.0
@@ -118,6 +118,7 @@ class Parameter:
     minimum: float = 0.0
     maximum: float = math.inf
     description: str = ""
+    corrects: str = ""
 
     def __post_init__(self) -> None:
         if not self.fixed:

@@ -2,11 +2,12 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal
 
 from sysid.problem.expressions import product_unit
-from sysid.problem.model import Constraint, Function, ModelError, Parameter, ProcessModel
+from sysid.problem.extension import extended
+from sysid.problem.model import Function, ModelError, Parameter, ProcessModel
 from sysid.problem.shapes import dry_friction
 
 Shape = Literal["sign", "linear", "square", "cube", "stribeck"]
@@ -87,19 +88,14 @@ def _with_term(model: ProcessModel, term: AddedTerm) -> ProcessModel:
         minimum=-math.inf,
         description=f"added to d{term.equation}/dt: {term.shape} of {term.of}",
     )
-    output, variants = model.output, model.variants
-    return replace(
+    output = model.output
+    return extended(
         model,
-        parameters=(*model.parameters, parameter),
-        derivative=_added(model.derivative, n, place, _function(term, signals.index(term.of))),
-        output=None if output is None else lambda x, u, p: output(x, u, p[:n]),
-        constraints=tuple(_of_first(constraint, n) for constraint in model.constraints),
-        equations=(*model.equations, f"d{term.equation}/dt += {term.parameter} {_text(term)}")
-        if model.equations
-        else (),
-        variants=None
-        if variants is None
-        else lambda: {name: _with_term(variant, term) for name, variant in variants().items()},
+        parameter,
+        _added(model.derivative, n, place, _function(term, signals.index(term.of))),
+        None if output is None else lambda x, u, p: output(x, u, p[:n]),
+        f"d{term.equation}/dt += {term.parameter} {_text(term)}",
+        lambda variant: _with_term(variant, term),
     )
 
 
@@ -120,11 +116,6 @@ def _added(derivative: Function, n: int, place: int, function: Callable[..., Any
 def _function(term: AddedTerm, place: int) -> Callable[[Any, Any], Any]:
     shape, centre, scale = _SHAPES[term.shape], term.centre, term.scale
     return lambda x, u: shape(((x + u)[place] - centre) / scale)
-
-
-def _of_first(constraint: Constraint, n: int) -> Constraint:
-    function = constraint.function
-    return replace(constraint, function=lambda p: function(p[:n]))
 
 
 def _text(term: AddedTerm) -> str:

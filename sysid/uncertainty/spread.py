@@ -72,11 +72,11 @@ class LogSpread:
         variance = float((n - 1) / n * np.sum((moves - moves.mean()) ** 2))
         shares = np.einsum("p,kpr,r->k", gradient, self.information, gradient)
         freedom = _freedom(shares / shares.sum())
-        own = float(np.sqrt(variance)) * _student(freedom)
+        single = float(np.sqrt(variance)) * _student(freedom)
         if np.sum(shares) ** 2 > _FEWEST * np.sum(shares**2):
-            return max(noise, own)
+            return max(noise, single)
         apart = special.fdtrc(freedom, self.freedom, variance / (self.ratio * noise**2))
-        return max(together, own if apart < _APART else float(np.sqrt(variance)))
+        return max(together, single if apart < _APART else float(np.sqrt(variance)))
 
 
 def spread(

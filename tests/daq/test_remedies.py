@@ -1,12 +1,22 @@
 """Settings that take out what was found wrong, in the command that comes next."""
 
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
 import pytest
 
+from daq import identify
 from daq.config.identification import IdentificationConfig
 from daq.identification.remedies import remedies
+from daq.lookup.models import find_model
+from sysid import BatchSimulator, Dataset
 from sysid.judging.score_tests import Finding
 from sysid.problem.faults import DataFault
 
+MOTOR = f"{Path(__file__).parents[2] / 'examples' / 'dc_motor.py'}:model"
 COLUMNS = {
     "columns": {
         "time": {"column": "t"},
@@ -41,7 +51,7 @@ def test_a_delay_is_added_to_what_is_taken_out_already():
 
 
 def test_a_sign_is_turned_round_where_the_file_says_it():
-    wrong = [found("gain", "y", -2.1), found("gain", "u", 0.3)]
+    wrong = [found("gain", "y", -2.1), found("gain", "u", 0.3, share=0.01)]
     assert mended(wrong, **COLUMNS) == ("columns.outputs.y.sign=1",)
     assert mended(wrong) == ()
 
@@ -61,9 +71,51 @@ def test_faults_of_samples_come_first_and_a_lag_is_taken_out_once():
     assert mended(faults=[fault("outliers", "note", "robust=true")]) == ()
 
 
+def test_gains_and_offsets_become_parameters():
+    wrong = [found("gain", "y", 0.3), found("offset", "u", -0.04), found("drift", "y", 1.0)]
+    assert mended(wrong) == ("channels.y.gain=[0.5, 2.6]", "channels.u.offset=[-0.2, 0.2]")
+    assert settings(**{"channels": {"u": {"offset": [-0.2, 0.2]}}}).channels["u"].gain is None
+
+
 @pytest.mark.parametrize(("value", "ends"), [(1e-5, "[1e-6, 0.001]"), (1e-3, "[1e-5, 0.01]")])
 def test_a_range_whose_end_decides_is_widened_there_once_the_data_are_right(value, ends):
     pushed = {"J": (value, 1e-5, 1e-3)}
     assert mended(pushed=pushed) == (f"ranges.J={ends}",)
     jolts = fault("outliers", setting="robust=true")
     assert mended(faults=[jolts], pushed=pushed) == ("robust=true",)
+
+
+def motor_log(seed):
+    """The motor of examples/dc_motor.py under a square voltage, its load logged at half of it."""
+    rng, n, motor = np.random.default_rng(seed), 200, find_model(MOTOR)
+    t = 0.01 * np.arange(n)
+    voltage = np.where(np.mod(t, 0.9 + 0.1 * seed) < 0.45, 1.0, -1.0)
+    load = 0.01 * np.sin(2.0 * np.pi * 0.35 * seed * t)
+    blank = Dataset(np.column_stack([voltage, load]), np.zeros((n, 2)), 0.01)
+    (outputs,) = BatchSimulator(motor, accuracy=1e-8).trajectories(motor.nominal, blank)
+    noisy = outputs + rng.normal(size=(n, 2)) * [0.005, 0.02]
+    columns = {"voltage": voltage, "load": 0.5 * load, "current": noisy[:, 0], "omega": noisy[:, 1]}
+    return pd.DataFrame({"t": t, **columns})
+
+
+@pytest.mark.soak
+def test_a_wrong_gain_is_fitted_by_the_command_and_stays_a_doubt():
+    """A load logged at half its size: a current of twice its size explains the same."""
+    logs = motor_log(1), motor_log(2)
+    quick = {"population": 150, "generations": 20}
+    first = identify(*logs, model=MOTOR, **quick)
+    found = remedies(
+        IdentificationConfig(), ("load", "current", "omega"), findings=first.suspicion.findings
+    )
+    ((channel, kind, ends),) = re.findall(r"channels\.(\w+)\.(\w+)=(.*)", " ".join(found))
+    assert first.verdict.trust == "poor" and kind == "gain"
+    errors = {channel: {kind: json.loads(ends)}}
+    second = identify(*logs, model=MOTOR, channels=errors, **quick)
+    values = second.parameters.value
+    assert values[f"gain_of_{channel}"] == pytest.approx(2.0, rel=0.02)
+    assert values["constant"] == pytest.approx(0.0238, rel=0.01)
+    # The resistance is the motor's with the load corrected, and twice that with the current.
+    assert values["resistance"] == pytest.approx(1.0 if channel == "load" else 2.0, rel=0.02)
+    assert second.verdict.predicted.trust == "good"
+    assert second.verdict.parameters.trust == "limited"
+    assert any("which channel is wrong" in reason for reason in second.verdict.parameters.reasons)
