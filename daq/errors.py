@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import difflib
 import inspect
+import os
 import traceback
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -198,4 +199,9 @@ def raised_in(kind: type, error: BaseException) -> str:
     if any(file.is_relative_to(installed / package) for package in _PACKAGES):
         return ""
     line = line_in(error, file)
-    return f" ({file}:{line})" if line is not None else ""
+    return f" ({nearby(file)}:{line})" if line is not None else ""
+
+
+def nearby(path: str | Path) -> str:
+    """A path, or ``FILE.py:CLASS``, as it is typed in the working folder; whole outside of it."""
+    return str(path).removeprefix(f"{Path.cwd()}{os.sep}")

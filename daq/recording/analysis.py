@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from daq.documents import plain
-from daq.errors import USER_CODE_ERRORS, ConfigError, RigError, RunError, raised_in
+from daq.errors import USER_CODE_ERRORS, ConfigError, RigError, RunError, nearby, raised_in
 from daq.experiment import ClosedLoop, Experiment
 from daq.files import make_folder, write_whole
 from daq.findings import Findings
@@ -72,7 +72,8 @@ def analyse(folder: str | Path, *, trust: bool = False, watch: Watch = ignore) -
     findings = conclude(experiment, folder)
     if findings is None:
         raise ConfigError(
-            f"the protocol {experiment.protocol!r} only excites, and concludes nothing by itself",
+            f"the protocol {nearby(experiment.protocol)!r} only excites, and concludes nothing by "
+            "itself",
             cure=f"rig identify {folder} finds parameters",
             file=folder,
         )

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from daq.errors import USER_CODE_ERRORS, ConfigError, RigError, RunError, raised_in
+from daq.errors import USER_CODE_ERRORS, ConfigError, RigError, RunError, nearby, raised_in
 from daq.experiment import (
     MOST_SAMPLES,
     Aboard,
@@ -31,8 +31,8 @@ _ROUNDING = 1e-9  # of a plan's bounds
 def failure(experiment: Experiment, doing: str, error: BaseException) -> str:
     """The sentence on an error in a protocol's code: which, where, what."""
     return (
-        f"the protocol {experiment.protocol!r} failed {doing}: {type(error).__name__}: {error}"
-        f"{raised_in(type(experiment), error)}"
+        f"the protocol {nearby(experiment.protocol)!r} failed {doing}: {type(error).__name__}: "
+        f"{error}{raised_in(type(experiment), error)}"
     )
 
 
