@@ -32,7 +32,7 @@ from sysid.problem.ranges import Range
 from sysid.problem.records import Data, RecordEstimator, split
 from sysid.problem.space import SearchSpace
 from sysid.threads import one_thread
-from sysid.uncertainty import Profile, Uncertainty, profile, uncertainty
+from sysid.uncertainty import Profile, Uncertainty, determined_rank, profile, uncertainty
 
 Criterion = Literal["auto", "compensated", "innovations", "likelihood", "error"]
 
@@ -356,6 +356,15 @@ class GASSI(RecordEstimator):
         """
         objective = self.final_objective(X, y, records)
         return uncertainty(objective, self.chromosome_, self._rivals, self._ridge)
+
+    @one_thread()
+    def determined_rank(self, X: Data, y: FloatArray | None = None, *, records: Any = None) -> int:
+        """How many of the free numbers, or of their combinations, the records determine.
+
+        That of ``uncertainty``, without its intervals, which take far longer. X, y, records: those
+        of ``fit``. Raises ModelError as ``uncertainty``.
+        """
+        return determined_rank(self.final_objective(X, y, records), self.chromosome_)
 
     @one_thread()
     def profile(

@@ -95,7 +95,7 @@ class Candidate:
             return cls(name, n, n, trained, tested, estimator.n_lags_)
         n = len(estimator.space_.names)
         try:
-            rank = estimator.uncertainty(training).rank
+            rank = estimator.determined_rank(training)
         except ModelError:  # without intervals all count
             rank = n
         return cls(name, n, rank, trained, tested)

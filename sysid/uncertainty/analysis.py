@@ -156,6 +156,12 @@ def uncertainty(
     return replace(result, joint=joint, simultaneous=simultaneous)
 
 
+def determined_rank(objective: Objective, chromosome: FloatArray) -> int:
+    """As ``rank`` of the ``uncertainty``, without the intervals, whose profiles cost most of it."""
+    local = sensitivity(objective, chromosome)
+    return _Analysis(local, ties(local)).covariance.rank
+
+
 def _succession(local: Sensitivity) -> FloatArray:
     criterion = local.criterion
     if isinstance(criterion, Innovations) and criterion.corrects:
