@@ -17,6 +17,7 @@ from sysid.uncertainty.colour import colour, score_covariance
 from sysid.uncertainty.sensitivity import (
     Sensitivity,
     input_noises,
+    noise_pushes,
     spans,
     start_errors,
     zero_errors,
@@ -101,6 +102,8 @@ def covariance(
     score = _larger(score, _score_covariance_by(weighted, input_noises(sensitivity)))
     for errors in (zero_errors(sensitivity), start_errors(sensitivity)):
         score += _score_covariance_by(weighted, errors)
+    pushes = np.array([*noise_pushes(sensitivity, weight)]).reshape(-1, slopes.shape[2])
+    score += pushes.T @ pushes
     rows = (slopes * np.sqrt(weight)[:, None]).reshape(-1, slopes.shape[2])
     sizes = np.linalg.norm(rows, axis=0)
     moving = sizes > _ROUNDING**2 * np.max(

@@ -19,6 +19,9 @@ _FILTER_PERTURBATION = 1e-6  # the same where kinks make a filter jump: fewer li
 _KINK = 0.01
 # Realisations of the inputs' noise: they give a variance to within 12 %.
 _DRAWS = 128
+# Shares by which the variance of an output's noise is raised until its innovations show it.
+_RAISED = 0.02 * 4.0 ** np.arange(12)
+_TINY = 1e-300
 
 
 @dataclass(frozen=True)
@@ -176,6 +179,39 @@ def start_errors(sensitivity: Sensitivity) -> Iterator[FloatArray]:
             outputs[0, j] += record.output_noise[j] or min(record.sample_noise(j), left[j])
             change = _change_by_record(sensitivity, k, replace(record, outputs=outputs))
             yield change * sensitivity.share
+
+
+def noise_pushes(local: Sensitivity, weight: FloatArray) -> Iterator[FloatArray]:
+    """Changes (n_free,) of a filter's score by a standard deviation of each output's noise.
+
+    The noise is such that the innovations' mean square is what the filter expects, which chance
+    moves; where noise of the inputs does most of it, it is hardly known. weight: (n_outputs,), of
+    the squares.
+    """
+    fitted, residual = local.criterion, local.residual
+    if not (isinstance(fitted, Innovations) and fitted.corrects):
+        return
+    score = np.einsum("tip,ti,i->p", local.slopes, residual, weight)
+    for j in np.flatnonzero((fitted.weights > 0.0) & (fitted.counts > 1)):
+        squares = residual[local.seen[:, j], j] ** 2
+        deviation = squares.std() / squares.mean() / np.sqrt(len(squares))
+        chromosome, fall = local.chromosome[None], 0.0
+        noise = fitted.noise.copy()
+        for raised in _RAISED:
+            noise[j] = fitted.noise[j] * np.sqrt(1.0 + raised)
+            raised_filter = fitted.of_noise(noise)
+            innovations = raised_filter.residuals(chromosome, local.steps).values[..., 0]
+            left = np.mean(innovations[local.seen[:, j], j] ** 2) / (1.0 + raised)
+            fall = 1.0 - left / squares.mean()
+            if not fall < deviation:
+                break
+        if not (np.isfinite(fall) and fall > 0.0):
+            continue
+        moved = sensitivity(raised_filter, local.chromosome)
+        # As weights follow the errors.
+        sizes = np.sum(residual**2, axis=0) / np.maximum(np.sum(moved.residual**2, axis=0), _TINY)
+        onward = np.einsum("tip,ti,i->p", moved.slopes, moved.residual, weight * sizes)
+        yield (onward - score) * deviation / fall
 
 
 def input_noises(sensitivity: Sensitivity) -> Iterator[FloatArray]:
