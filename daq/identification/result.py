@@ -483,9 +483,10 @@ def _uncertainty(uncertainty: Uncertainty | None, outputs: Sequence[str]) -> dic
         }
         for rival in uncertainty.rivals
     ]
-    succession = {  # none without a filter
-        name: round(float(value), 3)
-        for name, value in zip(outputs, uncertainty.succession, strict=False)
+    of_filter = {  # none without a filter
+        key: {name: round(float(v), 3) for name, v in zip(outputs, values, strict=True)}
+        for key, values in (("succession", uncertainty.succession), ("bent", uncertainty.bent))
+        if len(values)
     }
     return {
         "determined_directions": uncertainty.rank,
@@ -509,7 +510,7 @@ def _uncertainty(uncertainty: Uncertainty | None, outputs: Sequence[str]) -> dic
             "widening": round(uncertainty.simultaneous, 3),
         },
         "disagreement": round(uncertainty.disagreement, 3),
-        **({"succession": succession} if succession else {}),
+        **of_filter,
         "covariance": _covariance(uncertainty),
     }
 

@@ -26,6 +26,7 @@ belongs to the sum: without it, parameters that pass on more of that noise would
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Self
 
 import numpy as np
@@ -43,6 +44,9 @@ _LEAST_NOISE, _NEAR = 1e-2, 0.1
 _LEAST_OF_FILTER = 1e-4
 _TENTH = 0.1
 _TINY = 1e-300
+# Draws of the inputs' noise that show where equations bend under it, and parts of an innovation's
+# deviation from which they do.
+_DRAWS, _BENT = 8, 0.1
 
 
 class Innovations(Objective):
@@ -148,6 +152,42 @@ class Innovations(Objective):
         noise = np.sqrt(self.noise**2 + scatter)
         few: BoolArray = (noise < _NEAR * self.error) & (self.weights > 0.0)
         return few
+
+    def bent(self, chromosome: FloatArray) -> FloatArray:
+        """Share of the outputs' innovations, (n_outputs,), that a filter misjudges at (n_free,).
+
+        It takes equations for straight over what noise does. Noise added to the inputs and the
+        same taken from them move an innovation there by opposite amounts.
+        """
+        steps = self.steps_needed(chromosome[None])
+        rng = np.random.default_rng(0)
+
+        def innovations(moves: list[FloatArray]) -> FloatArray:
+            records = [
+                replace(record, inputs=record.inputs + move)
+                for record, move in zip(self.records, moves, strict=True)
+            ]
+            moved = self._with(records=records)
+            values: FloatArray = moved._simulated(chromosome[None], steps, balanced=False).values[
+                ..., 0
+            ]
+            return values
+
+        centre, bends = innovations([np.zeros_like(r.inputs) for r in self.records]), []
+        for _ in range(_DRAWS):
+            noise = [r.input_noise * rng.standard_normal(r.inputs.shape) for r in self.records]
+            middle = 0.5 * (innovations(noise) + innovations([-move for move in noise]))
+            bends.append(np.abs(middle - centre))
+        units = np.concatenate(
+            [
+                np.broadcast_to(self.noise / scale, record.outputs.shape)
+                for scale, record in zip(self.scales, self.records, strict=True)
+            ]
+        )
+        seen = np.concatenate([np.isfinite(record.outputs) for record in self.records])
+        bent = seen & ~(np.median(bends, axis=0) <= _BENT * units)
+        share: FloatArray = bent.sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
+        return share
 
     def share(self, chromosome: FloatArray, steps: IntArray) -> FloatArray:
         """Residuals in parts of the free run's where nothing corrects, (n_residuals, n_outputs)."""

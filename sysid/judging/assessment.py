@@ -50,6 +50,7 @@ _ABOVE_NOISE, _BY_CHANCE = 1.25, 0.01
 # Correlation of two outputs' residuals that is no sensor's; rank correlation of their size with an
 # output's rate of change; how far apart parameters of parts of the data are, in parts of chance.
 _SHARED, _BY_SPEED, _DISAGREEING = 0.3, 0.2, 1.5
+_BENT = 0.02  # share of innovations that a filter misjudges
 _ROUNDING = 2e-4  # of an output's deviation, below which errors may be those of a simulation
 
 
@@ -194,6 +195,7 @@ def judge(
             light += _disagreement(uncertainty, len(training))
         if uncertainty is not None:
             light += _filter_errors(model, uncertainty)
+            light += _bent_filter(model, uncertainty)
     if uncertainty is None:
         light.append("The parameters have no intervals, so how surely each is known is not known.")
     else:
@@ -474,6 +476,18 @@ def _corrected(model: ProcessModel, uncertainty: Uncertainty) -> Iterator[str]:
                 "always tell which channel is wrong, and with another corrected the parameters are "
                 "others. Find out which, and mend it before the next log."
             )
+
+
+def _bent_filter(model: ProcessModel, uncertainty: Uncertainty) -> Iterator[str]:
+    """Reason: a filter that takes for straight what is bent within noise."""
+    if np.any(uncertainty.bent > _BENT):
+        j = int(np.argmax(uncertainty.bent))
+        yield (
+            f"The noise of the inputs hides where the equations bend (in {uncertainty.bent[j]:.0%} "
+            f"of the samples of {model.output_names[j]}), as where motion turns: parameters that "
+            "act there may be off by more than their intervals say. Less time near standstill, or "
+            "less of that noise, tells them better."
+        )
 
 
 def _parameters_on_bounds(uncertainty: Uncertainty) -> Iterator[str]:

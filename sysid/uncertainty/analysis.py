@@ -72,7 +72,8 @@ class Uncertainty:
     where that is chance. factor: (n, n_free), independent changes of the parameters, one standard
     deviation each, and a unit of every tie: what a later stage is ``Given``. succession:
     (n_outputs,), correlation of each innovation with the one before where a filter's were
-    minimised, which are white at the right parameters of the right model; empty elsewhere.
+    minimised, which are white at the right parameters of the right model; empty elsewhere. bent:
+    likewise, share of the innovations for which its equations are no straight lines within noise.
     """
 
     parameters: tuple[Estimate, ...]
@@ -86,6 +87,7 @@ class Uncertainty:
     disagreement: float = 1.0
     factor: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
     succession: FloatArray = field(default_factory=lambda: np.zeros(0))
+    bent: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def correlation(self) -> FloatArray:
         """Correlation of the free parameters, NaN where there is no variance."""
@@ -151,6 +153,7 @@ def uncertainty(
         disagreement=spread.disagreement if spread else 1.0,
         factor=analysis.factor(),
         succession=_succession(local),
+        bent=_bent(local),
     )
     joint, simultaneous = analysis.together([e.name for e in result.determined()])
     return replace(result, joint=joint, simultaneous=simultaneous)
@@ -166,6 +169,13 @@ def _succession(local: Sensitivity) -> FloatArray:
     criterion = local.criterion
     if isinstance(criterion, Innovations) and criterion.corrects:
         return successive_correlation(local.residual, local.seen, local.lengths)
+    return np.zeros(0)
+
+
+def _bent(local: Sensitivity) -> FloatArray:
+    criterion = local.criterion
+    if isinstance(criterion, Innovations) and criterion.corrects:
+        return criterion.bent(local.chromosome)
     return np.zeros(0)
 
 

@@ -464,3 +464,10 @@ def test_a_filter_whose_errors_it_could_foresee_makes_parameters_doubtful():
     (reason,) = verdict(uncertainty=coloured).parameters.reasons
     assert reason.startswith("The filter's errors of current follow one another (correlation -0.45")
     assert verdict(uncertainty=replace(coloured, succession=np.array([0.1, 0.2]))).trust == "good"
+
+
+def test_a_filter_within_whose_noise_equations_bend_makes_parameters_doubtful():
+    bent = replace(told(""), bent=np.array([0.01, 0.07]))
+    (reason,) = verdict(uncertainty=bent).parameters.reasons
+    assert "bend (in 7% of the samples of current)" in reason
+    assert verdict(uncertainty=replace(bent, bent=np.array([0.01, 0.01]))).trust == "good"

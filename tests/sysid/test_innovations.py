@@ -339,6 +339,22 @@ def test_innovations_of_wrong_parameters_follow_one_another(share):
     assert uncertainty(objective, chromosome).succession.size == 0
 
 
+def test_a_filter_tells_where_noise_hides_the_bend_of_the_equations():
+    """|u| has its bend within the noise of a small u, and not of a large one."""
+    (record, _) = noisy_records(1)
+    bent = replace(lag(), derivative=lambda x, u, p: ((p[0] * abs(u[0]) - x[0]) / p[1],))
+
+    def share(model, size):
+        scaled = replace(record, inputs=size * record.inputs)
+        objective = Objective(BatchSimulator(model), SearchSpace.of(model), [scaled])
+        fitted = Innovations.of(objective, np.array([0.15]), corrects=True)
+        return fitted.bent(np.array([GAIN, TAU]))[0]
+
+    assert share(bent, 0.1) > 0.5
+    assert share(bent, 10.0) < 0.05
+    assert share(lag(), 0.1) == 0.0
+
+
 def test_a_filters_minimum_is_sought_all_over_where_innovations_can_be_foreseen():
     (record, _) = noisy_records(1)
     space = SearchSpace.of(lag())
