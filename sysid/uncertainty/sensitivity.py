@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.special import ndtr
 
 from sysid.arrays import BoolArray, FloatArray
 from sysid.fitting.innovations import Innovations
@@ -211,7 +212,19 @@ def noise_pushes(local: Sensitivity, weight: FloatArray) -> Iterator[FloatArray]
         # As weights follow the errors.
         sizes = np.sum(residual**2, axis=0) / np.maximum(np.sum(moved.residual**2, axis=0), _TINY)
         onward = np.einsum("tip,ti,i->p", moved.slopes, moved.residual, weight * sizes)
-        yield (onward - score) * deviation / fall
+        raises = deviation / fall
+        yield (onward - score) * raises * _of_positive(1.0 / (raises * raised))
+
+
+def _of_positive(mean: float) -> float:
+    """Deviation of a normal variable of unit deviation whose values below zero count as zero.
+
+    As a variance's estimate, which has no others. mean: of the normal one, zero or above.
+    """
+    below, density = ndtr(-mean), np.exp(-0.5 * mean**2) / np.sqrt(2.0 * np.pi)
+    first = mean * (1.0 - below) + density
+    second = (mean**2 + 1.0) * (1.0 - below) + mean * density
+    return float(np.sqrt(second - first**2))
 
 
 def input_noises(sensitivity: Sensitivity) -> Iterator[FloatArray]:

@@ -1,5 +1,6 @@
 """Noise of measured inputs: the filter against plain filters, and the bias that is to vanish."""
 
+import itertools
 import math
 from dataclasses import replace
 from functools import partial
@@ -337,6 +338,20 @@ def test_innovations_of_wrong_parameters_follow_one_another(share):
     else:
         assert succession == pytest.approx(lagged, abs=0.02) and succession > 0.8
     assert uncertainty(objective, chromosome).succession.size == 0
+
+
+def test_intervals_count_how_well_the_outputs_noise_is_known():
+    """Of a tenth of the inputs' share it is hardly known, and the time constant goes with it."""
+    errors, stated = [], []
+    for record in itertools.islice(noisy_records(12, of_output=0.02), 0, None, 2):
+        objective = Objective(BatchSimulator(lag(), accuracy=1e-4), SearchSpace.of(lag()), [record])
+        truth = np.array([GAIN, TAU])
+        by_error = Optimum(objective, truth, objective.rms(truth[None])[0], feasible=True)
+        fit = noisy_fit(True, None, objective, by_error)
+        errors.append(np.log(fit.chromosome[1] / TAU))
+        covariance = uncertainty(fit.objective, fit.chromosome).covariance
+        stated.append(np.sqrt(covariance[1, 1]))
+    assert 0.7 < np.median(stated) / np.std(errors) < 1.4
 
 
 def test_a_filter_tells_where_noise_hides_the_bend_of_the_equations():
