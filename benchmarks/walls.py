@@ -7,7 +7,7 @@ Walls rendered by the static law and by the inverse without what it takes off (f
 by the motor alone and with the brake: switched on in contact, or shared by its hysteresis state.
 Guaranteed: passive by ``haptics.passivity`` with 95 % over actuators whose parameters are uncertain
 by 3 %, in any passive hand. Held: the stiffest without damping that comes to rest, entered and
-left, in any hand that damps as a quarter of (A.2)'s does and is no stiffer than 40 N*m/rad.
+left, in any hand of (A.2)'s form that damps as a quarter of it and is no stiffer than 40 N*m/rad.
 Simulated: the stiffest wall that rests in all of so many hands from 1/4 to 4 times that of (A.2),
 each with an actuator of its own, after a tap. The best rendered damping of each. Measured: the
 stiffest wall that ``virtual_wall`` finds stable on the simulated rig, electronics, limits and all,

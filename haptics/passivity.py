@@ -22,8 +22,9 @@ The brake is passive, but it gives no b: within its yield travel it is a spring 
 passive while its current is constant: switched on under load that spring gives energy. Nothing is
 told of a law that shares its torque with the brake.
 
-A hand that damps adds to b. A hand no stiffer than k lets no impedance of the shaft fall below
-x = J omega - k / omega in its imaginary part, with any mass; so of each phi from 0 to pi / 2
+A hand that damps adds to b. A hand of a mass, a damper and a spring of k at most side by side lets
+no impedance of the shaft fall below x = J omega - k / omega in its imaginary part; a mass behind a
+spring does, just above their resonance. So of each phi from 0 to pi / 2
 
     Re e^(-j phi) Z >= d = b cos phi + x sin phi,
 
@@ -77,7 +78,11 @@ _TURNS = np.linspace(0.0, 0.5 * np.pi, 19)  # phi, of the discs
 
 @dataclass(frozen=True)
 class Hands:
-    """Passive hands of any mass: damping [N*m*s/rad] at least, stiffness [N*m/rad] at most."""
+    """Passive hands: damping [N*m*s/rad] at least, stiffness [N*m/rad] at most.
+
+    Of a finite stiffness: hands whose reactance at omega > 0 is -stiffness / omega or more, such as
+    a mass, a damper and a spring side by side.
+    """
 
     damping: float = 0.0
     stiffness: float = math.inf

@@ -120,8 +120,9 @@ class VirtualWall(WallSettings):
             f"{promise.abbott:.3g} N*m/rad."
         )
         damps = (
-            f"that damps by {hands.damping:.2g} N*m*s/rad or more, a quarter of (A.2)'s, and is no "
-            f"stiffer than {hands.stiffness:g} N*m/rad, with the brake off"
+            f"of (A.2)'s form (mass, damper and spring side by side) that damps by "
+            f"{hands.damping:.2g} N*m*s/rad or more, a quarter of (A.2)'s, and is no stiffer than "
+            f"{hands.stiffness:g} N*m/rad, with the brake off"
         )
         damped = (
             f"Walls without damping up to {springs:.3g} N*m/rad come to rest {sure}, entered and "
