@@ -222,7 +222,8 @@ def discs(
     middle = s.shape[1] // 2
     others = np.delete(P / least, middle, axis=1)
     turn = _TURNS[:, None] if np.isfinite(x[:, middle]).any() else _TURNS[:1, None]
-    d = b[:, middle] * np.cos(turn) + np.maximum(x[:, middle], -_STIFFEST) * np.sin(turn)
+    least_x = np.where(np.isfinite(x[:, middle]), x[:, middle], 0.0)  # without one: turn is 0
+    d = b[:, middle] * np.cos(turn) + least_x * np.sin(turn)
     with np.errstate(divide="ignore"):
         half = np.where(d > 0.0, 0.5 / np.maximum(d, 0.0), np.inf)
     direct, bounded = P[:, middle], np.where(d > 0.0, half, 0.0)

@@ -14,7 +14,10 @@ from daq.run.realtime import RealTime
 USUAL = 800.0  # Hz, of the shipped experiments
 _SPAN = 2.5  # s in each mode: as long as a timer takes to show that it is too slow
 _FEW = 0.01  # of the commands
-_LATE = "end other programs, lower sample_rate, or send further ahead ('ahead' of the experiment)"
+_LATE = (
+    "where wake-ups below are late as well, end other programs; otherwise it is the line there and "
+    "back: sample more slowly (--rate), or send further ahead (ahead in the experiment's file)"
+)
 
 
 def sampling_checks(device: Device, info: DeviceInfo, sample_rate: float | None) -> list[Check]:
@@ -52,7 +55,7 @@ def _sampled(device: Device, info: DeviceInfo, mode: Mode, rate: float) -> Check
         return Check(subject, verdict, error.mistakes[0].problem, cure)
     observation = f"{came} of {wanted} samples came"
     if came < wanted:
-        cure = "check the connection, raise its baud rate, or sample more slowly: --rate"
+        cure = "check cable and connectors; of a slow line raise the baud rate, or lower --rate"
         return Check(subject, "bad", observation, cure)
     if mode is Mode.OPEN_LOOP:
         return Check(subject, "good", observation)

@@ -101,7 +101,7 @@ def home(sampling: Sampling, homing: Homing, record: dict[str, Any]) -> None:
 
 def require_law(rig: Rig, law: str) -> None:
     """Raise ConfigError unless an open device has this controller, within the rig's limits."""
-    slew, cure = rig.config.limits.slew, "leave it out"
+    slew, cure = rig.config.limits.slew, "leave limits.slew out"
     if rig.info.law != law:
         what = f"has the controller {rig.info.law}" if rig.info.law else "has no controller"
         problem = f"{rig.info.name} {what} aboard; this experiment's is {law}"

@@ -16,8 +16,9 @@ class Correction:
     """What is wrong with a channel: its gain, by which it is to be multiplied, or its offset.
 
     Of an output the model's value is multiplied, or the offset added to it, before it is compared
-    with what was measured; of an input what was measured, before the model takes it. low, high:
-    range of the parameter; of an offset in the channel's unit.
+    with what was measured; of an input what was measured, before the model takes it. A channel that
+    is both is corrected as both. low, high: range of the parameter, with what means no error in it;
+    of an offset in the channel's unit.
 
     >>> Correction("torque", "gain", 0.5, 2.0).parameter
     'gain_of_torque'
@@ -55,10 +56,15 @@ def _with_correction(model: ProcessModel, correction: Correction) -> ProcessMode
     if channel not in units:
         there = ", ".join(units)
         raise ModelError(f"model {model.name} has no channel {channel!r}; it has {there}")
+    if not correction.low <= neutral <= correction.high:
+        raise ModelError(
+            f"the range of {correction.parameter}, {correction.low:g} to {correction.high:g}, does "
+            f"not hold {neutral:g}, which means no error"
+        )
     parameter = Parameter(
         correction.parameter,
         "1" if correction.kind == "gain" else units[channel],
-        neutral if correction.low <= neutral <= correction.high else correction.low,
+        neutral,
         correction.low,
         correction.high,
         minimum=-math.inf,

@@ -476,7 +476,7 @@ def test_a_disk_full_from_the_start_is_no_traceback(tmp_path):
 
 
 def test_flags_are_the_documented_bits():
-    assert [flag.value for flag in Flag] == [1, 2, 4, 8, 16, 32, 64]
+    assert [flag.value for flag in Flag] == [1, 2, 4, 8, 16, 32, 64, 128]
     assert math.log2(max(Flag)) < 63 and sys.maxsize > max(Flag)
 
 

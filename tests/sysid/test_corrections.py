@@ -39,7 +39,8 @@ def test_an_output_function_sees_the_corrected_input_too():
     ("correction", "words"),
     [
         (Correction("speed", "gain", 0.5, 2.0), "no channel 'speed'; it has voltage"),
-        (Correction("omega", "gain", 2.0, 0.5), "low end at or above"),
+        (Correction("omega", "gain", 1.1, 2.0), "1.1 to 2, does not hold 1, which means no error"),
+        (Correction("omega", "offset", 3.0, -3.0), "does not hold 0"),
     ],
 )
 def test_a_correction_of_what_is_not_there_is_refused_in_words(correction, words):
