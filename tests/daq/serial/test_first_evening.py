@@ -32,12 +32,15 @@ def evening(lab, run, **changes):
         result = run(["init", "--rig", "serial"], lab)
         assert result.returncode == 0, result.stderr
         numbered = re.findall(r"^(\d)\. (?:rig )?(.+?)  +", result.stdout, re.MULTILINE)
-        assert [int(place) for place, _ in numbered] == [1, 2, 3, 4, 5]
-        ports, check, *runs, more = [words.split() for _, words in numbered]
+        assert [int(place) for place, _ in numbered] == [1, 2, 3, 4, 5, 6]
+        ports, doctor, check, *runs, more = [words.split() for _, words in numbered]
         assert more == ["more"] and board.port in run([*ports, board.port], lab).stdout
         replace_in(lab / "rig.yaml", "# port: /dev/serial/by-id/usb-...", f"port: {board.port}")
         # The computer of a test has other work.
         replace_in(lab / "rig.yaml", "watchdog: 0.1", "watchdog: 2")
+        # Good or bad is the computer of a test, not the emulator.
+        checked = run([*doctor, "--wakes", "20"], lab).stdout
+        assert "2000 of 2000 samples came" in checked
         for name, change in changes.items():
             replace_in(lab / f"{name}.yaml", *change)
         journals = []
