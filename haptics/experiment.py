@@ -97,10 +97,8 @@ class ReferenceExperiment(TorqueExperiment):
         switches: Sequence[int],
         blend: float,
         logged: Sequence[FloatArray],
-    ) -> Aboard | None:
-        """What ``aboard`` returns; blend: time in which the outputs move over [s]."""
-        if not self.on_device:
-            return None
+    ) -> Aboard:
+        """What ``aboard`` returns on a device; blend: time in which the outputs move over [s]."""
         tuned = self.tuned_controller
         law = tuned.control.program(tuned.model, tuned.parameters).fingerprint
         samples = round(blend * self.sample_rate)

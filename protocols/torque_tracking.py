@@ -104,6 +104,8 @@ class TorqueTracking(ReferenceExperiment):
 
     def aboard(self) -> Aboard | None:
         """The reference, from the first sample until shortly before the last."""
+        if not self.on_device:
+            return None
         reference = self.reference(self.samples_in(self.duration))
         end = len(reference) - round(_BLEND * self.sample_rate)
         reference[max(end, 0) :] = 0.0  # commands again, of which the last shall be zero

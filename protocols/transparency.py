@@ -81,6 +81,8 @@ class Transparency(ReferenceExperiment):
 
     def aboard(self) -> Aboard | None:
         """No torque, by the controller in every second block."""
+        if not self.on_device:
+            return None
         n_samples = self.samples_in(2 * self.pairs * self.block, "block")
         blocks = np.arange(n_samples) // round(self.block * self.sample_rate)
         switches = np.flatnonzero(np.diff(blocks)) + 1
