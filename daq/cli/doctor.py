@@ -82,7 +82,7 @@ def doctor(
 
 
 def _of_rig(name: str, port: str | None, loopback: bool, rate: float | None) -> list[Check]:
-    from daq.diagnose.card import diagnose_rig
+    from daq.diagnose.device import diagnose_rig
     from daq.lookup.rigs import rig_on
 
     _, device = rig_on(name, port, watch=terminal.report_event)
