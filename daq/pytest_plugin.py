@@ -95,10 +95,10 @@ class Replayer:
     ) -> Replay:
         """The outputs of a model under the log's applied commands and measured load.
 
-        log: capture folder or CSV. parameters: ``parameters.yaml`` of an identification; default
-        the simulated rig's own. config: names the columns of a foreign log. trust: run the Python
-        file of a model that ``parameters.yaml`` names. The result has ``fit`` [%], ``rmse`` and
-        ``msd`` by output, and the arrays. Raises ConfigError.
+        log: capture folder or CSV. parameters: ``parameters.yaml`` of an identification, or its
+        folder; default the simulated rig's own. config: names the columns of a foreign log. trust:
+        run the Python file of a model that ``parameters.yaml`` names. The result has ``fit`` [%],
+        ``rmse`` and ``msd`` by output, and the arrays. Raises ConfigError.
         """
         from daq import replay
 

@@ -78,7 +78,8 @@ def export_fmu(
     Its C source is inside, and on Linux with a compiler (cc) what that compiles to; whoever
     simulates it needs no Python. Parameters and starts can be set, inputs are held over a step.
     """
-    from daq.fmu.export import export, result_file
+    from daq.fmu.export import export
+    from daq.identification.request import result_file
 
     file = result_file(result)
     unit = export(file, trust=trust)

@@ -23,7 +23,7 @@ def replay(
         Path | None,
         Option(
             metavar="PARAMETERS.yaml",
-            help="Result of an identification; default the simulated rig's own values.",
+            help="Result of an identification, or its folder; default the simulated rig's values.",
         ),
     ] = None,
     model: options.ModelsWithValues = None,

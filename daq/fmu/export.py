@@ -17,7 +17,7 @@ from daq.errors import ConfigError, RunError
 from daq.files import write_whole
 from daq.fmu.description import Variables, build_description, model_description
 from daq.identification.replay import read_parameters
-from daq.identification.request import PARAMETERS
+from daq.identification.request import PARAMETERS, result_file
 from sysid import ModelError, ProcessModel
 from sysid.arrays import FloatArray
 from sysid.engine.c_text import CTextError, c_text, numbers_text
@@ -95,19 +95,6 @@ def export(result: str | Path, *, trust: bool = False, compiler: str | None = "c
         raise ConfigError(str(error), file=path) from None
     resources = {PARAMETERS: path.read_bytes()}
     return unit_of(model, vector, compiler=compiler, resources=resources)
-
-
-def result_file(result: str | Path) -> Path:
-    """The ``parameters.yaml`` of an identification, given as it is, as its folder or its run's.
-
-    >>> result_file("runs/a/parameters.yaml").name
-    'parameters.yaml'
-    """
-    given = Path(result)
-    if not given.is_dir():
-        return given
-    inside = [given / PARAMETERS, given / "identification" / PARAMETERS]
-    return next((path for path in inside if path.exists()), inside[0])
 
 
 def unit_of(

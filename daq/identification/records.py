@@ -169,7 +169,11 @@ def _foreign(
         # The first sample tells where the model starts.
         first = int(np.argmax(np.isfinite(outputs).all(axis=1)))
         inputs, outputs, tick = inputs[first:], outputs[first:], tick[first:]
-    dataset = _dataset(path, model, inputs, outputs, tick, table.dt, path.stem)
+    dataset = replace(
+        _dataset(path, model, inputs, outputs, tick, table.dt, path.stem),
+        input_noise=table.input_noise,
+        output_noise=table.output_noise,
+    )
     warning = end_of_run(path, read_record(path), table.torn)
     log = LoggedRecord(dataset, path, warning, merged=tuple(others))
     return _prepared(log, model, selection)

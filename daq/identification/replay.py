@@ -17,7 +17,7 @@ from daq.config.identification import Signals
 from daq.errors import ConfigError, suggestion
 from daq.hal import FloatArray, Simulation
 from daq.identification.fit import take
-from daq.identification.request import SettingsRequest
+from daq.identification.request import SettingsRequest, result_file
 from daq.identification.result import Identification
 from daq.identification.settings import Problem, columns_of, problem_of, selection_of, with_signals
 from daq.lookup.models import find_model
@@ -129,12 +129,13 @@ def replay(
 ) -> Replay:
     """Simulate a model under the applied commands and the measured load of a log.
 
-    log: as for ``identify``. parameters: an identification or its ``parameters.yaml``. model: in
-    place of parameters a model by name, at its own values, such as ``actuator:parameters=A``.
-    config: settings of ``identify``, of which the columns of a foreign log and the part of it that
-    is used count, and without parameters its model, fixed and tied values, outputs and starts.
-    Without any of these the parameters are those of the simulated ``rig``. trust: run the Python
-    file of a model that ``parameters.yaml`` names. Raises ConfigError.
+    log: as for ``identify``. parameters: an identification, its ``parameters.yaml``, its folder or
+    its run's. model: in place of parameters a model by name, at its own values, such as
+    ``actuator:parameters=A``. config: settings of ``identify``, of which the columns of a foreign
+    log and the part of it that is used count, and without parameters its model, fixed and tied
+    values, outputs and starts. Without any of these the parameters are those of the simulated
+    ``rig``. trust: run the Python file of a model that ``parameters.yaml`` names. Raises
+    ConfigError.
 
     >>> from daq import record, replay
     >>> result = replay(record("prbs.yaml"))  # through the simulated rig's own model
@@ -203,7 +204,7 @@ def _parameters(
     if isinstance(parameters, Identification):
         return parameters.model, dict(parameters.estimator.parameters_), "identification"
     if parameters is not None:
-        return *read_parameters(Path(parameters), trust), str(parameters)
+        return *read_parameters(result_file(parameters), trust), str(parameters)
     _, device = load_rig(rig)
     if not isinstance(device, Simulation):
         cure = "give those of an identification with --parameters"

@@ -104,5 +104,23 @@ def forget(folder: Path) -> None:
         (folder / name).unlink(missing_ok=True)
 
 
+def result_file(result: str | Path) -> Path:
+    """The ``parameters.yaml`` of an identification, given as it is, as its folder or its run's.
+
+    Raises ConfigError for a folder without any.
+
+    >>> result_file("runs/a/parameters.yaml").name
+    'parameters.yaml'
+    """
+    given = Path(result)
+    if not given.is_dir():
+        return given
+    for place in (given, given / "identification"):
+        if (place / PARAMETERS).exists():
+            return place / PARAMETERS
+    cure = f"identify first: rig identify {shlex.quote(str(given))}"
+    raise ConfigError(f"no identification has written a {PARAMETERS} there", cure=cure, file=given)
+
+
 def _absolute(paths: Sequence[Path | str]) -> list[str]:
     return [str(Path(path).resolve()) for path in paths]

@@ -12,7 +12,7 @@ from daq.config.identification import IdentificationConfig
 from daq.config.yaml_file import YamlFile
 from daq.errors import ConfigError
 from daq.identification.foreign import unit_factor
-from daq.identification.request import PARAMETERS
+from daq.identification.request import result_file
 from sysid import Given, ModelError, ProcessModel
 
 _WELL = 0.3  # standard deviation in parts of a value, up to which it counts as found
@@ -24,13 +24,11 @@ def load(paths: Sequence[Path]) -> list[YamlFile]:
     """Results of identifications, by file or folder; ConfigError for what is none."""
     files = []
     for path in paths:
-        inside = (path / PARAMETERS, path / "identification" / PARAMETERS)
-        there = next((file for file in inside if file.exists()), inside[0])
-        files.append(yaml_file.load(there if path.is_dir() else path))
-    for file in files:
+        file = yaml_file.load(result_file(path))
         for key in ("parameters", "covariance"):
             if not isinstance(file.content.get(key), dict):
                 raise file.error((key,), "this key is missing; no result with intervals", _AGAIN)
+        files.append(file)
     return files
 
 

@@ -463,7 +463,8 @@ class GASSI(RecordEstimator):
             where = ", ".join(record.name for record in records[:3])
             raise ModelError(
                 f"criterion {self.criterion} needs the noise of a measured input, and {where} "
-                "tells none; give each Dataset its input_noise, or choose criterion likelihood"
+                "tells none; give it ('noise' of a column, input_noise of a Dataset), or choose "
+                "criterion likelihood"
             )
         return self._of_noisy_inputs(records, noisy)
 

@@ -562,7 +562,7 @@ def _untested(
         yield "Without intervals it is not tested whether more than the noise is left to explain."
     elif names:
         yield (
-            f"The noise of {', '.join(names)} is not known from a calibration: whether more could "
+            f"The noise of {', '.join(names)} is neither calibrated nor given: whether more could "
             "be explained is not tested."
         )
     if findings is None:

@@ -83,8 +83,10 @@ def test_a_table_does_for_a_log(recorded, tmp_path):
 def test_a_replay_is_the_same_from_the_result_and_from_its_file(recorded, found, tmp_path):
     _, _, validation = recorded
     replayed = replay(validation, found)
-    again = replay(validation.folder, found.save(tmp_path / "identification"))
-    pd.testing.assert_frame_equal(replayed.frame, again.frame)
+    found.save(tmp_path / "identification")
+    for result in ("identification/parameters.yaml", "identification", ""):  # the run's folder
+        again = replay(validation.folder, tmp_path / result)
+        pd.testing.assert_frame_equal(replayed.frame, again.frame)
     measured = replayed.frame.dropna()  # of some samples an encoder's speed is not known
     omega = measured["omega"]
     error = omega - measured["omega_simulated"]

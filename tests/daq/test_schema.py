@@ -37,7 +37,7 @@ SHIPPED = sorted(
 )
 # Numbers in a unit that stands elsewhere: in a model, or beside them.
 OF_A_MODEL = re.compile(
-    r"^(ranges|fixed|constant|value|range|parameters|initial|process_noise|scale|centre)$"
+    r"^(ranges|fixed|constant|noise|value|range|parameters|initial|process_noise|scale|centre)$"
 )
 
 
