@@ -8,18 +8,19 @@ import platform
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 from daq.config.rig import RigConfig
 from daq.identification import records as datasets
+from daq.identification.campaign import Workers
 from daq.lookup.experiments import load_experiment
 from daq.lookup.rigs import load_rig
 from daq.provenance import software_versions
 from daq.run.runner import run_experiment
 from sim_rig.backend import SimulatedDevice
-from sysid import Dataset
+from sysid import Dataset, StudyResult, study
 from sysid.problem.model import ProcessModel
 from sysid.threads import available_cores
 
@@ -28,6 +29,32 @@ def arguments(description: str) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--json", action="store_true", help="one JSON document")
     return parser
+
+
+def spreading(parser: argparse.ArgumentParser) -> None:
+    """Add the options that say where a study is computed."""
+    parser.add_argument("--jobs", type=int, default=1, help="processes here, -1 for all cores")
+    parser.add_argument("--dask", metavar="ADDRESS", help="a dask cluster's scheduler")
+
+
+def spread(
+    function: Callable[[Any], Any],
+    items: Iterable[Any],
+    options: argparse.Namespace,
+    told: Callable[[Any], str],
+) -> list[Any]:
+    """The function of every item, in their order, computed where the options say.
+
+    told: a line for each value as it comes. An item that fails is told, and left out; Ctrl-C keeps
+    what is there.
+    """
+
+    def tell(result: StudyResult) -> None:
+        line = result.problem or told(result.value)
+        print(f"{result.item}: {line} ({result.seconds:.0f} s)", file=sys.stderr, flush=True)
+
+    with Workers(options.jobs, options.dask).ready() as jobs:
+        return study(function, items, n_jobs=jobs, on_result=tell).values
 
 
 def machine() -> dict[str, Any]:

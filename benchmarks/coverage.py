@@ -1,7 +1,7 @@
 """Do the intervals cover the truth, and does a noise-free record give the true parameters?
 
-python -m benchmarks.coverage [--json] [--seeds 200] [--minutes M] [--exact 20]
-                              [--experiment prbs.yaml ...]
+python -m benchmarks.coverage [--json] [--seeds 200] [--exact 20] [--experiment prbs.yaml ...]
+                              [--jobs N] [--dask ADDRESS]
 
 Noise: shipped experiments on the simulated rig, a new seed of noise, offsets and search each time,
 identified from the shipped ranges; every quantity that gets an interval is asked whether it holds
@@ -9,20 +9,21 @@ the truth. Strong quantities have an interval by the curvature, weak ones one by
 likelihood, perhaps with one end. The bars: of each strong one 93 to 97 % hold and the mean error
 is below 0.3 standard deviations, of each weak one 90 to 99 %. Noise-free: the model's own outputs,
 identified with another seed of the search each time; every determined quantity is compared with
-the truth.
+the truth. Ctrl-C ends an experiment with the seeds that are done.
 """
 
 from __future__ import annotations
 
-import sys
+import argparse
+import functools
 import time
 from collections import defaultdict
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from benchmarks._common import arguments, report, rig_of, simulated_logs, timed
+from benchmarks._common import arguments, report, rig_of, simulated_logs, spread, spreading, timed
 from sim_rig.actuator import actuator
 from sysid import BatchSimulator, Dataset
 from sysid.arrays import FloatArray
@@ -38,89 +39,98 @@ _EXPERIMENTS = ("prbs.yaml", "constant_velocity.yaml", "hysteresis_loop.yaml")
 def main() -> None:
     parser = arguments(__doc__ or "")
     parser.add_argument("--seeds", type=int, default=200, help="of noise")
-    parser.add_argument(
-        "--minutes", type=float, default=np.inf, help="of processor time, for each experiment"
-    )
     parser.add_argument("--exact", type=int, default=20, help="seeds of the search without noise")
     parser.add_argument("--experiment", nargs="+", default=_EXPERIMENTS, help="shipped ones")
+    spreading(parser)
     options = parser.parse_args()
     figures = {
-        "coverage": {
-            name: coverage(options.seeds, name, options.minutes) for name in options.experiment
-        },
+        "coverage": {name: coverage(name, options) for name in options.experiment},
         "noise_free": noise_free(actuator(), options.exact) if options.exact else None,
     }
     report(figures, options.json, show)
 
 
-@dataclass
-class _Tally:
-    """What became of one quantity's intervals: how often they held, and errors of strong ones."""
+@dataclass(frozen=True)
+class _Held:
+    """Whether an interval holds the truth; error: in standard deviations, None of a weak one."""
 
-    strong: list[bool] = field(default_factory=list)
-    weak: list[bool] = field(default_factory=list)
-    errors: list[float] = field(default_factory=list)
-
-    def add(self, estimate: Estimate, truth: float) -> bool:
-        """Count an interval; whether it holds."""
-        held = bool(estimate.low is None or estimate.low <= truth)
-        held = held and bool(estimate.high is None or truth <= estimate.high)
-        (self.weak if estimate.std is None else self.strong).append(held)
-        if estimate.std is not None:
-            self.errors.append(_in_deviations(estimate, truth))
-        return held
-
-    def figures(self) -> dict[str, Any]:
-        """Shares that held, and the mean error in standard deviations."""
-        return {
-            "strong": len(self.strong),
-            "strong_coverage": _mean(self.strong),
-            "bias_in_deviations": _mean(self.errors),
-            "weak": len(self.weak),
-            "weak_coverage": _mean(self.weak),
-        }
+    name: str
+    holds: bool
+    error: float | None
 
 
-def coverage(seeds: int, experiment: str, minutes: float = np.inf) -> dict[str, Any]:
-    """Share of the 95 % intervals that hold the truth, for each quantity and together.
+@dataclass(frozen=True)
+class _Seed:
+    """What became of one seed's intervals. joint: the share that is stated to hold at once."""
 
-    minutes: of processor time, after which no further seed is begun.
-    """
-    begun = time.process_time()
+    seed: int
+    seconds: float
+    answers: int
+    joint: float | None
+    intervals: tuple[_Held, ...]
+
+    @property
+    def missed(self) -> list[str]:
+        """Quantities whose intervals do not hold the truth."""
+        return [interval.name for interval in self.intervals if not interval.holds]
+
+
+def coverage(experiment: str, options: argparse.Namespace) -> dict[str, Any]:
+    """Share of the 95 % intervals that hold the truth, for each quantity and together."""
+    seeds: list[_Seed] = spread(
+        functools.partial(_intervals, experiment, threads=1 if options.jobs != 1 else None),
+        range(options.seeds),
+        options,
+        lambda seed: f"{len(seed.intervals)} intervals, missed: {', '.join(seed.missed) or 'none'}",
+    )
+    quantities: dict[str, list[_Held]] = defaultdict(list)
+    for interval in (interval for seed in seeds for interval in seed.intervals):
+        quantities[interval.name].append(interval)
+    every = [interval for intervals in quantities.values() for interval in intervals]
+    return {
+        "seeds": len(seeds),
+        "missed": {seed.seed: seed.missed for seed in seeds if seed.missed},
+        **{key: value for key, value in _figures(every).items() if key.endswith("_coverage")},
+        "joint_coverage": _mean([not seed.missed for seed in seeds]),
+        "joint_coverage_stated": _mean([s.joint for s in seeds if s.joint is not None]),
+        "several_answers": _mean([seed.answers > 1 for seed in seeds]),
+        "processor_seconds_each": _mean([seed.seconds for seed in seeds]),
+        "quantities": {name: _figures(intervals) for name, intervals in quantities.items()},
+    }
+
+
+def _intervals(experiment: str, seed: int, *, threads: int | None) -> _Seed:
+    """The intervals from one run of a shipped experiment, beside the truth."""
     plant = rig_of(experiment)[1].options.plant
     load = "measured" if plant.sensor == "load" else plant.load
     model, truth = actuator(load=load, sensor=plant.sensor), _truth(plant.process_model())
-    tallies: dict[str, _Tally] = defaultdict(_Tally)
-    seconds, together, nominal, answers = [], [], [], []
-    missed: dict[int, list[str]] = {}
-    for seed in range(seeds):
-        if time.process_time() - begun > 60.0 * minutes:
-            break
-        training, _ = simulated_logs(model, seed, experiment)
+    training, _ = simulated_logs(model, seed, experiment)
+    begin = time.process_time()
+    fitted = GASSI(model, random_state=seed, threads=threads).fit(training)
+    uncertainty = fitted.uncertainty(training)
+    seconds = time.process_time() - begin
+    estimates = [e for e in uncertainty.determined() if "(0)" not in e.name]
+    held = tuple(_held(estimate, estimate.at(truth)) for estimate in estimates)
+    return _Seed(seed, seconds, 1 + len(uncertainty.rivals), uncertainty.joint, held)
 
-        start = time.process_time()
-        intervals = GASSI(model, random_state=seed).fit(training).uncertainty(training)
-        seconds.append(time.process_time() - start)
-        answers.append(1 + len(intervals.rivals))
-        held = {
-            estimate.name: tallies[estimate.name].add(estimate, estimate.at(truth))
-            for estimate in intervals.determined()
-            if "(0)" not in estimate.name
-        }
-        together.append(all(held.values()))
-        print(f"{experiment} seed {seed}: {sum(held.values())} of {len(held)}", file=sys.stderr)
-        missed[seed] = [name for name, holds in held.items() if not holds]
-        nominal.append(intervals.joint)
+
+def _held(estimate: Estimate, truth: float) -> _Held:
+    holds = estimate.low is None or estimate.low <= truth
+    holds = holds and (estimate.high is None or truth <= estimate.high)
+    error = None if estimate.std is None else _in_deviations(estimate, truth)
+    return _Held(estimate.name, bool(holds), error)
+
+
+def _figures(intervals: list[_Held]) -> dict[str, Any]:
+    """Shares that held, and the mean error in standard deviations."""
+    strong = [interval for interval in intervals if interval.error is not None]
+    weak = [interval for interval in intervals if interval.error is None]
     return {
-        "seeds": len(seconds),
-        "missed": {seed: names for seed, names in missed.items() if names},
-        "strong_coverage": _mean([held for t in tallies.values() for held in t.strong]),
-        "weak_coverage": _mean([held for t in tallies.values() for held in t.weak]),
-        "joint_coverage": _mean(together),
-        "joint_coverage_stated": _mean(nominal),
-        "several_answers": _mean([count > 1 for count in answers]),
-        "processor_seconds_each": float(np.median(seconds)),
-        "quantities": {name: tally.figures() for name, tally in tallies.items()},
+        "strong": len(strong),
+        "strong_coverage": _mean([interval.holds for interval in strong]),
+        "bias_in_deviations": _mean([interval.error for interval in strong]),
+        "weak": len(weak),
+        "weak_coverage": _mean([interval.holds for interval in weak]),
     }
 
 

@@ -10,6 +10,7 @@ from sysid.identifiability.analysis import identifiability
 
 if TYPE_CHECKING:
     from sysid.campaigns.runs import Campaign, Outcome, Run, Spread, campaign, combinations
+    from sysid.campaigns.study import Study, StudyResult, study
     from sysid.engine.simulation import BatchResult, BatchSimulator, Status
     from sysid.engine.stepper import Stepper
     from sysid.experiments import (
@@ -80,6 +81,8 @@ __all__ = [
     "State",
     "Status",
     "Stepper",
+    "Study",
+    "StudyResult",
     "TiedGroup",
     "campaign",
     "combinations",
@@ -99,12 +102,14 @@ __all__ = [
     "regression",
     "rmse",
     "select_orders",
+    "study",
 ]
 
 
 # What a command does not use it does not import: scikit-learn alone takes most of a second.
 _NAMES = {
     "sysid.campaigns.runs": "Campaign Outcome Run Spread campaign combinations",
+    "sysid.campaigns.study": "Study StudyResult study",
     "sysid.engine.simulation": "BatchResult BatchSimulator Status",
     "sysid.engine.stepper": "Stepper",
     "sysid.experiments": (

@@ -20,6 +20,8 @@ from sysid.problem.model import ModelError
 
 # Folders that installers make: of Python, and of Debian's packages.
 _INSTALLED = {"site-packages", "dist-packages"}
+# Packages that are installed together, also where this one runs from its sources.
+_EVERYWHERE = {"daq", "haptics", "protocols", "sim_rig", "sysid", "__main__"}
 _REGISTRY = threading.Lock()  # what travels as code is noted once for all threads of a worker
 
 
@@ -56,11 +58,10 @@ def _not_installed() -> Iterator[types.ModuleType]:
     """Loaded modules that another process may not find by their name."""
     paths = sysconfig.get_paths()
     places = {paths[key] for key in ("stdlib", "platstdlib", "purelib", "platlib")}
-    everywhere = (__name__.partition(".")[0], "__main__")
     for name, module in list(sys.modules.items()):
         file = Path(getattr(module, "__file__", None) or "")
         # Compiled modules have no code that could travel.
-        if file.suffix != ".py" or name.partition(".")[0] in everywhere:
+        if file.suffix != ".py" or name.partition(".")[0] in _EVERYWHERE:
             continue
         # Another environment's folder will do as well.
         installed = not _INSTALLED.isdisjoint(file.parts)

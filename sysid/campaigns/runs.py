@@ -7,20 +7,18 @@ on all of them.
 
 from __future__ import annotations
 
-import functools
 import itertools
 import os
-import threading
 import time
-import warnings
 from collections import defaultdict
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sysid.campaigns.parcels import pack, unpack
+from sysid.campaigns.study import described, end_with, unpack_once, work_through
 from sysid.problem.data import Dataset
 from sysid.problem.metrics import Metrics, evaluate, mean_known
 from sysid.problem.model import ModelError, ProcessModel
@@ -31,7 +29,6 @@ if TYPE_CHECKING:
 
     from sysid.gassi import GASSI
 
-_LOOK_EVERY = 0.5  # s between two looks of a worker at whether it is still wanted
 # Two seeds whose errors differ by no more than this share found the same minimum.
 _SAME = 0.01
 
@@ -239,27 +236,17 @@ def campaign(
         for place, packed in zip(order, _packed([runs[place] for place in order]), strict=True)
     ]
     outcomes: dict[int, Outcome] = {}
-    interrupted, problem = False, ""
-    results = _parallel(n_jobs)(jobs)
-    try:
-        for parcel in results:
-            place, outcome = _outcome(runs, parcel)
-            outcomes[place] = outcome
-            if on_outcome is not None:
-                on_outcome(outcome)
-            if outcome.estimator is not None and outcome.estimator.stopped_ == "interrupted":
-                # The search took the Ctrl-C for itself, to keep its best so far.
-                raise KeyboardInterrupt
-    except KeyboardInterrupt:
-        interrupted = True
-    except Exception as error:
-        # A worker that died, or one that lacks something, takes the others with it.
-        problem = _described(error)
-    finally:
-        if isinstance(results, Generator):
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # that some were not finished, which is known
-                results.close()
+
+    def take(parcel: bytes) -> None:
+        place, outcome = _outcome(runs, parcel)
+        outcomes[place] = outcome
+        if on_outcome is not None:
+            on_outcome(outcome)
+        if outcome.estimator is not None and outcome.estimator.stopped_ == "interrupted":
+            # The search took the Ctrl-C for itself, to keep its best so far.
+            raise KeyboardInterrupt
+
+    interrupted, problem = work_through(jobs, n_jobs, take)
     if not interrupted:
         for place in set(range(len(runs))) - set(outcomes):
             outcomes[place] = Outcome(runs[place], None, (), (), 0.0, problem)
@@ -292,7 +279,7 @@ def _identify(
     """A worker's part: fit, evaluate, and send back all but the model, which is here already."""
     from sysid.gassi import GASSI
 
-    _end_with(caller)
+    end_with(caller)
     started = time.perf_counter()
     fitted: GASSI | None = None
     scores: list[tuple[Metrics, ...]] = [(), ()]
@@ -300,7 +287,7 @@ def _identify(
     try:
         groups = unpack(data)
         arguments = {"threads": threads, **unpack(settings), "random_state": seed}
-        fitted = GASSI(_model(model), **arguments).fit(groups[0])
+        fitted = GASSI(unpack_once(model), **arguments).fit(groups[0])
         scores = [
             tuple(evaluate(record.outputs, fitted.predict(record)) for record in group)
             for group in groups
@@ -308,25 +295,8 @@ def _identify(
         fitted.model = None
         fitted.space_ = replace(fitted.space_, model=None)  # type: ignore[arg-type]
     except Exception as error:
-        fitted, problem = None, _described(error)
+        fitted, problem = None, described(error)
     return pack("result", (place, fitted, *scores, time.perf_counter() - started, problem))
-
-
-@functools.cache
-def _end_with(caller: int) -> None:
-    """If this is a process of the caller's, end it when that is gone, even by ``kill -9``."""
-
-    def watch() -> None:
-        while os.getppid() == caller:
-            time.sleep(_LOOK_EVERY)
-        os._exit(1)
-
-    if os.getppid() == caller:
-        threading.Thread(target=watch, daemon=True).start()
-
-
-# The same object for all runs of a worker, so that its kernels are made once.
-_model = functools.lru_cache(maxsize=8)(unpack)
 
 
 def _outcome(runs: Sequence[Run], parcel: bytes) -> tuple[int, Outcome]:
@@ -337,17 +307,6 @@ def _outcome(runs: Sequence[Run], parcel: bytes) -> tuple[int, Outcome]:
         fitted.space_ = replace(fitted.space_, model=run.model)
         fitted.threads = run.settings.get("threads")
     return place, Outcome(run, fitted, training, validation, seconds, problem)
-
-
-def _parallel(n_jobs: int | None) -> Any:
-    """joblib's Parallel that hands out results as they come, where its backend can."""
-    import joblib
-
-    # Each run by itself: a batch of several would only be finished as a whole.
-    try:
-        return joblib.Parallel(n_jobs, batch_size=1, return_as="generator_unordered")
-    except ValueError:
-        return joblib.Parallel(n_jobs, batch_size=1)
 
 
 def _threads(n_jobs: int | None, n_runs: int) -> int:
@@ -368,10 +327,6 @@ def _order(runs: Sequence[Run]) -> list[int]:
     counts: dict[int, Iterator[int]] = defaultdict(itertools.count)
     turns = [next(counts[id(run.model)]) for run in runs]
     return sorted(range(len(runs)), key=lambda place: turns[place])
-
-
-def _described(error: Exception) -> str:
-    return str(error) if isinstance(error, ModelError) else f"{type(error).__name__}: {error}"
 
 
 def _ranked(group: Sequence[Outcome]) -> list[Outcome]:

@@ -14,7 +14,17 @@ import numpy as np
 import pytest
 from joblib.externals.loky import get_reusable_executor
 
-from sysid import GASSI, Constraint, Dataset, ModelError, Run, campaign, combinations, fit_percent
+from sysid import (
+    GASSI,
+    Constraint,
+    Dataset,
+    ModelError,
+    Run,
+    campaign,
+    combinations,
+    fit_percent,
+    study,
+)
 from sysid.campaigns.parcels import pack, unpack
 from tests.soak import mostly_soak
 from tests.sysid.support import lag
@@ -245,13 +255,45 @@ def test_every_run_of_a_lost_worker_is_accounted_for():
     assert "worker" in found.failed[0].problem
 
 
+def gain_of(seed):
+    """What a study may ask for each seed; not of the third."""
+    if seed == 2:
+        raise ValueError("no such rig")
+    found = GASSI(lag(), random_state=seed, threads=1, **SETTINGS).fit(record(seed))
+    return seed, found.parameters_["gain"]
+
+
+def test_a_study_gives_the_same_in_other_processes_and_keeps_what_failed():
+    seen = []
+    here = study(gain_of, range(4))
+    there = study(gain_of, range(4), n_jobs=2, on_result=seen.append)
+    assert [value[0] for value in here.values] == [0, 1, 3] and there.values == here.values
+    for found in (here, there):
+        (failed,) = found.failed
+        assert (failed.item, failed.problem) == (2, "ValueError: no such rig")
+    assert {result.item for result in seen} == {0, 1, 2, 3}
+    with pytest.raises(ModelError, match=r"the study's function cannot be sent(.|\n)*locks"):
+        study(threading.Lock().acquire, [0])
+    with pytest.raises(ModelError, match="at least one item"):
+        study(gain_of, [])
+
+
+def test_ctrl_c_ends_a_study_and_keeps_what_is_done():
+    def interrupt(result):
+        if result.item == 1:
+            raise KeyboardInterrupt
+
+    found = study(lambda k: k, range(4), on_result=interrupt)
+    assert found.interrupted and found.values == [0, 1]
+
+
 @pytest.mark.soak
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no SIGKILL here")
 @pytest.mark.filterwarnings("ignore")  # of dask, that a worker has gone
 def test_a_worker_of_a_cluster_that_is_killed_costs_no_run(serial):
     distributed = pytest.importorskip("distributed", reason="dask.distributed is not installed")
     todo, found = serial
-    killed = []
+    values, killed = study(gain_of, range(4)).values, []
     with (
         distributed.LocalCluster(
             n_workers=2, threads_per_worker=1, dashboard_address=":0"
@@ -266,6 +308,7 @@ def test_a_worker_of_a_cluster_that_is_killed_costs_no_run(serial):
                 os.kill(killed[0], signal.SIGKILL)
 
         same(found, campaign(todo, on_outcome=kill))
+        assert study(gain_of, range(4)).values == values
     assert killed
 
 
