@@ -1,6 +1,7 @@
 """The ``rig`` command."""
 
 import contextlib
+import gc
 import os
 import signal
 import sys
@@ -12,6 +13,9 @@ from daq.errors import RigError, Terminated
 
 _INTERRUPTED = 130  # what Typer makes of Ctrl-C
 _NAMES = ("SIGINT", "SIGTERM", "SIGHUP")  # where there is such a signal
+# New objects between two searches for what only refers to itself. By Python's 700 there are
+# hundreds of searches while modules are loaded and figures drawn, in vain.
+_BETWEEN_COLLECTIONS = 50_000
 
 
 def main() -> None:
@@ -20,6 +24,7 @@ def main() -> None:
     heard = _hear_signals(ended)
     end: BaseException | None = None
     try:
+        gc.set_threshold(_BETWEEN_COLLECTIONS)
         # Ctrl-C may come while this is imported, too.
         from daq.cli.app import app
 

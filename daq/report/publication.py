@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from daq.documents import plain
-from daq.figures import style
 from daq.files import digest, make_folder, write_whole
 from daq.identification.baseline import Baseline, baselines_of
 from daq.identification.records import LoggedRecord, Split
@@ -20,6 +19,7 @@ from daq.progress import Progress, Watch, ignore
 from daq.report.latex import latex, latex_errors
 from daq.report.page import Drawing, Picture, page
 from daq.report.pictures import Subject, pictures
+from daq.report.renderer import Files, Renderer
 
 DATA, FIGURES = "report.json", "figures"
 _PAGE, _TABLE = "report.html", "parameters.tex"
@@ -33,6 +33,13 @@ def publish(result: Identification, folder: Path, watch: Watch = ignore) -> dict
 
     Raises RunError where the disk refuses.
     """
+    with Renderer() as renderer:
+        return _published(result, folder, renderer, watch)
+
+
+def _published(
+    result: Identification, folder: Path, renderer: Renderer, watch: Watch
+) -> dict[str, str]:
     watch(Progress("Report", 0, _STEPS, "linear baseline"))
     logs = [fitted.log for fitted in result.training], [fitted.log for fitted in result.validation]
     linear = baselines_of(result.model, *logs)
@@ -42,7 +49,7 @@ def publish(result: Identification, folder: Path, watch: Watch = ignore) -> dict
     baseline = None if isinstance(linear, str) else linear[0]
     subject = Subject(result.model, document, training, validation, baseline)
     drawings: list[Drawing] = []
-    for picture, files in draw(pictures(subject), folder / FIGURES, ["svg"]):
+    for picture, files in draw(pictures(subject), folder / FIGURES, ["svg"], renderer):
         drawings.append((picture, files["svg"]))
         count = len(drawings)
         watch(Progress("Report", min(count, _STEPS - 1), _STEPS, f"{count} figures"))
@@ -60,12 +67,17 @@ def publish(result: Identification, folder: Path, watch: Watch = ignore) -> dict
 
 
 def draw(
-    figures: Iterable[Picture], folder: Path, formats: Sequence[str]
-) -> Iterator[tuple[Picture, dict[str, bytes]]]:
-    """Figures, each written to files of the formats; with what is in them."""
+    figures: Iterable[Picture],
+    folder: Path,
+    formats: Sequence[str],
+    renderer: Renderer | None = None,
+) -> Iterator[tuple[Picture, Files]]:
+    """Figures, each written to files of the formats; with what is in them.
+
+    renderer: by which they are made; default this process alone.
+    """
     make_folder(folder)
-    for picture in figures:
-        contents = {kind: style.render(picture.figure, kind) for kind in formats}
+    for picture, contents in (renderer or Renderer(alone=True)).rendered(figures, formats):
         for kind, content in contents.items():
             write_whole(folder / f"{picture.name}.{kind}", content)
         yield picture, contents

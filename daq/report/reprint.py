@@ -17,6 +17,7 @@ from daq.identification.settings import columns_of
 from daq.progress import Progress, Watch, ignore
 from daq.report.pictures import Subject, pictures
 from daq.report.publication import DATA, FIGURES, draw
+from daq.report.renderer import Renderer
 from sysid import BatchSimulator, ProcessModel, free_run
 
 _AGAIN = "identify again to have a report of it"
@@ -41,12 +42,13 @@ def redraw(
             raise ConfigError(f"--format {kind}: figures are written as {written}")
     formats = [kind.lower() for kind in kinds]
     source = _report_in(folder)
-    subject = _subject(source, trust)
     target = out or source.parent / FIGURES
     files: list[Path] = []
-    for picture, _ in draw(pictures(subject), target, formats):
-        files += [target / f"{picture.name}.{kind}" for kind in formats]
-        watch(Progress("Figures", len(files), len(files) + 1, f"{len(files)} files"))
+    with Renderer() as renderer:
+        subject = _subject(source, trust)
+        for picture, _ in draw(pictures(subject), target, formats, renderer):
+            files += [target / f"{picture.name}.{kind}" for kind in formats]
+            watch(Progress("Figures", len(files), len(files) + 1, f"{len(files)} files"))
     return files
 
 
