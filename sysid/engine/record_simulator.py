@@ -154,7 +154,7 @@ class RecordSimulator:
         kept. Returns the residuals' sums of squares, (n, n_outputs), and error estimates in parts
         of what the accuracy allows, (n,).
         """
-        kept = np.full((len(values), values.shape[1], LANES), np.nan)
+        kept = np.empty((len(values), values.shape[1], LANES))
         lanes = np.arange(rows.start, rows.stop)
         n_samples = self.record.n_samples
         sse, estimates = self.block(parameters, starts, lanes, n_steps, n_samples, kept)
@@ -319,7 +319,7 @@ class RecordSimulator:
         outputs, (n, n_outputs).
         """
         q, more = self._measured.shape[1], len(self.averaged)
-        kept = np.full((n_samples, q + more, LANES), np.nan)
+        kept = np.empty((n_samples, q + more, LANES))
         signals = np.zeros((n_samples, q + more)), np.ones((n_samples, q + more))
         start = np.vstack([self._initial(starts, lanes), np.zeros((more, len(lanes)))])
         integrating = self._integrating
@@ -367,12 +367,16 @@ class RecordSimulator:
         sums = np.empty((2 * n_outputs, LANES))
         work = work_area(kernels.batch.work_rows * LANES)
         record = self._inputs[: len(signals[0])], *signals
-        p = np.ascontiguousarray(parameters[padded].T)
+        arguments = (
+            work, work.reshape(-1, LANES), kernels.batch.tables, *record, start,
+            np.ascontiguousarray(parameters[padded].T), self.record.dt, n_steps, sums, residuals,
+        )  # fmt: skip
         with explained_errors(kernels.model):
-            kernels.simulate(
-                work, work.reshape(-1, LANES), kernels.batch.tables, *record, start, p,
-                self.record.dt, n_steps, sums, residuals,
-            )  # fmt: skip
+            kernels.simulate(*arguments)
+            if residuals.size and not np.isfinite(sums[:n_outputs].sum(axis=0)).any():
+                # When all have blown up it stops, and leaves the rest as it is.
+                residuals.fill(np.nan)
+                kernels.simulate(*arguments)
         return sums[:n_outputs].T[: len(lanes)], sums[n_outputs:].T[: len(lanes)]
 
     def _attempt(self, population: Population, todo: IntArray, n_samples: int) -> FloatArray:

@@ -113,7 +113,7 @@ def fit_likelihood(
         optima = refitted
         best, *others = optima.ranked()
     rivals = [optimum for optimum in others if optima.deviance(optimum, best) < _TOLD_APART]
-    connected = [optima.connected(best, rival) for rival in rivals]
+    connected = optima.connected(best, rivals)
     apart = list(itertools.compress(rivals, np.logical_not(connected)))
     valley = itertools.compress(rivals, connected)
     ridge = [rival for rival in valley if optima.deviance(rival, best) < Z95**2]
@@ -190,28 +190,36 @@ class _Optima:
         sizes = np.maximum(sizes, sizes.max() + np.log(_LEAST_SHARE))
         return float(2.0 * np.sum(self._independent_samples * (sizes[0] - sizes[1])))
 
-    def connected(self, optimum: Optimum, rival: Optimum) -> bool:
-        """Whether a way leads from one to the other on which the data rule nothing out.
+    def connected(self, optimum: Optimum, rivals: Sequence[Optimum]) -> list[bool]:
+        """Whether ways lead from one to others on which the data rule nothing out.
 
         The coordinate that differs most is moved in steps, all others are fitted to each.
         """
         objective, coded = optimum.objective, self._objective.space.encode
-        at, end = coded(optimum.chromosome), coded(rival.chromosome)
-        place = int(np.argmax(np.abs(end - at) / objective.space.width))
-        for coordinate in at[place] + _WAY * (end - at)[place]:
-            at = at + (coordinate - at[place]) / (end - at)[place] * (end - at)
-            held = Restriction(held=(place, float(coordinate)))
-            start = objective.space.decode(at)
-            (fit,) = refine_each(
+        start, ends = coded(optimum.chromosome), [coded(rival.chromosome) for rival in rivals]
+        places = [int(np.argmax(np.abs(end - start) / objective.space.width)) for end in ends]
+        at, passable = [start] * len(ends), [True] * len(ends)
+        for part in _WAY:
+            descents = {}
+            for k in np.flatnonzero(passable).tolist():
+                place, way = places[k], ends[k] - at[k]
+                coordinate = start[place] + part * (ends[k] - start)[place]
+                begun = at[k] + (coordinate - at[k][place]) / way[place] * way
+                held = Restriction(held=(place, float(coordinate)))
+                descents[k] = begin(
+                    objective, objective.space.decode(begun), tolerance=_ROUGHLY, restriction=held
+                )
+            fits = refine_each(
                 objective,
-                [begin(objective, start, tolerance=_ROUGHLY, restriction=held)],
+                list(descents.values()),
                 max_iterations=_QUICKLY,
                 enough=lambda point: self._alike(point, optimum),
             )
-            if self.deviance(_optimum(objective, fit.chromosome, fit.rms), optimum) >= _TOLD_APART:
-                return False
-            at = coded(fit.chromosome)
-        return True
+            for k, fit in zip(descents, fits, strict=True):
+                reached = _optimum(objective, fit.chromosome, fit.rms)
+                passable[k] = self.deviance(reached, optimum) < _TOLD_APART
+                at[k] = coded(fit.chromosome)
+        return passable
 
     def _alike(self, point: Point, optimum: Optimum) -> bool:
         """Whether the data do not tell a point that was simulated from an optimum."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -270,13 +271,16 @@ class SearchSpace:
         return self._constraints_at(self.full(chromosomes))
 
     def _constraints_at(self, vectors: FloatArray) -> FloatArray:
-        columns, values = tuple(vectors.T), np.zeros((len(vectors), len(self.model.constraints)))
-        for i, constraint in enumerate(self.model.constraints):
-            try:
-                with time_limit(AT_A_POINT):
+        constraints = self.model.constraints
+        columns, values = tuple(vectors.T), np.zeros((len(vectors), len(constraints)))
+        text = ""
+        try:
+            with time_limit(AT_A_POINT) if constraints else nullcontext():
+                for i, constraint in enumerate(constraints):
+                    text = constraint.text
                     values[:, i] = constraint.function(columns)
-            except TimeoutError as error:
-                raise ModelError(f"constraint {constraint.text!r}: {error}") from error
+        except TimeoutError as error:
+            raise ModelError(f"constraint {text!r}: {error}") from error
         return values
 
 
