@@ -1,9 +1,10 @@
 """What designed experiments tell beside shipped and random ones of equal time and limits.
 
-python -m benchmarks.design [--json] [--rigs 8] [--case motor|actuator]
+python -m benchmarks.design [--json] [--rigs 8] [--case motor|oscillator|actuator]
 
-``motor``: a DC motor with Coulomb friction; 2 s designed from PRBS and multisines with free
-settings, against the best of 200 of the same drawn at random, repeated for as long.
+``motor``: a DC motor with Coulomb friction, ``oscillator``: a mass on a Bouc-Wen spring; 2 s
+designed from PRBS and multisines with free settings, against the best of 200 of the same drawn at
+random, repeated for as long.
 
 ``actuator``: the hybrid actuator with a mass wound up on its pulley; the whole plant is simulated
 for torque and limits, its torque is the identification model's input. 8 runs of 1.25 s designed
@@ -17,7 +18,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -70,17 +72,27 @@ WOUND = 10.0 * math.pi  # rad, five turns
 def main() -> None:
     parser = arguments(__doc__ or "")
     parser.add_argument("--rigs", type=int, default=8, help="hidden parameters drawn")
-    parser.add_argument("--case", choices=("motor", "actuator"), help="only this one")
+    parser.add_argument("--case", choices=(*CASES, "actuator"), help="only this one")
     options = parser.parse_args()
-    figures = {}
-    if options.case != "actuator":
-        figures["motor"] = motor_with_friction()
-    if options.case != "motor":
+    figures = {
+        name: against_random(case()) for name, case in CASES.items() if options.case in (None, name)
+    }
+    if options.case in (None, "actuator"):
         figures["actuator"] = hybrid_actuator(options.rigs)
     report(figures, options.json, show)
 
 
-# A motor with Coulomb friction.
+# Models of one input: a motor with Coulomb friction, an oscillator with hysteresis.
+
+
+@dataclass(frozen=True)
+class Case:
+    """A model of one input with its limits and the noise of its outputs; runs of 1 s at a rate."""
+
+    model: ProcessModel
+    noise: Mapping[str, float]
+    limits: Mapping[str, tuple[float, float]]
+    rate: float
 
 
 def motor() -> ProcessModel:
@@ -105,13 +117,53 @@ def motor() -> ProcessModel:
     )
 
 
-def motor_with_friction(seed: int = 0) -> dict[str, Any]:
-    shared: dict[str, Any] = {
-        "noise": {"i": 0.02, "omega": 0.5},
-        "limits": {"voltage": (-5.0, 5.0), "i": (-3.0, 3.0), "omega": (-80.0, 80.0)},
-        "seed": seed,
-    }
-    model, families = motor(), [voltage_prbs(), voltage_multisine()]
+def oscillator() -> ProcessModel:
+    """Bouc-Wen's, with the values of the published benchmark (Noel and Schoukens, 2016)."""
+
+    def derivative(x: Any, u: Any, p: Any) -> tuple[Any, ...]:
+        y, v, z = x
+        mass, damping, stiffness, alpha, beta, gamma, delta = p
+        force = alpha * v - beta * (gamma * abs(v) * z + delta * v * abs(z))
+        return (v, (u[0] - damping * v - stiffness * y - z) / mass, force)
+
+    values = {"mass": 2.0, "damping": 10.0, "stiffness": 5e4, "alpha": 5e4, "beta": 1e3}
+    units = ("kg", "N*s/m", "N/m", "N/m", "1/m")
+    positive = [
+        Parameter(name, unit, value, value / 2.0, value * 2.0, "log")
+        for (name, value), unit in zip(values.items(), units, strict=True)
+    ]
+    return ProcessModel(
+        name="oscillator with hysteresis",
+        states=(State("y", "m"), State("v", "m/s"), State("z", "N")),
+        inputs=(Input("force", "N"),),
+        outputs=(Output("y", "m"),),
+        parameters=(
+            *positive[:4],
+            replace(positive[4], fixed=True),  # gamma and delta are known in parts of it
+            Parameter("gamma", "1", 0.8, 0.4, 1.6, "log"),
+            Parameter("delta", "1", -1.1, -2.2, -0.55, minimum=-10.0),
+        ),
+        derivative=derivative,
+    )
+
+
+CASES: dict[str, Callable[[], Case]] = {
+    "motor": lambda: Case(
+        motor(),
+        {"i": 0.02, "omega": 0.5},
+        {"voltage": (-5.0, 5.0), "i": (-3.0, 3.0), "omega": (-80.0, 80.0)},
+        500.0,
+    ),
+    "oscillator": lambda: Case(
+        oscillator(), {"y": 2e-5}, {"force": (-150.0, 150.0), "y": (-3e-3, 3e-3)}, 750.0
+    ),
+}
+
+
+def against_random(case: Case, seed: int = 0) -> dict[str, Any]:
+    """Half widths after 2 s designed, and after twice the best of 200 random runs of 1 s."""
+    shared: dict[str, Any] = {"noise": case.noise, "limits": case.limits, "seed": seed}
+    model, families = case.model, [prbs(case), multisine(case)]
     begin = time.perf_counter()
     best = design(model, families, runs=1, candidates=200, generations=0, **shared)
     between = time.perf_counter()
@@ -132,29 +184,35 @@ def motor_with_friction(seed: int = 0) -> dict[str, Any]:
     }
 
 
-def of_voltage(**further: Setting) -> dict[str, Setting]:
-    """Settings of an excitation of the motor, with those of its own."""
-    level, seed = Setting(0.1, 5.0), Setting(1, 65535, whole=True)
-    return {"amplitude": level, "offset": Setting(-2.0, 2.0), **further, "seed": seed}
+def settings_of_case(case: Case, **further: Setting) -> dict[str, Setting]:
+    """Settings of an excitation of a model's input, with those of its own."""
+    (_, most), *_ = case.limits.values()
+    level, seed = Setting(0.02 * most, most), Setting(1, 65535, whole=True)
+    return {"amplitude": level, "offset": Setting(-0.4 * most, 0.4 * most), **further, "seed": seed}
 
 
-def voltage_prbs() -> Excitation:
+def prbs(case: Case) -> Excitation:
+    n = round(case.rate)
+
     def inputs(s: Mapping[str, float]) -> FloatArray:
-        return (s["offset"] + s["amplitude"] * levels(s["hold"], s["seed"], 500, 500.0))[:, None]
+        bits = levels(s["hold"], s["seed"], n, case.rate)
+        return (s["offset"] + s["amplitude"] * bits)[:, None]
 
-    settings = of_voltage(hold=Setting(0.002, 0.5, log=True))
-    return Excitation("prbs", settings, inputs, 1.0 / 500.0)
+    settings = settings_of_case(case, hold=Setting(0.002, 0.5, log=True))
+    return Excitation("prbs", settings, inputs, 1.0 / case.rate)
 
 
-def voltage_multisine() -> Excitation:
+def multisine(case: Case) -> Excitation:
+    n = round(case.rate)
+
     def inputs(s: Mapping[str, float]) -> FloatArray:
         lines = np.arange(1, 1 + round(s["highest"]))
         phases = np.random.default_rng(int(s["seed"])).uniform(0.0, 2.0 * np.pi, len(lines))
-        wave = np.cos(2.0 * np.pi * lines * np.arange(500)[:, None] / 500.0 + phases).sum(axis=1)
+        wave = np.cos(2.0 * np.pi * lines * np.arange(n)[:, None] / n + phases).sum(axis=1)
         return (s["offset"] + s["amplitude"] * wave / np.abs(wave).max())[:, None]
 
-    settings = of_voltage(highest=Setting(1.0, 200.0, log=True))
-    return Excitation("multisine", settings, inputs, 1.0 / 500.0)
+    settings = settings_of_case(case, highest=Setting(1.0, 0.4 * case.rate, log=True))
+    return Excitation("multisine", settings, inputs, 1.0 / case.rate)
 
 
 def levels(hold: float, seed: float, n: int, rate: float) -> FloatArray:
@@ -284,12 +342,12 @@ def _ratio(before: Sequence[float] | FloatArray, after: Sequence[float] | FloatA
 
 
 def show(figures: dict[str, Any]) -> None:
-    if "motor" in figures:
-        motor_figures = figures["motor"]
-        print("\nMotor with Coulomb friction, 2 s: half widths of 95 % intervals")
-        for name, widths in motor_figures["quantities"].items():
-            print(f"  {name:6} {100 * widths['random']:8.3g} %  {100 * widths['designed']:8.3g} %")
-        print(f"  narrower by {motor_figures['narrower']:.2f}, {motor_figures['seconds']}")
+    for case in figures.keys() & CASES.keys():
+        against = figures[case]
+        print(f"\n{case}, 2 s: half widths of 95 % intervals, best random and designed")
+        for name, widths in against["quantities"].items():
+            print(f"  {name:9} {100 * widths['random']:8.3g} %  {100 * widths['designed']:8.3g} %")
+        print(f"  narrower by {against['narrower']:.2f}, {against['seconds']}")
     if "actuator" in figures:
         result = figures["actuator"]
         print(f"\nActuator, 8 x 1.25 s: {result['seconds']:.1f} s, {result['refused']} refused")

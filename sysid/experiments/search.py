@@ -2,8 +2,10 @@
 
 A run adds its information to that of the others. So a set of runs is chosen as an exact design is:
 greedily, then by exchanges, each run for whichever candidate serves better (Fedorov, "Theory of
-Optimal Experiments", 1972). Settings of chosen runs are recombined and moved, by less and less, and
-their offspring become candidates.
+Optimal Experiments", 1972). Settings of chosen runs are recombined and moved, many together or
+alone (Meyer and Nachtsheim, "The coordinate-exchange algorithm for constructing exact optimal
+experimental designs", Technometrics 37, 1995), by less and less, and their offspring become
+candidates.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,6 +22,9 @@ from sysid.problem.model import ModelError
 from sysid.threads import Workers
 
 _WIDEST, _FINEST = 0.3, 0.02  # deviation of a moved setting, in parts of its range
+_TOGETHER = 0.5  # of offspring that differ in about half of the settings
+_TWO = 0.3  # of the others, that differ in two, not in one
+_MOVES = 0.6, 0.2, 0.2  # of a setting that is moved alone: nearby, anywhere, to an end
 _HALVINGS = 3  # of the way from a run that passes a limit to one that does not
 _ROUNDS = 20  # of exchanges
 _GAIN = 1e-9  # by which an exchange must lower the loss
@@ -125,11 +130,21 @@ class Search:
             if father.excitation is mother.excitation and self.rng.random() > progress:
                 from_father = self.rng.random(len(genes)) < 0.5
                 genes[from_father] = father.genes[from_father]
-            moves = width * self.rng.standard_normal(len(genes))
-            moves[self.rng.random(len(genes)) < 0.5] = 0.0
             back = partial(_midway, mother.genes)
-            trials.append(_Trial(mother.excitation, np.clip(genes + moves, 0.0, 1.0), back))
+            trials.append(_Trial(mother.excitation, self._moved(genes, width), back))
         self._settle(trials)
+
+    def _moved(self, genes: FloatArray, width: float) -> FloatArray:
+        """Genes of which about half are moved together, as along a limit, or one or two alone."""
+        rng = self.rng
+        if rng.random() < _TOGETHER:
+            moves = width * rng.standard_normal(len(genes))
+            return np.clip(genes + moves * (rng.random(len(genes)) < 0.5), 0.0, 1.0)
+        moved = genes.copy()
+        for k in rng.choice(len(genes), 1 + (rng.random() < _TWO), replace=False):
+            nearby = np.clip(moved[k] + 2.0 * width * rng.standard_normal(), 0.0, 1.0)
+            moved[k] = rng.choice([nearby, rng.random(), rng.integers(2)], p=_MOVES)
+        return moved
 
     def revise(self, revised: Callable[[RunCandidate], RunCandidate]) -> None:
         """Replace each candidate, the chosen ones included, by what is now known of it."""

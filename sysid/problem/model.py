@@ -414,8 +414,8 @@ def _call(where: str, function: Callable[..., Any], *args: Any) -> Any:
     except ZeroDivisionError:
         # Compiled code divides as IEEE 754 does; a model singular at rest is still a model.
         raise ModelError(
-            f"{where} divides by zero at the nominal parameters and initial state; "
-            f"choose other nominal values or guard the division"
+            f"{where} divides by zero at the nominal parameters, initial state and inputs of 0; "
+            "choose other values, or guard the division, as by max(u, 1.0) of what is never below"
         ) from None
     except Exception as error:
         raise ModelError(

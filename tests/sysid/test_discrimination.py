@@ -136,7 +136,7 @@ def test_the_runs_that_tell_pairs_apart_are_at_the_limits_and_beside_zero():
 
 def test_the_worst_pair_is_as_far_apart_as_a_search_of_all_runs_finds():
     models = {"square": SQUARE, "cubic": CUBIC}
-    more = {**QUICK, "candidates": 24, "generations": 6, "offspring": 8}
+    more = {**QUICK, "candidates": 24, "generations": 12, "offspring": 8}
     result = discriminate(models, [waves()], limits={"u": (-1.0, 1.0)}, runs=1, **more)
     best = 0.0
     excitation = waves()
