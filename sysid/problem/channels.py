@@ -14,6 +14,7 @@ from sysid.arrays import BoolArray, FloatArray
 _EQUAL = 1e-9  # of a channel's span: samples so close are the same
 _RESTING = 1e-3  # of its span: how near 0 a level is that of rest
 _HARMLESS = 1e-4  # of a channel's variance
+_NEARBY = 8  # samples on either side, among which one stands out
 _NORMAL = 0.6745  # median of the absolute value of a standard normal variable
 
 
@@ -179,7 +180,11 @@ def spikes(values: FloatArray, inputs: FloatArray) -> Spikes | None:
     finite = away[np.isfinite(away)]
     if len(finite) < 20:
         return None
-    usual = max(float(np.median(np.abs(finite))) / _NORMAL, resolution(values))
+    rough = float(np.median(np.abs(finite)))
+    # Among others as large, as where an excitation turns every few samples, none stands alone.
+    sizes = np.pad(np.where(np.isfinite(away), np.abs(away), rough), _NEARBY, "edge")
+    nearby = np.median(np.lib.stride_tricks.sliding_window_view(sizes, 2 * _NEARBY + 1), axis=1)
+    usual = np.maximum(np.maximum(rough, nearby) / _NORMAL, resolution(values))
     at = np.zeros(n, dtype=np.bool_)
     with np.errstate(invalid="ignore"):
         at[1:-1] = returned & (np.abs(away) > 7.0 * usual) & (usual > 0.0)
