@@ -11,6 +11,8 @@ import pytest
 import typer
 
 from daq.cli.app import app
+from daq.cli.terminal import watching
+from daq.progress import Note
 from tests.daq.support import environment, forked_rig, rig, write_experiment, write_rig
 
 GROUPS = typer.main.get_command(app).commands
@@ -154,6 +156,13 @@ def test_a_narrow_terminal_cuts_nothing(columns):
     assert max(map(len, sentences)) <= columns
     wide = shown[shown.index("Wide") :].splitlines()
     assert columns == 30 or max(map(len, wide)) <= columns
+
+
+def test_a_note_is_shown_once_however_often_it_is_given(capsys):
+    with watching(quiet=True) as watch:
+        for text in ("no cable", "no cable", "no hand", "no cable"):
+            watch(Note("note", text))
+    assert capsys.readouterr().err.splitlines() == ["rig: note: no cable", "rig: note: no hand"]
 
 
 def test_the_package_starts_as_the_command_does():
