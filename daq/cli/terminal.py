@@ -269,8 +269,8 @@ def watching(quiet: bool) -> Iterator[Watch]:
     """Shows what a use case says while it works, by the function to give it as ``watch``.
 
     Progress is a bar on a terminal, one plain line per finished activity otherwise; quiet: notes
-    and warnings only. Notes end the bars before them, and each is shown once, however many runs of a
-    characterisation give rise to it; an activity that an error ended is not shown as finished.
+    and warnings only. Notes end the bars before them, and each is shown once, however many runs
+    of a characterisation give rise to it; an activity that an error ended is not shown as finished.
     """
     update: Callable[[Progress], None] | None = None
     seen: set[Note] = set()

@@ -53,7 +53,7 @@ CORRECT = {
         (np.arange(N) % 97 == 5) * np.linspace(0.5, 1.0, N), noise=0.001, tau=0.002
     ),
     # Of four and a half samples a period at first, of a hundred at last.
-    "a chirp downwards": driven(np.cos(2.0 * np.pi * 71.3 * (1.0 - np.exp(-TIME / 3.17))), tau=0.005),
+    "a chirp downwards": driven(np.cos(448.0 * (1.0 - np.exp(-TIME / 3.17))), tau=0.005),
     "fine quantisation": replace(
         driven(wave()), outputs=np.round(driven(wave(), 0.0).outputs, 2)
     ),
