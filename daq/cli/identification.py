@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
         RivalRow,
         Rows,
     )
+    from daq.report.draft import Draft
     from sysid import Campaign
     from sysid.judging.comparison import Comparison, Row
     from sysid.uncertainty import Profile
@@ -27,11 +29,16 @@ _STRONG = 0.95  # correlation above which two parameters are named together
 
 
 def show_identification(
-    result: Identification, report: bool, json: bool, seeds: Sequence[str] = ()
+    result: Identification,
+    report: bool,
+    json: bool,
+    seeds: Sequence[str] = (),
+    draft: Draft | None = None,
 ) -> dict[str, Any]:
     """Print a result whose files are written, and publish its report; the document for machines.
 
-    seeds: lines on all seeds of the search, of which this result is the best.
+    seeds: lines on all seeds of the search, of which this result is the best. draft: what was begun
+    of the report.
     """
     document = {**result.document, "files": {"parameters": str(result.parameters_file)}}
     if not json:
@@ -45,19 +52,31 @@ def show_identification(
         print(f"Go on with the search: {result.resume_command}")
         return document
     if report:
-        document["files"] |= _publish(result, json)
+        document["files"] |= _publish(result, json, draft)
     if not json:
         _show_next(result)
     return document
 
 
-def _publish(result: Identification, json: bool) -> dict[str, str]:
+@contextlib.contextmanager
+def drafting(report: bool) -> Iterator[Draft | None]:
+    """A draft of a report that is wanted."""
+    if not report:
+        yield None
+        return
+    from daq.report.draft import Draft
+
+    with Draft() as draft:
+        yield draft
+
+
+def _publish(result: Identification, json: bool, draft: Draft | None) -> dict[str, str]:
     # Imports matplotlib, for which the printed result does not wait.
     from daq.report.publication import publish
 
     assert result.folder is not None
     with terminal.watching(json) as watch:
-        files = publish(result, result.folder, watch)
+        files = publish(result, result.folder, watch, draft)
     if not json:
         print(f"Report: {files['report']}")
     return files

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 from typer import BadParameter, Context, Option
 
 from daq.cli import options, terminal
-from daq.cli.identification import show_comparison, show_identification
+from daq.cli.identification import drafting, show_comparison, show_identification
 
 _WITH_RESUME = {"resume", "trust", "report", "json", "quiet", "verbose"}
 
@@ -76,9 +76,11 @@ def identify(
             raise BadParameter(
                 "--resume goes on as it was asked; give nothing but --json, --no-report or --trust"
             )
-        with terminal.watching(json) as watch:
-            result = fit.resume(resume, watch, trust=trust)
-        _finish(show_identification(result, report, json), json)
+        with drafting(report) as draft:
+            with terminal.watching(json) as watch:
+                begin = draft.begin if draft else None
+                result = fit.resume(resume, watch, trust=trust, loaded=begin)
+            _finish(show_identification(result, report, json, draft=draft), json)
         return
     if not logs:
         raise BadParameter("name the logs to identify from, or a folder with --resume")
@@ -107,9 +109,11 @@ def identify(
         _finish(show_comparison(compared, report, json), json)
         return
     request = replace(request, options={**chosen, "model": model[0] if model else None})
-    with terminal.watching(json) as watch:
-        result = fit.identify_files(logs, validate or [], request, out, watch)
-    _finish(show_identification(result, report, json), json)
+    with drafting(report) as draft:
+        with terminal.watching(json) as watch:
+            begin = draft.begin if draft else None
+            result = fit.identify_files(logs, validate or [], request, out, watch, begin)
+        _finish(show_identification(result, report, json, draft=draft), json)
 
 
 def _finish(document: dict[str, Any], json: bool) -> None:

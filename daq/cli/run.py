@@ -63,14 +63,17 @@ def _problem(config: Path | None, model: str | None, watch: Any) -> Problem:
 
 
 def _identify(problem: Problem, result: SessionResult, report: bool, json: bool) -> dict[str, Any]:
-    from daq.cli.identification import show_identification
+    from daq.cli.identification import drafting, show_identification
     from daq.identification.fit import fit
 
     validation = [result.validation.folder] if result.validation is not None else []
     folder = result.run.folder / "identification"
-    with terminal.watching(json) as watch, heeded():
-        identification = fit(problem, [result.run.folder], validation, folder, watch)
-    return show_identification(identification, report, json)
+    with drafting(report) as draft:
+        with terminal.watching(json) as watch, heeded():
+            begin = draft.begin if draft else None
+            runs = [result.run.folder]
+            identification = fit(problem, runs, validation, folder, watch, loaded=begin)
+        return show_identification(identification, report, json, draft=draft)
 
 
 def _document(result: SessionResult) -> dict[str, Any]:

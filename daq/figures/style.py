@@ -308,3 +308,8 @@ def render(figure: Figure, kind: str) -> bytes:
         figure.savefig(target, format=kind, dpi=DPI, metadata=_NAMELESS[kind], **packed)
     content = target.getvalue()
     return content.encode() if isinstance(content, str) else content
+
+
+def render_each(figure: Figure, kinds: Sequence[str]) -> dict[str, bytes]:
+    """A figure as files of several formats, by format."""
+    return {kind: render(figure, kind) for kind in kinds}

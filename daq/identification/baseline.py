@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Self
 
 from daq.identification.records import LoggedRecord
 from sysid import Dataset, ModelError
@@ -35,9 +35,45 @@ class Baseline:
     inputs: tuple[str, ...] = ()
 
 
-def baselines_of(
-    model: ProcessModel, training: Sequence[LoggedRecord], validation: Sequence[LoggedRecord]
-) -> list[Baseline] | str:
+@dataclass(frozen=True)
+class LinearData:
+    """What linear models are fitted to: records for training and for validation.
+
+    extended: the same with the model's ``regressors`` as inputs behind its own; regressors: their
+    names. lacking: why there can be no linear model, if there can be none.
+    """
+
+    records: Sequence[Sequence[Dataset]]
+    extended: Sequence[Sequence[Dataset]] = ()
+    regressors: tuple[str, ...] = ()
+    lacking: str = ""
+
+    @classmethod
+    def of(
+        cls,
+        model: ProcessModel,
+        training: Sequence[LoggedRecord],
+        validation: Sequence[LoggedRecord],
+    ) -> Self:
+        """Of a model's logs."""
+        q, m = len(model.outputs), len(model.inputs)
+        records = [[log.dataset for log in logs] for logs in (training, validation)]
+        rows = sum(record.n_samples for record in records[0])
+        if not m:
+            return cls(records, lacking="the model has no inputs")
+        if rows * q * (q + m) > _LARGEST:
+            why = (
+                f"choosing its orders on {rows} samples takes longer than a report may; "
+                "rig identify --oe does it"
+            )
+            return cls(records, lacking=why)
+        try:
+            return cls(records, *_extended(model, records))
+        except ModelError as error:
+            return cls(records, lacking=str(error))
+
+
+def baselines_of(data: LinearData) -> list[Baseline] | str:
     """Output-error models, the best linear free runs there are; or why there are none.
 
     First one with orders chosen on the ends of the training logs; then one with the model's
@@ -46,23 +82,15 @@ def baselines_of(
     There are none for logs too short, too long for the time that a report may take, or of several
     sample times.
     """
-    q, m = len(model.outputs), len(model.inputs)
-    records = [[log.dataset for log in logs] for logs in (training, validation)]
-    rows = sum(record.n_samples for record in records[0])
-    if not m:
-        return "the model has no inputs"
-    if rows * q * (q + m) > _LARGEST:
-        return (
-            f"choosing its orders on {rows} samples takes longer than a report may; "
-            "rig identify --oe does it"
-        )
+    if data.lacking:
+        return data.lacking
     try:
-        baselines = [_tuned("OE", *records)]
-        extended, names = _extended(model, records)
-        if names:
-            baselines.append(replace(_tuned("OE, more inputs", *extended), inputs=names))
-        if validation:
-            baselines.append(_in_hindsight(baselines[0], records[1]))
+        baselines = [_tuned("OE", *data.records)]
+        if data.regressors:
+            extended = _tuned("OE, more inputs", *data.extended)
+            baselines.append(replace(extended, inputs=data.regressors))
+        if data.records[1]:
+            baselines.append(_in_hindsight(baselines[0], data.records[1]))
     except ModelError as error:
         return str(error)
     return baselines

@@ -40,6 +40,8 @@ if TYPE_CHECKING:
 
     Source = str | Path | Recording | pd.DataFrame
 
+Loaded = Callable[[ProcessModel, Split], None]
+
 _COPY = 0.99  # of a log's samples that stand in another as well
 
 _STAGES = {
@@ -84,22 +86,29 @@ def identify_files(
     settings: SettingsRequest,
     out: Path | None,
     watch: Watch = ignore,
+    loaded: Loaded | None = None,
 ) -> Identification:
     """Identify and write the results into ``out``, or else beside the log.
 
-    Raises ConfigError before anything is computed, with cause and cure.
+    loaded: as of ``fit``. Raises ConfigError before anything is computed, with cause and cure.
     """
     problem = problem_of(settings, watch)
     folder = out or default_folder(logs, problem.model.name)
     check_writable(folder)
-    return fit(problem, logs, validate, folder, watch)
+    return fit(problem, logs, validate, folder, watch, loaded=loaded)
 
 
-def resume(folder: str | Path, watch: Watch = ignore, *, trust: bool = False) -> Identification:
+def resume(
+    folder: str | Path,
+    watch: Watch = ignore,
+    *,
+    trust: bool = False,
+    loaded: Loaded | None = None,
+) -> Identification:
     """Continue an identification that was interrupted, as it was requested.
 
     folder: of its results, or the capture folder above. trust: run the Python file of a model that
-    the request names. Raises ConfigError without such a one.
+    the request names. loaded: as of ``fit``. Raises ConfigError without such a one.
 
     >>> resume("runs")
     Traceback (most recent call last):
@@ -107,7 +116,7 @@ def resume(folder: str | Path, watch: Watch = ignore, *, trust: bool = False) ->
     """
     place, settings, training, validation = request.recall(Path(folder))
     problem = problem_of(settings, watch, record=None if trust else place / request.FILE)
-    return fit(problem, training, validation, place, watch, resume=True)
+    return fit(problem, training, validation, place, watch, resume=True, loaded=loaded)
 
 
 def fit(
@@ -118,12 +127,14 @@ def fit(
     watch: Watch = ignore,
     resume: bool = False,
     examine: Callable[[Identification], bool] = lambda result: True,
+    loaded: Loaded | None = None,
 ) -> Identification:
     """Fit a problem that has been checked to logs.
 
     folder: for ``parameters.yaml``, and while the search runs for what it takes to continue it.
     resume: continue from there. examine: whether what the model may lack is to be tested, which
-    may take longer than the fit. Raises ConfigError.
+    may take longer than the fit. loaded: is given the model and the logs, once these may be fitted.
+    Raises ConfigError.
     """
     train, check = load_logs(problem, training, validation)
     warn(watch, *(log.warning for log in (*train, *check)))
@@ -136,6 +147,8 @@ def fit(
     faults = faults_of(problem, logs)
     for fault in faults:
         watch(Note("warning" if fault.severity == "doubt" else "note", fault.sentence))
+    if loaded is not None:
+        loaded(problem.model, logs)
     if folder is not None and not resume:
         request.remember(folder, problem.request, _paths(training), _paths(validation))
     try:

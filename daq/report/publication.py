@@ -3,53 +3,57 @@
 import datetime
 import json
 import shlex
+from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from daq.documents import plain
+from daq.figures import style
 from daq.files import digest, make_folder, write_whole
-from daq.identification.baseline import Baseline, baselines_of
+from daq.identification.baseline import Baseline
 from daq.identification.records import LoggedRecord, Split
 from daq.identification.request import SettingsRequest
 from daq.identification.result import Identification, errors_document
 from daq.logs.recording import read_record, settings_of
 from daq.lookup.models import DEFAULT_MODEL
 from daq.progress import Progress, Watch, ignore
+from daq.report.draft import Draft
 from daq.report.latex import latex, latex_errors
 from daq.report.page import Drawing, Picture, page
 from daq.report.pictures import Subject, pictures
-from daq.report.renderer import Files, Renderer
+from daq.report.second_process import Job, SecondProcess, done
 
 DATA, FIGURES = "report.json", "figures"
 _PAGE, _TABLE = "report.html", "parameters.tex"
 _ERRORS_TABLE, _ERRORS = "errors.tex", "errors.csv"
 # What a report takes, for the progress display; a few figures more or fewer do no harm.
 _STEPS = 18
+_AHEAD = 2  # figures that the other process has before it, so that it never waits for one
+
+Files = dict[str, bytes]  # contents by format
 
 
-def publish(result: Identification, folder: Path, watch: Watch = ignore) -> dict[str, str]:
+def publish(
+    result: Identification, folder: Path, watch: Watch = ignore, draft: Draft | None = None
+) -> dict[str, str]:
     """Write the report into a folder; the files by what they are.
 
-    Raises RunError where the disk refuses.
+    draft: what was begun of it, if anything. Raises RunError where the disk refuses.
     """
-    with Renderer() as renderer:
-        return _published(result, folder, renderer, watch)
-
-
-def _published(
-    result: Identification, folder: Path, renderer: Renderer, watch: Watch
-) -> dict[str, str]:
+    if draft is None:
+        with Draft() as begun:
+            return publish(result, folder, watch, begun)
     watch(Progress("Report", 0, _STEPS, "linear baseline"))
     logs = [fitted.log for fitted in result.training], [fitted.log for fitted in result.validation]
-    linear = baselines_of(result.model, *logs)
+    linear = draft.baselines(result.model, logs)
     document = plain(_document(result, logs, linear))
     parts = result.training, result.validation
     training, validation = ([(fitted.log, fitted.run) for fitted in part] for part in parts)
     baseline = None if isinstance(linear, str) else linear[0]
     subject = Subject(result.model, document, training, validation, baseline)
     drawings: list[Drawing] = []
-    for picture, files in draw(pictures(subject), folder / FIGURES, ["svg"], renderer):
+    for picture, files in draw(pictures(subject), folder / FIGURES, ["svg"], draft.second):
         drawings.append((picture, files["svg"]))
         count = len(drawings)
         watch(Progress("Report", min(count, _STEPS - 1), _STEPS, f"{count} figures"))
@@ -70,17 +74,34 @@ def draw(
     figures: Iterable[Picture],
     folder: Path,
     formats: Sequence[str],
-    renderer: Renderer | None = None,
+    second: SecondProcess | None = None,
 ) -> Iterator[tuple[Picture, Files]]:
     """Figures, each written to files of the formats; with what is in them.
 
-    renderer: by which they are made; default this process alone.
+    second: a process that renders beside this one.
     """
     make_folder(folder)
-    for picture, contents in (renderer or Renderer(alone=True)).rendered(figures, formats):
+    for picture, contents in _rendered(figures, formats, second):
         for kind, content in contents.items():
             write_whole(folder / f"{picture.name}.{kind}", content)
         yield picture, contents
+
+
+def _rendered(
+    figures: Iterable[Picture], formats: Sequence[str], second: SecondProcess | None
+) -> Iterator[tuple[Picture, Files]]:
+    """Figures with what is in their files, in order, by whichever process is free."""
+    waiting: deque[tuple[Picture, Job[Files]]] = deque()
+    for picture in figures:
+        if second is not None and sum(job.pending for _, job in waiting) < _AHEAD:
+            job = second.call(style.render_each, picture.figure, formats)
+        else:
+            job = done(style.render_each(picture.figure, formats))
+        waiting.append((picture, job))
+        while waiting and not waiting[0][1].pending:
+            yield waiting[0][0], waiting.popleft()[1].result()
+    for picture, job in waiting:
+        yield picture, job.result()
 
 
 def command_of(

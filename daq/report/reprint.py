@@ -17,7 +17,7 @@ from daq.identification.settings import columns_of
 from daq.progress import Progress, Watch, ignore
 from daq.report.pictures import Subject, pictures
 from daq.report.publication import DATA, FIGURES, draw
-from daq.report.renderer import Renderer
+from daq.report.second_process import SecondProcess
 from sysid import BatchSimulator, ProcessModel, free_run
 
 _AGAIN = "identify again to have a report of it"
@@ -44,9 +44,9 @@ def redraw(
     source = _report_in(folder)
     target = out or source.parent / FIGURES
     files: list[Path] = []
-    with Renderer() as renderer:
+    with SecondProcess() as second:
         subject = _subject(source, trust)
-        for picture, _ in draw(pictures(subject), target, formats, renderer):
+        for picture, _ in draw(pictures(subject), target, formats, second):
             files += [target / f"{picture.name}.{kind}" for kind in formats]
             watch(Progress("Figures", len(files), len(files) + 1, f"{len(files)} files"))
     return files
