@@ -23,6 +23,7 @@ from functools import cached_property
 from typing import get_args
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.linalg import solve_triangular
 from scipy.special import chdtrc
 
@@ -243,8 +244,7 @@ class _Tests:
                 np.zeros(foreseen.shape[2]),
             ]
         )
-        noises = list(input_noises(local))
-        self._noises = np.stack(noises, axis=2) if noises else None
+        self._noises = list(input_noises(local))
         self._regression = self._coloured_by(self._residual)
 
     def admit(self, suspects: Sequence[Suspect]) -> None:
@@ -378,7 +378,7 @@ class _Regression:
         columns: FloatArray,
         free: FloatArray,
         residual: FloatArray,
-        noises: FloatArray | None,
+        noises: Sequence[tuple[slice, FloatArray]],
     ) -> None:
         self._whitening = whitening
         white, target = whitening(columns), whitening(residual[..., None])
@@ -386,7 +386,10 @@ class _Regression:
         self._basis, self._triangle = np.linalg.qr(np.vstack([white, np.diag(free)]))
         self._coefficients = self._solved(self._padded(target)[:, 0])
         self._residual = self._beyond(target)[:, 0]
-        self._noises = None if noises is None else self._beyond(whitening(noises))
+        self._noises = [
+            (whitening.rows_of(rows), whitening.of_record(rows, changes))
+            for rows, changes in noises
+        ]
         self._squares = float(self._residual[: self._n] @ self._residual[: self._n])
 
     def test(self, changes: FloatArray, one_sided: bool) -> _Result | None:
@@ -437,8 +440,9 @@ class _Regression:
         terms = (left * rest[:, None])[: self._n]
         terms = terms.reshape(-1, self._whitening.n_outputs, len(score)).sum(axis=1)
         covariance = _long_run_covariance(terms - terms.mean(axis=0))
-        if self._noises is not None:
-            pushes = left.T @ self._noises
+        if self._noises:
+            # What the columns make of the noise is at right angles to what they leave.
+            pushes = np.hstack([left[rows].T @ noise for rows, noise in self._noises])
             covariance = _larger(covariance, pushes @ pushes.T)
         return float(score @ np.linalg.solve(_larger(covariance, np.eye(len(score))), score))
 
@@ -515,16 +519,32 @@ class _Whitening:
         """Columns of the residuals."""
         return len(self.decorrelate)
 
+    @cached_property
+    def _filter(self) -> FloatArray:
+        """What makes a sample of it and those before, the oldest first, (q, (order + 1) q)."""
+        parts = [-matrix for matrix in self.model.coefficients[::-1]]
+        whole: FloatArray = self.decorrelate @ np.hstack([*parts, np.eye(self.n_outputs)])
+        return whole
+
     def __call__(self, columns: FloatArray) -> FloatArray:
         """The whitened columns, rows of outputs one after another."""
-        white = columns.copy()
-        for rows in record_rows(self.lengths):
-            part = columns[rows]
-            for k, matrix in enumerate(self.model.coefficients, start=1):
-                white[rows][k:] -= np.einsum("ij,tjm->tim", matrix, part[:-k])
-        white = np.einsum("ij,tjm->tim", self.decorrelate, white[self.kept])
-        whitened: FloatArray = white.reshape(-1, columns.shape[2])
-        return whitened
+        parts = [self.of_record(rows, columns[rows]) for rows in record_rows(self.lengths)]
+        return np.concatenate(parts)
+
+    def of_record(self, rows: slice, columns: FloatArray) -> FloatArray:
+        """Those of one record, (n_samples, n_outputs, k), by its rows of the residuals."""
+        _, q, k = columns.shape
+        order = len(self.model.coefficients)
+        flat = np.ascontiguousarray(columns).reshape(-1, k)
+        past = sliding_window_view(flat, (order + 1) * q, axis=0)[::q].swapaxes(1, 2)
+        white: FloatArray = (self._filter @ past)[self.kept[rows][order:]]
+        return white.reshape(-1, k)
+
+    def rows_of(self, rows: slice) -> slice:
+        """Rows of the whitened columns of one record, by its rows of the residuals."""
+        first = int(self.kept[: rows.start].sum())
+        count = int(self.kept[rows].sum())
+        return slice(self.n_outputs * first, self.n_outputs * (first + count))
 
 
 def colour_about_mean(

@@ -99,7 +99,7 @@ def covariance(
     noise = colour(residual, sensitivity.seen, sensitivity.lengths)
     score = score_covariance(weighted, sensitivity.lengths, noise)
     # Not all that the inputs' noise does is seen in residuals: parameters take up slow changes.
-    score = _larger(score, _score_covariance_by(weighted, input_noises(sensitivity)))
+    score = _larger(score, _score_covariance_by_inputs(sensitivity, weighted))
     for errors in (zero_errors(sensitivity), start_errors(sensitivity)):
         score += _score_covariance_by(weighted, errors)
     pushes = np.array([*noise_pushes(sensitivity, weight)]).reshape(-1, slopes.shape[2])
@@ -136,6 +136,15 @@ def _complement(ties: FloatArray, sizes: FloatArray) -> FloatArray:
     along = along[lengths[:, 0] > 0.0] / lengths[lengths[:, 0] > 0.0]
     across: FloatArray = null_space(np.concatenate([along, resting]).reshape(-1, len(sizes)))
     return across
+
+
+def _score_covariance_by_inputs(sensitivity: Sensitivity, weighted: FloatArray) -> FloatArray:
+    """Covariance of the score by the noise of the inputs, (n_free, n_free)."""
+    covariance = np.zeros((weighted.shape[2], weighted.shape[2]))
+    for rows, changes in input_noises(sensitivity):
+        pushes = np.tensordot(weighted[rows], changes, axes=([0, 1], [0, 1]))
+        covariance += pushes @ pushes.T
+    return covariance
 
 
 def _score_covariance_by(weighted: FloatArray, changes: Iterable[FloatArray]) -> FloatArray:

@@ -227,21 +227,22 @@ def _of_positive(mean: float) -> float:
     return float(np.sqrt(second - first**2))
 
 
-def input_noises(sensitivity: Sensitivity) -> Iterator[FloatArray]:
-    """Changes of all residuals whose outer products sum to the covariance by input noise.
+def input_noises(sensitivity: Sensitivity) -> Iterator[tuple[slice, FloatArray]]:
+    """Rows of each record's residuals, and their changes by noise of its inputs.
 
-    Each is (n_residuals, n_outputs), by noise that is drawn at random, always the same. None for
-    innovations of a filter that corrects itself, which hold it already.
+    Outer products of the changes (n_samples, n_outputs, n_draws) sum to their covariance; the noise
+    is drawn at random, always the same. None for innovations of a filter that corrects itself,
+    which hold it already.
     """
     if isinstance(sensitivity.objective, Innovations):
         return
-    rng = np.random.default_rng(0)
+    rng, places = np.random.default_rng(0), record_rows(sensitivity.lengths)
     for k, record in enumerate(sensitivity.objective.records):
         if np.any(record.input_noise):
             shape, noise = record.inputs.shape, record.input_noise
             errors = (rng.standard_normal(shape) * noise for _ in range(_DRAWS))
-            for change in _input_changes(sensitivity, k, errors):
-                yield change / np.sqrt(_DRAWS)
+            changes = np.stack(list(_driven_changes(sensitivity, k, errors)), axis=2)
+            yield places[k], changes / np.sqrt(_DRAWS)
 
 
 def _input_changes(
@@ -255,6 +256,18 @@ def _input_changes(
             yield _change_by_record(sensitivity, k, disturbed_record)
         return
     rows = record_rows(sensitivity.lengths)[k]
+    for part in _driven_changes(sensitivity, k, errors):
+        change = np.zeros_like(sensitivity.residual)
+        change[rows] = part
+        yield change
+
+
+def _driven_changes(
+    sensitivity: Sensitivity, k: int, errors: Iterable[FloatArray]
+) -> Iterator[FloatArray]:
+    """Changes (n_samples, n_outputs) of a free run's residuals of record k by errors of inputs."""
+    objective, record = sensitivity.objective, sensitivity.objective.records[k]
+    share = sensitivity.share[record_rows(sensitivity.lengths)[k]]
     chromosomes = sensitivity.chromosome[None]
     vectors = objective.space.full(chromosomes)
     initial = record.initial_state(objective.simulator.model)
@@ -270,9 +283,7 @@ def _input_changes(
         undisturbed = outputs(record) if undisturbed is None else undisturbed
         disturbed = outputs(replace(record, inputs=record.inputs + error))
         difference = (disturbed - undisturbed) / objective.scales[k]
-        change = np.zeros_like(sensitivity.residual)
-        change[rows] = np.where(np.isfinite(difference), difference, 0.0)
-        yield change * sensitivity.share
+        yield np.where(np.isfinite(difference), difference, 0.0) * share
 
 
 def _change_by_record(sensitivity: Sensitivity, k: int, record: Dataset) -> FloatArray:
