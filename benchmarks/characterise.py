@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import tempfile
 import time
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -52,17 +53,14 @@ def main() -> None:
 
 def hidden_rig(number: int, seconds: float) -> dict[str, Any]:
     """Figures of one rig."""
-    model = actuator()
-    rng = np.random.default_rng(number)
-    free = [p for p in model.parameters if not p.fixed]
-    truth = {p.name: p.nominal * rng.uniform(*FACTORS) for p in free}
+    model, truth = actuator(), hidden_parameters(number)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         rig = _rig_file(folder, number, truth)
         begin = time.perf_counter()
         designed = characterise.characterise(rig, seconds, None, folder / "c")
         spent = time.perf_counter() - begin
-        shipped = _shipped(folder, rig, designed.rounds[-1])
+        shipped = _shipped(folder, rig, designed.rounds[-1], number)
     nominal = dict(zip(model.parameter_names, model.nominal.tolist(), strict=True))
     structure, space = identifiability(model, sensors=False), SearchSpace.of(model)
     values = {q.text: q.value({**nominal, **truth}) for q in determined(structure, space)}
@@ -86,13 +84,29 @@ def hidden_rig(number: int, seconds: float) -> dict[str, Any]:
         "narrower": float(np.exp(np.mean(np.log(ratios)))) if ratios else None,
         "unbounded_by_prbs": sum(i.width is None for i in shipped.values()),
         "unbounded": len(designed.intervals) - len(bounded),
-        "covered": sum(_covers(i, values[i.name]) for i in bounded) / max(len(bounded), 1),
+        "covered": _share_covered(designed.intervals, values),
+        "covered_by_prbs": _share_covered(shipped.values(), values),
     }
 
 
-def _covers(interval: Interval, truth: float) -> bool:
-    assert interval.width is not None
-    return abs(truth - interval.value) <= interval.width * abs(interval.value)
+def hidden_parameters(number: int) -> dict[str, float]:
+    """Parameters of a rig: the first that are drawn which the model's constraints allow."""
+    space, rng = SearchSpace.of(actuator()), np.random.default_rng(number)
+    nominal = np.array([parameter.nominal for parameter in space.parameters])
+    while True:
+        values = nominal * rng.uniform(*FACTORS, len(nominal))
+        if space.feasible(values):
+            return dict(zip(space.names, values.tolist(), strict=True))
+
+
+def _share_covered(intervals: Iterable[Interval], truth: Mapping[str, float]) -> float:
+    """Share of the intervals with two ends that hold the truth."""
+    held = [
+        abs(truth[i.name] - i.value) <= i.width * abs(i.value)
+        for i in intervals
+        if i.width is not None
+    ]
+    return sum(held) / max(len(held), 1)
 
 
 def _rig_file(folder: Path, number: int, truth: dict[str, float]) -> Path:
@@ -104,7 +118,7 @@ def _rig_file(folder: Path, number: int, truth: dict[str, float]) -> Path:
     return path
 
 
-def _shipped(folder: Path, rig: Path, last: Round) -> dict[str, Interval]:
+def _shipped(folder: Path, rig: Path, last: Round, number: int) -> dict[str, Interval]:
     """Intervals of the same quantities from runs of the shipped PRBS."""
     content = yaml.safe_load(find_file("protocol", "prbs.yaml").read_text(encoding="utf-8"))
     logs = []
@@ -113,7 +127,9 @@ def _shipped(folder: Path, rig: Path, last: Round) -> dict[str, Interval]:
             content[channel]["seed"] = 1 + SEEDS * (2 * k + j)
         experiment = folder / f"prbs-{k}.yaml"
         experiment.write_text(yaml.safe_dump(content))
-        logs.append(record(experiment, rig, folder / "prbs").folder / LOG_NAME)
+        # The same seed would be the same noise in each.
+        options = {"seed": SEEDS * (number + 1) + k}
+        logs.append(record(experiment, rig, folder / "prbs", options=options).folder / LOG_NAME)
     identification = Round(folder / "shipped", 1)
     identification.folder.mkdir(parents=True)
     (identification.folder / "design.json").write_bytes((last.folder / "design.json").read_bytes())
