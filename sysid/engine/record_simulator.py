@@ -29,6 +29,7 @@ _ESTIMATE_LIMIT = 0.1
 # The estimate falls with the third power of the step where the equations are smooth.
 _ESTIMATE_ORDER = 3.0
 _MAX_ROUNDS = 6
+_MOST_KNOWN = 1024  # parameter vectors whose steps are kept
 # A trial on the record's first eighth saves one on all of it, except where it is too short to
 # tell anything.
 _PILOT_PART = 8
@@ -92,6 +93,7 @@ class RecordSimulator:
             windows = record.windows / record.dt  # in samples
         self.averaged = np.flatnonzero(windows.any(axis=(0, 2))).tolist()
         self._windows = np.ascontiguousarray(np.moveaxis(windows, 1, 0))
+        self._steps_of: dict[bytes, int] = {}
         self._means_of: dict[tuple[tuple[int, ...], bool], _Means] = {}
         if self.averaged:
             if self.scale is not None:
@@ -139,6 +141,21 @@ class RecordSimulator:
             steps[todo[again]] = more[again]
             todo = todo[again]
         return population
+
+    def steps_needed(self, parameters: FloatArray) -> IntArray:
+        """Integration steps per sample that each needs, (n,), also beyond what there may be.
+
+        Those that were asked for lately are known: a fit begins where another ended.
+        """
+        keys = [row.tobytes() for row in parameters]
+        unknown = [i for i, key in enumerate(keys) if key not in self._steps_of]
+        if unknown:
+            if len(self._steps_of) > _MOST_KNOWN:
+                self._steps_of.clear()
+                unknown = list(range(len(keys)))
+            steps = self.population(parameters[unknown]).n_steps.tolist()
+            self._steps_of.update(zip([keys[i] for i in unknown], steps, strict=True))
+        return np.array([self._steps_of[key] for key in keys], dtype=np.int64)
 
     def residuals(
         self,

@@ -335,7 +335,12 @@ class BatchSimulator:
     ) -> IntArray:
         """Integration steps per sample that each parameter vector needs, (n,)."""
         parameters = self._check(parameters, [record])
-        return np.minimum(self._on(record).population(parameters, starts).n_steps, self.max_steps)
+        simulator = self._on(record)
+        if starts is None:
+            steps = simulator.steps_needed(parameters)
+        else:
+            steps = simulator.population(parameters, starts).n_steps
+        return np.minimum(steps, self.max_steps)
 
     def _on(self, record: Dataset, scale: FloatArray | None = None) -> RecordSimulator:
         """What simulates a record; without a scale residuals are the outputs themselves."""

@@ -174,6 +174,8 @@ class LocalSearch:
 
     def _offer(self, point: Point) -> None:
         """Keep a point if it is the best yet."""
+        if self.feasible and point.error >= self.error:
+            return
         feasible = self._feasible(point.at)
         if (not feasible, point.error) < (not self.feasible, self.error):
             self.best, self.error, self.feasible = point.at, point.error, feasible
