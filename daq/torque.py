@@ -7,7 +7,6 @@ commands. Controllers are registered under the entry-point group ``rig.controlle
 
 import abc
 import hashlib
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol, Self
 
@@ -149,30 +148,6 @@ class OperatingPoint:
             outputs=list(self.outputs),
             name=f"{self.branch} at {1e3 * self.brake_current:g} mA",
         )
-
-
-def plausible_parameters(
-    model: ProcessModel, vector: FloatArray, names: Sequence[str], factor: FloatArray,
-    n: int, seed: int,
-) -> FloatArray:  # fmt: skip
-    """Parameters drawn from a covariance with all its ties, (at most n, n_parameters).
-
-    factor: (m, len(names)), whose product with its transpose is the covariance of the named ones:
-    what acts only together moves together. Positive parameters move by factors. Draws that break
-    the model's constraints are left out.
-    """
-    rng = np.random.default_rng(seed)
-    steps = np.zeros((n, len(vector)))
-    places = [model.parameter_names.index(name) for name in names]
-    steps[:, places] = rng.standard_normal((n, len(factor))) @ factor
-    positive = np.array([p.scale == "log" for p in model.parameters])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        factors = np.exp(np.where(positive, steps / vector, 0.0))
-    moved = np.where(positive, vector * factors, vector + steps)
-    kept = [
-        draw for draw in moved if all(c.function(tuple(draw)) <= 0.0 for c in model.constraints)
-    ]
-    return np.array(kept).reshape(-1, len(vector))
 
 
 class TorqueControl(Section, abc.ABC):

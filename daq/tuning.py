@@ -19,9 +19,10 @@ from daq.lookup.controllers import load_settings
 from daq.lookup.models import find_model, name_parts
 from daq.progress import Watch, ignore
 from daq.provenance import software_versions
-from daq.torque import Fact, OperatingPoint, TorqueControl, plausible_parameters
+from daq.torque import Fact, OperatingPoint, TorqueControl
 from daq.views import Lines, Shown
 from sysid import ModelError, ProcessModel
+from sysid.uncertainty.draws import plausible_parameters
 
 _HEAD = """\
 # A torque controller, made by rig tune; experiments name this file under 'torque_controller'.

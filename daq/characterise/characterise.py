@@ -19,7 +19,7 @@ from daq.config.yaml_file import TypedSettings
 from daq.designs.design import choose, write
 from daq.designs.runs import DATA
 from daq.designs.setup import Setup, set_up
-from daq.errors import ConfigError, RigError, Terminated
+from daq.errors import ConfigError, InterlockError, RigError, Terminated
 from daq.files import make_folder
 from daq.identification.fit import check_writable, fit
 from daq.identification.request import CHECKPOINT, SettingsRequest
@@ -147,7 +147,8 @@ def resume(
         if not isinstance(stop, ConfigError) or rounds_of(root):
             command = f"rig characterise --resume {shlex.quote(str(root))}"
             command += " --ask" * (ask is not None)
-            stop.add_note(f"what was done until then is kept; go on with: {command}")
+            again = "; what limits stop twice is left out" * isinstance(stop, InterlockError)
+            stop.add_note(f"what was done until then is kept; go on with: {command}{again}")
         raise
 
 
@@ -226,7 +227,7 @@ def _question(
         "plant": mounted.plant,
         "config": request.config,
         "parameters": None if last is None else str(last.identification),
-        "log": None if last is None else str(last.captures(last.experiments[0])[0]),
+        "log": None if last is None else str(_logs(done)[-1]),
         "time": seconds,
         "seed": len(done),
     }
@@ -304,9 +305,20 @@ def _run(current: Round, done: Sequence[Round], watch: Watch) -> None:
     seed: int | None = getattr(config.options, "seed", None)
     first = sum(len(each.experiments) for each in done)
     for place, experiment in enumerate(current.experiments, first):
-        if not current.captures(experiment):
+        if current.is_left_out(experiment):
+            watch(Note("warning", f"{experiment.stem} is left out: limits have stopped it twice"))
+        elif not current.captures(experiment):
             options = None if seed is None else {"seed": (seed + place) % _SEEDS}
             record(experiment, current.rig, current.runs, options=options, watch=watch)
+    if not _logs([*done, current]):
+        cure = "see why in the run.json of each, then characterise anew"
+        problem = "limits have stopped every run twice: there is nothing to identify from"
+        raise ConfigError(problem, cure=cure, file=current.runs)
+
+
+def _logs(rounds: Sequence[Round]) -> list[Path]:
+    """Folders of all runs that were completed, in their order."""
+    return [folder for each in rounds for folder in each.logs]
 
 
 def _identify(
@@ -318,11 +330,7 @@ def _identify(
     """
     folder = rounds[-1].identification
     problem = problem_of(SettingsRequest(request.config, {"model": request.model}), watch)
-    logs = [
-        each.captures(experiment)[0] / LOG_NAME
-        for each in rounds
-        for experiment in each.experiments
-    ]
+    logs = [folder / LOG_NAME for folder in _logs(rounds)]
     going_on = (folder / CHECKPOINT).exists()
 
     def is_last(result: Identification) -> bool:

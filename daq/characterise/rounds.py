@@ -18,10 +18,13 @@ from daq.designs.runs import DATA
 from daq.errors import ConfigError
 from daq.files import make_folder, write_whole
 from daq.identification.request import PARAMETERS
-from daq.logs.capture import COMPLETED, RUN_NAME
+from daq.logs.capture import COMPLETED, INTERLOCK, RUN_NAME
 
 _REQUEST = "characterise.json"
 _RUNS, _IDENTIFICATION = "runs", "identification"
+_STOPS = (
+    2  # by limits, from which on an experiment is left out: after the first its cause is sought
+)
 
 
 @dataclass(frozen=True)
@@ -138,10 +141,26 @@ class Round:
 
     def captures(self, experiment: Path) -> list[Path]:
         """Folders of an experiment's runs that were completed."""
+        return self._ended(experiment, COMPLETED)
+
+    def is_left_out(self, experiment: Path) -> bool:
+        """Whether limits have stopped an experiment so often that nobody has mended why."""
+        if self.captures(experiment):
+            return False
+        return len(self._ended(experiment, INTERLOCK)) >= _STOPS
+
+    @property
+    def logs(self) -> list[Path]:
+        """Folders of its runs, one of each experiment that was completed."""
+        captures = map(self.captures, self.experiments)
+        return [completed[0] for completed in captures if completed]
+
+    def _ended(self, experiment: Path, status: str) -> list[Path]:
+        """Folders of an experiment's runs that ended so."""
         return [
             record.parent
             for record in sorted(self.runs.glob(f"*-{experiment.stem}*/{RUN_NAME}"))
-            if json_file.load(record, "record", "delete its folder").get("status") == COMPLETED
+            if json_file.load(record, "record", "delete its folder").get("status") == status
         ]
 
     @property

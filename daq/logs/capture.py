@@ -29,6 +29,7 @@ _A_LOG = re.compile(r"log(-\d+)?\.csv")
 
 RUNNING = "running"
 COMPLETED = "completed"
+INTERLOCK = "interlock"  # ended by a limit
 
 
 @dataclass

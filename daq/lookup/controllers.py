@@ -15,8 +15,9 @@ from daq.lookup.models import find_model
 from daq.lookup.shipped import find_file, shipped_files
 from daq.lookup.user_code import locate
 from daq.progress import Watch, ignore
-from daq.torque import TorqueControl, TorqueLaw, plausible_parameters
+from daq.torque import TorqueControl, TorqueLaw
 from sysid import ModelError, ProcessModel
+from sysid.uncertainty.draws import plausible_parameters
 
 _MOST_ROUNDS = 20  # of draws, where the model's constraints refuse most
 _AGAIN = "make it anew with rig tune"

@@ -26,7 +26,6 @@ from daq.identification.rows import ParameterRow, Rows
 from daq.logs.columns import UNITS
 from daq.logs.recording import load
 from daq.report.page import Picture
-from daq.torque import plausible_parameters
 from sysid import Dataset, ModelError, Output, equilibrium, evaluate, linearize
 from sysid.arrays import FloatArray
 from sysid.judging.residual_tests import residual_test
@@ -35,6 +34,7 @@ from sysid.problem.model import ProcessModel
 from sysid.problem.plots import Evidence, Plot
 from sysid.response.frequency import FrequencyResponse, frequency_response, sampled_response
 from sysid.time_limit import AT_LENGTH, time_limit
+from sysid.uncertainty.draws import plausible_parameters
 
 if TYPE_CHECKING:
     from daq.identification.baseline import Baseline

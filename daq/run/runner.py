@@ -17,7 +17,7 @@ from daq.experiment import Aboard, ClosedLoop, Experiment, Plan
 from daq.hal import ANALOG_INPUTS, Device, Phase
 from daq.limits import Limits
 from daq.limits.device import saturation_warnings
-from daq.logs.capture import COMPLETED, RUNNING, Capture
+from daq.logs.capture import COMPLETED, INTERLOCK, RUNNING, Capture
 from daq.logs.writer import LogWriter
 from daq.rig import Rig
 from daq.run.hang import HangGuard
@@ -31,7 +31,7 @@ from daq.run.signals import SignalHandling
 from daq.views import Lines, Shown
 
 _STATUS: dict[type[BaseException], str] = {
-    InterlockError: "interlock",
+    InterlockError: INTERLOCK,
     IncompleteError: "incomplete",
 }  # others: failed
 

@@ -10,6 +10,7 @@ import pytest
 from sysid import Input, Output, Parameter, ProcessModel, State
 from sysid.identifiability import cache
 from sysid.identifiability.cache import kept_identifiability
+from sysid.uncertainty.draws import plausible_parameters
 
 
 def shaft_derivative(x, u, p):
@@ -92,3 +93,16 @@ def test_a_process_model_is_made_without_what_identifies_it():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_draws_keep_what_the_outputs_determine_however_far_the_others_go():
+    # J_m - J_b is hardly known, their sum to 1 %, B to 2 %.
+    apart = np.array([[0.8, -0.8, 0.0], [0.01, 0.01, 0.0], [0.0, 0.0, 0.02]])
+    vector = np.array([1.0, 1.0, 1.0])
+    drawn = plausible_parameters(shaft(), vector, shaft().parameter_names, apart, 4000, seed=0)
+    assert len(drawn) == 4000 and (drawn > 0.0).all()
+    total, (low, high) = drawn[:, 0] + drawn[:, 1], np.quantile(drawn[:, 0], [0.025, 0.975])
+    assert total.mean() == pytest.approx(2.0, rel=1e-3)
+    assert total.std() == pytest.approx(0.02, rel=0.1)  # as the covariance has it
+    assert drawn[:, 2].std() == pytest.approx(0.02, rel=0.1)
+    assert low < 0.4 and high > 1.6
