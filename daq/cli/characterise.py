@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -110,8 +111,16 @@ def _show(result: Characterisation) -> None:
     title = f"After {spent}: 95 % intervals in % of the value"
     head = ["quantity", "value", "unit", "half width", "expected"]
     terminal.print_table(title, head, rows, text=["unit"])
-    terminal.print_text(f"It ended because {result.reason}. Trust: {result.verdict['trust']}.")
+    terminal.print_text(f"It ended because {result.reason}.")
+    for subject in ("predictions", "parameters"):
+        statement = result.verdict[subject]
+        reasons = " ".join(statement["reasons"])
+        terminal.print_text(f"{subject.capitalize()}: {statement['trust']}. {reasons}")
+    for note in result.verdict["notes"]:
+        terminal.print_text(note)
     print(f"Page: {result.page}")
     print(f"Report: {result.report}")
     last = result.rounds[-1]
-    terminal.print_next(f"rig replay LOG --parameters {last.identification / 'parameters.yaml'}")
+    # Judged by a run that took no part.
+    run = f"rig run prbs.yaml --rig {shlex.quote(last.rig)}"
+    terminal.print_next(run, f"rig replay RUN --parameters {shlex.quote(str(last.identification))}")
