@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+import contextlib
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from daq.config.identification import IdentificationConfig
+from daq.config.identification import Column, IdentificationConfig
+from daq.config.units import factor
 from daq.notation import shortest
 from sysid.problem.faults import DataFault
 
@@ -13,11 +16,14 @@ if TYPE_CHECKING:
     from sysid.judging.score_tests import Finding
 
 _WIDER = 10.0  # by which factor a range is widened
+_ALIKE = 0.02  # by which a gain may differ from that between two units
+_ANGLES = ("rpm", "deg/s", "turn/s", "rad/s", "deg", "turn", "rad")
+_PREFIXES = ("m", "k")
 
 
 def remedies(
     settings: IdentificationConfig,
-    channels: Collection[str] = (),
+    channels: Mapping[str, str] | None = None,
     *,
     faults: Sequence[DataFault] = (),
     findings: Sequence[Finding] = (),
@@ -25,8 +31,8 @@ def remedies(
 ) -> tuple[str, ...]:
     """``KEY=VALUE`` for each thing found that a setting mends, empty for none.
 
-    channels: names of the model's inputs and outputs. pushed: value and range, searched on a
-    logarithm, of what the data want beyond it.
+    channels: units of the model's inputs and outputs by name. pushed: value and range, searched on
+    a logarithm, of what the data want beyond it.
 
     >>> from sysid.problem.faults import DataFault
     >>> late = DataFault("lag", "doubt", "training", ("log",), "y", "", "", "", 1.0,
@@ -37,22 +43,23 @@ def remedies(
     of_faults = [fault.setting for fault in faults if fault.severity == "doubt" and fault.setting]
     changes: dict[str, str] = dict(setting.split("=", 1) for setting in of_faults)
     lags = any(fault.kind == "lag" for fault in faults)  # which delays that were found are as well
-    of_all_logs = [f for f in findings if f.name in channels and not (lags and f.kind == "delay")]
-    changes |= dict(_of_channels(settings, of_all_logs))
+    units = channels or {}
+    of_all_logs = [f for f in findings if f.name in units and not (lags and f.kind == "delay")]
+    changes |= dict(_of_channels(settings, of_all_logs, units))
     if not changes:  # what is wrong with the data drives parameters to the ends
         changes |= dict(_of_ranges(pushed or {}))
     return tuple(f"{key}={value}" for key, value in changes.items())
 
 
 def _of_channels(
-    settings: IdentificationConfig, findings: Sequence[Finding]
+    settings: IdentificationConfig, findings: Sequence[Finding], units: Mapping[str, str]
 ) -> Iterator[tuple[str, str]]:
-    """Delays, gains and offsets that channels of all logs have, and signs of a foreign file's."""
-    columns: Mapping[str, str] = {}
+    """Delays, gains and offsets that channels of all logs have; of a foreign file signs and units."""
+    columns: dict[str, tuple[str, Column]] = {}
     if settings.columns is not None:
         parts = {"inputs": settings.columns.inputs, "outputs": settings.columns.outputs}
         columns = {
-            name: f"columns.{part}.{name}.sign={-column.sign}"
+            name: (f"columns.{part}.{name}", column)
             for part, signals in parts.items()
             for name, column in signals.items()
         }
@@ -60,14 +67,29 @@ def _of_channels(
         if finding.kind == "delay" and finding.counts and finding.amplitude is not None:
             late = settings.delay.get(finding.name, 0.0) + finding.amplitude
             yield f"delay.{finding.name}", shortest(float(f"{late:.3g}"))
+        key, column = columns.get(finding.name, ("", None))
+        unit = None
+        if column is not None and finding.kind == "gain" and finding.amplitude is not None:
+            unit = _taken_for(column.unit or units[finding.name], 1.0 + finding.amplitude)
         if finding.turned_round:
-            if finding.name in columns:
-                key, _, value = columns[finding.name].partition("=")
-                yield key, value
+            if column is not None:
+                yield f"{key}.sign", str(-column.sign)
+        elif unit is not None and finding.counts:
+            yield f"{key}.unit", unit
         elif finding.kind in _ERRORS and finding.counts and finding.amplitude is not None:
             ends = _ERRORS[finding.kind](finding.amplitude)
             text = ", ".join(shortest(float(f"{end:.3g}")) for end in ends)
             yield f"channels.{finding.name}.{finding.kind}", f"[{text}]"
+
+
+def _taken_for(unit: str, times: float) -> str | None:
+    """The unit of numbers that are so many times what they would be in another; None for none."""
+    prefixes = [prefix + unit for prefix in _PREFIXES] + [unit[1:]] * (unit[:1] in _PREFIXES)
+    for name in (*_ANGLES, *prefixes):
+        with contextlib.suppress(ValueError):
+            if name and math.isclose(factor(name, unit) * times, 1.0, rel_tol=_ALIKE):
+                return name
+    return None
 
 
 # Ranges of errors of channels, by the change of a gain of 1, and by an offset.

@@ -184,7 +184,8 @@ class Identification(Shown):
         """What to type to identify without what is wrong with data or ranges; None for nothing."""
         settings = remedies(
             self.problem.settings,
-            (*self.model.input_names, *self.model.output_names),
+            {s.name: s.unit for s in self.model.inputs}
+            | {s.name: s.unit for s in self.model.outputs},
             faults=self.faults,
             findings=() if self.suspicion is None else self.suspicion.findings,
             pushed=self._pushed,

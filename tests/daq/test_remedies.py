@@ -40,7 +40,11 @@ def fault(kind, severity="doubt", setting=""):
 
 def mended(findings=(), faults=(), pushed=None, **content):
     return remedies(
-        settings(**content), ("u", "y"), faults=faults, findings=findings, pushed=pushed
+        settings(**content),
+        {"u": "V", "y": "rad/s"},
+        faults=faults,
+        findings=findings,
+        pushed=pushed,
     )
 
 
@@ -54,6 +58,20 @@ def test_a_sign_is_turned_round_where_the_file_says_it():
     wrong = [found("gain", "y", -2.1), found("gain", "u", 0.3, share=0.01)]
     assert mended(wrong, **COLUMNS) == ("columns.outputs.y.sign=1",)
     assert mended(wrong) == ()
+
+
+@pytest.mark.parametrize(
+    ("times", "setting"),
+    [
+        (30.0 / np.pi, "columns.outputs.y.unit=rpm"),
+        (9.6, "columns.outputs.y.unit=rpm"),
+        (180.0 / np.pi, "columns.outputs.y.unit=deg/s"),
+        (1000.0, "columns.outputs.y.unit=mrad/s"),
+        (8.0, "channels.y.gain=[0.5, 16]"),
+    ],
+)
+def test_a_gain_between_two_units_is_a_unit(times, setting):
+    assert mended([found("gain", "y", times - 1.0)], **COLUMNS) == (setting,)
 
 
 def test_what_counts_little_or_is_of_a_single_log_is_left_alone():
