@@ -54,7 +54,7 @@ def remedies(
 def _of_channels(
     settings: IdentificationConfig, findings: Sequence[Finding], units: Mapping[str, str]
 ) -> Iterator[tuple[str, str]]:
-    """Delays, gains and offsets that channels of all logs have; of a foreign file signs and units."""
+    """Delays, gains and offsets of channels in all logs; signs and units of a foreign file's."""
     columns: dict[str, tuple[str, Column]] = {}
     if settings.columns is not None:
         parts = {"inputs": settings.columns.inputs, "outputs": settings.columns.outputs}

@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from sysid.arrays import FloatArray
+from sysid.arrays import BoolArray, FloatArray, IntArray
 from sysid.problem.channels import coarse_steps, noise, pile_ups, spikes, standstill
 from sysid.problem.copies import shared_samples
 from sysid.problem.data import Dataset
@@ -33,6 +33,7 @@ Role = Literal["command", "input", "sensor"]
 _COPIED = 0.5  # of a record's moving rows, beyond which it is no other record
 _STILL = 0.05  # of the motion in training, below which a record does not move
 _LONG = 10  # samples lost in a row that are many
+_ENOUGH = 0.3  # of a record, that is worth to be fitted by itself
 _GROSS = 5.0  # of a command's deviation, beyond which a single value is no command
 _LEFT_OUT = "as 'robust: true' has it, these samples count as not measured"
 _COARSE = 16  # steps in a channel's span, below which they are seen in the parameters
@@ -312,10 +313,20 @@ def _gaps(record: Dataset, part: Part) -> Iterator[DataFault]:
         f"{int(lost.sum())} samples ({_percent(share)}) are missing in {int(gaps.sum())} "
         f"gap{'s' * (int(gaps.sum()) != 1)}, the longest of {longest * usual * record.dt:.3g} s",
         "what its inputs did meanwhile is not known, and counts as if they had gone on",
-        "fit a part without gaps ('use: 0 s .. 2 s'), or record anew" if many
-        else "a few lost samples do no harm",
+        _without_gaps(record, rows, gaps) if many else "a few lost samples do no harm",
         share, moves_parameters=many and part == "training",
     )  # fmt: skip
+
+
+def _without_gaps(record: Dataset, rows: IntArray, gaps: BoolArray) -> str:
+    """What to do about gaps behind some of the measured rows but the first, (n_rows - 2,)."""
+    begins = np.append(1, 2 + np.flatnonzero(gaps))
+    ends = np.append(1 + np.flatnonzero(gaps), len(rows) - 1)
+    longest = int(np.argmax(rows[ends] - rows[begins]))
+    first, last = record.dt * rows[begins[longest]], record.dt * rows[ends[longest]]
+    if last - first < _ENOUGH * record.dt * record.n_samples:
+        return "record anew"
+    return f"fit the part without gaps ('use: {first:.4g} s .. {last:.4g} s'), or record anew"
 
 
 def _copies(training: Sequence[Dataset], validation: Sequence[Dataset]) -> Iterator[DataFault]:

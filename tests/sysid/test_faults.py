@@ -207,6 +207,16 @@ def test_a_long_gap_is_a_doubt_and_a_short_one_is_mentioned():
         fault = one_fault([replace(record, outputs=outputs)])
         assert (fault.kind, fault.severity) == ("gap", severity)
         assert f"{length} samples" in fault.statement
+        if severity == "doubt":
+            assert "'use: 2.5 s .. 9.99 s'" in fault.cure
+
+
+def test_gaps_everywhere_leave_no_part_to_fit():
+    record = driven(levels())
+    outputs = record.outputs.copy()
+    outputs[np.arange(N) % 100 < 12] = np.nan
+    fault = one_fault([replace(record, outputs=outputs)])
+    assert (fault.kind, fault.severity, fault.cure) == ("gap", "doubt", "record anew")
 
 
 def test_the_same_fault_of_several_records_is_said_once():
