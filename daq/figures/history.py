@@ -71,7 +71,7 @@ def history(overlays: Sequence[Overlay], trends: Sequence[Trend]) -> Figure:
 def narrowing(seconds: FloatArray, names: Sequence[str], widths: FloatArray) -> Figure:
     """Half widths of intervals [%] after so many logged seconds, (n_rounds, n_names)."""
     labels = [notation.label(name) for name in names]
-    figure, (panel,) = style.stack([2.4], top=style.legend_room(list(names)))
+    figure, (panel,) = style.stack([2.4], top=style.legend_room(labels))
     for place, (label, width) in enumerate(zip(labels, widths.T, strict=True)):
         panel.plot(
             seconds, width, marker="o", ms=2.8, lw=0.9, label=label,

@@ -15,6 +15,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
+from matplotlib.cbook import is_math_text
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
 from matplotlib.textpath import text_to_path
@@ -246,8 +247,9 @@ def _folded(label: str, room: float) -> str:
 def _text_width(text: str) -> float:
     """Inches that a legend's text takes."""
     font = FontProperties(size=_SETTINGS["legend.fontsize"])
-    plain = text.replace(r"\$", "$")
-    return float(text_to_path.get_text_width_height_descent(plain, font, False)[0]) / _POINTS
+    is_math = bool(is_math_text(text))
+    shown = text if is_math else text.replace(r"\$", "$")
+    return float(text_to_path.get_text_width_height_descent(shown, font, is_math)[0]) / _POINTS
 
 
 def thinned(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
