@@ -12,7 +12,11 @@ so the sum lies in a disc with the centre C = sum P_k / (2 b_k T) and the radius
 R = sum |P_k| / (2 b_k T). No passive hand and no passive brake makes the loop unstable if, at every
 frequency,
 
-    |1 + H C| > |H| R.
+    |1 + H C| > |H| R,
+
+provided that the law by itself is stable, at a shaft that does not move: then the loop is stable
+with Y = 0, which is in the disc, and stays so on the way to any other Y. A law that is not is
+refused.
 
 For an ideal amplifier this is Colgate and Schenkel's theorem ("Passivity of a class of
 sampled-data systems", Journal of Robotic Systems 14, 1997),
@@ -71,6 +75,7 @@ _BISECTIONS = 40
 _DAMPINGS = 25
 _SURE = 5.0  # %, of the draws may be below what is promised
 _TAPS = 7  # of multipliers, beside two for each sample of delay
+_UNSTABLE = 1e-4  # above 1, of a pole
 _SAME = 0.05  # of a law's response: by which the observers of a linear one differ
 _MIXTURES = np.linspace(0.0, 1.0, 11)
 _TURNS = np.linspace(0.0, 0.5 * np.pi, 19)  # phi, of the discs
@@ -126,7 +131,8 @@ class WallLaw:
     ) -> "WallLaw":
         """That of a controller on a branch of the hysteresis.
 
-        Raises UnknownPassivityError for one that takes the torque sensor or uses the brake.
+        Raises UnknownPassivityError for one that takes the torque sensor or uses the brake, or is
+        unstable by itself.
         """
         control = controller.control
         if isinstance(control, ActuatorControl) and control.allocation != "motor":
@@ -143,8 +149,16 @@ class WallLaw:
         program = control.program(controller.model, controller.parameters)
         law = LinearLaw.of(program, controller.model, branch)
         dynamics = ActuatorDynamics(controller.model, controller.parameters)
+        winding = _sampled_winding(dynamics, time)
+        largest = _largest_pole(law, *winding, control.ahead)
+        if largest > 1.0 + _UNSTABLE:
+            raise UnknownPassivityError(
+                f"{control.controller} is unstable by itself, at a shaft that is held (a pole of "
+                f"{largest:.4g} in sampled time): no hand makes its walls stable for certain, and "
+                "nothing is promised of it; lower its gains or shares"
+            )
         z = np.exp(1j * np.pi * np.geomspace(1e-3, 1.0, _FREQUENCIES))
-        current = _sampled_current(dynamics, z, time) / z**control.ahead
+        current = _sampled_current(*winding, z) / z**control.ahead
         rows = [law.F.shape[0]]
         inner = z[:, None, None] * np.eye(rows[0]) - law.F
         responses = np.linalg.solve(inner, np.broadcast_to(law.G, (len(z), *law.G.shape)))
@@ -387,14 +401,30 @@ def _currents(dynamics: ActuatorDynamics, s: ComplexArray) -> tuple[ComplexArray
     return by_volts, by_speed
 
 
-def _sampled_current(dynamics: ActuatorDynamics, z: ComplexArray, time: float) -> ComplexArray:
-    """The same by a held command, at points z of a sampled system."""
+def _sampled_winding(dynamics: ActuatorDynamics, time: float) -> tuple[FloatArray, FloatArray, int]:
+    """A and column of a held command over a sample, and place of the motor's current."""
     A, command, _, place = _electrical(dynamics)
     n = len(A)
     block = np.zeros((n + 1, n + 1))
     block[:n, :n], block[:n, n] = A, command
     step = expm(block * time)
-    inner = z[:, None, None] * np.eye(n) - step[:n, :n]
-    held = np.broadcast_to(step[:n, n:], (len(z), n, 1))
+    return step[:n, :n], step[:n, n], place
+
+
+def _sampled_current(A: FloatArray, b: FloatArray, place: int, z: ComplexArray) -> ComplexArray:
+    """The motor's current by a held command, at points z of a sampled system [A/V]."""
+    inner = z[:, None, None] * np.eye(len(A)) - A
+    held = np.broadcast_to(b[:, None], (len(z), len(b), 1))
     response: ComplexArray = np.linalg.solve(inner, held)[:, place, 0].astype(np.complex128)
     return response
+
+
+def _largest_pole(law: LinearLaw, A: FloatArray, b: FloatArray, place: int, ahead: int) -> float:
+    """Of a law with the motor's current that its commands make, at a shaft that is held."""
+    n, m = len(A), len(law.F)
+    loop = np.zeros((n + m + ahead,) * 2)
+    loop[:n, :n], loop[:n, n + m] = A, b  # the oldest command under way
+    loop[n : n + m, n : n + m], loop[n : n + m, place] = law.F, law.G[:, 3]
+    loop[n + m : -1, n + m + 1 :] = np.eye(ahead - 1)
+    loop[-1, n : n + m], loop[-1, place] = law.H[0], law.D[0, 3]
+    return float(np.abs(np.linalg.eigvals(loop)).max())

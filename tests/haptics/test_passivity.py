@@ -4,11 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
+from daq.experiment import Sample
 from daq.lookup.controllers import load_controller
+from haptics import laws
 from haptics.dynamics import ActuatorDynamics
 from haptics.evidence import HAND, HAND_RANGE
+from haptics.feedforward import Feedforward
 from haptics.linear_loop import LinearLaw, loop_margins, sampled_actuator
+from haptics.operating_points import operating_point
 from haptics.passivity import Hands, Passivity, Port, Tracker, UnknownPassivityError, discs
 from protocols.control.loop import tracker_gains
 from tests.haptics.test_torque_tracking import controller
@@ -184,6 +189,75 @@ def test_hands_that_are_no_clamps_let_the_inverse_hold_stiffer_walls(tmp_path):
         )
 
     assert stable(promised) and not stable(1.1 * promised)
+
+
+def ringing(check, K, mass, spring):
+    """Spectral radius of a wall's loop, the hand a damper beside a mass behind a spring."""
+    tuned, dynamics = check.controller, ActuatorDynamics(check.controller.model)
+    law = LinearLaw.of(tuned.control.program(tuned.model, tuned.parameters), tuned.model)
+    linear = operating_point(dynamics, "sliding forwards", 0.0).linear
+    theta, omega, i_m = (
+        tuned.model.state_names.index(name) for name in ("theta", "omega", "current_motor")
+    )
+    command, load = (
+        tuned.model.input_names.index(name) for name in ("applied_voltage_motor", "torque")
+    )
+    n, m = len(linear.A), len(law.F)
+    rates = np.zeros((n + 3, n + 3))  # and angle and speed of the mass, the command
+    rates[:n, :n], rates[:n, n + 2] = linear.A, linear.B[:, command]
+    rates[:n, theta] -= spring * linear.B[:, load]
+    rates[:n, omega] -= HELD * linear.B[:, load]
+    rates[:n, n] += spring * linear.B[:, load]
+    rates[n, n + 1] = 1.0
+    rates[n + 1, [theta, n]] = spring / mass, -spring / mass
+    step = expm(rates * T)
+    by_angle = law.G[:, 0] - K * law.G[:, 4], law.D[0, 0] - K * law.D[0, 4]
+    A = np.zeros((n + 3 + m,) * 2)
+    A[: n + 2, : n + 3] = step[: n + 2]
+    A[n + 2, [theta, i_m]], A[n + 2, n + 3 :] = (by_angle[1], law.D[0, 3]), law.H[0]
+    A[n + 3 :, theta], A[n + 3 :, i_m], A[n + 3 :, n + 3 :] = by_angle[0], law.G[:, 3], law.F
+    return np.abs(np.linalg.eigvals(A)).max()
+
+
+def test_a_mass_behind_a_soft_spring_is_a_clamp_above_their_resonance(tmp_path):
+    """So the promise for hands that are no clamps does not hold with it, that for any hand does."""
+    plain = {"friction_share": 0.0, "inertia_share": 0.0}
+    soft, clamps = (
+        passivity(tmp_path, "feedforward", held=HELD, stiffest=stiffest, **plain)
+        for stiffest in (40.0, np.inf)
+    )
+    assert ringing(soft, soft.springs_promised(), 1e-4, 40.0) > 1.002
+    assert ringing(soft, soft.springs_promised(), 1e3, 40.0) < 1.0 + 1e-9
+    for mass in (1e-5, 3e-5, 1e-4, 3e-4, 1e-3):
+        assert ringing(clamps, clamps.springs_promised(), mass, 40.0) < 1.0 + 1e-9
+
+
+class Backward(Feedforward):
+    """Its observer takes the hand's torque the wrong way round."""
+
+    def program(self, model, parameters):
+        program = super().program(model, parameters)
+        constants = list(program.constants)
+        constants[laws.FILTER_L + 2 * laws.HAND] = -1.0
+        return replace(program, constants=tuple(constants))
+
+
+def test_of_a_law_that_is_unstable_by_itself_nothing_is_promised(tmp_path):
+    """Its response alone would not tell."""
+    plain = {"friction_share": 0.0, "inertia_share": 0.0}
+    check = passivity(tmp_path, "feedforward", **plain)
+    assert check.promise(COUNT).stiffness > 0.0
+    control = Backward(**check.controller.control.model_dump())
+    law = control.law(check.controller.model, check.controller.parameters)
+    angles = [0.0] + 1599 * [1e-6]
+    volts = [
+        law.volts(Sample(k, k * T, 0.0, 0.0, 0.0, angle, 0.0, 0), 0.0)[0]
+        for k, angle in enumerate(angles)
+    ]
+    assert max(np.abs(volts[1200:])) > 20.0 * max(np.abs(volts[400:800])) > 0.0
+    unstable = replace(check, controller=replace(check.controller, control=control))
+    with pytest.raises(UnknownPassivityError, match="unstable by itself"):
+        unstable.promise(COUNT)
 
 
 def test_promised_springs_come_to_rest_however_they_are_entered_and_left(tmp_path):
