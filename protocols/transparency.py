@@ -11,7 +11,7 @@ from scipy.signal import butter, sosfiltfilt
 from daq.config.units import Hertz, Seconds
 from daq.experiment import Aboard, Answer, Controller, Plan, Sample, SettingError
 from daq.findings import Chart, Findings, Number, Series
-from daq.hal import FloatArray, Samples
+from daq.hal import FloatArray, IntArray, Samples
 from daq.torque import TorqueLaw
 from haptics.evidence import Scene, hand_path
 from haptics.experiment import ReferenceExperiment
@@ -46,7 +46,7 @@ class Transparency(ReferenceExperiment):
                 "block", f"{self.block:g} s hold no two periods at judged_to; make it {least:.2g} s"
             )
         lowest, highest = self.bounds()
-        n_samples = self.samples_in(2 * self.pairs * self.block, "block")
+        n_samples = self._n_samples
         remarks = (
             *self.controller_remarks(),
             "Hold the handle, and turn it to and fro alike in all blocks; every "
@@ -57,11 +57,19 @@ class Transparency(ReferenceExperiment):
 
     def share(self, n: int) -> FloatArray:
         """By how much the controller's commands are given, (n,): 0 to 1."""
-        time = np.arange(n) / self.sample_rate
-        block, within = np.divmod(time, self.block)
+        block, within = self._blocks(np.arange(n))
         rise = np.minimum(within / _RAMP, 1.0)
         shares: FloatArray = np.where(block % 2 == 1, rise, np.where(block > 0, 1.0 - rise, 0.0))
         return shares
+
+    @property
+    def _n_samples(self) -> int:
+        return 2 * self.pairs * self.samples_in(self.block, "block")
+
+    def _blocks(self, sample: IntArray) -> tuple[IntArray, FloatArray]:
+        """Which block samples are in, from 0, and how far in it [s]; of whole samples each."""
+        block, within = np.divmod(sample, self.samples_in(self.block, "block"))
+        return block, within / self.sample_rate
 
     def scenes(self) -> list[Scene]:
         """The controller comes while hands move at up to 10 rad/s."""
@@ -76,22 +84,21 @@ class Transparency(ReferenceExperiment):
 
     def controller(self) -> Controller:
         """The controller's law for no torque, in every second block."""
-        n_samples = self.samples_in(2 * self.pairs * self.block, "block")
-        return _Alternation(self.tuned_controller.law(), self.share(n_samples))
+        return _Alternation(self.tuned_controller.law(), self.share(self._n_samples))
 
     def aboard(self) -> Aboard | None:
         """No torque, by the controller in every second block."""
         if not self.on_device:
             return None
-        n_samples = self.samples_in(2 * self.pairs * self.block, "block")
-        blocks = np.arange(n_samples) // round(self.block * self.sample_rate)
-        switches = np.flatnonzero(np.diff(blocks)) + 1
-        share = self.share(n_samples)
-        return self.asked_of_device(np.zeros(n_samples), switches.tolist(), _RAMP, [share])
+        length = self.samples_in(self.block, "block")
+        switches = range(length, self._n_samples, length)
+        share = self.share(self._n_samples)
+        return self.asked_of_device(np.zeros(len(share)), switches, _RAMP, [share])
 
     def findings(self, samples: Samples, extra: Mapping[str, FloatArray]) -> Findings:
         """The torque felt with and without the controller, beside the speed of the shaft."""
-        within = (samples.time - samples.time[0]) % self.block
+        passed = np.rint((samples.time - samples.time[0]) * self.sample_rate).astype(np.int64)
+        _, within = self._blocks(passed)
         settled = within > _RAMP + _SETTLED
         parts = {
             "free": settled & (extra["controlled"] == 0.0),

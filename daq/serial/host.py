@@ -43,6 +43,10 @@ _REASONS = {
     Result.LATCHED: "holds its outputs at zero since its watchdog tripped",
     Result.UNKNOWN: "does not know the request; its firmware is incomplete",
 }
+_TOO_LATE = (
+    "no longer can: the sample at which its own controller was to come or go has passed, for this "
+    "computer was held up, or the run has ended"
+)
 
 
 @dataclass
@@ -412,4 +416,7 @@ def _unpack_welcome(payload: bytes) -> messages.Welcome | int:
 def refusal(reply: Reply) -> str:
     """Text of a device's refusal of a request."""
     name = Type(reply.request).name if reply.request in list(Type) else f"{reply.request:#x}"
-    return f"the device refuses {name}: it {_REASONS.get(reply.result, 'gives no reason')}"
+    reason = _REASONS.get(reply.result, "gives no reason")
+    if reply.request == Type.LAW and reply.result is Result.WRONG_STATE:
+        reason = _TOO_LATE
+    return f"the device refuses {name}: it {reason}"

@@ -5,6 +5,7 @@ The firmware itself answers in ``tests/firmware/test_law.py`` and, by ``rig run`
 """
 
 import dataclasses
+import json
 
 import numpy as np
 import pandas as pd
@@ -12,11 +13,13 @@ import pytest
 import yaml
 
 from daq.config.rig import RigConfig
-from daq.errors import ConfigError
+from daq.errors import ConfigError, DeviceError
 from daq.hal import Flag
 from daq.lookup.classes import find_class
 from daq.lookup.controllers import load_controller
 from daq.run.runner import run_experiment
+from daq.serial.host import refusal
+from daq.serial.messages import Reply, Result, Type
 from sim_rig.backend import SimulatedDevice, Simulation
 from tests.protocols.closed_loop import SHIPPED
 
@@ -120,6 +123,44 @@ def test_every_second_block_of_transparency_is_the_controllers(tmp_path):
     assert not any(volts for row in device.references.values() for volts in row)
     within = log[log["flags"] & 128 != 0]
     assert (within.controlled[within.tick % 960 > ramp] == 1.0).all()
+
+
+class HeldUp(Aboard):
+    """The order to go comes behind its tick: refused, as firmware does."""
+
+    zeroed = 0
+
+    def answer(self, first, blend, scales):
+        if scales is None:
+            raise DeviceError(refusal(Reply(Type.LAW, Result.WRONG_STATE, None)))
+        super().answer(first, blend, scales)
+
+    def safe(self):
+        super().safe()
+        self.zeroed += 1
+
+
+def test_an_order_that_comes_too_late_ends_the_run_with_what_was_logged(tmp_path):
+    device = HeldUp(fingerprint())
+    with pytest.raises(DeviceError, match=r"refuses LAW: .* for this computer was held up"):
+        run(tmp_path, "transparency", device, block=1.2, pairs=2, torque_controller=CONTROLLER)
+    assert device.orders == [(960, 80, True)] and device.zeroed > 0
+    (record,) = (json.loads(path.read_text()) for path in tmp_path.glob("*/run.json"))
+    (log,) = (pd.read_csv(path) for path in tmp_path.glob("*/log.csv"))
+    assert record["status"] == "failed" and "refuses LAW" in record["reason"]
+    assert 960 < len(log) < 1920, "it is refused ahead of its tick, while the law still answers"
+    assert not any(volts for row in device.references.values() for volts in row)
+
+
+def test_blocks_of_transparency_begin_with_whole_samples_in_orders_and_column_alike():
+    """641.04 samples a block would be a sample apart behind 13 blocks."""
+    settings = experiment("transparency", block=0.8013, pairs=20, torque_controller=CONTROLLER)
+    aboard = settings.aboard()
+    (share,) = aboard.logged
+    switches = np.array(aboard.switches)
+    assert len(share) == len(aboard.reference) == 40 * 641 and len(switches) == 39
+    begins = np.flatnonzero((np.diff(share[:-1]) == 0.0) & (np.diff(share[1:]) != 0.0)) + 1
+    np.testing.assert_array_equal(begins, switches)
 
 
 @pytest.mark.parametrize(
