@@ -23,6 +23,7 @@ from daq.torque import Fact, OperatingPoint, TorqueControl
 from daq.views import Lines, Shown
 from sysid import ModelError, ProcessModel
 from sysid.uncertainty.draws import plausible_parameters
+from sysid.threads import one_thread
 
 _HEAD = """\
 # A torque controller, made by rig tune; experiments name this file under 'torque_controller'.
@@ -117,6 +118,7 @@ class Tuning(Shown):
         write_whole(Path(path), _HEAD + text)
 
 
+@one_thread()
 def tune(
     settings: str | Path,
     parameters: str | Path | None = None,

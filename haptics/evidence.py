@@ -21,6 +21,7 @@ from haptics.dynamics import SHAFT, ActuatorDynamics
 from haptics.linear_loop import LinearLaw, LoopMargins, loop_margins
 from haptics.operating_points import Branch
 from haptics.program import compiled_trial, step_matrices, stiff_part
+from sysid.threads import one_thread
 
 BoolArray = NDArray[np.bool_]
 
@@ -77,6 +78,7 @@ class Outcomes:
         return moving
 
 
+@one_thread()
 def run_trials(
     controller: TunedController, program: LawProgram, scenes: list[Scene], limits: TripLimits,
     draws: int, seed: int = 0,
@@ -117,6 +119,7 @@ def run_trials(
     return Outcomes(results, hands)
 
 
+@one_thread()
 def family_margins(controller: TunedController, seed: int = 0) -> list[LoopMargins]:
     """Margins of plausible actuators in hands of both ends and the middle, by branch."""
     control = controller.control

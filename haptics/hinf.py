@@ -25,7 +25,7 @@ dT = C (z - A)^-1 (dA (z - A)^-1 B + dB).
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, Self
 
 import numpy as np
@@ -83,9 +83,9 @@ class Hinf(TorqueFeedback):
         gains = [float(f"{gain:.7g}") for gain in loops.gains(x)]
         return self.model_copy(update={"gains": gains})
 
-    def program(self, model: ProcessModel, parameters: FloatArray) -> LawProgram:
+    def loop_program(self, model: ProcessModel, parameters: FloatArray) -> LawProgram:
         """The regulator on top of the inverse, with these gains."""
-        program = super().program(model, parameters)
+        program = super().loop_program(model, parameters)
         if not self.gains:
             return program
         constants = list(program.constants)
@@ -97,10 +97,7 @@ class Hinf(TorqueFeedback):
             )
         for place, gain in zip(free, self.gains, strict=True):
             constants[place] = gain
-        return LawProgram(
-            program.entry, program.text, program.n_states, tuple(constants), program.parameters,
-            program.step,
-        )  # fmt: skip
+        return replace(program, constants=tuple(constants))
 
 
 def places(ahead: int) -> list[int]:
@@ -213,7 +210,7 @@ class LoopFamily:
         actuators: Sequence[FloatArray],
     ) -> None:  # fmt: skip
         self._control, self._model = control, model
-        program = control.program(model, parameters)
+        program = control.loop_program(model, parameters)
         self._entry, self._n = compiled_laws(model)[program.entry], program.n_states
         self._constants, self._p = np.array(program.constants), np.array(program.parameters)
         self.places = places(control.ahead)

@@ -41,7 +41,10 @@ STANDSTILL, BRAKE_SLOPE, SHARE, SMOOTHING, LEAD = 17, 18, 19, 20, 21
 # friction that is compensated: sliding, of that within the yield travel, and the z that slides.
 FILTER_ORDER = 5
 FILTER_A, FILTER_B, FILTER_L, REGULATOR = 22, 47, 52, 62
-FRICTION, YIELD_SHARE, SLIDING, CONSTANTS = 83, 84, 85, 86
+FRICTION, YIELD_SHARE, SLIDING = 83, 84, 85
+# What a hand makes of a reference, see ``haptics.reference_shape``.
+SHAPE_SLOPE, SHAPE_BEND, SHAPE_SMOOTHING, HAND_DAMPING, HAND_MEMORY = 86, 88, 90, 91, 92
+HAND_DOUBT, HAND_RANGE, CONSTANTS = 93, 94, 95
 
 # States: of the filter,
 ANGLE, SPEED, HAND, HAND_RATE, DISTURBANCE = 0, 1, 2, 3, 4
@@ -50,7 +53,9 @@ Z, DRIVING, STARTED, BRAKE = 5, 6, 7, 8
 # the last reference and whether there is one, the smoothed acceleration,
 REFERENCE, REFERRED, SMOOTHED = 9, 10, 11
 # what is predicted to when the command acts, currents that are coming, the regulator's answers.
-NEXT_ANGLE, NEXT_SPEED, NEXT_Z, COMING, DELTAS, STATES = 12, 13, 14, 15, 36, 56
+NEXT_ANGLE, NEXT_SPEED, NEXT_Z, COMING, DELTAS = 12, 13, 14, 15, 36
+# the reference's slope, slope and bend smoothed, the reference as shaped, and what tells the hand.
+SLOPE, SHAPED_SLOPE, SHAPED_BEND, SHAPED, MOVED, FELT, STATES = 56, 57, 58, 59, 60, 61, 62
 
 
 def static(
@@ -73,7 +78,7 @@ def feedforward(
     """The inverse: tau_r + k J domega/dt beside friction."""
     observe(theta, sensed, i_m, lost, s, c, p)
     look_ahead(s, c, p)
-    slope = reference_slope(reference, s, c)
+    slope = reference_slope(reference, lost, s, c)
     s[SMOOTHED] += c[SMOOTHING] * (shaft_acceleration(s, c) - s[SMOOTHED])
     wanted = reference + c[HORIZON] * slope + c[SHARE] * s[SMOOTHED]
     give(wanted, s, c, p, volts)
@@ -86,9 +91,13 @@ def lqg(
     """The regulator on top of the inverse: tau_r + delta - d beside friction."""
     observe(theta, sensed, i_m, lost, s, c, p)
     look_ahead(s, c, p)
-    slope = reference_slope(reference, s, c)
-    delta = regulate(reference + s[HAND], s[HAND_RATE] + slope, s, c)
-    wanted = reference + c[HORIZON] * slope + delta - s[DISTURBANCE]
+    before = s[SHAPED]
+    if s[REFERRED] == 0.0:
+        before = reference
+    shaped = shape(reference, lost, s, c)
+    slope = (shaped - before) / (c[TIME] * (1 + lost))
+    delta = regulate(shaped + s[HAND], s[HAND_RATE] + slope, s, c)
+    wanted = shaped + c[HORIZON] * slope + delta - s[DISTURBANCE]
     # What was given is what the next answer changes: nothing winds up.
     s[DELTAS + int(c[AHEAD]) - 1] += give(wanted, s, c, p, volts)
 
@@ -188,14 +197,39 @@ def look_ahead(s: Array, c: Array, p: Array) -> None:
     s[NEXT_Z] = turned(s[Z], angle, time, c, p)
 
 
-def reference_slope(reference: float, s: Array, c: Array) -> float:
+def reference_slope(reference: float, lost: int, s: Array, c: Array) -> float:
     """By which the reference changes [N*m/s]."""
     slope = 0.0
     if s[REFERRED] != 0.0:
-        slope = (reference - s[REFERENCE]) / c[TIME]
+        slope = (reference - s[REFERENCE]) / (c[TIME] * (1 + lost))
     s[REFERRED] = 1.0
     s[REFERENCE] = reference
     return slope
+
+
+def shape(reference: float, lost: int, s: Array, c: Array) -> float:
+    """The reference by which this hand feels the reference [N*m]."""
+    slope = reference_slope(reference, lost, s, c)
+    bend = c[TIME] * (slope - s[SLOPE]) / (1 + lost)
+    s[SLOPE] = slope
+    s[SHAPED_SLOPE] += c[SHAPE_SMOOTHING] * (c[TIME] * slope - s[SHAPED_SLOPE])
+    s[SHAPED_BEND] += c[SHAPE_SMOOTHING] * (bend - s[SHAPED_BEND])
+    y = mobility(slope, s, c)
+    s[SHAPED] = (
+        reference
+        + (c[SHAPE_SLOPE] + c[SHAPE_SLOPE + 1] * y) * s[SHAPED_SLOPE]
+        + (c[SHAPE_BEND] + c[SHAPE_BEND + 1] * y) * s[SHAPED_BEND]
+    )
+    return s[SHAPED]
+
+
+def mobility(slope: float, s: Array, c: Array) -> float:
+    """Of the hand, in parts of the design's: by what moves and what is felt along the slope."""
+    turned = c[HAND_DAMPING] * shaft_acceleration(s, c)
+    s[MOVED] += c[HAND_MEMORY] * (slope * turned - s[MOVED])
+    s[FELT] += c[HAND_MEMORY] * (slope * (turned - s[HAND_RATE]) - s[FELT])
+    y = (max(s[MOVED], 0.0) + c[HAND_DOUBT]) / (max(s[FELT], 0.0) + c[HAND_DOUBT])
+    return min(max(y, 1.0 / c[HAND_RANGE]), c[HAND_RANGE])
 
 
 def give(wanted: float, s: Array, c: Array, p: Array, volts: Array) -> float:

@@ -138,6 +138,24 @@ def loop_margins(
     return LoopMargins(float(np.abs(S).max()), float(1.0 / np.abs(S - 0.5).max()))
 
 
+def felt_responses(
+    law: LinearLaw, dynamics: ActuatorDynamics, hand: tuple[float, float],
+    z: NDArray[np.complex128], time: float, ahead: int,
+) -> NDArray[np.complex128]:  # fmt: skip
+    """The torque felt by the reference at points z, (n,), of a sliding shaft in a hand."""
+    branch: Branch = "sliding forwards"
+    A, _, _ = _closed(law, dynamics, branch, hand, time, ahead)
+    _, _, C = sampled_actuator(dynamics, branch, hand, time)
+    n, m = C.shape[1], len(law.F)
+    b, c = np.zeros(len(A)), np.zeros(len(A))
+    b[n : n + m], b[-2:], c[:n] = law.G[:, 4], law.D[:, 4], -C[2]
+    inner = z[:, None, None] * np.eye(len(A)) - A
+    felt: NDArray[np.complex128] = (
+        np.linalg.solve(inner, np.tile(b[:, None], (len(z), 1, 1)))[:, :, 0] @ c
+    )
+    return felt
+
+
 def sampled_actuator(
     dynamics: ActuatorDynamics, branch: Branch, hand: tuple[float, float], time: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:

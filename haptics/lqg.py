@@ -27,14 +27,14 @@ lowers it until the program's own loop, linearised there, has the same margin.
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
 from scipy.linalg import expm, solve_discrete_are
 
-from daq.config.units import NewtonMetres, Part, Unit
+from daq.config.units import NewtonMetres, Part, Seconds, Unit
 from daq.torque import Fact, LawProgram
 from haptics import laws
 from haptics.actuator_control import ActuatorControl
@@ -43,11 +43,13 @@ from haptics.feedforward import encoder_noise
 from haptics.linear_loop import LinearLaw, loop_margins
 from haptics.observer import Hand, SensorNoise, ShaftFilter
 from haptics.program import law_program
+from haptics.reference_shape import ReferenceShape
 from sysid import ModelError, ProcessModel
 from sysid.arrays import FloatArray
 
 _EFFORTS = np.geomspace(1.0, 1e6, 25)  # in parts of the least
 _FREQUENCIES = 60
+_DOUBT = 0.5  # N*m/s, slope of a reference that tells of the hand as much as the design
 _SHARES = np.linspace(1.0, 0.3, 8)
 
 
@@ -58,7 +60,11 @@ class TorqueFeedback(ActuatorControl):
 
     encoder_counts: int = Field(8192, ge=4, description="of the encoder in a revolution")
     torque_noise: NewtonMetres = Field(
-        0.007, gt=0.0, le=10.0, description="rms, of the torque sensor"
+        0.010,
+        gt=0.0,
+        le=10.0,
+        description="of the torque sensor, rms, as the filter reckons with it: more than it has "
+        "makes a calmer loop",
     )
     hand_damping: Annotated[float, Unit("N*m*s/rad")] = Field(
         0.018, gt=0.0, le=10.0, description="of the hand that the regulator is designed for"
@@ -71,6 +77,9 @@ class TorqueFeedback(ActuatorControl):
     )
     hand_rate: Annotated[float, Unit("N*m/s")] = Field(
         0.6, gt=0.0, le=1e3, description="by which its motion changes torque's slope in a sample"
+    )
+    hand_memory: Seconds = Field(
+        0.5, gt=0.0, le=100.0, description="over which the hand that shapes the reference is told"
     )
     disturbance: NewtonMetres = Field(
         2e-4, gt=0.0, le=1.0, description="by which unknown friction changes in a sample"
@@ -124,7 +133,7 @@ class TorqueFeedback(ActuatorControl):
         peaks = {}
         for share in (self.yield_share * _SHARES).tolist():
             control = self.model_copy(update={"yield_share": float(f"{share:.4g}")})
-            law = LinearLaw.of(control.program(model, parameters), model)
+            law = LinearLaw.of(control.loop_program(model, parameters), model)
             peaks[control.yield_share] = max(
                 loop_margins(
                     law,
@@ -142,11 +151,22 @@ class TorqueFeedback(ActuatorControl):
         return self.model_copy(update={"yield_share": best})
 
     def program(self, model: ProcessModel, parameters: FloatArray) -> LawProgram:
-        """The regulator on top of the inverse."""
+        """The regulator on top of the inverse, the reference shaped by the hand."""
+        loop = self.loop_program(model, parameters)
+        hand = self.hand_stiffness, self.hand_damping
+        shape = ReferenceShape.of(loop, model, hand, self.hand_range)
+        return replace(loop, constants=shape.placed(loop.constants))
+
+    def loop_program(self, model: ProcessModel, parameters: FloatArray) -> LawProgram:
+        """The same without shaping the reference."""
         dynamics = ActuatorDynamics(model, parameters)
         constants = self.shaft_filter(dynamics.inertia).placed(self.constants(dynamics))
         constants = Regulator.of(self, dynamics.inertia).placed(constants)
         constants[laws.YIELD_SHARE] = self.yield_share
+        constants[laws.HAND_DAMPING] = self.hand_damping
+        constants[laws.HAND_MEMORY] = 1.0 - math.exp(-1.0 / self.hand_memory / self.sample_rate)
+        constants[laws.HAND_DOUBT] = _DOUBT**2
+        constants[laws.HAND_RANGE] = self.hand_range
         return law_program("lqg", model, parameters, constants)
 
     def shaft_filter(self, inertia: float) -> ShaftFilter:
