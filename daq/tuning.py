@@ -22,8 +22,8 @@ from daq.provenance import software_versions
 from daq.torque import Fact, OperatingPoint, TorqueControl
 from daq.views import Lines, Shown
 from sysid import ModelError, ProcessModel
-from sysid.uncertainty.draws import plausible_parameters
 from sysid.threads import one_thread
+from sysid.uncertainty.draws import plausible_parameters
 
 _HEAD = """\
 # A torque controller, made by rig tune; experiments name this file under 'torque_controller'.
