@@ -24,18 +24,19 @@ _MOST_LINES = 12  # runs whose signals are drawn over each other
 _MOST_TRENDS = 12  # parameters that are drawn where none are named
 
 
-def quantities_of(entries: Sequence[RunEntry], names: Sequence[str] = ()) -> list[str]:
-    """Parameters and combinations with an interval of both ends in any of the runs.
-
-    names: those wanted, in this order. Raises ConfigError for one that no run has.
-    """
-    rows = [row for entry in entries for row in entry.quantities]
-    present = dict.fromkeys(row.name for row in rows)
+def require_quantities(entries: Sequence[RunEntry], names: Sequence[str]) -> None:
+    """Raise ConfigError for a parameter or combination that no run has."""
+    present = dict.fromkeys(row.name for entry in entries for row in entry.quantities)
     for name in names:
         if name not in present:
             cure = suggestion(name, list(present))
             raise ConfigError(f"no run has {name!r}", cure=cure, key="--parameters")
-    return list(names) or list(dict.fromkeys(row.name for row in rows if row.two_sided))
+
+
+def quantities_of(entries: Sequence[RunEntry]) -> list[str]:
+    """Parameters and combinations with an interval of both ends in any of the runs."""
+    rows = (row for entry in entries for row in entry.quantities if row.two_sided)
+    return list(dict.fromkeys(row.name for row in rows))
 
 
 def draw_comparison(
@@ -84,7 +85,7 @@ def _trends(entries: Sequence[RunEntry], names: Sequence[str]) -> list[Trend]:
     from daq.figures.history import Trend
 
     trends = []
-    for name in quantities_of(entries, names):
+    for name in names or quantities_of(entries):
         rows = [
             (entry, row)
             for entry in entries

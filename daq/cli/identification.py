@@ -100,13 +100,14 @@ def _show(result: Identification) -> None:
 
 def _show_next(result: Identification) -> None:
     step = result.next_step
-    if step is not None:
-        terminal.print_text(step.purpose)
     mapping = result.problem.mapping
     columns = f" --config {mapping.file.path}" if mapping is not None else ""
     log = (*result.validation, *result.training)[0].log.path
     replay = f"rig replay {log} --parameters {result.parameters_file}{columns}{result.trust_option}"
-    terminal.print_next(*([step.command] if step is not None else []), replay)
+    if step is None:
+        terminal.print_next(replay)
+    else:
+        terminal.print_next(step.command, replay, purpose=step.purpose)
 
 
 def _show_parameters(result: Identification) -> None:

@@ -59,27 +59,28 @@ def runs(
 ) -> None:
     """List recorded runs; search, compare and annotate them."""
     from daq.catalogue.annotation import annotate
-    from daq.catalogue.comparison import draw_comparison, quantities_of
+    from daq.catalogue.comparison import draw_comparison, quantities_of, require_quantities
     from daq.catalogue.index import catalogue
     from daq.catalogue.query import ordered, select
 
     names = [name.strip() for name in (parameters or "").split(",") if name.strip()]
     with terminal.watching(json) as watch:
         entries = catalogue(folder, watch)
-        chosen = ordered(select(folder, entries, terms or []), sort)[-(last or 0) :]
+        require_quantities(entries, names)
+        chosen = select(folder, ordered(entries, sort), terms or [])[-(last or 0) :]
         if note or tag or untag:
             if not terms:
                 raise BadParameter("say of which runs; name them, or a word that they have")
             chosen = annotate(folder, chosen, note or [], tag or [], untag or [])
         if plot is not None and chosen:
             draw_comparison(folder, chosen, names, plot, watch)
-    names = quantities_of(chosen, names) if compare or names else []
+    names = names or (quantities_of(chosen) if compare else [])
     if json:
         terminal.print_json({"folder": str(folder), "runs": [run.document for run in chosen]})
         return
     if not chosen:
         hint = "Record one:  rig run prbs.yaml" if not entries else "rig runs lists them all."
-        print(f"None of the {len(entries)} runs in {folder} is meant. {hint}")
+        print(f"0 of {len(entries)} runs in {folder}. {hint}")
     elif details:
         for entry in chosen:
             _show(entry, folder)

@@ -99,9 +99,11 @@ def report_event(event: Event) -> None:
         report(event.level, event.text)
 
 
-def print_next(*commands: str) -> None:
-    """Which commands a user may want now."""
+def print_next(*commands: str, purpose: str = "") -> None:
+    """Which commands a user may want now, and what the first is for."""
     if _volume.get() >= Volume.NORMAL:
+        if purpose:
+            print_text(purpose)
         for index, command in enumerate(commands):
             print(f"{'Then' if index else 'Next'}: {command}")
 

@@ -158,6 +158,8 @@ def _multiple(largest: float, unit: str) -> tuple[float, str]:
 def _mark_leaving(panel: Axes, time: FloatArray, values: FloatArray, color: str) -> bool:
     """Mark each stretch of a curve beyond its frame at the edge; whether there is one."""
     low, high = panel.get_ylim()
+    there = ~np.isnan(values)  # what is missing parts no stretch
+    time, values = time[there], values[there]
     inside, places = _INSIDE * (high - low), list[tuple[float, float, str]]()
     ends = ((values > high, high - inside, "^"), (values < low, low + inside, "v"))
     for beyond, edge, marker in ends:

@@ -67,6 +67,9 @@ _PLAIN = 30.0  # span of a logarithmic axis below which it needs more marks than
 # More points than a column of print can show are drawn as their envelope.
 _COLUMNS = 1400
 
+_USUAL = 0.95  # share of the distances between measured samples that are usual
+_GAP = 3.0  # times the largest of those, from which on a line is broken
+
 # The default takes a third more time in all, for files a twentieth smaller.
 _PNG_LEVEL = 3
 _LAYOUT = ("GDEF", "GPOS", "GSUB")  # tables of a font
@@ -255,8 +258,11 @@ def _text_width(text: str) -> float:
 def thinned(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     """A line that looks the same in print with no more points than can be told apart.
 
-    Of long records the lowest and highest point of each column are kept, in their order.
+    Of long records the lowest and highest point of each column are kept, in their order. NaN
+    breaks it only where more is missing than is usual for it: a signal sampled unevenly, or more
+    seldom than others, is a line as well.
     """
+    x, y = _joined(x, y)
     n = len(x)
     if n <= 4 * _COLUMNS:
         return x, y
@@ -267,6 +273,18 @@ def thinned(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     highs = np.where(np.isnan(blocks), -np.inf, blocks).argmax(axis=1)
     starts = np.arange(whole) * size
     kept = np.unique(np.concatenate([starts + lows, starts + highs, [0, n - 1]]))
+    return x[kept], y[kept]
+
+
+def _joined(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """A line without the NaN between points that are as far apart as most are."""
+    there = np.flatnonzero(~np.isnan(y))
+    if len(there) in (0, len(y)):
+        return x, y
+    distances = np.diff(x[there])
+    usual = np.quantile(distances, _USUAL, method="lower") if len(distances) else 0.0
+    missing = there[:-1][distances > _GAP * usual] + 1
+    kept = np.union1d(there, missing)
     return x[kept], y[kept]
 
 

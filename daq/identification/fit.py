@@ -92,7 +92,7 @@ def identify_files(
 
     loaded: as of ``fit``. Raises ConfigError before anything is computed, with cause and cure.
     """
-    problem = problem_of(settings, watch)
+    problem = problem_of(settings, watch, logs=[*logs, *validate])
     folder = out or default_folder(logs, problem.model.name)
     check_writable(folder)
     return fit(problem, logs, validate, folder, watch, loaded=loaded)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+import difflib
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,8 +13,8 @@ import numpy as np
 from daq.config.check import refuse
 from daq.config.identification import Column, Columns
 from daq.config.units import factor
-from daq.config.yaml_file import Key, YamlFile
-from daq.errors import ConfigError, suggestion
+from daq.config.yaml_file import Key, YamlFile, dotted
+from daq.errors import ConfigError, Mistake, suggestion
 from daq.hal import FloatArray, IntArray
 from daq.logs.table import column_names, read_table
 from daq.logs.time_base import require_rows, time_base
@@ -27,6 +28,7 @@ Signal = Input | Output
 SignalGroup = tuple[str, dict[str, Column], Sequence[Signal]]
 
 _CURE = "mend these cells or remove their lines (removed lines count as lost samples)"
+TIME_UNIT = ("columns", "time", "unit")
 _FASTER = 1.5  # times the log's rate above which a merged file is filtered first
 
 
@@ -66,25 +68,63 @@ def check_mapping(
     spare: ``inputs`` and ``outputs`` that may have one as well though this model is used without
     them.
     """
-    file, groups = mapping.file, _groups(model, mapping.columns)
-    for group, given, signals in groups:
-        needed = [signal.name for signal in signals]
+    refuse([*_mistakes_of_names(model, mapping, spare), *_mistakes_of_sources(model, mapping)])
+
+
+def check_columns(
+    model: ProcessModel, mapping: ColumnMapping, path: Path, others: Sequence[Path]
+) -> None:
+    """Raise ConfigError unless a log, or one of the others beside it, has the columns."""
+    _places(path, model, mapping, others)
+
+
+def _mistakes_of_names(
+    model: ProcessModel, mapping: ColumnMapping, spare: Mapping[str, Collection[str]]
+) -> Iterator[Mistake]:
+    """Of signals that the model has not, and of those that it has beside them."""
+    file = mapping.file
+    for group, given, signals in _groups(model, mapping.columns):
+        needed, misspelt = [signal.name for signal in signals], set[str]()
         for name in given:
             if name not in needed and name not in spare[group]:
-                problem = f"model {model.name} has no such signal; {suggestion(name, needed)}"
-                raise file.error(("columns", group, name), problem)
+                problem, cure = f"model {model.name} has no such signal", suggestion(name, needed)
+                yield file.mistake(("columns", group, name), problem, cure)
+                misspelt.update(difflib.get_close_matches(name, needed, n=1))
         for name in needed:
-            if name not in given:
-                problem = f"{name!r} of model {model.name} is missing; add it"
-                raise file.error(("columns", group), problem)
-    for name, column in mapping.columns.outputs.items():
-        if column.constant is not None:
-            key = ("columns", "outputs", name)
-            raise file.error(key, "an output must be measured, not constant")
-    for group, given, signals in groups:
+            if name not in given and name not in misspelt:
+                problem = f"{name!r} of model {model.name} is missing"
+                yield file.mistake(("columns", group), problem, "add it")
+
+
+def _mistakes_of_sources(model: ProcessModel, mapping: ColumnMapping) -> Iterator[Mistake]:
+    """Of what signals are taken from: a constant output, a column of another one, a wrong unit."""
+    file, taken = mapping.file, dict[str, Key]()
+    for group, given, signals in _groups(model, mapping.columns):
         for signal in signals:
-            unit_key = ("columns", group, signal.name, "unit")
-            unit_factor(file, unit_key, given[signal.name].unit, signal.unit)
+            if (column := given.get(signal.name)) is None:
+                continue
+            key = ("columns", group, signal.name)
+            if column.constant is not None and group == "outputs":
+                problem = "an output must be measured, not constant"
+                yield file.mistake(key, problem, "name its 'column'")
+            if column.column is not None and column.column in taken:
+                before = dotted(taken[column.column])
+                problem = f"{column.column!r} is the column of {before} already"
+                yield file.mistake((*key, "column"), problem, "each signal has its own: name it")
+            elif column.column is not None:
+                taken[column.column] = key
+            yield from _mistakes_of_unit(file, (*key, "unit"), column.unit, signal.unit)
+    yield from _mistakes_of_unit(file, TIME_UNIT, mapping.columns.time.unit, "s")
+
+
+def _mistakes_of_unit(
+    file: YamlFile, key: tuple[str, ...], unit: str | None, wanted: str
+) -> tuple[Mistake, ...]:
+    try:
+        unit_factor(file, key, unit, wanted)
+    except ConfigError as error:
+        return error.mistakes
+    return ()
 
 
 def _groups(model: ProcessModel, columns: Columns) -> list[SignalGroup]:
@@ -189,7 +229,11 @@ def _places(
     present = {file: column_names(file) for file in (path, *others)}
     wanted: list[tuple[Key, str | None]] = []
     for group, given, signals in _groups(model, mapping.columns):
-        wanted += [(("columns", group, s.name, "column"), given[s.name].column) for s in signals]
+        wanted += [
+            (("columns", group, s.name, "column"), given[s.name].column)
+            for s in signals
+            if s.name in given
+        ]
     mistakes, places = [], dict[Path, list[str]]({path: []})
     if time is not None:
         mistakes = [
@@ -222,7 +266,7 @@ def _foreign_time(
         assert time.sample_rate is not None
         tick: IntArray = np.arange(len(frame), dtype=np.int64)
         return tick / time.sample_rate, tick, 1.0 / time.sample_rate
-    seconds = unit_factor(mapping.file, ("columns", "time", "unit"), time.unit, "s")
+    seconds = unit_factor(mapping.file, TIME_UNIT, time.unit, "s")
     values = frame[time.column].to_numpy() * seconds
     cure = (
         "say 'grid: 0.001' (s) in 'columns: time:' to round uneven times to multiples of it, or "

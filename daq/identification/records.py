@@ -10,7 +10,7 @@ import numpy as np
 
 from daq.errors import ConfigError, suggestion
 from daq.hal import FloatArray, IntArray
-from daq.identification.foreign import ColumnMapping, read_foreign
+from daq.identification.foreign import TIME_UNIT, ColumnMapping, read_foreign
 from daq.identification.selection import EVERYTHING, Selection
 from daq.logs import matlab
 from daq.logs.capture import LOG_NAME
@@ -169,6 +169,13 @@ def _foreign(
         # The first sample tells where the model starts.
         first = int(np.argmax(np.isfinite(outputs).all(axis=1)))
         inputs, outputs, tick = inputs[first:], outputs[first:], tick[first:]
+    if _is_sparse(tick):
+        problem = (
+            f"read in {mapping.columns.time.unit}, times of {path} cover {tick[-1] - tick[0] + 1} "
+            f"sample times of {table.dt:g} s, of which it holds {len(tick)}"
+        )
+        cure = "write the unit that they are in: s, ms, us, min, h"
+        raise mapping.file.error(TIME_UNIT, f"{problem}, too few to identify from", cure)
     dataset = replace(
         _dataset(path, model, inputs, outputs, tick, table.dt, path.stem),
         input_noise=table.input_noise,
@@ -260,6 +267,11 @@ def _without_run_in(
     return replace(dataset, outputs=outputs)
 
 
+def _is_sparse(tick: IntArray) -> bool:
+    """Whether hardly any of the sample times that a log covers have a sample."""
+    return int(tick[-1] - tick[0]) + 1 > 50 * len(tick) + 1000
+
+
 def _dataset(
     path: Path,
     model: ProcessModel,
@@ -272,7 +284,7 @@ def _dataset(
     """A record in which lost samples keep their place: inputs go on, outputs are missing."""
     rows = tick - tick[0]
     length = int(rows[-1]) + 1
-    if length > 50 * len(rows) + 1000:
+    if _is_sparse(tick):
         problem = f"the log covers {length} sample times but holds {len(rows)} samples"
         cure = "too much is missing to identify anything from it"
         raise ConfigError(problem, cure=cure, file=path)

@@ -13,9 +13,10 @@ from daq.config.units import converted
 from daq.config.yaml_file import TypedSettings, YamlFile
 from daq.errors import ConfigError, Mistake, suggestion, together
 from daq.identification import datasheets, stages
-from daq.identification.foreign import ColumnMapping, check_mapping
+from daq.identification.foreign import ColumnMapping, check_columns, check_mapping
 from daq.identification.request import SettingsRequest
 from daq.identification.selection import EVERYTHING, Selection
+from daq.logs.recording import log_path
 from daq.lookup.models import DEFAULT_MODEL, find_model, whole_name
 from daq.progress import Note, Watch, ignore
 from sysid import Given, ModelError, ProcessModel, SearchSpace
@@ -54,13 +55,17 @@ class Problem:
 
 
 def problem_of(
-    request: SettingsRequest, watch: Watch = ignore, record: Path | None = None
+    request: SettingsRequest,
+    watch: Watch = ignore,
+    record: Path | None = None,
+    logs: Sequence[Path] = (),
 ) -> Problem:
     """Read and check settings and model; ConfigError names file, line, key and cure.
 
-    record: which the request comes from, and whose files of models are not to be run.
+    record: which the request comes from, and whose files of models are not to be run. logs: whose
+    columns are looked for as well.
     """
-    return problems_of(request, [request.options.get("model")], watch, record)[0]
+    return problems_of(request, [request.options.get("model")], watch, record, logs)[0]
 
 
 def problems_of(
@@ -68,6 +73,7 @@ def problems_of(
     names: Sequence[str | None],
     watch: Watch = ignore,
     record: Path | None = None,
+    logs: Sequence[Path] = (),
 ) -> list[Problem]:
     """The same settings for each of several models, None for the default one.
 
@@ -117,6 +123,7 @@ def problems_of(
             lambda: _with_starts(file, completed, model),
             lambda: _check_space(file, completed, model, earlier),
             lambda: None if mapping is None else check_mapping(model, mapping, spare),
+            *[partial(_check_columns, model, mapping, selection, log) for log in logs],
             lambda: _check_guesses(file, completed, model),
         )
         sources |= {
@@ -132,6 +139,15 @@ def problems_of(
         *[partial(problem, model, name) for (_, name), model in zip(declared, models, strict=True)],
     )
     return problems
+
+
+def _check_columns(
+    model: ProcessModel, mapping: ColumnMapping | None, selection: Selection, log: Path
+) -> None:
+    """Raise ConfigError where a log lacks a column; of a folder of logs only its reader knows."""
+    path = log_path(log)
+    if mapping is not None and path.is_file():
+        check_columns(model, mapping, path, selection.merged(path))
 
 
 def _in_order(*steps: Callable[[], Any]) -> list[Any]:

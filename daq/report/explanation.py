@@ -93,15 +93,23 @@ def _data_sentence(logs: Sequence[Mapping[str, Any]]) -> str:
         if used:
             seconds = sum(log["samples"] / log["sample_rate"] for log in used)
             samples = sum(log["samples"] for log in used)
+            measured = sum(log.get("measured", log["samples"]) for log in used)
             rates = sorted({log["sample_rate"] for log in used})
             rate = " to ".join(f"{rate:.4g}" for rate in dict.fromkeys((rates[0], rates[-1])))
             parts.append(
-                f"{verb} {_count(len(used), 'log')} of {samples} samples ({seconds:.3g} s at "
-                f"{rate} Hz)"
+                f"{verb} {_count(len(used), 'log')} of {_of_samples(measured, samples)} "
+                f"({seconds:.3g} s at {rate} Hz)"
             )
     if len(parts) == 1:
         return f"{parts[0]}; none was held back to judge it."
     return f"{', '.join(parts)}, which took no part in the fit."
+
+
+def _of_samples(measured: int, places: int) -> str:
+    """How much was measured, where that is not a sample at every sample time."""
+    if measured == places:
+        return f"{places} samples"
+    return f"{measured} measured samples on {places} sample times"
 
 
 def _errors(

@@ -8,6 +8,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from daq.documents import plain
 from daq.figures import style
 from daq.files import digest, make_folder, write_whole
@@ -126,6 +128,7 @@ def fingerprints(logs: Split) -> list[dict[str, Any]]:
             "name": log.dataset.name,
             "use": use,
             "samples": log.dataset.n_samples,
+            "measured": int(np.isfinite(log.dataset.outputs).any(axis=1).sum()),
             "sample_rate": 1.0 / log.dataset.dt,
             "sha256": digest(log.path),
             **({"merged": {str(f): digest(f) for f in log.merged}} if log.merged else {}),

@@ -116,6 +116,13 @@ def test_runs_are_selected_by_what_is_known_of_them(lab, terms, expected):
     assert operators(listed(lab, *terms)) == expected
 
 
+def test_no_run_of_a_parameter_that_others_have_is_an_answer(lab):
+    words = ("gain>99", "--parameters", "gain", "--sort", "gain", "--compare")
+    result = rig("runs", *words, cwd=lab)
+    assert (result.returncode, result.stderr) == (0, "")
+    assert result.stdout.startswith("0 of 3 runs in runs. ")
+
+
 def test_of_several_folders_any_is_meant(lab):
     first, second, _ = captures(lab)
     assert operators(listed(lab, first, lab / second)) == ["Ann", "Bob"]

@@ -160,6 +160,15 @@ def test_a_long_record_is_thinned_without_losing_its_extremes():
     assert (x[0], x[-1]) == (0.0, 199_999.0)
 
 
+def test_what_is_measured_seldom_or_unevenly_is_a_line_and_what_is_missing_a_gap():
+    place = np.arange(300)
+    measured = (place % 3 == 0) & (place % 7 != 0) & ((place < 100) | (place > 200))
+    x, y = style.thinned(0.01 * place, np.where(measured, 1.0, np.nan))
+    assert np.count_nonzero(~np.isnan(y)) == np.count_nonzero(measured)
+    (gap,) = np.flatnonzero(np.isnan(y))
+    assert x[gap - 1] < 1.0 < 2.0 < x[gap + 1]
+
+
 def test_a_model_that_runs_away_does_not_flatten_what_was_measured(figures):
     response, residual = figures["responses"].axes[:2]
     assert response.get_ylim()[1] < 2.0

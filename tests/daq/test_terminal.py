@@ -11,7 +11,7 @@ import pytest
 import typer
 
 from daq.cli.app import app
-from daq.cli.terminal import watching
+from daq.cli.terminal import Volume, output, print_next, watching
 from daq.progress import Note
 from tests.daq.support import environment, forked_rig, rig, write_experiment, write_rig
 
@@ -163,6 +163,13 @@ def test_a_note_is_shown_once_however_often_it_is_given(capsys):
         for text in ("no cable", "no cable", "no hand", "no cable"):
             watch(Note("note", text))
     assert capsys.readouterr().err.splitlines() == ["rig: note: no cable", "rig: note: no hand"]
+
+
+def test_what_a_next_command_is_for_is_said_with_it_or_not_at_all(capsys):
+    for level in (Volume.QUIET, Volume.NORMAL):
+        with output(level, documents_alone=False):
+            print_next("rig identify LOG", purpose="Search longer:")
+    assert capsys.readouterr().out == "Search longer:\nNext: rig identify LOG\n"
 
 
 def test_the_package_starts_as_the_command_does():
