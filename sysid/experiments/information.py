@@ -17,7 +17,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.linalg import pinvh
 
-from sysid.arrays import FloatArray
+from sysid.arrays import BoolArray, FloatArray
 from sysid.engine.simulation import BatchSimulator
 from sysid.experiments.disturbance import with_disturbances
 from sysid.fitting.means import mean_of_sides
@@ -28,6 +28,7 @@ from sysid.problem.space import SearchSpace
 
 # Share of the largest information above which a direction that tells nothing is told something.
 _PHANTOM = 1e-10
+_BURST = 1e3  # times its span, by which no output moves over the range of a parameter
 # Draws of the inputs' noise: they give a variance to within a third.
 _DRAWS = 16
 
@@ -62,6 +63,7 @@ class Informant:
         n_free, unknown = len(self._space.index), self._unknown(record)
         n_draws = _DRAWS if len(self._noisy) else 0
         slopes = self._slopes(record, chromosomes, n_free, unknown, n_draws)
+        slopes[self._burst(slopes[..., :n_free], record, chromosomes)] = np.nan
         errors = self.variances(record, chromosomes)
         joint = [
             self._joint(each, scatter, n_free + len(unknown))
@@ -131,6 +133,18 @@ class Informant:
             np.hstack([vectors, quiet]), [with_errors], along, steps, start_directions=[moved]
         )
         return slopes
+
+    def _burst(self, slopes: FloatArray, record: Dataset, chromosomes: FloatArray) -> BoolArray:
+        """Whether tangents have burst where the simulation has not, (n,).
+
+        Steps that leave a state bounded, as on a saturating one, may still make more of its tangent
+        with each; what moves by a thousand times its span over a parameter's range is no answer.
+        """
+        outputs = self._simulator.trajectories(self._space.full(chromosomes), record)
+        spans = np.maximum(np.ptp(outputs, axis=1), self._noise)
+        largest = np.max(np.abs(slopes) * self._space.width, axis=(1, 3), initial=0.0)
+        burst: BoolArray = np.any(largest > _BURST * spans, axis=1)
+        return burst
 
     def variances(self, record: Dataset, chromosomes: FloatArray) -> FloatArray:
         """Variances of the samples' errors, inputs without noise, (n, n_samples, n_outputs)."""
