@@ -18,6 +18,7 @@ from daq.logs.encoder import SPEED, MeanSpeeds
 from daq.logs.recording import Recording, end_of_run, log_path, read_record
 from daq.logs.recording import load as load_recording
 from daq.logs.time_base import refuse_rows, require_rows, time_base
+from daq.views import Shown
 from sysid.problem.data import Dataset
 from sysid.problem.faults import mended
 from sysid.problem.model import ModelError, ProcessModel
@@ -39,8 +40,8 @@ class Preparation:
     start: float
 
 
-@dataclass(frozen=True)
-class LoggedRecord:
+@dataclass(frozen=True, repr=False)
+class LoggedRecord(Shown):
     """A log as a record for a model; warning: how a run that did not complete ended.
 
     measured: its record with the faulty samples that ``robust`` leaves out of ``dataset``; None
@@ -54,6 +55,12 @@ class LoggedRecord:
     measured: Dataset | None = None
     preparation: Preparation | None = None
     merged: tuple[Path, ...] = ()
+
+    @property
+    def headline(self) -> str:
+        """Its name, length and rate."""
+        n, dt = self.dataset.n_samples, self.dataset.dt
+        return f"{self.dataset.name}, {n} samples, {n * dt:.4g} s at {1.0 / dt:.4g} Hz"
 
 
 Split = tuple[list[LoggedRecord], list[LoggedRecord]]  # for training, for validation

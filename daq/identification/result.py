@@ -55,13 +55,19 @@ yaml.SafeDumper.add_representer(
 )
 
 
-@dataclass(frozen=True)
-class FittedLog:
+@dataclass(frozen=True, repr=False)
+class FittedLog(Shown):
     """A log with the identified model's free run on it, (n_samples, n_outputs), and its errors."""
 
     log: LoggedRecord
     run: FloatArray
     result: RecordResult
+
+    @property
+    def headline(self) -> str:
+        """Its name and length, and the fit of each output."""
+        fits = ", ".join(f"{fit:.1f}" for fit in self.result.metrics.fit)
+        return f"{self.log.headline}, fit {fits} %"
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,7 @@ _KEYED_BY = {
 }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Problem:
     """What is to be identified, checked before any log is read or rig moved.
 
@@ -52,6 +52,9 @@ class Problem:
     request: SettingsRequest
     selection: Selection = EVERYTHING
     given: Given | None = None
+
+    def __repr__(self) -> str:
+        return f"<Problem: parameters of {self.model_name}>"
 
 
 def problem_of(

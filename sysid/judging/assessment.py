@@ -54,7 +54,7 @@ _BENT = 0.02  # share of innovations that a filter misjudges
 _ROUNDING = 2e-4  # of an output's deviation, below which errors may be those of a simulation
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class RecordResult:
     """A model's errors on a record; ``simulated``: whether its free run came to the end.
 
@@ -73,6 +73,10 @@ class RecordResult:
     shared: FloatArray | None = None
     by_speed: FloatArray | None = None
     alone: FloatArray | None = None
+
+    def __repr__(self) -> str:
+        fits = ", ".join(f"{fit:.1f}" for fit in self.metrics.fit)
+        return f"<RecordResult: {self.name}, fit {fits} %>"
 
 
 @dataclass(frozen=True)

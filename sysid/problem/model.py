@@ -159,7 +159,7 @@ class Constraint:
     function: Callable[[tuple[Any, ...]], Any]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ProcessModel:
     """Named states, inputs, outputs, parameters, and the functions between them.
 
@@ -187,6 +187,8 @@ class ProcessModel:
     ...     parameters=(Parameter("tau", "s", nominal=0.5, lower=0.1, upper=2.0),),
     ...     derivative=lambda x, u, p: ((u[0] - x[0]) / p[0],),
     ... )
+    >>> lag
+    <ProcessModel: lag, u -> y, 1 states, 1 parameters>
     >>> lag.derivative((0.0,), (1.0,), (0.5,))
     (2.0,)
     """
@@ -206,6 +208,11 @@ class ProcessModel:
     regressors: Callable[[Any], Mapping[str, Any]] | None = None
     equations: tuple[str, ...] = ()
     variants: Callable[[], Mapping[str, ProcessModel]] | None = None
+
+    def __repr__(self) -> str:
+        signals = f"{', '.join(self.input_names) or 'no input'} -> {', '.join(self.output_names)}"
+        sizes = f"{len(self.states)} states, {len(self.parameters)} parameters"
+        return f"<ProcessModel: {self.name}, {signals}, {sizes}>"
 
     def __post_init__(self) -> None:
         for kind in ("states", "inputs", "outputs", "parameters", "constraints", "equations"):

@@ -58,7 +58,7 @@ class Rival:
     intervals: Mapping[str, tuple[float, float]]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Uncertainty:
     """Intervals of an identified chromosome, and what the data leave undetermined.
 
@@ -88,6 +88,12 @@ class Uncertainty:
     factor: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
     succession: FloatArray = field(default_factory=lambda: np.zeros(0))
     bent: FloatArray = field(default_factory=lambda: np.zeros(0))
+
+    def __repr__(self) -> str:
+        known = sum(not estimate.why for estimate in self.parameters)
+        combined = len(self.determined()) - known
+        shares = f"{known} of {len(self.parameters)} parameters, {combined} combinations"
+        return f"<Uncertainty: intervals of {shares}; rank {self.rank}>"
 
     def correlation(self) -> FloatArray:
         """Correlation of the free parameters, NaN where there is no variance."""

@@ -56,6 +56,11 @@ def test_an_identification_says_what_may_be_used_and_shows_intervals(log):
     low, high = (float(end) for end in shown["K_m"][2].split(" .. "))
     assert low < float(shown["K_m"][1]) < high and shown["K_m"][3] == "N*m/A"
     assert shown["L_m"][2:] == ["-", "mH", "fixed"]
+    parts = ("model", "estimator", "problem", "uncertainty", "training", "verdict", "suspicion")
+    lengths = {part: len(repr(getattr(result, part))) for part in parts}
+    assert max(lengths.values()) < 700, lengths
+    assert repr(result.training[0].result).startswith("<RecordResult: ")
+    assert f"{len(log.frame)} samples" in result.training[0]._repr_html_()
 
 
 def test_a_tied_parameter_is_not_called_fixed():
