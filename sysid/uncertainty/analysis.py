@@ -90,9 +90,9 @@ class Uncertainty:
     bent: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def __repr__(self) -> str:
-        known = sum(not estimate.why for estimate in self.parameters)
-        combined = len(self.determined()) - known
-        shares = f"{known} of {len(self.parameters)} parameters, {combined} combinations"
+        single = sum(not estimate.why for estimate in self.parameters)
+        combined = len(self.determined()) - single
+        shares = f"{single} of {len(self.parameters)} parameters, {combined} combinations"
         return f"<Uncertainty: intervals of {shares}; rank {self.rank}>"
 
     def correlation(self) -> FloatArray:
