@@ -8,7 +8,6 @@ import numpy as np
 from scipy.linalg import null_space
 
 from sysid.arrays import BoolArray, FloatArray
-from sysid.identifiability import null_directions
 from sysid.identifiability.cache import kept_identifiability
 from sysid.problem.model import ModelError, ProcessModel
 from sysid.problem.space import SearchSpace
@@ -102,6 +101,8 @@ def _felt(sensitivity: Sensitivity, directions: FloatArray) -> BoolArray:
 
 def _directions(sensitivity: Sensitivity, model: ProcessModel) -> FloatArray:
     """Tied directions of the coordinates, where not all combinations have a name."""
+    from sysid.identifiability import null_directions  # loads flint, and is seldom needed
+
     space, chromosome = sensitivity.objective.space, sensitivity.chromosome
     states = dict.fromkeys(model.state_names[i] for _, i in space.estimated)
     n = len(space.index)
