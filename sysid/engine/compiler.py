@@ -95,13 +95,15 @@ def kalman_filter(
     noisy: tuple[int, ...],
     driven: tuple[int, ...] = (),
     averaged: tuple[int, ...] = (),
+    coloured: bool = False,
 ) -> Filter:
     """Compile a model's filter for noise on some inputs and states; as ``kernels``.
 
     noisy, driven: their places; averaged: places of outputs, as of ``FilterKernel``, whose model
-    is ``with_integrals`` of them. Raises ModelError for equations that cannot be differentiated.
+    is ``with_integrals`` of them; coloured: whether the inputs' noise may be. Raises ModelError for
+    equations that cannot be differentiated.
     """
-    kernel = FilterKernel(model, variation(model, noisy, driven), averaged)
+    kernel = FilterKernel(model, variation(model, noisy, driven), averaged, coloured=coloured)
     text = f"{kernel.structure.program}\n\n{kernel.text()}"
     return Filter(kernel, *_compiled(model, text, {}, ("innovations",)))
 

@@ -15,7 +15,8 @@ the variance r of the output
 
 and what is kept of e, the innovation, is e sqrt(r0 / s), with r0 a variance like r but the same for
 all samples: without noise of inputs and process, and of one variance, the error of the free run.
-With noise of the process the sum of log(s / r) stands behind the sum of their squares. With
+Noise of the inputs may be coloured: n_(k+1) is then a part of n_k, the colour, and what is new in
+it. With noise of the process the sum of log(s / r) stands behind the sum of their squares. With
 ``corrects`` zero nothing is taken in: e is that error whatever the noise, and s its variance.
 Chromosomes are lanes, as in the batch kernel.
 """
@@ -49,9 +50,15 @@ class FilterKernel(BatchKernel):
     """
 
     def __init__(
-        self, model: ProcessModel, variation: Variation, averaged: Sequence[int] = ()
+        self,
+        model: ProcessModel,
+        variation: Variation,
+        averaged: Sequence[int] = (),
+        *,
+        coloured: bool = False,
     ) -> None:
         super().__init__(model, variation.structure)
+        self.coloured = coloured
         self.variation, self.reached = variation, variation.reached
         self.n_noises = len(variation.noisy)
         self.counts["gains"] = len(variation.gains)
@@ -99,8 +106,8 @@ class FilterKernel(BatchKernel):
             *block(f"for j in range({2 * q}):", block(EACH_LANE, [sums])),
         ]
         head = (
-            "def innovations(X, rows, tables, u, y, w, r, unit, mean, s, intensity, spread, "
-            "corrects, start, p, dt, n_steps, sums, record):"
+            "def innovations(X, rows, tables, u, y, w, r, unit, mean, s, colour, intensity, "
+            "spread, corrects, start, p, dt, n_steps, sums, record):"
         )
         return "\n".join(block(head, body))
 
@@ -112,7 +119,7 @@ class FilterKernel(BatchKernel):
         """P before the first sample: ``spread`` of the states, and the noises' variances."""
         n = len(self.reached)
         variances = {(a, a): f"spread[{a}]" if a < n else f"s[{a - n}]" for a in range(self._size)}
-        behind = self._places[self._size :]
+        behind = self._places[n:]
         nothing = [f"{at(self._before + place)} = 0.0" for place in behind]
         return [*self._stored(variances), *nothing]
 
@@ -121,7 +128,8 @@ class FilterKernel(BatchKernel):
         n, lines = len(self.reached), self._outputs()
         if self.output_states is None and self.variation.gains:
             lines += self.call("gains", "g", [at(i) for i in range(self.n_states)], "v")
-        lines += [*self._loaded(), *[f"d{a} = 0.0" for a in self._places]]
+        expected = {n + k: at(self._noises + k) for k in range(self.n_noises) if self.coloured}
+        lines += [*self._loaded(), *[f"d{a} = {expected.get(a, 0.0)}" for a in self._places]]
         for j in range(self.n_measured):
             lines += self._taken_in(j)
         begun, kept = self._integral.values(), self._kept_of_outputs()
@@ -215,6 +223,12 @@ class FilterKernel(BatchKernel):
         """x and P of the next sample."""
         n = len(self.reached)
         phi, gamma = self._jacobian_of("state", "begin"), self._jacobian_of("end")
+        fresh = {k: f"s[{k}]" for k in range(self.n_noises)}
+        if self.coloured:  # what goes on of a noise acts at the interval's end as well
+            fresh = {k: f"(1.0 - colour[{k}] * colour[{k}]) * {s}" for k, s in fresh.items()}
+            for (a, k), response in gamma.items():
+                begun = f"{phi[a, n + k]} + " if (a, n + k) in phi else ""
+                phi[a, n + k] = f"({begun}colour[{k}] * {response})"
         lines = [*self._loaded(), *self._tilted()]
         process = self._process()
         for a, i in enumerate(self.reached):
@@ -230,7 +244,7 @@ class FilterKernel(BatchKernel):
             for b in range(a, n):
                 terms = [f"M{a}_{c} * {phi[b, c]}" for c in range(self._size) if (b, c) in phi]
                 terms += [
-                    f"{gamma[a, k]} * {gamma[b, k]} * s[{k}]"
+                    f"{gamma[a, k]} * {gamma[b, k]} * {fresh[k]}"
                     for k in range(self.n_noises)
                     if (a, k) in gamma and (b, k) in gamma
                 ]
@@ -241,14 +255,28 @@ class FilterKernel(BatchKernel):
                 ]
                 variances[a, b] = _sum(terms)
             for k in range(self.n_noises):
-                if (a, k) in gamma:
-                    variances[a, n + k] = f"{gamma[a, k]} * s[{k}]"
+                terms = [f"{gamma[a, k]} * {fresh[k]}"] if (a, k) in gamma else []
+                terms += [f"colour[{k}] * M{a}_{n + k}"] if self.coloured else []
+                variances[a, n + k] = _sum(terms)
             for place in self._places[self._size :]:
                 terms = [f"{phi[a, c]} * P{c}_{place}" for c in range(self._size) if (a, c) in phi]
                 variances[a, place] = _sum(terms)
-        variances |= {(n + k, n + k): f"s[{k}]" for k in range(self.n_noises)}
+        variances |= {(n + k, n + k): noise for k, noise in fresh.items()}
         variances |= {(a, b): f"P{a}_{b}" for a, b in self._pairs if a >= self._size}
+        if self.coloured:
+            variances |= self._going_on(fresh)
+            lines += [f"{at(self._noises + k)} *= colour[{k}]" for k in fresh]
         return lines + self._stored(variances)
+
+    def _going_on(self, fresh: Mapping[int, str]) -> dict[_Place, str]:
+        """Covariances of noises of the next sample with one another and with what is kept."""
+        n, going = len(self.reached), {}
+        for a, b in self._pairs:
+            if n <= a < self._size:
+                parts = [f"colour[{a - n}]", f"P{a}_{b}"]
+                parts += [f"colour[{b - n}]"] if b < self._size else []
+                going[a, b] = _sum([" * ".join(parts), *([fresh[a - n]] if a == b else [])])
+        return going
 
     def _process(self) -> list[dict[int, str]]:
         """Responses to a level rate of each driven state, by row."""

@@ -184,6 +184,7 @@ class RecordSimulator:
         noise: FloatArray,
         scatter: FloatArray,
         process: FloatArray,
+        colour: FloatArray,
         corrects: bool,
         parameters: FloatArray,
         starts: FloatArray | None,
@@ -195,7 +196,8 @@ class RecordSimulator:
 
         noise: (n_outputs,), standard deviations; scatter: (n_samples, n_outputs), variances of
         single samples beside it. process: (n_states,), standard deviations of the states' rates
-        over the root of a second. corrects: whether the filter takes outputs in. A state that
+        over the root of a second. colour: (n_inputs,), how much of the inputs' noise goes on from
+        sample to sample. corrects: whether the filter takes outputs in. A state that
         starts at the first sample of an output has that sample's error. Returns with the sums of
         squares those of the logarithms of the innovations' variances in parts of the outputs',
         (n, n_outputs).
@@ -224,9 +226,9 @@ class RecordSimulator:
         with explained_errors(model):
             kalman.innovations(
                 work, work.reshape(-1, LANES), kernel.tables, self._inputs, measured, weights,
-                variances, noise**2, mean, of_inputs, intensity, np.array(spread),
-                float(corrects), start, np.ascontiguousarray(parameters[padded].T), record.dt,
-                n_steps, sums, kept,
+                variances, noise**2, mean, of_inputs, colour[list(kernel.variation.noisy)],
+                intensity, np.array(spread), float(corrects), start,
+                np.ascontiguousarray(parameters[padded].T), record.dt, n_steps, sums, kept,
             )  # fmt: skip
         values[:] = kept[..., : len(lanes)]
         sse, logarithms = (half.T[: len(lanes)] for half in np.split(sums, 2))

@@ -201,6 +201,7 @@ class BatchSimulator:
         *,
         scatter: Sequence[FloatArray] | None = None,
         process: FloatArray | None = None,
+        colour: Sequence[FloatArray] | None = None,
         corrects: bool = True,
         balanced: bool = True,
     ) -> Residuals:
@@ -209,19 +210,23 @@ class BatchSimulator:
         Noise of the inputs is the records' own; noise: (n_outputs,), standard deviations of the
         outputs; scatter: per record, (n_samples, n_outputs), variances that single samples have
         beside that; process: (n_states,), intensities of the process's noise, standard deviations
-        of the states' rates over the root of a second. An innovation is scaled by the output's
-        noise over its own standard deviation: without noise of inputs and process innovations are
-        the residuals. With noise of the process, where ``balanced``, all of an output are
-        multiplied by the geometric mean of those deviations: their sum of squares is then least
-        where the likelihood of an output of unknown noise is largest. Unless it ``corrects`` itself
-        by the outputs, they are those of the free run, scaled so. See ``filter_kernel``. Raises
-        ModelError for equations that cannot be differentiated.
+        of the states' rates over the root of a second; colour: per record, (n_inputs,), parts of
+        the inputs' noise that go on from sample to sample, default none. An innovation is scaled by
+        the output's noise over its own standard deviation: without noise of inputs and process
+        innovations are the residuals. With noise of the process, where ``balanced``, all of an
+        output are multiplied by the geometric mean of those deviations: their sum of squares is
+        then least where the likelihood of an output of unknown noise is largest. Unless it
+        ``corrects`` itself by the outputs, they are those of the free run, scaled so. See
+        ``filter_kernel``. Raises ModelError for equations that cannot be differentiated.
         """
         process = np.zeros(len(self.model.states)) if process is None else process
         driven = tuple(np.flatnonzero(process).tolist())
         averaged = tuple(sorted({j for record in records for j in self._on(record).averaged}))
         model = with_integrals(self.model, averaged) if averaged else self.model
-        kalman = kalman_filter(model, noisy_inputs(records), driven, averaged)
+        white = np.zeros((len(records), len(self.model.inputs)))
+        colours = white if colour is None else np.asarray(colour)
+        coloured = bool(colours.any())
+        kalman = kalman_filter(model, noisy_inputs(records), driven, averaged, coloured)
         logarithms = np.zeros((len(parameters), len(records), len(noise)))
         if scatter is None:
             scatter = [np.zeros(record.outputs.shape) for record in records]
@@ -231,8 +236,8 @@ class BatchSimulator:
         ) -> tuple[FloatArray, FloatArray]:
             values = part[..., rows]
             sse, logarithms[rows, r] = simulator.innovations(
-                kalman, noise, scatter[r], process, corrects, parameters, starts[r], rows, steps,
-                values,
+                kalman, noise, scatter[r], process, colours[r], corrects, parameters, starts[r],
+                rows, steps, values,
             )  # fmt: skip
             return sse, np.where(np.isfinite(sse).all(axis=1), 0.0, np.inf)
 

@@ -33,6 +33,7 @@ import numpy as np
 
 from sysid.arrays import BoolArray, FloatArray, IntArray
 from sysid.engine.simulation import BatchResult, Residuals, Status
+from sysid.fitting.averages import coloured, denoised
 from sysid.fitting.means import each_mean_once, scatter
 from sysid.fitting.objective import Objective
 
@@ -44,6 +45,7 @@ _LEAST_NOISE, _NEAR = 1e-2, 0.1
 _LEAST_OF_FILTER = 1e-4
 _TENTH = 0.1
 _TINY = 1e-300
+_SHOWING = 0.025  # part of an output's peak that inputs' averages may take from it
 # Draws of the inputs' noise that show where equations bend under it, and parts of an innovation's
 # deviation from which they do.
 _DRAWS, _BENT = 8, 0.1
@@ -65,6 +67,8 @@ class Innovations(Objective):
     error: FloatArray
     corrects: bool
     process: FloatArray
+    colour: list[FloatArray]
+    quiet: bool
 
     @classmethod
     def of(
@@ -74,14 +78,20 @@ class Innovations(Objective):
         *,
         corrects: bool,
         process: FloatArray | None = None,
+        quiet: bool = False,
     ) -> Self:
         """An objective's counterpart."""
         variant = cls.__new__(cls)
         vars(variant).update(vars(objective))
+        variant.colour = [np.zeros(len(r.input_noise)) for r in objective.records]
         if corrects:
             variant.records = [each_mean_once(record) for record in objective.records]
             seen = [np.isfinite(record.outputs).sum(axis=0) for record in variant.records]
             variant.counts = np.sum(seen, axis=0)
+        variant.quiet = quiet
+        if quiet:
+            parts = [denoised(record) for record in variant.records]
+            variant.records, variant.colour = [q.record for q in parts], [q.colour for q in parts]
         variant.noise = variant.error = np.maximum(noise, _TINY)
         variant.scatter = [scatter(record) for record in variant.records]
         variant.corrects = corrects
@@ -100,8 +110,10 @@ class Innovations(Objective):
     ) -> Self:
         """Its counterpart with the noise that the innovations show at a chromosome, (n_free,)."""
         steps = objective.steps_needed(chromosome[None])[0]
-        error = objective.in_units(objective.residuals(chromosome[None], steps).values[..., 0])
-        variant = cls.of(objective, error, corrects=corrects, process=process)
+        residual = objective.residuals(chromosome[None], steps).values[..., 0]
+        error = objective.in_units(residual)
+        quiet = corrects and _may_average(objective, chromosome, steps, residual)
+        variant = cls.of(objective, error, corrects=corrects, process=process, quiet=quiet)
         return variant.settled(chromosome)
 
     def settled(self, chromosome: FloatArray) -> Self:
@@ -175,7 +187,10 @@ class Innovations(Objective):
 
         centre, bends = innovations([np.zeros_like(r.inputs) for r in self.records]), []
         for _ in range(_DRAWS):
-            noise = [r.input_noise * rng.standard_normal(r.inputs.shape) for r in self.records]
+            noise = [
+                coloured(record.input_noise * rng.standard_normal(record.inputs.shape), colour)
+                for record, colour in zip(self.records, self.colour, strict=True)
+            ]
             middle = 0.5 * (innovations(noise) + innovations([-move for move in noise]))
             bends.append(np.abs(middle - centre))
         units = np.concatenate(
@@ -220,9 +235,24 @@ class Innovations(Objective):
             self.noise,
             scatter=self.scatter,
             process=self.process,
+            colour=self.colour,
             corrects=self.corrects,
             balanced=balanced,
         )
+
+
+def _may_average(
+    objective: Objective, chromosome: FloatArray, steps: IntArray, residual: FloatArray
+) -> bool:
+    """Whether what averaged inputs lose is too little to show in the outputs of a free run.
+
+    residual: that of the inputs as they are, (n_residuals, n_outputs).
+    """
+    parts = [denoised(record) for record in objective.records]
+    lost = max(float(part.lost.max(initial=0.0)) for part in parts)
+    averaged = objective.on([part.record for part in parts])
+    moved = averaged.residuals(chromosome[None], steps).values[..., 0] - residual
+    return bool(np.sqrt(lost * np.mean(moved**2, axis=0)).max() < _SHOWING)
 
 
 def _to_the_end(first: FloatArray, second: FloatArray) -> FloatArray:

@@ -49,7 +49,9 @@ def by_filter(objective: Objective, fitted: Innovations, little: BoolArray) -> l
         part = objective.on(excerpt.datasets(), excerpt.places)
         part = part.over(space.without_starts().with_starts(part.records))
     noise = np.where(little, _LITTLE, 1.0) * fitted.noise
-    filtered = Innovations.of(part, noise, corrects=True, process=fitted.process)
+    filtered = Innovations.of(
+        part, noise, corrects=True, process=fitted.process, quiet=fitted.quiet
+    )
     minima = _minima(filtered)
     return minima if excerpt is None else excerpt.on_all(part.space, minima)[1]
 

@@ -23,6 +23,7 @@ from sysid import (
     SearchSpace,
     State,
 )
+from sysid.fitting.averages import denoised
 from sysid.fitting.innovations import Innovations
 from sysid.fitting.objective import Objective
 from sysid.gassi.likelihood import Optimum, better_by_filter, noisy_fit, towards
@@ -69,6 +70,31 @@ def kalman_filter(u, y):
             x, P = x - P[:, 0] / s * e, P - np.outer(P[:, 0], P[:, 0]) / s
             innovations[k] = e * OF_OUTPUT / np.sqrt(s)
     return innovations
+
+
+@pytest.mark.parametrize("hold", ["zoh", "foh"])
+def test_coloured_noise_of_an_input_is_that_of_a_kalman_filter_that_knows_its_colour(hold):
+    rng = np.random.default_rng(3)
+    u, y, colour = prbs(rng, 60, -1.0, 1.0), rng.standard_normal(60), 0.8
+    a = math.exp(-DT / TAU)
+    end = 0.0 if hold == "zoh" else GAIN * (1.0 - TAU / DT * (1.0 - a))
+    begin = GAIN * (1.0 - a) - end
+    # States are y and the noise of the present input, which goes on into the next one.
+    F = np.array([[a, begin + end * colour], [0.0, colour]])
+    Q = OF_INPUT**2 * (1.0 - colour**2) * np.outer([end, 1.0], [end, 1.0])
+    x, P = np.array([y[0], 0.0]), np.diag([OF_OUTPUT**2, OF_INPUT**2])
+    expected = [0.0]
+    for k in range(1, len(y)):
+        x = F @ x + np.array([begin * u[k - 1] + end * u[k], 0.0])
+        P = F @ P @ F.T + Q
+        e, s = x[0] - y[k], P[0, 0] + OF_OUTPUT**2
+        x, P = x - P[:, 0] / s * e, P - np.outer(P[:, 0], P[:, 0]) / s
+        expected.append(e * OF_OUTPUT / np.sqrt(s))
+    record = Dataset(u, y, DT, input_noise=np.array([OF_INPUT]))
+    model = lag().with_holds({"u": hold})
+    colours = [np.array([colour])]
+    innovations = simulate(model, [GAIN, TAU], record, [OF_OUTPUT], steps=3, colour=colours)
+    assert innovations[:, 0] == pytest.approx(expected, abs=1e-10)
 
 
 def pendulum():
@@ -322,6 +348,21 @@ def test_where_noise_explains_all_of_a_free_run_a_filter_takes_over():
     assert fit.parameters_["gain"] == pytest.approx(GAIN, rel=0.01)
     estimates = fit.uncertainty(record).parameters
     assert all(e.low < truth < e.high for e, truth in zip(estimates, (GAIN, TAU), strict=True))
+
+
+def test_noise_above_the_frequencies_of_an_input_is_averaged_away():
+    time, noise = np.arange(4000) * DT, 0.1 * np.random.default_rng(0).standard_normal(4000)
+    slow, steps = np.sin(0.3 * time), np.sign(np.sin(0.3 * time))
+    of = {}
+    for name, signal in (("slow", slow), ("steps", steps)):
+        record = Dataset(signal + noise, signal, DT, input_noise=np.array([0.1]))
+        of[name] = denoised(record)
+    error = of["slow"].record.inputs[:, 0] - slow
+    assert np.std(error) < 0.3 * np.std(noise)
+    assert of["slow"].record.input_noise[0] == pytest.approx(np.std(error), rel=0.2)
+    onward = np.corrcoef(error[1:], error[:-1])[0, 1]
+    assert onward == pytest.approx(of["slow"].colour[0], abs=0.03)
+    assert np.max(np.abs(of["steps"].record.inputs[:, 0] - steps - noise)) < 0.3
 
 
 @pytest.mark.parametrize("share", [1.0, 0.5])
