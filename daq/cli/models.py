@@ -168,7 +168,7 @@ def _show(name: str, model: ProcessModel, options: list[dict[str, Any]]) -> None
         print(f"  {equation}")
     if model.equations:
         print()
-    rows = [["state", s.name, s.unit, _start(s)] for s in model.states]
+    rows = [["state", s.name, s.unit, _start(s, model)] for s in model.states]
     rows += [["input", s.name, s.unit, s.hold] for s in model.inputs]
     rows += [["output", s.name, s.unit, s.description] for s in model.outputs]
     head = ["kind", "name", "unit", "note"]
@@ -201,7 +201,9 @@ def _show_options(name: str, options: list[dict[str, Any]]) -> None:
     )
 
 
-def _start(state: State) -> str:
+def _start(state: State, model: ProcessModel) -> str:
+    if state.initial_range is None and state.first_sample and state.name in model.output_names:
+        return f"starts at its first sample, else at {state.initial:g}"
     if state.initial_range is None:
         return f"starts at {state.initial:g}"
     low, high = state.initial_range

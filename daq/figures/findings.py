@@ -21,6 +21,7 @@ _SCALE = 0.12  # in, for a power of ten above the panel
 _EDGE = 0.16  # in, where the legend's room begins
 _THIN = {"lw": 0.5, "alpha": 0.7, "label": None}
 _POINTS = 700  # of a cloud, beyond which a part looks the same
+_LEGIBLE = 2.5  # times the size of a cloud's points, as a legend shows them
 
 
 @style.styled
@@ -128,5 +129,5 @@ def plot(
             panel.plot(x, y, **look)
         panel.set_xlabel(f"{name} {notation.bracketed(unit)}", labelpad=1.5)
         style.name_y(panel, quantity.label, notation.bracketed(quantity.unit))
-    style.legend(figure, panels[0])
+    style.legend(figure, panels[0], marks=_LEGIBLE if points else 1.0)
     return figure

@@ -18,6 +18,7 @@ from matplotlib.axis import Axis
 from matplotlib.cbook import is_math_text
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
+from matplotlib.lines import Line2D
 from matplotlib.textpath import text_to_path
 from matplotlib.ticker import (
     FuncFormatter,
@@ -212,16 +213,24 @@ def legend_room(labels: Sequence[str], left: float = LEFT) -> float:
     return _arranged(labels, left)[2]
 
 
-def legend(figure: Figure, panel: Axes, left: float = LEFT, above: float = 0.0) -> None:
-    """What the lines of a panel mean, at the top of the figure; above: inches kept free there."""
+def legend(
+    figure: Figure, panel: Axes, left: float = LEFT, above: float = 0.0, marks: float = 1.0
+) -> None:
+    """What the lines of a panel mean, at the top of the figure.
+
+    above: inches kept free there. marks: how much larger its marks are than the panel's.
+    """
     handles, labels = panel.get_legend_handles_labels()
     width, tall = figure.get_size_inches()
     shown, columns, _ = _arranged(labels, left)
-    figure.legend(
-        handles, shown, loc="upper left", ncols=columns,
+    drawn = figure.legend(
+        handles, shown, loc="upper left", ncols=columns, markerscale=marks,
         bbox_to_anchor=((left - _SPARE) / float(width), 1 - (0.02 + above) / float(tall)),
         borderaxespad=0.0, borderpad=0.0,
     )  # fmt: skip
+    for handle in drawn.legend_handles:
+        if marks != 1.0 and isinstance(handle, Line2D):
+            handle.set_markeredgewidth(marks * handle.get_markeredgewidth())
 
 
 def _arranged(labels: Sequence[str], left: float) -> tuple[list[str], int, float]:

@@ -41,18 +41,15 @@ def knowledge(estimates: Sequence[Estimate]) -> str:
     >>> from sysid.uncertainty import Estimate
     >>> ends = [("c1", 1.0, None), ("c0", None, 2.0), ("R_m", 0.8, 1.2)]
     >>> knowledge([Estimate(name, "1", 1.0, low=low, high=high) for name, low, high in ends])
-    'c1 and c0 are known on one side only, R_m is known to 20 %'
+    'Little is known of c1, c0 (one end only), R_m (to 20 %)'
     """
     alike: dict[str, list[str]] = {}
     for estimate in estimates[:_NAMED]:
         alike.setdefault(_known(estimate), []).append(estimate.name)
-    parts = [
-        f"{' and '.join(names)} {'are' if len(names) > 1 else 'is'} {how}"
-        for how, names in alike.items()
-    ]
+    parts = [f"{', '.join(names)} ({how})" for how, names in alike.items()]
     if len(estimates) > _NAMED:
-        parts.append(f"{len(estimates) - _NAMED} more to no better than {100.0 * _WIDE:g} %")
-    return ", ".join(parts)
+        parts.append(f"{len(estimates) - _NAMED} more (to no better than {100.0 * _WIDE:g} %)")
+    return f"Little is known of {', '.join(parts)}"
 
 
 def design_command(parameters: Path, logs: Sequence[Path], more: Sequence[str] = ()) -> str | None:
@@ -87,8 +84,8 @@ def _known(estimate: Estimate) -> str:
     if estimate.why:
         return "hardly felt"
     if estimate.low is None or estimate.high is None:
-        return "known on one side only"
-    return f"known to {notation.number(100.0 * _half_width(estimate), 2)} %"
+        return "one end only"
+    return f"to {notation.number(100.0 * _half_width(estimate), 2)} %"
 
 
 def _half_width(estimate: Estimate) -> float:

@@ -242,7 +242,7 @@ class Identification(Shown):
         command = design_command(self.folder, logs, more)
         if command is None:
             return None
-        purpose = f"{knowledge(wide)}. Runs that would tell more, and how narrowly, finds:"
+        purpose = f"{knowledge(wide)}. To design runs that would narrow them:"
         return NextStep(purpose, command)
 
     @property

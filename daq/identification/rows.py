@@ -357,8 +357,8 @@ class Rows:
             return ""
         coverage, widening = self.together
         return (
-            f"Each interval holds in 95 of 100 repetitions, all {n} at once in "
-            f"{100.0 * coverage:.0f}; {widening:.2f} times as wide they would in 95."
+            f"Of 100 repetitions each interval holds the true value in 95, all {n} at once in "
+            f"{100.0 * coverage:.0f}. Intervals {widening:.2f} times as wide would all hold in 95."
         )
 
     @property

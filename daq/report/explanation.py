@@ -1,5 +1,6 @@
 """What a report's page says beside its tables: sentences, and what to do next."""
 
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -179,13 +180,14 @@ def _steps(document: Mapping[str, Any], rows: Rows) -> list[Step]:
     """What a reader may do with the result, or to better it: the most useful first."""
     verdict, steps = document["verdict"], _cures(rows)
     if verdict["predictions"]["trust"] != "poor":
+        again = document["reproduction"]
         use = (
             "Use the model for inputs like those of the logs; it is proven for no others. To "
-            "simulate it on another log of the rig:"
+            f"simulate it on another log of the rig, in {again['folder']}:"
         )
-        columns = document["reproduction"]["columns"]
-        command = "rig replay LOG --parameters parameters.yaml"
-        command += f" --config {columns}" if columns else ""
+        columns, parameters = again["columns"], again.get("parameters", "parameters.yaml")
+        command = f"rig replay LOG --parameters {shlex.quote(parameters)}"
+        command += f" --config {shlex.quote(columns)}" if columns else ""
         steps.insert(0, Step(use, command=command + trust_option(document["model"])))
     elif not steps:
         steps.append(Step("See in the residuals below when and where the model errs."))

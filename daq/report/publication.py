@@ -15,7 +15,7 @@ from daq.figures import style
 from daq.files import digest, make_folder, write_whole
 from daq.identification.baseline import Baseline
 from daq.identification.records import LoggedRecord, Split
-from daq.identification.request import SettingsRequest
+from daq.identification.request import PARAMETERS, SettingsRequest
 from daq.identification.result import Identification, errors_document
 from daq.logs.recording import read_record, settings_of
 from daq.lookup.models import DEFAULT_MODEL
@@ -182,6 +182,7 @@ def _reproduction(result: Identification, logs: Split) -> dict[str, Any]:
     return {
         "command": command_of(problem.request, logs, models, seed),
         "folder": str(Path.cwd()),
+        "parameters": str(result.parameters_file or PARAMETERS),
         "columns": problem.request.config if problem.mapping is not None else None,
         "hold_back": problem.settings.hold_back,
         "selection": problem.selection.document,

@@ -10,6 +10,7 @@ import functools
 import hashlib
 import math
 import os
+import re
 import sys
 import tempfile
 import threading
@@ -195,15 +196,41 @@ def explained_errors(model: ProcessModel) -> Iterator[None]:
     try:
         yield
     except NumbaError as error:
-        lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-        causes = (s for s in lines if "File " not in s and "pipeline" not in s)
-        place = next((s for s in lines if s.startswith('File "') and "<kernel>" not in s), "")
+        text = str(error)
+        lines = [line.strip() for line in text.splitlines() if line.strip()]
+        causes = (s for s in lines if not _ABOUT_KERNELS.search(s))
+        cause = next(causes, "unknown cause")
+        if refused := _REFUSED.search(text):
+            cause = f"{refused[1]} is not understood with what it is given"
+        cure = " (use min and max)" if refused and refused[1] == "clip" else ""
         raise ModelError(
-            f"model {model.name}: its functions cannot be compiled: "
-            f"{next(causes, 'unknown cause')} {place}\n"
+            f"model {model.name}: its functions cannot be compiled: {_place_in(model, text)}{cause}"
+            f"{cure}\n"
             "  They may use floats, tuples, math functions, conditions and helper functions of the "
             "same kind; not lists, dictionaries, strings or objects."
         ) from None
+
+
+# Of the compiler's complaints: a function that has no such arguments, and lines that led there.
+_REFUSED = re.compile(r"Function\(<function (\w+) at 0x")
+_LINE = re.compile(r" at (.+) \((\d+)\)$|File \"(.+)\", line (\d+)", re.MULTILINE)
+_ABOUT_KERNELS = re.compile(
+    "File|pipeline|<intrinsic|^>>>|^There are|^- Of which|^Intrinsic|^With|^Rej"
+)
+
+
+def _place_in(model: ProcessModel, text: str) -> str:
+    """``FILE:LINE: `` of the first line of a model's own file in a complaint; empty for none."""
+    sources = {
+        Path(function.__code__.co_filename).resolve()
+        for function in (model.derivative, model.output)
+        if isinstance(function, types.FunctionType)
+    }
+    for match in _LINE.finditer(text):
+        file, line = filter(None, match.group(1, 2, 3, 4))
+        if (whole := Path(file).resolve()) in sources:
+            return f"{str(whole).removeprefix(f'{Path.cwd()}{os.sep}')}:{line}: "
+    return ""
 
 
 def fingerprint(model: ProcessModel) -> str:

@@ -35,11 +35,11 @@ def test_what_is_hardly_known_is_what_experiments_can_tell_the_widest_first():
 
 
 def test_it_is_said_in_few_words():
-    assert knowledge([WIDE]) == "R_m is known to 20 %"
+    assert knowledge([WIDE]) == "Little is known of R_m (to 20 %)"
     many = [VAGUE, ONE_SIDED, *(replace(WIDE, name=f"p{k}") for k in range(4))]
     assert knowledge(many) == (
-        "c0 is hardly felt, c1 is known on one side only, p0 and p1 are known to 20 %, "
-        "2 more to no better than 10 %"
+        "Little is known of c0 (hardly felt), c1 (one end only), p0, p1 (to 20 %), "
+        "2 more (to no better than 10 %)"
     )
 
 

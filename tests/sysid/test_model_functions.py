@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import types
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -140,7 +141,11 @@ def on_an_object(x, u, p):
     return (GAIN.factor * x[1], -p[0] * x[1] if x[1] > 0.0 else 0.0)
 
 
-@pytest.mark.parametrize("derivative", [on_a_list, on_an_object])
+def clipped(x, u, p):
+    return (np.clip(x[1], -1.0, 1.0), -p[0] * x[1])
+
+
+@pytest.mark.parametrize("derivative", [on_a_list, on_an_object, clipped])
 def test_a_function_that_cannot_be_compiled_says_so(derivative):
     model = build("odd", derivative)
     with pytest.raises(ModelError) as caught:
@@ -150,3 +155,7 @@ def test_a_function_that_cannot_be_compiled_says_so(derivative):
     assert "They may use floats, tuples, math functions" in text
     assert "Traceback" not in text
     assert len(text) < 700
+    assert f"{Path(__file__).name}:" in text
+    if derivative is clipped:
+        line = clipped.__code__.co_firstlineno + 1
+        assert f":{line}: clip is not understood" in text and "(use min and max)" in text
