@@ -192,6 +192,25 @@ def test_an_answer_that_is_no_number_is_a_limit_passed(host):
     assert len(tripped) == 1 and set(played.outputs[tripped[0] :]) == {ZERO}
 
 
+@pytest.mark.parametrize("on", [True, False])
+def test_an_order_behind_its_tick_changes_nothing(host, on):
+    """Late to come, commands go on; late to go, the law does, to references that are zero."""
+    start = orders(host, *([] if on else [lambda host: law(host, True, ON)]))
+
+    def at_tick(tick):
+        start(tick)
+        if tick == 250:
+            host._number += 1
+            host.send(line.LAW, law(host, on, 200))
+
+    commands = [(500, 20)] * 200 + [ZERO] * 200
+    played = host.play(400, commands, Limits(), at_tick=at_tick)
+    flags = [sample.flags & LAW for sample in played.samples[:400]]
+    assert flags == ([0] * 400 if on else [0] * ON + [LAW] * 300)
+    if on:
+        assert played.outputs[: len(commands) - 1] == commands[:-1]
+
+
 HALF_BROKEN = """
 typedef float rig_real;
 typedef struct { rig_real volts[2]; int ticks; } rig_controller;
