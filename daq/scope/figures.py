@@ -1,6 +1,5 @@
 """The figures of a page: one for each quantity, over one axis of time."""
 
-import itertools
 import math
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
@@ -30,6 +29,7 @@ from daq.scope.overlay import EarlierRun
 from daq.scope.trigger import Trigger
 
 _CALM = 0.03  # of a column's span that a stretch may cover and still be drawn as broad: 3 pixels
+_BROAD, _BROAD_ABOVE = 6.0, 2.0  # pixels of what was asked, and of what came of it
 _MARGIN, _FILLED = 0.06, 0.7  # parts of a figure's height: free at each end, filled at least
 _NEAR = 0.7  # of a limit from which its line is shown
 FLAGS = "flags"
@@ -180,14 +180,19 @@ def as_data(columns: Sequence[str], view: View, span: FloatArray) -> dict[str, A
     """
     each = points_of(view)
     data: dict[str, Any] = {"t": np.repeat(view.time, each)}
-    for name in itertools.chain.from_iterable(groups_of(columns)):
+    for name, is_broad in _drawn(columns):
         place = columns.index(name)
         low, high = view.low[:, place], view.high[:, place]
         data[name] = np.stack([low, high], axis=1)[:, :each].ravel()
-        if is_wanted(name):
+        if is_broad:
             calm = high - low <= _CALM * span[place]
             data[broad_name(name)] = np.repeat(np.where(calm, low, np.nan), each)
     return data
+
+
+def _drawn(columns: Sequence[str]) -> list[tuple[str, bool]]:
+    """Columns with a curve, and whether it is broad: where several lie over each other."""
+    return [(name, len(group) > 1) for group in groups_of(columns) for name in group]
 
 
 def flag_marks(view: View) -> dict[str, list[Any]]:
@@ -224,8 +229,10 @@ def _curve_figure(group: Sequence[str], sources: Sources, time: Range1d, cursor:
     # A line of one pixel costs a browser without a graphics card a tenth of one of 1.2 pixels.
     for column in group:
         color = color_of(column)
-        if is_wanted(column):
-            _draw(plot, sources.samples, column, broad_name(column), color, 3.0)
+        if len(group) > 1:
+            # A pixel of blue over orange is olive: two are blue, with orange on both sides.
+            width = _BROAD if is_wanted(column) else _BROAD_ABOVE
+            _draw(plot, sources.samples, column, broad_name(column), color, width)
         _draw(plot, sources.samples, column, column, color)
     plot.name, plot.tags = f"figure of {label}", list(group)
     return plot
