@@ -24,7 +24,7 @@ _NEGLIGIBLE = 1e-3  # part of the largest weight
 _MEAN_SQUARE, _LARGEST = 1.25, 5.5
 # Most that may be lost of a signal, in parts of what is taken away, and the deviations of chance
 # that may hide it.
-_MOST_LOST, _SURELY = 0.2, 2.0
+_MOST_LOST, _SURELY = 0.1, 2.0
 
 
 @dataclass(frozen=True)

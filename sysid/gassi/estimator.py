@@ -116,6 +116,7 @@ class GASSI(RecordEstimator):
     criterion_, criterion_reason_ : what it was, and why.
     output_noise_ : (n_outputs,), noise of the outputs, None where that of inputs and process does
         not count.
+    averaged_inputs_ : whether a filter took noisy inputs as averages.
     rivals_ : parameters in each further minimum that explains the data as well as the result.
     error_ : mean over outputs of the RMSE normalised by max|y| (see ``Objective``); of ``cega``
         (4.6) (see ``CegaObjective``).
@@ -222,6 +223,7 @@ class GASSI(RecordEstimator):
         self._final_accuracy = self.accuracy
         self.criterion_, self.criterion_reason_ = self._criterion(data, preset)
         self.output_noise_: FloatArray | None = None
+        self.averaged_inputs_ = False
         self.excerpt_ = Excerpt.of(data, self.search_samples) if preset.refine else None
         searched = objective
         if self.excerpt_ is not None:
@@ -316,6 +318,7 @@ class GASSI(RecordEstimator):
         self.output_weights_ = likeliest.objective.weights
         if isinstance(likeliest.objective, Innovations):
             self.output_noise_ = likeliest.objective.noise
+            self.averaged_inputs_ = likeliest.objective.quiet
             if likeliest.objective.corrects and self.criterion_ == "compensated":
                 self.criterion_, self.criterion_reason_ = "innovations", _OVERWHELMED
 
@@ -400,7 +403,11 @@ class GASSI(RecordEstimator):
             return objective
         corrects = self.criterion_ == "innovations"
         return Innovations.of(
-            objective, self.output_noise_, corrects=corrects, process=self._process()
+            objective,
+            self.output_noise_,
+            corrects=corrects,
+            process=self._process(),
+            quiet=self.averaged_inputs_,
         )
 
     def _at_final_accuracy(self, objective: Objective) -> Objective:

@@ -365,6 +365,21 @@ def test_noise_above_the_frequencies_of_an_input_is_averaged_away():
     assert np.max(np.abs(of["steps"].record.inputs[:, 0] - steps - noise)) < 0.3
 
 
+def test_intervals_are_those_of_the_averaged_inputs_that_were_fitted():
+    rng = np.random.default_rng(2)
+    u = 3.0 * np.sin(0.5 * np.arange(4000) * DT)
+    y = linear_response(np.array([[-1.0 / TAU]]), np.array([[GAIN / TAU]]), u[:, None], DT, "zoh")
+    y = y + 0.05 * rng.standard_normal(y.shape)
+    noise = np.array([0.1])
+    record = Dataset(u + 0.1 * rng.standard_normal(4000), y, DT, input_noise=noise)
+    fit = GASSI(lag(), population=20, generations=8, criterion="innovations").fit(record)
+    fitted = fit.final_objective(record)
+    assert fit.averaged_inputs_ and fitted.records[0].input_noise[0] < 0.5 * noise[0]
+    assert fitted.settled(fit.chromosome_).noise == pytest.approx(fit.output_noise_, rel=0.02)
+    gain = next(e for e in fit.uncertainty(record).parameters if e.name == "gain")
+    assert gain.low < GAIN < gain.high
+
+
 @pytest.mark.parametrize("share", [1.0, 0.5])
 def test_innovations_of_wrong_parameters_follow_one_another(share):
     record = next(noisy_records(1))
