@@ -8,6 +8,7 @@ import shlex
 import shutil
 import subprocess
 from html.parser import HTMLParser
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -225,9 +226,12 @@ def test_verdict_in_two_sentences_and_how_to_do_it_again(page, document, work, r
     (ambiguity,) = document["ambiguities"]
     assert re.search(rf"Measure {ambiguity['measure'][0]} by other means", page.text)
     assert "give the values under fixed in a file for --config:" in page.text
-    assert re.search(
-        r"rig replay LOG --parameters parameters.yaml --config \S*id.yaml --trust", page.text
-    )
+    (folder, result) = re.search(
+        r"log of the rig, in (\S+): rig replay LOG --parameters (\S+) --config \S*id.yaml --trust",
+        page.text,
+    ).groups()
+    assert folder == document["reproduction"]["folder"]
+    assert (Path(folder) / result).is_file()
     for log in document["reproduction"]["logs"]:
         assert log["sha256"] in page.text
     assert document["software"]["numpy"] in page.text
