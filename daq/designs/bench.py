@@ -96,7 +96,7 @@ class PlantBench:
                 return None
             for name, values in measured.items():
                 signals.setdefault(name, np.empty((len(vectors), len(inputs))))[places] = values
-        if self._leads_astray(inputs, dt, vectors, steps):
+        if self._leads_astray(inputs, dt, vectors, steps, signals):
             return None
         return [self._record(inputs, dt, signals, k) for k in range(len(vectors))]
 
@@ -158,12 +158,18 @@ class PlantBench:
         return True
 
     def _leads_astray(
-        self, inputs: FloatArray, dt: float, vectors: FloatArray, steps: IntArray
+        self,
+        inputs: FloatArray,
+        dt: float,
+        vectors: FloatArray,
+        steps: IntArray,
+        measured: Mapping[str, FloatArray],
     ) -> bool:
         """Whether the plant does what the model does not, or what its encoder does not tell.
 
-        With the likeliest vector, or more than half of some that are soon computed; at commands
-        that are larger by the margin, for an amplifier ends at once.
+        Or what would pass for hardware that fails. With the likeliest vector, or more than half of
+        some that are soon computed; at commands that are larger by the margin, for an amplifier
+        ends at once. measured: signals by name (n, n_samples) at the commands as they are.
         """
         larger = self._scale * inputs
         others = 1 + np.argsort(steps[1:], kind="stable")[: _FOLLOWED - 1]
@@ -175,7 +181,13 @@ class PlantBench:
                 of_it = {name: values[k] for name, values in signals.items()}
                 record = self._record(larger, dt, signals, k)
                 follows = self._follows(record, vectors[place], of_it, n_steps)
-                astray += not (follows and self._tells_speed(of_it["omega"]))
+                as_it_is = {name: values[place] for name, values in measured.items()}
+                astray += not (
+                    follows
+                    and self._tells_speed(of_it["omega"])
+                    and self._seems_healthy(self._samples(larger, dt, of_it, 1.0))
+                    and self._seems_healthy(self._samples(inputs, dt, as_it_is, 1.0))
+                )
                 if astray and (place == 0 or astray > _MINORITY * (1 + len(others))):
                     return True
         return False
@@ -219,9 +231,17 @@ class PlantBench:
         if not all(np.isfinite(values).all() for values in signals.values()):
             return False
         return all(
-            self._passes(self._samples(inputs, dt, {n: s[k] for n, s in signals.items()}))
+            self._passes(
+                self._samples(inputs, dt, {n: s[k] for n, s in signals.items()}, self._scale)
+            )
             for k in range(n_runs)
         )
+
+    def _seems_healthy(self, samples: Samples) -> bool:
+        """Whether no limit takes a run for that of hardware which fails."""
+        limits = Limits(self._rig, ratings=False)
+        limits.begin(Phase.RUN, 1.0 / (samples.time[1] - samples.time[0]))
+        return limits.check(samples) is None
 
     def _passes(self, samples: Samples) -> bool:
         limits, rate = Limits(self._rig, faults=False), 1.0 / (samples.time[1] - samples.time[0])
@@ -231,9 +251,11 @@ class PlantBench:
         limits.begin(Phase.RUN, rate)
         return limits.check(samples) is None
 
-    def _samples(self, inputs: FloatArray, dt: float, signals: Mapping[str, FloatArray]) -> Samples:
-        """A run as a log would have it, with all that it does larger by the margin."""
-        n, scale = len(inputs), self._scale
+    def _samples(
+        self, inputs: FloatArray, dt: float, signals: Mapping[str, FloatArray], scale: float
+    ) -> Samples:
+        """A run as a log would have it, with all that it does larger by a factor."""
+        n = len(inputs)
         missing = np.zeros(n)
         measured = {name: scale * signals.get(name, missing) for name in MEASURED}
         volts = {

@@ -41,12 +41,15 @@ class Doubt:
 
 
 class Limits:
-    """All limits of a rig, asked together; faults: also those that tell hardware which fails."""
+    """All limits of a rig, asked together.
 
-    def __init__(self, config: RigConfig, *, faults: bool = True) -> None:
+    faults: those too that tell hardware which fails; ratings: the others.
+    """
+
+    def __init__(self, config: RigConfig, *, faults: bool = True, ratings: bool = True) -> None:
         users = [_UserCode(settings) for settings in config.limits.own]
         limits = [*_built_in(config), *users]
-        self._limits = [limit for limit in limits if faults or not limit.tells_faults]
+        self._limits = [each for each in limits if (faults if each.tells_faults else ratings)]
         self._phase = Phase.OPEN
         self._doubts: dict[Limit, Doubt] = {}
 

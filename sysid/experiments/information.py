@@ -29,6 +29,8 @@ from sysid.problem.space import SearchSpace
 # Share of the largest information above which a direction that tells nothing is told something.
 _PHANTOM = 1e-10
 _BURST = 1e3  # times its span, by which no output moves over the range of a parameter
+# Share of the largest scatter, of coordinates of like scatter, below which a direction has none.
+_LEAST, _TINY = 1e-9, 1e-300
 # Draws of the inputs' noise: they give a variance to within a third.
 _DRAWS = 16
 
@@ -173,7 +175,11 @@ class Informant:
         if not n_draws or not np.isfinite(curvature).all():
             return curvature
         pushes, score = weighted.T @ changes.reshape(-1, n_draws), quiet.T @ quiet
-        effective: FloatArray = curvature @ pinvh(score + pushes @ pushes.T / n_draws) @ curvature
+        scatter = score + pushes @ pushes.T / n_draws
+        # Rounding along what no record tells must not come back divided by next to nothing.
+        size = np.sqrt(np.maximum(np.diag(scatter), _TINY))
+        inverse = pinvh(scatter / np.outer(size, size), rtol=_LEAST)
+        effective: FloatArray = curvature @ (inverse / np.outer(size, size)) @ curvature
         return effective
 
     def null_directions(self, chromosome: FloatArray) -> FloatArray:

@@ -69,6 +69,7 @@ def test_all_of_a_family_are_runs_of_the_frames_length_within_the_ranges(name):
         ({"travel": [-1.0, 5.01]}, 1.2),
         ({"i2t": {"motor": {"continuous": 0.1, "budget": 0.01}}}, 0.6),
         ({"command": {"motor": [-0.5, 0.5]}}, 0.6),
+        ({"encoder": {"acceleration": 200.0}}, 1.2),  # what a healthy shaft would not do
     ],
 )
 def test_a_run_beyond_any_limit_is_refused(limits, motor):
