@@ -81,9 +81,9 @@ class Question(Section):
     )
     draws: int = Field(2, ge=1, le=64, description="parameter sets over which it is averaged")
     checks: int = Field(16, ge=1, le=1024, description="parameter sets that must keep the limits")
-    candidates: int = Field(64, ge=1, le=100_000, description="runs tried at random")
-    generations: int = Field(6, ge=0, le=1000, description="rounds in which the best are varied")
-    offspring: int = Field(12, ge=1, le=10_000, description="new runs in each")
+    candidates: int = Field(96, ge=1, le=100_000, description="runs tried at random")
+    generations: int = Field(8, ge=0, le=1000, description="rounds in which the best are varied")
+    offspring: int = Field(16, ge=1, le=10_000, description="new runs in each")
     seed: int = Field(0, ge=0, le=2**32 - 1, description="one seed, one result")
 
     @model_validator(mode="after")

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from threading import Lock
 
 import numpy as np
+import numpy.typing as npt
 
 from daq.config.rig import RigConfig
 from daq.designs.knowledge import expected_jitter, speed_noise
@@ -12,6 +13,7 @@ from daq.experiment import Plan
 from daq.hal import CHANNELS, FloatArray, IntArray, Phase, Samples
 from daq.limits import Limits
 from daq.limits.base import TURN
+from daq.limits.encoder import Acceleration
 from daq.logs.encoder import SPEED
 from daq.run.plan import check_commands
 from sysid import BatchSimulator, Dataset, ProcessModel
@@ -88,15 +90,22 @@ class PlantBench:
         if not self._commands_allowed(inputs, dt):
             return None
         steps = self._steps(dt, vectors)
+        # What refuses most is computed first.
+        if self._astray(inputs, dt, vectors[:1], steps[:1]).any():
+            return None
         signals: dict[str, FloatArray] = {}
-        # Those that are soon computed first: they refuse most of what is refused.
+        # Those that are soon computed first: they refuse most of what limits refuse.
         for places in _by_steps(steps):
             measured = self._run(inputs, dt, vectors[places], int(steps[places].max()))
             if not self._within_limits(inputs, dt, measured):
                 return None
             for name, values in measured.items():
                 signals.setdefault(name, np.empty((len(vectors), len(inputs))))[places] = values
-        if self._leads_astray(inputs, dt, vectors, steps, signals):
+        others = 1 + np.argsort(steps[1:], kind="stable")[: _FOLLOWED - 1]
+        astray = self._astray(inputs, dt, vectors[others], steps[others])
+        moves = [{name: s[place] for name, s in signals.items()} for place in (0, *others)]
+        struck = np.array([not self._accelerates(inputs, dt, of_it) for of_it in moves], dtype=bool)
+        if struck[0] or np.sum(astray | struck[1:]) > _MINORITY * (1 + len(others)):
             return None
         return [self._record(inputs, dt, signals, k) for k in range(len(vectors))]
 
@@ -157,40 +166,25 @@ class PlantBench:
             return False
         return True
 
-    def _leads_astray(
-        self,
-        inputs: FloatArray,
-        dt: float,
-        vectors: FloatArray,
-        steps: IntArray,
-        measured: Mapping[str, FloatArray],
-    ) -> bool:
-        """Whether the plant does what the model does not, or what its encoder does not tell.
+    def _astray(
+        self, inputs: FloatArray, dt: float, vectors: FloatArray, steps: IntArray
+    ) -> npt.NDArray[np.bool_]:
+        """Whether the plant does what the model does not, or what its encoder does not tell, (n,).
 
-        Or what would pass for hardware that fails. With the likeliest vector, or more than half of
-        some that are soon computed; at commands that are larger by the margin, for an amplifier
-        ends at once. measured: signals by name (n, n_samples) at the commands as they are.
+        Or what would pass for hardware that fails. At commands that are larger by the margin, for
+        an amplifier ends at once.
         """
-        larger = self._scale * inputs
-        others = 1 + np.argsort(steps[1:], kind="stable")[: _FOLLOWED - 1]
-        astray = 0
-        for places in (np.zeros(1, dtype=np.int64), others):
-            n_steps = int(steps[places].max(initial=1))
-            signals = self._run(larger, dt, vectors[places], n_steps)
-            for k, place in enumerate(places):
-                of_it = {name: values[k] for name, values in signals.items()}
-                record = self._record(larger, dt, signals, k)
-                follows = self._follows(record, vectors[place], of_it, n_steps)
-                as_it_is = {name: values[place] for name, values in measured.items()}
-                astray += not (
-                    follows
-                    and self._tells_speed(of_it["omega"])
-                    and self._seems_healthy(self._samples(larger, dt, of_it, 1.0))
-                    and self._seems_healthy(self._samples(inputs, dt, as_it_is, 1.0))
-                )
-                if astray and (place == 0 or astray > _MINORITY * (1 + len(others))):
-                    return True
-        return False
+        larger, n_steps = self._scale * inputs, int(steps.max(initial=1))
+        signals = self._run(larger, dt, vectors, n_steps)
+        astray = np.zeros(len(vectors), dtype=bool)
+        for k, vector in enumerate(vectors):
+            of_it = {name: values[k] for name, values in signals.items()}
+            astray[k] = not (
+                self._tells_speed(of_it["omega"])
+                and self._accelerates(larger, dt, of_it)
+                and self._follows(self._record(larger, dt, signals, k), vector, of_it, n_steps)
+            )
+        return astray
 
     def _tells_speed(self, omega: FloatArray) -> bool:
         """Whether the encoder tells a speed (n_samples,).
@@ -237,11 +231,13 @@ class PlantBench:
             for k in range(n_runs)
         )
 
-    def _seems_healthy(self, samples: Samples) -> bool:
-        """Whether no limit takes a run for that of hardware which fails."""
-        limits = Limits(self._rig, ratings=False)
-        limits.begin(Phase.RUN, 1.0 / (samples.time[1] - samples.time[0]))
-        return limits.check(samples) is None
+    def _accelerates(
+        self, inputs: FloatArray, dt: float, signals: Mapping[str, FloatArray]
+    ) -> bool:
+        """Whether a shaft's speed changes no faster than the limit holds for possible."""
+        limits = Limits(self._rig, only=Acceleration)
+        limits.begin(Phase.RUN, 1.0 / dt)
+        return limits.check(self._samples(inputs, dt, signals, 1.0)) is None
 
     def _passes(self, samples: Samples) -> bool:
         limits, rate = Limits(self._rig, faults=False), 1.0 / (samples.time[1] - samples.time[0])

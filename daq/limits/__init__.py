@@ -43,13 +43,19 @@ class Doubt:
 class Limits:
     """All limits of a rig, asked together.
 
-    faults: those too that tell hardware which fails; ratings: the others.
+    faults: those too that tell hardware which fails. only: those of one class.
     """
 
-    def __init__(self, config: RigConfig, *, faults: bool = True, ratings: bool = True) -> None:
+    def __init__(
+        self, config: RigConfig, *, faults: bool = True, only: type[Limit] = Limit
+    ) -> None:
         users = [_UserCode(settings) for settings in config.limits.own]
         limits = [*_built_in(config), *users]
-        self._limits = [each for each in limits if (faults if each.tells_faults else ratings)]
+        self._limits = [
+            limit
+            for limit in limits
+            if isinstance(limit, only) and (faults or not limit.tells_faults)
+        ]
         self._phase = Phase.OPEN
         self._doubts: dict[Limit, Doubt] = {}
 
