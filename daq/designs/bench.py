@@ -38,7 +38,8 @@ class PlantBench:
     by name; a run in which the plant does what the model does not, such as an amplifier at the end
     of its range, would lead its parameters astray, and is refused as well. timed: whether the
     rig's speed is one count over the time between edges, whose instants err; a run in which the
-    shaft turns round every few samples is refused then.
+    shaft turns round every few samples is refused then. known: whether the draws are those of an
+    identification: then none that is compared may lead the model astray.
     """
 
     def __init__(
@@ -50,6 +51,7 @@ class PlantBench:
         margin: float = 0.1,
         noise: Mapping[str, float] | None = None,
         timed: bool = False,
+        known: bool = False,
     ) -> None:
         for name in set(model.input_names) - {*COMMANDS, *plant.output_names}:
             raise ConfigError(
@@ -66,6 +68,7 @@ class PlantBench:
             )
         self._model, self._rig, self._turns = model, rig, turns
         self._timed = timed and SPEED in model.output_names
+        self._astray_at_most = 0.0 if known else _MINORITY
         self._scale = 1.0 / (1.0 - margin)
         self._simulator = BatchSimulator(plant, accuracy=_ACCURACY, threads=1)
         self._model_simulator = BatchSimulator(model, accuracy=_ACCURACY, threads=1)
@@ -85,7 +88,8 @@ class PlantBench:
         """As of ``sysid.experiments.bench.Bench``; inputs: commands (n_samples, 2) [V].
 
         Refused is what passes a limit with any vector, and what leads the model astray with the
-        likeliest or with more than half of those that are compared.
+        likeliest or with more than half of those that are compared, or any that is known to be
+        plausible.
         """
         if not self._commands_allowed(inputs, dt):
             return None
@@ -105,7 +109,7 @@ class PlantBench:
         astray = self._astray(inputs, dt, vectors[others], steps[others])
         moves = [{name: s[place] for name, s in signals.items()} for place in (0, *others)]
         struck = np.array([not self._accelerates(inputs, dt, of_it) for of_it in moves], dtype=bool)
-        if struck[0] or np.sum(astray | struck[1:]) > _MINORITY * (1 + len(others)):
+        if struck[0] or np.sum(astray | struck[1:]) > self._astray_at_most * (1 + len(others)):
             return None
         return [self._record(inputs, dt, signals, k) for k in range(len(vectors))]
 

@@ -39,8 +39,10 @@ def plausible_parameters(
     with np.errstate(divide="ignore", invalid="ignore"):
         steps = np.where(steps == 0.0, 0.0, steps / increments)
     moved = _moved(np.tile(vector, (n, 1)), steps, positive)
-    for combinations in _curved(model, names):
-        moved = _tied(model, vector, steps, moved, places, positive, combinations)
+    # What goes beyond all numbers is left out.
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        for combinations in _curved(model, names):
+            moved = _tied(model, vector, steps, moved, places, positive, combinations)
     kept = [
         draw
         for draw in moved[np.isfinite(moved).all(axis=1)]
@@ -74,8 +76,7 @@ def _tied(
     values, slopes = _evaluated(model, vector[None], positive, combinations)
     scale, rise = np.abs(values[0]), steps @ slopes[0].T
     # A sum of positive parameters stays positive, however far the covariance would take it.
-    with np.errstate(over="ignore"):
-        by_factors = scale * np.exp(rise / scale)
+    by_factors = scale * np.exp(rise / scale)
     wanted = np.where(_is_positive(model, combinations), by_factors, values + rise)
     free = np.zeros(len(vector), dtype=np.bool_)
     free[list(places)] = True
