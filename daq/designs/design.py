@@ -102,7 +102,18 @@ def choose(setup: Setup, watch: Watch = ignore) -> Design:
         )
     except ModelError as error:
         key = ("targets",) if setup.targets else ("protocols",)
-        raise setup.file.error(key, str(error)) from None
+        raise setup.file.error(key, f"{error}{_strays(setup)}") from None
+
+
+def _strays(setup: Setup) -> str:
+    """How many runs were refused for the model's sake, and the cure; empty for none."""
+    count = setup.bench.strays
+    if not count:
+        return ""
+    return (
+        f" (in {count} runs the plant did what model {setup.problem.model_name} does not: name one "
+        "that is like the plant, as --model actuator:hysteresis=dahl for a rig of that kind)"
+    )
 
 
 def write(setup: Setup, chosen: Design, folder: Path) -> DesignResult:

@@ -1,13 +1,11 @@
 """What an experiment is to bring: scalar criteria of its information.
 
 D: the entropy of the parameters falls most. A: the mean of the chosen quantities' variances is
-least. E: the worst of them is. widths: the geometric mean of their deviations is, in which those
-that leave an interval wider than 15 % count fourfold. ``targets``: the quantities miss their
-deviations by the smallest factor, the product of those that do (Atkinson, Donev and Tobias,
-"Optimum Experimental Designs, with SAS", 2007, chapter 10). All are losses in logarithms, so that
-their mean over draws of the parameters (ED-optimality: Pronzato and Walter, "Robust experiment
-design via stochastic approximation", Mathematical Biosciences 75, 1985) lets no draw outweigh the
-others by its size.
+least. E: the worst of them is. ``targets``: the quantities miss their deviations by the smallest
+factor, the product of those that do (Atkinson, Donev and Tobias, "Optimum Experimental Designs,
+with SAS", 2007, chapter 10). All are losses in logarithms, so that their mean over draws of the
+parameters (ED-optimality: Pronzato and Walter, "Robust experiment design via stochastic
+approximation", Mathematical Biosciences 75, 1985) lets no draw outweigh the others by its size.
 """
 
 from dataclasses import dataclass, field
@@ -17,11 +15,9 @@ import numpy as np
 
 from sysid.arrays import FloatArray
 from sysid.problem.model import ModelError
-from sysid.uncertainty.estimate import Z95
 
-Name = Literal["D", "A", "E", "widths"]
+Name = Literal["D", "A", "E"]
 
-_WIDE, _FURTHER = 0.15 / Z95, 3.0  # deviation of what is hardly known, and what it counts further
 _MET = 1e-3  # what a target that is met counts, so that of designs that meet all one is the best
 
 
@@ -56,10 +52,6 @@ class Criterion:
             missed = np.log(deviations / self.targets)
             short: FloatArray = np.where(missed > 0.0, missed, _MET * missed).sum(axis=-1)
             return np.asarray(short.mean(axis=1))
-        if self.name == "widths":
-            sizes = np.log(deviations)
-            wide = np.maximum(sizes - np.log(_WIDE), 0.0)
-            return np.asarray((sizes + _FURTHER * wide).mean(axis=(1, 2)))
         variances = deviations**2
         counted = variances.max(axis=-1) if self.name == "E" else variances.mean(axis=-1)
         losses: FloatArray = 0.5 * np.log(counted).mean(axis=1)

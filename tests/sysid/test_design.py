@@ -18,7 +18,6 @@ from sysid import (
     State,
     design,
 )
-from sysid.experiments.criteria import Criterion
 from sysid.experiments.information import Informant, refuse_phantoms
 from tests.sysid.support import blank
 
@@ -205,19 +204,6 @@ def test_an_error_of_the_simulation_that_passes_for_information_is_refused():
     refuse_phantoms(np.array([[1.0, 1.0], [1.0, 1.0]]), null)
     with pytest.raises(ModelError, match="its error passes for information"):
         refuse_phantoms(np.array([[1.0, 1.0], [1.0, 1.0 + 1e-6]]), null)
-
-
-@pytest.mark.parametrize(
-    ("deviations", "better"),
-    [
-        ([[0.01, 0.06], [0.02, 0.04]], 0),  # the smaller product of the two
-        ([[0.01, 0.30], [0.035, 0.10]], 1),  # 30 % is so wide that it counts more
-    ],
-)
-def test_widths_are_compared_by_their_geometric_mean_unless_wide(deviations, better):
-    information = np.array([[np.diag(1.0 / np.square(row))] for row in deviations])
-    criterion = Criterion("widths", np.zeros((2, 2)), np.eye(2)[None])
-    assert np.argmin(criterion.losses(information)) == better
 
 
 def test_earlier_information_leaves_less_to_gain():
