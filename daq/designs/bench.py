@@ -38,8 +38,8 @@ class PlantBench:
     by name; a run in which the plant does what the model does not, such as an amplifier at the end
     of its range, would lead its parameters astray, and is refused as well. timed: whether the
     rig's speed is one count over the time between edges, whose instants err; a run in which the
-    shaft turns round every few samples is refused then. known: whether the draws are those of an
-    identification: then none that is compared may lead the model astray. strays: runs that were
+    shaft turns round every few samples is refused then. identified: whether the draws are those of
+    an identification: then none that is compared may lead the model astray. strays: runs that were
     refused since the plant does what the model does not.
     """
 
@@ -52,7 +52,7 @@ class PlantBench:
         margin: float = 0.1,
         noise: Mapping[str, float] | None = None,
         timed: bool = False,
-        known: bool = False,
+        identified: bool = False,
     ) -> None:
         for name in set(model.input_names) - {*COMMANDS, *plant.output_names}:
             raise ConfigError(
@@ -69,7 +69,7 @@ class PlantBench:
             )
         self._model, self._rig, self._turns = model, rig, turns
         self._timed = timed and SPEED in model.output_names
-        self._known, self.strays = known, 0
+        self._identified, self.strays = identified, 0
         self._scale = 1.0 / (1.0 - margin)
         self._simulator = BatchSimulator(plant, accuracy=_ACCURACY, threads=1)
         self._model_simulator = BatchSimulator(model, accuracy=_ACCURACY, threads=1)
@@ -108,12 +108,12 @@ class PlantBench:
             for name, values in measured.items():
                 signals.setdefault(name, np.empty((len(vectors), len(inputs))))[places] = values
         others = np.arange(1, min(_FOLLOWED, len(vectors)))
-        if not self._known:  # of wide ranges the slow ones are soon computed
+        if not self._identified:  # of wide ranges the slow ones are soon computed
             others = 1 + np.argsort(steps[1:], kind="stable")[: _FOLLOWED - 1]
         astray = self._astray(inputs, dt, vectors[others], steps[others])
         moves = [{name: s[place] for name, s in signals.items()} for place in (0, *others)]
         struck = np.array([not self._accelerates(inputs, dt, of_it) for of_it in moves], dtype=bool)
-        at_most = 0.0 if self._known else _MINORITY * (1 + len(others))
+        at_most = 0.0 if self._identified else _MINORITY * (1 + len(others))
         if struck[0] or np.sum(astray | struck[1:]) > at_most:
             return None
         return [self._record(inputs, dt, signals, k) for k in range(len(vectors))]

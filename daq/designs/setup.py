@@ -137,8 +137,8 @@ def _set_up_each(
         plant = _plant(file, question, rig_name, device, turns, parts)
         space = _space(file, problem)
         earlier = result if name is None or _is_of(result, problem) else None
-        known = earlier is not None
-        bench = PlantBench(problem.model, plant, rig, turns, margin, noise, timed, known)
+        identified = earlier is not None
+        bench = PlantBench(problem.model, plant, rig, turns, margin, noise, timed, identified)
         setups.append(
             Setup(
                 file, question, rig_name, rig, problem, space, bench, families,

@@ -186,8 +186,9 @@ def test_mistakes_are_named_with_their_cure(folder, args, what):
 
 
 def test_structures_of_different_outputs_cannot_be_ranked(folder):
-    settings = SETTINGS + "    w: {column: y}\n"
-    (folder / "id.yaml").write_text(settings)
+    (folder / "id.yaml").write_text(SETTINGS + "    w: {column: again}\n")
+    log = pd.read_csv(folder / "training.csv")
+    log.assign(again=log["y"]).to_csv(folder / "training.csv", index=False)
     result = identify(folder, "--model", LAG, "--model", "models.py:pair")
     assert result.returncode == 2
     assert "models.py:lag has the outputs y" in result.stderr

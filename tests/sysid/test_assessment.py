@@ -220,7 +220,9 @@ def test_errors_above_the_noise_make_parameters_doubtful_and_predictions_not():
     # Without a calibration of the current that of the speed is tested all the same.
     data = record(2)
     unknown = examine(data, data.outputs + NOISE, expected([NOISE**2, np.nan], data))
-    assert "noise of current is not known" in verdict([unknown], [unknown]).notes[0]
+    assert (
+        "noise of current is neither calibrated nor given" in verdict([unknown], [unknown]).notes[0]
+    )
 
 
 def test_what_the_parameters_own_uncertainty_leaves_of_an_input_is_not_missing_dynamics():
