@@ -22,9 +22,7 @@ from daq.logs.capture import COMPLETED, INTERLOCK, RUN_NAME
 
 _REQUEST = "characterise.json"
 _RUNS, _IDENTIFICATION = "runs", "identification"
-_STOPS = (
-    2  # by limits, from which on an experiment is left out: after the first its cause is sought
-)
+_STOPS = 2  # by limits, from which on an experiment is left out; after one its cause is sought
 
 
 @dataclass(frozen=True)

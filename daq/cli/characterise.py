@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from typer import Argument, Option
 
 from daq.cli import completion, options, terminal
+from daq.cli.identification import print_verdict
 from daq.config.units import converted
 from daq.errors import ConfigError
 
@@ -112,12 +113,7 @@ def _show(result: Characterisation) -> None:
     head = ["quantity", "value", "unit", "half width", "expected"]
     terminal.print_table(title, head, rows, text=["unit"])
     terminal.print_text(f"It ended because {result.reason}.")
-    for subject in ("predictions", "parameters"):
-        statement = result.verdict[subject]
-        reasons = " ".join(statement["reasons"])
-        terminal.print_text(f"{subject.capitalize()}: {statement['trust']}. {reasons}")
-    for note in result.verdict["notes"]:
-        terminal.print_text(note)
+    print_verdict(result.verdict)
     print(f"Page: {result.page}")
     print(f"Report: {result.report}")
     last = result.rounds[-1]

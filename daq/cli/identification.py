@@ -253,7 +253,7 @@ def _show_residuals(rows: Rows) -> None:
 def _show_notes(result: Identification) -> None:
     from daq.identification.rows import start_sentences
 
-    rows, verdict = result.rows, result.verdict
+    rows = result.rows
     if result.interrupted:
         terminal.print_text(
             f"Stopped by Ctrl-C after {len(result.estimator.history_)} generations: "
@@ -276,11 +276,7 @@ def _show_notes(result: Identification) -> None:
         )
     for name, how in result.document.get("averaged", {}).items():
         terminal.print_text(f"Output {name}: {how}.")
-    statements = {"Predictions": verdict.predicted, "Parameters": verdict.parameters}
-    for subject, statement in statements.items():
-        terminal.print_text(f"{subject}: {statement.trust}. {' '.join(statement.reasons)}")
-    for note in verdict.notes:
-        terminal.print_text(note)
+    print_verdict(result.document["verdict"])
     for line in start_sentences(result.document["metrics"]["validation"]):
         terminal.print_text(line)
     if rows.refined:
@@ -288,6 +284,16 @@ def _show_notes(result: Identification) -> None:
         for sentence in (rows.together_sentence, rows.disagreement_sentence):
             if sentence:
                 terminal.print_text(sentence)
+
+
+def print_verdict(verdict: Mapping[str, Any]) -> None:
+    """Both statements with their reasons, and notes, of a result's document."""
+    for subject in ("predictions", "parameters"):
+        statement = verdict[subject]
+        reasons = " ".join(statement["reasons"])
+        terminal.print_text(f"{subject.capitalize()}: {statement['trust']}. {reasons}")
+    for note in verdict["notes"]:
+        terminal.print_text(note)
 
 
 def print_errors(errors: Mapping[str, Mapping[str, OutputErrors]], of: str = "") -> None:

@@ -138,9 +138,8 @@ def design(
     may be. targets: half width of the 95 % interval that is wanted, in parts of the value, by
     parameter or combination (``{"K_m": 0.01, "J_m + J_b": 0.05}``); runs are added until all are
     met; precision: the same for all that experiments can tell. Without them the ``criterion``
-    decides: D of all parameters; A (mean variance), E (largest variance) or widths (geometric
-    mean, those wider than 15 % counting more) of ``quantities``, by default all that experiments
-    can tell.
+    decides: D of all parameters; A (mean variance) or E (largest variance) of ``quantities``, by
+    default all that experiments can tell.
 
     prior: what is known, by default the model's ranges around its nominal values; before: (n_free,
     n_free), information of runs that have been made. ranges, fixed, tied: as of an identification.

@@ -65,8 +65,9 @@ class Informant:
         n_free, unknown = len(self._space.index), self._unknown(record)
         n_draws = _DRAWS if len(self._noisy) else 0
         slopes = self._slopes(record, chromosomes, n_free, unknown, n_draws)
-        slopes[self._burst(slopes[..., :n_free], record, chromosomes)] = np.nan
-        errors = self.variances(record, chromosomes)
+        outputs = self._simulator.trajectories(self._space.full(chromosomes), record)
+        slopes[self._burst(slopes[..., :n_free], outputs)] = np.nan
+        errors = self.variances(record, outputs)
         joint = [
             self._joint(each, scatter, n_free + len(unknown))
             for each, scatter in zip(slopes, errors, strict=True)
@@ -136,24 +137,25 @@ class Informant:
         )
         return slopes
 
-    def _burst(self, slopes: FloatArray, record: Dataset, chromosomes: FloatArray) -> BoolArray:
+    def _burst(self, slopes: FloatArray, outputs: FloatArray) -> BoolArray:
         """Whether tangents have burst where the simulation has not, (n,).
 
         Steps that leave a state bounded, as on a saturating one, may still make more of its tangent
         with each; what moves by a thousand times its span over a parameter's range is no answer.
         """
-        outputs = self._simulator.trajectories(self._space.full(chromosomes), record)
         spans = np.maximum(np.ptp(outputs, axis=1), self._noise)
         largest = np.max(np.abs(slopes) * self._space.width, axis=(1, 3), initial=0.0)
         burst: BoolArray = np.any(largest > _BURST * spans, axis=1)
         return burst
 
-    def variances(self, record: Dataset, chromosomes: FloatArray) -> FloatArray:
-        """Variances of the samples' errors, inputs without noise, (n, n_samples, n_outputs)."""
-        white = np.broadcast_to(self._noise**2, (len(chromosomes), *record.outputs.shape))
+    def variances(self, record: Dataset, outputs: FloatArray) -> FloatArray:
+        """Variances of the samples' errors, inputs without noise, (n, n_samples, n_outputs).
+
+        outputs: of so many simulations of the record, which say how much an instant's error does.
+        """
+        white = np.broadcast_to(self._noise**2, outputs.shape)
         if not record.jitter.any():
             return white
-        outputs = self._simulator.trajectories(self._space.full(chromosomes), record)
         rates = np.diff(outputs, axis=1) / record.dt
         return white + np.array([mean_of_sides(each**2) for each in rates]) * record.jitter**2
 

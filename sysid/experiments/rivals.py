@@ -82,7 +82,7 @@ def answer(structure: Hypothesis, record: Dataset, n_steps: int, counted: BoolAr
     """
     vector, values = structure.space.full(structure.values), structure.values
     outputs = structure.simulator.trajectories(vector[None], record, n_steps)[0]
-    variances = structure.informant.variances(record, values[None])[0]
+    variances = structure.informant.variances(record, outputs[None])[0]
     pushes = structure.informant.pushes(record, values)
     moved = np.sum(pushes**2, axis=-1) / max(pushes.shape[-1], 1)
     with np.errstate(invalid="ignore"):

@@ -141,7 +141,8 @@ class Search:
             moves = width * rng.standard_normal(len(genes))
             return np.clip(genes + moves * (rng.random(len(genes)) < 0.5), 0.0, 1.0)
         moved = genes.copy()
-        for k in rng.choice(len(genes), 1 + (rng.random() < _TWO), replace=False):
+        count = min(1 + (rng.random() < _TWO), len(genes))
+        for k in rng.choice(len(genes), count, replace=False):
             nearby = np.clip(moved[k] + 2.0 * width * rng.standard_normal(), 0.0, 1.0)
             moved[k] = rng.choice([nearby, rng.random(), rng.integers(2)], p=_MOVES)
         return moved

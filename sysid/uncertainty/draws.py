@@ -7,7 +7,7 @@ import numpy as np
 from sysid.arrays import BoolArray, FloatArray
 from sysid.identifiability.cache import kept_identifiability
 from sysid.identifiability.combination import Combination
-from sysid.problem.model import ProcessModel
+from sysid.problem.model import ModelError, ProcessModel
 
 _STEPS = 30  # of Newton's method, which takes about five
 _CLOSE = 1e-9  # in parts of a combination's value
@@ -36,11 +36,10 @@ def plausible_parameters(
     steps[:, places] = rng.standard_normal((n, len(factor))) @ factor
     positive = np.array([p.scale == "log" for p in model.parameters])
     increments = np.where(positive, vector, 1.0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        steps = np.where(steps == 0.0, 0.0, steps / increments)
-    moved = _moved(np.tile(vector, (n, 1)), steps, positive)
     # What goes beyond all numbers is left out.
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        steps = np.where(steps == 0.0, 0.0, steps / increments)
+        moved = _moved(np.tile(vector, (n, 1)), steps, positive)
         for combinations in _curved(model, names):
             moved = _tied(model, vector, steps, moved, places, positive, combinations)
     kept = [
@@ -53,15 +52,18 @@ def plausible_parameters(
 
 def _moved(vectors: FloatArray, steps: FloatArray, positive: BoolArray) -> FloatArray:
     """Vectors after steps in search coordinates, both (n, n_parameters)."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        moved: FloatArray = np.where(positive, vectors * np.exp(steps), vectors + steps)
+    moved: FloatArray = np.where(positive, vectors * np.exp(steps), vectors + steps)
     return moved
 
 
 def _curved(model: ProcessModel, names: Sequence[str]) -> list[list[Combination]]:
     """Combinations of each tied group that moves and has one that is no product."""
-    groups = []
-    for group in kept_identifiability(model).tied:
+    groups: list[list[Combination]] = []
+    try:
+        tied = kept_identifiability(model).tied if len(names) else ()
+    except (ModelError, ArithmeticError):  # equations that cannot be followed
+        return groups
+    for group in tied:
         usable = [c for c in group.combinations if set(c.names) <= set(model.parameter_names)]
         if any(len(c.terms) > 1 and set(c.names) & set(names) for c in usable):
             groups.append(usable)

@@ -213,3 +213,12 @@ def test_earlier_information_leaves_less_to_gain():
     for once, twice in zip(first.quantities, second.quantities, strict=True):
         assert twice.before == pytest.approx(once.after, rel=1e-6)
         assert twice.after < 0.8 * once.after
+
+
+def test_excitations_of_a_single_setting_have_offspring():
+    step = Excitation(
+        "step", {"height": Setting(0.1, 2.0)}, lambda s: np.full((100, 1), s["height"]), DT
+    )
+    for seed in range(3):
+        result = design(lag(), [step], noise=NOISE, seed=seed, **(QUICK | {"offspring": 12}))
+        assert result.runs[0].settings["height"] == pytest.approx(2.0, rel=0.1)
