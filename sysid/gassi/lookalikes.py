@@ -13,7 +13,8 @@ import numpy as np
 
 from sysid.arrays import BoolArray, ComplexArray, FloatArray
 from sysid.fitting.objective import Objective
-from sysid.response.linearization import jacobians
+from sysid.gassi.responses import alike_responses
+from sysid.response.linearization import linear_models
 
 _FASTEST_SEEN = 0.4  # of the sample rate: slower modes have no alias that could be mistaken
 _REACH = 2.0  # times that aliases may be faster or slower than the mode
@@ -31,7 +32,8 @@ def lookalikes(objective: Objective, chromosome: FloatArray) -> list[FloatArray]
     """Chromosomes (n_free,) in the ranges whose fastest mode is this one's or an alias of it."""
     modes = _Modes(objective, chromosome)
     dt = objective.records[0].dt
-    return [*_swaps(objective, chromosome), *_twins(modes), *_aliases(modes, dt)]
+    starts = [*_swaps(objective, chromosome), *_twins(modes), *_aliases(modes, dt)]
+    return [*starts, *alike_responses(objective, chromosome)]
 
 
 def _swaps(objective: Objective, chromosome: FloatArray) -> list[FloatArray]:
@@ -163,6 +165,6 @@ class _Modes:
 
     def _eigenvalues(self, at: FloatArray) -> ComplexArray:
         vectors = self.space.full(self.space.decode(at))
-        matrices = jacobians(self.model, self.x, self.u, vectors)
+        matrices = linear_models(self.model, self.x, self.u, vectors).A
         eigenvalues = np.linalg.eigvals(np.where(np.isfinite(matrices), matrices, 0.0))
         return eigenvalues.astype(np.complex128)

@@ -570,10 +570,7 @@ def _untested(
             "be explained is not tested."
         )
     if findings is None:
-        parameters = () if uncertainty is None else uncertainty.parameters
-        ends = [p.name for p in parameters if p.pushed and not p.why]
-        since = f": {', '.join(ends)} on an end of the range would look like it" if ends else ""
-        yield f"What the model may lack was not tested{since}."
+        yield "What the model may lack was not tested."
 
 
 def _parameter_praise(findings: Sequence[Finding] | None) -> str:

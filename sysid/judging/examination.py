@@ -1,24 +1,27 @@
 """All that a verdict rests on, of a fitted estimator: runs and their tests, what is missing."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-
-import numpy as np
+from dataclasses import dataclass, replace
 
 from sysid.arrays import FloatArray
 from sysid.fitting.free_run import estimate_start
+from sysid.fitting.objective import Objective
+from sysid.fitting.refinement import refine
 from sysid.gassi import GASSI, PRESETS
-from sysid.judging.alternatives import Alternative, best_alternative, fits
-from sysid.judging.assessment import FITTED, RecordResult, Verdict, examine, judge
+from sysid.judging.alternatives import Alternative, best_alternative
+from sysid.judging.assessment import RecordResult, Verdict, examine, judge
 from sysid.judging.expected_errors import expected_errors
 from sysid.judging.lags import lag_faults
 from sysid.judging.score_tests import Finding, missing_physics
 from sysid.judging.starts import estimated_starts
 from sysid.problem.data import Dataset
 from sysid.problem.faults import data_faults
-from sysid.problem.model import ModelError
+from sysid.problem.model import ModelError, Parameter
 from sysid.threads import one_thread
 from sysid.uncertainty import Uncertainty
+from sysid.uncertainty.analysis import uncertainty as intervals
+
+_BEYOND = 10.0  # times its range, to where a parameter is freed that stands on an end of it
 
 
 @dataclass(frozen=True)
@@ -94,14 +97,34 @@ def suspected(
     """
     if uncertainty is None:
         return None
-    if any(p.pushed and not p.why for p in uncertainty.parameters):
-        runs = [estimator.predict(record) for record in training]
-        if np.all(fits(training, runs) > FITTED):
-            return None  # what an end of a range leaves looks like something missing
     try:
-        objective = estimator.final_objective(list(training))
-        findings = missing_physics(objective, estimator.chromosome_, uncertainty)
+        objective, chromosome = estimator.final_objective(list(training)), estimator.chromosome_
+        tested = uncertainty
+        if any(p.pushed for p in uncertainty.parameters):
+            # What an end of a range leaves looks like something missing.
+            objective, chromosome = _freed(objective, chromosome)
+            tested = intervals(objective, chromosome)
+        findings = missing_physics(objective, chromosome, tested)
     except ModelError:  # equations that cannot be added to, or a run that fails
         return None
     fitted = best_alternative(findings, estimator, uncertainty, training, validation)
     return Suspicion(findings, fitted)
+
+
+def _freed(objective: Objective, chromosome: FloatArray) -> tuple[Objective, FloatArray]:
+    """The objective and its minimum where parameters on an end of their range go beyond it."""
+    space = objective.space
+    parameters = zip(space.parameters, space.on_bound(chromosome), strict=True)
+    freed = tuple(_widened(p) if on_bound else p for p, on_bound in parameters)
+    wide = objective.over(replace(space, parameters=freed))
+    return wide, refine(wide, chromosome).chromosome
+
+
+def _widened(parameter: Parameter) -> Parameter:
+    """A parameter in a range far beyond its own, as far as its physical limits let it."""
+    low, high = parameter.lower, parameter.upper
+    if parameter.scale == "log":
+        low, high = low / _BEYOND, high * _BEYOND
+    else:
+        low, high = low - _BEYOND * (high - low), high + _BEYOND * (high - low)
+    return replace(parameter, lower=max(low, parameter.minimum), upper=min(high, parameter.maximum))

@@ -74,7 +74,9 @@ MOVED, _LARGE = 1.5, 0.25
 _TURNED = -1.3  # change of a gain that is 1, below which it is its sign that is wrong
 _TIMES = (0.5, 2.5, 21)  # delays that are tried, in parts of what a small one tells
 _REACH = 10.0  # of a term's range in parts of the size that its test found
-_FREEDOM = 1.0  # standard deviation of a coordinate before the data: a factor of e
+# Standard deviation of a coordinate before the data: a factor of e; where an end of a range decides
+# its value, the data want it elsewhere, and nobody knows where.
+_FREEDOM, _UNBOUND = 1.0, 1e6
 
 
 @dataclass(frozen=True)
@@ -237,9 +239,11 @@ class _Tests:
         zeros = [zero[..., None] for zero in zero_errors(local)]
         foreseen, chance = (part / self._scales[..., None] for part in (foreseen, chance))
         self._columns = np.concatenate([local.slopes, *zeros, chance, foreseen], axis=2)
+        on_bound = local.objective.space.on_bound(local.chromosome)
+        freedom = np.where(on_bound, _UNBOUND, _FREEDOM)
         self._free = np.concatenate(
             [
-                1.0 / (_FREEDOM * spans(local.objective, local.chromosome)),
+                1.0 / (freedom * spans(local.objective, local.chromosome)),
                 np.ones(len(zeros) + chance.shape[2]),
                 np.zeros(foreseen.shape[2]),
             ]
@@ -277,7 +281,7 @@ class _Tests:
             self._columns = np.concatenate([self._columns, admitted], axis=2)
             self._free = np.concatenate([self._free, np.zeros(admitted.shape[2])])
             self._regression = self._coloured_by(residual)
-            left.remove(surest)
+            left = [i for i in left if i != surest and not suspects[i].same(suspects[surest])]
 
     def _again(
         self, changes: FloatArray, suspect: Suspect, first: "_Result"

@@ -27,7 +27,9 @@ _PARTS = (0.5, 2.0)  # of a variant's further parameters
 _KNEE = 0.8  # share of a signal's peak from where its saturation is looked for
 _LEVELS = 8  # of a signal, below which it shows no function
 _JUMPING = 0.05  # mean square of a signal's steps in parts of its variance, from where it jumps
-_LITTLE = 0.1  # of a sample: a delay that is tested
+# Delays that are tested [samples]: of a large one a small one tells little where inputs jump.
+_DELAYS = (0.1, -12.0, -4.0, 4.0, 12.0)
+_RECORD = 0.1  # of a record, beyond which no delay is tested
 _PROBE = 1e-3  # part of a parameter that tells how rates follow it
 _PERIODS = (1, 2, 3, 4)  # of a disturbance that nobody measured, in a record
 _POINTS = 50  # at which an equation is asked for what it depends on
@@ -60,6 +62,10 @@ class Suspect:
         rubs = any(term.shape == "stribeck" for term in self.terms)
         return rubs or self.kind in ("variant", "saturation")
 
+    def same(self, suspect: "Suspect") -> bool:
+        """Whether it is a delay of the same channel, of another size."""
+        return self.late is not None and (self.kind, self.name) == (suspect.kind, suspect.name)
+
 
 def channel_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
     """Faults of the outputs' and inputs' channels, the same throughout all records.
@@ -68,7 +74,7 @@ def channel_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
     """
     model = runs[0].model
     for j, output in enumerate(model.outputs):
-        yield _delay(output.name, partial(_late_output, runs, j), runs[0].record.dt)
+        yield from _delays(output.name, partial(_late_output, runs, j), runs)
         zeroed = any(run.record.output_zero[j] for run in runs)
         for kind, unit, signal in _faults(partial(_output, j), zeroed):
             change = [_column(run.outputs, j, signal(run)) for run in runs]
@@ -76,17 +82,22 @@ def channel_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
     for i, given in enumerate(model.inputs):
         if not any(np.any(run.record.inputs[:, i]) for run in runs):
             continue
-        yield _delay(given.name, partial(_late_input, runs, i), runs[0].record.dt)
+        yield from _delays(given.name, partial(_late_input, runs, i), runs)
         zeroed = any(run.record.input_zero[i] for run in runs)
         for kind, unit, signal in _faults(partial(_input, i), zeroed):
             change = [run.driven(_column(run.record.inputs, i, signal(run))) for run in runs]
             yield Suspect(kind, given.name, unit or given.unit, np.concatenate(change)[..., None])
 
 
-def _delay(name: str, late: Callable[[float], FloatArray], dt: float) -> Suspect:
-    """A channel that is logged late, tested by a tenth of a sample."""
-    small = _LITTLE * dt
-    return Suspect("delay", name, "s", late(small) / small, late=late)
+def _delays(
+    name: str, late: Callable[[float], FloatArray], runs: Sequence[DisturbedRun]
+) -> Iterator[Suspect]:
+    """A channel that is logged late, or early, by little and by more."""
+    shortest = min(run.record.n_samples for run in runs)
+    for samples in _DELAYS:
+        if abs(samples) < _RECORD * shortest:
+            delay = samples * runs[0].record.dt
+            yield Suspect("delay", name, "s", late(delay) / delay, late=late)
 
 
 def _late_output(runs: Sequence[DisturbedRun], j: int, delay: float) -> FloatArray:

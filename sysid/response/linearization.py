@@ -7,7 +7,7 @@ import numpy as np
 
 from sysid.arrays import FloatArray
 from sysid.engine.gradient import Gradient
-from sysid.problem.model import ModelError, ProcessModel
+from sysid.problem.model import Function, ModelError, ProcessModel
 
 # How far beside the guess an equilibrium is looked for in turn, in the states' own units.
 _NUDGES = (0.0, 0.1, -0.1, 1.0, -1.0)
@@ -73,20 +73,38 @@ def jacobian(
     return _at(model, _gradient(model.derivative, len(x), len(u)), x, u, p)[:, : len(x)]
 
 
-def jacobians(model: ProcessModel, x: FloatArray, u: FloatArray, p: FloatArray) -> FloatArray:
-    """df/dx at one point under each of several parameter vectors, (m, n_states, n_states).
+def linear_models(model: ProcessModel, x: FloatArray, u: FloatArray, p: FloatArray) -> LinearModel:
+    """The matrices of ``linearize`` at one point under each of several parameter vectors.
 
-    p: (m, n_parameters). All at once, unless the equations branch on what differs between them.
-    NaN where there is no slope, as of a root at zero.
+    p: (m, n_parameters). Each (m, ...): all at once, unless the equations branch on what differs
+    between them. NaN where there is no slope, as of a root at zero.
     """
-    n, m = len(x), len(p)
-    gradient = _gradient(model.derivative, n, 0)
+    n, m = len(x), len(u)
+    slopes = _under_each(model, model.derivative, n, x, u, p)
+    if model.output is not None:
+        outputs = _under_each(model, model.output, len(model.outputs), x, u, p)
+    else:
+        assert model.output_states is not None
+        outputs = np.repeat(np.eye(n + m)[None, list(model.output_states)], len(p), axis=0)
+    return LinearModel(slopes[..., :n], slopes[..., n:], outputs[..., :n], outputs[..., n:])
+
+
+def _under_each(
+    model: ProcessModel,
+    function: Function,
+    values: int,
+    x: FloatArray,
+    u: FloatArray,
+    p: FloatArray,
+) -> FloatArray:
+    """Derivatives of one of the model's functions under parameter vectors, (m, values, n)."""
+    gradient = _gradient(function, len(x), len(u))
     columns = [float(c[0]) if np.all(c == c[0]) else c for c in p.T]
     try:
         with np.errstate(all="ignore"):
-            slopes = gradient.at(x.tolist(), u.tolist(), columns, (m,))
+            slopes = gradient.at(x.tolist(), u.tolist(), columns, (len(p),))
     except ArithmeticError:
-        return np.full((m, n, n), np.nan)
+        return np.full((len(p), values, len(x) + len(u)), np.nan)
     except (TypeError, ValueError):
         return np.stack([_at(model, gradient, x, u, row) for row in p])
     return np.ascontiguousarray(np.moveaxis(slopes, 2, 0))

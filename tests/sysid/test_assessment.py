@@ -338,17 +338,6 @@ def test_a_parameter_at_an_end_of_its_range_limits(whys, text):
     assert (found.trust, found.reasons) == ("limited", (text,))
 
 
-def test_what_an_end_hides_is_said_where_the_data_push_at_it():
-    whole = told("bound")
-    pushed = replace(
-        whole, parameters=tuple(replace(p, pushed=p.on_bound) for p in whole.parameters)
-    )
-    (note,) = [n for n in verdict(uncertainty=pushed).notes if "lack" in n]
-    assert note == (
-        "What the model may lack was not tested: p0 on an end of the range would look like it."
-    )
-
-
 def test_grave_reasons_come_before_light_ones():
     found = verdict(
         validation=[result(2, (0.6, 1.5 * NOISE))], uncertainty=told("bound"), feasible=False

@@ -121,6 +121,37 @@ def test_a_minimum_among_aliases_is_found_from_any_other(seed):
 # --- rivals ---------------------------------------------------------------------------------
 
 
+def test_lags_change_places_through_parameters_of_unlike_units():
+    """Of a motor by its speed alone: L J, R J + L B and R B + K^2 are all that it shows.
+
+    With R and K known, L and R J / B, J and L B / R may change places.
+    """
+    R, K, L, J, B = 1.2, 0.1, 6e-3, 1.5e-4, 7.5e-3
+
+    def range_of(name, unit, value):
+        return Parameter(name, unit, 2.0 * value, value / 10.0, 10.0 * value, "log")
+
+    motor = ProcessModel(
+        name="motor",
+        states=(State("current", "A"), State("omega", "rad/s")),
+        inputs=(Input("voltage", "V"),),
+        outputs=(Output("omega", "rad/s"),),
+        parameters=(
+            range_of("L", "H", L),
+            range_of("J", "kg*m^2", J),
+            range_of("B", "N*m*s/rad", B),
+        ),
+        derivative=lambda x, u, p: (
+            (u[0] - R * x[0] - K * x[1]) / p[0],
+            (K * x[0] - p[2] * x[1]) / p[1],
+        ),
+    )
+    target = objective_of(motor, record_of(motor, 2e-3))
+    exchanged = [R * J / B, L * B / R, B]
+    starts = lookalikes(target, np.array([L, J, B]))
+    assert any(start == pytest.approx(exchanged, rel=1e-2) for start in starts)
+
+
 @pytest.mark.soak
 def test_lags_that_may_change_places_have_an_interval_for_each_answer():
     record = record_of(lags(), 0.01, noise=0.02)

@@ -20,7 +20,7 @@ from sysid import (
     jacobian,
     linearize,
 )
-from sysid.response.linearization import jacobians
+from sysid.response.linearization import linear_models
 from tests.sysid.support import lag, motor, motor_matrices, outputs_of
 
 MODELS = {
@@ -111,7 +111,7 @@ def test_jacobians_of_many_are_those_of_each(name, seed):
     p = model.nominal * rng.uniform(0.5, 2.0, (5, len(model.parameters)))
     p[:, rng.random(p.shape[1]) < 0.5] = model.nominal[rng.integers(p.shape[1])]
     expected = [jacobian(model, x, u, row) for row in p]
-    np.testing.assert_allclose(jacobians(model, x, u, p), expected, rtol=1e-9, atol=1e-300)
+    np.testing.assert_allclose(linear_models(model, x, u, p).A, expected, rtol=1e-9, atol=1e-300)
 
 
 def test_of_a_root_at_zero_no_slope_is_known():
@@ -123,7 +123,7 @@ def test_of_a_root_at_zero_no_slope_is_known():
         parameters=(Parameter("a", "m^0.5/s", 1.0, 0.1, 10.0),),
         derivative=lambda x, u, p: (u[0] - p[0] * math.sqrt(max(x[0], 0.0)),),
     )
-    found = jacobians(tank, np.zeros(1), np.ones(1), np.ones((3, 1)))
+    found = linear_models(tank, np.zeros(1), np.ones(1), np.ones((3, 1))).A
     assert found.shape == (3, 1, 1) and np.isnan(found).all()
 
 
@@ -156,7 +156,7 @@ def test_jacobians_of_many_differentiate_and_branch_as_one(derivative):
     p = np.random.default_rng(3).uniform(0.6, 1.9, (20, 2))
     for x in np.array([[0.7, 0.9], [1.4, 0.3]]):
         expected = [jacobian(model, x, np.zeros(0), row) for row in p]
-        np.testing.assert_allclose(jacobians(model, x, np.zeros(0), p), expected, rtol=1e-9)
+        np.testing.assert_allclose(linear_models(model, x, np.zeros(0), p).A, expected, rtol=1e-9)
 
 
 def counting(x, u, p):
@@ -220,7 +220,7 @@ def test_what_cannot_be_differentiated_says_so(derivative, message):
     with pytest.raises(ModelError, match=f"model odd cannot be differentiated: {message}"):
         jacobian(model, np.ones(2), np.zeros(0))
     with pytest.raises(ModelError, match=f"model odd cannot be differentiated: {message}"):
-        jacobians(model, np.ones(2), np.zeros(0), np.array([[1.0], [1.5]]))
+        linear_models(model, np.ones(2), np.zeros(0), np.array([[1.0], [1.5]]))
 
 
 # --- operating points -----------------------------------------------------------------------

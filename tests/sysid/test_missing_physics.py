@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from benchmarks._stress_cases import FRICTION, MODEL, NOISE, TRUTH, WITH_FRICTION, cases
-from benchmarks.stress import tried
+from benchmarks.stress import fitted, tried
 from sysid import BatchSimulator, Dataset, Input, Output, Parameter, ProcessModel, State
 from sysid.gassi import GASSI
 from sysid.judging.disturbed import DisturbedRun
@@ -72,6 +72,29 @@ def test_with_a_known_noise_all_that_is_above_it_is_told():
     outcome = tried(replace(CASES["friction along a turn"], calibration=1.0), 0)
     assert outcome.verdict.parameters.trust == "limited"
     assert outcome.moved
+
+
+def of_range(name, low, high):
+    """The motor's model with one parameter in a range of its own."""
+    parameters = tuple(
+        replace(p, nominal=low, lower=low, upper=high) if p.name == name else p
+        for p in MODEL.parameters
+    )
+    return replace(MODEL, parameters=parameters)
+
+
+def test_where_an_end_of_a_range_holds_a_parameter_a_late_input_is_named_all_the_same():
+    late = replace(CASES["load ten samples late"], model=of_range("K", 0.05, 0.098))
+    assert tried(late, 0).verdict.parameters.reasons[0].startswith("load is logged 0.02")
+
+
+def test_what_an_end_of_a_range_leaves_is_nothing_missing():
+    narrow = replace(CASES["noise not known"], model=of_range("J", 2e-5, 1e-4))
+    (training,), validation = narrow.records(0)
+    estimator = fitted(narrow, [training], 0)
+    uncertainty = estimator.uncertainty(training)
+    assert [p.name for p in uncertainty.parameters if p.pushed] == ["J"]
+    assert suspected(estimator, uncertainty, [training], [validation]).findings == ()
 
 
 @pytest.mark.soak

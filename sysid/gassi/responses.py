@@ -1,0 +1,128 @@
+"""Parameters far from a minimum under which a linearised model answers its inputs alike.
+
+A second-order lag does not say which of its time constants is the electrical one, and the two may
+change places through parameters of quite different units. So parameters are sought anywhere in the
+ranges whose frequency response, from every input to every output, is that of the minimum: by
+Levenberg and Marquardt from many places at once, which costs no simulation. Parameters that the
+response does not tell apart are left where they are, so that what is found is not merely elsewhere
+in the same valley.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sysid.arrays import BoolArray, ComplexArray, FloatArray, IntArray
+from sysid.fitting.objective import Objective
+from sysid.response.linearization import linear_models
+
+_STARTS, _ITERATIONS = 32, 25
+_FREQUENCIES = 12  # from a period of the record to near half the sample rate
+_DAMPING, _EASED, _STIFFENED = 1e-2, 0.3, 10.0
+_DIFFERENCE = 1e-6
+_ROUNDING = 1e-4  # of the largest, below which a column adds nothing to those before it
+_FLOOR = 0.01  # of a response's peak, below which it hardly matters
+_ALIKE = 0.05  # rms of the difference of two responses in parts of their size
+_APART = 0.03  # of the ranges, within which two places are one
+_MOST = 6
+
+
+def alike_responses(objective: Objective, chromosome: FloatArray) -> list[FloatArray]:
+    """Chromosomes (n_free,) far from one, and from each other, that answer inputs as it does."""
+    responses = _Responses(objective, chromosome)
+    free = responses.independent()
+    if not len(free):
+        return []
+    ends, misses = responses.nearest(free)
+    kept = [responses.start]
+    for i in np.argsort(misses):
+        new = all(np.abs((ends[i] - end) / responses.width).max() > _APART for end in kept)
+        if misses[i] < _ALIKE and new and len(kept) <= _MOST:
+            kept.append(ends[i])
+    return [responses.space.decode(end) for end in kept[1:]]
+
+
+class _Responses:
+    """Frequency responses of the model linearised at the first record's start.
+
+    start: search coordinates of the minimum, (n_free,).
+    """
+
+    def __init__(self, objective: Objective, chromosome: FloatArray) -> None:
+        self.space, self.model = objective.space, objective.simulator.model
+        record = objective.records[0]
+        declared = record.initial_state(self.model)
+        self._x = self.space.starts(chromosome[None], 0, declared)[0]
+        self._u = record.inputs[0]
+        self._varied = np.ptp(record.inputs, axis=0) > 0.0
+        longest = 2.0 * np.pi / (record.n_samples * record.dt)
+        self._omega = np.geomspace(longest, 0.8 * np.pi / record.dt, _FREQUENCIES)
+        self.start, self.width = self.space.encode(chromosome), self.space.width
+        self._reference = self._response(self.start[None])[0]
+        self._floor = _FLOOR * np.abs(self._reference).max(axis=0)
+
+    def independent(self) -> IntArray:
+        """Places of parameters that the response tells apart, the one that does most first."""
+        slopes = self._slopes(self.start[None], np.arange(len(self.start)))[0]
+        chosen: list[int] = []
+        largest = np.linalg.norm(slopes, axis=0).max(initial=0.0)
+        while len(chosen) < slopes.shape[1]:
+            sizes = np.linalg.norm(slopes, axis=0)
+            best = int(np.argmax(sizes))
+            if not sizes[best] > _ROUNDING * largest:
+                break
+            chosen.append(best)
+            direction = slopes[:, best] / sizes[best]
+            slopes = slopes - np.outer(direction, direction @ slopes)
+        return np.array(chosen, dtype=np.int64)
+
+    def nearest(self, free: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Coordinates (n, n_free) whose responses come nearest, and by how much they miss, (n,)."""
+        rng = np.random.default_rng(0)
+        lower, upper = self.space.coded_lower, self.space.coded_lower + self.width
+        at = np.repeat(self.start[None], _STARTS, axis=0)
+        at[:, free] = rng.uniform(lower[free], upper[free], (_STARTS, len(free)))
+        miss, damping = self._miss(at), np.full(_STARTS, _DAMPING)
+        ends = tuple(bound[free] for bound in self.space.coded_bounds)
+        for _ in range(_ITERATIONS):
+            slopes = self._slopes(at, free)
+            square = np.swapaxes(slopes, 1, 2) @ slopes
+            size = np.einsum("nii->ni", square)
+            square += (damping[:, None] * size + 1e-12)[:, :, None] * np.eye(len(free))
+            step = np.linalg.solve(square, -np.swapaxes(slopes, 1, 2) @ miss[:, :, None])[..., 0]
+            trial = at.copy()
+            trial[:, free] = np.clip(at[:, free] + step * self.width[free], *ends)
+            moved = self._miss(trial)
+            better = np.sum(moved**2, axis=1) < np.sum(miss**2, axis=1)
+            at, miss = np.where(better[:, None], trial, at), np.where(better[:, None], moved, miss)
+            damping *= np.where(better, _EASED, _STIFFENED)
+        return at, np.sqrt(np.mean(miss**2, axis=1))
+
+    def _slopes(self, at: FloatArray, places: IntArray) -> FloatArray:
+        """Slopes of the differences by parts of the ranges of some parameters, (n, m, n_places)."""
+        beside = np.repeat(at[:, None], len(places), axis=1)
+        beside[:, np.arange(len(places)), places] += _DIFFERENCE * self.width[places]
+        moved = self._miss(beside.reshape(-1, at.shape[1])).reshape(len(at), len(places), -1)
+        slopes: FloatArray = (moved - self._miss(at)[:, None]) / _DIFFERENCE
+        return np.swapaxes(slopes, 1, 2)
+
+    def _miss(self, at: FloatArray) -> FloatArray:
+        """Differences from the minimum's response, in parts of the mean of both sizes, (n, m)."""
+        response = self._response(at)
+        size = np.abs(response) + np.abs(self._reference) + self._floor
+        with np.errstate(invalid="ignore"):
+            miss = np.where(size > 0.0, 2.0 * (response - self._reference) / size, 0.0)
+        miss = miss.reshape(len(at), -1)
+        parts: FloatArray = np.concatenate([miss.real, miss.imag], axis=1)
+        return np.where(np.isfinite(parts), parts, 2.0)
+
+    def _response(self, at: FloatArray) -> ComplexArray:
+        """Responses (n, n_frequencies, n_outputs, n_varied)."""
+        vectors = self.space.full(self.space.decode(at))
+        a, b, c, d = linear_models(self.model, self._x, self._u, vectors)
+        b, d = b[:, None, :, self._varied], d[:, None, :, self._varied]
+        s = 1j * self._omega[:, None, None] * np.eye(a.shape[1])
+        whole: BoolArray = np.all(np.isfinite(a), axis=(1, 2), keepdims=True)
+        a = np.where(whole, a, np.eye(a.shape[1]))
+        response = c[:, None] @ np.linalg.solve(s - a[:, None], b.astype(np.complex128)) + d
+        return np.where(whole[..., None], response, np.nan)
