@@ -265,6 +265,11 @@ class ChannelErrors(Section):
     offset: tuple[float, float] | None = Field(
         None, description="what is to be added to it, in its unit", examples=[[-0.5, 0.5]]
     )
+    drift: tuple[float, float] | None = Field(
+        None,
+        description="what is to be added to it for every second since a log's first sample",
+        examples=[[-0.01, 0.01]],
+    )
 
 
 class Signals(Section):
@@ -297,7 +302,7 @@ class Signals(Section):
     )
     channels: dict[str, ChannelErrors] = Field(
         default_factory=dict,
-        description="gains and offsets of inputs and outputs, fitted with the model's parameters",
+        description="gains, offsets, drifts of inputs and outputs, fitted with the parameters",
         examples=[{"torque": {"gain": [0.5, 2.0]}}],
     )
 

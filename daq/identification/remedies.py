@@ -92,10 +92,10 @@ def _taken_for(unit: str, times: float) -> str | None:
     return None
 
 
-# Ranges of errors of channels, by the change of a gain of 1, and by an offset.
+# Ranges of errors of channels, by the change of a gain of 1, by an offset and by a drift.
 _ERRORS: Mapping[str, Callable[[float], tuple[float, float]]] = {
     "gain": lambda change: (min(1.0, 1.0 + change) / 2.0, max(1.0, 1.0 + change) * 2.0),
-    "offset": lambda size: (-5.0 * abs(size), 5.0 * abs(size)),
+    **dict.fromkeys(("offset", "drift"), lambda size: (-5.0 * abs(size), 5.0 * abs(size))),
 }
 
 

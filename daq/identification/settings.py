@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
 from daq.config import check, yaml_file
 from daq.config.identification import IdentificationConfig, Signals, TermSetting
@@ -20,7 +20,7 @@ from daq.logs.recording import log_path
 from daq.lookup.models import DEFAULT_MODEL, find_model, whole_name
 from daq.progress import Note, Watch, ignore
 from sysid import Given, ModelError, ProcessModel, SearchSpace
-from sysid.problem.corrections import Correction, with_corrections
+from sysid.problem.corrections import Correction, Kind, with_corrections
 from sysid.problem.terms import AddedTerm, with_terms
 
 File = TypeVar("File", bound=YamlFile)
@@ -316,7 +316,7 @@ def _with_additions(file: YamlFile, signals: Signals, model: ProcessModel) -> Pr
     """The model with terms in its equations, the outputs that count, and errors of channels."""
     model = _with_outputs(file, signals, _with_terms(file, signals, model))
     for channel, errors in signals.channels.items():
-        for kind in ("gain", "offset"):
+        for kind in get_args(Kind):
             ends: tuple[float, float] | None = getattr(errors, kind)
             if ends is None:
                 continue

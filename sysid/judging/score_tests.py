@@ -587,7 +587,7 @@ def describe(findings: Iterable[Finding]) -> list[str]:
 _WORDS = {
     "delay": "{name} is logged {amplitude:.3g} s {late}",
     "offset": "{name} is {amplitude:.3g} {unit} off",
-    "drift": "{name} drifts by {amplitude:.3g} {unit} from a record's first to last sample",
+    "drift": "{name} drifts by {amplitude:.3g} {unit} from a record's first sample on",
     "saturation": "{name} saturates near its largest values",
 }
 

@@ -76,17 +76,19 @@ def channel_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
     for j, output in enumerate(model.outputs):
         yield from _delays(output.name, partial(_late_output, runs, j), runs)
         zeroed = any(run.record.output_zero[j] for run in runs)
-        for kind, unit, signal in _faults(partial(_output, j), zeroed):
-            change = [_column(run.outputs, j, signal(run)) for run in runs]
-            yield Suspect(kind, output.name, unit or output.unit, np.concatenate(change)[..., None])
+        for kind, signal in _faults(partial(_output, j), zeroed):
+            changes = np.concatenate([_column(run.outputs, j, signal(run)) for run in runs])
+            yield Suspect(kind, output.name, _unit(kind, output.unit), changes[..., None])
     for i, given in enumerate(model.inputs):
         if not any(np.any(run.record.inputs[:, i]) for run in runs):
             continue
         yield from _delays(given.name, partial(_late_input, runs, i), runs)
         zeroed = any(run.record.input_zero[i] for run in runs)
-        for kind, unit, signal in _faults(partial(_input, i), zeroed):
-            change = [run.driven(_column(run.record.inputs, i, signal(run))) for run in runs]
-            yield Suspect(kind, given.name, unit or given.unit, np.concatenate(change)[..., None])
+        for kind, signal in _faults(partial(_input, i), zeroed):
+            parts = [run.driven(_column(run.record.inputs, i, signal(run))) for run in runs]
+            # By what a log has too much, less has acted.
+            changes = np.concatenate(parts) * (-1.0 if kind in ("offset", "drift") else 1.0)
+            yield Suspect(kind, given.name, _unit(kind, given.unit), changes[..., None])
 
 
 def _delays(
@@ -169,7 +171,7 @@ def likely_noise(signal: FloatArray, deviation: float) -> FloatArray:
     return likely
 
 
-_Fault = tuple[Kind, str, Callable[[DisturbedRun], FloatArray]]
+_Fault = tuple[Kind, Callable[[DisturbedRun], FloatArray]]
 
 
 def _output(j: int, run: DisturbedRun) -> FloatArray:
@@ -182,10 +184,20 @@ def _input(i: int, run: DisturbedRun) -> FloatArray:
 
 def _faults(signal: Callable[[DisturbedRun], FloatArray], zeroed: bool) -> Iterator[_Fault]:
     if not zeroed:
-        yield "offset", "", lambda run: np.ones(run.record.n_samples)
-    yield "drift", "", lambda run: np.linspace(-0.5, 0.5, run.record.n_samples)
-    yield "gain", "1", signal
-    yield "saturation", "1", lambda run: _clipped(signal(run))
+        yield "offset", lambda run: np.ones(run.record.n_samples)
+    yield "drift", _time
+    yield "gain", signal
+    yield "saturation", lambda run: _clipped(signal(run))
+
+
+def _time(run: DisturbedRun) -> FloatArray:
+    """Since a record's first sample."""
+    return np.arange(run.record.n_samples, dtype=np.float64) * run.record.dt
+
+
+def _unit(kind: Kind, unit: str) -> str:
+    """Unit of a fault's size in a channel of this unit."""
+    return {"offset": unit, "drift": f"{unit}/s"}.get(kind, "1")
 
 
 def _clipped(signal: FloatArray) -> FloatArray:

@@ -1,24 +1,28 @@
-"""Gain and offset of a model's channels, as parameters that are identified with its own."""
+"""Gain, offset and drift of a model's channels, as parameters that are identified with its own."""
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from sysid.problem.extension import extended
-from sysid.problem.model import Function, ModelError, Parameter, ProcessModel, picker
+from sysid.problem.model import Function, ModelError, Parameter, ProcessModel, State, picker
 
-Kind = Literal["gain", "offset"]
+Kind = Literal["gain", "offset", "drift"]
+
+# Time since a record's first sample, a state of models whose channels drift.
+_CLOCK = State("time_of_record", "s", first_sample=False)
 
 
 @dataclass(frozen=True)
 class Correction:
-    """What is wrong with a channel: its gain, by which it is to be multiplied, or its offset.
+    """What is wrong with a channel: its gain, by which it is to be multiplied, offset, or drift.
 
     Of an output the model's value is multiplied, or the offset added to it, before it is compared
     with what was measured; of an input what was measured, before the model takes it. A channel that
-    is both is corrected as both. low, high: range of the parameter, with what means no error in it;
-    of an offset in the channel's unit.
+    is both is corrected as both. A drift is an offset that grows with the time since a record's
+    first sample. low, high: range of the parameter, with what means no error in it; of an offset in
+    the channel's unit, of a drift in that per second.
 
     >>> Correction("torque", "gain", 0.5, 2.0).parameter
     'gain_of_torque'
@@ -36,7 +40,7 @@ class Correction:
 
 
 def with_corrections(model: ProcessModel, corrections: Sequence[Correction]) -> ProcessModel:
-    """The model with the gains and offsets of channels as parameters behind its own.
+    """The model with the gains, offsets and drifts of channels as parameters behind its own.
 
     Raises ModelError for a channel that it has not, a bad range, or a name that it has already.
 
@@ -52,6 +56,7 @@ def with_corrections(model: ProcessModel, corrections: Sequence[Correction]) -> 
 
 def _with_correction(model: ProcessModel, correction: Correction) -> ProcessModel:
     channel, neutral = correction.channel, 1.0 if correction.kind == "gain" else 0.0
+    drifts = correction.kind == "drift"
     units = {s.name: s.unit for s in model.inputs} | {s.name: s.unit for s in model.outputs}
     if channel not in units:
         there = ", ".join(units)
@@ -63,7 +68,7 @@ def _with_correction(model: ProcessModel, correction: Correction) -> ProcessMode
         )
     parameter = Parameter(
         correction.parameter,
-        "1" if correction.kind == "gain" else units[channel],
+        {"gain": "1", "offset": units[channel], "drift": f"{units[channel]}/s"}[correction.kind],
         neutral,
         correction.low,
         correction.high,
@@ -71,17 +76,36 @@ def _with_correction(model: ProcessModel, correction: Correction) -> ProcessMode
         description=f"{correction.kind} of the channel {channel}",
         corrects=channel,
     )
+    model = _timed(model) if drifts else model
     n, derivative, output = len(model.parameters), model.derivative, _output_of(model)
+    clock = model.state_names.index(_CLOCK.name) if drifts else 0
     taken = _corrected(model.input_names, correction)
     given = _corrected(model.output_names, correction)
-    sign = "*" if correction.kind == "gain" else "+"
+    sign, times = "*" if correction.kind == "gain" else "+", " * t" if drifts else ""
+
+    def size(x: Any, p: Any) -> Any:
+        return p[n] * x[clock] if drifts else p[n]
+
     return extended(
         model,
         parameter,
-        lambda x, u, p: derivative(x, taken(u, p[n]), p[:n]),
-        lambda x, u, p: given(output(x, taken(u, p[n]), p[:n]), p[n]),
-        f"{channel} {sign} {correction.parameter}",
+        lambda x, u, p: derivative(x, taken(u, size(x, p)), p[:n]),
+        lambda x, u, p: given(output(x, taken(u, size(x, p)), p[:n]), size(x, p)),
+        f"{channel} {sign} {correction.parameter}{times}",
         lambda variant: _with_correction(variant, correction),
+    )
+
+
+def _timed(model: ProcessModel) -> ProcessModel:
+    """The model with the time since a record's first sample as its last state."""
+    if _CLOCK.name in model.state_names:
+        return model
+    n, derivative, output = len(model.states), model.derivative, model.output
+    return replace(
+        model,
+        states=(*model.states, _CLOCK),
+        derivative=lambda x, u, p: (*derivative(x[:n], u, p), 1.0),
+        output=None if output is None else lambda x, u, p: output(x[:n], u, p),
     )
 
 

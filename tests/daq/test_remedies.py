@@ -89,9 +89,13 @@ def test_faults_of_samples_come_first_and_a_lag_is_taken_out_once():
     assert mended(faults=[fault("outliers", "note", "robust=true")]) == ()
 
 
-def test_gains_and_offsets_become_parameters():
-    wrong = [found("gain", "y", 0.3), found("offset", "u", -0.04), found("drift", "y", 1.0)]
-    assert mended(wrong) == ("channels.y.gain=[0.5, 2.6]", "channels.u.offset=[-0.2, 0.2]")
+def test_gains_offsets_and_drifts_become_parameters():
+    wrong = [found("gain", "y", 0.3), found("offset", "u", -0.04), found("drift", "y", 0.01)]
+    assert mended(wrong) == (
+        "channels.y.gain=[0.5, 2.6]",
+        "channels.u.offset=[-0.2, 0.2]",
+        "channels.y.drift=[-0.05, 0.05]",
+    )
     assert settings(**{"channels": {"u": {"offset": [-0.2, 0.2]}}}).channels["u"].gain is None
 
 

@@ -1,4 +1,4 @@
-"""Gains and offsets of channels as parameters: as a model that has them written out, and found."""
+"""Gains, offsets and drifts of channels: as a model that has them written out, and found."""
 
 import dataclasses
 
@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from benchmarks._stress_cases import MODEL, TRUTH, cases
-from sysid import ModelError
+from benchmarks.stress import tried
+from sysid import BatchSimulator, ModelError
 from sysid.gassi import GASSI
 from sysid.problem.corrections import Correction, with_corrections
 
@@ -33,6 +34,33 @@ def test_an_output_function_sees_the_corrected_input_too():
     corrected = with_corrections(straight, [BOTH[0], Correction("current", "gain", 0.5, 2.0)])
     (given,) = corrected.output((2.0, 0.0), (3.0, 0.0), (*VALUES, 1.5, 0.8))
     assert given == pytest.approx(0.8 * (VALUES[0] * 2.0 - 4.5))
+
+
+def test_a_drift_grows_from_the_first_sample_of_every_record():
+    drifts = [Correction("load", "drift", -1.0, 1.0), Correction("omega", "drift", -1.0, 1.0)]
+    corrected = with_corrections(MODEL, drifts)
+    assert corrected.state_names == ("current", "omega", "time_of_record")
+    assert [p.unit for p in corrected.parameters[-2:]] == ["N*m/s", "rad/s/s"]
+    (record,), _ = {case.name: case for case in cases()}["motor"].records(0)
+    vector = np.array([*VALUES, 0.03, -2.0])
+    (whole,) = BatchSimulator(corrected).trajectories(vector[None], record)
+    time = record.dt * np.arange(record.n_samples)
+    # A load on a straight line between samples; the held one's steps are as small as samples.
+    loads = record.inputs + np.outer(time + 0.5 * record.dt, [0.0, 0.03])
+    there = dataclasses.replace(record, inputs=loads)
+    (expected,) = BatchSimulator(MODEL).trajectories(np.array([VALUES]), there)
+    expected[:, 1] -= 2.0 * time
+    np.testing.assert_allclose(whole, expected, atol=2e-3 * np.abs(expected).max())
+
+
+def test_a_drift_that_is_named_is_fitted_by_its_correction():
+    case = {case.name: case for case in cases()}["load drifts"]
+    outcome = tried(case, 0)
+    assert outcome.verdict.parameters.reasons[0].startswith("load drifts by 0.0")
+    corrected = with_corrections(MODEL, [Correction("load", "drift", -0.2, 0.2)])
+    estimator = GASSI(corrected, population=60, generations=12).fit(case.records(0)[0])
+    # The load was logged 0.05 N*m too high at the end of 1.5 s.
+    assert estimator.parameters_["drift_of_load"] == pytest.approx(-0.05 / 1.5, rel=0.01)
 
 
 @pytest.mark.parametrize(

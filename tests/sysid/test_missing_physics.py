@@ -33,7 +33,7 @@ CASES = {case.name: case for case in cases()}
             ("sign of the current", "current has the opposite sign"),
             ("speed clipped at 80 %", "omega saturates near its largest values"),
             ("Coulomb friction, load's noise", "a term in the sign of omega"),
-            ("load off in later logs", "load of training 2 is -0.0"),
+            ("load off in later logs", "load of training 2 is 0.0"),
         ],
     ),
 )
