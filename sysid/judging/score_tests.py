@@ -506,7 +506,7 @@ class _Whitening:
         counted = local.objective.weights > 0.0
         measured = counted & local.seen
         residual = np.where(measured, residual, 0.0)
-        model = colour_about_mean(residual, local.seen, measured, local.lengths)
+        model = colour_about_line(residual, local.seen, measured, local.lengths)
         values, vectors = np.linalg.eigh(model.noise)
         floor = 1e-12 * max(float(values[-1]), 1e-300)
         roots = np.where(values > floor, 1.0 / np.sqrt(np.maximum(values, floor)), 0.0)
@@ -551,20 +551,25 @@ class _Whitening:
         return slice(self.n_outputs * first, self.n_outputs * (first + count))
 
 
-def colour_about_mean(
+def colour_about_line(
     residual: FloatArray, seen: BoolArray, measured: BoolArray, lengths: tuple[int, ...]
 ) -> Autoregression:
-    """Colour of residuals (n, q) about their mean, of outputs that forget soon enough.
+    """Colour of residuals (n, q) about offset and drift, of outputs that forget soon enough.
 
-    An offset is no colour: an autoregression would take it for a memory without end, and
-    whitening would erase it. Of noise that is nearly as slow as a record its mean is part. The
-    mean is that of all records: what is wrong in some of them looks like an offset of each.
+    These are no colour: an autoregression would take them for a memory without end, and
+    whitening would erase them. Of noise that is nearly as slow as a record they are part. The
+    line is that of all records: what is wrong in some of them looks like an offset of each.
     """
-    mean = np.where(measured, residual.sum(axis=0) / np.maximum(measured.sum(axis=0), 1), 0.0)
-    centred = residual - mean
+    time = np.concatenate([np.arange(n, dtype=np.float64) for n in lengths])
+    line = np.zeros_like(residual)
+    for j in np.flatnonzero(measured.any(axis=0)):
+        at = measured[:, j]
+        slope = np.cov(time[at], residual[at, j])[0, 1] / max(float(np.var(time[at], ddof=1)), 1.0)
+        line[at, j] = residual[at, j].mean() + slope * (time[at] - time[at].mean())
+    centred = residual - line
     model = colour(centred, seen, lengths)
     soon = _FORGETS * longest_memory(model, np.mean(centred**2, axis=0)) <= min(lengths)
-    return model if soon.all() else colour(residual - np.where(soon, mean, 0.0), seen, lengths)
+    return model if soon.all() else colour(residual - np.where(soon, line, 0.0), seen, lengths)
 
 
 def _gradient(local: Sensitivity, estimate: Estimate) -> FloatArray:

@@ -16,7 +16,7 @@ from sysid import BatchSimulator, Dataset, Input, Output, Parameter, ProcessMode
 from sysid.gassi import GASSI
 from sysid.judging.disturbed import DisturbedRun
 from sysid.judging.examination import suspected, verdict_of
-from sysid.judging.score_tests import colour_about_mean
+from sysid.judging.score_tests import colour_about_line
 from tests.soak import mostly_soak
 from tests.sysid.reference import simulate
 
@@ -50,15 +50,17 @@ def test_an_offset_is_no_colour_of_the_residuals():
     assert outcome.verdict.parameters.reasons[0].startswith("current is 0.3 A off")
 
 
-def test_the_mean_of_noise_that_is_as_slow_as_the_record_is_its_colour():
+def test_offset_and_drift_are_no_colour_but_of_noise_as_slow_as_the_record():
     noise = np.cumsum(np.random.default_rng(0).standard_normal((750, 1)), axis=0)
     measured = np.ones_like(noise, dtype=bool)
-    slow, offset = (
-        colour_about_mean(e, measured, measured, (750,))
-        for e in (noise + 100.0, np.diff(noise, axis=0, prepend=0.0) + 100.0)
+    white, ramp = np.diff(noise, axis=0, prepend=0.0), np.linspace(0.0, 50.0, 750)[:, None]
+    slow, offset, drift = (
+        colour_about_line(e, measured, measured, (750,))
+        for e in (noise + 100.0, white + 100.0, white + 100.0 + ramp)
     )
     assert abs(1.0 - slow.coefficients.sum()) < 0.01
     assert abs(1.0 - offset.coefficients.sum()) > 0.5
+    assert abs(1.0 - drift.coefficients.sum()) > 0.5
 
 
 @pytest.mark.parametrize("seed", mostly_soak([0, 1]))
