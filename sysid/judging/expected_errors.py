@@ -94,7 +94,7 @@ def expected_errors(
     exact = fine.trajectories(vector[None], record, None, start[None])[0]
     error = np.where(np.isfinite(exact), exact - undisturbed, 0.0)
     systematic.append(error[..., None])
-    for i, deviation in _noisy_starts(simulator, record).items():
+    for i, deviation in _noisy_starts(simulator, record, undisturbed).items():
         moved = start.copy()
         moved[i] += deviation
         run = simulator.trajectories(vector[None], record, n_steps, moved[None])[0]
@@ -106,10 +106,13 @@ def expected_errors(
     return ExpectedErrors(variance, np.concatenate(systematic, axis=2))
 
 
-def _noisy_starts(simulator: BatchSimulator, record: Dataset) -> dict[int, float]:
-    """Standard deviation of the first sample at which a state starts, by the state's place."""
+def _noisy_starts(simulator: BatchSimulator, record: Dataset, run: FloatArray) -> dict[int, float]:
+    """Standard deviation of the first sample at which a state starts, by the state's place.
+
+    run: (n_samples, n_outputs), the free run.
+    """
     return {
-        i: record.sample_noise(j)
+        i: record.sample_noise(j, record.outputs[:, j] - run[:, j])
         for i, j in enumerate(record.starts_at_samples(simulator.model))
         if j is not None
     }

@@ -142,7 +142,7 @@ def missing_physics(
     # Noise of an input makes its gain look smaller: that is no fault.
     channels = [s for s in channels if s.kind != "gain" or s.name not in noisy]
     foreseen = np.concatenate([_foreseen_noise(runs), _simulation_error(runs, local)], axis=2)
-    tests = _Tests(local, uncertainty, foreseen, _noisy_starts(runs))
+    tests = _Tests(local, uncertainty, foreseen, _noisy_starts(runs, local))
     alone = [e.name for e in uncertainty.determined() if e.name in model.parameter_names]
     tests.admit([*channels, *variant_suspects(runs), *change_suspects(runs, alone)])
     tests.admit(list(in_single_records(channels, runs)))
@@ -195,15 +195,18 @@ def _simulation_error(runs: Sequence[DisturbedRun], local: Sensitivity) -> Float
     return error if np.any(size > _INEXACT * left) else error[..., :0]
 
 
-def _noisy_starts(runs: Sequence[DisturbedRun]) -> FloatArray:
+def _noisy_starts(runs: Sequence[DisturbedRun], local: Sensitivity) -> FloatArray:
     """Changes (n_rows, n_outputs, k) by one noise of each first sample at which a run starts."""
     lengths = tuple(run.record.n_samples for run in runs)
     columns = [np.zeros((sum(lengths), runs[0].outputs.shape[1], 0))]
-    for run, rows in zip(runs, record_rows(lengths), strict=True):
+    places = zip(runs, record_rows(lengths), local.objective.scales, strict=True)
+    for run, rows, scale in places:
+        left = local.residual[rows] * scale
         for place, j in enumerate(run.record.starts_at_samples(run.model)):
             if j is not None:
                 column = np.zeros((*columns[0].shape[:2], 1))
-                column[rows, :, 0] = run.record.sample_noise(j) * run.started(place)
+                deviation = run.record.sample_noise(j, left[:, j])
+                column[rows, :, 0] = deviation * run.started(place)
                 columns.append(column)
     return np.concatenate(columns, axis=2)
 

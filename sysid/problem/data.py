@@ -167,9 +167,12 @@ class Dataset:
                 x0[i] = first[state.name]
         return x0
 
-    def sample_noise(self, output: int) -> float:
-        """Standard deviation of an output's noise: as calibrated, else as its samples show it."""
-        return float(self.output_noise[output]) or noise(self.outputs[:, output])
+    def sample_noise(self, output: int, residual: FloatArray) -> float:
+        """Standard deviation of an output's noise: as calibrated, else as residuals (n,) show it.
+
+        Of a signal that moves fast its samples do not show it, but what a model leaves of them.
+        """
+        return float(self.output_noise[output]) or noise(residual)
 
     def starts_at_samples(self, model: ProcessModel) -> list[int | None]:
         """For each state the output whose first sample it starts at, None where it does not."""

@@ -166,18 +166,17 @@ def given_errors(sensitivity: Sensitivity) -> Iterator[FloatArray]:
 def start_errors(sensitivity: Sensitivity) -> Iterator[FloatArray]:
     """Changes (n_residuals, n_outputs) by a deviation of each first sample that a run starts at.
 
-    Such a run keeps the noise of one sample for as long as the plant remembers its start. Where no
-    calibration knows the noise it is that of the samples, and not above what the model leaves.
+    Such a run keeps the noise of one sample for as long as the plant remembers its start.
     """
     objective = sensitivity.objective
     places = zip(objective.records, record_rows(sensitivity.lengths), objective.scales, strict=True)
     for k, (record, rows, scale) in enumerate(places):
-        left = np.sqrt(np.mean(sensitivity.residual[rows] ** 2, axis=0)) * scale
+        left = sensitivity.residual[rows] * scale
         for j in record.starts_at_samples(objective.simulator.model):
             if j is None:
                 continue
             outputs = record.outputs.copy()
-            outputs[0, j] += record.output_noise[j] or min(record.sample_noise(j), left[j])
+            outputs[0, j] += record.sample_noise(j, left[:, j])
             change = _change_by_record(sensitivity, k, replace(record, outputs=outputs))
             yield change * sensitivity.share
 

@@ -68,3 +68,15 @@ def test_a_right_model_is_expected_to_err_by_its_start(calibrated):
 def test_intervals_hold_the_truth():
     estimates = [estimate(seed, calibrated=False) for seed in range(60)]
     assert np.mean([e.low < RATE < e.high for e in estimates]) > 0.9
+
+
+def test_noise_below_fast_motion_is_that_which_the_model_leaves():
+    """An oscillation of a hundred times the noise, whose samples do not show it."""
+    rng, u = np.random.default_rng(0), np.cos(2.5 * np.arange(N))
+    y = RATE * DT * np.concatenate([[0.0], np.cumsum(u)[:-1]]) * 4000.0 * SIGMA
+    noisy = y + SIGMA * rng.standard_normal(N)
+    record = Dataset(4000.0 * SIGMA * u, noisy, DT)
+    start = record.initial_state(INTEGRATOR)
+    expected = expected_errors(SIMULATOR, SPACE, np.array([RATE]), record, start, None)
+    size = np.sqrt(np.mean(np.sum(expected.systematic**2, axis=2)))
+    assert size == pytest.approx(SIGMA, rel=0.2)
