@@ -1,6 +1,7 @@
 """Whether ``rig check`` tells the experiments that trip from those that do not.
 
-python -m benchmarks.evidence [--json] [--experiments 12] [--draws 300] [--fresh 100] [--seed 0]
+python -m benchmarks.evidence [--json] [--experiments 12] [--draws 1000] [--fresh 100] [--seed 0]
+                              [--kept FILE.jsonl]
 
 Experiments are drawn: a rig as ``benchmarks.torque`` draws it, known to 1 to 5 %; controller and
 sample rate, half of the controllers mistuned behind the back of ``rig tune``; protocol, largest
@@ -8,12 +9,14 @@ torque (0.05 to 0.6 N*m) and highest frequency of the reference, limits of speed
 100 rad/s and 0.4 to 3.5 N*m. Each is checked on ``draws`` plausible actuators and hands, until one
 fails; then it is tried on ``fresh`` others of the same uncertainty, by the same simulation, until
 one fails. Let through: how many of the fresh trials trip or do not come to rest. Refused: in how
-many experiments one of the fresh ones does.
+many experiments one of the fresh ones does. ``--kept``: a file of a row an experiment, from which
+a run that was ended goes on.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import tempfile
 from pathlib import Path
@@ -31,7 +34,7 @@ from daq.errors import ConfigError
 from daq.experiment import TripLimits
 from daq.lookup.controllers import TunedController, load_controller
 from daq.lookup.experiments import load_experiment
-from haptics.evidence import Scene, run_trials
+from haptics.evidence import Outcomes, Scene, family_margins, run_trials
 from haptics.experiment import TorqueExperiment
 from sim_rig.actuator import actuator
 
@@ -57,18 +60,27 @@ MISTUNED: dict[str, tuple[dict[str, Any], ...]] = {
     ),
     "hinf": ({"yield_share": 1.0, "gains": []}, {"hand_damping": 0.15, "gains": []}),
 }
-CHUNK = 50  # trials
 
 
 def main() -> None:
     parser = arguments(__doc__ or "")
     parser.add_argument("--experiments", type=int, default=12)
-    parser.add_argument("--draws", type=int, default=300)
+    parser.add_argument("--draws", type=int, default=1000)
     parser.add_argument("--fresh", type=int, default=100)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--kept", type=Path)
     options = parser.parse_args()
-    rows = [measure(options.seed + k, options) for k in range(options.experiments)]
-    report({"experiments": rows}, options.json, show)
+    kept: Path | None = options.kept
+    lines = kept.read_text().splitlines() if kept is not None and kept.exists() else []
+    rows = {row["seed"]: row for row in map(json.loads, lines)}
+    seeds = range(options.seed, options.seed + options.experiments)
+    for seed in seeds:
+        if seed not in rows:
+            rows[seed] = measure(seed, options)
+            if kept is not None:
+                with kept.open("a") as file:
+                    file.write(f"{json.dumps(rows[seed])}\n")
+    report({"experiments": [rows[seed] for seed in seeds]}, options.json, show)
 
 
 def measure(seed: int, options: argparse.Namespace) -> dict[str, Any]:
@@ -95,22 +107,21 @@ def measure(seed: int, options: argparse.Namespace) -> dict[str, Any]:
     scenes = _scenes(tuned, protocol, changes if protocol == "torque_tracking" else {})
     checked = _failing(tuned, scenes, limits, options.draws, 0)
     fresh = _failing(tuned, scenes, limits, options.fresh, seed + 1)
-    return {**row, "refused": checked[1] > 0, "checked": checked, "fresh": fresh}
+    disk = min(member.margins.disk for member in family_margins(tuned))
+    return {**row, "refused": checked[1] > 0, "checked": checked, "fresh": fresh, "disk": disk}
 
 
 def _failing(
     tuned: TunedController, scenes: list[Scene], limits: TripLimits, trials: int, seed: int
 ) -> tuple[int, int]:
     """Trials until some fail, and how many do."""
-    program, done = tuned.control.program(tuned.model, tuned.parameters), 0
-    while done < trials:
-        count = min(CHUNK, trials - done)
-        outcomes = run_trials(tuned, program, scenes, limits, count, 1000 * seed + done)
-        done += count
-        failed = int(outcomes.tripped.sum() + outcomes.restless.sum())
-        if failed:
-            return done, failed
-    return done, 0
+
+    def failed(outcomes: Outcomes) -> bool:
+        return bool(outcomes.failures())
+
+    program = tuned.control.program(tuned.model, tuned.parameters)
+    outcomes = run_trials(tuned, program, scenes, limits, trials, seed, enough=failed)
+    return len(outcomes.results), sum(outcomes.failures().values())
 
 
 def _controller(
@@ -151,13 +162,14 @@ def _scenes(tuned: TunedController, protocol: str, changes: dict[str, Any]) -> l
 
 def show(figures: dict[str, Any]) -> None:
     rows = [row for row in figures["experiments"] if "refused" in row]
-    print("failed of trials until then: checked, fresh")
+    print("failed of trials until then: checked, fresh; least disk margin")
     for row in rows:
         (checked, failed), (fresh, fresh_failed) = row["checked"], row["fresh"]
         print(
             f"{row['seed']:>6} {row['controller']:>12} {row['rate']:>5.0f} Hz {row['torque']:>6.3f}"
             f" N*m {row['speed']:>6.1f} rad/s {row['torque_limit']:>5.2f} N*m {failed:>3}/{checked}"
-            f" {fresh_failed:>3}/{fresh} {row['protocol']} {row['mistuned'] or ''}"
+            f" {fresh_failed:>3}/{fresh} {row['disk']:>5.2f} {row['protocol']}"
+            f" {row['mistuned'] or ''}"
         )
     print(f"{len(figures['experiments']) - len(rows)} cannot be tuned")
     through = [row for row in rows if not row["refused"]]

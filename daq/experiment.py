@@ -18,6 +18,7 @@ from daq.config.metadata import Metadata
 from daq.config.units import Amperes, Hertz, Seconds, Turns
 from daq.findings import Chart, Findings, Heatmap, Number
 from daq.hal import CHANNELS, FloatArray, Mode, Samples
+from daq.progress import Watch, ignore
 
 MOST_SAMPLES = 20_000_000
 
@@ -356,7 +357,7 @@ class ClosedLoop(Experiment):
         """What ``rig check --plot`` draws where the plan has no references; None for nothing."""
         return None
 
-    def evidence(self, limits: TripLimits, draws: int) -> Evidence | None:
+    def evidence(self, limits: TripLimits, draws: int, watch: Watch = ignore) -> Evidence | None:
         """What ``draws`` simulated trials say of the run; None where none can be made.
 
         Raises ConfigError, and ValueError as ``plan`` does.

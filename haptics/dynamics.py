@@ -22,6 +22,7 @@ SHAFT = ("omega", "z", "theta")
 CURRENTS = ("current_motor", "current_brake")
 
 _TURNS = 1.0  # rad that a shaft turns until its hysteresis surely slides
+_BISECTIONS = 45
 
 
 @dataclass(frozen=True)
@@ -93,13 +94,17 @@ class ActuatorDynamics:
     @cached_property
     def sliding(self) -> float:
         """The hysteresis variable at which a shaft that turns forwards slides."""
-        z, step = 0.0, 1e-3
-        for _ in range(int(_TURNS / step)):
-            change = step * self._z_rate(1.0, z + 0.5 * step * self._z_rate(1.0, z))
-            z += change
-            if abs(change) < 1e-9 * abs(z):
+        # From z = 0 on, in steps of a milliradian within the yield travel, then by bisection.
+        low, step = 0.0, 1e-3 * self._z_rate(1.0, 0.0)
+        for _ in range(int(_TURNS / 1e-3)):
+            if self._z_rate(1.0, low + step) <= 0.0:
                 break
-        return z
+            low += step
+        for _ in range(_BISECTIONS):
+            step *= 0.5
+            if self._z_rate(1.0, low + step) > 0.0:
+                low += step
+        return low
 
     @cached_property
     def stiffness(self) -> float:

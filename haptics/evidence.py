@@ -6,6 +6,7 @@ where a variant of the model with limits has it.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +21,8 @@ from haptics import trial
 from haptics.dynamics import SHAFT, ActuatorDynamics
 from haptics.linear_loop import LinearLaw, LoopMargins, loop_margins
 from haptics.operating_points import Branch
-from haptics.program import compiled_trial, step_matrices, stiff_part
+from haptics.program import trial_kernels
+from sysid.engine.scheme import LANES, work_area
 from sysid.threads import one_thread
 
 BoolArray = NDArray[np.bool_]
@@ -30,11 +32,18 @@ HAND_RANGE = 4.0  # factor either way
 STIFFEST_HAND = 40.0  # N*m/rad, of those that walls are promised for: 250 times (A.2)'s
 NOISE = (5e-3, 5e-3, 7e-3)  # A, A, N*m: rms of the sensors
 
-_LONGEST_STEP = 1.6e-4  # s; an amplifier at its end is faster than its linear part
+_LONGEST_STEP = 2.5e-4  # s; of hysteresis at 100 rad/s, and of amplifiers at their ends
 _STILL = 0.25  # s at the end over which the shaft is to be at rest
 _CALM = 1.0  # rad/s rms that an encoder's counts and the sensors' noise leave at most
+_PARTS = 10  # of the trials, after which they are weighed
 _FAMILY = 24  # members whose margins are computed
 _TRIPS = ("current_motor", "current_brake", "speed", "torque")
+LEAST_DISK = 0.2  # disk margin below which an experiment is warned of
+_NO_SPREAD = "No uncertainty of the actuator is known: the trials differ by the hand."
+_CURE = (
+    "A lower friction_share, yield_share, inertia_share or acceleration_filter, or lqg in place of "
+    "feedforward, has more margin."
+)
 _BRANCHES: tuple[Branch, ...] = ("within yield", "sliding forwards")
 
 
@@ -64,10 +73,24 @@ class Outcomes:
         """How many trials each limit ended, (4,)."""
         return np.array([np.sum(self.results[:, trial.TRIPPED] == k + 1) for k in range(4)])
 
+    def failures(self, *, walls: bool = False) -> dict[str, int]:
+        """How many trials speak against the experiment, by what they do; nothing that none does.
+
+        walls: whether not to come to rest is what the experiment is to find out.
+        """
+        counts = {
+            f"simulated trials trip {name}": int(number)
+            for name, number in zip(_TRIPS, self.tripped, strict=True)
+        }
+        if not walls:
+            counts["do not come to rest"] = int((self.restless | self.left).sum())
+        return {what: number for what, number in counts.items() if number}
+
     @property
     def left(self) -> BoolArray:
-        """Which trials left their wall."""
-        gone: BoolArray = self.results[:, trial.LEFT] > 0.0
+        """Which trials ran to the end and left their wall."""
+        ended = self.results[:, trial.TRIPPED] == 0.0
+        gone: BoolArray = ended & (self.results[:, trial.LEFT] > 0.0)
         return gone
 
     @property
@@ -81,46 +104,99 @@ class Outcomes:
 @one_thread()
 def run_trials(
     controller: TunedController, program: LawProgram, scenes: list[Scene], limits: TripLimits,
-    draws: int, seed: int = 0,
+    draws: int, seed: int = 0, *, enough: Callable[[Outcomes], bool] = lambda outcomes: False,
 ) -> Outcomes:  # fmt: skip
-    """Trials of scenes in turn, each with a plausible actuator and hand."""
-    model, control = controller.model, controller.control
+    """Trials of scenes in turn, each with a plausible actuator and hand.
+
+    enough: whether the trials so far decide, asked after each tenth of them and at the end; then no
+    more are made.
+    """
     rng = np.random.default_rng(seed)
     actuators = controller.plausible(draws, seed)
     if not len(actuators):
         actuators = controller.parameters[None]
-    time = program.step.time
-    steps = max(1, math.ceil(time / _LONGEST_STEP))
-    A = np.stack([stiff_part(model, p) for p in actuators])
-    matrices = step_matrices(A, np.full(len(A), time / steps))
     hands = np.array(HAND) * HAND_RANGE ** rng.uniform(-1.0, 1.0, (draws, 1))
-    names = model.state_names
-    omega, _, theta = SHAFT
-    states = [names.index(k) for k in (omega, theta, "current_motor", "current_brake")]
-    inputs = ("applied_voltage_motor", "applied_voltage_brake", "torque")
-    places = np.array(states + [model.input_names.index(k) for k in inputs])
-    ends = limits.current_motor, limits.current_brake, limits.speed, limits.torque
-    bounds = np.array([*ends, *limits.motor, *limits.brake])
-    c, p = np.array(program.constants), np.array(program.parameters)
-    run, results = compiled_trial(model, program.entry), np.zeros((draws, trial.RESULT))
-    for k in range(draws):
-        scene, place = scenes[k % len(scenes)], k % len(actuators)
-        noise = rng.standard_normal((len(scene.reference), 3)) * NOISE
-        walled = scene.wall is not None
-        wall = np.zeros(trial.WALL) if scene.wall is None else scene.wall
-        last = round(_STILL / time)
-        run(
-            scene.reference, scene.share, scene.path, noise, wall, walled, bounds,
-            limits.count, control.ahead, last, places, steps, time,
-            np.zeros(program.n_states), c, p, actuators[place], matrices[place],
-            model.initial_state, np.zeros(len(model.inputs)), np.array([*hands[k], 0.0, 0.0]),
-            np.zeros((6, len(names))), np.zeros((control.ahead + 1, 2)), results[k],
+    blocks, results = TrialBlocks(controller, program, limits), np.empty((0, trial.RESULT))
+    part = LANES * math.ceil(draws / _PARTS / LANES)
+    for first in range(0, draws, LANES):
+        rows = np.arange(first, min(first + LANES, draws))
+        stretch = [scenes[k % len(scenes)] for k in rows]
+        block = blocks.run(stretch, actuators[rows % len(actuators)], hands[rows], rng)
+        results = np.concatenate([results, block])
+        outcomes = Outcomes(results, hands[: len(results)])
+        weighed = len(results) % part == 0 or len(results) == draws
+        if weighed and enough(outcomes):
+            break
+    return outcomes
+
+
+class TrialBlocks:
+    """Blocks of up to ``LANES`` trials of one law."""
+
+    def __init__(
+        self, controller: TunedController, program: LawProgram, limits: TripLimits
+    ) -> None:
+        self._kernels = trial_kernels(controller.model, program.entry)
+        self._program, self._ahead = program, controller.control.ahead
+        self._count = limits.count
+        ends = limits.current_motor, limits.current_brake, limits.speed, limits.torque
+        self._limits = np.array([*ends, *limits.motor, *limits.brake])
+        model, kernel = self._kernels.model, self._kernels.plants.kernel
+        omega, _, theta = SHAFT
+        states = (omega, theta, "current_motor", "current_brake")
+        inputs = ("applied_voltage_motor", "applied_voltage_brake", "hand_theta", "hand_omega")
+        self._places = np.array(
+            [model.state_names.index(name) for name in states]
+            + [model.input_names.index(name) for name in inputs]
+            + [kernel.n_inputs]
+        )
+
+    def run(
+        self,
+        scenes: list[Scene],
+        actuators: FloatArray,
+        hands: FloatArray,
+        rng: np.random.Generator,
+    ) -> FloatArray:
+        """Results of trials, (m, ``trial.RESULT``); actuators (m, n_parameters), hands (m, 2)."""
+        program, plants, model = self._program, self._kernels.plants, self._kernels.model
+        m, kernel, time = len(scenes), plants.kernel, program.step.time
+        lanes = np.arange(LANES) % m
+        parameters = np.ascontiguousarray(np.hstack([actuators, hands])[lanes].T)
+        work, inputs = work_area(kernel.work_rows * LANES), work_area(kernel.input_rows * LANES)
+        inputs[:] = 0.0
+        initial = model.initial_state
+        steps = max(1, math.ceil(time / _LONGEST_STEP))
+        plants.prepare(
+            work, work.reshape(-1, LANES), kernel.tables, np.tile(initial[:, None], LANES),
+            parameters, time / steps,
         )  # fmt: skip
-    return Outcomes(results, hands)
+        noise = np.stack([rng.standard_normal((len(s.reference), 3)) * NOISE for s in scenes])
+        none, results = np.zeros(trial.WALL), np.zeros((m, trial.RESULT))
+        tracker = np.zeros((m, trial.TRACKER))
+        tracker[:, trial.TRACKED] = initial[self._places[trial.THETA]]
+        self._kernels.run(
+            np.stack([s.reference for s in scenes]), np.stack([s.share for s in scenes]),
+            np.stack([s.path for s in scenes]), noise,
+            np.stack([none if s.wall is None else s.wall for s in scenes]), self._limits, hands,
+            self._count, self._ahead, round(_STILL / time), self._places, steps, time, work,
+            inputs, np.zeros((m, program.n_states)), np.array(program.constants),
+            np.array(program.parameters), tracker, np.zeros((m, self._ahead + 1, 2)), results,
+        )  # fmt: skip
+        return results
+
+
+@dataclass(frozen=True)
+class FamilyLoop:
+    """Margins of one loop of a family; hand: in parts of (A.2)'s."""
+
+    branch: Branch
+    hand: float
+    margins: LoopMargins
 
 
 @one_thread()
-def family_margins(controller: TunedController, seed: int = 0) -> list[LoopMargins]:
+def family_margins(controller: TunedController, seed: int = 0) -> list[FamilyLoop]:
     """Margins of plausible actuators in hands of both ends and the middle, by branch."""
     control = controller.control
     actuators = np.concatenate(
@@ -128,14 +204,14 @@ def family_margins(controller: TunedController, seed: int = 0) -> list[LoopMargi
     )
     program = control.program(controller.model, controller.parameters)
     laws_of = {branch: LinearLaw.of(program, controller.model, branch) for branch in _BRANCHES}
+    time, ahead = 1.0 / control.sample_rate, control.ahead
     return [
-        loop_margins(
-            laws_of[branch],
-            dynamics,
+        FamilyLoop(
             branch,
-            (HAND[0] * scale, HAND[1] * scale),
-            1.0 / control.sample_rate,
-            control.ahead,
+            scale,
+            loop_margins(
+                laws_of[branch], dynamics, branch, (HAND[0] * scale, HAND[1] * scale), time, ahead
+            ),
         )
         for dynamics in (ActuatorDynamics(controller.model, p) for p in actuators)
         for branch in _BRANCHES
@@ -164,42 +240,57 @@ def fading(values: FloatArray, time: float) -> FloatArray:
 
 
 def weigh(
-    outcomes: Outcomes, margins: list[LoopMargins], spread: bool, *, walls: bool = False
+    outcomes: Outcomes, family: list[FamilyLoop], draws: int, spread: bool, *, walls: bool = False
 ) -> Evidence:
     """What trials and margins come to, and whether they speak against the experiment.
 
-    walls: whether not to come to rest is what the experiment is to find out.
+    draws: of trials that were asked for. spread: whether the actuators differ. walls: as of
+    ``Outcomes.failures``.
     """
     results, tripped = outcomes.results, outcomes.tripped
     restless = outcomes.restless | outcomes.left
     count = len(results)
-    peak = max(margin.sensitivity for margin in margins)
+    least = min(family, key=lambda member: member.margins.disk)
+    peak = max(member.margins.sensitivity for member in family)
     largest = results[:, trial.MOST : trial.MOST + 4].max(axis=0)
     units = ("A", "A", "rad/s", "N*m")
     numbers = [
         Number("trials", count, "1", meaning="each with an actuator and a hand of its own"),
         Number("tripped", float(tripped.sum()), "1", meaning="of them, by any limit"),
         Number("restless", float(restless.sum()), "1", meaning="that did not come to rest"),
-        Number("disk_margin", min(m.disk for m in margins), "1", meaning="least of the family"),
+        Number("disk_margin", least.margins.disk, "1", meaning="least of the family"),
         *([Number("sensitivity", peak, "1", meaning="largest |S|")] if math.isfinite(peak) else []),
         *(
             Number(f"largest_{name}", float(most), unit, meaning="of all trials")
             for name, most, unit in zip(_TRIPS, largest, units, strict=True)
         ),
     ]
-    unstable = sum(not margin.stable for margin in margins)
-    remarks = []
-    if not spread:
-        remarks.append("No uncertainty of the actuator is known: the trials differ by the hand.")
-    if unstable:
-        remarks.append(
-            f"{unstable} of {len(margins)} linear loops are unstable: disk margin 0, |S| infinite."
-        )
+    remarks = [] if spread else [_NO_SPREAD]
+    if least.margins.disk < LEAST_DISK:
+        remarks.append(_warning(least, sum(not member.margins.stable for member in family)))
+    first = "" if count == draws else "the first "
     refusals = [
-        f"{number:.0f} of {count} simulated trials trip {name}"
-        for name, number in zip(_TRIPS, tripped, strict=True)
-        if number
+        f"{number:.0f} of {first}{count} {what}"
+        for what, number in outcomes.failures(walls=walls).items()
     ]
-    if restless.any() and not walls:
-        refusals.append(f"{restless.sum()} of {count} do not come to rest")
     return Evidence(tuple(numbers), tuple(remarks), "; ".join(refusals))
+
+
+def _warning(least: FamilyLoop, unstable: int) -> str:
+    """What a small disk margin means, by the loop that has it."""
+    where = f"{least.branch}, in a hand of {least.hand:g} times that of (A.2)"
+    if unstable:
+        text = (
+            f"Warning: {unstable} loops of the family are unstable as linear ones (one of them "
+            f"{where}): disk margin 0, |S| infinite. In the trials friction held them."
+        )
+    else:
+        disk = least.margins.disk
+        gain, phase = 2.0 * disk / (2.0 + disk), 2.0 * math.atan(0.5 * disk)
+        text = (
+            f"Warning: a disk margin of {disk:.2g} ({where}): a gain that is off by "
+            f"{100.0 * gain:.2g} % or a phase by {math.degrees(phase):.2g} degrees may make this "
+            "loop swing. The trials have such actuators as the identification leaves open, and "
+            "nothing that the model lacks."
+        )
+    return f"{text} {_CURE}"

@@ -9,7 +9,8 @@ from pydantic import Field
 from daq.experiment import Aboard, ClosedLoop, Evidence, SettingError, TripLimits
 from daq.hal import FloatArray
 from daq.lookup.controllers import TunedController, load_controller
-from haptics.evidence import Scene, family_margins, run_trials, weigh
+from daq.progress import Progress, Watch, ignore
+from haptics.evidence import Outcomes, Scene, family_margins, run_trials, weigh
 
 
 class TorqueExperiment(ClosedLoop):
@@ -60,16 +61,27 @@ class TorqueExperiment(ClosedLoop):
         """What its trials ask of the controller; none by default, and then no trials."""
         return []
 
-    def evidence(self, limits: TripLimits, draws: int) -> Evidence | None:
-        """Trials of its scenes, each with a plausible actuator and hand, and margins."""
+    def evidence(self, limits: TripLimits, draws: int, watch: Watch = ignore) -> Evidence | None:
+        """Trials of its scenes, each with a plausible actuator and hand, and margins.
+
+        They end at the first tenth of the trials that speaks against the experiment.
+        """
         scenes = self.scenes() if self.is_controlled else []
         if not scenes:
             return None
+        walls = any(scene.wall is not None for scene in scenes)
+
+        def refused(outcomes: Outcomes) -> bool:
+            done = len(outcomes.results)
+            watch(Progress("Simulated trials", done, draws, f"{done}/{draws}"))
+            return bool(outcomes.failures(walls=walls))
+
         tuned = self.tuned_controller
         program = tuned.control.program(tuned.model, tuned.parameters)
-        outcomes = run_trials(tuned, program, scenes, limits, draws)
-        walls = any(scene.wall is not None for scene in scenes)
-        return weigh(outcomes, family_margins(tuned), bool(tuned.spread[0]), walls=walls)
+        watch(Progress("Simulated trials", 0, draws, f"0/{draws}"))
+        outcomes = run_trials(tuned, program, scenes, limits, draws, enough=refused)
+        spread = bool(tuned.spread[0])
+        return weigh(outcomes, family_margins(tuned), draws, spread, walls=walls)
 
 
 class ReferenceExperiment(TorqueExperiment):

@@ -5,6 +5,7 @@ import inspect
 import math
 import types
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,12 +15,16 @@ from daq.experiment import Sample
 from daq.torque import LawProgram, ModelStep
 from haptics import laws, model_step, trial
 from haptics.dynamics import SHAFT
-from sysid import ProcessModel, linearize
+from sysid import Input, Output, Parameter, ProcessModel, linearize
 from sysid.arrays import FloatArray
-from sysid.engine.compiler import compiled_text
+from sysid.engine.compiler import SampleLanes, compiled_text, sample_lanes
 from sysid.engine.scalar_text import ScalarEquations
 
 LONGEST_STEP = 4e-4  # s, of the model
+HAND = (
+    Parameter("hand_stiffness", "N*m/rad", 0.16, 0.0, 100.0),
+    Parameter("hand_damping", "N*m*s/rad", 0.0179, 0.0, 10.0),
+)
 _LIMITED = "limits=true"
 LAWS = ("static", "feedforward", "lqg")
 
@@ -78,16 +83,49 @@ def with_limits(model: ProcessModel) -> ProcessModel:
     return variant if variant is not None and fits else model
 
 
+@dataclass(frozen=True)
+class TrialKernels:
+    """Compiled trials of a law, and the kernel of the plants that they advance.
+
+    model: of the plants, each in a hand of its own.
+    """
+
+    model: ProcessModel
+    plants: SampleLanes
+    run: Callable[..., None]
+
+
 @functools.lru_cache(maxsize=4)
-def compiled_trial(model: ProcessModel, law: str) -> Callable[..., None]:
+def trial_kernels(model: ProcessModel, law: str) -> TrialKernels:
     """``haptics.trial`` with a law, as machine code; the actuator's amplifiers have ends."""
+    in_hand = held(with_limits(model))
+    plants = sample_lanes(in_hand)
     text = source_of(trial).replace("answer(", f"{law}(")
-    # Of two functions of a name the last is taken.
-    plant = ScalarEquations(with_limits(model)).slopes()
-    function: Callable[..., None]
-    whole = "\n\n".join([law_text(model), plant, text])
-    (function,) = compiled_text(f"trial_{law}", whole, ["trial"])
-    return function
+    whole = f"# {plants.key}\n{law_text(model)}\n\n{text}"
+    called = {"next_sample": plants.advance}
+    (run,) = compiled_text(f"trial_{law}", whole, ["trials"], called)
+    return TrialKernels(in_hand, plants, run)
+
+
+def held(model: ProcessModel) -> ProcessModel:
+    """The model in a hand: two more inputs, its angle and speed, and parameters, see ``HAND``."""
+    derivative, m, n = model.derivative, len(model.inputs), len(model.parameters)
+    omega, _, theta = (model.state_names.index(name) for name in SHAFT)
+    load = model.input_names.index("torque")
+
+    def in_hand(x: Any, u: Any, p: Any) -> Any:
+        push = p[n] * (u[m] - x[theta]) + p[n + 1] * (u[m + 1] - x[omega])
+        return derivative(x, (*u[:load], u[load] + push, *u[load + 1 : m]), p[:n])
+
+    held_inputs = tuple(replace(signal, hold="zoh") for signal in model.inputs)
+    return ProcessModel(
+        f"{model.name} in a hand",
+        model.states,
+        (*held_inputs, Input("hand_theta", "rad", "foh"), Input("hand_omega", "rad/s")),
+        (Output("theta", "rad"),),
+        (*model.parameters, *HAND),
+        in_hand,
+    )
 
 
 def law_program(

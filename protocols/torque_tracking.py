@@ -6,7 +6,6 @@ from typing import ClassVar
 
 import numpy as np
 from pydantic import Field
-from scipy.signal import butter, sosfiltfilt
 
 from daq.config.units import Hertz, NewtonMetres, Seconds
 from daq.experiment import Aboard, Answer, Controller, Plan, Sample, SettingError
@@ -15,7 +14,7 @@ from daq.hal import FloatArray, Samples
 from daq.torque import TorqueLaw
 from haptics.evidence import Scene, fading, hand_path
 from haptics.experiment import ReferenceExperiment
-from protocols.analysis.results import TIME, TORQUE
+from protocols.analysis.results import TIME, TORQUE, low_passed
 from protocols.multisine import crest_factor
 
 _DRAWS = 64  # sets of phases, of which the one with the lowest crest factor is taken
@@ -71,11 +70,9 @@ class TorqueTracking(ReferenceExperiment):
         time = np.arange(n) / self.sample_rate
         frequency = np.linspace(*self.band, self.lines)
         phase_of_line = 2.0 * np.pi * np.outer(frequency, time)
-        rng = np.random.default_rng(self.seed)
-        sums = (
-            np.cos(phase_of_line + rng.uniform(0.0, 2.0 * np.pi, (self.lines, 1))).sum(axis=0)
-            for _ in range(_DRAWS)
-        )
+        cosine, sine = np.cos(phase_of_line), np.sin(phase_of_line)
+        phases = np.random.default_rng(self.seed).uniform(0.0, 2.0 * np.pi, (_DRAWS, self.lines))
+        sums = (np.cos(phase) @ cosine - np.sin(phase) @ sine for phase in phases)
         wave = min(sums, key=crest_factor)
         rise = np.clip(np.minimum(time, time[-1] - time) / max(self.fade, 1e-9), 0.0, 1.0)
         shape = 0.5 - 0.5 * np.cos(np.pi * rise)
@@ -117,8 +114,8 @@ class TorqueTracking(ReferenceExperiment):
         if len(samples) < 2.0 * self.sample_rate / self.judged_to + 30:
             raise ValueError("too few samples were logged to tell an error from noise")
         reference, felt = extra["torque_ref"], -samples.torque
-        sections = butter(2, self.judged_to, fs=self.sample_rate, output="sos")
-        error = sosfiltfilt(sections, felt - reference)
+        shown = low_passed(felt, self.judged_to, self.sample_rate)
+        error = low_passed(felt - reference, self.judged_to, self.sample_rate)
         size, rms = (math.sqrt(float(np.mean(x**2))) for x in (reference, error))
         fastest = float(np.max(np.abs(samples.omega)))
         numbers = [
@@ -133,7 +130,7 @@ class TorqueTracking(ReferenceExperiment):
         last = samples.time >= samples.time[-1] - self.fade - _SHOWN
         time = samples.time[last]
         series = (
-            Series("felt", time, sosfiltfilt(sections, felt)[last]),
+            Series("felt", time, shown[last]),
             Series("asked for", time, reference[last], style="model"),
         )
         chart = Chart("torque", "Torque on the hand", TIME, TORQUE, series)

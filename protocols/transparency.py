@@ -6,7 +6,6 @@ from typing import ClassVar
 
 import numpy as np
 from pydantic import Field
-from scipy.signal import butter, sosfiltfilt
 
 from daq.config.units import Hertz, Seconds
 from daq.experiment import Aboard, Answer, Controller, Plan, Sample, SettingError
@@ -15,7 +14,7 @@ from daq.hal import FloatArray, IntArray, Samples
 from daq.torque import TorqueLaw
 from haptics.evidence import Scene, hand_path
 from haptics.experiment import ReferenceExperiment
-from protocols.analysis.results import TIME, TORQUE
+from protocols.analysis.results import TIME, TORQUE, low_passed
 
 _RAMP = 0.1  # s, in which the controller comes and goes
 _SETTLED = 0.3  # s behind the end of a ramp, that do not count
@@ -104,10 +103,9 @@ class Transparency(ReferenceExperiment):
             "free": settled & (extra["controlled"] == 0.0),
             "controlled": settled & (extra["controlled"] == 1.0),
         }
-        sections = butter(2, self.judged_to, fs=self.sample_rate, output="sos")
         if len(samples) < 100 or not all(rows.any() for rows in parts.values()):
             raise ValueError("the run ended before a controlled block did")
-        felt = sosfiltfilt(sections, -samples.torque)
+        felt = low_passed(-samples.torque, self.judged_to, self.sample_rate)
         torque = {name: _rms(felt[rows]) for name, rows in parts.items()}
         speed = {name: _rms(samples.omega[rows]) for name, rows in parts.items()}
         if min(speed.values()) < _MOVING:

@@ -8,6 +8,7 @@ import numpy as np
 from daq.experiment import Controller, Evidence, Plan, TripLimits
 from daq.findings import Chart, Findings, Number, Series
 from daq.hal import FloatArray, Samples
+from daq.progress import Watch, ignore
 from haptics.evidence import HAND, HAND_RANGE, STIFFEST_HAND, Scene
 from haptics.passivity import Hands, Passivity, Tracker, UnknownPassivityError
 from protocols.analysis.results import DAMPING, STIFFNESS
@@ -73,9 +74,9 @@ class VirtualWall(WallSettings):
             for cell in self.cells
         ]  # fmt: skip
 
-    def evidence(self, limits: TripLimits, draws: int) -> Evidence | None:
+    def evidence(self, limits: TripLimits, draws: int, watch: Watch = ignore) -> Evidence | None:
         """The same as of any controller's experiment, and which walls are passive."""
-        evidence = super().evidence(limits, draws)
+        evidence = super().evidence(limits, draws, watch)
         if evidence is None:
             return None
         try:

@@ -155,7 +155,7 @@ def _evidence(session: Session, draws: int, watch: Watch) -> Evidence | None:
     experiment, rig = session.loaded.experiment, session.rig
     if not isinstance(experiment, ClosedLoop):
         return None
-    evidence = evidence_of(experiment, trip_limits(rig), draws)
+    evidence = evidence_of(experiment, trip_limits(rig), draws, watch)
     if evidence is not None and evidence.refusal:
         raise ConfigError(
             evidence.refusal,

@@ -24,6 +24,7 @@ from daq.experiment import (
 )
 from daq.findings import Chart, Heatmap
 from daq.hal import CHANNELS, FloatArray, Samples
+from daq.progress import Watch
 
 _ROUNDING = 1e-9  # of a plan's bounds
 
@@ -164,10 +165,12 @@ def aboard_of(experiment: Experiment) -> Aboard | None:
         return experiment.aboard() if isinstance(experiment, ClosedLoop) else None
 
 
-def evidence_of(experiment: ClosedLoop, limits: TripLimits, draws: int) -> Evidence | None:
+def evidence_of(
+    experiment: ClosedLoop, limits: TripLimits, draws: int, watch: Watch
+) -> Evidence | None:
     """What a protocol's trials say beforehand. Raises ConfigError."""
     with _before_the_run(experiment, "in evidence()"):
-        return experiment.evidence(limits, draws)
+        return experiment.evidence(limits, draws, watch)
 
 
 @contextlib.contextmanager

@@ -67,3 +67,12 @@ def table_of_rows(
     values = {column: each for (column, *_), each in zip(columns, np.array(rows).T, strict=True)}
     units = {column: unit.strip("[]") for column, _, unit in columns if unit}
     return Table(name, title, values, units, printed)
+
+
+def low_passed(values: FloatArray, highest: float, sample_rate: float) -> FloatArray:
+    """What values, (n,), have up to a frequency, without delay; both in hertz."""
+    from scipy.signal import butter, sosfiltfilt
+
+    sections = butter(2, highest, fs=sample_rate, output="sos")
+    filtered: FloatArray = sosfiltfilt(sections, values)
+    return filtered

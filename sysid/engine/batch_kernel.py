@@ -102,6 +102,7 @@ class BatchKernel(Scheme):
     def _all_lanes(self, paired: bool) -> list[str]:
         """One step of all lanes and their error estimates, as scalars of lane l."""
         lines = [
+            *self._inputs_of_lane(),
             *[f"x{i} = {at(i)}" for i in range(self.n_states)],
             self._constants(),
             *self.slope("x", "ua", "m", "k"),
@@ -112,6 +113,10 @@ class BatchKernel(Scheme):
         if paired:
             return block(f"for l in range({LANES // 2}):", _paired(lines))
         return block(EACH_LANE, lines)
+
+    def _inputs_of_lane(self) -> list[str]:
+        """Inputs that are lane l's, where not all have the same."""
+        return []
 
     def _estimate(self) -> list[str]:
         """Add the step's error estimate, as it shows in the outputs, to the lane's sums."""

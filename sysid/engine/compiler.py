@@ -25,6 +25,7 @@ import numpy as np
 
 from sysid.engine.batch_kernel import BatchKernel
 from sysid.engine.filter_kernel import FilterKernel
+from sysid.engine.sample_kernel import SampleKernel
 from sysid.engine.structure import analyse
 from sysid.engine.substitution import KNOWN_MODULES, Copier, names_in
 from sysid.engine.tangent import TangentKernel
@@ -130,6 +131,28 @@ def tangents(model: ProcessModel) -> Tangents:
     return Tangents(kernel, *_compiled(model, text, {}, ("simulate",)))
 
 
+@dataclass(frozen=True)
+class SampleLanes:
+    """A model's compiled functions of ``SampleKernel``; key: fingerprint of what they do."""
+
+    kernel: SampleKernel
+    key: str
+    prepare: Callable[..., None]
+    advance: Callable[..., None]
+
+
+@_once
+def sample_lanes(model: ProcessModel) -> SampleLanes:
+    """Compile what advances lanes of a model sample by sample; as ``kernels``."""
+    from sysid.engine.intrinsics import many_registers
+
+    kernel = SampleKernel(model, analyse(model))
+    text = f"{kernel.structure.program}\n\n{kernel.text(many_registers=many_registers())}"
+    called = {name: getattr(model, name) for name in sorted(kernel.structure.calls)}
+    functions = _compiled(model, text, called, ("prepare", "advance"))
+    return SampleLanes(kernel, _key(text, called), *functions)
+
+
 def _compiled(
     model: ProcessModel, text: str, called: Mapping[str, Any], functions: Sequence[str]
 ) -> list[Any]:
@@ -170,10 +193,13 @@ def _define(name: str, text: str, scope: dict[str, Any]) -> Path | None:
     return path
 
 
-def compiled_text(name: str, text: str, functions: Sequence[str]) -> list[Any]:
+def compiled_text(
+    name: str, text: str, functions: Sequence[str], called: Mapping[str, Any] | None = None
+) -> list[Any]:
     """Functions of a text of plain scalar Python, compiled; all that they call stands in it.
 
-    name: by which it lies in the cache folder.
+    name: by which it lies in the cache folder. called: compiled functions that the text calls; it
+    has to differ where they do.
 
     >>> text = "def double(x): return 2.0 * x"
     >>> (double,) = compiled_text("example", text, ["double"])
@@ -185,6 +211,7 @@ def compiled_text(name: str, text: str, functions: Sequence[str]) -> list[Any]:
     for key, item in scope.items():
         if isinstance(item, types.FunctionType) and key not in functions:
             scope[key] = _njit(item)
+    scope |= called or {}
     return [_njit(scope[key], nogil=True, cache=path is not None) for key in functions]
 
 

@@ -1,6 +1,7 @@
 """Trials before a run: against theory, against the simulated rig, and what they refuse."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +16,17 @@ from daq.experiment import TripLimits
 from daq.lookup.controllers import load_controller
 from daq.lookup.experiments import load_experiment
 from daq.recording.preview import trip_limits
+from haptics import trial
 from haptics.dynamics import ActuatorDynamics
-from haptics.evidence import HAND, HAND_RANGE, STIFFEST_HAND, run_trials
+from haptics.evidence import (
+    HAND,
+    HAND_RANGE,
+    STIFFEST_HAND,
+    Outcomes,
+    family_margins,
+    run_trials,
+    weigh,
+)
 from haptics.linear_loop import LinearLaw, loop_margins
 from haptics.passivity import Hands, Passivity, Tracker
 from protocols.analysis.walls import SampledWall
@@ -79,6 +89,40 @@ def test_a_limit_ends_the_trials_that_reach_it(static):
     assert trials(tuned, file, 12, low).tripped.tolist() == [0, 0, 6, 0]
 
 
+def test_trials_end_at_the_first_tenth_that_decides(static):
+    folder, path, tuned = static
+    scenes = load_experiment(str(experiment(folder, path, duration=4.0))).experiment.scenes()
+    program = tuned.control.program(tuned.model, tuned.parameters)
+    low = replace(LIMITS, speed=5.0)
+    weighed = []
+
+    def enough(outcomes):
+        weighed.append(len(outcomes.results))
+        return bool(outcomes.failures())
+
+    outcomes = run_trials(tuned, program, scenes, low, 300, enough=enough)
+    assert weighed == [32] and len(outcomes.results) == len(outcomes.hands) == 32
+    evidence = weigh(outcomes, family_margins(tuned), 300, spread=False)
+    assert " of the first 32 simulated trials trip speed" in evidence.refusal
+    whole = run_trials(tuned, program, scenes, low, 300)
+    assert np.array_equal(whole.results[:32], outcomes.results) and len(whole.results) == 300
+
+
+def test_a_small_disk_margin_is_explained_and_a_robust_loop_is_not_warned_of(static, tmp_path):
+    """The inverse takes friction off a sample late, which a light hand hardly stands."""
+    outcomes = Outcomes(np.zeros((1, trial.RESULT)), np.zeros((1, 2)))
+    inverse = load_controller(str(controller(tmp_path, "feedforward")), tmp_path)
+    remarks = {}
+    for name, tuned in (("static", static[2]), ("feedforward", inverse)):
+        evidence = weigh(outcomes, family_margins(tuned), 1, spread=True)
+        assert not evidence.refusal
+        remarks[name] = " ".join(evidence.remarks)
+    assert remarks["static"] == ""
+    assert "disk margin of 0.059 (within yield, in a hand of 0.25 times" in remarks["feedforward"]
+    # (2 - d) / (2 + d) of the gain, and 2 atan(d / 2) of the phase.
+    assert "a gain that is off by 5.7 % or a phase by 3.4 degrees" in remarks["feedforward"]
+
+
 def test_a_law_that_feeds_nothing_back_has_all_margins(static):
     _, _, tuned = static
     law = LinearLaw.of(tuned.control.program(tuned.model, tuned.parameters), tuned.model)
@@ -101,7 +145,9 @@ def test_rig_check_tells_trials_and_refuses_what_trips(static):
     slow["limits"]["speed"] = 5.0
     (folder / "slow.yaml").write_text(yaml.safe_dump(slow))
     refused = rig("check", file.name, "--draws", "50", "--rig", "slow.yaml", cwd=folder)
-    assert refused.returncode == 2 and "of 50 simulated trials trip speed" in refused.stderr
+    assert (
+        refused.returncode == 2 and "of the first 16 simulated trials trip speed" in refused.stderr
+    )
     done = rig("check", file.name, "--draws", "0", "--rig", "slow.yaml", cwd=folder)
     assert done.returncode == 0, done.stderr
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from daq.experiment import Sample
+from haptics import laws, model_step, trial
 from haptics.feedforward import Feedforward
 from haptics.laws import STATES
 from haptics.lqg import Lqg
@@ -26,6 +27,18 @@ def samples(n=600):
         if k % 50 != 20:
             theta, omega = 2.0 * np.sin(5.0 * t), 10.0 * np.cos(5.0 * t)
             yield Sample(k, t, 0.3 * np.sin(9.0 * t), 0.0, 0.05 * np.sin(12.0 * t), theta, omega, 0)
+
+
+def test_the_texts_that_are_compiled_together_share_no_name():
+    """Of two numbers or functions of one name the last would be taken for both."""
+    names = [
+        name
+        for module in (laws, model_step, trial)
+        for name, item in vars(module).items()
+        if getattr(item, "__module__", "") == module.__name__
+        or (name.isupper() and name != "TYPE_CHECKING")
+    ]
+    assert len(names) > 100 and len(names) == len(set(names))
 
 
 @pytest.mark.parametrize("control", CONTROLS, ids=lambda control: control.controller)
