@@ -44,7 +44,8 @@ def remedies(
     changes: dict[str, str] = dict(setting.split("=", 1) for setting in of_faults)
     lags = any(fault.kind == "lag" for fault in faults)  # which delays that were found are as well
     units = channels or {}
-    of_all_logs = [f for f in findings if f.name in units and not (lags and f.kind == "delay")]
+    whole = [f for f in findings if f.name in units or f.kind == "exchange"]
+    of_all_logs = [f for f in whole if not (lags and f.kind == "delay")]
     changes |= dict(_of_channels(settings, of_all_logs, units))
     if not changes:  # what is wrong with the data drives parameters to the ends
         changes |= dict(_of_ranges(pushed or {}))
@@ -64,6 +65,11 @@ def _of_channels(
             for name, column in signals.items()
         }
     for finding in findings:
+        if finding.kind == "exchange":
+            pair = finding.name.split(" and ")
+            for name, taken in zip(pair, reversed(pair), strict=True):
+                if name in columns and taken in columns:
+                    yield f"{columns[name][0]}.column", columns[taken][1].column or taken
         if finding.kind == "delay" and finding.counts and finding.amplitude is not None:
             late = settings.delay.get(finding.name, 0.0) + finding.amplitude
             yield f"delay.{finding.name}", shortest(float(f"{late:.3g}"))

@@ -10,6 +10,7 @@ from sysid.fitting.refinement import refine
 from sysid.gassi import GASSI, PRESETS
 from sysid.judging.alternatives import Alternative, best_alternative
 from sysid.judging.assessment import RecordResult, Verdict, examine, judge
+from sysid.judging.exchanges import exchanged_channels
 from sysid.judging.expected_errors import expected_errors
 from sysid.judging.lags import lag_faults
 from sysid.judging.score_tests import Finding, missing_physics
@@ -107,6 +108,9 @@ def suspected(
         findings = missing_physics(objective, chromosome, tested)
     except ModelError:  # equations that cannot be added to, or a run that fails
         return None
+    exchange = exchanged_channels(estimator, uncertainty, training)
+    if exchange is not None:
+        return Suspicion((exchange,), None)  # what else is found is of the wrong channels
     fitted = best_alternative(findings, estimator, uncertainty, training, validation)
     return Suspicion(findings, fitted)
 

@@ -597,6 +597,7 @@ _WORDS = {
     "offset": "{name} is {amplitude:.3g} {unit} off",
     "drift": "{name} drifts by {amplitude:.3g} {unit} from a record's first sample on",
     "saturation": "{name} saturates near its largest values",
+    "exchange": "{name} have changed places in the log",
 }
 
 

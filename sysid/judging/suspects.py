@@ -20,7 +20,16 @@ from sysid.problem.preparation import at_places
 from sysid.problem.terms import AddedTerm, Shape
 
 Kind = Literal[
-    "variant", "delay", "offset", "drift", "gain", "saturation", "change", "function", "disturbance"
+    "variant",
+    "delay",
+    "offset",
+    "drift",
+    "gain",
+    "saturation",
+    "change",
+    "function",
+    "disturbance",
+    "exchange",
 ]
 
 _PARTS = (0.5, 2.0)  # of a variant's further parameters

@@ -89,6 +89,17 @@ def test_faults_of_samples_come_first_and_a_lag_is_taken_out_once():
     assert mended(faults=[fault("outliers", "note", "robust=true")]) == ()
 
 
+def test_exchanged_channels_take_each_other_s_column():
+    outputs = {"y": {"column": "left"}, "z": {"column": "right"}}
+    columns = {"columns": {**COLUMNS["columns"], "outputs": outputs}}
+    exchange = [found("exchange", "y and z", 1.0)]
+    assert mended(exchange, **columns) == (
+        "columns.outputs.y.column=right",
+        "columns.outputs.z.column=left",
+    )
+    assert mended(exchange) == ()
+
+
 def test_gains_offsets_and_drifts_become_parameters():
     wrong = [found("gain", "y", 0.3), found("offset", "u", -0.04), found("drift", "y", 0.01)]
     assert mended(wrong) == (
