@@ -2,10 +2,12 @@
 
 import math
 from collections.abc import Callable
+from typing import Self
 
 import numpy as np
 from pydantic import Field
 
+from daq.config.units import RadiansPerSecond
 from daq.torque import Fact, OperatingPoint, TorqueControl
 from haptics import laws
 from haptics.allocation import Allocation, Preference
@@ -35,12 +37,22 @@ _FACTS: tuple[tuple[str, str, str, Callable[[ActuatorDynamics], float]], ...] = 
         lambda d: -d.rest(0.0, 1.0, d.sliding, 0.0),
     ),
     (
+        "viscous_friction",
+        "N*m*s/rad",
+        "by which the sliding shaft's torque grows, from 1 to 30 rad/s",
+        lambda d: (d.rest(0.0, 1.0, d.sliding, 0.0) - d.rest(0.0, 30.0, d.sliding, 0.0)) / 29.0,
+    ),
+    (
         "yield_angle",
         "rad",
         "by which the shaft turns before it slides",
         lambda d: 1.0 / d.stiffness,
     ),
 )
+
+
+_SLIDING = 2.0  # rad/s, of a shaft that slides as operating points have it, and more
+_DOUBT = 0.25  # of the residual torque, that the speed's share of friction may be in doubt
 
 
 class ActuatorControl(TorqueControl):
@@ -106,3 +118,39 @@ class ActuatorControl(TorqueControl):
         }
         shared = dict(enumerate(self.shared(dynamics).constants))
         return [float({**values, **shared}.get(k, 0.0)) for k in range(laws.CONSTANTS)]
+
+
+class InverseControl(ActuatorControl):
+    """Settings of a controller that takes the shaft's friction off by the model."""
+
+    encoder_counts: int = Field(8192, ge=4, description="of the encoder in a revolution")
+    friction_speed: RadiansPerSecond = Field(
+        1000.0,
+        gt=0.0,
+        le=1000.0,
+        description="up to which the model tells friction, which is held beyond; tune lowers it to "
+        "where the identification leaves too much of it open",
+    )
+
+    def constants(self, dynamics: ActuatorDynamics) -> list[float]:
+        """The same, and how far friction is trusted."""
+        constants = super().constants(dynamics)
+        constants[laws.FRICTION_SPEED] = self.friction_speed
+        return constants
+
+    def trusting(self, facts: tuple[Fact, ...]) -> Self:
+        """With friction no further than it is known.
+
+        A log of low speeds tells Coulomb from viscous friction badly, and the latter's share grows
+        with the speed. What is taken off too much drives the shaft.
+        """
+        viscous, residual = (
+            next(fact for fact in facts if fact.name == name)
+            for name in ("viscous_friction", "residual_torque")
+        )
+        low, high = viscous.ends
+        doubt = 0.5 * (high - low)
+        if not doubt * self.friction_speed > _DOUBT * abs(residual.value):
+            return self
+        speed = max(_DOUBT * abs(residual.value) / doubt, _SLIDING)
+        return self.model_copy(update={"friction_speed": float(f"{speed:.4g}")})

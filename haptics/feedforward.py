@@ -27,7 +27,7 @@ from pydantic import Field
 from daq.config.units import Hertz, NewtonMetres, Part
 from daq.torque import Fact, LawProgram
 from haptics import laws
-from haptics.actuator_control import ActuatorControl
+from haptics.actuator_control import InverseControl
 from haptics.dynamics import ActuatorDynamics
 from haptics.observer import Hand, SensorNoise, ShaftFilter
 from haptics.program import law_program
@@ -37,7 +37,7 @@ from sysid.arrays import FloatArray
 _CERTAIN = 0.95  # of the inertia, the most that is ever taken off
 
 
-class Feedforward(ActuatorControl):
+class Feedforward(InverseControl):
     """Inverse of amplifiers, coil, hysteresis, friction and inertia."""
 
     controller: Literal["feedforward"] = Field(description="feedforward")
@@ -53,7 +53,6 @@ class Feedforward(ActuatorControl):
     acceleration_filter: Hertz = Field(
         50.0, gt=0.0, le=1e4, description="bandwidth of the acceleration that is compensated"
     )
-    encoder_counts: int = Field(8192, ge=4, description="of the encoder in a revolution")
     hand_walk: NewtonMetres = Field(
         0.03, gt=0.0, le=10.0, description="by which the hand's torque changes in a sample, roughly"
     )
@@ -64,10 +63,10 @@ class Feedforward(ActuatorControl):
         parameters: FloatArray,
         facts: tuple[Fact, ...],
     ) -> Self:
-        """No more of the inertia than the least plausible one has."""
+        """No more of the inertia than the least plausible one has, and friction as it is known."""
         inertia = next(fact for fact in facts if fact.name == "inertia")
         share = min(self.inertia_share, _CERTAIN * inertia.ends[0] / inertia.value)
-        return self.model_copy(update={"inertia_share": float(f"{share:.4g}")})
+        return self.trusting(facts).model_copy(update={"inertia_share": float(f"{share:.4g}")})
 
     def program(self, model: ProcessModel, parameters: FloatArray) -> LawProgram:
         """The inverse."""

@@ -44,7 +44,9 @@ FILTER_A, FILTER_B, FILTER_L, REGULATOR = 22, 47, 52, 62
 FRICTION, YIELD_SHARE, SLIDING = 83, 84, 85
 # What a hand makes of a reference, see ``haptics.reference_shape``.
 SHAPE_SLOPE, SHAPE_BEND, SHAPE_SMOOTHING, HAND_DAMPING, HAND_MEMORY = 86, 88, 90, 91, 92
-HAND_DOUBT, HAND_RANGE, CONSTANTS = 93, 94, 95
+HAND_DOUBT, HAND_RANGE = 93, 94
+# The speed up to which friction is taken from the model.
+FRICTION_SPEED, CONSTANTS = 95, 96
 
 # States: of the filter,
 ANGLE, SPEED, HAND, HAND_RATE, DISTURBANCE = 0, 1, 2, 3, 4
@@ -128,7 +130,8 @@ def motor_current(torque: float, c: Array) -> float:
 
 def rest(i_b: float, omega: float, z: float, theta: float, c: Array, p: Array) -> float:
     """Torque of brake, friction and damping on the shaft [N*m]."""
-    return c[INERTIA] * acceleration(0.0, i_b, omega, z, theta, p)
+    sure = min(max(omega, -c[FRICTION_SPEED]), c[FRICTION_SPEED])
+    return c[INERTIA] * acceleration(0.0, i_b, sure, z, theta, p)
 
 
 def turned(z: float, angle: float, time: float, c: Array, p: Array) -> float:

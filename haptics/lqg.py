@@ -37,7 +37,7 @@ from scipy.linalg import expm, solve_discrete_are
 from daq.config.units import NewtonMetres, Part, Seconds, Unit
 from daq.torque import Fact, LawProgram
 from haptics import laws
-from haptics.actuator_control import ActuatorControl
+from haptics.actuator_control import InverseControl
 from haptics.dynamics import ActuatorDynamics
 from haptics.feedforward import encoder_noise
 from haptics.linear_loop import LinearLaw, loop_margins
@@ -53,12 +53,11 @@ _DOUBT = 0.5  # N*m/s, slope of a reference that tells of the hand as much as th
 _SHARES = np.linspace(1.0, 0.3, 8)
 
 
-class TorqueFeedback(ActuatorControl):
+class TorqueFeedback(InverseControl):
     """Settings of a filter and a regulator on top of the inverse; LQG makes their gains."""
 
     takes_torque: ClassVar[bool] = True
 
-    encoder_counts: int = Field(8192, ge=4, description="of the encoder in a revolution")
     torque_noise: NewtonMetres = Field(
         0.010,
         gt=0.0,
@@ -112,9 +111,9 @@ class TorqueFeedback(ActuatorControl):
         inertias, constants = (by_name[name].ends for name in ("inertia", "motor_constant"))
         strengths = [constant / dynamics.motor_constant for constant in constants]
         hands = np.geomspace(1.0 / self.hand_range, self.hand_range, 5).tolist()
-        peak = math.inf
+        trusting, peak = self.trusting(facts), math.inf
         for effort in (self.effort * _EFFORTS).tolist():
-            control = self.model_copy(update={"effort": float(f"{effort:.4g}")})
+            control = trusting.model_copy(update={"effort": float(f"{effort:.4g}")})
             loop = TorqueLoop(control, dynamics)
             cases = itertools.product({*inertias}, {*strengths}, hands)
             peak = max(loop.peak_sensitivity(*case) for case in cases)

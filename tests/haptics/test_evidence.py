@@ -108,16 +108,16 @@ def test_trials_end_at_the_first_tenth_that_decides(static):
     assert np.array_equal(whole.results[:32], outcomes.results) and len(whole.results) == 300
 
 
-def test_a_small_disk_margin_is_explained_and_a_robust_loop_is_not_warned_of(static, tmp_path):
+def test_a_small_disk_margin_is_explained_and_a_robust_loop_is_not_warned_of(tmp_path):
     """The inverse takes friction off a sample late, which a light hand hardly stands."""
     outcomes = Outcomes(np.zeros((1, trial.RESULT)), np.zeros((1, 2)))
-    inverse = load_controller(str(controller(tmp_path, "feedforward")), tmp_path)
     remarks = {}
-    for name, tuned in (("static", static[2]), ("feedforward", inverse)):
+    for name in ("static", "feedforward", "lqg"):
+        tuned = load_controller(str(controller(tmp_path, name)), tmp_path)
         evidence = weigh(outcomes, family_margins(tuned), 1, spread=True)
         assert not evidence.refusal
         remarks[name] = " ".join(evidence.remarks)
-    assert remarks["static"] == ""
+    assert remarks["static"] == remarks["lqg"] == ""
     assert "disk margin of 0.059 (within yield, in a hand of 0.25 times" in remarks["feedforward"]
     # (2 - d) / (2 + d) of the gain, and 2 atan(d / 2) of the phase.
     assert "a gain that is off by 5.7 % or a phase by 3.4 degrees" in remarks["feedforward"]

@@ -5,6 +5,7 @@ import pytest
 
 from daq.experiment import Sample
 from haptics import laws, model_step, trial
+from haptics.dynamics import ActuatorDynamics
 from haptics.feedforward import Feedforward
 from haptics.laws import STATES
 from haptics.lqg import Lqg
@@ -56,3 +57,16 @@ def test_machine_code_answers_as_python_does(control):
             reference, lost, s, c, p, volts,
         )  # fmt: skip
         assert law.volts(sample, reference) == pytest.approx(tuple(volts), abs=1e-9)
+
+
+@pytest.mark.parametrize(("speed", "counted"), [(4.0, 4.0), (20.0, 6.0), (-20.0, -6.0)])
+def test_friction_beyond_the_speed_to_which_it_is_known_is_that_at_it(speed, counted):
+    """The motor of a shaft that turns steadily gives what the model has against the motion."""
+    control = Feedforward(controller="feedforward", allocation="motor", friction_speed=6.0)
+    dynamics, law = ActuatorDynamics(MODEL), control.law(MODEL, MODEL.nominal)
+    for k in range(400):
+        t = k / control.sample_rate
+        volts, _ = law.volts(Sample(k, t, 0.0, 0.0, 0.0, speed * t, speed, 0), 0.0)
+    current = dynamics.motor.gain * volts + dynamics.motor.emf * speed
+    friction = -dynamics.rest(0.0, counted, np.copysign(dynamics.sliding, speed), 0.0)
+    assert dynamics.motor_constant * current == pytest.approx(friction, rel=0.02)

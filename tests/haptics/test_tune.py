@@ -74,6 +74,17 @@ def test_operating_points_of_draws_go_to_python_control_with_their_ties(tmp_path
     assert np.corrcoef(springs, alpha1)[0, 1] > 0.999
 
 
+def test_friction_is_taken_off_up_to_the_speed_to_which_it_is_known(tmp_path):
+    """A quarter of the residual torque in doubt; a rig that is known well has no such speed."""
+    settings = write(tmp_path / "t.yaml", SETTINGS)
+    vague = tune(settings, result(tmp_path, B={"B_m": 2.0}))
+    low, high = np.percentile(vague.draws[:, RIG.parameter_names.index("B_m")], [2.5, 97.5])
+    speed = 0.25 * facts(vague)["residual_torque"].value / (0.5 * (high - low))
+    assert vague.control.friction_speed == pytest.approx(speed, rel=1e-3) and speed < 10.0
+    for known in (result(tmp_path, K={"K_m": 0.02}), result(tmp_path)):
+        assert tune(settings, known).control.friction_speed == 1000.0
+
+
 @pytest.mark.soak
 def test_no_more_inertia_is_taken_off_than_the_least_plausible_one(tmp_path):
     settings = write(tmp_path / "t.yaml", SETTINGS)
