@@ -1,7 +1,7 @@
 """Which virtual walls are passive for certain, and which rest in simulation: the Z-width.
 
 python -m benchmarks.walls [--json] [--rates 800 4000] [--hands 24] [--plot z_width.png]
-                           [--measure] [--fresh 12]
+                           [--measure 800] [--fresh 12]
 
 Walls rendered by the static law and by the inverse without what it takes off (friction, inertia),
 by the motor alone and with the brake: switched on in contact, or shared by its hysteresis state.
@@ -71,9 +71,9 @@ POSITION, LEAN = 0.2, 0.5  # rad
 def main() -> None:
     parser = arguments(__doc__ or "")
     parser.add_argument("--rates", type=float, nargs="+", default=[800.0, 4000.0])
-    parser.add_argument("--hands", type=int, default=12)
+    parser.add_argument("--hands", type=int, default=24)
     parser.add_argument("--plot", type=Path)
-    parser.add_argument("--measure", action="store_true")
+    parser.add_argument("--measure", type=float, nargs="+", default=[])
     parser.add_argument("--fresh", type=int)
     options = parser.parse_args()
     if options.fresh is not None:
@@ -89,7 +89,7 @@ def main() -> None:
         {
             "rate": rate,
             "variant": name,
-            **measure(rate, dict(settings), options.hands, options.measure),
+            **measure(rate, dict(settings), options.hands, rate in options.measure),
         }
         for rate in options.rates
         for name, settings in VARIANTS.items()
@@ -293,11 +293,13 @@ _DRAWN = {
     "guaranteed": ("guaranteed for any hand", "#0072B2"),
     "held": ("guaranteed for hands that damp", "#009E73"),
     "simulated": ("at rest in simulation", "#E69F00"),
+    "measured": ("stable in runs of virtual_wall", "#CC79A7"),
 }
+_BAR = 0.2  # of the distance of two variants
 
 
 def draw(rows: list[dict[str, Any]], path: Path) -> None:
-    """The Z-width at each rate: guaranteed and simulated, motor alone and with the brake."""
+    """The Z-width at each rate by what tells it, of the motor alone and with the brake."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -310,14 +312,16 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
     for rate, axis in zip(rates, axes[0], strict=True):
         chosen = {row["variant"]: row for row in rows if row["rate"] == rate}
         place = np.arange(len(names))
-        lowest = 0.3 * min(row[key] for row in rows for key in _DRAWN if row[key] > 0.0)
-        for shift, (key, (label, color)) in zip((-0.27, 0.0, 0.27), _DRAWN.items(), strict=True):
+        lowest = 0.3 * min(row[key] for row in rows for key in _DRAWN if row[key])
+        for j, (key, (label, color)) in enumerate(_DRAWN.items()):
+            shift = _BAR * (j - 0.5 * (len(_DRAWN) - 1))
             stiffest = [chosen[name][key] for name in names]
-            bars = axis.bar(place + shift, stiffest, 0.25, label=label, color=color)
-            labels = [f"{float(f'{value:.2g}'):g}" if value > 0.0 else "" for value in stiffest]
+            heights = [value or 0.0 for value in stiffest]
+            bars = axis.bar(place + shift, heights, _BAR, label=label, color=color)
+            labels = [f"{float(f'{value:.2g}'):g}" if value else "" for value in stiffest]
             axis.bar_label(bars, labels, fontsize=7)
             for k, value in enumerate(stiffest):
-                if not value > 0.0:
+                if value == 0.0:  # None was not measured
                     axis.text(k + shift, 1.1 * lowest, "–", ha="center", fontsize=7)
         axis.set_ylim(lowest, 3.0 * max(row["simulated"] for row in rows))
         first = chosen[names[0]]
