@@ -186,8 +186,8 @@ class Identification(Shown):
         return self._again(model=f"{name}{',' if ':' in name else ':'}{alternative.name}")
 
     @property
-    def remedy_command(self) -> str | None:
-        """What to type to identify without what is wrong with data or ranges; None for nothing."""
+    def remedy(self) -> NextStep | None:
+        """Identifying without what is wrong with data or ranges; None for nothing."""
         settings = remedies(
             self.problem.settings,
             {s.name: s.unit for s in self.model.inputs}
@@ -196,7 +196,15 @@ class Identification(Shown):
             findings=() if self.suspicion is None else self.suspicion.findings,
             pushed=self._pushed,
         )
-        return self._again(*settings) if settings else None
+        if not settings:
+            return None
+        purpose = "Identify again without what was found wrong with data or ranges"
+        if units := [s for s in settings if s.partition("=")[0].endswith(".unit")]:
+            purpose += (
+                f" ({', '.join(units)} is a guess by the size of a gain: look at the file, for a "
+                "sensor's scale may be wrong as well)"
+            )
+        return NextStep(f"{purpose}:", self._again(*settings))
 
     @property
     def _pushed(self) -> dict[str, tuple[float, float, float]]:
@@ -218,10 +226,8 @@ class Identification(Shown):
             return NextStep(
                 f"Identify with {alternative.name}, which explains these data better:", command
             )
-        if (command := self.remedy_command) is not None:
-            return NextStep(
-                "Identify again without what was found wrong with data or ranges:", command
-            )
+        if (remedy := self.remedy) is not None:
+            return remedy
         if self._searched_in_vain and not self.interrupted:
             settings = self.problem.settings
             longer = {"seed": settings.seed + 1, "population": 2 * settings.population}

@@ -63,7 +63,8 @@ _CHANCE: dict[Kind, float] = {
 _SEVERAL = ("variant", "function", "disturbance")  # have no single amplitude
 _MOST = 5  # findings
 _MOST_SAMPLES = 10_000  # that are tested: beyond, what matters has long been significant
-_LIKELY = 6  # suspects that are tested again by the colour of what they leave
+_AS_MUCH = 0.95  # of what another explains, that counts as the same
+_LIKELY = 8  # suspects that are tested again by the colour of what they leave
 _LAGS = 20  # of what colour whitening may leave
 _FORGETS = 20  # samples of a record that count as independent, from where its mean is no colour
 _NEW = 1e-2  # share of a suspect that no change of the parameters makes, below which it is theirs
@@ -71,6 +72,7 @@ _INEXACT = 1e-2  # of the residuals' deviation, from where a simulation's error 
 # Standard deviations by which a finding moves a parameter noticeably: an interval reaches 1.96. And
 # share of the residuals that it explains, from where it counts whatever it moves.
 MOVED, _LARGE = 1.5, 0.25
+_NEARLY_ALL = 0.9  # of what is left, beside which a line's guess leaves what looks like anything
 _TURNED = -1.3  # change of a gain that is 1, below which it is its sign that is wrong
 _TIMES = (0.5, 2.5, 21)  # delays that are tried, in parts of what a small one tells
 _REACH = 10.0  # of a term's range in parts of the size that its test found
@@ -118,6 +120,11 @@ class Finding:
         return self.farthest > MOVED or self.share > _LARGE
 
     @property
+    def explains(self) -> bool:
+        """Whether next to nothing is left with a channel's fault taken out."""
+        return self.amplitude is not None and self.share > _NEARLY_ALL
+
+    @property
     def turned_round(self) -> bool:
         """Whether a channel has the opposite sign of what the model has."""
         return self.kind == "gain" and (self.amplitude or 0.0) < _TURNED
@@ -144,11 +151,11 @@ def missing_physics(
     foreseen = np.concatenate([_foreseen_noise(runs), _simulation_error(runs, local)], axis=2)
     tests = _Tests(local, uncertainty, foreseen, _noisy_starts(runs, local))
     alone = [e.name for e in uncertainty.determined() if e.name in model.parameter_names]
+    channels = [*channels, *in_single_records(channels, runs)]
     tests.admit([*channels, *variant_suspects(runs), *change_suspects(runs, alone)])
-    tests.admit(list(in_single_records(channels, runs)))
-    if not any(finding.kind == "variant" for finding in tests.findings):
+    if not any(finding.kind == "variant" or finding.explains for finding in tests.findings):
         tests.admit([*function_suspects(runs), *disturbance_suspects(runs)])
-    return tuple(tests.findings)
+    return tests.settled()
 
 
 def _runs(local: Sensitivity) -> list[DisturbedRun]:
@@ -251,6 +258,7 @@ class _Tests:
                 np.zeros(foreseen.shape[2]),
             ]
         )
+        self._ends = [self._columns.shape[2]]  # of the columns until each finding
         self._noises = list(input_noises(local))
         self._regression = self._coloured_by(self._residual)
 
@@ -265,13 +273,19 @@ class _Tests:
                 for i in left
                 if (result := self._regression.test(changes[i], suspects[i].one_sided)) is not None
             }
-            likely = sorted(first, key=lambda i: first[i].log_p)[:_LIKELY]
+            likely: list[int] = []
+            for i in sorted(first, key=lambda i: first[i].log_p):
+                if len(likely) < _LIKELY and not any(suspects[i].same(suspects[k]) for k in likely):
+                    likely.append(i)
             results = {i: self._again(changes[i], suspects[i], first[i]) for i in likely}
             logs = {i: result.log_p + np.log(tests) for i, (result, _) in results.items()}
             significant = [i for i in logs if logs[i] < np.log(_CHANCE[suspects[i].kind])]
             if not significant:
                 return
-            surest = min(significant, key=lambda i: logs[i])
+            # Of probabilities too small for a number what explains more decides.
+            alike = [i for i in significant if logs[i] == min(logs.values())]
+            enough = _AS_MUCH * max(results[i][0].share for i in alike)
+            surest = next(i for i in alike if results[i][0].share >= enough)
             result, residual = results[surest]
             if suspects[surest].late is not None:
                 changes[surest], result, residual = self._as_late(
@@ -283,6 +297,7 @@ class _Tests:
             admitted = changes[surest][..., size > 0.0] / size[size > 0.0]
             self._columns = np.concatenate([self._columns, admitted], axis=2)
             self._free = np.concatenate([self._free, np.zeros(admitted.shape[2])])
+            self._ends.append(len(self._free))
             self._regression = self._coloured_by(residual)
             left = [i for i in left if i != surest and not suspects[i].same(suspects[surest])]
 
@@ -315,6 +330,20 @@ class _Tests:
             return suspect.changes / self._scales[..., None], result, residual
         changes, test, delay = best
         return changes, replace(test, amplitudes=np.array([delay])), self._left(changes, test)
+
+    def settled(self) -> tuple[Finding, ...]:
+        """The findings, with what each explains by the colour that all of them leave.
+
+        By the colour of what was left before, which others had their part in, it is too little.
+        """
+        whitening, rests = self._regression.whitening, []
+        for end in self._ends:
+            columns, free = self._columns[..., :end], self._free[:end]
+            rests.append(_Regression(whitening, columns, free, self._residual, ()).squares)
+        return tuple(
+            replace(finding, share=max(1.0 - after / before, 0.0) if before > 0.0 else 0.0)
+            for finding, before, after in zip(self.findings, rests, rests[1:], strict=False)
+        )
 
     def _left(self, changes: FloatArray, result: "_Result") -> FloatArray:
         return self._residual - self._columns @ result.coefficients - changes @ result.amplitudes
@@ -387,7 +416,7 @@ class _Regression:
         residual: FloatArray,
         noises: Sequence[tuple[slice, FloatArray]],
     ) -> None:
-        self._whitening = whitening
+        self.whitening = whitening
         white, target = whitening(columns), whitening(residual[..., None])
         self._n, self._more = len(target), len(free)
         self._basis, self._triangle = np.linalg.qr(np.vstack([white, np.diag(free)]))
@@ -397,7 +426,7 @@ class _Regression:
             (whitening.rows_of(rows), whitening.of_record(rows, changes))
             for rows, changes in noises
         ]
-        self._squares = float(self._residual[: self._n] @ self._residual[: self._n])
+        self.squares = float(self._residual[: self._n] @ self._residual[: self._n])
 
     def test(self, changes: FloatArray, one_sided: bool) -> _Result | None:
         """The test of a suspect's changes; None where the parameters do all that it does.
@@ -406,7 +435,7 @@ class _Regression:
         degrees of freedom as amplitudes turned out to be (Susko, "Likelihood ratio tests with
         boundary constraints using data-dependent degrees of freedom", Biometrika 100, 2013).
         """
-        white = self._whitening(changes)
+        white = self.whitening(changes)
         size = np.linalg.norm(white, axis=0)
         used = np.flatnonzero(size > 0.0)
         if not len(used):
@@ -438,14 +467,14 @@ class _Regression:
             whole,
             self._coefficients + move,
             move,
-            min(float(score @ score) / max(self._squares, 1e-300), 1.0),
+            min(float(score @ score) / max(self.squares, 1e-300), 1.0),
         )
 
     def _statistic(self, left: FloatArray, score: FloatArray) -> float:
         """The score's square in units of its covariance, in every direction the larger of three."""
         rest = self._residual - left @ score
         terms = (left * rest[:, None])[: self._n]
-        terms = terms.reshape(-1, self._whitening.n_outputs, len(score)).sum(axis=1)
+        terms = terms.reshape(-1, self.whitening.n_outputs, len(score)).sum(axis=1)
         covariance = _long_run_covariance(terms - terms.mean(axis=0))
         if self._noises:
             # What the columns make of the noise is at right angles to what they leave.
@@ -560,15 +589,16 @@ def colour_about_line(
     """Colour of residuals (n, q) about offset and drift, of outputs that forget soon enough.
 
     These are no colour: an autoregression would take them for a memory without end, and
-    whitening would erase them. Of noise that is nearly as slow as a record they are part. The
-    line is that of all records: what is wrong in some of them looks like an offset of each.
+    whitening would erase them. Of noise that is nearly as slow as a record they are part. Each
+    record has a line of its own: what is off in one of several is no slow noise of all.
     """
-    time = np.concatenate([np.arange(n, dtype=np.float64) for n in lengths])
     line = np.zeros_like(residual)
-    for j in np.flatnonzero(measured.any(axis=0)):
-        at = measured[:, j]
-        slope = np.cov(time[at], residual[at, j])[0, 1] / max(float(np.var(time[at], ddof=1)), 1.0)
-        line[at, j] = residual[at, j].mean() + slope * (time[at] - time[at].mean())
+    for rows in record_rows(lengths):
+        for j in np.flatnonzero(measured[rows].any(axis=0)):
+            at = rows.start + np.flatnonzero(measured[rows, j])
+            time = at - at.mean()
+            slope = (time @ residual[at, j]) / max(float(time @ time), 1.0)
+            line[at, j] = residual[at, j].mean() + slope * time
     centred = residual - line
     model = colour(centred, seen, lengths)
     soon = _FORGETS * longest_memory(model, np.mean(centred**2, axis=0)) <= min(lengths)

@@ -152,3 +152,31 @@ def test_a_wrong_gain_is_fitted_by_the_command_and_stays_a_doubt():
     assert second.verdict.predicted.trust == "good"
     assert second.verdict.parameters.trust == "limited"
     assert any("which channel is wrong" in reason for reason in second.verdict.parameters.reasons)
+
+
+@pytest.mark.soak
+def test_a_speed_in_other_units_is_a_guess_and_no_term_in_the_equations(tmp_path):
+    """Its size explains all that is left, so that nothing beside a line's guess of it is tried."""
+    columns = {
+        "time": {"column": "t"},
+        "inputs": {"voltage": {"column": "voltage"}, "load": {"column": "load"}},
+        "outputs": {"current": {"column": "current"}, "omega": {"column": "omega"}},
+    }
+    paths = [tmp_path / f"{seed}.csv" for seed in (1, 2)]
+    for seed, path in enumerate(paths, 1):
+        log = motor_log(seed)
+        log["load"], log["omega"] = 2.0 * log["load"], 30.0 / np.pi * log["omega"]
+        log.to_csv(path, index=False)
+    result = identify(
+        paths[0],
+        validate=paths[1],
+        model=MOTOR,
+        columns=columns,
+        population=150,
+        generations=20,
+    )
+    (finding,) = result.suspicion.findings
+    assert (finding.kind, finding.name) == ("gain", "omega")
+    assert 1.0 + finding.amplitude == pytest.approx(30.0 / np.pi, rel=2e-3)
+    assert result.next_step.command.endswith("--set columns.outputs.omega.unit=rpm")
+    assert "is a guess by the size of a gain" in result.next_step.purpose
