@@ -27,6 +27,9 @@ from sysid import ModelError, ProcessModel, Stepper
 _BLOCK = 256  # ticks simulated at once in open loop
 _REAL_TIME_BLOCK = 0.02  # s between deliveries of a device in real time
 _ACCURACY = 1e-4  # of the plant's states in parts of what matters: a tenth of the noise and below
+# Of the motion between which edges of the encoder are timed, and at least so many a tick: the
+# motor's current settles in few.
+_LONGEST_STEP, _FEWEST_STEPS = 8e-5, 4  # s
 _INTERLOCK = int(hal.Flag.INTERLOCK)
 _OUTPUT_BITS, _IDEAL_BITS = 16, 24  # of the converters that a board would have
 
@@ -287,8 +290,10 @@ class SimulatedDevice:
             self._steppers[sample_rate] = ForeignStepper(self._unit, sample_rate)
         if sample_rate not in self._steppers:
             plant, scale = self._plant, state_sizes(self._plant)
+            dt = 1.0 / sample_rate
+            n_steps = max(_FEWEST_STEPS, math.ceil(dt / _LONGEST_STEP))
             self._steppers[sample_rate] = Stepper(
-                plant, plant.nominal, 1.0 / sample_rate, scale=scale, accuracy=_ACCURACY
+                plant, plant.nominal, dt, n_steps=n_steps, scale=scale, accuracy=_ACCURACY
             )
         return self._steppers[sample_rate]
 

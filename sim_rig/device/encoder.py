@@ -9,6 +9,7 @@ from numba import njit
 from daq.hal import FloatArray
 
 _STANDSTILL = 0.1  # s without an edge after which the shaft counts as standing still
+_HALVINGS = 30  # of a step, in which an edge is sought
 
 
 @dataclass
@@ -39,8 +40,8 @@ class EncoderCounter:
 
         motion: (n, 2), angle [rad] and speed [rad/s] at times origin + (first + i) * step, the
         first at a tick; last: (2,), those one step behind them, which end the last interval. Edges
-        in between are timed by interpolation. With a common origin the result does not depend on
-        where a motion is cut into calls.
+        in between are timed by the cubic through angles and speeds. With a common origin the result
+        does not depend on where a motion is cut into calls.
         """
         per_radian = self.counts_per_turn / (2.0 * math.pi)
         counted = np.vstack([motion, last]) * per_radian
@@ -61,7 +62,7 @@ def _count(
     count, edge_time, direction, rate = memory[0], memory[1], memory[2], memory[3]
     for i in range(n):
         now = origin + (first + i) * step
-        here, there = there, motion[i + 1, 0]
+        there = motion[i + 1, 0]
         if i % per_tick == 0:
             shown = rate
             if edge_time < 0.0 or now - edge_time > _STANDSTILL:
@@ -76,16 +77,29 @@ def _count(
         sign = 1.0 if moved > 0.0 else -1.0
         # The last boundary crossed: the floor going up, one above it going down.
         boundary = math.floor(there) if sign > 0.0 else math.floor(there) + 1.0
-        share = (boundary - here) / (there - here) if there != here else 1.0
-        crossing = now + min(max(share, 0.0), 1.0) * step
+        at, ahead = motion[i], motion[i + 1]
+        crossing = now + _share(at, ahead, step, boundary) * step
         if abs(moved) > 1.0:
-            # Both edges lie in this step: the speed half a count before the last of them.
-            middle = share - 0.5 / abs(there - here)
-            rate = (there - here) / step + (middle - 0.5) * (motion[i + 1, 1] - motion[i, 1])
-        elif direction == sign and crossing > edge_time:
-            rate = sign / (crossing - edge_time)
-        else:
-            rate = 0.0
+            # Both edges lie in this step.
+            edge_time, direction = now + _share(at, ahead, step, boundary - sign) * step, sign
+        timed = direction == sign and crossing > edge_time
+        rate = sign / (crossing - edge_time) if timed else 0.0
         count, edge_time, direction = math.floor(there), crossing, sign
     memory[0], memory[1], memory[2], memory[3] = count, edge_time, direction, rate
     return counts, rates
+
+
+@njit(cache=True, nogil=True)
+def _share(here: FloatArray, there: FloatArray, step: float, boundary: float) -> float:
+    """Part of a step in which a boundary is reached: of the cubic through both ends' motion."""
+    way, first, last = there[0] - here[0], step * here[1], step * there[1]
+    square, cube = 3.0 * way - 2.0 * first - last, first + last - 2.0 * way
+    low, high = 0.0, 1.0
+    for _ in range(_HALVINGS):
+        share = 0.5 * (low + high)
+        passed = here[0] + share * (first + share * (square + share * cube)) - boundary
+        if passed * way > 0.0:
+            high = share
+        else:
+            low = share
+    return 0.5 * (low + high)
