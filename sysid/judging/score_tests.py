@@ -20,7 +20,6 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import get_args
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -55,11 +54,7 @@ from sysid.uncertainty.sensitivity import (
 )
 from sysid.uncertainty.ties import free_gradient, named_values
 
-# Probability of a finding by chance, all tests together; a variant is fitted to confirm it.
-_CHANCE: dict[Kind, float] = {
-    **dict.fromkeys(get_args(Kind), 1e-4),
-    "variant": 1e-3,
-}
+_CHANCE = 1e-3  # probability of a finding by chance, all tests together
 _SEVERAL = ("variant", "function", "disturbance")  # have no single amplitude
 _MOST = 5  # findings
 _MOST_SAMPLES = 10_000  # that are tested: beyond, what matters has long been significant
@@ -266,7 +261,8 @@ class _Tests:
         """Admit the suspects that are there by more than chance, each given those before it."""
         changes = [s.changes / self._scales[..., None] for s in suspects]
         left = [i for i, change in enumerate(changes) if np.any(change)]
-        tests = len(left)
+        delays = {suspects[i].name for i in left if suspects[i].kind == "delay"}
+        tests = len(delays) + sum(suspects[i].kind != "delay" for i in left)
         while left and len(self.findings) < _MOST:
             first = {
                 i: result
@@ -279,7 +275,7 @@ class _Tests:
                     likely.append(i)
             results = {i: self._again(changes[i], suspects[i], first[i]) for i in likely}
             logs = {i: result.log_p + np.log(tests) for i, (result, _) in results.items()}
-            significant = [i for i in logs if logs[i] < np.log(_CHANCE[suspects[i].kind])]
+            significant = [i for i in logs if logs[i] < np.log(_CHANCE)]
             if not significant:
                 return
             # Of probabilities too small for a number what explains more decides.
