@@ -379,8 +379,8 @@ MORE_DATA = (
     _in_data("speed without direction", each(*SPEED, lambda s, rng: np.abs(s))),
     _in_data("voltage ten samples late", each(*VOLTAGE, _late(10)), " late", " early"),
     _in_data("speed ten samples late", each(*SPEED, _late(10)), " late", " early"),
-    _in_data("speed through a filter", each(*SPEED, _low_passed(4.0)), " late"),
-    _in_data("current through a filter", each(*CURRENT, _low_passed(1.5)), " late"),
+    _in_data("speed through a filter", each(*SPEED, _low_passed(4.0)), "filter"),
+    _in_data("current through a filter", each(*CURRENT, _low_passed(1.5)), "filter"),
     _in_data("current hums", each(*CURRENT, _hum(0.5))),
     _in_data(
         "sampling jitters", both(each(*CURRENT, _jittered(0.3)), each(*SPEED, _jittered(0.3)))

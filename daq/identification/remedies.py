@@ -45,7 +45,7 @@ def remedies(
     lags = any(fault.kind == "lag" for fault in faults)  # which delays that were found are as well
     units = channels or {}
     whole = [f for f in findings if f.name in units or f.kind == "exchange"]
-    of_all_logs = [f for f in whole if not (lags and f.kind == "delay")]
+    of_all_logs = [f for f in whole if not (lags and f.comes_late)]
     changes |= dict(_of_channels(settings, of_all_logs, units))
     if not changes:  # what is wrong with the data drives parameters to the ends
         changes |= dict(_of_ranges(pushed or {}))
@@ -70,7 +70,7 @@ def _of_channels(
             for name, taken in zip(pair, reversed(pair), strict=True):
                 if name in columns and taken in columns:
                     yield f"{columns[name][0]}.column", columns[taken][1].column or taken
-        if finding.kind == "delay" and finding.counts and finding.amplitude is not None:
+        if finding.kind in ("delay", "filter") and finding.counts and finding.amplitude is not None:
             late = settings.delay.get(finding.name, 0.0) + finding.amplitude
             yield f"delay.{finding.name}", shortest(float(f"{late:.3g}"))
         key, column = columns.get(finding.name, ("", None))

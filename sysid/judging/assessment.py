@@ -185,7 +185,7 @@ def judge(
         # Other functions were asked for beside a test's guess of this one.
         missing = [f for f in missing if f.kind not in ("function", "disturbance")]
     if any(fault.kind == "lag" for fault in doubts):
-        missing = [f for f in missing if f.kind != "delay"]  # the same, seen less sharply
+        missing = [f for f in missing if not f.comes_late]  # the same, seen less sharply
     counting = [f for f in missing if f.counts]
     if not counting and _moved_together(missing) > MOVED:
         counting = missing
@@ -413,7 +413,8 @@ def _patterns(model: ProcessModel, results: Sequence[RecordResult]) -> Iterator[
         if size > _BY_SPEED:
             yield (
                 f"{name} errs more the faster it changes (rank correlation {size:.2f}): instants "
-                "of sampling that are not those of the log, or a time constant that varies. "
+                "of sampling that are not those of the log, a time constant that varies, or "
+                "motion faster than the model's, as of a shaft or belt that gives. "
                 "Parameters may be off by more than their intervals."
             )
     alone = _largest(results, [result.alone for result in results])
@@ -421,8 +422,8 @@ def _patterns(model: ProcessModel, results: Sequence[RecordResult]) -> Iterator[
         if share:
             yield (
                 f"{100.0 * share:.2g} % of what is left of {name} stands alone, far from what is "
-                "left beside it: outliers too small to be seen in the samples. Squared, they count "
-                "more than their number; leave them out."
+                "left beside it: outliers too small to be seen in the samples, or jerks that the "
+                "model lacks, as of play. Squared, they count more than their number."
             )
 
 

@@ -90,7 +90,8 @@ class Finding:
     """Something that the model lacks: what it is, how sure, and what it would move.
 
     name, unit: as of its suspect. amplitude: of a channel's fault, in the unit; None of others.
-    term: of a function the one that it is most like, with a range to fit it in. p_value: by chance,
+    term: of a function the one that it is most like, with a range to fit it in. of_input: whether
+    a channel is an input. p_value: by chance,
     all tests counted. share: of the whitened residuals' squares that it explains. moves: the
     farthest first.
     """
@@ -103,6 +104,7 @@ class Finding:
     share: float
     moves: tuple[Move, ...]
     term: AddedTerm | None = None
+    of_input: bool = False
 
     @property
     def farthest(self) -> float:
@@ -113,6 +115,11 @@ class Finding:
     def counts(self) -> bool:
         """Whether it moves a parameter noticeably, or is much of what is left."""
         return self.farthest > MOVED or self.share > _LARGE
+
+    @property
+    def comes_late(self) -> bool:
+        """Whether it is a channel's delay, or what is one of a little."""
+        return self.kind in ("delay", "filter", "lag")
 
     @property
     def explains(self) -> bool:
@@ -261,8 +268,9 @@ class _Tests:
         """Admit the suspects that are there by more than chance, each given those before it."""
         changes = [s.changes / self._scales[..., None] for s in suspects]
         left = [i for i, change in enumerate(changes) if np.any(change)]
-        delays = {suspects[i].name for i in left if suspects[i].kind == "delay"}
-        tests = len(delays) + sum(suspects[i].kind != "delay" for i in left)
+        # A channel that is late by this or that is one suspect.
+        late = {(suspects[i].kind, suspects[i].name) for i in left if suspects[i].late is not None}
+        tests = len(late) + sum(suspects[i].late is None for i in left)
         while left and len(self.findings) < _MOST:
             first = {
                 i: result
@@ -284,9 +292,14 @@ class _Tests:
             surest = next(i for i in alike if results[i][0].share >= enough)
             result, residual = results[surest]
             if suspects[surest].late is not None:
-                changes[surest], result, residual = self._as_late(
-                    suspects[surest], *results[surest]
-                )
+                # A delay, a filter and a lag of a little are one; of more they are not.
+                sized = {
+                    i: self._as_late(suspects[i], *results[i])
+                    for i in significant
+                    if suspects[i].late is not None and suspects[i].name == suspects[surest].name
+                }
+                surest = min(sized, key=lambda i: float(np.sum(sized[i][2] ** 2)))
+                changes[surest], result, residual = sized[surest]
             term = self._term(suspects[surest], changes[surest], residual)
             self.findings.append(self._finding(suspects[surest], result, logs[surest], term))
             size = np.sqrt(np.mean(changes[surest] ** 2, axis=(0, 1)))
@@ -319,7 +332,7 @@ class _Tests:
         best = None
         for delay in little * np.linspace(*_TIMES):
             changes = suspect.late(delay) / self._scales[..., None]
-            test = regression.test(changes, False)
+            test = regression.test(changes, suspect.one_sided)
             if test is not None and (best is None or test.share > best[1].share):
                 best = changes, test, delay
         if best is None:
@@ -384,6 +397,7 @@ class _Tests:
             result.share,
             tuple(moves),
             term,
+            suspect.of_input,
         )
 
 
@@ -620,8 +634,10 @@ def describe(findings: Iterable[Finding]) -> list[str]:
 
 _WORDS = {
     "delay": "{name} is logged {amplitude:.3g} s {late}",
-    "offset": "{name} is {amplitude:.3g} {unit} off",
-    "drift": "{name} drifts by {amplitude:.3g} {unit} from a record's first sample on",
+    "filter": "{name} is logged through a filter of {amplitude:.3g} s",
+    "lag": "{name} acts with a lag of {amplitude:.3g} s",
+    "offset": "{name} is {amplitude:.3g} {unit} off{instead}",
+    "drift": "{name} drifts by {amplitude:.3g} {unit} from a record's first sample on{instead}",
     "saturation": "{name} saturates near its largest values",
     "exchange": "{name} have changed places in the log",
 }
@@ -644,10 +660,14 @@ def description(finding: Finding) -> str:
         times = f"is {1.0 + amplitude:.3g} times what"
         is_what = "has the opposite sign of what" if finding.turned_round else times
         return f"{finding.name} {is_what} the model has"
-    late = "late" if amplitude > 0.0 else "early, or acts so much later"
+    early = "early, or acts so much later" if finding.of_input else "early, or its inputs so late"
+    late = "late" if amplitude > 0.0 else early
+    instead = ", or something not measured acts like it" if finding.of_input else ""
     text = _WORDS[finding.kind]
     size = abs(amplitude) if finding.kind == "delay" else amplitude
-    return text.format(name=finding.name, late=late, amplitude=size, unit=unit).replace("  ", " ")
+    return text.format(
+        name=finding.name, late=late, amplitude=size, unit=unit, instead=instead
+    ).replace("  ", " ")
 
 
 def _term_text(term: AddedTerm) -> str:

@@ -11,6 +11,7 @@ from functools import partial
 from typing import Any, Literal
 
 import numpy as np
+from scipy.signal import lfilter
 
 from sysid.arrays import FloatArray
 from sysid.judging.disturbed import DisturbedRun
@@ -22,6 +23,8 @@ from sysid.problem.terms import AddedTerm, Shape
 Kind = Literal[
     "variant",
     "delay",
+    "filter",
+    "lag",
     "offset",
     "drift",
     "gain",
@@ -38,6 +41,7 @@ _LEVELS = 8  # of a signal, below which it shows no function
 _JUMPING = 0.05  # mean square of a signal's steps in parts of its variance, from where it jumps
 # Delays that are tested [samples]: of a large one a small one tells little where inputs jump.
 _DELAYS = (0.1, -12.0, -4.0, 4.0, 12.0)
+_FILTERS = (1.0, 5.0)  # time constants of filters that are tested [samples]
 _RECORD = 0.1  # of a record, beyond which no delay is tested
 _PROBE = 1e-3  # part of a parameter that tells how rates follow it
 _PERIODS = (1, 2, 3, 4)  # of a disturbance that nobody measured, in a record
@@ -54,8 +58,8 @@ class Suspect:
 
     name: of the channel, the variant, or the equation. terms: of functions, one for each amplitude,
     their ranges those of one unit. changes: (n_rows, n_outputs, n_amplitudes), records one after
-    another, in the outputs' units. late: of a delay, the change by so many seconds of it: where
-    outputs jump that by a little is no guide.
+    another, in the outputs' units. late: of a delay or a filter, the change by so many seconds of
+    it: where outputs jump that by a little is no guide. of_input: whether a channel is an input.
     """
 
     kind: Kind
@@ -64,12 +68,13 @@ class Suspect:
     changes: FloatArray
     terms: tuple[AddedTerm, ...] = ()
     late: Callable[[float], FloatArray] | None = None
+    of_input: bool = False
 
     @property
     def one_sided(self) -> bool:
         """Whether only amplitudes above zero make sense: friction never drives."""
         rubs = any(term.shape == "stribeck" for term in self.terms)
-        return rubs or self.kind in ("variant", "saturation")
+        return rubs or self.kind in ("variant", "saturation", "filter", "lag")
 
     def same(self, suspect: "Suspect") -> bool:
         """Whether it is a delay of the same channel, of another size."""
@@ -83,7 +88,8 @@ def channel_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
     """
     model = runs[0].model
     for j, output in enumerate(model.outputs):
-        yield from _delays(output.name, partial(_late_output, runs, j), runs)
+        yield from _late("delay", output.name, partial(_late_output, runs, j), runs)
+        yield from _late("filter", output.name, partial(_filtered_output, runs, j), runs)
         zeroed = any(run.record.output_zero[j] for run in runs)
         for kind, signal in _faults(partial(_output, j), zeroed):
             changes = np.concatenate([_column(run.outputs, j, signal(run)) for run in runs])
@@ -91,24 +97,27 @@ def channel_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
     for i, given in enumerate(model.inputs):
         if not any(np.any(run.record.inputs[:, i]) for run in runs):
             continue
-        yield from _delays(given.name, partial(_late_input, runs, i), runs)
+        for kind, change in _LATE_INPUTS.items():
+            for late in _late(kind, given.name, partial(_input_changed, runs, i, change), runs):
+                yield replace(late, of_input=True)
         zeroed = any(run.record.input_zero[i] for run in runs)
         for kind, signal in _faults(partial(_input, i), zeroed):
             parts = [run.driven(_column(run.record.inputs, i, signal(run))) for run in runs]
             # By what a log has too much, less has acted.
             changes = np.concatenate(parts) * (-1.0 if kind in ("offset", "drift") else 1.0)
-            yield Suspect(kind, given.name, _unit(kind, given.unit), changes[..., None])
+            unit = _unit(kind, given.unit)
+            yield Suspect(kind, given.name, unit, changes[..., None], of_input=True)
 
 
-def _delays(
-    name: str, late: Callable[[float], FloatArray], runs: Sequence[DisturbedRun]
+def _late(
+    kind: Kind, name: str, change: Callable[[float], FloatArray], runs: Sequence[DisturbedRun]
 ) -> Iterator[Suspect]:
-    """A channel that is logged late, or early, by little and by more."""
+    """A channel that comes late, or early, by little and by more."""
     shortest = min(run.record.n_samples for run in runs)
-    for samples in _DELAYS:
+    for samples in _DELAYS if kind == "delay" else _FILTERS:
         if abs(samples) < _RECORD * shortest:
-            delay = samples * runs[0].record.dt
-            yield Suspect("delay", name, "s", late(delay) / delay, late=late)
+            time = samples * runs[0].record.dt
+            yield Suspect(kind, name, "s", change(time) / time, late=change)
 
 
 def _late_output(runs: Sequence[DisturbedRun], j: int, delay: float) -> FloatArray:
@@ -119,14 +128,58 @@ def _late_output(runs: Sequence[DisturbedRun], j: int, delay: float) -> FloatArr
     return np.concatenate(parts)[..., None]
 
 
-def _late_input(runs: Sequence[DisturbedRun], i: int, delay: float) -> FloatArray:
-    """An input that is logged late has acted before."""
-    held = runs[0].model.inputs[i].hold == "zoh"
-    parts = []
-    for run in runs:
-        moved = _shifted(run.record.inputs[:, i], delay / run.record.dt, held)
-        parts.append(run.driven(_column(run.record.inputs, i, moved)))
+def _filtered_output(runs: Sequence[DisturbedRun], j: int, time: float) -> FloatArray:
+    parts = [
+        _column(run.outputs, j, _smoothed(run.outputs[:, j], time / run.record.dt)) for run in runs
+    ]
     return np.concatenate(parts)[..., None]
+
+
+_Change = Callable[[DisturbedRun, int, float], FloatArray]
+
+
+def _input_changed(
+    runs: Sequence[DisturbedRun], i: int, change: _Change, time: float
+) -> FloatArray:
+    parts = [
+        run.driven(_column(run.record.inputs, i, change(run, i, time / run.record.dt)))
+        for run in runs
+    ]
+    return np.concatenate(parts)[..., None]
+
+
+def _acted_before(run: DisturbedRun, i: int, samples: float) -> FloatArray:
+    """What is logged late has acted before."""
+    held = run.model.inputs[i].hold == "zoh"
+    return _shifted(run.record.inputs[:, i], samples, held)
+
+
+def _unfiltered(run: DisturbedRun, i: int, samples: float) -> FloatArray:
+    """What acted, of which a filter was logged, was steeper."""
+    signal, pole = run.record.inputs[:, i], np.exp(-1.0 / samples)
+    change: FloatArray = np.diff(signal, prepend=signal[0]) * pole / (1.0 - pole)
+    return change
+
+
+def _lagging(run: DisturbedRun, i: int, samples: float) -> FloatArray:
+    return _smoothed(run.record.inputs[:, i], samples)
+
+
+_LATE_INPUTS: dict[Kind, _Change] = {
+    "delay": _acted_before,
+    "filter": _unfiltered,
+    "lag": _lagging,
+}
+
+
+def _smoothed(signal: FloatArray, samples: float) -> FloatArray:
+    """Change of a signal by a filter of first order with this time constant."""
+    if not samples > 0.0:
+        return np.zeros_like(signal)
+    pole = np.exp(-1.0 / samples)
+    moved = signal - signal[0]
+    change: FloatArray = lfilter([1.0 - pole], [1.0, -pole], moved) - moved
+    return change
 
 
 def _shifted(signal: FloatArray, samples: float, held: bool) -> FloatArray:
