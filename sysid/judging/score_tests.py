@@ -636,6 +636,7 @@ _WORDS = {
     "delay": "{name} is logged {amplitude:.3g} s {late}",
     "filter": "{name} is logged through a filter of {amplitude:.3g} s",
     "lag": "{name} acts with a lag of {amplitude:.3g} s",
+    "play": "{name} acts through play (hysteresis) of {amplitude:.3g} {unit}",
     "offset": "{name} is {amplitude:.3g} {unit} off{instead}",
     "drift": "{name} drifts by {amplitude:.3g} {unit} from a record's first sample on{instead}",
     "saturation": "{name} saturates near its largest values",
@@ -665,9 +666,11 @@ def description(finding: Finding) -> str:
     instead = ", or something not measured acts like it" if finding.of_input else ""
     text = _WORDS[finding.kind]
     size = abs(amplitude) if finding.kind == "delay" else amplitude
-    return text.format(
-        name=finding.name, late=late, amplitude=size, unit=unit, instead=instead
-    ).replace("  ", " ")
+    return (
+        text.format(name=finding.name, late=late, amplitude=size, unit=unit, instead=instead)
+        .replace("  ", " ")
+        .strip()
+    )
 
 
 def _term_text(term: AddedTerm) -> str:

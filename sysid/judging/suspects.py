@@ -25,6 +25,7 @@ Kind = Literal[
     "delay",
     "filter",
     "lag",
+    "play",
     "offset",
     "drift",
     "gain",
@@ -42,6 +43,7 @@ _JUMPING = 0.05  # mean square of a signal's steps in parts of its variance, fro
 # Delays that are tested [samples]: of a large one a small one tells little where inputs jump.
 _DELAYS = (0.1, -12.0, -4.0, 4.0, 12.0)
 _FILTERS = (1.0, 5.0)  # time constants of filters that are tested [samples]
+_PLAYS = (0.02, 0.1)  # parts of an input's peak
 _RECORD = 0.1  # of a record, beyond which no delay is tested
 _PROBE = 1e-3  # part of a parameter that tells how rates follow it
 _PERIODS = (1, 2, 3, 4)  # of a disturbance that nobody measured, in a record
@@ -74,7 +76,7 @@ class Suspect:
     def one_sided(self) -> bool:
         """Whether only amplitudes above zero make sense: friction never drives."""
         rubs = any(term.shape == "stribeck" for term in self.terms)
-        return rubs or self.kind in ("variant", "saturation", "filter", "lag")
+        return rubs or self.kind in ("variant", "saturation", "filter", "lag", "play")
 
     def same(self, suspect: "Suspect") -> bool:
         """Whether it is a delay of the same channel, of another size."""
@@ -100,6 +102,7 @@ def channel_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
         for kind, change in _LATE_INPUTS.items():
             for late in _late(kind, given.name, partial(_input_changed, runs, i, change), runs):
                 yield replace(late, of_input=True)
+        yield from _plays(given, partial(_input_changed, runs, i, _with_play), runs, i)
         zeroed = any(run.record.input_zero[i] for run in runs)
         for kind, signal in _faults(partial(_input, i), zeroed):
             parts = [run.driven(_column(run.record.inputs, i, signal(run))) for run in runs]
@@ -139,30 +142,49 @@ _Change = Callable[[DisturbedRun, int, float], FloatArray]
 
 
 def _input_changed(
-    runs: Sequence[DisturbedRun], i: int, change: _Change, time: float
+    runs: Sequence[DisturbedRun], i: int, change: _Change, size: float
 ) -> FloatArray:
-    parts = [
-        run.driven(_column(run.record.inputs, i, change(run, i, time / run.record.dt)))
-        for run in runs
-    ]
+    parts = [run.driven(_column(run.record.inputs, i, change(run, i, size))) for run in runs]
     return np.concatenate(parts)[..., None]
 
 
-def _acted_before(run: DisturbedRun, i: int, samples: float) -> FloatArray:
+def _plays(
+    given: Input, change: Callable[[float], FloatArray], runs: Sequence[DisturbedRun], i: int
+) -> Iterator[Suspect]:
+    """An input that acts through play, by little and by more."""
+    peak = max(float(np.abs(run.record.inputs[:, i]).max()) for run in runs)
+    for part in _PLAYS:
+        size = part * peak
+        changes = change(size) / size
+        yield Suspect("play", given.name, given.unit, changes, late=change, of_input=True)
+
+
+def _with_play(run: DisturbedRun, i: int, width: float) -> FloatArray:
+    """What acts is dragged along by the ends of the play."""
+    signal = run.record.inputs[:, i]
+    at, dragged = float(signal[0]), []
+    for value in signal.tolist():
+        at = min(max(at, value - 0.5 * width), value + 0.5 * width)
+        dragged.append(at)
+    change: FloatArray = np.array(dragged) - signal
+    return change
+
+
+def _acted_before(run: DisturbedRun, i: int, time: float) -> FloatArray:
     """What is logged late has acted before."""
     held = run.model.inputs[i].hold == "zoh"
-    return _shifted(run.record.inputs[:, i], samples, held)
+    return _shifted(run.record.inputs[:, i], time / run.record.dt, held)
 
 
-def _unfiltered(run: DisturbedRun, i: int, samples: float) -> FloatArray:
+def _unfiltered(run: DisturbedRun, i: int, time: float) -> FloatArray:
     """What acted, of which a filter was logged, was steeper."""
-    signal, pole = run.record.inputs[:, i], np.exp(-1.0 / samples)
+    signal, pole = run.record.inputs[:, i], np.exp(-run.record.dt / time)
     change: FloatArray = np.diff(signal, prepend=signal[0]) * pole / (1.0 - pole)
     return change
 
 
-def _lagging(run: DisturbedRun, i: int, samples: float) -> FloatArray:
-    return _smoothed(run.record.inputs[:, i], samples)
+def _lagging(run: DisturbedRun, i: int, time: float) -> FloatArray:
+    return _smoothed(run.record.inputs[:, i], time / run.record.dt)
 
 
 _LATE_INPUTS: dict[Kind, _Change] = {

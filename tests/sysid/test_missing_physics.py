@@ -10,7 +10,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks._stress_cases import FRICTION, MODEL, NOISE, TRUTH, WITH_FRICTION, cases
+from benchmarks._stress_cases import (
+    DT,
+    FRICTION,
+    MODEL,
+    NOISE,
+    TRUTH,
+    WITH_FRICTION,
+    Plant,
+    cases,
+    excitation,
+)
 from benchmarks.stress import fitted, tried
 from sysid import BatchSimulator, Dataset, Input, Output, Parameter, ProcessModel, State
 from sysid.gassi import GASSI
@@ -76,6 +86,22 @@ def test_with_a_known_noise_all_that_is_above_it_is_told():
     outcome = tried(replace(CASES["friction along a turn"], calibration=1.0), 0)
     assert outcome.verdict.parameters.trust == "limited"
     assert outcome.moved
+
+
+def test_an_input_that_acts_through_play_is_named_with_it():
+    """A valve or a gear: what acts is dragged along, half of the play behind."""
+    rng = np.random.default_rng(0)
+    inputs = excitation(rng)
+    acting = inputs.copy()
+    for k in range(1, len(inputs)):
+        reach = inputs[k, 1] - 0.01, inputs[k, 1] + 0.01
+        acting[k, 1] = np.clip(acting[k - 1, 1], *reach)
+    outputs = Plant().run(acting, NOISE * rng.standard_normal((len(inputs), 2)), TRUTH)[1]
+    record = Dataset(inputs, outputs, DT)
+    estimator = GASSI(MODEL, population=60, generations=12).fit(record)
+    finding, *_ = suspected(estimator, estimator.uncertainty(record), [record]).findings
+    assert (finding.kind, finding.name) == ("play", "load")
+    assert finding.amplitude == pytest.approx(0.02, rel=0.1)
 
 
 def of_range(name, low, high):
