@@ -101,7 +101,7 @@ def test_an_input_that_acts_through_play_is_named_with_it():
     estimator = GASSI(MODEL, population=60, generations=12).fit(record)
     finding, *_ = suspected(estimator, estimator.uncertainty(record), [record]).findings
     assert (finding.kind, finding.name) == ("play", "load")
-    assert finding.amplitude == pytest.approx(0.02, rel=0.1)
+    assert finding.amplitude == pytest.approx(0.02, rel=0.15)
 
 
 def of_range(name, low, high):
