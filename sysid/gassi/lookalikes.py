@@ -20,7 +20,7 @@ _FASTEST_SEEN = 0.4  # of the sample rate: slower modes have no alias that could
 _REACH = 2.0  # times that aliases may be faster or slower than the mode
 _MOST_ALIASES = 6
 _STAGES, _ITERATIONS = 3, 2  # on the way to the alias, Newton steps at each
-_HARM = 2.0  # times the error that a swap may cost before its descent
+_HARM = 2.0  # times the error that starts may have which are no more than worth a try
 _TURNED = 3  # parameters that are moved to find twins
 _TURNS = (-0.3, -0.15, 0.15, 0.3)  # by these parts of their ranges
 _DIFFERENCE = 1e-6
@@ -32,25 +32,35 @@ def lookalikes(objective: Objective, chromosome: FloatArray) -> list[FloatArray]
     """Chromosomes (n_free,) in the ranges whose fastest mode is this one's or an alias of it."""
     modes = _Modes(objective, chromosome)
     dt = objective.records[0].dt
-    starts = [*_swaps(objective, chromosome), *_twins(modes), *_aliases(modes, dt)]
-    return [*starts, *alike_responses(objective, chromosome)]
+    swapped, alike = _swaps(objective, chromosome), alike_responses(objective, chromosome)
+    tried = _harmless(objective, chromosome, [*swapped, *alike])
+    return [*tried, *_twins(modes), *_aliases(modes, dt)]
+
+
+def _harmless(
+    objective: Objective, chromosome: FloatArray, starts: list[FloatArray]
+) -> list[FloatArray]:
+    """Those of some starts (n_free,) in the ranges whose error is no multiple of a chromosome's."""
+    rows = np.stack([chromosome, *starts])
+    coded = objective.space.encode(
+        np.maximum(rows, np.finfo(np.float64).tiny * objective.space.log)
+    )
+    lower, upper = objective.space.coded_bounds
+    admitted = np.all((coded >= lower) & (coded <= upper), axis=1)
+    errors, _ = objective.evaluate(np.where(admitted[:, None], rows, chromosome))
+    kept = admitted & (errors < _HARM * errors[0])
+    return list(rows[1:][kept[1:]])
 
 
 def _swaps(objective: Objective, chromosome: FloatArray) -> list[FloatArray]:
-    """Chromosomes with two parameters of a unit swapped, where that does little harm."""
+    """Chromosomes with two parameters of a unit swapped."""
     space = objective.space
     units = np.array([parameter.unit for parameter in space.parameters[: len(space.index)]])
     pairs = np.argwhere(np.triu(units[:, None] == units, 1))
-    # The last one is the chromosome itself.
-    swapped = np.repeat(chromosome[None], len(pairs) + 1, axis=0)
-    for row, pair in zip(swapped, pairs, strict=False):
+    swapped = np.repeat(chromosome[None], len(pairs), axis=0)
+    for row, pair in zip(swapped, pairs, strict=True):
         row[pair] = row[pair[::-1]]
-    coded = space.encode(np.maximum(swapped, np.finfo(np.float64).tiny * space.log))
-    lower, upper = space.coded_bounds
-    admitted = np.all((coded >= lower) & (coded <= upper), axis=1)
-    errors, _ = objective.evaluate(np.where(admitted[:, None], swapped, chromosome))
-    kept = admitted & (errors < _HARM * errors[-1])
-    return list(swapped[:-1][kept[:-1]])
+    return list(swapped)
 
 
 def _aliases(modes: _Modes, dt: float) -> list[FloatArray]:

@@ -17,6 +17,7 @@ from sysid.fitting.objective import Objective
 from sysid.response.linearization import linear_models
 
 _STARTS, _ITERATIONS = 32, 25
+_LEFT, _BY_THEN = 10, 6  # starts that go on, and iterations after which those are the nearest
 _FREQUENCIES = 12  # from a period of the record to near half the sample rate
 _DAMPING, _EASED, _STIFFENED = 1e-2, 0.3, 10.0
 _DIFFERENCE = 1e-6
@@ -84,7 +85,10 @@ class _Responses:
         at[:, free] = rng.uniform(lower[free], upper[free], (_STARTS, len(free)))
         miss, damping = self._miss(at), np.full(_STARTS, _DAMPING)
         ends = tuple(bound[free] for bound in self.space.coded_bounds)
-        for _ in range(_ITERATIONS):
+        for k in range(_ITERATIONS):
+            if k == _BY_THEN:
+                nearest = np.argsort(np.sum(miss**2, axis=1))[:_LEFT]
+                at, miss, damping = at[nearest], miss[nearest], damping[nearest]
             slopes = self._slopes(at, free)
             square = np.swapaxes(slopes, 1, 2) @ slopes
             size = np.einsum("nii->ni", square)
