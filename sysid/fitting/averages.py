@@ -2,7 +2,8 @@
 
 White noise has all frequencies; what drives a plant often has few. An input is averaged over as
 many samples as change it by no more than its noise does: each wider average is compared with the
-one before, on the whole and at every sample, so that one step in a slow record keeps it as it is.
+one before, on the whole and at every sample, so that one step in a slow record keeps it as it is,
+and none is taken whose change would be hidden by chance.
 What is left of the noise is less, and coloured, n_(k+1) = a n_k + what is new. The weights are such
 that white noise becomes just that, so that a filter may count on it.
 """
@@ -12,19 +13,20 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.fft import irfft, next_fast_len, rfft
 
 from sysid.arrays import FloatArray
 from sysid.problem.data import Dataset
 
 # Colours that are tried: from each to the next the noise's variance falls by the root of two.
-_COLOURS = tuple((2.0 ** (k / 2) - 1.0) / (2.0 ** (k / 2) + 1.0) for k in range(1, 13))
+_COLOURS = tuple((2.0 ** (k / 2) - 1.0) / (2.0 ** (k / 2) + 1.0) for k in range(1, 41))
 _NEGLIGIBLE = 1e-3  # part of the largest weight
 # Mean square change, in parts of what noise does, and the largest in its deviations, by which a
 # wider average is taken to change more than noise.
 _MEAN_SQUARE, _LARGEST = 1.25, 5.5
-# Most that may be lost of a signal, in parts of what is taken away, and the deviations of chance
-# that may hide it.
-_MOST_LOST, _SURELY = 0.1, 2.0
+# Most that may be lost of a signal, in parts of what is taken away, the deviations of chance that
+# may hide it, and the most that they may hide of what one step takes away.
+_MOST_LOST, _SURELY, _HIDDEN = 0.1, 2.0, 0.15
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,7 @@ def denoised(record: Dataset) -> Denoised:
     >>> quiet = denoised(Dataset(noisy, noisy, 0.01, input_noise=np.ones(1)))
     >>> error = np.std(quiet.record.inputs[:, 0] - slow)
     >>> quiet.record.input_noise.round(2), error.round(2), quiet.colour.round(2)
-    (array([0.18]), np.float64(0.18), array([0.94]))
+    (array([0.21]), np.float64(0.21), array([0.92]))
     """
     inputs, noise = record.inputs.copy(), record.input_noise.astype(np.float64)
     colour, lost = np.zeros(len(noise)), np.zeros(len(noise))
@@ -81,11 +83,11 @@ def _averaged(signal: FloatArray, noise: float) -> tuple[FloatArray, float, floa
         expected = noise * float(np.linalg.norm(difference))
         change = (next_average - average) / expected
         excess = float(np.mean(change**2)) - 1.0
-        hidden = max(excess, 0.0) + _SURELY * _chance(difference, len(signal))
-        taken, lost = taken + expected**2, lost + expected**2 * hidden
+        chance = _SURELY * _chance(difference, len(signal))
+        taken, lost = taken + expected**2, lost + expected**2 * (max(excess, 0.0) + chance)
         if excess > _MEAN_SQUARE - 1.0 or np.abs(change).max() > _LARGEST:
             break
-        if lost > _MOST_LOST * taken:
+        if chance > _HIDDEN or lost > _MOST_LOST * taken:
             break
         weights, average, colour, share = wider, next_average, wider_colour, lost / taken
     return average, colour, share
@@ -93,8 +95,9 @@ def _averaged(signal: FloatArray, noise: float) -> tuple[FloatArray, float, floa
 
 def _chance(weights: FloatArray, count: int) -> float:
     """Deviation of the mean square of so much white noise, weighted so, in parts of itself."""
-    correlation = np.correlate(weights, weights, mode="full")
-    return float(np.sqrt(2.0 / count) * np.linalg.norm(correlation) / correlation.max())
+    size = next_fast_len(2 * len(weights), real=True)
+    correlation = irfft(np.abs(rfft(weights, size)) ** 2, size)
+    return float(np.sqrt(2.0 / count) * np.linalg.norm(correlation) / correlation[0])
 
 
 def _weights(colour: float) -> FloatArray:
@@ -111,7 +114,8 @@ def _weights(colour: float) -> FloatArray:
 
 
 def _convolved(signal: FloatArray, weights: FloatArray) -> FloatArray:
-    """Beyond its ends a signal goes on as its image in the end point."""
-    reach = len(weights) // 2
-    ends = np.pad(signal, reach, mode="reflect", reflect_type="odd")
-    return np.convolve(ends, weights, mode="valid")
+    """Beyond its ends a signal goes on as its mirror image: no end point counts for more."""
+    beyond = np.pad(signal, len(weights) // 2, mode="symmetric")
+    size = next_fast_len(len(beyond), real=True)
+    convolved: FloatArray = irfft(rfft(beyond, size) * rfft(weights, size), size)
+    return convolved[len(weights) - 1 : len(beyond)]

@@ -365,6 +365,14 @@ def test_noise_above_the_frequencies_of_an_input_is_averaged_away():
     assert np.max(np.abs(of["steps"].record.inputs[:, 0] - steps - noise)) < 0.3
 
 
+def test_averages_are_as_wide_as_chance_can_be_told_and_trust_no_end_point():
+    noise = np.random.default_rng(0).standard_normal(16384)
+    noise[[0, -1]] = 3.0
+    quiet = denoised(Dataset(2.0 + noise, noise, DT, input_noise=np.ones(1))).record
+    assert 0.05 < quiet.input_noise[0] < 0.08
+    assert np.max(np.abs(quiet.inputs - 2.0)) < 5.0 * quiet.input_noise[0]
+
+
 def test_intervals_are_those_of_the_averaged_inputs_that_were_fitted():
     rng = np.random.default_rng(2)
     u = 3.0 * np.sin(0.5 * np.arange(4000) * DT)
