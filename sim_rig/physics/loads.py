@@ -19,6 +19,7 @@ _HAND_INERTIA = 1e-3  # kg*m^2
 HAND_STIFFNESS = _HAND_FREQUENCY**2 * _HAND_INERTIA  # N*m/rad
 HAND_DAMPING = 2.0 * 0.707 * _HAND_FREQUENCY * _HAND_INERTIA  # N*m*s/rad
 
+_INERTIA = 1e-6  # kg*m^2, of the pulley; assumed: small, of aluminium
 _MASS = 0.25  # kg, the lab's 250 g
 _CABLE = 5000.0  # N/m, assumed: thin braided cable, half a metre
 
@@ -104,7 +105,9 @@ _FREE = LoadModel(lambda theta, omega, x, u, p: (0.0,))
 
 _MEASURED = LoadModel(
     lambda theta, omega, x, u, p: (u[0],),
-    inputs=(Input("torque", "N*m", "foh", "load torque on the shaft, as measured"),),
+    inputs=(
+        Input("torque", "N*m", "foh", "load torque on the shaft, as measured", ("omega", _INERTIA)),
+    ),
 )
 
 _PULLEY = LoadModel(
@@ -117,7 +120,7 @@ _PULLEY = LoadModel(
     (
         fixed("mass", "kg", _MASS, "hanging mass"),
         fixed("radius", "m", 0.005, "of the pulley; assumed: the brake's residual holds the load"),
-        fixed("J_p", "kg*m^2", 1e-6, "pulley inertia; assumed: small, of aluminium"),
+        fixed("J_p", "kg*m^2", _INERTIA, "pulley inertia; assumed: small, of aluminium"),
         fixed("k_cable", "N/m", _CABLE, "stiffness; assumed: thin braided cable, half a metre"),
         fixed("d_cable", "s/m", 4.0, "loss; assumed: a seventh of critical under the mass"),
         fixed("length", "m", 0.5, "of cable that can be wound; assumed: sixteen turns"),

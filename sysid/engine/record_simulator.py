@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sysid.arrays import BoolArray, FloatArray, IntArray
+from sysid.engine.bends import splines_of, with_bends
 from sysid.engine.compiler import Filter, Kernels, Tangents, explained_errors, kernels
 from sysid.engine.scheme import LANES, work_area
 from sysid.engine.windows import (
@@ -16,7 +17,6 @@ from sysid.engine.windows import (
     with_integrals,
 )
 from sysid.problem.data import Dataset
-from sysid.problem.model import ProcessModel
 from sysid.threads import Workers
 
 # Steps are first chosen from a bound on the fastest rate of the nonlinear part; this far along
@@ -80,7 +80,7 @@ class RecordSimulator:
     def __post_init__(self) -> None:
         record, model = self.record, self.kernels.model
         self._start = record.initial_state(model)
-        self._inputs = _with_bends(model, record.inputs)
+        self._inputs = with_bends(model, record, splines_of(model))
         missing = ~np.isfinite(record.outputs)
         outputs = np.where(missing, 0.0, record.outputs)
         self._peak = np.abs(outputs).max(axis=0)
@@ -221,11 +221,12 @@ class RecordSimulator:
         if key not in self._means_of:  # the same in every run of a fit
             self._means_of[key] = self._means(*key)
         mean, cut = self._means_of[key]
+        inputs = with_bends(model, record, kernel.splines)
         weights[0, [j for j in self.averaged if j not in cut]] = 0.0  # its mean is not over yet
         measured = self._after_the_last(cut, parameters, starts, lanes, n_steps)
         with explained_errors(model):
             kalman.innovations(
-                work, work.reshape(-1, LANES), kernel.tables, self._inputs, measured, weights,
+                work, work.reshape(-1, LANES), kernel.tables, inputs, measured, weights,
                 variances, noise**2, mean, of_inputs, colour[list(kernel.variation.noisy)],
                 intensity, np.array(spread), float(corrects), start,
                 np.ascontiguousarray(parameters[padded].T), record.dt, n_steps, sums, kept,
@@ -456,22 +457,6 @@ class RecordSimulator:
             return np.repeat(self._start[:, None], len(lanes), axis=1)
         rows = lanes if len(starts) > 1 else np.zeros_like(lanes)
         return np.ascontiguousarray(np.asarray(starts, dtype=np.float64)[rows].T)
-
-
-def _with_bends(model: ProcessModel, inputs: FloatArray) -> FloatArray:
-    """Inputs, and behind them the squares' and cubes' coefficients of those that are splines.
-
-    From sample k a spline is u_k + (u_k+1 - u_k) r + a (r^2 - r) + b (r^3 - r), 0 <= r <= 1.
-    """
-    splines = [j for j, signal in enumerate(model.inputs) if signal.hold == "spline"]
-    if not splines:
-        return inputs
-    from scipy.interpolate import CubicSpline
-
-    pieces = CubicSpline(np.arange(len(inputs)), inputs[:, splines]).c
-    bends = np.zeros((len(inputs), 2 * len(splines)))
-    bends[:-1, 0::2], bends[:-1, 1::2] = pieces[1], pieces[0]
-    return np.ascontiguousarray(np.hstack([inputs, bends]))
 
 
 def _finer(steps: IntArray, excess: FloatArray) -> IntArray:

@@ -26,6 +26,7 @@ from functools import cached_property
 import numpy as np
 
 from sysid.arrays import FloatArray, IntArray
+from sysid.engine.bends import splines_of
 from sysid.engine.program import listed
 from sysid.engine.structure import Structure
 from sysid.problem.model import ProcessModel
@@ -61,7 +62,7 @@ class Scheme:
         self.recorded_slopes = [j for j, u in enumerate(model.inputs) if u.hold != "zoh"]
         # Whatever stands behind a record's inputs rises within a sample.
         self.interpolated = [*self.recorded_slopes, *range(self.n_recorded, self.n_inputs)]
-        self.splines = [j for j, u in enumerate(model.inputs) if u.hold == "spline"]
+        self.splines = splines_of(model)
         self.counts = {
             "remainder": self.n_states,
             "observe": self.n_outputs,

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sysid.arrays import FloatArray, IntArray
+from sysid.engine.bends import bent
 from sysid.engine.compiler import kalman_filter, kernels, tangents
 from sysid.engine.record_simulator import RecordSimulator
 from sysid.engine.scheme import LANES
@@ -222,7 +223,8 @@ class BatchSimulator:
         process = np.zeros(len(self.model.states)) if process is None else process
         driven = tuple(np.flatnonzero(process).tolist())
         averaged = tuple(sorted({j for record in records for j in self._on(record).averaged}))
-        model = with_integrals(self.model, averaged) if averaged else self.model
+        model = bent(self.model) if all(record.between.size for record in records) else self.model
+        model = with_integrals(model, averaged) if averaged else model
         white = np.zeros((len(records), len(self.model.inputs)))
         colours = white if colour is None else np.asarray(colour)
         coloured = bool(colours.any())

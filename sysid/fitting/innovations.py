@@ -36,6 +36,8 @@ from sysid.engine.simulation import BatchResult, Residuals, Status
 from sysid.fitting.averages import coloured, denoised
 from sysid.fitting.means import each_mean_once, scatter
 from sysid.fitting.objective import Objective
+from sysid.fitting.reactions import with_reactions
+from sysid.problem.data import Dataset
 
 _ROUNDS, _STEADY = 30, 1e-4  # of the outputs' noise, and its relative change at the end
 _FARTHEST = 2.3  # change of its logarithm that two rounds may foretell
@@ -79,8 +81,9 @@ class Innovations(Objective):
         corrects: bool,
         process: FloatArray | None = None,
         quiet: bool = False,
+        near: FloatArray | None = None,
     ) -> Self:
-        """An objective's counterpart."""
+        """An objective's counterpart; near: (n_free,), where states react as they do."""
         variant = cls.__new__(cls)
         vars(variant).update(vars(objective))
         variant.colour = [np.zeros(len(r.input_noise)) for r in objective.records]
@@ -88,6 +91,8 @@ class Innovations(Objective):
             variant.records = [each_mean_once(record) for record in objective.records]
             seen = [np.isfinite(record.outputs).sum(axis=0) for record in variant.records]
             variant.counts = np.sum(seen, axis=0)
+        if near is not None:
+            variant.records = variant._reacting(near)
         variant.quiet = quiet
         if quiet:
             parts = [denoised(record) for record in variant.records]
@@ -113,8 +118,19 @@ class Innovations(Objective):
         residual = objective.residuals(chromosome[None], steps).values[..., 0]
         error = objective.in_units(residual)
         quiet = corrects and _may_average(objective, chromosome, steps, residual)
-        variant = cls.of(objective, error, corrects=corrects, process=process, quiet=quiet)
+        variant = cls.of(
+            objective, error, corrects=corrects, process=process, quiet=quiet, near=chromosome
+        )
         return variant.settled(chromosome)
+
+    def _reacting(self, chromosome: FloatArray) -> list[Dataset]:
+        """The records with what their inputs do between samples."""
+        model, vector = self.simulator.model, self.space.full(chromosome[None])[0]
+        starts = self._starts(chromosome[None])
+        return [
+            with_reactions(model, record, vector, start[0])
+            for record, start in zip(self.records, starts, strict=True)
+        ]
 
     def settled(self, chromosome: FloatArray) -> Self:
         """With the noise that the innovations show at a chromosome, (n_free,)."""

@@ -408,6 +408,7 @@ class GASSI(RecordEstimator):
             corrects=corrects,
             process=self._process(),
             quiet=self.averaged_inputs_,
+            near=self.chromosome_,
         )
 
     def _at_final_accuracy(self, objective: Objective) -> Objective:

@@ -25,7 +25,9 @@ class Dataset:
     errors can be; 0 where it is not known. windows: (n_samples, n_outputs, 2), the time over which
     a sensor averaged each sample of an output, its begin and end in seconds from the sample on;
     both 0 where it was sampled at its instant. Simulated outputs are averaged alike. jitter:
-    (n_samples, n_outputs), standard deviation of when each window was [s]. Default none.
+    (n_samples, n_outputs), standard deviation of when each window was [s]. between: (n_samples,
+    n_inputs), by how much the mean of an interpolated input up to the next sample differs from that
+    of a straight line, for which filters bend it. Default none.
 
     Raises ModelError for mismatched shapes, fewer than two rows, complex numbers, inputs that are
     not finite, or infinite outputs.
@@ -45,6 +47,7 @@ class Dataset:
     output_noise: FloatArray = field(default_factory=lambda: np.zeros(0))
     windows: FloatArray = field(default_factory=lambda: np.zeros(0))
     jitter: FloatArray = field(default_factory=lambda: np.zeros(0))
+    between: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def __repr__(self) -> str:
         size = f"{self.n_samples} samples, dt={self.dt:g} s"
@@ -67,6 +70,11 @@ class Dataset:
         for name in ("input_zero", "output_zero", "input_noise", "output_noise"):
             object.__setattr__(self, name, self._deviations(name))
         self._check_windows()
+        if self.between.size and self.between.shape != self.inputs.shape:
+            raise ModelError(
+                f"{self.name}: between has shape {self.between.shape}; give a number for each "
+                f"sample and input: {self.inputs.shape}"
+            )
 
     def _check_windows(self) -> None:
         """Raise ModelError for windows that are none of these outputs'."""
@@ -142,6 +150,7 @@ class Dataset:
             outputs=self.outputs[rows],
             windows=self.windows[rows],
             jitter=self.jitter[rows],
+            between=self.between[rows],
             name=name,
         )
 

@@ -70,7 +70,8 @@ class Input:
 
     ``zoh`` holds each sample until the next, ``foh`` interpolates linearly, ``spline`` runs a
     cubic spline through all samples of a record (where a model is advanced sample by sample,
-    without knowing what comes, linearly).
+    without knowing what comes, linearly). reaction: a state, and by how much of its rate the
+    input is less, as a torque is by an inertia behind its sensor: between samples it bends as that.
 
     >>> Input("load", "N*m", hold="foh").hold
     'foh'
@@ -80,6 +81,7 @@ class Input:
     unit: str
     hold: Hold = "zoh"
     description: str = ""
+    reaction: tuple[str, float] | None = None
 
 
 @dataclass(frozen=True)

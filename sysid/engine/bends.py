@@ -1,0 +1,49 @@
+"""Inputs that are no straight lines between samples.
+
+From sample k one is u_k + (u_(k+1) - u_k) r + a (r^2 - r) + b (r^3 - r), 0 <= r <= 1. a and b are
+those of a cubic spline, or such that the input has the mean that a record says: -6 times what that
+is more than the straight line's, and none.
+"""
+
+import functools
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from sysid.arrays import FloatArray
+from sysid.problem.data import Dataset
+from sysid.problem.model import ProcessModel
+
+
+def splines_of(model: ProcessModel) -> list[int]:
+    """Places of the inputs that are no straight lines."""
+    return [j for j, signal in enumerate(model.inputs) if signal.hold == "spline"]
+
+
+@functools.lru_cache(maxsize=8)  # one model for the same question: its kernels are kept by it
+def bent(model: ProcessModel) -> ProcessModel:
+    """The model with inputs that records bend where a state reacts on them."""
+    inputs = [replace(u, hold="spline") if u.reaction else u for u in model.inputs]
+    return replace(model, inputs=tuple(inputs))
+
+
+def with_bends(model: ProcessModel, record: Dataset, splines: Sequence[int]) -> FloatArray:
+    """Inputs of a record, and behind them a and b of each of the splines, by their places.
+
+    >>> from sysid.examples import lag
+    >>> record = Dataset(np.zeros(3), np.zeros(3), 0.1, between=np.array([[0.5], [0.0], [0.0]]))
+    >>> model = replace(lag(), inputs=(replace(lag().inputs[0], reaction=("y", 1.0)),))
+    >>> with_bends(model, record, [0])[0]
+    array([ 0., -3.,  0.])
+    """
+    bends = np.zeros((record.n_samples, 2 * len(splines)))
+    for place, j in enumerate(splines):
+        if record.between.size and model.inputs[j].reaction:
+            bends[:, 2 * place] = -6.0 * record.between[:, j]
+        else:
+            from scipy.interpolate import CubicSpline
+
+            pieces = CubicSpline(np.arange(record.n_samples), record.inputs[:, j]).c
+            bends[:-1, 2 * place], bends[:-1, 2 * place + 1] = pieces[1], pieces[0]
+    return np.ascontiguousarray(np.hstack([record.inputs, bends])) if splines else record.inputs
