@@ -19,7 +19,7 @@ from daq.designs.setup import Setup, set_up, set_up_structures
 from daq.documents import plain
 from daq.files import write_whole
 from daq.identification.fit import check_writable
-from daq.progress import Watch, ignore
+from daq.progress import Note, Watch, ignore
 from sysid import Design, ModelError
 from sysid import design as choose_runs
 
@@ -78,7 +78,7 @@ def choose(setup: Setup, watch: Watch = ignore) -> Design:
     """The runs that tell most. Raises ConfigError where none can be made."""
     question, settings, given = setup.question, setup.problem.settings, setup.problem.given
     try:
-        return choose_runs(
+        chosen = choose_runs(
             setup.problem.model,
             [family.excitation() for family in setup.families.values()],
             noise=setup.noise,
@@ -103,6 +103,11 @@ def choose(setup: Setup, watch: Watch = ignore) -> Design:
     except ModelError as error:
         key = ("targets",) if setup.targets else ("protocols",)
         raise setup.file.error(key, f"{error}{_strays(setup)}") from None
+    if chosen.phantoms:
+        problem = "the simulation's error would pass for information"
+        cure = "a lower accuracy, such as 1e-4 in --config, makes it less"
+        watch(Note("warning", f"{chosen.phantoms} runs are left out: {problem}; {cure}"))
+    return chosen
 
 
 def _strays(setup: Setup) -> str:

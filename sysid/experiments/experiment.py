@@ -10,7 +10,7 @@ from sysid.engine.simulation import BatchSimulator
 from sysid.experiments import criteria
 from sysid.experiments.bench import Bench, FreeRun
 from sysid.experiments.excitation import Excitation
-from sysid.experiments.information import Informant, refuse_phantoms
+from sysid.experiments.information import Informant, tells_nothing_there
 from sysid.experiments.prior import Prior
 from sysid.experiments.quantities import chosen, determined, relative_gradients
 from sysid.experiments.search import RunCandidate, Search
@@ -84,7 +84,8 @@ class Design(ChosenRuns):
 
     quantities: of all that the equations let experiments tell. tied, unseen: what no experiment
     with these outputs tells, with what would (``fix``). information: (n_free, n_free), of the
-    search coordinates, of all runs at the values that the design starts from.
+    search coordinates, of all runs at the values that the design starts from. phantoms: runs that
+    were left out since the simulation's error would have passed for information.
 
     >>> run = DesignedRun("step", {"height": 1.0}, np.ones((50, 1)), dt=0.01)
     >>> Design((run, run), (), (), (), np.eye(2), attempts=64, refused=3).duration
@@ -95,6 +96,7 @@ class Design(ChosenRuns):
     tied: tuple[TiedGroup, ...]
     unseen: tuple[str, ...]
     information: FloatArray
+    phantoms: int = field(default=0, kw_only=True)
 
     @property
     def met(self) -> bool:
@@ -150,8 +152,9 @@ def design(
     many runs are tried at random, and how often how many new ones are made of the best. watch: is
     told how many runs have been simulated, and how many of them kept the limits.
 
-    Raises ModelError for unknown names, equations that cannot be differentiated, where every
-    candidate would pass a limit, and where the simulation's error would pass for information.
+    Left out are runs of which the simulation's error would pass for information. Raises ModelError
+    for unknown names, equations that cannot be differentiated, and where every candidate would pass
+    a limit.
 
     >>> from sysid.experiments import Excitation, Setting
     >>> from sysid.examples import lag
@@ -181,13 +184,20 @@ def design(
     drawn = knowledge.draws(space, max(draws, checks), rng)
     robust, vectors = drawn[:draws], space.full(drawn)
     bench = bench or FreeRun(simulator, limits, margin)
+    null = [informant.null_directions(chromosome) for chromosome in robust]
+    phantoms: list[str] = []
 
     def evaluate(excitation: Excitation, genes: FloatArray) -> RunCandidate | None:
         records = bench.records(excitation.signal(genes), excitation.dt, vectors)
         if records is None:
             return None
         expected = _information(informant, records[:draws], robust)
-        return RunCandidate(excitation, genes, expected) if np.isfinite(expected).all() else None
+        if not np.isfinite(expected).all():
+            return None
+        if not all(map(tells_nothing_there, expected, null)):
+            phantoms.append(excitation.name)
+            return None
+        return RunCandidate(excitation, genes, expected)
 
     goals = np.array(list((targets or {}).values())) / Z95
     gradients = relative_gradients(wanted, space, robust)
@@ -196,8 +206,6 @@ def design(
     search = Search(excitations, evaluate, of_information, rng, runs, workers, watch)
     search.run(candidates, generations, offspring)
     total = search.total()
-    for expected, chromosome in zip(total, robust, strict=True):
-        refuse_phantoms(expected, informant.null_directions(chromosome))
     return Design(
         tuple(designed_run(search.pool[i]) for i in search.chosen),
         _predicted(determined(structure, space), space, robust, information, total, targets or {}),
@@ -206,6 +214,7 @@ def design(
         total[0],
         attempts=search.attempts,
         refused=search.attempts - len(search.pool),
+        phantoms=len(phantoms),
     )
 
 
