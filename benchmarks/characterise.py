@@ -1,6 +1,6 @@
 """What `rig characterise` tells of hidden rigs, beside 8 runs of the shipped PRBS.
 
-python -m benchmarks.characterise [--json] [--rigs 3] [--first 0] [--time 10]
+python -m benchmarks.characterise [--json] [--rigs 3] [--first 0] [--time 10] [--model actuator]
 
 Each rig is the simulated one with the model's nominal values, each times a factor of 0.6 to 1.6
 drawn anew. It is characterised from the model's ranges within 10 s of logged time; the same rig
@@ -29,6 +29,7 @@ from daq.identification.fit import fit
 from daq.identification.request import SettingsRequest
 from daq.identification.settings import problem_of
 from daq.logs.capture import LOG_NAME
+from daq.lookup.models import DEFAULT_MODEL, find_model
 from daq.lookup.shipped import find_file
 from sim_rig.actuator import actuator
 from sysid import identifiability
@@ -45,22 +46,23 @@ def main() -> None:
     parser.add_argument("--rigs", type=int, default=3, help="hidden parameters drawn")
     parser.add_argument("--first", type=int, default=0, help="number of the first rig")
     parser.add_argument("--time", type=float, default=10.0, help="logged time [s]")
+    parser.add_argument("--model", default=DEFAULT_MODEL, help="that is identified")
     options = parser.parse_args()
     numbers = range(options.first, options.first + options.rigs)
-    rigs = [hidden_rig(number, options.time) for number in numbers]
+    rigs = [hidden_rig(number, options.time, options.model) for number in numbers]
     report({"rigs": rigs}, options.json, show)
 
 
-def hidden_rig(number: int, seconds: float) -> dict[str, Any]:
-    """Figures of one rig."""
-    model, truth = actuator(), hidden_parameters(number)
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
+def hidden_rig(number: int, seconds: float, name: str) -> dict[str, Any]:
+    """Figures of one rig, by the name of the model that is identified."""
+    model, truth = find_model(name), hidden_parameters(number)
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
         rig = _rig_file(folder, number, truth)
         begin = time.perf_counter()
-        designed = characterise.characterise(rig, seconds, None, folder / "c")
+        designed = characterise.characterise(rig, seconds, None, folder / "c", model=name)
         spent = time.perf_counter() - begin
-        shipped = _shipped(folder, rig, designed.rounds[-1], number)
+        shipped = _shipped(folder, rig, designed.rounds[-1], number, name)
     nominal = dict(zip(model.parameter_names, model.nominal.tolist(), strict=True))
     structure, space = identifiability(model, sensors=False), SearchSpace.of(model)
     values = {q.text: q.value({**nominal, **truth}) for q in determined(structure, space)}
@@ -118,7 +120,7 @@ def _rig_file(folder: Path, number: int, truth: dict[str, float]) -> Path:
     return path
 
 
-def _shipped(folder: Path, rig: Path, last: Round, number: int) -> dict[str, Interval]:
+def _shipped(folder: Path, rig: Path, last: Round, number: int, model: str) -> dict[str, Interval]:
     """Intervals of the same quantities from runs of the shipped PRBS."""
     content = yaml.safe_load(find_file("protocol", "prbs.yaml").read_text(encoding="utf-8"))
     logs = []
@@ -133,7 +135,8 @@ def _shipped(folder: Path, rig: Path, last: Round, number: int) -> dict[str, Int
     identification = Round(folder / "shipped", 1)
     identification.folder.mkdir(parents=True)
     (identification.folder / "design.json").write_bytes((last.folder / "design.json").read_bytes())
-    fit(problem_of(SettingsRequest()), logs, [], identification.identification)
+    problem = problem_of(SettingsRequest(options={"model": model}))
+    fit(problem, logs, [], identification.identification)
     return {interval.name: interval for interval in identification.intervals()}
 
 
