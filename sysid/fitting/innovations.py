@@ -26,6 +26,7 @@ belongs to the sum: without it, parameters that pass on more of that noise would
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Self
 
@@ -156,6 +157,14 @@ class Innovations(Objective):
     def of_noise(self, noise: FloatArray) -> Self:
         """With other noise of the outputs, (n_outputs,)."""
         return self._with(noise=noise)
+
+    def on(self, records: Sequence[Dataset], places: Sequence[int] | None = None) -> Objective:
+        """The same, noise and averages included, on parts of its records."""
+        part = super().on(records, places)
+        if places is not None:
+            colours = [self.colour[place] for place in places]
+            vars(part).update(colour=colours, scatter=[scatter(record) for record in records])
+        return part
 
     @property
     def _least_scatter(self) -> FloatArray:

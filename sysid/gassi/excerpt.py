@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sysid.arrays import FloatArray
+from sysid.fitting.objective import Objective
 from sysid.problem.data import Dataset
 from sysid.problem.space import SearchSpace
 
@@ -81,6 +82,27 @@ class Excerpt:
         outputs = part.outputs.copy()
         outputs[1 : int(_RUN_IN * len(outputs))] = np.nan
         return replace(part, outputs=outputs)
+
+    def of_all(self, objective: Objective) -> Objective:
+        """An objective of the records as that of the parts."""
+        part = objective.on(self.datasets(), self.places)
+        return part.over(objective.space.without_starts().with_starts(part.records))
+
+    def on_parts(
+        self, space: SearchSpace, part_space: SearchSpace, chromosome: FloatArray
+    ) -> FloatArray:
+        """A chromosome (n_free,) of the records as that of the parts.
+
+        The part at a record's beginning starts where the record does, others as declared.
+        """
+        n = len(space.index)
+        on_parts = part_space.with_nominal_starts(chromosome[:n])
+        starts = dict(zip(space.estimated, chromosome[n:], strict=True))
+        for j, (k, state) in enumerate(part_space.estimated):
+            if self.parts[k].begin == 0:
+                on_parts[n + j] = starts[self.parts[k].place, state]
+        low, high = np.array([(p.lower, p.upper) for p in part_space.parameters]).T
+        return np.clip(on_parts, low, high)
 
     def on_all(
         self, space: SearchSpace, chromosomes: Sequence[FloatArray]

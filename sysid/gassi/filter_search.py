@@ -18,7 +18,7 @@ from sysid.gassi.excerpt import Excerpt
 from sysid.gassi.operators import stratified
 from sysid.uncertainty.colour import SUCCESSIVE, successive_correlation
 
-_SAMPLES = 3072  # that tell enough
+SAMPLES = 3072  # that tell enough
 _SPREAD = 512  # chromosomes
 # Noise of an output whose innovations follow one another, in parts of what they show: their noise
 # is what cannot be foreseen.
@@ -44,16 +44,13 @@ def by_filter(objective: Objective, fitted: Innovations, little: BoolArray) -> l
     objective: of the free runs' errors. fitted: a filter for its records. little: (n_outputs,),
     outputs of which that filter's noise is overrated.
     """
-    excerpt, space, part = Excerpt.of(objective.records, _SAMPLES), objective.space, objective
-    if excerpt is not None:
-        part = objective.on(excerpt.datasets(), excerpt.places)
-        part = part.over(space.without_starts().with_starts(part.records))
     noise = np.where(little, _LITTLE, 1.0) * fitted.noise
-    filtered = Innovations.of(
-        part, noise, corrects=True, process=fitted.process, quiet=fitted.quiet
-    )
-    minima = _minima(filtered)
-    return minima if excerpt is None else excerpt.on_all(part.space, minima)[1]
+    filtered = fitted.of_noise(noise).weighed(objective.weights)
+    excerpt = Excerpt.of(fitted.records, SAMPLES)
+    if excerpt is None:
+        return _minima(filtered)
+    part = excerpt.of_all(filtered)
+    return excerpt.on_all(part.space, _minima(part))[1]
 
 
 def _minima(objective: Objective) -> list[FloatArray]:

@@ -23,7 +23,8 @@ from sysid.fitting.free_run import FINER, FINEST
 from sysid.fitting.innovations import Innovations
 from sysid.fitting.objective import Objective
 from sysid.fitting.refinement import Refinement, begin, refine, refine_each
-from sysid.gassi.filter_search import by_filter, coloured
+from sysid.gassi.excerpt import Excerpt
+from sysid.gassi.filter_search import SAMPLES, by_filter, coloured
 from sysid.gassi.lookalikes import lookalikes
 from sysid.gassi.slide import slid
 from sysid.uncertainty.colour import colour, longest_memory
@@ -98,9 +99,11 @@ def fit_likelihood(
     whether the minima have their lookalikes among them.
     """
     objective = _resolved(objective, minima[0])
-    # A filter begins at the minima of free runs, and does not end there.
+    # A filter begins at the minima of free runs, and does not end there; what looks like a minimum
+    # it tells itself.
     roughly = noise == "innovations"
-    optima = _explored(objective, minima, watch, lookalike=not explored, roughly=roughly)
+    lookalike = not (explored or roughly)
+    optima = _explored(objective, minima, watch, lookalike=lookalike, roughly=roughly)
     best, *others = optima.ranked()
     refitted = None
     if noise is not None:
@@ -337,22 +340,30 @@ def _refitted(
     """The best optimum and those not told from it by the error, refitted for noisy inputs.
 
     None where without corrections the inputs' noise would explain more than there is. The others
-    are refitted, and compared, at the noise of the first, and the best of them by its own.
+    are refitted, and compared, at the noise of the first, and the best of them by its own. A
+    filter tells minima apart that free runs do not, and others look like its own.
     """
     first = fit(ranked[0], watch)
     if first is None:
         return None
     likely = [o for o in ranked[1:] if by_error.deviance(o, ranked[0]) < _CONCEIVABLE]
     starts = [optimum.chromosome for optimum in likely]
-    if isinstance(first.objective, Innovations) and first.objective.corrects:
+    filters = isinstance(first.objective, Innovations) and first.objective.corrects
+    if filters:
+        starts += lookalikes(ranked[0].objective, ranked[0].chromosome)
         first, starts = better_by_filter(fit, first, starts, ranked[0], watch)
-    optima = _Optima(objective, first.rms * _too_well(ranked[0].rms))
+    optima, best, explored = _Optima(objective, first.rms * _too_well(ranked[0].rms)), first, None
     optima.add(first)
-    ends = _conceivable(first.objective, starts, optima, first)
-    descents = [begin(first.objective, end.chromosome) for end in ends]
-    for end in refine_each(first.objective, descents):
-        optima.add(_optimum(first.objective, end.chromosome, end.rms))
-    best = optima.ranked()[0]
+    for _ in range(_EXPLORED if filters else 1):
+        if best is explored:
+            break
+        explored = best
+        starts += lookalikes(first.objective, best.chromosome) if filters else []
+        ends = _conceivable(first.objective, starts, optima, best)
+        descents = [begin(first.objective, end.chromosome) for end in ends]
+        for end in refine_each(first.objective, descents):
+            optima.add(_optimum(first.objective, end.chromosome, end.rms))
+        best, starts = optima.ranked()[0], []
     if best is not first:
         optima.refit(best, fit(replace(best, objective=ranked[0].objective), watch))
     return optima
@@ -361,19 +372,67 @@ def _refitted(
 def _conceivable(
     objective: Objective, starts: Sequence[FloatArray], optima: _Optima, best: Optimum
 ) -> list[Refinement]:
-    """Where descents come to soon, what is no minimum yet known and not far behind the best."""
-    ends = refine_each(
+    """Where descents come to soon, what is no minimum yet known and not far behind the best.
+
+    The best is one of these where that is better than the known ``best``.
+    """
+    excerpt = Excerpt.of(objective.records, SAMPLES)
+    if excerpt is not None and starts:
+        starts = _conceivable_by(excerpt, objective, starts, optima, best)
+    ends = [end for end in _quickly(objective, starts, optima.new) if optima.new(end.chromosome)]
+    reached = [_optimum(objective, end.chromosome, end.rms) for end in ends]
+    deviances = np.array([optima.deviance(optimum, best) for optimum in reached])
+    near = deviances - deviances.min(initial=0.0) < _CONCEIVABLE
+    return list(itertools.compress(ends, near))
+
+
+def _conceivable_by(
+    excerpt: Excerpt,
+    objective: Objective,
+    starts: Sequence[FloatArray],
+    optima: _Optima,
+    best: Optimum,
+) -> list[FloatArray]:
+    """What is left of starts (n_free,), moved to their minima on an excerpt, by that alone.
+
+    By how far the best one's minimum there is from that on all samples all of them are moved back.
+    """
+    part, space = excerpt.of_all(objective), objective.space
+    first = refine(
+        part,
+        excerpt.on_parts(space, part.space, best.chromosome),
+        tolerance=_ROUGHLY,
+        max_iterations=_QUICKLY,
+    )
+    (there,) = excerpt.on_all(part.space, [first.chromosome])[1]
+    back = space.encode(best.chromosome) - space.encode(there)
+
+    def on_all(chromosome: FloatArray) -> FloatArray:
+        (there,) = excerpt.on_all(part.space, [chromosome])[1]
+        return space.decode(np.clip(space.encode(there) + back, *space.coded_bounds))
+
+    begun = [excerpt.on_parts(space, part.space, start) for start in starts]
+    ends = _quickly(part, begun, lambda chromosome: optima.new(on_all(chromosome)))
+    share = excerpt.n_samples / sum(record.n_samples for record in objective.records)
+    minimum = _optimum(part, first.chromosome, first.rms)
+    return [
+        on_all(end.chromosome)
+        for end in ends
+        if optima.new(on_all(end.chromosome))
+        and share * optima.deviance(_optimum(part, end.chromosome, end.rms), minimum) < _CONCEIVABLE
+    ]
+
+
+def _quickly(
+    objective: Objective, starts: Sequence[FloatArray], new: Callable[[FloatArray], bool]
+) -> list[Refinement]:
+    """Where descents come to soon; they end where they come to what is not new."""
+    return refine_each(
         objective,
         [begin(objective, start, tolerance=_ROUGHLY) for start in starts],
         max_iterations=_QUICKLY,
-        enough=lambda point: not optima.new(objective.space.decode(point.at)),
+        enough=lambda point: not new(objective.space.decode(point.at)),
     )
-    return [
-        end
-        for end in ends
-        if optima.new(end.chromosome)
-        and optima.deviance(_optimum(objective, end.chromosome, end.rms), best) < _CONCEIVABLE
-    ]
 
 
 def better_by_filter(

@@ -1,4 +1,4 @@
-"""Parameters far from a minimum under which a model's fastest mode looks the same.
+"""Parameters far from a minimum under which a model's fast modes look the same.
 
 Through the sampling: a mode of rate -s +- jw, sampled every dt, has the multiplier
 exp((-s +- jw) dt), and so do modes of w + 2 pi k / dt and of 2 pi k / dt - w. A model that rings
@@ -8,6 +8,9 @@ swap roles. Such starts for descents follow from the eigenvalues of the linearis
 """
 
 from __future__ import annotations
+
+import copy
+from typing import Self
 
 import numpy as np
 
@@ -29,12 +32,13 @@ _REACHED = 0.02  # part of the frequency by which the end may miss the alias
 
 
 def lookalikes(objective: Objective, chromosome: FloatArray) -> list[FloatArray]:
-    """Chromosomes (n_free,) in the ranges whose fastest mode is this one's or an alias of it."""
-    modes = _Modes(objective, chromosome)
-    dt = objective.records[0].dt
+    """Chromosomes (n_free,) in the ranges of which a fast mode is this one's or an alias of it."""
+    fastest, dt = _Modes(objective, chromosome), objective.records[0].dt
     swapped, alike = _swaps(objective, chromosome), alike_responses(objective, chromosome)
-    tried = _harmless(objective, chromosome, [*swapped, *alike])
-    return [*tried, *_twins(modes), *_aliases(modes, dt)]
+    starts = _harmless(objective, chromosome, [*swapped, *alike])
+    for modes in (fastest, *fastest.others(2.0 * np.pi * _FASTEST_SEEN / dt)):
+        starts += [*_twins(modes), *_aliases(modes, dt)]
+    return starts
 
 
 def _harmless(
@@ -65,7 +69,7 @@ def _swaps(objective: Objective, chromosome: FloatArray) -> list[FloatArray]:
 
 def _aliases(modes: _Modes, dt: float) -> list[FloatArray]:
     """Chromosomes with the mode at the frequencies that sampling does not tell from its own."""
-    mode = modes.fastest
+    mode = modes.mode
     frequencies = _aliased(mode.imag, dt)
     if mode.imag * dt < 2.0 * np.pi * _FASTEST_SEEN or not len(frequencies):
         return []
@@ -79,7 +83,7 @@ def _aliases(modes: _Modes, dt: float) -> list[FloatArray]:
 
 def _twins(modes: _Modes) -> list[FloatArray]:
     """Chromosomes with one parameter that acts on the mode moved, the rest keeping the mode."""
-    mode = modes.fastest
+    mode = modes.mode
     places = np.repeat(modes.acting[:_TURNED], len(_TURNS))
     at, _ = modes.here(len(places))
     turned = np.arange(at.shape[1]) == places[:, None]
@@ -110,7 +114,7 @@ def _aliased(frequency: float, dt: float) -> FloatArray:
 class _Modes:
     """Eigenvalues of the model linearised at the first record's start, by search coordinates.
 
-    start: those of the minimum, (n_free,). fastest: the eigenvalue there of largest imaginary
+    start: those of the minimum, (n_free,). mode: the eigenvalue there of largest imaginary
     part, or of largest size where nothing oscillates. acting: places of the parameters that act
     on it, the strongest first; differences of the rest are not taken.
     """
@@ -124,16 +128,27 @@ class _Modes:
         self.bounds = self.space.coded_bounds
         (values,) = self._eigenvalues(self.start[None])
         speeds = values.imag if values.imag.max() > 0.0 else np.abs(values)
-        self.fastest = complex(values[np.argmax(speeds)])
-        self.acting = np.arange(len(self.start))
+        self._look_at(complex(values[np.argmax(speeds)]))
+
+    def others(self, frequency: float) -> list[Self]:
+        """The same of further modes above a frequency [rad/s]."""
+        (values,) = self._eigenvalues(self.start[None])
+        fast = [complex(v) for v in values if v.imag > frequency and v != self.mode]
+        copies = [copy.copy(self) for _ in fast]
+        for modes, mode in zip(copies, fast, strict=True):
+            modes._look_at(mode)
+        return copies
+
+    def _look_at(self, mode: complex) -> None:
+        self.mode, self.acting = mode, np.arange(len(self.start))
         (slopes,) = self.slopes(*self.here(1))
         size = np.linalg.norm(slopes, axis=0)
         strongest = np.argsort(size)[::-1]
         self.acting = strongest[size[strongest] > _ACTING * size.max()]
 
     def here(self, count: int) -> tuple[FloatArray, ComplexArray]:
-        """The minimum and its fastest mode, repeated."""
-        return np.repeat(self.start[None], count, axis=0), np.full(count, self.fastest)
+        """The minimum and its mode, repeated."""
+        return np.repeat(self.start[None], count, axis=0), np.full(count, self.mode)
 
     def towards(
         self,

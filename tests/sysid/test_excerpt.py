@@ -84,6 +84,8 @@ def test_a_record_starts_where_the_part_at_its_beginning_does():
     )
     assert whole.names == ("gain", "tau", "inside(0) 1", "inside(0) 2")
     assert chromosome.tolist() == [2.0, 0.05, 1.0, 5.0]
+    parts = excerpt.on_parts(whole, of_parts, chromosome)
+    assert parts.tolist() == [2.0, 0.05, 1.0, *[of_parts.parameters[-2].nominal] * 3, 5.0]
     bare, (alone,) = excerpt.on_all(plain, [np.array([2.0, 0.05])])
     assert bare == plain and alone.tolist() == [2.0, 0.05]
 

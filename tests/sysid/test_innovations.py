@@ -26,6 +26,7 @@ from sysid import (
 from sysid.fitting.averages import denoised
 from sysid.fitting.innovations import Innovations
 from sysid.fitting.objective import Objective
+from sysid.gassi.excerpt import Excerpt
 from sysid.gassi.likelihood import Optimum, better_by_filter, noisy_fit, towards
 from sysid.uncertainty import uncertainty
 from sysid.uncertainty.sensitivity import sensitivity
@@ -371,6 +372,21 @@ def test_averages_are_as_wide_as_chance_can_be_told_and_trust_no_end_point():
     quiet = denoised(Dataset(2.0 + noise, noise, DT, input_noise=np.ones(1))).record
     assert 0.05 < quiet.input_noise[0] < 0.08
     assert np.max(np.abs(quiet.inputs - 2.0)) < 5.0 * quiet.input_noise[0]
+
+
+def test_a_filter_on_the_first_part_of_a_record_is_that_of_the_record():
+    rng = np.random.default_rng(0)
+    u = 3.0 * np.sin(0.5 * np.arange(4000) * DT)
+    y = lfilter([PART], [1.0, PART - 1.0], GAIN * u) + OF_OUTPUT * rng.standard_normal(4000)
+    noisy = u + OF_INPUT * rng.standard_normal(4000)
+    record = Dataset(noisy, y, DT, input_noise=np.array([OF_INPUT]))
+    objective = Objective(BatchSimulator(lag()), SearchSpace.of(lag()), [record])
+    whole = Innovations.of(objective, np.array([OF_OUTPUT]), corrects=True, quiet=True)
+    part = Excerpt.of(whole.records, 1024).of_all(whole)
+    assert part.records[0].n_samples == 1024 and part.records[0].input_noise < 0.3 * OF_INPUT
+    chromosome = np.array([[GAIN, TAU]])
+    expected = whole.residuals(chromosome, [4]).values[:1024]
+    assert part.residuals(chromosome, [4]).values[:1024] == pytest.approx(expected, abs=1e-12)
 
 
 def test_intervals_are_those_of_the_averaged_inputs_that_were_fitted():

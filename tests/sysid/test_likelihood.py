@@ -94,6 +94,35 @@ def test_aliases_have_the_same_multiplier_over_a_sample():
     assert len(set(frequencies)) >= 2
 
 
+def test_every_mode_that_sampling_hardly_sees_has_aliases():
+    def derivative(x, u, p):
+        return (
+            x[1],
+            p[0] ** 2 * (u[0] - x[0]) - 120.0 * x[1],
+            x[3],
+            p[1] ** 2 * (u[0] - x[2]) - 120.0 * x[3],
+        )
+
+    model = ProcessModel(
+        name="two oscillators",
+        states=tuple(State(name, "1", first_sample=False) for name in ("x", "v", "y", "w")),
+        inputs=(Input("u", "1"),),
+        outputs=(Output("x", "1"), Output("y", "1")),
+        parameters=tuple(
+            Parameter(name, "rad/s", value, 100.0, 5000.0, "log")
+            for name, value in (("fast", 900.0), ("slow", 700.0))
+        ),
+        derivative=derivative,
+    )
+    starts = lookalikes(objective_of(model, record_of(model, 0.01)), model.nominal)
+    rings, here = (np.sqrt(np.square(c) - 60.0**2) for c in (starts, model.nominal))
+    moved = np.abs(rings / here - 1.0) > 0.1
+    for place in (0, 1):
+        aliases = rings[moved[:, place] & ~moved[:, 1 - place], place]
+        assert len(aliases) >= 2
+        assert np.cos(0.01 * aliases) == pytest.approx(np.cos(0.01 * here[place]), abs=0.02)
+
+
 def test_slow_models_have_no_aliases():
     model = oscillator(50.0, 5.0, 500.0)
     here = np.array([50.0, 20.0, 1.0])
