@@ -51,6 +51,7 @@ _CONCEIVABLE = 40.0  # the same before a minimum has been refined to its end
 _MOST_PROMISING = 3  # minima of a part of the data that are fitted to all
 _QUICKLY, _ROUGHLY = 15, 1e-4  # iterations and tolerance until then
 _WAY = np.array([0.25, 0.5, 0.75])  # parts of the way between two minima that are tried
+_SLACK = 1e-10  # of the most that is told, which is told of every coordinate
 _EXPLORED = 2  # minima whose lookalikes are descended from
 # Minima are one when the way between them, were all linear, changed twice the log-likelihood by
 # less than this.
@@ -196,11 +197,12 @@ class _Optima:
     def connected(self, optimum: Optimum, rivals: Sequence[Optimum]) -> list[bool]:
         """Whether ways lead from one to others on which the data rule nothing out.
 
-        The coordinate that differs most is moved in steps, all others are fitted to each.
+        The coordinate that differs by most deviations, so none that is only felt with others, is
+        moved in steps, all others are fitted to each.
         """
         objective, coded = optimum.objective, self._objective.space.encode
         start, ends = coded(optimum.chromosome), [coded(rival.chromosome) for rival in rivals]
-        places = [int(np.argmax(np.abs(end - start) / objective.space.width)) for end in ends]
+        places = [int(np.argmax(np.abs(end - start) / self._deviations)) for end in ends]
         at, passable = [start] * len(ends), [True] * len(ends)
         for part in _WAY:
             descents = {}
@@ -248,6 +250,17 @@ class _Optima:
         slopes = (first.slopes / rms[:, None]).reshape(-1, first.slopes.shape[2])
         information: FloatArray = slopes.T @ slopes
         return information
+
+    @cached_property
+    def _deviations(self) -> FloatArray:
+        """Standard deviations of the coordinates, (n_free,), were errors white."""
+        width = self._objective.space.width
+        information = self._information * np.outer(width, width)
+        felt = information + _SLACK * max(float(np.diag(information).max()), _TINY) * np.eye(
+            len(width)
+        )
+        deviations: FloatArray = np.sqrt(np.diag(np.linalg.inv(felt))) * width
+        return deviations
 
     @cached_property
     def _sensitivity(self) -> Sensitivity:
