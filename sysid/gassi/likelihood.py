@@ -50,6 +50,7 @@ _TOLD_APART = 13.3
 _CONCEIVABLE = 40.0  # the same before a minimum has been refined to its end
 _MOST_PROMISING = 3  # minima of a part of the data that are fitted to all
 _QUICKLY, _ROUGHLY = 15, 1e-4  # iterations and tolerance until then
+_AT_ONCE = 8  # descents side by side, which later ones need not repeat
 _WAY = np.array([0.25, 0.5, 0.75])  # parts of the way between two minima that are tried
 _SLACK = 1e-10  # of the most that is told, which is told of every coordinate
 _EXPLORED = 2  # minima whose lookalikes are descended from
@@ -164,11 +165,11 @@ class _Optima:
         if self.new(optimum.chromosome):
             self._optima.append(optimum)
 
-    def new(self, chromosome: FloatArray) -> bool:
-        """Whether a chromosome is far from all minima in directions that the data feel."""
+    def new(self, chromosome: FloatArray, others: Sequence[FloatArray] = ()) -> bool:
+        """Whether a chromosome is far from all minima, and others, where the data feel it."""
         coded = self._objective.space.encode
-        for optimum in self._optima:
-            moved = coded(optimum.chromosome) - coded(chromosome)
+        for minimum in (*_chromosomes(self._optima), *others):
+            moved = coded(minimum) - coded(chromosome)
             if moved @ self._information @ moved < _ONE:
                 return False
         return True
@@ -363,7 +364,6 @@ def _refitted(
     starts = [optimum.chromosome for optimum in likely]
     filters = isinstance(first.objective, Innovations) and first.objective.corrects
     if filters:
-        starts += lookalikes(ranked[0].objective, ranked[0].chromosome)
         first, starts = better_by_filter(fit, first, starts, ranked[0], watch)
     optima, best, explored = _Optima(objective, first.rms * _too_well(ranked[0].rms)), first, None
     optima.add(first)
@@ -392,7 +392,7 @@ def _conceivable(
     excerpt = Excerpt.of(objective.records, SAMPLES)
     if excerpt is not None and starts:
         starts = _conceivable_by(excerpt, objective, starts, optima, best)
-    ends = [end for end in _quickly(objective, starts, optima.new) if optima.new(end.chromosome)]
+    ends = _quickly(objective, starts, optima.new)
     reached = [_optimum(objective, end.chromosome, end.rms) for end in ends]
     deviances = np.array([optima.deviance(optimum, best) for optimum in reached])
     near = deviances - deviances.min(initial=0.0) < _CONCEIVABLE
@@ -425,27 +425,52 @@ def _conceivable_by(
         return space.decode(np.clip(space.encode(there) + back, *space.coded_bounds))
 
     begun = [excerpt.on_parts(space, part.space, start) for start in starts]
-    ends = _quickly(part, begun, lambda chromosome: optima.new(on_all(chromosome)))
+
+    def new(chromosome: FloatArray, others: Sequence[FloatArray]) -> bool:
+        return optima.new(on_all(chromosome), [on_all(end) for end in others])
+
+    ends = _quickly(part, begun, new)
     share = excerpt.n_samples / sum(record.n_samples for record in objective.records)
     minimum = _optimum(part, first.chromosome, first.rms)
     return [
         on_all(end.chromosome)
         for end in ends
-        if optima.new(on_all(end.chromosome))
-        and share * optima.deviance(_optimum(part, end.chromosome, end.rms), minimum) < _CONCEIVABLE
+        if share * optima.deviance(_optimum(part, end.chromosome, end.rms), minimum) < _CONCEIVABLE
     ]
 
 
 def _quickly(
-    objective: Objective, starts: Sequence[FloatArray], new: Callable[[FloatArray], bool]
+    objective: Objective,
+    starts: Sequence[FloatArray],
+    new: Callable[[FloatArray, Sequence[FloatArray]], bool],
 ) -> list[Refinement]:
-    """Where descents come to soon; they end where they come to what is not new."""
-    return refine_each(
-        objective,
-        [begin(objective, start, tolerance=_ROUGHLY) for start in starts],
-        max_iterations=_QUICKLY,
-        enough=lambda point: not new(objective.space.decode(point.at)),
-    )
+    """Where descents come to soon that is new, also to those before them; others end on the way."""
+    ends: list[Refinement] = []
+    for first in range(0, len(starts), _AT_ONCE):
+        before = [end.chromosome for end in ends]
+        descents = [
+            begin(objective, start, tolerance=_ROUGHLY)
+            for start in starts[first : first + _AT_ONCE]
+        ]
+        wave = refine_each(
+            objective,
+            descents,
+            max_iterations=_QUICKLY,
+            enough=partial(_known, objective, new, before),
+        )
+        for end in sorted(wave, key=lambda end: end.error):
+            if new(end.chromosome, [kept.chromosome for kept in ends]):
+                ends.append(end)
+    return ends
+
+
+def _known(
+    objective: Objective,
+    new: Callable[[FloatArray, Sequence[FloatArray]], bool],
+    before: Sequence[FloatArray],
+    point: Point,
+) -> bool:
+    return not new(objective.space.decode(point.at), before)
 
 
 def better_by_filter(
