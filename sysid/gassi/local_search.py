@@ -34,16 +34,7 @@ _FAR = (0.15, 0.45)  # parts of a range by which parameters move along their val
 _SLACK = 1e-8  # keeps parameters on which nothing depends from following
 _ITERATIONS_EACH = 12  # what a descent from a first start may be expected to take
 
-_PLAIN_STATE = (
-    "reserve",
-    "polishing",
-    "polished",
-    "best",
-    "error",
-    "feasible",
-    "record",
-    "in_vain",
-)
+_PLAIN_STATE = ("reserve", "polishing", "polished", "best", "error", "feasible", "record", "in_vain")
 
 
 @dataclass(frozen=True)
