@@ -259,7 +259,7 @@ class GASSI(RecordEstimator):
         finally:
             if checkpoints is not None:
                 checkpoints.flush()
-        return "converged" if run.converged else "generations"
+        return "converged" if run.search.converged else "generations"
 
     def _conclude(
         self, run: SearchRun, objective: Objective, notify: Callable[[Progress], None]

@@ -26,15 +26,12 @@ _POLISHING, _MOST_ITERATIONS = 15, 50
 _SAME = 1e-3  # share by which an output's error differs between minima, or they are one
 _NEAR = 0.02  # share of the best error within which descents and minima count as near it
 _BEFORE_GIVING_UP = 2  # iterations
-# So many descents in a row without a gain of so large a share of the error, and others would find
-# nothing either.
-_IN_VAIN, _A_GAIN = 3 * AT_ONCE, 1e-3
 _MOST_POINTS, _FEWEST_POINTS = 16, 4  # along each parameter's range
 _FAR = (0.15, 0.45)  # parts of a range by which parameters move along their valleys
 _SLACK = 1e-8  # keeps parameters on which nothing depends from following
 _ITERATIONS_EACH = 12  # what a descent from a first start may be expected to take
 
-_PLAIN_STATE = ("reserve", "polishing", "polished", "best", "error", "feasible", "record", "in_vain")
+_PLAIN_STATE = ("reserve", "polishing", "polished", "best", "error", "feasible")
 
 
 @dataclass(frozen=True)
@@ -79,12 +76,6 @@ class LocalSearch:
         self.best: FloatArray = self.descents[0].point.at
         self.error = np.inf
         self.feasible = self._feasible(self.best)
-        self.record, self.in_vain = np.inf, 0  # the last error that was a gain, descents since then
-
-    @property
-    def converged(self) -> bool:
-        """Whether nothing better has come for so long that nothing is to be expected."""
-        return self.in_vain >= _IN_VAIN
 
     @property
     def left(self) -> int:
@@ -149,8 +140,6 @@ class LocalSearch:
     def _only_polishing_left(self) -> bool:
         if self.error <= refinement.ROUNDING or not (self.descents or self.minima):
             return True
-        if self.converged and not self.descents:
-            return True
         going_on = self.descents or self.dips
         variation_cost = self.n_varied * self.points + 2 * self.iteration_cost
         return self.left < self.reserve + (self.iteration_cost if going_on else variation_cost)
@@ -174,16 +163,8 @@ class LocalSearch:
                 live.append(descent)
         least = min([self.error, *(descent.point.error for descent in live)])
         self.descents = [descent for descent in live if not _hopeless(descent, least)]
-        self._count(len(moved) - len(self.descents))
         if not (self.descents or self.minima):
             self._add(Point(self.best, self.error))
-
-    def _count(self, ended: int) -> None:
-        """Count descents that have ended since the last gain."""
-        if not self.feasible or self.error < (1.0 - _A_GAIN) * self.record:
-            self.record, self.in_vain = self.error, 0
-        else:
-            self.in_vain += ended
 
     def _take(self, descent: Descent) -> None:
         """Offer the point that a descent has reached for sure."""

@@ -54,11 +54,6 @@ class SearchRun:
         return self.local is not None and self.local.polished
 
     @property
-    def converged(self) -> bool:
-        """Whether it ended before its budget, as nothing better came any more."""
-        return self.search.converged or (self.local is not None and self.local.converged)
-
-    @property
     def best(self) -> Best | None:
         """The best yet, None before the first generation; starts are estimated only locally."""
         search, local, space = self.search, self.local, self.objective.space

@@ -95,17 +95,6 @@ def test_jumps_leave_a_minimum_that_a_descent_cannot(seed):
     assert target.simulations <= before + 6000
 
 
-def test_a_search_ends_when_nothing_better_comes():
-    noise = np.random.default_rng(1).normal(0.0, 0.02, (200, 2))
-    clean = motor_record()
-    record = Dataset(clean.inputs, clean.outputs + noise * clean.outputs.max(axis=0), clean.dt)
-    fitted = GASSI(motor(), population=200, generations=50, criterion="error").fit(record)
-    assert fitted.stopped_ == "converged"
-    assert fitted.n_simulations_ < 0.6 * 200 * 50
-    nominal = refine(objective(motor(), record), np.array([p.nominal for p in motor().parameters]))
-    assert fitted.error_ <= (1.0 + 1e-4) * nominal.error
-
-
 def test_the_budget_is_kept_and_the_end_is_a_minimum():
     noise = np.random.default_rng(0).normal(0.0, 0.02, (200, 2))
     clean = motor_record()
