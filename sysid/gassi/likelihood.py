@@ -210,7 +210,8 @@ class _Optima:
             for k in np.flatnonzero(passable).tolist():
                 place, way = places[k], ends[k] - at[k]
                 coordinate = start[place] + part * (ends[k] - start)[place]
-                begun = at[k] + (coordinate - at[k][place]) / way[place] * way
+                left = way[place]  # nothing, of two that rounding alone sets apart
+                begun = at[k] + ((coordinate - at[k][place]) / left if left else 0.0) * way
                 held = Restriction(held=(place, float(coordinate)))
                 descents[k] = begin(
                     objective, objective.space.decode(begun), tolerance=_ROUGHLY, restriction=held
@@ -254,13 +255,12 @@ class _Optima:
 
     @cached_property
     def _deviations(self) -> FloatArray:
-        """Standard deviations of the coordinates, (n_free,), were errors white."""
+        """Deviations of the coordinates, (n_free,), were errors white, but for a common factor."""
         width = self._objective.space.width
         information = self._information * np.outer(width, width)
-        felt = information + _SLACK * max(float(np.diag(information).max()), _TINY) * np.eye(
-            len(width)
-        )
-        deviations: FloatArray = np.sqrt(np.diag(np.linalg.inv(felt))) * width
+        most = max(float(np.diag(information).max()), _TINY)
+        inverse = np.linalg.inv(information / most + _SLACK * np.eye(len(width)))
+        deviations: FloatArray = np.sqrt(np.maximum(np.diag(inverse), 1.0)) * width
         return deviations
 
     @cached_property

@@ -84,7 +84,7 @@ class Disturbed(SimulatedDevice):
     def overwrite(self, log):
         with log.open("r+b") as file:
             file.seek(500_000)
-            file.write(b"9")
+            file.write(b"x")  # whatever stood there
 
     def remove(self, log):
         shutil.rmtree(log.parent)
