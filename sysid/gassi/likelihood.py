@@ -387,16 +387,18 @@ def _conceivable(
 ) -> list[Refinement]:
     """Where descents come to soon, what is no minimum yet known and not far behind the best.
 
-    The best is one of these where that is better than the known ``best``.
+    None is left out for another of them, which may be at its end sooner.
     """
-    excerpt = Excerpt.of(objective.records, SAMPLES)
+    # A filter forgets where an excerpt starts, as free runs do not.
+    filters = isinstance(objective, Innovations) and objective.corrects
+    excerpt = Excerpt.of(objective.records, SAMPLES) if filters else None
     if excerpt is not None and starts:
         starts = _conceivable_by(excerpt, objective, starts, optima, best)
-    ends = _quickly(objective, starts, optima.new)
-    reached = [_optimum(objective, end.chromosome, end.rms) for end in ends]
-    deviances = np.array([optima.deviance(optimum, best) for optimum in reached])
-    near = deviances - deviances.min(initial=0.0) < _CONCEIVABLE
-    return list(itertools.compress(ends, near))
+    return [
+        end
+        for end in _quickly(objective, starts, optima.new)
+        if optima.deviance(_optimum(objective, end.chromosome, end.rms), best) < _CONCEIVABLE
+    ]
 
 
 def _conceivable_by(
