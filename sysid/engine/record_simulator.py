@@ -95,6 +95,7 @@ class RecordSimulator:
         self._windows = np.ascontiguousarray(np.moveaxis(windows, 1, 0))
         self._steps_of: dict[bytes, int] = {}
         self._means_of: dict[tuple[tuple[int, ...], bool], _Means] = {}
+        self._inputs_of: dict[tuple[int, ...], FloatArray] = {}
         if self.averaged:
             if self.scale is not None:
                 # What a window saw before the record is not known.
@@ -221,7 +222,10 @@ class RecordSimulator:
         if key not in self._means_of:  # the same in every run of a fit
             self._means_of[key] = self._means(*key)
         mean, cut = self._means_of[key]
-        inputs = with_bends(model, record, kernel.splines)
+        inputs = self._inputs_of.get(tuple(kernel.splines))
+        if inputs is None:  # likewise
+            inputs = with_bends(model, record, kernel.splines)
+            self._inputs_of[tuple(kernel.splines)] = inputs
         weights[0, [j for j in self.averaged if j not in cut]] = 0.0  # its mean is not over yet
         measured = self._after_the_last(cut, parameters, starts, lanes, n_steps)
         with explained_errors(model):

@@ -11,10 +11,10 @@ from functools import partial
 from typing import Any, Literal
 
 import numpy as np
-from scipy.signal import lfilter
 
 from sysid.arrays import FloatArray
 from sysid.judging.disturbed import DisturbedRun
+from sysid.linear.polynomials import all_pole
 from sysid.problem.data import Dataset
 from sysid.problem.model import Input, ProcessModel, State
 from sysid.problem.preparation import at_places
@@ -200,7 +200,8 @@ def _smoothed(signal: FloatArray, samples: float) -> FloatArray:
         return np.zeros_like(signal)
     pole = np.exp(-1.0 / samples)
     moved = signal - signal[0]
-    change: FloatArray = lfilter([1.0 - pole], [1.0, -pole], moved) - moved
+    smoothed = all_pole(np.array([-pole]), (1.0 - pole) * moved[:, None])
+    change: FloatArray = smoothed[:, 0] - moved
     return change
 
 

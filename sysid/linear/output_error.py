@@ -16,10 +16,9 @@ from functools import cached_property
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from scipy.linalg import lapack
 
 from sysid.arrays import BoolArray, FloatArray, IntArray
-from sysid.linear.polynomials import reflect_poles
+from sysid.linear.polynomials import all_pole, reflect_poles
 from sysid.linear.prediction_error import least_squares
 from sysid.problem.data import Dataset
 from sysid.problem.model import ModelError
@@ -65,14 +64,7 @@ class Drive:
 
     def through(self, f: FloatArray, columns: FloatArray) -> FloatArray:
         """Columns (n, k) filtered by 1/F(q), from zero at the start of each record."""
-        # scipy.signal, which has a filter, takes half a second to load.
-        bands = np.ones((len(f) + 1, len(columns)), order="F")
-        bands[1:] = f[:, None]
-        for begin in self._begins:
-            for lag in range(1, len(f) + 1):
-                bands[lag, max(begin - lag, 0) : begin] = 0.0
-        filtered, _ = lapack.dtbtrs(bands, columns, uplo="L", diag="U")
-        return np.asarray(filtered, dtype=np.float64)
+        return all_pole(f, columns, self._begins.tolist())
 
     def past(self, values: FloatArray, lags: int) -> FloatArray:
         """Values (n,) of 1, 2, ... rows earlier, zero before each record, (n, lags)."""

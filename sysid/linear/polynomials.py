@@ -87,6 +87,24 @@ def filtered(P: FloatArray, x: FloatArray) -> FloatArray:
     return np.asarray(np.sum(terms, axis=0), dtype=np.float64)
 
 
+def all_pole(f: FloatArray, columns: FloatArray, begins: Sequence[int] = ()) -> FloatArray:
+    """Columns (n, k) filtered by 1/F(q), from zero at the first row and at each of ``begins``.
+
+    f: (nf,), F's coefficients after the leading 1.
+
+    >>> all_pole(np.array([-0.5]), np.ones((3, 1)))[:, 0]
+    array([1.  , 1.5 , 1.75])
+    """
+    # scipy.signal, which has a filter, takes half a second to load.
+    bands = np.ones((len(f) + 1, len(columns)), order="F")
+    bands[1:] = f[:, None]
+    for begin in begins:
+        for lag in range(1, len(f) + 1):
+            bands[lag, max(begin - lag, 0) : begin] = 0.0
+    filtered, _ = lapack.dtbtrs(bands, columns, uplo="L", diag="U")
+    return np.asarray(filtered, dtype=np.float64)
+
+
 def innovations(
     A: FloatArray, C: FloatArray, drive: FloatArray, past: FloatArray, outputs: Any = np.nan
 ) -> tuple[FloatArray, FloatArray]:
