@@ -52,6 +52,10 @@ _SHOWING = 0.025  # part of an output's peak that inputs' averages may take from
 # Draws of the inputs' noise that show where equations bend under it, and parts of an innovation's
 # deviation from which they do.
 _DRAWS, _BENT = 8, 0.1
+# Integration steps of a free run that one of a filter may stand for, and by how many deviations of
+# any quantity the difference may move it.
+_COARSER, _MOVING = (3, 2), 0.2
+_FEWEST = 2  # a sample, where a free run takes more
 
 
 class Innovations(Objective):
@@ -62,7 +66,8 @@ class Innovations(Objective):
     outputs correct the states. process: (n_states,), noise of the states' rates, in their units
     over the root of a second. scatter: per record, (n_samples, n_outputs), variances of single
     samples beside the noise, by the jitter of their windows. Where it corrects, the records have
-    each mean over a window once.
+    each mean over a window once. coarseness: integration steps of a free run that one of the
+    filter's stands for.
     """
 
     noise: FloatArray
@@ -72,6 +77,7 @@ class Innovations(Objective):
     process: FloatArray
     colour: list[FloatArray]
     quiet: bool
+    coarseness: int
 
     @classmethod
     def of(
@@ -100,7 +106,7 @@ class Innovations(Objective):
             variant.records, variant.colour = [q.record for q in parts], [q.colour for q in parts]
         variant.noise = variant.error = np.maximum(noise, _TINY)
         variant.scatter = [scatter(record) for record in variant.records]
-        variant.corrects = corrects
+        variant.corrects, variant.coarseness = corrects, 1
         n_states = len(objective.simulator.model.states)
         variant.process = np.zeros(n_states) if process is None else process
         return variant
@@ -122,7 +128,41 @@ class Innovations(Objective):
         variant = cls.of(
             objective, error, corrects=corrects, process=process, quiet=quiet, near=chromosome
         )
-        return variant.settled(chromosome)
+        return variant.settled(chromosome).eased(chromosome)
+
+    def eased(self, chromosome: FloatArray) -> Self:
+        """With as few integration steps as tell the same at a chromosome, (n_free,).
+
+        Errors of a free run's steps add up over its memory; a filter forgets them, as its outputs
+        correct it, and noise covers what is left of them.
+        """
+        if not self.corrects:
+            return self
+        exact = self._with(coarseness=1)._in_noise(chromosome)
+        for coarseness in _COARSER:
+            coarser = self._with(coarseness=coarseness)
+            if np.linalg.norm(coarser._in_noise(chromosome) - exact) < _MOVING:
+                return coarser
+        return self
+
+    def _in_noise(self, chromosome: FloatArray) -> FloatArray:
+        """Innovations (n_residuals, n_outputs) at (n_free,) in parts of the outputs' noise."""
+        steps = self.steps_needed(chromosome[None])
+        values = self._simulated(chromosome[None], steps, balanced=False).values[..., 0]
+        return values / self._noise_of_each()
+
+    def _noise_of_each(self) -> FloatArray:
+        """Noise of the outputs in the units of residuals, (n_residuals, n_outputs)."""
+        parts = [
+            np.broadcast_to(self.noise / scale, record.outputs.shape)
+            for scale, record in zip(self.scales, self.records, strict=True)
+        ]
+        return np.concatenate(parts)
+
+    def steps_needed(self, chromosomes: FloatArray) -> IntArray:
+        """As ``Objective.steps_needed``, of which a filter that corrects needs a part."""
+        steps = super().steps_needed(chromosomes)
+        return np.maximum(steps // self.coarseness, np.minimum(steps, _FEWEST))
 
     def _reacting(self, chromosome: FloatArray) -> list[Dataset]:
         """The records with what their inputs do between samples."""
@@ -218,12 +258,7 @@ class Innovations(Objective):
             ]
             middle = 0.5 * (innovations(noise) + innovations([-move for move in noise]))
             bends.append(np.abs(middle - centre))
-        units = np.concatenate(
-            [
-                np.broadcast_to(self.noise / scale, record.outputs.shape)
-                for scale, record in zip(self.scales, self.records, strict=True)
-            ]
-        )
+        units = self._noise_of_each()
         seen = np.concatenate([np.isfinite(record.outputs) for record in self.records])
         bent = seen & ~(np.median(bends, axis=0) <= _BENT * units)
         share: FloatArray = bent.sum(axis=0) / np.maximum(seen.sum(axis=0), 1)

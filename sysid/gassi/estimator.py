@@ -401,15 +401,15 @@ class GASSI(RecordEstimator):
         objective = self._at_final_accuracy(self._objective(data).weighed(self.output_weights_))
         if self.output_noise_ is None:
             return objective
-        corrects = self.criterion_ == "innovations"
-        return Innovations.of(
+        fitted = Innovations.of(
             objective,
             self.output_noise_,
-            corrects=corrects,
+            corrects=self.criterion_ == "innovations",
             process=self._process(),
             quiet=self.averaged_inputs_,
             near=self.chromosome_,
         )
+        return fitted.eased(self.chromosome_)
 
     def _at_final_accuracy(self, objective: Objective) -> Objective:
         """The objective, simulated as accurately as at the end of ``fit``."""

@@ -59,7 +59,8 @@ class _Responses:
         longest = 2.0 * np.pi / (record.n_samples * record.dt)
         self._omega = np.geomspace(longest, 0.8 * np.pi / record.dt, _FREQUENCIES)
         self.start, self.width = self.space.encode(chromosome), self.space.width
-        self._reference = self._response(self.start[None])[0]
+        self._reference = self._answers(self._system(self.start[None]))[0][0]
+        self._shape = self._reference.shape
         self._floor = _FLOOR * np.abs(self._reference).max(axis=0)
 
     def independent(self) -> IntArray:
@@ -84,12 +85,13 @@ class _Responses:
         at = np.repeat(self.start[None], _STARTS, axis=0)
         at[:, free] = rng.uniform(lower[free], upper[free], (_STARTS, len(free)))
         miss, damping = self._miss(at), np.full(_STARTS, _DAMPING)
+        slopes = self._slopes(at, free)
         ends = tuple(bound[free] for bound in self.space.coded_bounds)
         for k in range(_ITERATIONS):
             if k == _BY_THEN:
                 nearest = np.argsort(np.sum(miss**2, axis=1))[:_LEFT]
                 at, miss, damping = at[nearest], miss[nearest], damping[nearest]
-            slopes = self._slopes(at, free)
+                slopes = slopes[nearest]
             square = np.swapaxes(slopes, 1, 2) @ slopes
             size = np.einsum("nii->ni", square)
             square += (damping[:, None] * size + 1e-12)[:, :, None] * np.eye(len(free))
@@ -100,33 +102,59 @@ class _Responses:
             better = np.sum(moved**2, axis=1) < np.sum(miss**2, axis=1)
             at, miss = np.where(better[:, None], trial, at), np.where(better[:, None], moved, miss)
             damping *= np.where(better, _EASED, _STIFFENED)
+            if better.any():
+                slopes[better] = self._slopes(at[better], free)
         return at, np.sqrt(np.mean(miss**2, axis=1))
 
     def _slopes(self, at: FloatArray, places: IntArray) -> FloatArray:
         """Slopes of the differences by parts of the ranges of some parameters, (n, m, n_places)."""
+        shape = len(at), len(places), -1
         beside = np.repeat(at[:, None], len(places), axis=1)
         beside[:, np.arange(len(places)), places] += _DIFFERENCE * self.width[places]
-        moved = self._miss(beside.reshape(-1, at.shape[1])).reshape(len(at), len(places), -1)
-        slopes: FloatArray = (moved - self._miss(at)[:, None]) / _DIFFERENCE
+        system, moved = self._system(at), self._system(beside.reshape(-1, at.shape[1]))
+        change = moved.reshape(shape) - system.reshape(len(at), 1, -1)
+        response, left, right = self._answers(system)
+        # (n, f, q, 1, i, 1) times (n, f, 1, m, 1, j)
+        factors = left[:, :, :, None, :, None] * np.swapaxes(right, 2, 3)[:, :, None, :, None, :]
+        factors = factors.reshape(len(at), -1, change.shape[2])
+        moved_response = change @ np.swapaxes(factors, 1, 2)
+        moved_response = response[:, None] + moved_response.reshape(*shape[:2], *self._shape)
+        missed = self._missed(moved_response.reshape(-1, *self._shape)).reshape(shape)
+        slopes: FloatArray = (missed - self._missed(response)[:, None]) / _DIFFERENCE
         return np.swapaxes(slopes, 1, 2)
 
     def _miss(self, at: FloatArray) -> FloatArray:
         """Differences from the minimum's response, in parts of the mean of both sizes, (n, m)."""
-        response = self._response(at)
+        return self._missed(self._answers(self._system(at))[0])
+
+    def _missed(self, response: ComplexArray) -> FloatArray:
+        """The same of responses (n, n_frequencies, n_outputs, n_varied)."""
         size = np.abs(response) + np.abs(self._reference) + self._floor
         with np.errstate(invalid="ignore"):
             miss = np.where(size > 0.0, 2.0 * (response - self._reference) / size, 0.0)
-        miss = miss.reshape(len(at), -1)
+        miss = miss.reshape(len(response), -1)
         parts: FloatArray = np.concatenate([miss.real, miss.imag], axis=1)
         return np.where(np.isfinite(parts), parts, 2.0)
 
-    def _response(self, at: FloatArray) -> ComplexArray:
-        """Responses (n, n_frequencies, n_outputs, n_varied)."""
+    def _system(self, at: FloatArray) -> FloatArray:
+        """Matrices [[A, B], [C, D]] at coordinates (n, n_free), of the inputs that vary."""
         vectors = self.space.full(self.space.decode(at))
         a, b, c, d = linear_models(self.model, self._x, self._u, vectors)
-        b, d = b[:, None, :, self._varied], d[:, None, :, self._varied]
-        s = 1j * self._omega[:, None, None] * np.eye(a.shape[1])
-        whole: BoolArray = np.all(np.isfinite(a), axis=(1, 2), keepdims=True)
-        a = np.where(whole, a, np.eye(a.shape[1]))
-        response = c[:, None] @ np.linalg.solve(s - a[:, None], b.astype(np.complex128)) + d
-        return np.where(whole[..., None], response, np.nan)
+        return np.block([[a, b[..., self._varied]], [c, d[..., self._varied]]])
+
+    def _answers(self, system: FloatArray) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
+        """Responses (n, n_frequencies, n_outputs, n_varied), and what moves them.
+
+        By a small change of the system a response changes by left @ change @ right.
+        """
+        n = len(self._x)
+        (a, b), (c, d) = ((rows[:, None, :, :n], rows[:, None, :, n:])
+                          for rows in (system[:, :n], system[:, n:]))  # fmt: skip
+        whole: BoolArray = np.all(np.isfinite(a), axis=(2, 3), keepdims=True)
+        s = 1j * self._omega[:, None, None]
+        inverse = np.linalg.inv(s * np.eye(n) - np.where(whole, a, np.eye(n)))
+        states, outputs = inverse @ b, c @ inverse
+        response = np.where(whole, c @ states + d, np.nan)
+        ones = (np.broadcast_to(np.eye(k), (*response.shape[:2], k, k)) for k in response.shape[2:])
+        left = np.concatenate([outputs, next(ones)], axis=3)
+        return response, left, np.concatenate([states, next(ones)], axis=2)

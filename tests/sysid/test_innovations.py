@@ -341,6 +341,23 @@ def test_a_noisy_input_chooses_the_criterion():
     assert GASSI(lag(), population=20, generations=2).fit(timed).criterion_ == "innovations"
 
 
+@pytest.mark.parametrize(("noise", "coarseness"), [(0.1, 3), (5e-7, 1)])
+def test_a_filter_takes_fewer_steps_where_noise_covers_what_they_miss(noise, coarseness):
+    rng, model, p, n = np.random.default_rng(2), pendulum(), np.array([2.0, 9.0, 0.4]), 300
+    u = np.column_stack([prbs(rng, n, -3.0, 3.0), prbs(rng, n, -1.0, 1.0)])
+    record = Dataset(u, np.zeros((n, 2)), 0.1, input_noise=np.array([noise, 0.0]))
+    exact = BatchSimulator(model, accuracy=1e-11).trajectories(p[None], record)[0]
+    record = replace(record, outputs=exact + noise * rng.standard_normal(exact.shape))
+    objective = Objective(BatchSimulator(model, accuracy=1e-6), SearchSpace.of(model), [record])
+    fitted = Innovations.of(objective, np.full(2, noise), corrects=True).eased(p)
+    (needed,) = objective.steps_needed(p[None])
+    (steps,) = fitted.steps_needed(p[None])
+    assert steps == needed // coarseness
+    coarse, fine = (fitted.residuals(p[None], k).values[..., 0] for k in (steps, [128]))
+    # No combination of parameters is moved by more deviations.
+    assert np.linalg.norm((coarse - fine) * objective.scales[0] / noise) < 0.2
+
+
 def test_where_noise_explains_all_of_a_free_run_a_filter_takes_over():
     *_, record = list(noisy_records(2, of_output=0.01))[:3]
     fit = GASSI(lag(), population=20, generations=8).fit(record)
