@@ -27,7 +27,7 @@ from sysid.uncertainty.sensitivity import Sensitivity, sensitivity
 from sysid.uncertainty.ties import Ties, free_gradient, named_values, ties
 
 # Standard deviation of a logarithm above which the slopes at the estimate are no guide.
-_WEAK = 0.3
+_WEAK = 0.2
 _SAMPLED = 40  # points of a range at which it is tried whether simulations fail
 _DRAWS = 20_000  # of all quantities together
 _ALIKE = 0.05  # rivals closer than this are one
