@@ -101,7 +101,8 @@ class HysteresisLoop(VelocityLoop):
         """The shaft at rest while the brake goes from one command to another, (4, n)."""
         ramp = round(abs(brake - before) / _BRAKE_SLOPE * self.sample_rate)
         rest = round(_REST * self.sample_rate)
-        commands = np.concatenate([np.linspace(before, brake, ramp), np.full(rest, brake)])
+        rising = np.linspace(before, brake, ramp, endpoint=False)
+        commands = np.concatenate([rising, np.full(rest, brake)])
         return np.stack(np.broadcast_arrays(0.0, commands, -1.0, -1.0))
 
     def _counted_cycles(self, samples: Samples) -> list[Cycles]:
