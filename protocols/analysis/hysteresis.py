@@ -101,26 +101,33 @@ def motion(cycles: Cycles) -> FloatArray:
 
 def hysteresis(angle: FloatArray, rate: float, part: float) -> FloatArray:
     """w along periodic angles, (n_levels, n) [rad]; settled, as after many periods."""
-    steps = np.diff(angle, axis=1, append=angle[:, :1])
-    sign = np.sign(steps).T
-    way = rate * np.abs(steps).T
-    w = np.zeros(len(angle))
-    settled = np.empty(angle.shape)
-    for _cycle in range(2):  # the first one forgets where it began, and is written over
-        for k in range(angle.shape[1]):
-            settled[:, k] = w
-            w = np.where(sign[k] == 0.0, w, sign[k] * _along(sign[k] * w, way[k], part))
-    return settled
-
-
-def _along(u: FloatArray, way: FloatArray, part: float) -> FloatArray:
-    """u after a way, in units of 1/rate, in its direction, (n_levels,)."""
+    ways = rate * np.diff(angle, axis=1, append=angle[:, :1])
     slope = max(2.0 * part - 1.0, 1e-6)
-    # Way that is left once u has come up to zero, and u where it has not.
-    left = way - np.log1p(slope * np.maximum(-u, 0.0)) / slope
-    below = (1.0 - (1.0 - slope * np.minimum(u, 0.0)) * np.exp(-slope * way)) / slope
-    above = 1.0 - (1.0 - np.maximum(u, 0.0)) * np.exp(-np.maximum(left, 0.0))
-    return np.where(left > 0.0, above, below)
+    return np.array([_settled(row, slope) for row in ways.tolist()])
+
+
+def _settled(ways: list[float], slope: float) -> list[float]:
+    """w along periodic ways in units of 1/rate, signed by their direction.
+
+    Numbers one by one: of so few levels arrays take ten times as long.
+    """
+    w, along = 0.0, []
+    for way in (*ways, *ways):  # the first period forgets where it began, and is left out
+        along.append(w)
+        if way != 0.0:
+            sign = math.copysign(1.0, way)
+            w = sign * _along(sign * w, abs(way), slope)
+    return along[len(ways) :]
+
+
+def _along(u: float, way: float, slope: float) -> float:
+    """u after a way, in units of 1/rate, in its direction; slope: 2 part - 1."""
+    if u < 0.0:
+        left = way - math.log1p(-slope * u) / slope  # of it, once u has come up to zero
+        if left <= 0.0:
+            return (1.0 - (1.0 - slope * u) * math.exp(-slope * way)) / slope
+        u, way = 0.0, left
+    return 1.0 - (1.0 - u) * math.exp(-way)
 
 
 def fit(levels: list[Cycles]) -> LoopFit:
