@@ -113,7 +113,7 @@ class TestSerialDevice(HalContract):
         )
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(n, marks=pytest.mark.soak) for n in (1, 2, 3))])
+@pytest.mark.parametrize("seed", mostly_soak([0, 1]))
 @pytest.mark.parametrize("name", [*EXCITATIONS, *LOOPS])
 def test_without_a_fault_every_protocol_is_completed(tmp_path, name, seed):
     load, sensor = ("free", "between") if name == "constant_velocity.yaml" else ("pulley", "load")

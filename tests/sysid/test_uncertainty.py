@@ -244,7 +244,7 @@ def slow(rng, n, cutoff=0.97):
     return (lfilter([1.0], [1.0, -cutoff], white, axis=0)[300:] + 1.0) / 3.0
 
 
-def coverage(record_of, seeds=200):
+def coverage(record_of, seeds=100):
     """Share of 95 % intervals that hold the truth, over fresh noise; one list of records a seed.
 
     And the share that intervals of white residuals would.
@@ -402,7 +402,7 @@ def test_noise_of_an_input_that_the_residuals_show_is_not_counted_twice():
 @pytest.mark.soak
 def test_intervals_cover_with_noise_on_an_input():
     inside = []
-    for seed in range(150):
+    for seed in range(60):
         record = noisy_record(np.random.default_rng([5, seed]), 0.3, 0.01)
         found = estimates(NOISY.tell(records=[record]))
         inside += [found["k"].low < 3.0 < found["k"].high, found["c"].low < 1.0 < found["c"].high]
@@ -422,7 +422,7 @@ def lag_record(rng, n=200, sigma=0.05):
 def test_intervals_of_a_lag_cover():
     simulator, space = BatchSimulator(lag(), accuracy=1e-6), SearchSpace.of(lag())
     inside = []
-    for seed in range(100):
+    for seed in range(50):
         objective = Objective(simulator, space, [lag_record(np.random.default_rng([9, seed]))])
         found = uncertainty(objective, refine(objective, np.array([2.0, 0.05])).chromosome)
         inside += [e.low < v < e.high for e, v in zip(found.parameters, (2.0, 0.05), strict=True)]
@@ -713,7 +713,7 @@ def test_a_weak_parameter_has_the_ends_that_its_slope_gives(seed):
 @pytest.mark.soak
 def test_ends_of_a_weak_parameter_hold_the_truth():
     held = []
-    for seed in range(100):
+    for seed in range(50):
         problem = Problem(small_effect, [unknown("a", 2.0), unknown("b", 0.2)], inputs=2, seed=seed)
         b = estimates(problem.tell())["b"]
         held.append((b.low or 0.0) <= 0.2 <= (b.high or np.inf))
@@ -793,7 +793,7 @@ def test_logs_that_disagree_widen_to_the_spread_between_them():
     assert b.std == pytest.approx(quantile * expected, rel=0.15)
 
 
-def coverage_of_few(spread, n_logs, repeats=150):
+def coverage_of_few(spread, n_logs, repeats=100):
     """Share of intervals of a and b that hold their means, where those of logs spread so."""
     rng, held = np.random.default_rng(1), []
     for seed in range(repeats):
@@ -816,7 +816,7 @@ def test_intervals_of_few_logs_hold_whether_they_differ_or_not(spread, n_logs):
 def test_half_of_the_logs_does_not_contradict_the_other_half():
     rng = np.random.default_rng(3)
     overlaps = []
-    for seed in range(60):
+    for seed in range(30):
         records = logs_with(1.0 + 0.2 * rng.standard_normal(12), seed=seed)
         one, other = (slopes_problem().tell(records=half) for half in (records[::2], records[1::2]))
         overlaps += [
