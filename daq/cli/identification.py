@@ -99,9 +99,12 @@ def _show(result: Identification) -> None:
 
 
 def _show_next(result: Identification) -> None:
+    from daq.identification.request import set_options
+
     step = result.next_step
     mapping = result.problem.mapping
     columns = f" --config {mapping.file.path}" if mapping is not None else ""
+    columns += set_options(result.problem.reading)
     log = (*result.validation, *result.training)[0].log.path
     replay = f"rig replay {log} --parameters {result.parameters_file}{columns}{result.trust_option}"
     if step is None:

@@ -28,6 +28,7 @@ def replay(
     ] = None,
     model: options.ModelsWithValues = None,
     config: options.ConfigFile = None,
+    settings: options.Settings = None,
     figure: Annotated[
         Path | None, Option(metavar="FILE.png|pdf|svg", help="Default beside the log.")
     ] = None,
@@ -46,10 +47,14 @@ def replay(
     Several models are drawn together: --model actuator:parameters=A --model actuator:parameters=B.
     """
     from daq.identification.replay import replay as simulate
+    from daq.identification.request import set_options
 
     bounds = _bounds(fail_under or [])
     names: Sequence[str | None] = model or [None]
-    results = [simulate(log, parameters, rig, config, model=name, trust=trust) for name in names]
+    results = [
+        simulate(log, parameters, rig, config, model=name, settings=settings or [], trust=trust)
+        for name in names
+    ]
     first = results[0]
     _require_outputs(results, bounds)
     if first.warning is not None:
@@ -67,6 +72,7 @@ def replay(
             print(f"Figure: {drawn}")
         if all(document["passed"] for document in documents):
             columns = f" --config {config}" if config is not None else ""
+            columns += set_options(settings or [])
             trusted = " --trust" if trust else ""
             again = f"rig replay ANOTHER_LOG --parameters {parameters}{columns}{trusted}"
             terminal.print_next(again if parameters else f"rig identify {log}")

@@ -19,7 +19,7 @@ from daq.hal import FloatArray, Simulation
 from daq.identification.fit import take
 from daq.identification.request import SettingsRequest, result_file
 from daq.identification.result import Identification
-from daq.identification.settings import Problem, columns_of, problem_of, selection_of, with_signals
+from daq.identification.settings import Problem, problem_of, reading_of, with_signals
 from daq.lookup.models import find_model
 from daq.lookup.rigs import DEFAULT_RIG, load_rig
 from daq.notation import percent, quantity
@@ -125,6 +125,7 @@ def replay(
     config: str | Path | None = None,
     *,
     model: str | None = None,
+    settings: Sequence[str] = (),
     trust: bool = False,
 ) -> Replay:
     """Simulate a model under the applied commands and the measured load of a log.
@@ -133,9 +134,9 @@ def replay(
     its run's. model: in place of parameters a model by name, at its own values, such as
     ``actuator:parameters=A``. config: settings of ``identify``, of which the columns of a foreign
     log and the part of it that is used count, and without parameters its model, fixed and tied
-    values, outputs and starts. Without any of these the parameters are those of the simulated
-    ``rig``. trust: run the Python file of a model that ``parameters.yaml`` names. Raises
-    ConfigError.
+    values, outputs and starts. settings: others over those, as ``key=value``. Without any of these
+    the parameters are those of the simulated ``rig``. trust: run the Python file of a model that
+    ``parameters.yaml`` names. Raises ConfigError.
 
     >>> from daq import record, replay
     >>> result = replay(record("prbs.yaml"))  # through the simulated rig's own model
@@ -144,10 +145,11 @@ def replay(
     """
     file, valued = None if config is None else Path(config), None
     if parameters is None and (model is not None or (file is not None and _sets_values(file))):
-        problem = problem_of(SettingsRequest(None if file is None else str(file), {"model": model}))
+        request = SettingsRequest(None if file is None else str(file), {"model": model}, settings)
+        problem = problem_of(request)
         chosen, values, source = problem.model, _declared(problem), problem.model_name
-        settings = problem.settings
-        valued = file if settings.fixed or settings.tied or problem.given else None
+        under = problem.settings
+        valued = file if under.fixed or under.tied or problem.given else None
         mapping, selection = problem.mapping, problem.selection
     elif model is not None:
         raise ConfigError(
@@ -155,7 +157,7 @@ def replay(
         )
     else:
         chosen, values, source = _parameters(parameters, str(rig), trust)
-        mapping, selection = columns_of(file, chosen), selection_of(file, chosen)
+        mapping, selection = reading_of(file, settings, chosen)
     logged = take(log, "data", chosen, mapping, selection)
     record = logged.dataset
     try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -47,13 +48,13 @@ class SettingsRequest:
         >>> " ".join(asked.words(["delay.omega=4 ms"], model="lag"))
         '--config drive.yaml --model lag --seed 1 --guess --set robust=true --set delay.omega=4 ms'
         """
-        words = [] if self.config is None else ["--config", self.config]
+        words = [] if self.config is None else ["--config", _from_here(self.config)]
         whole = {**self.options, **options}
         for name, value in sorted(whole.items(), key=lambda option: option[0] != "model"):
             for each in value if isinstance(value, list | tuple) else [value]:
                 if each is not None:
                     words.append(f"--{name.replace('_', '-')}")
-                    words += [] if each is True else [str(each)]
+                    words += [] if each is True else [_from_here(str(each))]
         replaced = {setting.partition("=")[0] for setting in settings}
         kept = [s for s in self.settings if s.partition("=")[0] not in replaced]
         return [*words, *(word for setting in (*kept, *settings) for word in ("--set", setting))]
@@ -98,6 +99,15 @@ def resume_command(folder: Path) -> str:
     return f"rig identify --resume {shlex.quote(str(folder))}"
 
 
+def set_options(settings: Sequence[str]) -> str:
+    """Settings as further words of a command.
+
+    >>> set_options(["delay.y=4 ms"])
+    " --set 'delay.y=4 ms'"
+    """
+    return "".join(f" --set {shlex.quote(setting)}" for setting in settings)
+
+
 def forget(folder: Path) -> None:
     """Remove what is needed only to continue."""
     for name in (CHECKPOINT, FILE):
@@ -120,6 +130,11 @@ def result_file(result: str | Path) -> Path:
             return place / PARAMETERS
     cure = f"identify first: rig identify {shlex.quote(str(given))}"
     raise ConfigError(f"no identification has written a {PARAMETERS} there", cure=cure, file=given)
+
+
+def _from_here(name: str) -> str:
+    """An absolute name as one would type it, where it is in the working folder or below."""
+    return name.removeprefix(f"{Path.cwd()}{os.sep}")
 
 
 def _absolute(paths: Sequence[Path | str]) -> list[str]:

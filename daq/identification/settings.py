@@ -1,6 +1,7 @@
 """From configuration and command line to a checked model and its search settings."""
 
 import dataclasses
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -15,7 +16,7 @@ from daq.errors import ConfigError, Mistake, suggestion, together
 from daq.identification import datasheets, stages
 from daq.identification.foreign import ColumnMapping, check_columns, check_mapping
 from daq.identification.request import SettingsRequest
-from daq.identification.selection import EVERYTHING, Selection
+from daq.identification.selection import EVERYTHING, KEYS, Selection
 from daq.logs.recording import log_path
 from daq.lookup.models import DEFAULT_MODEL, find_model, whole_name
 from daq.progress import Note, Watch, ignore
@@ -55,6 +56,12 @@ class Problem:
 
     def __repr__(self) -> str:
         return f"<Problem: parameters of {self.model_name}>"
+
+    @property
+    def reading(self) -> list[str]:
+        """Of what was typed as ``key=value`` all that says how logs are read."""
+        keys = ("columns", *KEYS)
+        return [s for s in self.request.settings if re.split(r"[.=]", s)[0].strip() in keys]
 
 
 def problem_of(
@@ -236,34 +243,24 @@ def with_signals(file: YamlFile, signals: Signals, model: ProcessModel) -> Proce
     return _with_starts(file, signals, _with_additions(file, signals, model))
 
 
-def columns_of(config: Path | None, model: ProcessModel) -> ColumnMapping | None:
-    """The columns of a configuration, for the model that parameters are of.
+def reading_of(
+    config: Path | None, typed: Sequence[str], model: ProcessModel
+) -> tuple[ColumnMapping | None, Selection]:
+    """How logs are read for a model that has its parameters: columns, and which samples count.
 
-    The file may name another, for which the columns serve as well; ConfigError where they do not.
+    config: may name another model, for which the columns serve as well. typed: settings over it, as
+    ``key=value``. Raises ConfigError.
     """
-    file, settings = _configuration(config, model)
-    columns = settings.columns
-    if file is None or columns is None:
-        return None
+    written = None if config is None else yaml_file.load(config)
+    file, unconverted = in_model_units(TypedSettings.of({}, typed, written), [model])
+    settings = check.validate(file, IdentificationConfig, others=unconverted)
+    selection, columns = Selection.under(settings, file), settings.columns
+    if columns is None:
+        return None, selection
     mapping = ColumnMapping(file, columns)
     # The file may be of a comparison, in which other models have other signals.
     check_mapping(model, mapping, {"inputs": columns.inputs, "outputs": columns.outputs})
-    return mapping
-
-
-def selection_of(config: Path | None, model: ProcessModel) -> Selection:
-    """Which samples of a log count by a configuration, whatever model it names; ConfigError."""
-    file, settings = _configuration(config, model)
-    return Selection.under(settings, file)
-
-
-def _configuration(
-    config: Path | None, model: ProcessModel
-) -> tuple[YamlFile | None, IdentificationConfig]:
-    if config is None:
-        return None, IdentificationConfig()
-    file, unconverted = in_model_units(yaml_file.load(config), [model])
-    return file, check.validate(file, IdentificationConfig, others=unconverted)
+    return mapping, selection
 
 
 def gassi_settings(problem: Problem) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from daq.identification.request import set_options
 from daq.identification.rows import OutputErrors, Rows, logs_of, mean_errors, start_sentences
 from daq.lookup.models import trust_option
 from sysid import ProcessModel
@@ -188,6 +189,7 @@ def _steps(document: Mapping[str, Any], rows: Rows) -> list[Step]:
         columns, parameters = again["columns"], again.get("parameters", "parameters.yaml")
         command = f"rig replay LOG --parameters {shlex.quote(parameters)}"
         command += f" --config {shlex.quote(columns)}" if columns else ""
+        command += set_options(again["settings"])
         steps.insert(0, Step(use, command=command + trust_option(document["model"])))
     elif not steps:
         steps.append(Step("See in the residuals below when and where the model errs."))

@@ -184,6 +184,7 @@ def _reproduction(result: Identification, logs: Split) -> dict[str, Any]:
         "folder": str(Path.cwd()),
         "parameters": str(result.parameters_file or PARAMETERS),
         "columns": problem.request.config if problem.mapping is not None else None,
+        "settings": problem.reading,
         "hold_back": problem.settings.hold_back,
         "selection": problem.selection.document,
         "logs": fingerprints(logs),

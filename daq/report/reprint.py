@@ -13,7 +13,7 @@ from daq.identification.baseline import refitted
 from daq.identification.records import LoggedRecord, Split
 from daq.identification.replay import read_parameters
 from daq.identification.selection import Selection
-from daq.identification.settings import columns_of
+from daq.identification.settings import reading_of
 from daq.progress import Progress, Watch, ignore
 from daq.report.pictures import Subject, pictures
 from daq.report.publication import DATA, FIGURES, draw
@@ -89,7 +89,8 @@ def _restored(document: Mapping[str, Any], source: Path, trust: bool) -> Subject
 
 def _logs(reproduction: Mapping[str, Any], model: ProcessModel) -> Split:
     """The logs as they were used; ConfigError for one that is gone or another now."""
-    columns = columns_of(Path(reproduction["columns"]) if reproduction["columns"] else None, model)
+    config = Path(reproduction["columns"]) if reproduction["columns"] else None
+    columns, _ = reading_of(config, reproduction.get("settings", []), model)
     selection = Selection.of(reproduction.get("selection", {}))
     root = Path(reproduction["folder"])
     logs: dict[str, dict[Path, LoggedRecord]] = {"training": {}, "validation": {}}

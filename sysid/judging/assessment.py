@@ -515,10 +515,7 @@ def _lacking(alternative: Alternative) -> str:
         for name, (old, new) in alternative.fits.items()
         if new - old >= 1.0
     ]
-    moved = [
-        f"{name} {_change(old, new)}" + (f" {unit}" if unit not in ("", "1") else "")
-        for name, (old, new, unit) in list(alternative.values.items())[:3]
-    ]
+    moved = [f"{name} {_change(*move)}" for name, move in list(alternative.values.items())[:3]]
     effect = ", ".join([*fits, *moved]) or "it explains the training data better"
     return f"The model lacks {alternative.name}; fitted with it: {effect}."
 
@@ -526,7 +523,8 @@ def _lacking(alternative: Alternative) -> str:
 def _moving(finding: Finding) -> str:
     """Reason: something missing that moves parameters."""
     moved = [
-        f"{m.quantity.name} {_change(m.quantity.value, m.quantity.value + m.change)}"
+        f"{m.quantity.name} "
+        + _change(m.quantity.value, m.quantity.value + m.change, m.quantity.unit)
         for m in finding.moves[:3]
         if abs(m.deviations) > 1.0
     ]
@@ -542,16 +540,16 @@ def _moving(finding: Finding) -> str:
     return f"{says}{text} ({chance})" + (f"; {effect}." if not finding.turned_round else ".")
 
 
-def _change(old: float, new: float) -> str:
+def _change(old: float, new: float, unit: str) -> str:
     """Two values, to as many digits as tell them apart.
 
-    >>> _change(0.0030012, 0.0030104), _change(1.2, 80.0)
-    ('0.003001 -> 0.00301', '1.2 -> 80')
+    >>> _change(0.0030012, 0.0030104, "H"), _change(1.2, 80.0, "1")
+    ('0.003001 -> 0.00301 H', '1.2 -> 80')
     """
     size, difference = max(abs(old), abs(new)), abs(new - old)
     apart = math.ceil(math.log10(size / difference)) + 1 if difference else 3
     digits = min(max(apart, 3), 6)
-    return f"{old:.{digits}g} -> {new:.{digits}g}"
+    return f"{old:.{digits}g} -> {new:.{digits}g} {'' if unit == '1' else unit}".strip()
 
 
 def _untested(

@@ -1,6 +1,8 @@
 """Foreign logs that are cut, merged, moved, detrended and decimated before they are used."""
 
 import dataclasses
+import re
+import shlex
 
 import numpy as np
 import pandas as pd
@@ -17,7 +19,7 @@ from daq.report.reprint import redraw
 from sysid import GASSI, Dataset
 from sysid.examples import lag
 from sysid.problem.preparation import Preparation, low_pass, prepare
-from tests.daq.support import OF_LAG
+from tests.daq.support import OF_LAG, rig
 
 GAIN, TAU, DT, N = 3.0, 0.04, 1e-3, 3000
 
@@ -64,7 +66,7 @@ def test_an_output_that_comes_late_is_moved_back(late):
     times = record.time - late
     smooth = np.sin(20.0 * record.time)
     moved = dataclasses.replace(record, outputs=np.sin(20.0 * times))
-    made = prepare(lag(), moved, Preparation(delay={"y": late}))
+    made = prepare(lag(), moved, Preparation(delay={"y": -late}))
     first = round(made.start / DT)
     then = slice(first, first + made.dataset.n_samples)
     inner = slice(20, -20)
@@ -187,3 +189,21 @@ def test_files_whose_times_do_not_meet_are_refused(folder):
     late.to_csv(folder / "day1_force.csv", index=False)
     with pytest.raises(ConfigError, match="no time is in all of"):
         loaded(folder, merge="*_force.csv")
+
+
+def test_a_replay_reads_a_log_as_the_identification_did(folder):
+    problem(folder)
+    log = clean()
+    late = np.interp(log.time - 4e-3, log.time, log.outputs[:, 0])
+    frame = pd.DataFrame({"t": log.time, "u": log.inputs[:, 0], "y": -late})
+    frame.to_csv(folder / "late.csv", index=False)
+    small = "--population", "20", "--generations", "3", "--no-report"
+    words = "--config", "id.yaml", "--set", "delay.y=4 ms", "--set", "columns.outputs.y.sign=-1"
+    done = rig("identify", "late.csv", "--hold-back", "0.3", *words, *small, cwd=folder)
+    shown = next(line for line in done.stdout.splitlines() if "rig replay" in line)
+    again = shlex.split(shown.partition("rig replay ")[2])
+    replayed = rig("replay", *again, cwd=folder)
+    assert replayed.returncode == 0, replayed.stderr
+    fit = re.search(r"^ y .* ([\d.-]+) $", replayed.stdout, re.MULTILINE)[1]
+    assert float(fit) > 99.0, "neither moved nor turned round it fits far worse"
+    assert str(folder) not in done.stdout
