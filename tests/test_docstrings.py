@@ -14,6 +14,15 @@ import protocols
 import sim_rig
 import sysid
 
+# Examples that take seconds.
+LONG = {
+    "daq.designs.design.design",
+    "daq.identification.campaign.campaign",
+    "daq.identification.comparison.ComparisonResult",
+    "sysid.campaigns.runs.campaign",
+    "sysid.experiments.discrimination.discriminate",
+}
+
 
 def modules_of(package):
     yield package.__name__
@@ -29,7 +38,8 @@ def examples():
         for name in modules_of(package):
             for test in finder.find(importlib.import_module(name)):
                 if test.examples:
-                    yield pytest.param(test, id=test.name)
+                    marks = [pytest.mark.soak] * (test.name in LONG)
+                    yield pytest.param(test, id=test.name, marks=marks)
 
 
 @pytest.mark.parametrize("example", list(examples()))

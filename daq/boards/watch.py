@@ -1,6 +1,8 @@
 """What this program watches for a card that cannot: the rate of its counts, and limits."""
 
+import math
 from collections import deque
+from itertools import islice
 
 import numpy as np
 import numpy.typing as npt
@@ -29,13 +31,13 @@ class RateEstimate:
     def _next(self, count: int) -> float:
         """Counts a sample."""
         self._counts.append(count)
-        recent = [count - earlier for earlier in reversed(self._counts)]
-        slope = 0.0
-        for n in range(1, len(recent)):
-            line = recent[n] / n
-            if any(abs(line * m - recent[m]) > 1.0 for m in range(1, n)):
+        slope, low, high = 0.0, -math.inf, math.inf  # lines that come within one of all since
+        for n, earlier in enumerate(islice(reversed(self._counts), 1, None), start=1):
+            moved = count - earlier
+            if not low <= moved / n <= high:
                 break
-            slope = line
+            slope = moved / n
+            low, high = max(low, (moved - 1) / n), min(high, (moved + 1) / n)
         return slope
 
 

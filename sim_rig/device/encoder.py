@@ -44,7 +44,9 @@ class EncoderCounter:
         does not depend on where a motion is cut into calls.
         """
         per_radian = self.counts_per_turn / (2.0 * math.pi)
-        counted = np.vstack([motion, last]) * per_radian
+        counted = np.empty((len(motion) + 1, 2))
+        counted[:-1], counted[-1] = motion, last
+        counted *= per_radian
         counted[:, 0] += self.phase
         counts, rates = _count(counted, origin, first, step, per_tick, self.memory)
         return counts, rates

@@ -89,8 +89,10 @@ class Played:
 def collect(rig, n, blocks=None):
     """Receive until ``n`` samples are there; all of them, as received."""
     blocks = [] if blocks is None else blocks
-    while sum(map(len, blocks)) < n:
+    received = sum(map(len, blocks))
+    while received < n:
         blocks.append(rig.receive())
+        received += len(blocks[-1])
     return blocks
 
 

@@ -155,6 +155,7 @@ def test_an_encoder_that_counts_the_other_way_ends_the_run(tmp_path):
         run(experiment(), tmp_path, {"load": "free", "sensor": "between"}, rig)
 
 
+@pytest.mark.soak
 def test_a_run_that_ended_early_concludes_from_what_there_is(tmp_path):
     chosen, plant = experiment(torque_sensor="between"), {"load": "free", "sensor": "between"}
     samples, extra = run(chosen, tmp_path, plant, ideal=True)

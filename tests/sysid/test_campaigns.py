@@ -263,6 +263,7 @@ def gain_of(seed):
     return seed, found.parameters_["gain"]
 
 
+@pytest.mark.soak
 def test_a_study_gives_the_same_in_other_processes_and_keeps_what_failed():
     seen = []
     here = study(gain_of, range(4))

@@ -92,6 +92,7 @@ def test_what_a_refitted_rival_leaves_is_that_of_the_closed_form():
     assert noncentrality([told], rival, end) == pytest.approx(exact, rel=1e-6)
 
 
+@pytest.mark.soak
 def test_a_rival_that_blows_up_on_its_way_is_fitted_all_the_same():
     grows = growth()
     one = structure(grows)
@@ -114,6 +115,7 @@ def test_noise_of_an_input_counts_as_the_test_scatters():
     assert 0.6 < left.efficiency() < 1.7  # white after all, for the spring answers at once
 
 
+@pytest.mark.soak
 def test_the_runs_that_tell_pairs_apart_are_at_the_limits_and_beside_zero():
     models = {"linear": LINEAR, "square": SQUARE, "cubic": CUBIC}
     result = discriminate(models, [waves(-1.0)], limits={"u": (-2.0, 2.0)}, runs=2, **QUICK)
@@ -170,6 +172,7 @@ def test_one_seed_gives_one_result_whatever_the_threads(monkeypatch):
     assert several.contests == alone.contests
 
 
+@pytest.mark.soak
 def test_structures_that_do_the_same_are_told_apart_by_no_run():
     twin = spring("twin", lambda u, p: 2.0 * p[0] * u, ("half", 0.6, 0.1, 2.5))
     with pytest.raises(ModelError, match="no run within the limits tells any"):

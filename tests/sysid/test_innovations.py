@@ -451,6 +451,7 @@ def test_intervals_count_how_well_the_outputs_noise_is_known():
     assert 0.7 < np.median(stated) / np.std(errors) < 1.4
 
 
+@pytest.mark.soak
 def test_a_filter_tells_where_noise_hides_the_bend_of_the_equations():
     """|u| has its bend within the noise of a small u, and not of a large one."""
     (record, _) = noisy_records(1)
@@ -486,6 +487,7 @@ def test_a_filters_minimum_is_sought_all_over_where_innovations_can_be_foreseen(
     assert better_by_filter(fit, from_truth, rest, by_error, None) == (from_truth, rest)
 
 
+@pytest.mark.soak
 def test_an_output_whose_error_is_all_of_an_inputs_noise_counts_like_the_others():
     """Hardly anything is left of it beside the other, which itself tells the lag badly."""
     rng = np.random.default_rng(0)
@@ -515,6 +517,7 @@ def two_lags():
     )
 
 
+@pytest.mark.soak
 def test_where_a_filter_jumps_slopes_are_those_of_the_side_without():
     """At rest on a kink: below it the state is damped, above it is not."""
     model = ProcessModel(

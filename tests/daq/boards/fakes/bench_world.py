@@ -245,7 +245,7 @@ class World:
 
     def _simulate(self, n):
         """Substeps with the outputs that there are; what was latched at their beginning."""
-        self._device.send(self._tick, np.tile(self.outputs, (n, 1)))
+        self._device.send(self._tick, np.full((n, len(self.outputs)), self.outputs))
         raw = self._device.receive()
         assert len(raw.tick) == n
         self._tick += n
