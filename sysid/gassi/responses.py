@@ -65,6 +65,8 @@ class _Responses:
 
     def independent(self) -> IntArray:
         """Places of parameters that the response tells apart, the one that does most first."""
+        if not self._reference.size:  # no input varies
+            return np.empty(0, dtype=np.int64)
         slopes = self._slopes(self.start[None], np.arange(len(self.start)))[0]
         chosen: list[int] = []
         largest = np.linalg.norm(slopes, axis=0).max(initial=0.0)
