@@ -14,6 +14,7 @@ from daq.catalogue.entries import RunEntry
 from daq.errors import ConfigError, suggestion
 
 _CONDITION = re.compile(r"\s*([^<>=!]+?)\s*(<=|>=|!=|=|<|>)\s*(.*?)\s*", re.DOTALL)
+_DATE = re.compile(r"\d{4}(-\d\d(-\d\d.*)?)?$")  # or a month, or a year: texts in their order
 _ORDERS: dict[str, Callable[[Any, Any], bool]] = {
     "<": operator.lt,
     "<=": operator.le,
@@ -132,7 +133,7 @@ def _folder(root: Path, term: str) -> str | None:
 
 
 def _checked(entries: Sequence[RunEntry], condition: Condition) -> Condition:
-    """A condition that can be asked; ConfigError where an order wants a number and has none."""
+    """A condition that can be asked; ConfigError where an order wants a number or a date."""
     facts = [entry.facts[condition.key] for entry in entries if condition.key in entry.facts]
     numbers = any(isinstance(fact, int | float) for fact in facts)
     if numbers and condition.operator in _ORDERS:
@@ -141,6 +142,10 @@ def _checked(entries: Sequence[RunEntry], condition: Condition) -> Condition:
         except ValueError:
             problem = f"{condition.value!r} is no number, as {condition.key} is"
             raise ConfigError(problem, cure=f"for example '{condition.key}>0.1'") from None
+    dated = condition.key == "started" and condition.operator in _ORDERS
+    if dated and not _DATE.match(condition.value):
+        problem = f"{condition.value!r} is no date, as started is"
+        raise ConfigError(problem, cure="write year-month-day, 'started>=2026-11-01'")
     return condition
 
 

@@ -43,6 +43,7 @@ def check(
     torque controller by trials.
     """
     from daq.recording import preview
+    from daq.recording.session import lacks_port
 
     with terminal.watching(json) as watch:
         checked = preview.check(experiment, rig, port, draws=draws, watch=watch)
@@ -55,6 +56,8 @@ def check(
     if plot is not None:
         print(f"Figure: {plot}")
     on = f" --rig {rig}" if rig is not None else ""
+    if lacks_port(checked.session.rig):
+        port = "PORT"  # to be filled in, as rig ports has it
     on += f" --port {port}" if port is not None else ""
     identify = " --identify" if checked.session.validation and not checked.concludes else ""
     terminal.print_next(f"rig run {experiment}{on}{identify}")

@@ -42,7 +42,7 @@ def run(
         result = session.record(out, validation=identify, watch=watch)
     document = _document(result)
     if not json:
-        _show(result, identifiable=session.plan.excites and not identify)
+        _show(result, session.plan.excites, identify)
     if problem is not None:
         if result.validation is None and not json:
             path = session.loaded.file.path
@@ -89,7 +89,20 @@ def _document(result: SessionResult) -> dict[str, Any]:
     return document
 
 
-def _show(result: SessionResult, identifiable: bool) -> None:
+def _show_rest(folder: Path) -> None:
+    """What the sensors read at zero command, by the calibration."""
+    from daq.logs.capture import LOG_NAME
+    from daq.logs.columns import UNITS
+    from daq.logs.recording import read_record
+    from daq.notation import quantity
+
+    record = read_record(folder / LOG_NAME) or {}
+    offsets, noise = record["offsets"], record["calibration"]["noise"]
+    rows = [[k, *(quantity(x[k], UNITS[k]) for x in (offsets, noise))] for k in noise]
+    terminal.print_table("Sensors at zero command", ["sensor", "offset", "noise"], rows)
+
+
+def _show(result: SessionResult, excites: bool, identify: bool) -> None:
     from daq.cli.analyse import next_commands, show_findings
     from daq.diagnose import punctuality
 
@@ -109,5 +122,7 @@ def _show(result: SessionResult, identifiable: bool) -> None:
             terminal.report("note", note)
     for doubt in result.doubts:
         terminal.report("warning", doubt)
-    if identifiable:
+    if not excites:
+        _show_rest(result.run.folder)
+    elif not identify:
         terminal.print_next(*next_commands(result.run.folder))

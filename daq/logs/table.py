@@ -303,8 +303,8 @@ def _layout_with(path: Path, columns: Sequence[str]) -> Layout:
         if name not in header:
             raise ConfigError(
                 f"column {name!r} is missing",
-                cure=f"{suggestion(name, names)} (the file has {', '.join(names)}). Columns of "
-                "other programs are named in the 'columns' section of a file given with --config",
+                cure=f"{suggestion(name, names)}. Columns of other programs are named in the "
+                "'columns' section of a file given with --config",
                 file=path,
                 line=line,
             )

@@ -144,7 +144,8 @@ def check(
     >>> check("prbs.yaml").seconds
     1.25
     """
-    session = open_session(str(experiment), None if rig is None else str(rig), port, watch=watch)
+    name = None if rig is None else str(rig)
+    session = open_session(str(experiment), name, port, watch=watch, to_run=False)
     settings = session.loaded.experiment
     channels = {name: _facts(session.plan, session.rig, settings, name) for name in CHANNELS}
     return Preview(session, channels, _evidence(session, draws, watch) if draws else None)

@@ -86,11 +86,13 @@ def open_session(
     port: str | None = None,
     realtime: bool = False,
     watch: Watch = ignore,
+    *,
+    to_run: bool = True,
 ) -> Session:
     """Read and check an experiment, its validation run and a rig; ConfigError with all mistakes.
 
     rig: default what the experiment's file says it is for. port, realtime: settings of its backend
-    over those of its file.
+    over those of its file. to_run: whether the rig has to be reachable.
     """
     name = rig or rig_for(experiment, watch)
     loaded, (config, device) = together(
@@ -100,7 +102,7 @@ def open_session(
     # Checked even where it will not run: a mistake in the file is best heard of early.
     validation = loaded.validation()
     runs = [run for run in (loaded, validation) if run is not None]
-    return Session(loaded, validation, config, device, _plan(runs, config, name), name)
+    return Session(loaded, validation, config, device, _plan(runs, config, name, to_run), name)
 
 
 def record(
@@ -144,20 +146,27 @@ def _noting(loaded: LoadedExperiment, notes: list[str]) -> LoadedExperiment:
     return replace(loaded, experiment=loaded.experiment.model_copy(update={"metadata": metadata}))
 
 
-def _plan(runs: Sequence[LoadedExperiment], config: RigConfig, rig: str) -> Plan:
+def _plan(
+    runs: Sequence[LoadedExperiment], config: RigConfig, rig: str, to_run: bool = True
+) -> Plan:
     """What the first of some runs will do; ConfigError with all that keeps any from being run."""
     first, *_ = together(
         *[partial(run.plan, config) for run in runs],
-        partial(_require_port, config, rig),
+        *([partial(_require_port, config, rig)] if to_run else []),
         partial(require_phase, config.options, runs[0].experiment.mode, rig),
     )
     plan: Plan = first
     return plan
 
 
+def lacks_port(config: RigConfig) -> bool:
+    """Whether a rig is on a port that is still to be named."""
+    return getattr(config.options, "port", None) == ""
+
+
 def _require_port(config: RigConfig, rig: str) -> None:
     """Raise ConfigError for a rig on a port that is still to be named."""
-    if getattr(config.options, "port", None) == "":
+    if lacks_port(config):
         cure = "give --port PORT, or write it there; 'rig ports' lists the ports that there are"
         raise ConfigError("no port is named", cure=cure, file=rig, key="options.port")
 

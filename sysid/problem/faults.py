@@ -141,13 +141,18 @@ def after_mending(faults: Sequence[DataFault], model: ProcessModel) -> tuple[Dat
 
 
 def _merged(faults: Sequence[DataFault]) -> list[DataFault]:
-    """One fault for all records in which it is the same, described by the worst of them."""
-    alike: dict[tuple[str, ...], list[DataFault]] = {}
+    """One fault for all records in which it is the same, described by the worst of them.
+
+    Those of training come first, as they are what parameters come from; what makes a validation
+    none is a fault by itself.
+    """
+    alike: dict[tuple[object, ...], list[DataFault]] = {}
     for fault in faults:
-        alike.setdefault((fault.kind, fault.severity, fault.channel, fault.part), []).append(fault)
+        key = fault.kind, fault.severity, fault.channel, fault.voids_validation
+        alike.setdefault(key, []).append(fault)
     merged = []
     for group in alike.values():
-        ordered = sorted(group, key=lambda fault: -fault.share)
+        ordered = sorted(group, key=lambda fault: (fault.part == "validation", -fault.share))
         records = dict.fromkeys(name for fault in ordered for name in fault.records)
         merged.append(replace(ordered[0], records=tuple(records)))
     return merged

@@ -135,6 +135,7 @@ def test_of_several_folders_any_is_meant(lab):
         (("oprator=Ann",), "did you mean 'operator'?"),
         (("--sort", "gian"), "did you mean 'gain'?"),
         (("gain>high",), "'high' is no number, as gain is"),
+        (("started>=20.9.2026",), "'20.9.2026' is no date, as started is"),
         (("--parameters", "gian"), "did you mean 'gain'?"),
         (("--in", "nowhere"), "record a run"),
         (("--tag", "x"), "say of which runs"),

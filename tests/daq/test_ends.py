@@ -344,10 +344,12 @@ def test_a_folder_in_which_nothing_can_be_recorded_does_not_stay(tmp_path):
     assert list((tmp_path / "runs").iterdir()) == []
 
 
-@pytest.mark.parametrize("command", ["run", "check"])
-def test_a_serial_rig_wants_its_port_before_anything_is_recorded(tmp_path, command):
+def test_a_serial_rig_wants_its_port_before_anything_is_recorded_and_not_to_be_checked(tmp_path):
     write_experiment(tmp_path / "e.yaml")
-    result = rig(command, "e.yaml", "--rig", "serial.yaml", cwd=tmp_path)
+    checked = rig("check", "e.yaml", "--rig", "serial.yaml", cwd=tmp_path)
+    assert checked.returncode == 0, checked.stderr
+    assert "Next: rig run e.yaml --rig serial.yaml --port PORT" in checked.stdout
+    result = rig("run", "e.yaml", "--rig", "serial.yaml", cwd=tmp_path)
     assert result.returncode == 2
     assert "options.port: no port is named; give --port PORT" in result.stderr
     assert "'rig ports'" in result.stderr and not (tmp_path / "runs").exists()

@@ -91,6 +91,15 @@ def test_what_cannot_be_exported_is_a_mistake_that_leaves_nothing(tmp_path, kind
     assert [file.name for file in tmp_path.iterdir()] == ["log.csv"]
 
 
+def test_columns_that_no_run_has_are_not_exported_and_no_wrong_option_is_named(
+    tmp_path,
+):
+    (tmp_path / "belt.csv").write_text("Zeit [ms];Weg [mm]\n0,0;1,5\n1,0;1,6\n")
+    done = rig("export", "parquet", "belt.csv", cwd=tmp_path)
+    assert done.returncode == 2 and "it has Zeit [ms], Weg [mm]" in done.stderr
+    assert "--config" not in done.stderr
+
+
 def test_a_log_of_another_program_is_exported_without_a_record(tmp_path):
     names = "t,cmd_voltage_motor,cmd_voltage_brake,current_motor,current_brake,torque,theta,omega"
     (tmp_path / "day1.csv").write_text(f"{names}\n0,1,0,0,0,0,0,0\n0.1,1,0,0.5,0,0,0,0\n")

@@ -224,6 +224,10 @@ def test_the_same_fault_of_several_records_is_said_once():
     fault = one_fault(records)
     assert set(fault.records) == {record.name for record in records}
     assert "(and 3 more)" in fault.sentence
+    training, *validation = records
+    (both,) = data_faults(lag(), [training], validation)
+    assert both.records[0] == training.name and "(and 3 more)" in both.sentence
+    assert both.part == "training" and both.moves_parameters
 
 
 def shaft():
