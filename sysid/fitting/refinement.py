@@ -40,7 +40,7 @@ from sysid.fitting.objective import Objective, Responses
 from sysid.fitting.quadratic import CANDIDATES, Candidates, Quadratic, candidates, heavier
 from sysid.problem.space import SearchSpace
 
-_MOST_ITERATIONS = 50
+MOST_ITERATIONS = 50
 ROUNDING = 1e-12  # errors below it are those of the arithmetic
 _KEPT = 0.02  # share of the promise below which a gain counts as a failure
 _FAR = 0.05  # parts of the ranges; after longer moves the integration steps are chosen anew
@@ -65,7 +65,7 @@ def refine(
     objective: Objective,
     chromosome: FloatArray,
     *,
-    max_iterations: int = _MOST_ITERATIONS,
+    max_iterations: int = MOST_ITERATIONS,
     tolerance: float = TOLERANCE,
     restriction: Restriction = FREE,
     on_iteration: Callable[[Point], None] | None = None,
@@ -87,7 +87,7 @@ def refine(
 def refine_each(
     objective: Objective,
     descents: Sequence[Descent],
-    max_iterations: int = _MOST_ITERATIONS,
+    max_iterations: int = MOST_ITERATIONS,
     enough: Callable[[Point], bool] = lambda point: False,
 ) -> list[Refinement]:
     """The same by several descents that begin, side by side in the same batches.

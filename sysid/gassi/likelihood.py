@@ -13,7 +13,7 @@ import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from sysid.fitting.descent import TOLERANCE, Point, Restriction
 from sysid.fitting.free_run import FINER, FINEST
 from sysid.fitting.innovations import Innovations
 from sysid.fitting.objective import Objective
-from sysid.fitting.refinement import Refinement, begin, refine, refine_each
+from sysid.fitting.refinement import MOST_ITERATIONS, Refinement, begin, refine, refine_each
 from sysid.gassi.excerpt import Excerpt
 from sysid.gassi.filter_search import SAMPLES, by_filter, coloured
 from sysid.gassi.lookalikes import lookalikes
@@ -54,6 +54,7 @@ _AT_ONCE = 8  # descents side by side, which later ones need not repeat
 _WAY = np.array([0.25, 0.5, 0.75])  # parts of the way between two minima that are tried
 _SLACK = 1e-10  # of the most that is told, which is told of every coordinate
 _EXPLORED = 2  # minima whose lookalikes are descended from
+_EXPLORED_BY_FILTER = 5  # the same, of which each has to be better than the one before
 # Minima are one when the way between them, were all linear, changed twice the log-likelihood by
 # less than this.
 _ONE = 16.0
@@ -159,6 +160,13 @@ class _Optima:
     def __init__(self, objective: Objective, scale: FloatArray | float = 1.0) -> None:
         self._objective, self._scale = objective, np.maximum(scale, _TINY)
         self._optima: list[Optimum] = []
+
+    @classmethod
+    def around(cls, first: Optimum, objective: Objective, too_well: FloatArray) -> Self:
+        """One refitted for noisy inputs; too_well: (n_outputs,), as of ``_too_well``."""
+        optima = cls(objective, first.rms * too_well)
+        optima.add(first)
+        return optima
 
     def add(self, optimum: Optimum) -> None:
         """Add a minimum if it is a new one."""
@@ -339,7 +347,7 @@ def _weighed(
         objective = weighed
         end = refine(objective, chromosome, tolerance=tolerance, on_iteration=watch)
         chromosome, rms = end.chromosome, end.rms
-        if steady:
+        if steady and end.iterations < MOST_ITERATIONS:  # along bent valleys it takes more
             break
     return _optimum(objective, chromosome, rms)
 
@@ -355,7 +363,9 @@ def _refitted(
 
     None where without corrections the inputs' noise would explain more than there is. The others
     are refitted, and compared, at the noise of the first, and the best of them by its own. A
-    filter tells minima apart that free runs do not, and others look like its own.
+    filter tells minima apart that free runs do not, and others look like its own. Free runs may
+    lead it to a poor one, whose noise is too large to compare by: from one that is far better all
+    begins anew at its noise.
     """
     first = fit(ranked[0], watch)
     if first is None:
@@ -365,9 +375,9 @@ def _refitted(
     filters = isinstance(first.objective, Innovations) and first.objective.corrects
     if filters:
         first, starts = better_by_filter(fit, first, starts, ranked[0], watch)
-    optima, best, explored = _Optima(objective, first.rms * _too_well(ranked[0].rms)), first, None
-    optima.add(first)
-    for _ in range(_EXPLORED if filters else 1):
+    too_well = _too_well(ranked[0].rms)
+    optima, best, explored = _Optima.around(first, objective, too_well), first, None
+    for _ in range(_EXPLORED_BY_FILTER if filters else 1):
         if best is explored:
             break
         explored = best
@@ -376,7 +386,14 @@ def _refitted(
         descents = [begin(first.objective, end.chromosome) for end in ends]
         for end in refine_each(first.objective, descents):
             optima.add(_optimum(first.objective, end.chromosome, end.rms))
-        best, starts = optima.ranked()[0], []
+        (best, *others), starts = optima.ranked(), []
+        if filters and optima.deviance(first, best) > _TOLD_APART:
+            anew = fit(replace(best, objective=ranked[0].objective), watch)
+            if anew is not None:
+                near = (o for o in others if optima.deviance(o, best) < _CONCEIVABLE)
+                starts = [optimum.chromosome for optimum in near]
+                optima, best = _Optima.around(anew, objective, too_well), anew
+                first = anew
     if best is not first:
         optima.refit(best, fit(replace(best, objective=ranked[0].objective), watch))
     return optima

@@ -9,7 +9,7 @@ likelihood, which may end on one side only.
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
 
@@ -21,17 +21,20 @@ from sysid.problem.given import covariance_factor
 from sysid.uncertainty.colour import successive_correlation
 from sysid.uncertainty.covariance import covariance
 from sysid.uncertainty.estimate import Z95, Estimate, Invariant, Why
-from sysid.uncertainty.profile import Tracer, traced
+from sysid.uncertainty.profile import Fit, Tracer, traced
 from sysid.uncertainty.quantities import Coordinate, Expression
 from sysid.uncertainty.sensitivity import Sensitivity, sensitivity
 from sysid.uncertainty.ties import Ties, free_gradient, named_values, ties
 
 # Standard deviation of a logarithm above which the slopes at the estimate are no guide.
 _WEAK = 0.2
+_AWAY = 0.5  # deviations between an estimate and the minimum that slopes foretell
 _SAMPLED = 40  # points of a range at which it is tried whether simulations fail
 _DRAWS = 20_000  # of all quantities together
 _ALIKE = 0.05  # rivals closer than this are one
 _SIDES = (-1.0, 1.0)
+_ROUNDS = 3  # of searches that go on from what others came to
+_FAR = 0.1  # of the way to an end, by which such a place is beyond it
 
 
 @dataclass(frozen=True)
@@ -187,16 +190,44 @@ def _bent(local: Sensitivity) -> FloatArray:
 
 @dataclass(frozen=True)
 class _Draft:
-    """An estimate; with a tracer one whose ends its profile tells.
+    """An estimate; without a deviation, unless it is tied, one whose ends its profile tells.
 
-    valley: values, of the rest of a valley, that the interval holds. place: of a parameter, a
-    part of whose range may be one where simulations fail.
+    traced: whether they are that profile's. place: of a parameter, a part of whose range may be
+    one where simulations fail.
     """
 
     estimate: Estimate
     tracer: Tracer | None = None
-    valley: tuple[float, ...] = ()
     place: int | None = None
+    traced: bool = False
+
+    def searches(self, fits: Sequence[Fit]) -> dict[float, Fit | None]:
+        """Sides on which the profile is to be searched, and the fits to go on from."""
+        if self.tracer is None:
+            return {}
+        if self.estimate.std is None and not self.traced:
+            return dict.fromkeys(_SIDES)
+        far = {sign: self.farthest(fits, sign, _FAR) for sign in _SIDES}
+        if self.traced or not any(far.values()):
+            return {sign: fit for sign, fit in far.items() if fit is not None}
+        return far
+
+    def farthest(self, fits: Sequence[Fit], sign: float, part: float = 0.0) -> Fit | None:
+        """Of fits that explain the data the farthest beyond an end, by a part of the way there."""
+        end = self.estimate.low if sign < 0.0 else self.estimate.high
+        if self.tracer is None or end is None:
+            return None
+        edge = end + part * (end - self.estimate.value)
+        there = [fit for fit in map(self.tracer.as_seen, fits) if fit.statistic <= Z95**2]
+        value = self.tracer.quantity.value
+        beyond = [fit for fit in there if sign * (value(fit.place) - edge) > 0.0]
+        return max(beyond, key=lambda fit: sign * fit.place, default=None)
+
+    def with_end(self, sign: float, end: float | None) -> Self:
+        """The same with an end of its profile."""
+        estimate = replace(self.estimate, std=None)
+        estimate = replace(estimate, low=end) if sign < 0.0 else replace(estimate, high=end)
+        return replace(self, estimate=estimate, traced=True)
 
 
 class _Analysis:
@@ -208,7 +239,7 @@ class _Analysis:
         self.local, self.ties = local, structure
         self.objective, self.space = local.objective, local.objective.space
         self.chromosome, self.coded = local.chromosome, self.space.encode(local.chromosome)
-        self.ridge = [self.space.encode(point) for point in ridge]
+        self.ridge = [Fit(0.0, 0.0, self.space.encode(point), local.error) for point in ridge]
         self.named = named_values(self.space, self.chromosome)
         self.on_bound = self.space.on_bound(self.chromosome)
         self.free = covariance(local, structure.directions)
@@ -237,14 +268,13 @@ class _Analysis:
             return _Draft(replace(estimate, why="tied"))
         self.gradients[parameter.name] = gradient
         deviation = self.covariance.deviation(gradient)
+        spread = self.free if self.pushed[j] else self.covariance
+        tracer = Tracer(self.local, spread, gradient, Coordinate(self.space, j))
         if not self._is_guide(j, deviation):
-            spread = self.free if self.pushed[j] else self.covariance
-            tracer = Tracer(self.local, spread, gradient, Coordinate(self.space, j))
-            valley = tuple(self._decoded(j, point[j]) for point in self.ridge)
-            return _Draft(estimate, tracer, valley, j)
+            return _Draft(estimate, tracer, j)
         low, high = (self._decoded(j, self.coded[j] + sign * Z95 * deviation) for sign in _SIDES)
         std = deviation * abs(float(self.local.increments[j]))
-        return _Draft(replace(estimate, std=std, low=low, high=high))
+        return _Draft(replace(estimate, std=std, low=low, high=high), tracer, j)
 
     def ambiguities(self) -> Iterator[tuple[Ambiguity, list[Invariant]]]:
         """Parameters that hang together by the equations, and the combinations that do not."""
@@ -330,9 +360,16 @@ class _Analysis:
         low, high = (self.coded[j] + sign * Z95 * deviation for sign in _SIDES)
         lower, upper = (float(bounds[j]) for bounds in self.space.coded_bounds)
         inside = lower < low and high < upper
-        valley = any(not low <= point[j] <= high for point in self.ridge)
         narrow = deviation < _WEAK if self.space.log[j] else True
-        return inside and narrow and not valley and not self.local.failing[j]
+        settled = self._arrived(np.eye(len(self.coded))[j], deviation)
+        return inside and narrow and settled and not self.local.failing[j]
+
+    def _arrived(self, gradient: FloatArray, deviation: float) -> bool:
+        """Whether the slopes have their minimum near the estimate, seen along a quantity.
+
+        A descent in a bent valley may stop away from it, and an end of a range may hold it.
+        """
+        return bool(abs(gradient @ self.covariance.newton_step) < _AWAY * deviation)
 
     def combination(self, combination: Invariant) -> _Draft:
         """Estimate of a combination of tied parameters."""
@@ -342,34 +379,55 @@ class _Analysis:
         self.gradients[text] = gradient
         deviation = self.covariance.deviation(gradient)
         positive = bool(np.all(self.space.log[gradient != 0.0])) and value > 0.0
-        if not (np.isfinite(deviation) and (not positive or deviation < _WEAK * value)):
-            moved = gradient / value if positive else gradient
-            quantity = Expression(self.space, combination, positive)
-            return _Draft(estimate, Tracer(self.local, self.covariance, moved, quantity))
+        moved = gradient / value if positive else gradient
+        quantity = Expression(self.space, combination, positive)
+        tracer = Tracer(self.local, self.covariance, moved, quantity)
+        narrow = np.isfinite(deviation) and (not positive or deviation < _WEAK * value)
+        if not (narrow and self._arrived(gradient, deviation)):
+            return _Draft(estimate, tracer)
         product = " + " not in text and " - " not in text
         if product and deviation < _WEAK * abs(value):
             low, high = sorted(value * np.exp(sign * Z95 * deviation / value) for sign in _SIDES)
         else:
             low, high = (value + sign * Z95 * deviation for sign in _SIDES)
-        return _Draft(replace(estimate, std=deviation, low=float(low), high=float(high)))
+        return _Draft(replace(estimate, std=deviation, low=float(low), high=float(high)), tracer)
 
     def settled(self, drafts: Sequence[_Draft]) -> list[Estimate]:
-        """Estimates with the ends that profiles tell, wide enough for the rest of a valley."""
-        tracers = [draft.tracer for draft in drafts if draft.tracer is not None]
-        ends = iter(traced([(t, t.bound(sign)) for t in tracers for sign in _SIDES]))
-        return [
-            self._profiled(d, next(ends), next(ends)) if d.tracer else d.estimate for d in drafts
-        ]
+        """Estimates with the ends that profiles tell.
 
-    def _profiled(self, draft: _Draft, low: float | None, high: float | None) -> Estimate:
-        low = None if low is None else min([low, *draft.valley])
-        high = None if high is None else max([high, *draft.valley])
+        What explains the data is in every interval, whatever it was fitted for. Where a valley
+        bends the profile of one quantity so comes to places to which the slopes of another do not
+        lead, or before which its valley turns back; from there the search for its end goes on.
+        """
+        drafts, fits = list(drafts), list(self.ridge)
+        for _ in range(_ROUNDS):
+            searches = [
+                (k, draft.tracer, sign, begin)
+                for k, draft in enumerate(drafts)
+                if draft.tracer
+                for sign, begin in draft.searches(fits).items()
+            ]
+            if not searches:
+                break
+            ends = traced([(t, t.bound(sign, begin)) for _, t, sign, begin in searches], fits)
+            for (k, _, sign, _), end in zip(searches, ends, strict=True):
+                drafts[k] = drafts[k].with_end(sign, end)
+        return [self._profiled(draft, fits) if draft.traced else draft.estimate for draft in drafts]
+
+    def _profiled(self, draft: _Draft, fits: Sequence[Fit]) -> Estimate:
+        assert draft.tracer is not None
+        low, high = (
+            end if fit is None else draft.tracer.quantity.value(fit.place)
+            for end, fit in (
+                (draft.estimate.low, draft.farthest(fits, -1.0)),
+                (draft.estimate.high, draft.farthest(fits, 1.0)),
+            )
+        )
         why: Why = "vague" if low is None and high is None else ""
         estimate = replace(draft.estimate, low=low, high=high, why=why)
-        if draft.tracer is None or draft.place is None:
-            return estimate
-        failing = draft.tracer.failed or self.local.failing[draft.place]
-        return replace(estimate, failing=self._failing(draft.place)) if failing else estimate
+        if draft.place is not None and (draft.tracer.failed or self.local.failing[draft.place]):
+            return replace(estimate, failing=self._failing(draft.place))
+        return estimate
 
     def _failing(self, place: int) -> float:
         """Share of a parameter's range in which the model cannot be simulated."""

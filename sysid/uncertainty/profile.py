@@ -1,6 +1,5 @@
 """Profile likelihood: how much worse the best fit becomes as one parameter is moved."""
 
-import itertools
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, TypeVar
@@ -23,7 +22,8 @@ _ITERATIONS = 20
 # A parameter without a standard deviation is moved by parts of its range.
 _BLIND_SHARE = 0.05
 _RESOLUTION = 0.02  # of the statistic, to which refits go
-_REFITS, _NEAR = 10, 0.1  # of one end, until the root of the statistic is so near its level
+_REFITS, _NEAR = 20, 0.1  # of one end, until the root of the statistic is so near its level,
+_GAP = 0.02  # or two fits on both sides of it so near each other, in parts of the way there
 _LEAP = 8.0  # times the distance, that the next point may be away at most
 _TETHER = 200.0  # loss of likelihood by a quantity that is a standard deviation off its place
 _BEYOND = 3.0  # widths of a range to which its open end is searched
@@ -71,16 +71,17 @@ def profile(objective: Objective, chromosome: FloatArray, name: str) -> Profile:
     values = np.array([tracer.quantity.value(coordinate) for coordinate, _ in points])
     statistic = np.array([statistic for _, statistic in points])
     unit, value = space.parameters[place].unit, float(chromosome[place])
-    low, high = (tracer.crossing(side) for side in (below, above))
+    low, high = traced([(tracer, tracer.bound(sign)) for sign in (-1.0, 1.0)])
     return Profile(name, unit, value, values, statistic, low, high)
 
 
 class Fit(NamedTuple):
-    """A fit of all parameters to a place of a quantity: its statistic, search coordinates."""
+    """A fit of all parameters to a place of a quantity: statistic, search coordinates, error."""
 
     place: float
     statistic: float
     at: FloatArray
+    error: float
 
     @property
     def root(self) -> float:
@@ -100,8 +101,13 @@ _Result = TypeVar("_Result")
 Search = Generator[Wanted, Fit, _Result]
 
 
-def traced(searches: Sequence[tuple["Tracer", Search[_Result]]]) -> list[_Result]:
-    """Results of searches along profiles of one estimate, side by side in the same batches."""
+def traced(
+    searches: Sequence[tuple["Tracer", Search[_Result]]], fits: list[Fit] | None = None
+) -> list[_Result]:
+    """Results of searches along profiles of one estimate, side by side in the same batches.
+
+    fits: is given all that were made on the way.
+    """
     results: dict[int, _Result] = {}
     answers: dict[int, Fit | None] = dict.fromkeys(range(len(searches)))
     while answers:
@@ -111,8 +117,10 @@ def traced(searches: Sequence[tuple["Tracer", Search[_Result]]]) -> list[_Result
                 wanted[i] = searches[i][1].send(answer)  # type: ignore[arg-type]  # None begins it
             except StopIteration as end:
                 results[i] = end.value
-        fits = _fitted([(searches[i][0], task) for i, task in wanted.items()])
-        answers = dict(zip(wanted, fits, strict=True))
+        made = _fitted([(searches[i][0], task) for i, task in wanted.items()])
+        answers = dict(zip(wanted, made, strict=True))
+        if fits is not None:
+            fits += made
     return [results[i] for i in range(len(searches))]
 
 
@@ -125,7 +133,7 @@ def _fitted(tasks: Sequence[tuple["Tracer", Wanted]]) -> list[Fit]:
     ends = np.stack([end.chromosome for end in refine_each(objective, descents, _ITERATIONS)])
     errors, coded = objective.evaluate(ends)[0].tolist(), objective.space.encode(ends)
     return [
-        Fit(wanted.place, max(0.0, tracer.factor * (error - tracer.error)), at)
+        Fit(wanted.place, tracer.statistic(error), at, error)
         for (tracer, wanted), error, at in zip(tasks, errors, coded, strict=True)
     ]
 
@@ -159,7 +167,7 @@ class Tracer:
         self.objective = objective
         self.start = objective.space.encode(local.chromosome)
         self.centre = quantity.at(self.start)
-        self.error = self._error(local.chromosome)
+        self.error = local.error
         deviation = covariance.deviation(gradient)
         self.unit = deviation if np.isfinite(deviation) else _BLIND_SHARE * quantity.width
         # Statistic per loss of error.
@@ -180,7 +188,8 @@ class Tracer:
 
     def side(self, sign: float) -> Search[list[tuple[float, float]]]:
         """Places and statistics on one side, outwards until well beyond the 95 % level."""
-        end, last = self._end(sign), self._at_centre
+        end = self._end(sign)
+        before = last = self._at_centre
         points: list[tuple[float, float]] = []
         for step in _STEPS:
             place = self.centre + sign * step * self.unit
@@ -188,41 +197,71 @@ class Tracer:
             place = end if beyond else place
             if place == self.centre:
                 break
-            last = yield self._wanted(place, last)
+            before, last = last, (yield self._wanted(place, last, before))
             points.append((place, last.statistic))
             if beyond or last.statistic > 1.5 * Z95**2:
                 break
         return points
 
-    def bound(self, sign: float) -> Search[float | None]:
-        """Value on one side at which the statistic passes the 95 % level, None for nowhere."""
+    def bound(self, sign: float, begin: Fit | None = None) -> Search[float | None]:
+        """Value on one side at which the statistic passes the 95 % level, None for nowhere.
+
+        begin: a fit on that side, below the level, that the search goes on from.
+        """
         end = self._end(sign)
-        if sign * (end - self.centre) <= 0.0:
+        before = inside = begin or self._at_centre
+        outside: Fit | None = None
+        if sign * (end - inside.place) <= 0.0:
             return None
-        inside, outside = self._at_centre, None
-        step = Z95 * self.unit
+        beyond = halve = False
         for _ in range(_REFITS):
-            if outside is None:
-                place = self.centre + sign * min(step, abs(end - self.centre))
-            else:
-                place = inside.place + _share(inside, outside) * (outside.place - inside.place)
-            fit = yield self._wanted(place, inside)
-            if fit.statistic > Z95**2:
+            place = self._next(sign, end, inside, outside, halve=halve)
+            fit = yield self._wanted(place, inside, before)
+            repeated = outside is not None and place == outside.place
+            halve, beyond = beyond == (fit.statistic > Z95**2), fit.statistic > Z95**2
+            if beyond:
                 outside = fit
             else:
-                inside = fit
+                before, inside, outside = inside, fit, None if repeated else outside
                 if place == end:
                     return None
-                # The root of the statistic is nearly straight, if it is felt at all.
-                step *= float(np.clip(1.2 * Z95 / max(fit.root, 1e-3), 1.5, _LEAP))
-            if outside is not None and abs(fit.root - Z95) < _NEAR:
+            if outside is not None and (repeated or abs(fit.root - Z95) < _NEAR):
                 break
         if outside is None:
             return None
         if not np.isfinite(outside.statistic):
             self.failed = True
             return self.quantity.value(inside.place)
-        return self.crossing([(fit.place, fit.statistic) for fit in (inside, outside)])
+        share = (Z95 - inside.root) / (outside.root - inside.root)
+        return self.quantity.value(inside.place + share * (outside.place - inside.place))
+
+    def _next(
+        self, sign: float, end: float, inside: Fit, outside: Fit | None, *, halve: bool
+    ) -> float:
+        """The place to fit next on the way to an end, between fits on both sides of the level.
+
+        halve: where a straight root misled, the last two fits are on one side.
+        """
+        out = abs(inside.place - self.centre)
+        if outside is None:
+            # The root of the statistic is nearly straight, if it is felt at all.
+            growth = float(np.clip(1.2 * Z95 / max(inside.root, 1e-3), 1.5, _LEAP))
+            step = out * growth if out > 0.0 else Z95 * self.unit
+            return self.centre + sign * min(step, abs(end - self.centre))
+        apart = abs(outside.place - inside.place)
+        if apart <= _GAP * (out + apart):
+            # A descent from afar may have stopped short: there once more.
+            return outside.place
+        share = 0.5 if halve else _share(inside, outside)
+        return inside.place + share * (outside.place - inside.place)
+
+    def statistic(self, error: float) -> float:
+        """Twice the loss of log-likelihood by an error."""
+        return max(0.0, self.factor * (error - self.error))
+
+    def as_seen(self, fit: Fit) -> Fit:
+        """A fit that was made for another quantity, by this one's place and statistic."""
+        return fit._replace(place=self.quantity.at(fit.at), statistic=self.statistic(fit.error))
 
     def begun(self, place: float, at: FloatArray) -> Descent:
         """A descent to a place from search coordinates (n_free,), or the nearest possible."""
@@ -234,14 +273,6 @@ class Tracer:
         point = Point(np.clip(near, *restriction.bounds(space)))
         return Descent(point, tolerance=self.tolerance, restriction=restriction)
 
-    def crossing(self, points: list[tuple[float, float]]) -> float | None:
-        """Value at which the root of the statistic, nearly straight, passes the 95 % level."""
-        for (a, low), (b, high) in itertools.pairwise(points):
-            below, above = np.sqrt(low), np.sqrt(high)
-            if below <= Z95 < above:
-                return self.quantity.value(a + (b - a) * (Z95 - below) / (above - below))
-        return None
-
     def _end(self, sign: float) -> float:
         """The end of the range on one side, or where the search for one ends."""
         farthest = self.centre + sign * _BEYOND * self.quantity.width
@@ -249,17 +280,14 @@ class Tracer:
 
     @property
     def _at_centre(self) -> Fit:
-        return Fit(self.centre, 0.0, self.start)
+        return Fit(self.centre, 0.0, self.start, self.error)
 
-    def _wanted(self, place: float, last: Fit) -> Wanted:
-        """A fit to a place, from where the last one and the way to it lead."""
+    def _wanted(self, place: float, last: Fit, before: Fit) -> Wanted:
+        """A fit to a place, from where the last two and the way between them lead."""
         way = self.direction
-        if last.place != self.centre:
-            way = (last.at - self.start) / (last.place - self.centre)
+        if last.place != before.place:
+            way = (last.at - before.at) / (last.place - before.place)
         return Wanted(place, (last.at + (place - last.place) * way, last.at))
-
-    def _error(self, chromosome: FloatArray) -> float:
-        return float(self.objective.evaluate(chromosome[None])[0][0])
 
 
 def _share(inside: Fit, outside: Fit) -> float:

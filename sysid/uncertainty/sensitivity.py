@@ -59,6 +59,11 @@ class Sensitivity:
         return self.slopes[:, self.objective.weights > 0.0].reshape(-1, len(self.chromosome))
 
     @cached_property
+    def error(self) -> float:
+        """What the criterion is at the chromosome."""
+        return float(self.criterion.evaluate(self.chromosome[None])[0][0])
+
+    @cached_property
     def increments(self) -> FloatArray:
         """Change of each parameter per unit of its coordinate, (n_free,)."""
         return np.where(self.objective.space.log, self.chromosome, 1.0)

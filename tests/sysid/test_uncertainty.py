@@ -35,8 +35,9 @@ from sysid import (
 )
 from sysid.fitting.descent import Restriction
 from sysid.fitting.objective import Objective
-from sysid.fitting.refinement import refine
-from sysid.uncertainty import uncertainty
+from sysid.fitting.refinement import MOST_ITERATIONS, refine
+from sysid.gassi.likelihood import fit_likelihood
+from sysid.uncertainty import profile, uncertainty
 from sysid.uncertainty.colour import Autoregression, colour, score_covariance
 from sysid.uncertainty.ties import Ties
 from tests.sysid.support import Formula, lag, linear_response, prbs
@@ -636,6 +637,47 @@ def test_what_hardly_differs_from_a_tie_has_wide_intervals():
     assert not any(e.excludes(BRUSHED) for e in result.parameters)
 
 
+def feedback(weight, seed):
+    """Like a motor's K and B, of which K + B / K is known, and K by itself by a weight as small."""
+
+    def formula(p, u):
+        return columns((p["k"] + p["b"] / p["k"]) * u[:, 0] + weight * p["k"] * u[:, 1])
+
+    parameters = [unknown("k", 1.0), unknown("b", 0.4)]
+    return Problem(formula, parameters, sigma=0.1, inputs=2, seed=seed)
+
+
+@pytest.mark.parametrize("begun", [(0.3, 0.33), (1.38, 0.05)], ids=["one side", "the other"])
+@pytest.mark.parametrize("seed", [3, 6])
+def test_a_valley_that_turns_back_is_followed_behind_its_turn(seed, begun):
+    """b = k (1.4 - k) has two values of k for each below 0.49, and ends of its range at both."""
+    objective = feedback(0.004, seed).objective()
+    end = refine(objective, np.array(begun), max_iterations=300)
+    b = estimates(uncertainty(objective, end.chromosome))["b"]
+    assert (b.low, b.std) == (None, None)
+    assert b.high == pytest.approx(0.49, rel=0.03)
+
+
+@pytest.mark.parametrize("begun", [(0.3, 0.33), (0.15, 0.2)])
+def test_where_a_descent_stops_in_a_bent_valley_matters_to_no_interval(begun):
+    objective = feedback(0.02, 4).objective()
+    minimum, stopped = (
+        refine(objective, np.array(begun), max_iterations=most).chromosome for most in (300, 30)
+    )
+    k = estimates(uncertainty(objective, stopped))["k"]
+    assert abs(stopped[0] - minimum[0]) > 0.1
+    assert k.high == pytest.approx(profile(objective, minimum, "k").high, rel=0.02)
+
+
+def test_a_descent_along_a_bent_valley_comes_to_its_end():
+    objective = feedback(0.02, 4).objective()
+    begun = np.array([0.15, 0.2])
+    end = refine(objective, begun, max_iterations=1000)
+    assert end.iterations > MOST_ITERATIONS
+    reached = fit_likelihood(objective, [begun], explored=True).optimum
+    np.testing.assert_allclose(reached.chromosome, end.chromosome, rtol=1e-3)
+
+
 def test_what_the_data_feel_is_not_tied_whatever_the_equations_seem_to_say():
     """Of a model whose outputs are another formula than its equations."""
     model = lag(derivative=lambda x, u, p: (p[0] * p[1] * u[0] - x[0],))
@@ -947,8 +989,11 @@ def test_lost_samples_cost_what_they_would_have_told(lost):
     outputs = record.outputs.copy()
     outputs[np.random.default_rng(1).random(len(outputs)) < lost] = np.nan
     at = np.array([p.nominal for p in UNITS])
-    whole = uncertainty(problem.objective(), at)
-    part = uncertainty(problem.objective([Dataset(record.inputs, outputs, record.dt)]), at)
+    halved = [Dataset(record.inputs, outputs, record.dt)]
+    whole, part = (
+        uncertainty(objective, refine(objective, at).chromosome)
+        for objective in (problem.objective(), problem.objective(halved))
+    )
     for one, other in zip(whole.parameters, part.parameters, strict=True):
         assert other.std / one.std == pytest.approx(1.0 / np.sqrt(1.0 - lost), rel=0.05)
 
