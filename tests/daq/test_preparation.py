@@ -123,6 +123,7 @@ def loaded(folder, **changes):
     return records.load(folder / "day1.csv", asked.model, asked.mapping, asked.selection)
 
 
+@pytest.mark.soak
 def test_a_log_is_merged_moved_cut_and_decimated_and_the_report_shows_it(folder):
     steps = {"merge": "*_force.csv", "use": "0.1 s .. 2.7 s", "delay": {"y": "4 ms"}, "decimate": 5}
     problem(folder, **steps)

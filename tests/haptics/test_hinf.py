@@ -51,6 +51,7 @@ def largest_sensitivity(control, actuators):
     )
 
 
+@pytest.mark.soak
 def test_slopes_of_the_responses_are_those_of_differences():
     loops = LoopFamily(START, MODEL, MODEL.nominal, [MODEL.nominal])
     x, step = 0.01 * np.arange(len(loops.free)), 1e-4

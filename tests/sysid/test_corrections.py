@@ -53,6 +53,7 @@ def test_a_drift_grows_from_the_first_sample_of_every_record():
     np.testing.assert_allclose(whole, expected, atol=2e-3 * np.abs(expected).max())
 
 
+@pytest.mark.soak
 def test_a_drift_that_is_named_is_fitted_by_its_correction():
     case = {case.name: case for case in cases()}["load drifts"]
     outcome = tried(case, 0)

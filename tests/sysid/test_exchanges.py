@@ -60,6 +60,7 @@ def fitted(log):
     return GASSI(TWO_MASSES, population=60, generations=12).fit(log)
 
 
+@pytest.mark.soak
 def test_exchanged_speeds_are_named_with_what_the_parameters_become():
     logs = [record(seed, name) for seed, name in ((1, "training"), (2, "validation"))]
     training, validation = (replace(log, outputs=log.outputs[:, ::-1]) for log in logs)

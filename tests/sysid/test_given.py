@@ -50,7 +50,7 @@ def test_independent_changes_add_up_and_those_that_cancel_do_not():
 @pytest.mark.soak
 def test_intervals_of_the_second_stage_hold_the_truth_and_merely_fixed_ones_do_not():
     held = np.zeros(2)
-    for seed in range(40):
+    for seed in range(20):
         whole = lag_record(seed=seed, gain=2.0)  # another gain, the same tau
         short = Dataset(whole.inputs[:24], whole.outputs[:24], whole.dt)
         first = GASSI(lag(), random_state=seed, **QUICK).fit(short)
@@ -59,7 +59,7 @@ def test_intervals_of_the_second_stage_hold_the_truth_and_merely_fixed_ones_do_n
         for k, given in enumerate((factor, [])):
             _, estimate = second_stage(drifting(seed), first.parameters_["tau"], given)
             held[k] += estimate.low <= 3.0 <= estimate.high
-    assert held[0] >= 35 > held[1]
+    assert held[0] >= 17 > held[1]
 
 
 def test_the_factor_is_the_covariance_in_the_parameters_units():

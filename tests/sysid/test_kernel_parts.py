@@ -134,6 +134,7 @@ def test_vector_functions_pass_not_a_number_on(name):
     assert math.isnan(getattr(_vector_math, name)(math.nan))
 
 
+@pytest.mark.soak
 def test_parts_that_are_alike_share_their_matrices_and_run_as_each_alone():
     """Two oscillators of the same parameters, each driven by an input of its own."""
     rng = np.random.default_rng(0)
