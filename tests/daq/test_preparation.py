@@ -66,7 +66,7 @@ def test_an_output_that_comes_late_is_moved_back(late):
     times = record.time - late
     smooth = np.sin(20.0 * record.time)
     moved = dataclasses.replace(record, outputs=np.sin(20.0 * times))
-    made = prepare(lag(), moved, Preparation(delay={"y": -late}))
+    made = prepare(lag(), moved, Preparation(delay={"y": late}))
     first = round(made.start / DT)
     then = slice(first, first + made.dataset.n_samples)
     inner = slice(20, -20)
