@@ -1,6 +1,7 @@
 """What designed experiments tell beside shipped and random ones of equal time and limits.
 
-python -m benchmarks.design [--json] [--rigs 8] [--case motor|oscillator|actuator]
+python -m benchmarks.design [--json] [--rigs 8] [--designs 50]
+                            [--case motor|oscillator|actuator|phantoms]
 
 ``motor``: a DC motor with Coulomb friction, ``oscillator``: a mass on a Bouc-Wen spring; 2 s
 designed from PRBS and multisines with free settings, against the best of 200 of the same drawn at
@@ -10,6 +11,9 @@ random, repeated for as long.
 for torque and limits, its torque is the identification model's input. 8 runs of 1.25 s designed
 from the model's nominal values, against 8 times the shipped PRBS, both judged at hidden parameters
 drawn anew, a factor of 0.6 to 1.6 each.
+
+``phantoms``: small designs for the actuator from values drawn anew, and how much of their
+information lies along directions that the equations leave undetermined, in parts of the largest.
 
 Figures are half widths of predicted 95 % intervals by the sensors' noise, the torque's included.
 """
@@ -23,6 +27,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.linalg import null_space
 
 from benchmarks._common import arguments, report
 from daq.lookup.experiments import load_experiment
@@ -72,13 +77,17 @@ WOUND = 10.0 * math.pi  # rad, five turns
 def main() -> None:
     parser = arguments(__doc__ or "")
     parser.add_argument("--rigs", type=int, default=8, help="hidden parameters drawn")
-    parser.add_argument("--case", choices=(*CASES, "actuator"), help="only this one")
+    parser.add_argument("--designs", type=int, default=50, help="of the case phantoms")
+    further = ("actuator", "phantoms")
+    parser.add_argument("--case", choices=(*CASES, *further), help="only this one")
     options = parser.parse_args()
     figures = {
         name: against_random(case()) for name, case in CASES.items() if options.case in (None, name)
     }
     if options.case in (None, "actuator"):
         figures["actuator"] = hybrid_actuator(options.rigs)
+    if options.case in (None, "phantoms"):
+        figures["phantoms"] = phantoms(options.designs)
     report(figures, options.json, show)
 
 
@@ -332,6 +341,31 @@ def deviations(
     return judged.deviations(total[None, None])[0, 0]
 
 
+def phantoms(n_designs: int) -> dict[str, Any]:
+    """Information along what nothing tells, of small designs, in parts of the largest.
+
+    The directions are those that leave every combination that experiments can tell as it is.
+    """
+    model = actuator()
+    bench, space = WoundActuator(model), SearchSpace.of(model)
+    quantities = determined(identifiability(model, sensors=False), space)
+    nominal, gains, refused = model.nominal[list(space.index)], [], 0
+    for seed in range(n_designs):
+        rng = np.random.default_rng(seed)
+        drawn = (nominal * rng.uniform(0.6, 1.6, len(nominal)) for _ in range(1000))
+        values = next(v for v in drawn if space.feasible(v))
+        prior = Prior(values, np.diag(np.full(len(nominal), 0.1**2)))
+        designed = design(
+            model, [commands()], noise=NOISE, runs=2, prior=prior, bench=bench, seed=seed,
+            draws=2, candidates=16, generations=3, offspring=8,
+        )  # fmt: skip
+        null = null_space(relative_gradients(quantities, space, values[None])[0])
+        along = np.diag(null.T @ designed.information @ null)
+        gains.append(float(np.abs(along).max() / np.abs(designed.information).max()))
+        refused += designed.phantoms
+    return {"directions": null.shape[1], "largest_gains": gains, "left_out": refused}
+
+
 def settings_of(designed: Design) -> list[dict[str, float]]:
     return [dict(run.settings) for run in designed.runs]
 
@@ -355,6 +389,12 @@ def show(figures: dict[str, Any]) -> None:
             print(f"  {name:20} {100 * widths['before']:8.3g} %  {100 * widths['after']:8.3g} %")
         print("  narrower than 8 x PRBS by", [round(r, 2) for r in result["narrower"]])
         print("  widest [%]", [round(100 * w, 2) for w in result["worst"]])
+
+    if "phantoms" in figures:
+        result = figures["phantoms"]
+        gains = result["largest_gains"]
+        print(f"\nPhantoms, {len(gains)} designs, {result['directions']} directions: at most")
+        print(f"  {max(gains):.1e} of the largest information; {result['left_out']} runs left out")
 
 
 if __name__ == "__main__":
