@@ -121,8 +121,7 @@ class _Responses:
         factors = factors.reshape(len(at), -1, change.shape[2])
         moved_response = change @ np.swapaxes(factors, 1, 2)
         moved_response = response[:, None] + moved_response.reshape(*shape[:2], *self._shape)
-        count = len(at) * len(places)  # written out: inputs that never vary leave nothing to count
-        missed = self._missed(moved_response.reshape(count, *self._shape)).reshape(shape)
+        missed = self._missed(moved_response.reshape(-1, *self._shape)).reshape(shape)
         slopes: FloatArray = (missed - self._missed(response)[:, None]) / _DIFFERENCE
         return np.swapaxes(slopes, 1, 2)
 

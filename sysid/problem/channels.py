@@ -15,6 +15,7 @@ _EQUAL = 1e-9  # of a channel's span: samples so close are the same
 _RESTING = 1e-3  # of its span: how near 0 a level is that of rest
 _HARMLESS = 1e-4  # of a channel's variance
 _NEARBY = 8  # samples on either side, among which one stands out
+_SOME, _BRIEF = 4, 32  # samples of a burst
 _NORMAL = 0.6745  # median of the absolute value of a standard normal variable
 
 
@@ -154,7 +155,8 @@ def resolution(values: FloatArray) -> float:
 def spikes(values: FloatArray, inputs: FloatArray) -> Spikes | None:
     """Single samples that leave their neighbours and return, too far for noise, or a sharp corner.
 
-    None where all together they are below a per cent of the channel's own deviation.
+    And short bursts of such, to and fro, beyond all that the channel does elsewhere. None where all
+    together they are below a per cent of the channel's own deviation.
     inputs: (n, n_inputs), whose jumps answer for pulses that follow them.
 
     >>> quiet = 0.01 * np.random.default_rng(0).standard_normal(400)
@@ -196,6 +198,7 @@ def spikes(values: FloatArray, inputs: FloatArray) -> Spikes | None:
         # What follows a jump may be as large as what usually follows one.
         reaction = np.quantile(reactions, 0.9)
         at[1:-1] &= ~jolted[1:-1] | (np.abs(away) > 3.0 * reaction)
+    at |= _bursts(values, away, 7.0 * max(rough / _NORMAL, resolution(values)), jolted)
     count = int(at.sum())
     if count == 0:
         return None
@@ -203,6 +206,28 @@ def spikes(values: FloatArray, inputs: FloatArray) -> Spikes | None:
     if sizes @ sizes < _HARMLESS * len(finite) * np.nanvar(values):
         return None
     return Spikes(count / len(finite), float(np.median(sizes)), at)
+
+
+def _bursts(values: FloatArray, away: FloatArray, least: float, jolted: BoolArray) -> BoolArray:
+    """Samples of short bursts that go to and fro beyond a channel's range elsewhere, (n,).
+
+    away: of samples from their neighbours' mean, (n - 2,). least: of it that is no noise. jolted:
+    where an input has just jumped, (n,), which what follows may answer.
+    """
+    at = np.zeros(len(values), dtype=np.bool_)
+    wild = 1 + np.flatnonzero(np.abs(away) > least)
+    for group in np.split(wild, 1 + np.flatnonzero(np.diff(wild) > _NEARBY // 2)):
+        if not _SOME <= len(group) <= _BRIEF or least == 0.0:
+            continue
+        inside = slice(max(group[0] - 1, 0), group[-1] + 2)
+        rest = np.delete(values, inside)
+        low, high = np.nanmin(rest), np.nanmax(rest)
+        beyond = max(np.nanmax(values[inside]) - high, low - np.nanmin(values[inside]))
+        turns = np.mean(np.diff(np.sign(away[group[0] - 1 : group[-1]])) != 0.0)
+        answers = jolted[max(group[0] - _NEARBY, 0) : group[-1] + 1].any()
+        if beyond > 0.25 * (high - low) and turns > 0.5 and not answers:
+            at[group] = True
+    return at
 
 
 def _after_jumps(inputs: FloatArray) -> BoolArray:

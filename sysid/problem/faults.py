@@ -256,8 +256,8 @@ class _Channel:
         count = int(jolts.at.sum())
         statement = (
             f"{count} sample{'s' * (count != 1)} of {self.name} ({_percent(jolts.share)}) "
-            f"{'stand' if count > 1 else 'stands'} alone, typically {self._quantity(jolts.size)} "
-            "off the neighbours"
+            f"{'stand' if count > 1 else 'stands'} off the neighbours, typically by "
+            f"{self._quantity(jolts.size)}"
         )
         effect = "squared, they count more than their number, and move every parameter"
         cure = "write 'robust: true', which counts them as not measured"

@@ -262,7 +262,7 @@ def test_a_fault_is_told_before_the_fit_and_stands_in_the_result(folder):
     assert result.returncode == 0, result.stderr
     (fault,) = json.loads(result.stdout)["data_faults"]
     assert (fault["kind"], fault["channel"], fault["moves_parameters"]) == ("outliers", "y", True)
-    warning = result.stderr.index("rig: warning: jolted: 3 samples of y (1.5 %) stand alone")
+    warning = result.stderr.index("rig: warning: jolted: 3 samples of y (1.5 %) stand off")
     assert warning < result.stderr.index("Genetic search") if "Genetic" in result.stderr else True
     assert "'robust: true'" in fault["sentence"]
 

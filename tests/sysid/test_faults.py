@@ -219,6 +219,17 @@ def test_gaps_everywhere_leave_no_part_to_fit():
     assert (fault.kind, fault.severity, fault.cure) == ("gap", "doubt", "record anew")
 
 
+def test_a_burst_of_interference_is_named_where_no_input_has_jumped():
+    record = driven(levels(length=40))
+    outputs = record.outputs.copy()
+    start = int(np.flatnonzero(np.diff(record.inputs[:, 0]))[3]) + 16
+    outputs[start : start + 8, 0] += np.ptp(outputs) * np.array([1, -2, 2, -1, 2, -1, 1, -2])
+    fault = one_fault([replace(record, outputs=outputs)])
+    assert (fault.kind, fault.setting) == ("outliers", "robust=true")
+    left_out = np.flatnonzero(np.isnan(mended(lag(), replace(record, outputs=outputs)).outputs))
+    assert set(range(start, start + 8)) <= set(left_out) <= set(range(start - 1, start + 9))
+
+
 def test_the_same_fault_of_several_records_is_said_once():
     records = [changed(driven(levels(k), seed=k), FAULTS["clipped"]) for k in range(4)]
     fault = one_fault(records)
