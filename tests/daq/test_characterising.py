@@ -128,7 +128,7 @@ def test_a_person_is_asked_for_the_mounting_that_tells_more(folder):
     tight = {"backend": "simulated", "limits": {"speed": 4.0}, "mountings": change}
     write_yaml(folder / "rig.yaml", tight)
     begin = [*words("rig.yaml", "--time", "1.5", "--json"), "--ask"]
-    done = rig(*begin, cwd=folder, timeout=400, input="")
+    done = rig(*begin, cwd=folder, timeout=400)  # nobody answers
     assert done.returncode == 2
     assert "round 2: take the load off" in done.stderr
     assert "--resume c --ask" in done.stderr

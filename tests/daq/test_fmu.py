@@ -102,6 +102,7 @@ def feeding_through():
     )
 
 
+@pytest.mark.soak
 @compiled
 def test_starts_parameters_and_states_are_set_and_kept(tmp_path):
     model = feeding_through()

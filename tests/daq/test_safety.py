@@ -295,7 +295,7 @@ def collector():
     gc.freeze()
 
 
-@pytest.mark.parametrize("left_aside", [False, True])
+@pytest.mark.parametrize("left_aside", mostly_soak([True, False]))
 def test_everything_of_real_time_is_given_back(left_aside, collector):
     collector.unfreeze()
     if left_aside:

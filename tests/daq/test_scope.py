@@ -519,6 +519,7 @@ main()
 """
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize("number", ["SIGINT", "SIGTERM"])
 def test_a_tab_that_does_not_read_leaves_no_word_at_the_end(tmp_path, number):
     process = subprocess.Popen(

@@ -103,6 +103,7 @@ def test_a_rival_that_blows_up_on_its_way_is_fitted_all_the_same():
     assert refit([told], one, np.array([3.0])) == pytest.approx([-1.0], rel=1e-3)
 
 
+@pytest.mark.soak
 def test_noise_of_an_input_counts_as_the_test_scatters():
     u, sigma = np.linspace(-0.5, 1.5, 60), 0.1
     truth, rival = structure(SQUARE, sigma), structure(LINEAR, sigma)

@@ -516,6 +516,7 @@ def test_starts_of_several_records_have_columns_of_their_own():
     assert shares == pytest.approx([1.0, -1.0, -1.0, 0.0, 1.0, 1.0])
 
 
+@pytest.mark.soak
 def test_ties_of_a_search_count():
     """With alpha1 known the bristle would have its unit; in a ratio to alpha0 it has not."""
     space = SearchSpace.of(actuator(), fixed={"R_b": 120.0}, tied={"alpha1": "200 * alpha0"})

@@ -323,6 +323,7 @@ def mean_error(criterion, records):
     return np.mean(errors, axis=0)
 
 
+@pytest.mark.soak
 def test_the_bias_that_noise_of_an_input_brings_is_taken_away():
     records = list(noisy_records(4))
     free_run = mean_error("likelihood", records)

@@ -384,6 +384,7 @@ def answer(model, record, seed):
     return fitted.uncertainty(record).parameters
 
 
+@pytest.mark.soak
 def test_a_ridge_is_told_alike_by_every_seed(far_below_half):
     first, *others = (answer(*far_below_half, seed) for seed in range(3))
     assert all(estimate.std is None for estimate in first)  # by the profile, not the curvature

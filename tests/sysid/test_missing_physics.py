@@ -37,12 +37,12 @@ CASES = {case.name: case for case in cases()}
     ("name", "words"),
     mostly_soak(
         [
+            ("sign of the current", "current has the opposite sign"),
             ("load half", "load is 1.9"),
             ("speed through a filter", "omega is logged through a filter of 0.007"),
             ("load ten samples late", "load is logged 0.02"),
             ("Coulomb friction", "a term in the sign of omega in domega/dt, like dry friction"),
             ("drag", "a term in omega (square) in domega/dt"),
-            ("sign of the current", "current has the opposite sign"),
             ("speed clipped at 80 %", "omega saturates near its largest values"),
             ("Coulomb friction, load's noise", "a term in the sign of omega"),
             ("load off in later logs", "load of training 2 is 0.0"),

@@ -222,6 +222,7 @@ def test_outputs_of_a_card_of_national_instruments_come_behind_all_conversions()
         np.testing.assert_allclose(device.measure_phase(), 0.2, atol=0.02)
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
