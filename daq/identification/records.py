@@ -146,7 +146,8 @@ def _prepared(log: LoggedRecord, model: ProcessModel, selection: Selection) -> L
         made, before = selection.prepared(log.dataset, log.path, model), log.dataset
         steps = (*_merging(log), *made.steps)
         preparation = Preparation(steps, before, made.dataset, made.start)
-        log = replace(log, dataset=made.dataset, preparation=preparation)
+        dataset = replace(made.dataset, begin=before.begin + made.start)
+        log = replace(log, dataset=dataset, preparation=preparation)
     elif log.merged:
         log = replace(log, preparation=Preparation(_merging(log), log.dataset, log.dataset, 0.0))
     log = replace(log, dataset=_without_run_in(log.dataset, log.path, model, selection))
@@ -172,10 +173,12 @@ def _foreign(
     table = read_foreign(path, model, mapping, others)
     rows = selection.rows(path, table.time)
     inputs, outputs, tick = table.inputs[rows], table.outputs[rows], table.tick[rows]
+    time = table.time[rows]
     if selection.run_in is None:
         # The first sample tells where the model starts.
         first = int(np.argmax(np.isfinite(outputs).all(axis=1)))
         inputs, outputs, tick = inputs[first:], outputs[first:], tick[first:]
+        time = time[first:]
     if _is_sparse(tick):
         problem = (
             f"read in {mapping.columns.time.unit}, times of {path} cover {tick[-1] - tick[0] + 1} "
@@ -187,6 +190,7 @@ def _foreign(
         _dataset(path, model, inputs, outputs, tick, table.dt, path.stem),
         input_noise=table.input_noise,
         output_noise=table.output_noise,
+        begin=float(time[0]),
     )
     warning = end_of_run(path, read_record(path), table.torn)
     log = LoggedRecord(dataset, path, warning, merged=tuple(others))
@@ -249,6 +253,7 @@ def _from_log(
         speed = np.array([name == SPEED for name in model.output_names])
         outputs = np.where(speed, speeds.values[:, None], outputs)
     dataset = _dataset(log.path, model, inputs[rows], outputs[rows], tick[rows], log.dt, title)
+    dataset = replace(dataset, begin=float(log.frame["t"].to_numpy()[rows][0]))
     if speeds is not None:
         windows, jitter = np.zeros((*dataset.outputs.shape, 2)), np.zeros(dataset.outputs.shape)
         places = tick[rows] - tick[rows][0]

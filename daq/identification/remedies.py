@@ -40,7 +40,8 @@ def remedies(
     >>> remedies(IdentificationConfig(), faults=[late])
     ('delay.y=0.004',)
     """
-    of_faults = [fault.setting for fault in faults if fault.severity == "doubt" and fault.setting]
+    doubts = [fault for fault in faults if fault.severity == "doubt"]
+    of_faults = [setting for fault in doubts for setting in fault.setting.splitlines()]
     changes: dict[str, str] = dict(setting.split("=", 1) for setting in of_faults)
     lags = any(fault.kind == "lag" for fault in faults)  # which delays that were found are as well
     units = channels or {}

@@ -27,7 +27,8 @@ class Dataset:
     both 0 where it was sampled at its instant. Simulated outputs are averaged alike. jitter:
     (n_samples, n_outputs), standard deviation of when each window was [s]. between: (n_samples,
     n_inputs), by how much the mean of an interpolated input up to the next sample differs from that
-    of a straight line, for which filters bend it. Default none.
+    of a straight line, for which filters bend it. Default none. begin: instant of the first row as
+    whoever made the record counts time [s].
 
     Raises ModelError for mismatched shapes, fewer than two rows, complex numbers, inputs that are
     not finite, or infinite outputs.
@@ -48,6 +49,7 @@ class Dataset:
     windows: FloatArray = field(default_factory=lambda: np.zeros(0))
     jitter: FloatArray = field(default_factory=lambda: np.zeros(0))
     between: FloatArray = field(default_factory=lambda: np.zeros(0))
+    begin: float = 0.0
 
     def __repr__(self) -> str:
         size = f"{self.n_samples} samples, dt={self.dt:g} s"
@@ -152,6 +154,7 @@ class Dataset:
             jitter=self.jitter[rows],
             between=self.between[rows],
             name=name,
+            begin=self.begin + begin * self.dt,
         )
 
     def check(self, model: ProcessModel) -> None:

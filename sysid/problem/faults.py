@@ -1,5 +1,6 @@
 """What is wrong with records before anything is fitted to them, and what it does to parameters."""
 
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -47,8 +48,8 @@ class DataFault:
     is said of them; cure: how to mend it. severity: ``doubt`` where a result may be wrong by it,
     ``note`` where the user has to judge. share: of the samples of the worst record, the first of
     ``records``. moves_parameters: whether it biases parameters beyond what their intervals know.
-    voids_validation: whether it makes the errors in validation no evidence. setting: ``KEY=VALUE``
-    of an identification's configuration that takes it out; empty for none.
+    voids_validation: whether it makes the errors in validation no evidence. setting: ``KEY=VALUE``,
+    one a line, of an identification's configuration that take it out; empty for none.
 
     >>> fault = DataFault("still", "doubt", "validation", ("rest",), "", "it does not move",
     ...     "a validation that does not move is none", "validate with another log", 1.0,
@@ -154,7 +155,8 @@ def _merged(faults: Sequence[DataFault]) -> list[DataFault]:
     for group in alike.values():
         ordered = sorted(group, key=lambda fault: (fault.part == "validation", -fault.share))
         records = dict.fromkeys(name for fault in ordered for name in fault.records)
-        merged.append(replace(ordered[0], records=tuple(records)))
+        settings = "\n".join(dict.fromkeys(fault.setting for fault in ordered if fault.setting))
+        merged.append(replace(ordered[0], records=tuple(records), setting=settings))
     return merged
 
 
@@ -313,25 +315,36 @@ def _gaps(record: Dataset, part: Part) -> Iterator[DataFault]:
     share = float(lost.sum() / (lost.sum() + len(rows)))
     longest = round(float(lost.max()))
     many = longest >= _LONG or share > 0.05
+    part_without = _without_gaps(record, rows, gaps) if many else None
+    if not many:
+        cure = "a few lost samples do no harm"
+    elif part_without is None:
+        cure = "record anew"
+    else:
+        cure = f"fit the part without gaps ('use: {part_without}'), or record anew"
+    named = re.fullmatch(r"[\w-]+", record.name) is not None  # as a key can be
+    setting = f"use.{record.name}={part_without}" if part_without and named else ""
     yield DataFault(
         "gap", "doubt" if many else "note", part, (record.name,), "",
         f"{int(lost.sum())} samples ({_percent(share)}) are missing in {int(gaps.sum())} "
         f"gap{'s' * (int(gaps.sum()) != 1)}, the longest of {longest * usual * record.dt:.3g} s",
         "what its inputs did meanwhile is not known, and counts as if they had gone on",
-        _without_gaps(record, rows, gaps) if many else "a few lost samples do no harm",
-        share, moves_parameters=many and part == "training",
+        cure, share, moves_parameters=many and part == "training", setting=setting,
     )  # fmt: skip
 
 
-def _without_gaps(record: Dataset, rows: IntArray, gaps: BoolArray) -> str:
-    """What to do about gaps behind some of the measured rows but the first, (n_rows - 2,)."""
+def _without_gaps(record: Dataset, rows: IntArray, gaps: BoolArray) -> str | None:
+    """The longest stretch without gaps, as ``use`` has it; None where it is too short.
+
+    rows: that are measured. gaps: behind which of them but the first one is, (n_rows - 2,).
+    """
     begins = np.append(1, 2 + np.flatnonzero(gaps))
     ends = np.append(1 + np.flatnonzero(gaps), len(rows) - 1)
     longest = int(np.argmax(rows[ends] - rows[begins]))
     first, last = record.dt * rows[begins[longest]], record.dt * rows[ends[longest]]
     if last - first < _ENOUGH * record.dt * record.n_samples:
-        return "record anew"
-    return f"fit the part without gaps ('use: {first:.4g} s .. {last:.4g} s'), or record anew"
+        return None
+    return f"{record.begin + first:.6g} s .. {record.begin + last:.6g} s"
 
 
 def _copies(training: Sequence[Dataset], validation: Sequence[Dataset]) -> Iterator[DataFault]:

@@ -18,6 +18,7 @@ from daq.report.publication import publish
 from daq.report.reprint import redraw
 from sysid import GASSI, Dataset
 from sysid.examples import lag
+from sysid.problem.faults import data_faults
 from sysid.problem.preparation import Preparation, low_pass, prepare
 from tests.daq.support import OF_LAG, rig
 
@@ -190,6 +191,22 @@ def test_files_whose_times_do_not_meet_are_refused(folder):
     late.to_csv(folder / "day1_force.csv", index=False)
     with pytest.raises(ConfigError, match="no time is in all of"):
         loaded(folder, merge="*_force.csv")
+
+
+def test_a_gap_is_cut_out_by_the_setting_that_is_named_for_it(folder):
+    log = clean()
+    frame = pd.DataFrame({"t": 100.0 + log.time, "u": log.inputs[:, 0], "y": log.outputs[:, 0]})
+    frame.drop(index=range(800, 900)).to_csv(folder / "gap.csv", index=False)
+    problem(folder)
+
+    def faults(*settings):
+        asked = problem_of(SettingsRequest(str(folder / "id.yaml"), {}, settings))
+        loaded = records.load(folder / "gap.csv", asked.model, asked.mapping, asked.selection)
+        return data_faults(asked.model, [loaded.dataset])
+
+    (gap,) = faults()
+    assert (gap.kind, gap.setting) == ("gap", "use.gap=100.9 s .. 102.999 s")
+    assert faults(gap.setting) == ()
 
 
 def test_a_replay_reads_a_log_as_the_identification_did(folder):

@@ -209,6 +209,11 @@ def test_a_long_gap_is_a_doubt_and_a_short_one_is_mentioned():
         assert f"{length} samples" in fault.statement
         if severity == "doubt":
             assert "'use: 2.5 s .. 9.99 s'" in fault.cure
+            other = replace(driven(levels(1), seed=1), name="2", begin=100.0)
+            other.outputs[200 : 200 + length] = np.nan
+            fault = one_fault([replace(record, outputs=outputs, name="1"), other])
+            settings = "use.1=2.5 s .. 9.99 s", "use.2=102.5 s .. 109.99 s"
+            assert tuple(fault.setting.splitlines()) == settings
 
 
 def test_gaps_everywhere_leave_no_part_to_fit():
