@@ -348,9 +348,8 @@ class _Analysis:
 
     def _pushed(self) -> BoolArray:
         """Parameters that the data push against an end of their range, (n_free,)."""
-        step, (lower, upper) = self.free.newton_step, self.space.coded_bounds
-        outwards = np.where(self.coded - lower < upper - self.coded, -step, step)
-        deviations = np.array([self.free.deviation(g) for g in np.eye(len(step))])
+        outwards = self._outwards(self.free.newton_step)
+        deviations = np.array([self.free.deviation(g) for g in np.eye(len(outwards))])
         free = ~np.array(self.ties.bound, dtype=bool)
         pushed: BoolArray = self.on_bound & free & (outwards > Z95 * deviations)
         return pushed
@@ -367,9 +366,18 @@ class _Analysis:
     def _arrived(self, gradient: FloatArray, deviation: float) -> bool:
         """Whether the slopes have their minimum near the estimate, seen along a quantity.
 
-        A descent in a bent valley may stop away from it, and an end of a range may hold it.
+        A descent in a bent valley may stop away from it. What an end of a range holds stays there.
         """
-        return bool(abs(gradient @ self.covariance.newton_step) < _AWAY * deviation)
+        step, curvature = self.covariance.newton_step, self.covariance.curvature
+        held = np.flatnonzero(self.on_bound & (self._outwards(step) > 0.0))
+        follows = curvature[:, held] @ np.linalg.pinv(curvature[np.ix_(held, held)])
+        return bool(abs(gradient @ (step - follows @ step[held])) < _AWAY * deviation)
+
+    def _outwards(self, step: FloatArray) -> FloatArray:
+        """A step's parts towards the nearer end of each range, (n_free,)."""
+        lower, upper = self.space.coded_bounds
+        parts: FloatArray = np.where(self.coded - lower < upper - self.coded, -step, step)
+        return parts
 
     def combination(self, combination: Invariant) -> _Draft:
         """Estimate of a combination of tied parameters."""
