@@ -163,9 +163,9 @@ def _sizes(model: ProcessModel) -> list[str]:
 
 
 def _show(name: str, model: ProcessModel, options: list[dict[str, Any]]) -> None:
-    print(f"{model.name}: {model.description}")
+    terminal.print_text(f"{model.name}: {model.description}")
     for equation in model.equations:
-        print(f"  {equation}")
+        terminal.print_text(f"  {equation}")
     if model.equations:
         print()
     rows = [["state", s.name, s.unit, _start(s, model)] for s in model.states]
@@ -194,8 +194,8 @@ def _show_options(name: str, options: list[dict[str, Any]]) -> None:
         for o in options
     ]
     terminal.print_table("Options", head, rows, text=head)
-    last = options[-1]
-    print(
+    last = next((o for o in reversed(options) if len(o["choices"]) > 1), options[-1])
+    terminal.print_text(
         f"Another combination: rig models {name_parts(name)[0]}:{last['name']}="
         f"{last['choices'][-1]}, with a comma between options; --model takes the same name"
     )

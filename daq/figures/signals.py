@@ -95,7 +95,7 @@ def responses(time: FloatArray, outputs: Sequence[Panel]) -> Figure:
         _respond(time, output, axes[2 * j], axes[2 * j + 1]) for j, output in enumerate(outputs)
     ]
     if any(leaves):
-        axes[0].plot([], [], ls="", marker="^", ms=3, color="0.4", label="beyond")
+        axes[0].plot([], [], ls="", marker="^", ms=3, color="0.4", label="beyond frame")
     axes[-1].set_xlabel("time [s]")
     style.legend(figure, axes[0])
     return figure

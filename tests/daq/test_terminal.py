@@ -181,3 +181,9 @@ def test_the_package_starts_as_the_command_does():
         for module in ("daq", "daq.cli")
     ]  # fmt: skip
     assert said[0] == said[1] != ""
+
+
+def test_the_combination_of_options_that_is_shown_is_one(tmp_path):
+    shown = rig("models", "actuator", cwd=tmp_path).stdout
+    name = re.search(r"Another combination: rig models (\S+), with", shown)[1]
+    assert rig("models", name, cwd=tmp_path).returncode == 0
