@@ -655,8 +655,8 @@ def description(finding: Finding) -> str:
         return f"a slow signal in d{finding.name}/dt that nobody measured"
     assert amplitude is not None
     if finding.kind == "change":
-        size = f"{100.0 * amplitude:+.{0 if abs(amplitude) >= 0.01 else 2}f} % of its value"
-        return f"{finding.name} changes by {size} from a record's first to last sample"
+        change = f"{100.0 * amplitude:+.{0 if abs(amplitude) >= 0.01 else 2}f} % of its value"
+        return f"{finding.name} changes by {change} from a record's first to last sample"
     if finding.kind == "gain":
         times = f"is {1.0 + amplitude:.3g} times what"
         is_what = "has the opposite sign of what" if finding.turned_round else times
