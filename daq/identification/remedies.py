@@ -19,6 +19,7 @@ _WIDER = 10.0  # by which factor a range is widened
 _ALIKE = 0.02  # by which a gain may differ from that between two units
 _ANGLES = ("rpm", "deg/s", "turn/s", "rad/s", "deg", "turn", "rad")
 _PREFIXES = ("m", "k")
+_OF_SAMPLES = ("clipped", "frozen", "gap", "outliers")  # kinds of faults
 
 
 def remedies(
@@ -47,8 +48,11 @@ def remedies(
     units = channels or {}
     whole = [f for f in findings if f.name in units or f.kind == "exchange"]
     of_all_logs = [f for f in whole if not (lags and f.comes_late)]
-    changes |= dict(_of_channels(settings, of_all_logs, units))
-    if not changes:  # what is wrong with the data drives parameters to the ends
+    # A gain or offset that wrong samples, or unknown inputs in a gap, may feign is not fitted yet.
+    spoiled = any(fault.kind in _OF_SAMPLES for fault in doubts)
+    of_channels = dict(_of_channels(settings, of_all_logs, units)).items()
+    changes |= {k: v for k, v in of_channels if not (spoiled and k.startswith("channels."))}
+    if not changes and not spoiled:  # what is wrong with the data drives parameters to the ends
         changes |= dict(_of_ranges(pushed or {}))
     return tuple(f"{key}={value}" for key, value in changes.items())
 

@@ -108,6 +108,7 @@ def test_gains_offsets_and_drifts_become_parameters():
         "channels.y.drift=[-0.05, 0.05]",
     )
     assert settings(**{"channels": {"u": {"offset": [-0.2, 0.2]}}}).channels["u"].gain is None
+    assert mended(wrong, [fault("gap", setting="use.log=0 s .. 1 s")]) == ("use.log=0 s .. 1 s",)
 
 
 @pytest.mark.parametrize(("value", "ends"), [(1e-5, "[1e-6, 0.001]"), (1e-3, "[1e-5, 0.01]")])
