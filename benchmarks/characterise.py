@@ -1,6 +1,7 @@
 """What `rig characterise` tells of hidden rigs, beside 8 runs of the shipped PRBS.
 
-python -m benchmarks.characterise [--json] [--rigs 3] [--first 0] [--time 10] [--model actuator]
+python -m benchmarks.characterise [--json] [--rigs 3] [--first 0] [--time 10]
+                                 [--model actuator:limits=true]
 
 Each rig is the simulated one with the model's nominal values, each times a factor of 0.6 to 1.6
 drawn anew. It is characterised from the model's ranges within 10 s of logged time; the same rig
@@ -29,7 +30,7 @@ from daq.identification.fit import fit
 from daq.identification.request import SettingsRequest
 from daq.identification.settings import problem_of
 from daq.logs.capture import LOG_NAME
-from daq.lookup.models import DEFAULT_MODEL, find_model
+from daq.lookup.models import DRIVEN_MODEL, find_model
 from daq.lookup.shipped import find_file
 from sim_rig.actuator import actuator
 from sysid import identifiability
@@ -46,7 +47,7 @@ def main() -> None:
     parser.add_argument("--rigs", type=int, default=3, help="hidden parameters drawn")
     parser.add_argument("--first", type=int, default=0, help="number of the first rig")
     parser.add_argument("--time", type=float, default=10.0, help="logged time [s]")
-    parser.add_argument("--model", default=DEFAULT_MODEL, help="that is identified")
+    parser.add_argument("--model", default=DRIVEN_MODEL, help="that is identified")
     options = parser.parse_args()
     numbers = range(options.first, options.first + options.rigs)
     rigs = [hidden_rig(number, options.time, options.model) for number in numbers]

@@ -15,6 +15,7 @@ import numpy as np
 from daq.characterise.mounts import Ask, MountedRig, mounted_rigs
 from daq.characterise.page import write_page
 from daq.characterise.rounds import Interval, Request, Round, rounds_of
+from daq.config import yaml_file
 from daq.config.yaml_file import TypedSettings
 from daq.designs.design import choose, write
 from daq.designs.runs import DATA
@@ -26,7 +27,7 @@ from daq.identification.request import CHECKPOINT, SettingsRequest
 from daq.identification.result import Identification
 from daq.identification.settings import problem_of
 from daq.logs.capture import LOG_NAME
-from daq.lookup.models import whole_name
+from daq.lookup.models import DRIVEN_MODEL, whole_name
 from daq.lookup.rigs import load_rig
 from daq.notation import quantity
 from daq.progress import Note, Started, Watch, ignore
@@ -106,7 +107,8 @@ def characterise(
     """Find a rig's parameters: design runs, run them, identify, and again.
 
     time: logged time of all runs, at most [s]. precision: half width wanted of all 95 % intervals
-    [%], None for as narrow as they get. out: a new folder for all of it. settings: keys of the
+    [%], None for as narrow as they get. model: by default the configuration's, or else the actuator
+    with the ends of its amplifiers. out: a new folder for all of it. settings: keys of the
     designs, as ``key=value``. ask: tells a person to change to another mounting of the rig's
     file where that tells more; None: it stays as it is. Raises ConfigError before anything moves,
     and what a run raises.
@@ -115,7 +117,7 @@ def characterise(
         _absolute(rig) if Path(rig).exists() else str(rig),
         time,
         precision,
-        None if model is None else whole_name(model),
+        _model_of(model, config),
         None if plant is None else whole_name(plant),
         None if config is None else _absolute(config),
         tuple(settings),
@@ -193,6 +195,13 @@ def _nothing_to_tell(first: Round) -> ConfigError:
         )
         cure = "give more time or longer runs (--set run=5s), wider limits, or less noise"
     return ConfigError(f"nothing was run: {problem}", cure=cure, file=first.folder / DATA)
+
+
+def _model_of(name: str | None, config: str | Path | None) -> str | None:
+    """The whole name of the model; None for the one that a configuration names."""
+    if name is None and config is not None and yaml_file.load(Path(config)).content.get("model"):
+        return None
+    return whole_name(name or DRIVEN_MODEL)
 
 
 def _absolute(path: str | Path) -> str:

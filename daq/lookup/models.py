@@ -13,6 +13,8 @@ from sysid import ModelError, ProcessModel
 from sysid.time_limit import AT_LENGTH, time_limit
 
 DEFAULT_MODEL = "actuator"
+# Of designed runs, which drive amplifiers to their ends: known ends tell what nothing else does.
+DRIVEN_MODEL = f"{DEFAULT_MODEL}:limits=true"
 
 
 def name_parts(name: str) -> tuple[str, str | None, str]:

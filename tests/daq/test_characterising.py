@@ -8,7 +8,8 @@ import subprocess
 
 import pytest
 
-from daq.characterise.rounds import Round, rounds_of
+from daq.characterise import characterise as use_case
+from daq.characterise.rounds import Request, Round, rounds_of
 from sim_rig.actuator import actuator
 from tests.daq.support import few_free, rig, start_rig, write_yaml
 
@@ -19,7 +20,8 @@ QUICK = ["candidates=8", "generations=0", "draws=1", "checks=2", "calibration=16
 
 def words(*more):
     settings = [word for setting in QUICK for word in ("--set", setting)]
-    return ["characterise", "--config", "id.yaml", "--out", "c", *settings, *more]
+    begin = ["characterise", "--config", "id.yaml", "--model", "actuator", "--out", "c"]
+    return [*begin, *settings, *more]
 
 
 @pytest.fixture
@@ -141,6 +143,19 @@ def test_a_person_is_asked_for_the_mounting_that_tells_more(folder):
     first, second, *_ = rounds_of(folder / "c")
     assert (folder / "rig.yaml").samefile(first.rig)
     assert (folder / "free.yaml").samefile(second.rig)
+
+
+@pytest.mark.parametrize(
+    ("given", "named"), [({}, "actuator:limits=true"), ({"model": "actuator"}, None)]
+)
+def test_without_a_name_the_model_has_the_ends_of_its_amplifiers(
+    tmp_path, monkeypatch, given, named
+):
+    monkeypatch.setattr(use_case, "resume", lambda folder, **_: Request.load(folder))
+    config = write_yaml(tmp_path / "id.yaml", given)
+    request = use_case.characterise("simulated.yaml", 10.0, out=tmp_path / "c", config=config)
+    assert request.model == named
+    assert Request.load(tmp_path / "c").model == named
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no SIGKILL")
