@@ -578,7 +578,7 @@ def towards(
     """
     change = np.log(settled.noise / fitted.noise)
     part = np.divide(change, last, out=np.zeros_like(change), where=last != 0.0)
-    change = np.where(part < _SWINGING, change / (1.0 - part), change)
+    change = change / np.where(part < _SWINGING, 1.0 - part, 1.0)
     return settled.of_noise(fitted.noise * np.exp(change)), change
 
 

@@ -114,12 +114,13 @@ class _Responses:
         beside = np.repeat(at[:, None], len(places), axis=1)
         beside[:, np.arange(len(places)), places] += _DIFFERENCE * self.width[places]
         system, moved = self._system(at), self._system(beside.reshape(-1, at.shape[1]))
-        change = moved.reshape(shape) - system.reshape(len(at), 1, -1)
         response, left, right = self._answers(system)
         # (n, f, q, 1, i, 1) times (n, f, 1, m, 1, j)
         factors = left[:, :, :, None, :, None] * np.swapaxes(right, 2, 3)[:, :, None, :, None, :]
-        factors = factors.reshape(len(at), -1, change.shape[2])
-        moved_response = change @ np.swapaxes(factors, 1, 2)
+        factors = factors.reshape(len(at), -1, system[0].size)
+        with np.errstate(invalid="ignore", over="ignore"):  # where there is no finite system
+            change = moved.reshape(shape) - system.reshape(len(at), 1, -1)
+            moved_response = change @ np.swapaxes(factors, 1, 2)
         moved_response = response[:, None] + moved_response.reshape(*shape[:2], *self._shape)
         missed = self._missed(moved_response.reshape(-1, *self._shape)).reshape(shape)
         slopes: FloatArray = (missed - self._missed(response)[:, None]) / _DIFFERENCE

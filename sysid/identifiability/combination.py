@@ -10,6 +10,10 @@ from sysid.problem.expressions import product_text, product_unit, sum_text
 _ALIKE = 1e-9  # a coefficient this close to a product of fixed values is that product
 
 
+def _power(value: float, power: float) -> float:
+    return math.inf if value == 0.0 and power < 0.0 else value**power
+
+
 @dataclass(frozen=True)
 class Term:
     """A coefficient times powers of parameters, and of starts such as ``z(0)``.
@@ -23,8 +27,8 @@ class Term:
     factors: tuple[tuple[str, float], ...] = ()
 
     def value(self, values: Mapping[str, float]) -> float:
-        """Value at parameters by name."""
-        product: float = math.prod([values[name] ** power for name, power in self.powers])
+        """Value at parameters by name; infinite where one that divides is zero."""
+        product: float = math.prod([_power(values[name], power) for name, power in self.powers])
         return self.coefficient * product
 
     def named(self, fixed: Mapping[str, float]) -> "Term":

@@ -122,8 +122,8 @@ def _moved(
         combination = estimate.combination
         names = (estimate.name,) if combination is None else combination.names
         shared = all(name in parameters for name in names)
-        if shared and estimate.std and estimate.excludes(parameters):
+        if shared and estimate.deviation and estimate.excludes(parameters):
             value = estimate.at(parameters)
-            far = abs(value - estimate.value) / estimate.std
+            far = abs(value - estimate.value) / estimate.deviation
             moved.append((far, estimate.name, (estimate.value, value, estimate.unit)))
     return {name: values for _, name, values in sorted(moved, key=lambda m: -m[0])}

@@ -100,9 +100,9 @@ def _tested(
     if share > _LESS or p_value > _SURE:
         return None
     moves = [
-        Move(e, e.at(fitted.parameters_) - e.value, (e.at(fitted.parameters_) - e.value) / e.std)
+        Move(e, change := e.at(fitted.parameters_) - e.value, change / e.deviation)
         for e in uncertainty.determined()
-        if e.std
+        if e.deviation
     ]
     moves.sort(key=lambda move: -abs(move.deviations))
     name = " and ".join(names)

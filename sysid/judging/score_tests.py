@@ -239,7 +239,7 @@ class _Tests:
         """
         self.findings: list[Finding] = []
         self._local, self._residual = local, -local.residual
-        self._estimates = [e for e in uncertainty.determined() if e.std]
+        self._estimates = [e for e in uncertainty.determined() if e.deviation]
         gradients = [_gradient(local, e) for e in self._estimates]
         self._gradients = np.array(gradients).reshape(-1, local.slopes.shape[2])
         self._scales = np.concatenate(
@@ -382,9 +382,9 @@ class _Tests:
     ) -> Finding:
         moved = self._gradients @ result.move[: self._gradients.shape[1]]
         moves = [
-            Move(e, float(change), float(change) / e.std)
+            Move(e, float(change), float(change) / e.deviation)
             for e, change in zip(self._estimates, moved, strict=True)
-            if e.std
+            if e.deviation
         ]
         moves.sort(key=lambda move: -abs(move.deviations))
         several, amplitudes = suspect.kind in _SEVERAL, result.amplitudes

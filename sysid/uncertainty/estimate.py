@@ -62,6 +62,13 @@ class Estimate:
     failing: float = 0.0
     combination: Invariant | None = None
 
+    @property
+    def deviation(self) -> float | None:
+        """Standard deviation, or that of which an interval with two ends would be."""
+        if self.std is not None or self.low is None or self.high is None:
+            return self.std
+        return (self.high - self.low) / (2.0 * Z95)
+
     def at(self, parameters: Mapping[str, float]) -> float:
         """Value of the quantity for other values of the parameters."""
         combination = self.combination
