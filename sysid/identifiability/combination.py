@@ -11,7 +11,10 @@ _ALIKE = 1e-9  # a coefficient this close to a product of fixed values is that p
 
 
 def _power(value: float, power: float) -> float:
-    return math.inf if value == 0.0 and power < 0.0 else value**power
+    try:
+        return value**power
+    except ZeroDivisionError:
+        return math.inf
 
 
 @dataclass(frozen=True)
