@@ -12,9 +12,10 @@ _ALIKE = 1e-9  # a coefficient this close to a product of fixed values is that p
 
 def _power(value: float, power: float) -> float:
     try:
-        return value**power
+        raised: float = value**power
     except ZeroDivisionError:
         return math.inf
+    return raised
 
 
 @dataclass(frozen=True)
